@@ -1,0 +1,1 @@
+"""The gateway agent: configuration, pipeline, recording, store, publication and the command line."""

@@ -1,0 +1,84 @@
+"""The model V = S a + Q (Eq. 8), what a window of data is, and what a calibration says.
+
+Units: accelerations in m/s2; outputs V in the sensor's own output unit; S in output unit per m/s2; Q in the output
+unit. S has a row an output axis and a column a direction, so S[0, 1] is S_xy: output x, excited along y.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+PARAMETERS = ("Sxx", "Sxy", "Sxz", "Syx", "Syy", "Syz", "Szx", "Szy", "Szz", "Qx", "Qy", "Qz")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pose:
+    """How the sensor stands: what its ideal twin would read.
+
+    The input acceleration in the sensor's frame is `a(t) = direction @ u(t) + gravity_mps2`, u being the reference's
+    m channels in m/s2 (m = 0 at rest, 1 for a uniaxial reference, 3 for a tri-axial one).
+    `direction` is (3, m); `gravity_mps2` (3,) is what an ideal sensor reads at rest there (zeros where the sensor or
+    the equation does not feel it). `theta_rad`, `alpha_rad` are kept where the pose came from the clamp (Eqs. 9-11).
+    `position` names the pose: windows of one position share its angle and offset errors.
+    """
+
+    position: str
+    direction: Array
+    gravity_mps2: Array
+    theta_rad: float | None = None
+    alpha_rad: float | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WindowSums:
+    """Additive summary of a window on the reference's own basis, one entry a segment (a cycle, or a second).
+
+    Columns of z, q = 2 m + 3: the reference's m channels u, their m time derivatives du/dt, then V_x, V_y, V_z.
+    `count` (K,) samples; `mean` (K, q); `scatter` (K, q, q) = sum (z - mean)(z - mean)'. Centred, so that nothing is
+    lost to cancellation; merged by Chan's formula (calib.sums).
+    """
+
+    reference_channels: int
+    count: Array
+    mean: Array
+    scatter: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Window:
+    """One window of known excitation: where the sensor stood, its sums, and the verdict on it."""
+
+    start_s: float
+    stop_s: float
+    pose: Pose
+    sums: WindowSums
+    used: bool
+    reason: str  # why it is not used, "" where it is
+    points: int
+    left_out: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration:
+    """S and Q with what is known of them.
+
+    `covariance` (12, 12) in the order of PARAMETERS (S row by row, then Q); `determined` (12,) tells which of the
+    parameters the data support; the others carry NaN in files' estimates, the prior's value in an agent.
+    `degrees_of_freedom` of the type A part, inf where it does not matter.
+    """
+
+    sensitivity: Array
+    offset: Array
+    covariance: Array
+    determined: NDArray[np.bool_]
+    degrees_of_freedom: float
+    method: str
+
+    @property
+    def standard_uncertainty(self) -> Array:
+        """(12,) square roots of the covariance's diagonal."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))

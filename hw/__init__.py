@@ -1,0 +1,1 @@
+"""Devices: the sample block every driver yields, the sensor protocol, the drivers and the virtual bench."""

@@ -1,0 +1,1 @@
+"""Import packages are the top-level folders; tests run against the checkout."""
