@@ -1,0 +1,24 @@
+"""`fieldcal check`: all faults of a configuration at once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from agent.config import ConfigError, load_config
+
+
+@click.command()
+@click.argument("config", type=click.Path(path_type=Path))
+def check(config: Path) -> int:
+    """Say every fault of CONFIG, each with its path and value. Exit status 2 if there is one."""
+    try:
+        loaded = load_config(config)
+    except ConfigError as error:
+        for fault in error.faults:
+            click.echo(fault, err=True)
+        return 2
+    poses = sum(len(channel.poses) for channel in loaded.channels)
+    click.echo(f"{config}: good; {len(loaded.devices)} devices, {len(loaded.channels)} channels, {poses} poses")
+    return 0

@@ -1,0 +1,133 @@
+"""Reader threads: one a device, into one bounded queue. Devices may come and go; nothing is dropped in silence."""
+
+from __future__ import annotations
+
+import json
+import queue
+import threading
+import time
+from dataclasses import asdict
+from typing import Any
+
+from agent.events import DeviceChange, Event, Gap
+from hw.sensor import ConfigurationError, DeviceError, Sensor
+
+BLOCKS_A_SECOND = 2
+QUEUE_S = 30  # the queue holds this much of every device (architecture.md, flow)
+BACK_OFF_S = (0.1, 5.0)  # first and longest pause between attempts to reopen
+CONFIGURATION_BACK_OFF_S = 5.0  # somebody has to change something first; no use in hurrying
+
+
+class EventQueue:
+    """Bounded. When it is full a block is counted as dropped, and the count leaves as a `Gap` before the next event."""
+
+    def __init__(self, devices: int) -> None:
+        self._queue: queue.Queue[Event] = queue.Queue(maxsize=QUEUE_S * BLOCKS_A_SECOND * devices)
+        self._dropped: dict[str, int] = {}
+        self._lock = threading.Lock()
+
+    def put(self, device: str, event: Event) -> None:
+        """Add an event, or count it as dropped. Never blocks a reader."""
+        try:
+            self._queue.put_nowait(event)
+        except queue.Full:
+            with self._lock:
+                self._dropped[device] = self._dropped.get(device, 0) + 1
+
+    def get(self, timeout_s: float) -> Event | None:
+        """The next event, or None after `timeout_s`."""
+        try:
+            return self._queue.get(timeout=max(0.0, timeout_s))
+        except queue.Empty:
+            return None
+
+    def take_gaps(self) -> list[Gap]:
+        """What was dropped since the last call. Cheap when nothing was."""
+        if not self._dropped:
+            return []
+        with self._lock:
+            dropped, self._dropped = self._dropped, {}
+        now = time.monotonic_ns()
+        return [
+            Gap(device=d, t_monotonic_ns=now, dropped=n, unit="blocks", reason="the queue to the pipeline was full")
+            for d, n in sorted(dropped.items())
+        ]
+
+    def depth(self) -> int:
+        """How many events wait."""
+        return self._queue.qsize()
+
+
+class Reader(threading.Thread):
+    """Opens a device, reads it until told to stop, reopens it with back-off when it is lost."""
+
+    def __init__(self, name: str, sensor: Sensor, events: EventQueue) -> None:
+        super().__init__(name=f"reader-{name}", daemon=True)
+        self.device = name
+        self._sensor = sensor
+        self._events = events
+        self._stop_request = threading.Event()
+        self._said = ""
+
+    def stop(self) -> None:
+        """Ask the thread to end; it does within one block."""
+        self._stop_request.set()
+
+    def run(self) -> None:
+        """Read until stopped. An error of a driver never ends the thread."""
+        attempt = 0
+        while not self._stop_request.is_set():
+            pause_s = min(BACK_OFF_S[1], BACK_OFF_S[0] * 2 ** min(attempt, 10))
+            try:
+                info = self._sensor.open()
+                self._report("open", f"{info.kind} {info.serial_number}".strip(), json.dumps(asdict(info)), attempt)
+                attempt, self._said = 0, ""
+                self._read()
+            except ConfigurationError as error:
+                pause_s = CONFIGURATION_BACK_OFF_S
+                self._report_lost(str(error), attempt)
+            except DeviceError as error:
+                self._report_lost(str(error), attempt)
+            except Exception as error:  # a driver's own bug must not end the agent
+                self._report_lost(f"fault in the driver: {type(error).__name__}: {error}", attempt)
+            finally:
+                self._sensor.close()
+            attempt += 1
+            self._stop_request.wait(pause_s)
+
+    def _read(self) -> None:
+        while not self._stop_request.is_set():
+            block = self._sensor.read_block()
+            for drop in self._sensor.take_drops():
+                self._events.put(
+                    self.device,
+                    Gap(
+                        device=self.device,
+                        t_monotonic_ns=time.monotonic_ns(),
+                        dropped=drop.count,
+                        unit=drop.unit,
+                        reason=drop.reason,
+                    ),
+                )
+            if block is not None:
+                self._events.put(self.device, block)
+
+    def _report_lost(self, message: str, attempt: int) -> None:
+        # The same words every few seconds for a month would fill the recording; they are said when they change.
+        if message != self._said:
+            self._report("lost", message, "", attempt)
+            self._said = message
+
+    def _report(self, state: Any, message: str, info_json: str, attempt: int) -> None:
+        self._events.put(
+            self.device,
+            DeviceChange(
+                device=self.device,
+                state=state,
+                t_monotonic_ns=time.monotonic_ns(),
+                t_utc_ns=time.time_ns(),
+                message=message,
+                info_json=info_json,
+                attempt=attempt,
+            ),
+        )

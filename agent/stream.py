@@ -1,0 +1,119 @@
+"""The newest samples of one device, with the clock that says when each was taken."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.timing import ClockModel
+from hw.block import BlockFlags, SampleBlock
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cut:
+    """Samples between two times: their times in seconds, their indications, and what is wrong with them."""
+
+    first_index: int
+    time_s: NDArray[np.float64]
+    indications: NDArray[np.float64]
+    gap: bool
+    saturated: bool
+
+
+class DeviceStream:
+    """Blocks of one device as they come, forgotten when `forget_before` says so.
+
+    Times are seconds since the run's origin on the gateway's monotonic clock. A RESTART (the index does not go on in
+    time) empties the buffer and starts the clock model anew; `broken_s` is when that last happened.
+    """
+
+    def __init__(self, origin_ns: int) -> None:
+        self._origin_ns = origin_ns
+        self._blocks: deque[SampleBlock] = deque()
+        self._clock: ClockModel | None = None
+        self.newest_arrival_s: float | None = None
+        self.first_sample_s: float | None = None
+        self.broken_s: float | None = None
+
+    def update(self, block: SampleBlock) -> None:
+        """Take the next block."""
+        arrivals_s = (block.burst_t_monotonic_ns - self._origin_ns) * 1e-9
+        first_arrival_s = float(arrivals_s[0])
+        if self._clock is None:
+            self._clock = ClockModel(block.nominal_rate_hz)
+            self.first_sample_s = first_arrival_s - int(block.burst_count[0]) / block.nominal_rate_hz
+        elif block.flags & BlockFlags.RESTART:
+            self._clock = ClockModel(block.nominal_rate_hz)
+            self._blocks.clear()
+            self.broken_s = first_arrival_s
+        self._clock.update(block.first_index + block.burst_count.astype(np.int64) - 1, arrivals_s)
+        self._blocks.append(block)
+        self.newest_arrival_s = float(arrivals_s[-1])
+
+    def newest_s(self) -> float | None:
+        """Time of the newest sample, None without one."""
+        if not self._blocks or self._clock is None:
+            return None
+        newest = self._blocks[-1]
+        return float(self._clock.result().time_of(np.array([newest.first_index + newest.n - 1]))[0])
+
+    def cut(self, start_s: float, stop_s: float) -> Cut | None:
+        """All samples with start_s <= t < stop_s by the clock model as it is now; None if there are none."""
+        if not self._blocks or self._clock is None:
+            return None
+        clock = self._clock.result()
+        index = np.concatenate([block.first_index + np.arange(block.n) for block in self._blocks])
+        time_s = clock.time_of(index)
+        lo, hi = (int(i) for i in np.searchsorted(time_s, (start_s, stop_s)))
+        if hi <= lo:
+            return None
+        values = np.concatenate([block.indications for block in self._blocks]).astype(np.float64)
+        flags = np.concatenate([np.full(block.n, int(block.flags)) for block in self._blocks])[lo:hi]
+        return Cut(
+            first_index=int(index[lo]),
+            time_s=time_s[lo:hi],
+            indications=values[lo:hi],
+            gap=bool(index[hi - 1] - index[lo] != hi - 1 - lo),
+            saturated=bool(np.any(flags & int(BlockFlags.SATURATED))),
+        )
+
+    def forget_before(self, time_s: float) -> None:
+        """Drop whole blocks that ended before `time_s` (by arrival, which is never early)."""
+        while len(self._blocks) > 1 and (self._blocks[0].t_monotonic_ns - self._origin_ns) * 1e-9 < time_s:
+            self._blocks.popleft()
+
+    def snapshot(self) -> dict[str, Any]:
+        """State for `restore`, bit-exact."""
+        return {
+            "clock": self._clock.snapshot() if self._clock else None,
+            "nominal_rate_hz": self._blocks[-1].nominal_rate_hz if self._blocks else 0.0,
+            "blocks": [_block_state(block) for block in self._blocks],
+            "newest_arrival_s": self.newest_arrival_s,
+            "first_sample_s": self.first_sample_s,
+            "broken_s": self.broken_s,
+        }
+
+    @classmethod
+    def restore(cls, origin_ns: int, state: dict[str, Any]) -> DeviceStream:
+        """The stream whose `snapshot` this is."""
+        stream = cls(origin_ns)
+        if state["clock"] is not None:
+            stream._clock = ClockModel.restore(state["clock"])
+        stream._blocks.extend(_block_of(s) for s in state["blocks"])
+        stream.newest_arrival_s = state["newest_arrival_s"]
+        stream.first_sample_s = state["first_sample_s"]
+        stream.broken_s = state["broken_s"]
+        return stream
+
+
+def _block_state(block: SampleBlock) -> dict[str, Any]:
+    state = {name: getattr(block, name) for name in SampleBlock.__slots__}
+    return state | {"flags": int(block.flags)}
+
+
+def _block_of(state: dict[str, Any]) -> SampleBlock:
+    return SampleBlock(**(state | {"flags": BlockFlags(state["flags"])}))
