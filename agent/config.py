@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ByteSize, ConfigDict, Field, ValidationError, model_validator
 
+from calib.geometry import beside
 from hw.sensor import DeviceError, load_driver
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,62}$", description="a chunk of a Zenoh key")]
@@ -80,11 +81,19 @@ class Channel(Section):
     late_horizon_s: Annotated[float, Field(gt=0, le=600)] = 5.0
     silence_s: Annotated[float, Field(gt=0, le=3600, description="without a block the status is INVALID")] = 5.0
     windows: Annotated[int, Field(ge=1, le=1000, description="how many of the newest windows the solution uses")] = 24
+    # A tri-axial reference beside the sensor needs no poses: a = R a_ref, R row by row. What the sensor reads at rest
+    # belongs here only where the reference is AC-coupled.
+    rotation: tuple[float, float, float, float, float, float, float, float, float] | None = None
+    rotation_gravity_mps2: Vector | None = (0.0, 0.0, 0.0)
     poses: tuple[PoseInterval, ...] = ()
     poses_repeat_s: Annotated[float | None, Field(gt=0)] = None
 
     @model_validator(mode="after")
     def _schedule(self) -> Channel:
+        if self.rotation is not None:
+            if self.poses or self.reference is None:
+                raise ValueError("rotation is for a tri-axial reference and takes the place of poses")
+            beside([self.rotation[i : i + 3] for i in (0, 3, 6)])
         end = 0.0
         for i, pose in enumerate(self.poses):
             if pose.start_s < end:

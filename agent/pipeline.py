@@ -5,13 +5,12 @@ Live, devices feed it; in an audit, a recording does. `restore(snapshot())` equa
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import msgspec
 
 from agent.channel import ChannelState
-from agent.config import Config, parse_config
+from agent.config import Config
 from agent.events import CalibrationUpdate, DeviceChange, Event, Result, RunStart, Tick
 from agent.snapshot import pack, unpack
 from hw.block import SampleBlock
@@ -44,8 +43,8 @@ class Pipeline:
 
     @classmethod
     def restore(cls, config_json: str, snapshot: bytes) -> Pipeline:
-        """The pipeline whose `snapshot` this is. Raises ValueError or ConfigError on what is none."""
-        pipeline = cls(parse_config(json.loads(config_json), "recorded configuration"))
+        """The pipeline whose `snapshot` this is. Raises ValueError on what is none."""
+        pipeline = cls(Config.model_validate_json(config_json))
         state = unpack(snapshot)
         pipeline._run_id = state["run_id"]
         pipeline._next_sequence = state["next_sequence"]

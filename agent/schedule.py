@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from agent.config import Channel, PoseInterval
-from calib.geometry import clamp_pose, direction_pose, rest_pose
+from calib.geometry import along, at_rest, beside, clamp
 from calib.model import Pose
 
 # A pose that holds for long is cut into windows of this length, so that memory stays bounded and news comes.
@@ -26,19 +26,34 @@ class Piece:
 
 def pieces(channel: Channel, after_s: float) -> Iterator[Piece]:
     """The pieces that lie after `after_s`, in order of time; without end where the schedule repeats."""
-    period_s = channel.poses_repeat_s
-    if not channel.poses:
+    for start_s, stop_s, pose in _stretches(channel, after_s):
+        first_s = max(start_s + channel.guard_s, after_s)
+        while first_s < stop_s - channel.guard_s:
+            last_s = min(first_s + WINDOW_S, stop_s - channel.guard_s)
+            yield Piece(first_s, last_s, pose)
+            first_s = last_s
+
+
+def _stretches(channel: Channel, after_s: float) -> Iterator[tuple[float, float, Pose]]:
+    if channel.rotation is not None:
+        rows = [channel.rotation[i : i + 3] for i in (0, 3, 6)]
+        yield 0.0, math.inf, beside(rows, channel.rotation_gravity_mps2)
         return
-    for cycle in itertools.count(int(after_s // period_s)) if period_s else (0,):
+    period_s = channel.poses_repeat_s
+    for cycle in itertools.count(int(after_s // period_s)) if period_s and channel.poses else (0,):
         base_s = cycle * period_s if period_s else 0.0
         for i, interval in enumerate(channel.poses):
-            start_s = max(after_s, base_s + interval.start_s + channel.guard_s)
-            stop_s = base_s + interval.stop_s - channel.guard_s
-            for part in range(math.ceil((stop_s - start_s) / WINDOW_S)):
-                first_s = start_s + part * WINDOW_S
-                yield Piece(first_s, min(stop_s, first_s + WINDOW_S), interval_pose(interval, channel, str(i + 1)))
+            yield base_s + interval.start_s, base_s + interval.stop_s, _pose(interval, channel, str(i + 1))
 
 
-def interval_pose(interval: PoseInterval, channel: Channel, position: str) -> Pose:
-    """The pose as the estimator takes it."""
-    raise NotImplementedError
+def _pose(interval: PoseInterval, channel: Channel, position: str) -> Pose:
+    feels_gravity = channel.coupling == "dc"
+    if interval.theta_deg is not None and interval.alpha_deg is not None:
+        theta_rad, alpha_rad = math.radians(interval.theta_deg), math.radians(interval.alpha_deg)
+        g = channel.gravity_mps2 if feels_gravity else 0.0
+        return clamp(theta_rad, alpha_rad, g, channel.static_sign, position)
+    if interval.direction is not None:
+        gravity = interval.gravity_mps2 if feels_gravity else (0.0, 0.0, 0.0)
+        return along(interval.direction, gravity, position)
+    assert interval.gravity_mps2 is not None  # the configuration allows no other form
+    return at_rest(interval.gravity_mps2, position)

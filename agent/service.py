@@ -1,0 +1,180 @@
+"""The agent at work: readers -> one queue -> pipeline -> recording -> store -> network. One loop, one order."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+import uuid
+from collections.abc import Sequence
+from pathlib import Path
+
+from agent import __version__
+from agent.config import Config
+from agent.events import CalibrationUpdate, Event, Result, RunStart, Tick
+from agent.fingerprint import fingerprint, versions
+from agent.history import History, Record, StoreError
+from agent.pipeline import Pipeline
+from agent.publication import Publisher
+from agent.reader import EventQueue, Reader
+from agent.recording import Recorder
+from agent.recording_thread import RecordingThread
+from agent.store import Store
+from agent.watch import Watch
+from hw.sensor import boot_id, load_driver
+
+TICK_S = 1.0
+POLL_S = 0.2  # how soon a signal is seen when no device speaks
+READER_STOP_S = 0.7  # a reader ends within one block; one that hangs in a driver is left behind
+
+
+class Service:
+    """One run. `stop` may be called from a signal handler; `run` returns when all files are closed."""
+
+    def __init__(self, config: Config, data_dir: Path, watch: Watch) -> None:
+        self._config = config
+        self._data_dir = data_dir
+        self._watch = watch
+        self._stop_request = threading.Event()
+        self._sequence = 0
+
+    def stop(self) -> None:
+        """End the run; `run` returns within two seconds."""
+        self._stop_request.set()
+
+    def run(self, duration_s: float | None) -> None:
+        """Read, calibrate, record and publish until stopped or `duration_s` is over.
+
+        Raises StoreError or OSError where the data directory cannot be used at all.
+        """
+        self._data_dir.mkdir(parents=True, exist_ok=True)
+        self._store = Store(self._data_dir)
+        if self._store.set_aside:
+            self._watch.say(f"the state file was corrupt and is kept as {self._store.set_aside}")
+        config = self._config
+        self._recorder = Recorder(
+            self._data_dir,
+            [device.name for device in config.devices],
+            [channel.sensor for channel in config.channels],
+            max_bytes=int(config.recording.rotate_bytes),
+            max_age_s=config.recording.rotate_s,
+        )
+        self._publisher = self._publication()
+        events = EventQueue(len(config.devices))
+        readers = [Reader(d.name, _sensor(d.name, d.driver, d.options), events) for d in config.devices]
+        self._begin()
+        writer = RecordingThread(self._recorder, self._deliver, flush_s=config.recording.flush_s)
+        try:
+            writer.put(0, self._run_start(continuation=False), [])
+            for reader in readers:
+                reader.start()
+            self._loop(events, writer, duration_s)
+        finally:
+            for reader in readers:
+                reader.stop()
+            deadline = time.monotonic() + READER_STOP_S
+            for reader in readers:
+                if reader.ident is not None:
+                    reader.join(max(0.0, deadline - time.monotonic()))
+            writer.close()
+            if self._publisher is not None:
+                self._publisher.close()
+            self._store.close()
+
+    def _publication(self) -> Publisher | None:
+        if not self._config.zenoh.enabled:
+            return None
+        gateway = self._config.gateway
+        publisher = Publisher(gateway.site, gateway.name, self._config.zenoh.connect, self._store)
+        publisher.start()
+        return publisher
+
+    def _begin(self) -> None:
+        self._origin_ns = time.monotonic_ns()
+        self._run_id = uuid.uuid4().hex
+        self._pipeline = Pipeline.begin(
+            self._config, self._run_id, self._origin_ns, self._store.last_sequence(), self._kept()
+        )
+
+    def _kept(self) -> dict[str, CalibrationUpdate]:
+        """Calibrations in force at the end of the run before. What cannot be read is said and left."""
+        kept: dict[str, CalibrationUpdate] = {}
+        try:
+            with History(self._store.path) as history:
+                for channel in self._config.channels:
+                    record = history.in_force(channel.sensor)
+                    if record is not None:
+                        kept[channel.sensor] = calibration_of(record)
+        except (StoreError, ValueError) as error:
+            self._watch.say(f"the calibration in force cannot be restored: {error}")
+        return kept
+
+    def _run_start(self, *, continuation: bool) -> RunStart:
+        gateway = self._config.gateway
+        return RunStart(
+            run_id=self._run_id,
+            site=gateway.site,
+            gateway=gateway.name,
+            boot_id=boot_id(),
+            t_monotonic_ns=time.monotonic_ns() if continuation else self._origin_ns,
+            t_utc_ns=time.time_ns(),
+            config_json=self._config.model_dump_json(),
+            versions={"fieldcal": __version__, **versions()},
+            fingerprint=fingerprint(),
+            snapshot=self._pipeline.snapshot(),
+            file_sequence=self._recorder.next_file_sequence,
+            event_sequence=self._sequence,
+            continuation=continuation,
+        )
+
+    def _loop(self, events: EventQueue, writer: RecordingThread, duration_s: float | None) -> None:
+        next_tick = time.monotonic() + TICK_S
+        end = float("inf") if duration_s is None else time.monotonic() + duration_s
+        while not self._stop_request.is_set() and time.monotonic() < end:
+            for gap in events.take_gaps():
+                self._step(gap, writer)
+            event = events.get(min(POLL_S, next_tick - time.monotonic(), end - time.monotonic()))
+            if event is not None:
+                self._step(event, writer)
+            if time.monotonic() >= next_tick:
+                next_tick += TICK_S
+                self._step(Tick(t_monotonic_ns=time.monotonic_ns(), t_utc_ns=time.time_ns()), writer)
+                self._watch.health(events.depth(), self._recorder, self._publisher and self._publisher.state())
+            if writer.wants_rotation:
+                self._sequence += 1
+                writer.put(self._sequence, self._run_start(continuation=True), [])
+
+    def _step(self, event: Event, writer: RecordingThread) -> None:
+        self._sequence += 1
+        results = self._pipeline.step(event)
+        writer.put(self._sequence, event, results)
+        self._watch.update(event, results)
+
+    def _deliver(self, event_sequence: int, results: Sequence[Result], recorded: bool) -> None:
+        """In the recording's thread, when the disk has the results: store, then network."""
+        path = self._recorder.path
+        records = [Record.of(r, recorded=recorded, recording=path.name if path else "") for r in results]
+        try:
+            self._store.commit(records)
+        except StoreError as error:
+            self._watch.say(f"the store cannot keep results up to event {event_sequence}: {error}")
+        if self._publisher is not None:
+            for record in records:
+                self._publisher.publish(record)
+
+
+def calibration_of(record: Record) -> CalibrationUpdate:
+    """The calibration a record holds. Raises ValueError where it is none of this version."""
+    import msgspec
+
+    fields = dict(record.fields)
+    fields.pop("recorded", None)
+    try:
+        return msgspec.convert(fields, CalibrationUpdate)
+    except msgspec.ValidationError as error:
+        raise ValueError(f"result {record.sequence}: {error}") from None
+
+
+def _sensor(name: str, driver: str, options: dict[str, object]):  # type: ignore[no-untyped-def]
+    factory = load_driver(driver)
+    return factory(name, factory.options_model.model_validate(options))
