@@ -55,6 +55,15 @@ class SampleBlock:
 
 
 @dataclass(frozen=True, slots=True)
+class Drop:
+    """What a driver read and could not use, for the record of the run."""
+
+    count: int
+    unit: Literal["samples", "lines", "bytes"]
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
 class DeviceInfo:
     """Who a device is, as read from it, and how it was set."""
 

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import difflib
+import functools
+import time
 from collections.abc import Callable, Mapping
-from importlib.metadata import entry_points
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Any, ClassVar, Protocol, cast, runtime_checkable
 
 from pydantic import BaseModel, ConfigDict
 
-from hw.block import DeviceInfo, SampleBlock
+from hw.block import DeviceInfo, Drop, SampleBlock
 
 ENTRY_POINT_GROUP = "fieldcal.sensors"
+
+Clock = Callable[[], tuple[int, int]]
+"""Returns (CLOCK_MONOTONIC, UTC), both in ns, read one right after the other."""
 
 
 class DeviceError(Exception):
@@ -39,7 +46,9 @@ class Options(BaseModel):
 class Sensor(Protocol):
     """A device that yields sample blocks. All methods are called from one reader thread.
 
-    Drivers are built as `Driver(name, options, clock=...)` and do no I/O before `open`.
+    Drivers are built as `Driver(name, options, clock=..., sleep=...)` and do no I/O before `open`. All their waiting
+    goes through `sleep` (seconds) or a read that data end, so that a simulated clock drives them faster than real time.
+    The first block after `open` carries RESTART; indices go on over `close` and `open` and never repeat.
     """
 
     options_model: ClassVar[type[Options]]
@@ -48,7 +57,13 @@ class Sensor(Protocol):
         """Identify, reset, configure, read back. Raises ConfigurationError, IdentityError or DeviceLost."""
 
     def read_block(self) -> SampleBlock | None:
-        """The next block (about 0.5 s of bursts); None when nothing came within about 0.5 s. Raises DeviceLost."""
+        """The next block (about 0.5 s of bursts, never empty); None when nothing came in that time.
+
+        Raises DeviceLost, but only after all that was read before the loss has been returned.
+        """
+
+    def take_drops(self) -> list[Drop]:
+        """What was read and could not be used since the last call, one entry a reason; mostly empty. Never raises."""
 
     def close(self) -> None:
         """Release the port; never raises, may be called twice, a closed sensor can be opened again."""
@@ -59,10 +74,57 @@ class DriverFactory(Protocol):
 
     options_model: ClassVar[type[Options]]
 
-    def __call__(self, name: str, options: Any, *, clock: Callable[[], tuple[int, int]] = ...) -> Sensor: ...
+    def __call__(
+        self, name: str, options: Any, *, clock: Clock = ..., sleep: Callable[[float], None] = ...
+    ) -> Sensor: ...
 
 
 BUILT_IN: Mapping[str, str] = {
     "adxl355": "hw.adxl355:Adxl355",
     "serial-csv": "hw.serial_stream:SerialCsv",
 }
+
+
+def driver_names() -> list[str]:
+    """Names of all drivers, built in and installed as plug-ins, sorted. Imports none of them."""
+    return sorted({*BUILT_IN, *(entry.name for entry in entry_points(group=ENTRY_POINT_GROUP))})
+
+
+def load_driver(name: str) -> DriverFactory:
+    """The driver of this name, imported now. A built-in name cannot be taken over by a plug-in.
+
+    Raises ConfigurationError for a name that nobody has, and for a plug-in that cannot be imported or is no driver.
+    """
+    if name in BUILT_IN:
+        entry = EntryPoint(name, BUILT_IN[name], ENTRY_POINT_GROUP)
+    else:
+        found = list(entry_points(group=ENTRY_POINT_GROUP, name=name))
+        if not found:
+            raise ConfigurationError(_unknown(name))
+        entry = found[0]
+    try:
+        driver = entry.load()
+    except Exception as error:  # a plug-in's module may raise anything while it is imported
+        raise ConfigurationError(f"driver {name!r} ({entry.value}) cannot be loaded: {error!r}") from error
+    model = getattr(driver, "options_model", None)
+    if not (callable(driver) and isinstance(model, type) and issubclass(model, Options)):
+        raise ConfigurationError(f"driver {name!r} ({entry.value}) is no sensor class with an options_model")
+    return cast(DriverFactory, driver)
+
+
+def _unknown(name: str) -> str:
+    names = driver_names()
+    near = difflib.get_close_matches(name, names, n=1)
+    hint = f"did you mean {near[0]!r}? " if near else ""
+    return f"no driver {name!r}: {hint}there are {', '.join(names)}"
+
+
+def system_clock() -> tuple[int, int]:
+    """CLOCK_MONOTONIC and UTC of this machine, ns."""
+    return time.monotonic_ns(), time.time_ns()
+
+
+@functools.cache
+def boot_id() -> str:
+    """The kernel's name of this boot, which says what CLOCK_MONOTONIC counts from."""
+    return Path("/proc/sys/kernel/random/boot_id").read_text("ascii").strip()

@@ -1,0 +1,158 @@
+"""A device on a pseudo-terminal: what a USB serial sensor is to pyserial, unplugging included."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import tempfile
+import threading
+import time
+import tty
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+BURST_S = 0.008  # USB adapters hand bytes on every 1 to 16 ms
+
+
+class PtyDevice:
+    """Writes the text that is due to whoever has the port open, and never waits for a reader.
+
+    `text_due(t_s)` returns the text that became due since its last call, as bytes; `clock()` is the device's time in
+    seconds. `path` is a symbolic link that stays the same over `unplug` and `replug`. Either `start` a thread that
+    serves in bursts, or call `serve` yourself. As on a wire, what nobody reads is lost: without a reader all of it,
+    with a slow one what the kernel's buffer does not hold (`lost_bytes`).
+    """
+
+    def __init__(
+        self, text_due: Callable[[float], bytes], clock: Callable[[], float] = time.monotonic, link: Path | None = None
+    ) -> None:
+        self._text_due = text_due
+        self._clock = clock
+        self._directory = tempfile.TemporaryDirectory(prefix="fieldcal-") if link is None else None
+        self.path = Path(self._directory.name) / "port" if self._directory else Path(link or "")
+        self.lost_bytes = 0
+        self._garbage = b""
+        self._master: int | None = None
+        self._lock = threading.Lock()  # serve against unplug and replug
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+        self.replug()
+
+    def replug(self) -> None:
+        """Make the port (again): a new terminal under the same path. Raises FileExistsError if the path is taken."""
+        with self._lock:
+            if self._master is not None:
+                return
+            master, slave = os.openpty()
+            try:
+                tty.setraw(slave)  # otherwise the terminal echoes what the device wrote before the port was opened
+                os.set_blocking(master, False)
+                self.path.symlink_to(os.ttyname(slave))
+            except BaseException:
+                os.close(master)
+                raise
+            finally:
+                os.close(slave)  # only so does the master hear whether anybody reads
+            self._master = master
+
+    def unplug(self) -> None:
+        """Hang up: a reader's next call fails, and the path is gone."""
+        with self._lock:
+            if self._master is not None:
+                os.close(self._master)
+                self._master = None
+                self.path.unlink(missing_ok=True)
+
+    def has_reader(self) -> bool:
+        """Whether somebody has the port open."""
+        with self._lock:
+            return self._open_for_reading()
+
+    def inject(self, garbage: bytes) -> None:
+        """Write this before the next text."""
+        self._garbage += garbage
+
+    def serve(self) -> None:
+        """Write what is due now."""
+        text = self._garbage + self._text_due(self._clock())
+        self._garbage = b""
+        with self._lock:
+            written = 0
+            if self._master is not None and text and self._open_for_reading():
+                with contextlib.suppress(BlockingIOError):
+                    written = os.write(self._master, text)
+            self.lost_bytes += len(text) - written
+
+    def start(self) -> None:
+        """Serve from a thread until `stop`."""
+        self._stop.clear()
+        self._thread = threading.Thread(target=self._run, name=f"pty {self.path}", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the thread, hang up and remove the path."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+        self.unplug()
+        if self._directory is not None:
+            self._directory.cleanup()
+
+    def _run(self) -> None:
+        while not self._stop.wait(BURST_S):
+            self.serve()
+
+    def _open_for_reading(self) -> bool:
+        if self._master is None:
+            return False
+        poll = select.poll()
+        poll.register(self._master, 0)
+        return not any(event & select.POLLHUP for _, event in poll.poll(0))
+
+
+class SampleLines:
+    """Text of a sampled signal in the serial text protocol, for `PtyDevice`.
+
+    `values(first, n)` returns (n, axes) indications; `samples_due(t_s)` how many samples exist at `t_s` in all. Starts
+    with a comment, since a reader gives up the line within which it opened the port.
+    """
+
+    def __init__(
+        self,
+        values: Callable[[int, int], NDArray[np.float64]],
+        samples_due: Callable[[float], int],
+        *,
+        sequence: bool = True,
+        decimals: int = 6,
+    ) -> None:
+        self._values = values
+        self._samples_due = samples_due
+        self._sequence = sequence
+        self._format = f"%.{decimals}f"
+        self._next = 0
+        self._greeting = b"# fieldcal virtual device\n"
+
+    def __call__(self, t_s: float) -> bytes:
+        due = self._samples_due(t_s) - self._next
+        if due <= 0:
+            return b""
+        text = self._greeting + format_lines(
+            self._values(self._next, due), self._format, self._next if self._sequence else None
+        )
+        self._next += due
+        self._greeting = b""
+        return text
+
+
+def format_lines(values: NDArray[np.float64], number: str = "%.6f", first_sequence: int | None = None) -> bytes:
+    """Lines of the serial text protocol for (n, axes) values; with their sequence, if its first number is given."""
+    fields: Sequence[str] = [number] * values.shape[1]
+    if first_sequence is not None:
+        fields = ["%d", *fields]
+        values = np.column_stack([np.arange(first_sequence, first_sequence + len(values)), values])
+    return ((",".join(fields) + "\n") * len(values) % tuple(values.ravel().tolist())).encode("ascii")
