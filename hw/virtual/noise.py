@@ -1,0 +1,69 @@
+"""Random numbers that depend on seed, stream and block alone, so that nobody's way of asking changes them."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+BLOCK = 2048  # samples a block: 2 s at 1 kHz, long enough that a block's fixed cost is small
+
+
+class Stream(IntEnum):
+    """What a random number is for."""
+
+    SENSOR = 1
+    SENSOR_COLOURED = 2
+    SENSOR_COLOURED_START = 3
+    SENSOR_ARRIVAL = 4
+    REFERENCE = 5
+    REFERENCE_ARRIVAL = 6
+    KNOCK = 7
+    WINDOW_OFFSET = 8
+    PRESET = 9
+
+
+def generator(seed: int, stream: Stream, block: int = 0) -> np.random.Generator:
+    """The generator of one block: Philox, keyed by seed and stream, its counter's high word being the block."""
+    return np.random.Generator(np.random.Philox(key=[seed, int(stream)], counter=[0, 0, 0, block]))
+
+
+class ColouredNoise:
+    """Stationary AR(1) noise of SD 1, x_k = phi x_(k-1) + sqrt(1 - phi^2) w_k, three axes, block by block.
+
+    The state at a block's beginning follows from all blocks before it; going on from the last one asked for is cheap,
+    going back starts again at the first.
+    """
+
+    def __init__(self, seed: int, phi: float) -> None:
+        if not 0 < phi < 1:
+            raise ValueError(f"AR(1) coefficient must lie between 0 and 1, got {phi}")
+        self._seed, self._phi = seed, phi
+        # 32 steps at a time by a triangular matrix instead of one at a time
+        step = np.arange(32)
+        self._kernel = np.tril(phi ** np.abs(step[:, None] - step[None, :])) * np.sqrt(1 - phi**2)
+        self._decay = phi ** (step[:, None] + 1.0)
+        self._next = 0
+        self._state = self._start()
+
+    def block(self, block: int) -> Array:
+        """(BLOCK, 3) values of one block."""
+        if block < self._next:
+            self._next, self._state = 0, self._start()
+        while self._next < block:
+            self._advance()
+        return self._advance()
+
+    def _start(self) -> Array:
+        return np.asarray(generator(self._seed, Stream.SENSOR_COLOURED_START).normal(size=3))
+
+    def _advance(self) -> Array:
+        white = generator(self._seed, Stream.SENSOR_COLOURED, self._next).normal(size=(BLOCK // 32, 32, 3))
+        values = self._kernel @ white
+        for part in values:
+            part += self._decay * self._state
+            self._state = part[-1].copy()
+        self._next += 1
+        return np.asarray(values.reshape(BLOCK, 3))

@@ -1,0 +1,121 @@
+"""All that can be set on the virtual bench. Every fault is off by default; the values are what is true, not priors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hw.virtual.motion import Motion, sine
+from hw.virtual.schedule import STANDARD_GRAVITY_MPS2, Schedule, clamped
+from hw.virtual.timebase import Bursts, Clock
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensorParameters:
+    """The accelerometer under calibration: V = S a + Q (Eq. 8), and how it falls short of that.
+
+    `sensitivity` (3, 3) in output unit per m/s2, `offset` (3,) in output unit. What is said in m/s2 acts on the output
+    through `nominal_sensitivity`. The filters act on all axes alike; `lag_s` is a pure delay an axis.
+    """
+
+    sensitivity: Array = field(default_factory=lambda: np.eye(3))
+    offset: Array = field(default_factory=lambda: np.zeros(3))
+    unit: str = "m/s2"
+    nominal_sensitivity: float = 1.0
+    resolution: float = 0.0  # output unit; 0: not quantised
+    limit: float = np.inf  # output unit; indications are held within +- limit
+    clock: Clock = field(default_factory=Clock)
+    bursts: Bursts | None = None  # None: every sample is stamped with its true time
+    noise_mps2: float = 0.0  # SD of white noise
+    coloured_noise_mps2: float = 0.0  # SD of AR(1) noise
+    coloured_phi: float = 0.99
+    lag_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    lowpass_hz: float | None = None
+    lowpass_order: Literal[1, 2] = 1
+    highpass_hz: float | None = None  # AC-coupled, first order: gravity is not felt
+    offset_by_position_mps2: Array | None = None  # (positions, 3)
+    offset_by_window_mps2: float = 0.0  # SD of a new offset in every window, each axis
+    offset_per_k_mps2: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    sensitivity_per_k: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReferenceParameters:
+    """The reference: uniaxial on the slide, or tri-axial beside the sensor where `rotation` is given.
+
+    `rotation` (3, 3) is R in a = R a_ref. `sensitivity` multiplies what it measures: 1.001 is 0.1 % too high, -1 has
+    the polarity turned. Noise and resolution are in its own unit, m/s2 or m/s.
+    """
+
+    rotation: Array | None = None
+    quantity: Literal["acceleration", "velocity"] = "acceleration"
+    feels_gravity: bool = True  # a tri-axial one; a uniaxial one on a level slide has none to feel
+    sensitivity: float = 1.0
+    noise: float = 0.0
+    resolution: float = 0.0
+    clock: Clock = field(default_factory=Clock)
+    bursts: Bursts | None = None
+    lag_s: float = 0.0
+    highpass_hz: float | None = None
+
+    @property
+    def channels(self) -> Literal[1, 3]:
+        """Number of channels."""
+        return 1 if self.rotation is None else 3
+
+
+@dataclass(frozen=True, slots=True)
+class ClampErrors:
+    """True angle minus nominal angle of the clamp, in degrees; the lists have one entry a position."""
+
+    theta_deg: float = 0.0
+    alpha_deg: float = 0.0
+    theta_by_position_deg: tuple[float, ...] = ()
+    alpha_by_position_deg: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Knocks:
+    """Blows on the sensor that the reference does not see: half-sines at random times, in random directions."""
+
+    rate_hz: float = 0.0  # mean number a second
+    peak_mps2: float = 8.0  # the highest; each is 0.3 to 1 of it
+    duration_s: float = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class Temperature:
+    """Slow temperature of the sensor, mean + swing * sin; the sensor's S and Q are stated at `mean_degc`."""
+
+    mean_degc: float = 25.0
+    swing_k: float = 0.0
+    period_s: float = 1800.0
+
+    def at(self, t_s: Array) -> Array:
+        """Temperature at times `t_s`, degC."""
+        return np.asarray(self.mean_degc + self.swing_k * np.sin(2 * np.pi * t_s / self.period_s))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BenchParameters:
+    """The whole bench. By default the paper's: 3 Hz sine of 10 m/s2, theta 35 deg, six cycles a position, no fault."""
+
+    schedule: Schedule = field(
+        default_factory=lambda: Schedule(
+            tuple(clamped(35.0, alpha, hold_s=2.0) for alpha in (0.0, 30.0, 120.0, 210.0)), turn_s=1.0
+        )
+    )
+    motion: Motion = field(default_factory=lambda: sine(3.0, 10.0))
+    sensor: SensorParameters = field(default_factory=SensorParameters)
+    reference: ReferenceParameters = field(default_factory=ReferenceParameters)
+    gravity_mps2: float = STANDARD_GRAVITY_MPS2
+    static_sign: Literal[-1, 1] = 1  # -1: the sensor's z points out of the clamp, at rest it reads -e
+    clamp: ClampErrors = field(default_factory=ClampErrors)
+    knocks: Knocks = field(default_factory=Knocks)
+    temperature: Temperature = field(default_factory=Temperature)
+    handling_mps2: float = 0.5  # amplitude of the shaking while a person turns the clamp

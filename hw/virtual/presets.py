@@ -1,0 +1,102 @@
+"""The two benches `fieldcal run` shows without a configuration: an ADXL355 on the paper's clamp, plain and faulty."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from hw.virtual.motion import multisine
+from hw.virtual.noise import Stream, generator
+from hw.virtual.parameters import (
+    BenchParameters,
+    Knocks,
+    ReferenceParameters,
+    SensorParameters,
+    Temperature,
+)
+from hw.virtual.schedule import STANDARD_GRAVITY_MPS2, Schedule, clamped
+from hw.virtual.spread import Spread, drawn
+from hw.virtual.timebase import Bursts, Clock
+
+COUNTS_PER_MPS2 = 256_000 / STANDARD_GRAVITY_MPS2  # ADXL355 at 2 g
+# 20 bit: 20.08 m/s2. Gravity (8.0 on z, 5.6 across), 6 m/s2 of motion and an 8 m/s2 knock stay below 18.
+LARGEST_COUNT = 2**19 - 1
+THETA_DEG = 35.0
+ALPHAS_DEG = (0.0, 30.0, 120.0, 210.0)
+HOLD_S = 10.0
+TURN_S = 3.0
+START_S = 3.0  # a gateway has its devices open by then: four positions are through after 52 s
+# 22.5 ug/sqrt(Hz) over a quarter of 1 kHz (ADXL355 data sheet: bandwidth ODR / 4)
+ADXL355_NOISE_MPS2 = 22.5e-6 * STANDARD_GRAVITY_MPS2 * 250**0.5
+
+
+def plain(seed: int) -> BenchParameters:
+    """The sensor's own clock, bursts and noise; no lag, true angles, constant Q.
+
+    S is some per cent off nominal with transverse terms, Q some tenths of a m/s2 (data sheet: up to 75 mg); they and
+    the phases of the motion follow from `seed`. The ADXL355's rate is 0.33 % off (measured on such parts: 12 s an
+    hour). Reference: uniaxial accelerometer on the slide, 1 kHz, in m/s2, its clock 40 ppm off.
+    """
+    random = generator(seed, Stream.PRESET)
+    main = np.diag(1 + random.uniform(-0.04, 0.04, 3))
+    transverse = random.uniform(-0.015, 0.015, (3, 3)) * (1 - np.eye(3))
+    offset = random.uniform(0.1, 0.5, 3) * random.choice([-1.0, 1.0], 3)
+    return BenchParameters(
+        schedule=Schedule(tuple(clamped(THETA_DEG, alpha, HOLD_S) for alpha in ALPHAS_DEG), TURN_S, START_S),
+        motion=multisine(random),
+        sensor=SensorParameters(
+            sensitivity=COUNTS_PER_MPS2 * (main + transverse),
+            offset=COUNTS_PER_MPS2 * offset,
+            unit="count",
+            nominal_sensitivity=COUNTS_PER_MPS2,
+            resolution=1.0,
+            limit=LARGEST_COUNT,
+            clock=Clock(1000.0, rate_error=3.3e-3, offset_s=0.4e-3, wander=20e-6),
+            bursts=Bursts(),
+            noise_mps2=ADXL355_NOISE_MPS2,
+        ),
+        reference=ReferenceParameters(
+            noise=0.002,
+            resolution=1e-5,
+            clock=Clock(1000.0, rate_error=40e-6, offset_s=0.7e-3),
+            bursts=Bursts(poll_s=0.01),
+        ),
+    )
+
+
+def faulty(seed: int) -> BenchParameters:
+    """All faults of an ordinary field recording on top of `plain`, drawn by `seed` where they are uncertain.
+
+    The sensor lags by 5 ms, its rate is 1.3 % off, the clamp's angles are known to 0.2 deg (0.1 deg in common), the
+    offset differs by 0.05 m/s2 between positions, moves with 5 K of temperature, knocks hit the sensor alone, the
+    reference is known to 0.1 %, its slide moves 1 % sideways.
+    """
+    bench = plain(seed)
+    spread = Spread(
+        angle_deg=0.2,
+        theta_deg=0.2,
+        alpha_common_deg=0.1,
+        offset_position_mps2=0.05,
+        reference_pct=0.1,
+        transverse_motion_pct=1.0,
+    )
+    sensor = replace(
+        bench.sensor,
+        clock=replace(bench.sensor.clock, rate_error=0.013, wander=50e-6),
+        lag_s=(0.005, 0.005, 0.005),
+        # data sheet: offset 0.15 mg/K, sensitivity 0.01 %/K
+        offset_per_k_mps2=(1.5e-3, -1.0e-3, 1.5e-3),
+        sensitivity_per_k=1e-4,
+    )
+    bench = replace(
+        bench,
+        sensor=sensor,
+        knocks=Knocks(rate_hz=0.5, peak_mps2=8.0),
+        temperature=Temperature(swing_k=5.0, period_s=1800.0),
+    )
+    return drawn(bench, spread, np.random.default_rng([seed, Stream.PRESET]))
+
+
+PRESETS: dict[str, Callable[[int], BenchParameters]] = {"plain": plain, "faulty": faulty}

@@ -1,0 +1,92 @@
+"""When a virtual device takes its samples, and when a gateway gets to read them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hw.virtual.noise import BLOCK, Stream, generator
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Clock:
+    """A device's own clock: sample k is taken at offset_s + k T + (wander T_w / 2 pi) sin(2 pi k T / T_w).
+
+    T = 1 / (nominal_rate_hz * (1 + rate_error)), T_w = wander_period_s; `wander` is the greatest fractional change of
+    the period in a thermal cycle (250e-6: +-250 ppm).
+    """
+
+    nominal_rate_hz: float = 1000.0
+    rate_error: float = 0.0
+    offset_s: float = 0.0
+    wander: float = 0.0
+    wander_period_s: float = 1800.0
+
+    @property
+    def rate_hz(self) -> float:
+        """The true mean rate."""
+        return self.nominal_rate_hz * (1 + self.rate_error)
+
+    def times(self, first: int, n: int) -> Array:
+        """True times of samples first .. first + n - 1 on the bench's clock, in s."""
+        return self._time(np.arange(first, first + n))
+
+    def due(self, t_s: Array | float) -> IntArray:
+        """How many samples exist at `t_s`: those taken at or before it."""
+        t = np.asarray(t_s, dtype=float)
+        ticks = (t - self.offset_s) * self.rate_hz
+        for _ in range(5):  # the wander is below 1e-2, each turn gains two digits or more
+            ticks = (t - self.offset_s - self._wander_s(ticks / self.rate_hz)) * self.rate_hz
+        count = np.floor(ticks).astype(np.int64) + 1
+        # rounding in the inverse must not contradict times()
+        count -= self._time(count - 1) > t
+        count += self._time(count) <= t
+        return np.maximum(count, 0)
+
+    def _time(self, index: IntArray) -> Array:
+        nominal = index / self.rate_hz
+        return self.offset_s + nominal + self._wander_s(nominal)
+
+    def _wander_s(self, nominal_s: Array) -> Array:
+        turn = 2 * np.pi / self.wander_period_s
+        return self.wander / turn * np.sin(turn * nominal_s)
+
+
+@dataclass(frozen=True, slots=True)
+class Bursts:
+    """When a gateway reads a device: every `poll_s`, late by `least_late_s` + an exponential, rarely by a stall."""
+
+    poll_s: float = 0.016
+    least_late_s: float = 80e-6
+    mean_late_s: float = 200e-6
+    stall_probability: float = 0.01
+    longest_stall_s: float = 0.015
+    spread: bool = False  # stamps go back from a burst's arrival at the nominal rate instead of being all alike
+
+    def arrivals(self, seed: int, stream: Stream, until_s: float) -> Array:
+        """Arrival times (B,) of the reads up to `until_s`, never running backwards."""
+        reads = int(until_s / self.poll_s)
+        late = np.concatenate([self._lateness(seed, stream, block) for block in range(reads // BLOCK + 1)])
+        times = self.poll_s * np.arange(1, reads + 1) + late[:reads]
+        times = np.maximum.accumulate(times)
+        return np.asarray(times[times <= until_s])
+
+    def stamps(self, clock: Clock, arrivals: Array) -> Array:
+        """The stamp (N,) a gateway writes to each sample that `arrivals` brought."""
+        due = clock.due(arrivals)
+        count = np.diff(due, prepend=0)
+        stamps = np.repeat(arrivals, count)
+        if self.spread:
+            stamps -= (np.repeat(due, count) - 1 - np.arange(due[-1] if len(due) else 0)) / clock.nominal_rate_hz
+        return stamps
+
+    def _lateness(self, seed: int, stream: Stream, block: int) -> Array:
+        random = generator(seed, stream, block)
+        late = self.least_late_s + random.exponential(self.mean_late_s, BLOCK)
+        stalled = random.random(BLOCK) < self.stall_probability
+        return np.asarray(late + stalled * random.uniform(0.3, 1.0, BLOCK) * self.longest_stall_s)
