@@ -13,7 +13,7 @@ from hw.block import SampleBlock
 
 
 class RunStart(msgspec.Struct, frozen=True, kw_only=True):
-    """First event of every file: all that replaying the file needs. `continuation`: the run goes on from a file before."""
+    """First event of every file: all that replaying it needs. `continuation`: the run goes on from another file."""
 
     run_id: str
     site: str
@@ -28,7 +28,6 @@ class RunStart(msgspec.Struct, frozen=True, kw_only=True):
     file_sequence: int
     event_sequence: int  # of this event; the next event has the next number
     continuation: bool = False
-    previous_sha256: str = ""  # of the file before, closed, in this data directory
 
 
 class DeviceChange(msgspec.Struct, frozen=True, kw_only=True):
