@@ -1,0 +1,243 @@
+"""Events and results as protobuf messages (agent/proto/fieldcal.proto), bit for bit both ways.
+
+A message is known by its schema name; the topic is where it stands in a recording. Floats keep every bit (NaN, -0.0,
+infinities); sample arrays pass as the little-endian arrays they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+import numpy as np
+from google.protobuf import descriptor_pb2
+from google.protobuf.message import DecodeError, Message
+
+from agent.events import (
+    CalibrationUpdate,
+    DeviceChange,
+    Event,
+    Gap,
+    PoseChange,
+    ReferenceChange,
+    Result,
+    RunStart,
+    StatusChange,
+    Tick,
+    WindowReport,
+)
+from agent.proto import fieldcal_pb2 as pb
+from calib.model import PARAMETERS
+from hw.block import BlockFlags, SampleBlock
+
+PACKAGE = "fieldcal.v1"
+EVENTS_TOPIC = "/events"
+RESULT_TOPICS = {WindowReport: "window", CalibrationUpdate: "calibration", StatusChange: "status"}
+
+_EVENT_FIELDS: dict[type[Any], str] = {
+    RunStart: "run_start",
+    PoseChange: "pose_change",
+    ReferenceChange: "reference_change",
+    DeviceChange: "device_change",
+    Gap: "gap",
+    Tick: "tick",
+}
+_EVENT_KINDS = {field: kind for kind, field in _EVENT_FIELDS.items()}
+_S_AND_Q = [name.lower() for name in PARAMETERS]
+_U = [f"u_{name}" for name in _S_AND_Q]
+_RESIDUALS = ["residual_sd_x", "residual_sd_y", "residual_sd_z"]
+_COUNTS, _DECIMALS = ("x_counts", "y_counts", "z_counts"), ("x", "y", "z")
+
+
+class MessageError(ValueError):
+    """A message that is no event or result of this format; the text names the field and its value."""
+
+
+def topic_of(item: Event | Result) -> str:
+    """Topic on which an event or result is recorded."""
+    if isinstance(item, SampleBlock):
+        return f"/{item.device}/raw"
+    if isinstance(item, WindowReport | CalibrationUpdate | StatusChange):
+        return f"/{item.sensor}/{RESULT_TOPICS[type(item)]}"
+    return EVENTS_TOPIC
+
+
+def schema_of(topic: str) -> str:
+    """Full name of the message that is recorded on a topic of this program."""
+    names = {"events": "Event", "raw": "RawBlock"} | {name: name.capitalize() for name in RESULT_TOPICS.values()}
+    return f"{PACKAGE}.{names[topic.rsplit('/', 1)[1]]}"
+
+
+def schema_data(schema_name: str) -> bytes:
+    """FileDescriptorSet (serialised) that holds this one message, as MCAP wants it for encoding `protobuf`."""
+    file = descriptor_pb2.FileDescriptorProto()
+    pb.DESCRIPTOR.CopyToProto(file)
+    kept = [message for message in file.message_type if f"{PACKAGE}.{message.name}" == schema_name]
+    del file.message_type[:]
+    file.message_type.extend(kept)
+    return descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString(deterministic=True)
+
+
+def encode(event_sequence: int, item: Event | Result) -> bytes:
+    """Wire bytes of an event, or of a result caused by the event with this sequence number.
+
+    Raises ValueError where the item does not fit the format (shapes, text that is no Unicode).
+    """
+    if isinstance(item, SampleBlock):
+        return _encode_block(event_sequence, item)
+    if isinstance(item, CalibrationUpdate):
+        message: Message = _calibration_message(event_sequence, item)
+    elif isinstance(item, WindowReport):
+        message = pb.Window(event_sequence=event_sequence, **msgspec.structs.asdict(item))
+    elif isinstance(item, StatusChange):
+        message = pb.Status(event_sequence=event_sequence, **msgspec.structs.asdict(item))
+    else:
+        message = pb.Event(event_sequence=event_sequence, **{_EVENT_FIELDS[type(item)]: _event_values(item)})
+    return message.SerializeToString(deterministic=True)
+
+
+def decode(schema_name: str, data: bytes) -> tuple[int, Event | Result]:
+    """(event_sequence, event or result) of wire bytes. Raises MessageError, nothing else, whatever the bytes are."""
+    decoder = _DECODERS.get(schema_name)
+    if decoder is None:
+        raise MessageError(f"schema {schema_name!r} is none of {', '.join(_DECODERS)}")
+    try:
+        return decoder(data)
+    except MessageError:
+        raise
+    except (DecodeError, msgspec.ValidationError, ValueError) as error:
+        raise MessageError(f"{schema_name}: {error}") from None
+
+
+def _event_values(event: Any) -> dict[str, Any]:
+    values = msgspec.structs.asdict(event)
+    if isinstance(event, RunStart):
+        del values["event_sequence"]
+    if isinstance(event, PoseChange):
+        for name in ("direction", "gravity_mps2"):
+            values[name] = values[name] and dict(zip("xyz", values[name], strict=True))
+    return values
+
+
+def _decode_event(data: bytes) -> tuple[int, Event]:
+    message = pb.Event.FromString(data)
+    field = message.WhichOneof("event")
+    if field is None:
+        raise MessageError("event: empty, or of a kind unknown to this version")
+    values = _values(getattr(message, field))
+    if field == "run_start":
+        values["event_sequence"] = message.event_sequence
+    for name in {"direction", "gravity_mps2"} & values.keys():
+        values[name] = (values[name].x, values[name].y, values[name].z)
+    return message.event_sequence, msgspec.convert(values, _EVENT_KINDS[field], builtin_types=(bytes,))
+
+
+def _values(message: Message) -> dict[str, Any]:
+    """Fields of a message as Python values; what is optional and absent is left out."""
+    values: dict[str, Any] = {}
+    for field in message.DESCRIPTOR.fields:
+        if field.has_presence and not message.HasField(field.name):
+            continue
+        value = getattr(message, field.name)
+        is_map = field.message_type is not None and field.message_type.GetOptions().map_entry
+        values[field.name] = dict(value) if is_map else value
+    return values
+
+
+def _result_decoder(
+    message_type: Callable[[], Message], kind: type[WindowReport] | type[StatusChange]
+) -> Callable[[bytes], tuple[int, Event | Result]]:
+    def decode_result(data: bytes) -> tuple[int, Event | Result]:
+        message = message_type()
+        message.ParseFromString(data)
+        values = _values(message)
+        return values.pop("event_sequence"), msgspec.convert(values, kind)
+
+    return decode_result
+
+
+def _calibration_message(event_sequence: int, update: CalibrationUpdate) -> pb.Calibration:
+    values = msgspec.structs.asdict(update)
+    s_and_q = [*np.asarray(values.pop("sensitivity")).reshape(9).tolist(), *values.pop("offset")]
+    covariance = np.asarray(values.pop("covariance"), dtype=np.float64).reshape(12, 12)
+    values |= zip(_S_AND_Q, s_and_q, strict=True)
+    values |= zip(_U, values.pop("standard_uncertainty"), strict=True)
+    values |= zip(_RESIDUALS, values.pop("residual_sd"), strict=True)
+    return pb.Calibration(event_sequence=event_sequence, covariance=covariance.ravel(), **values)
+
+
+def _decode_calibration(data: bytes) -> tuple[int, Result]:
+    values = _values(pb.Calibration.FromString(data))
+    s_and_q = [values.pop(name) for name in _S_AND_Q]
+    values["sensitivity"] = [s_and_q[0:3], s_and_q[3:6], s_and_q[6:9]]
+    values["offset"] = s_and_q[9:]
+    values["standard_uncertainty"] = [values.pop(name) for name in _U]
+    values["residual_sd"] = [values.pop(name) for name in _RESIDUALS]
+    values["covariance"] = np.array(values["covariance"]).reshape(12, 12).tolist()
+    values["determined"] = list(values["determined"])
+    return values.pop("event_sequence"), msgspec.convert(values, CalibrationUpdate)
+
+
+def _encode_block(event_sequence: int, block: SampleBlock) -> bytes:
+    """A block through RawBlockBytes, whose bytes are those of RawBlock."""
+    decimal = block.indications.dtype == np.float64
+    if not decimal and block.indications.dtype != np.int32:
+        raise ValueError(f"indications of {block.device} are {block.indications.dtype}, not int32 or float64")
+    columns = np.ascontiguousarray(block.indications.T, "<f8" if decimal else "<i4")
+    message = pb.RawBlockBytes(
+        event_sequence=event_sequence,
+        device=block.device,
+        boot_id=block.boot_id,
+        t_utc_ns=block.t_utc_ns,
+        first_index=block.first_index,
+        nominal_rate_hz=block.nominal_rate_hz,
+        flags=int(block.flags),
+        temperature_raw=block.temperature_raw,
+        temperature_degc=block.temperature_degc,
+        axes=len(columns),
+        decimal=decimal,
+        burst_t_monotonic_ns=block.burst_t_monotonic_ns.astype("<i8", copy=False).tobytes(),
+        burst_count=block.burst_count.astype("<i4", copy=False).tobytes(),
+    )
+    for name, column in zip(_DECIMALS if decimal else _COUNTS, columns, strict=False):
+        setattr(message, name, column.tobytes())
+    return message.SerializeToString(deterministic=True)
+
+
+def _decode_block(data: bytes) -> tuple[int, SampleBlock]:
+    m = pb.RawBlockBytes.FromString(data)
+    if m.axes not in (1, 3):
+        raise MessageError(f"raw block: axes {m.axes}, not 1 or 3")
+    arrival = np.frombuffer(m.burst_t_monotonic_ns, "<i8")
+    count = np.frombuffer(m.burst_count, "<i4")
+    names, kind = (_DECIMALS, "<f8") if m.decimal else (_COUNTS, "<i4")
+    columns = [np.frombuffer(getattr(m, name), kind) for name in names[: m.axes]]
+    n = len(columns[0])
+    if len(arrival) != len(count) or not len(count) or count[-1] != n or any(len(c) != n for c in columns):
+        raise MessageError(f"raw block: {n} samples, but bursts and axes of other lengths")
+    indications = np.empty((n, m.axes), columns[0].dtype)
+    for axis, column in enumerate(columns):
+        indications[:, axis] = column
+    return m.event_sequence, SampleBlock(
+        device=m.device,
+        boot_id=m.boot_id,
+        t_utc_ns=m.t_utc_ns,
+        first_index=m.first_index,
+        nominal_rate_hz=m.nominal_rate_hz,
+        burst_t_monotonic_ns=arrival,
+        burst_count=count,
+        indications=indications,
+        flags=BlockFlags(m.flags),
+        temperature_raw=m.temperature_raw if m.HasField("temperature_raw") else None,
+        temperature_degc=m.temperature_degc if m.HasField("temperature_degc") else None,
+    )
+
+
+_DECODERS: dict[str, Callable[[bytes], tuple[int, Event | Result]]] = {
+    f"{PACKAGE}.Event": _decode_event,
+    f"{PACKAGE}.RawBlock": _decode_block,
+    f"{PACKAGE}.Window": _result_decoder(pb.Window, WindowReport),
+    f"{PACKAGE}.Calibration": _decode_calibration,
+    f"{PACKAGE}.Status": _result_decoder(pb.Status, StatusChange),
+}

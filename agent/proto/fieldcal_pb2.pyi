@@ -1,0 +1,363 @@
+from google.protobuf.internal import containers as _containers
+from google.protobuf import descriptor as _descriptor
+from google.protobuf import message as _message
+from collections.abc import Iterable as _Iterable, Mapping as _Mapping
+from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
+
+DESCRIPTOR: _descriptor.FileDescriptor
+
+class Event(_message.Message):
+    __slots__ = ("event_sequence", "run_start", "pose_change", "reference_change", "device_change", "gap", "tick")
+    class Vector3(_message.Message):
+        __slots__ = ("x", "y", "z")
+        X_FIELD_NUMBER: _ClassVar[int]
+        Y_FIELD_NUMBER: _ClassVar[int]
+        Z_FIELD_NUMBER: _ClassVar[int]
+        x: float
+        y: float
+        z: float
+        def __init__(self, x: _Optional[float] = ..., y: _Optional[float] = ..., z: _Optional[float] = ...) -> None: ...
+    class RunStart(_message.Message):
+        __slots__ = ("run_id", "site", "gateway", "boot_id", "t_monotonic_ns", "t_utc_ns", "config_json", "versions", "fingerprint", "snapshot", "file_sequence", "continuation")
+        class VersionsEntry(_message.Message):
+            __slots__ = ("key", "value")
+            KEY_FIELD_NUMBER: _ClassVar[int]
+            VALUE_FIELD_NUMBER: _ClassVar[int]
+            key: str
+            value: str
+            def __init__(self, key: _Optional[str] = ..., value: _Optional[str] = ...) -> None: ...
+        class FingerprintEntry(_message.Message):
+            __slots__ = ("key", "value")
+            KEY_FIELD_NUMBER: _ClassVar[int]
+            VALUE_FIELD_NUMBER: _ClassVar[int]
+            key: str
+            value: str
+            def __init__(self, key: _Optional[str] = ..., value: _Optional[str] = ...) -> None: ...
+        RUN_ID_FIELD_NUMBER: _ClassVar[int]
+        SITE_FIELD_NUMBER: _ClassVar[int]
+        GATEWAY_FIELD_NUMBER: _ClassVar[int]
+        BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+        T_MONOTONIC_NS_FIELD_NUMBER: _ClassVar[int]
+        T_UTC_NS_FIELD_NUMBER: _ClassVar[int]
+        CONFIG_JSON_FIELD_NUMBER: _ClassVar[int]
+        VERSIONS_FIELD_NUMBER: _ClassVar[int]
+        FINGERPRINT_FIELD_NUMBER: _ClassVar[int]
+        SNAPSHOT_FIELD_NUMBER: _ClassVar[int]
+        FILE_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+        CONTINUATION_FIELD_NUMBER: _ClassVar[int]
+        run_id: str
+        site: str
+        gateway: str
+        boot_id: str
+        t_monotonic_ns: int
+        t_utc_ns: int
+        config_json: str
+        versions: _containers.ScalarMap[str, str]
+        fingerprint: _containers.ScalarMap[str, str]
+        snapshot: bytes
+        file_sequence: int
+        continuation: bool
+        def __init__(self, run_id: _Optional[str] = ..., site: _Optional[str] = ..., gateway: _Optional[str] = ..., boot_id: _Optional[str] = ..., t_monotonic_ns: _Optional[int] = ..., t_utc_ns: _Optional[int] = ..., config_json: _Optional[str] = ..., versions: _Optional[_Mapping[str, str]] = ..., fingerprint: _Optional[_Mapping[str, str]] = ..., snapshot: _Optional[bytes] = ..., file_sequence: _Optional[int] = ..., continuation: _Optional[bool] = ...) -> None: ...
+    class PoseChange(_message.Message):
+        __slots__ = ("sensor", "t_monotonic_ns", "position", "theta_deg", "alpha_deg", "direction", "gravity_mps2")
+        SENSOR_FIELD_NUMBER: _ClassVar[int]
+        T_MONOTONIC_NS_FIELD_NUMBER: _ClassVar[int]
+        POSITION_FIELD_NUMBER: _ClassVar[int]
+        THETA_DEG_FIELD_NUMBER: _ClassVar[int]
+        ALPHA_DEG_FIELD_NUMBER: _ClassVar[int]
+        DIRECTION_FIELD_NUMBER: _ClassVar[int]
+        GRAVITY_MPS2_FIELD_NUMBER: _ClassVar[int]
+        sensor: str
+        t_monotonic_ns: int
+        position: str
+        theta_deg: float
+        alpha_deg: float
+        direction: Event.Vector3
+        gravity_mps2: Event.Vector3
+        def __init__(self, sensor: _Optional[str] = ..., t_monotonic_ns: _Optional[int] = ..., position: _Optional[str] = ..., theta_deg: _Optional[float] = ..., alpha_deg: _Optional[float] = ..., direction: _Optional[_Union[Event.Vector3, _Mapping]] = ..., gravity_mps2: _Optional[_Union[Event.Vector3, _Mapping]] = ...) -> None: ...
+    class ReferenceChange(_message.Message):
+        __slots__ = ("sensor", "t_monotonic_ns", "reference")
+        SENSOR_FIELD_NUMBER: _ClassVar[int]
+        T_MONOTONIC_NS_FIELD_NUMBER: _ClassVar[int]
+        REFERENCE_FIELD_NUMBER: _ClassVar[int]
+        sensor: str
+        t_monotonic_ns: int
+        reference: str
+        def __init__(self, sensor: _Optional[str] = ..., t_monotonic_ns: _Optional[int] = ..., reference: _Optional[str] = ...) -> None: ...
+    class DeviceChange(_message.Message):
+        __slots__ = ("device", "state", "t_monotonic_ns", "t_utc_ns", "message", "info_json", "attempt")
+        DEVICE_FIELD_NUMBER: _ClassVar[int]
+        STATE_FIELD_NUMBER: _ClassVar[int]
+        T_MONOTONIC_NS_FIELD_NUMBER: _ClassVar[int]
+        T_UTC_NS_FIELD_NUMBER: _ClassVar[int]
+        MESSAGE_FIELD_NUMBER: _ClassVar[int]
+        INFO_JSON_FIELD_NUMBER: _ClassVar[int]
+        ATTEMPT_FIELD_NUMBER: _ClassVar[int]
+        device: str
+        state: str
+        t_monotonic_ns: int
+        t_utc_ns: int
+        message: str
+        info_json: str
+        attempt: int
+        def __init__(self, device: _Optional[str] = ..., state: _Optional[str] = ..., t_monotonic_ns: _Optional[int] = ..., t_utc_ns: _Optional[int] = ..., message: _Optional[str] = ..., info_json: _Optional[str] = ..., attempt: _Optional[int] = ...) -> None: ...
+    class Gap(_message.Message):
+        __slots__ = ("device", "t_monotonic_ns", "dropped", "unit", "reason")
+        DEVICE_FIELD_NUMBER: _ClassVar[int]
+        T_MONOTONIC_NS_FIELD_NUMBER: _ClassVar[int]
+        DROPPED_FIELD_NUMBER: _ClassVar[int]
+        UNIT_FIELD_NUMBER: _ClassVar[int]
+        REASON_FIELD_NUMBER: _ClassVar[int]
+        device: str
+        t_monotonic_ns: int
+        dropped: int
+        unit: str
+        reason: str
+        def __init__(self, device: _Optional[str] = ..., t_monotonic_ns: _Optional[int] = ..., dropped: _Optional[int] = ..., unit: _Optional[str] = ..., reason: _Optional[str] = ...) -> None: ...
+    class Tick(_message.Message):
+        __slots__ = ("t_monotonic_ns", "t_utc_ns")
+        T_MONOTONIC_NS_FIELD_NUMBER: _ClassVar[int]
+        T_UTC_NS_FIELD_NUMBER: _ClassVar[int]
+        t_monotonic_ns: int
+        t_utc_ns: int
+        def __init__(self, t_monotonic_ns: _Optional[int] = ..., t_utc_ns: _Optional[int] = ...) -> None: ...
+    EVENT_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    RUN_START_FIELD_NUMBER: _ClassVar[int]
+    POSE_CHANGE_FIELD_NUMBER: _ClassVar[int]
+    REFERENCE_CHANGE_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_CHANGE_FIELD_NUMBER: _ClassVar[int]
+    GAP_FIELD_NUMBER: _ClassVar[int]
+    TICK_FIELD_NUMBER: _ClassVar[int]
+    event_sequence: int
+    run_start: Event.RunStart
+    pose_change: Event.PoseChange
+    reference_change: Event.ReferenceChange
+    device_change: Event.DeviceChange
+    gap: Event.Gap
+    tick: Event.Tick
+    def __init__(self, event_sequence: _Optional[int] = ..., run_start: _Optional[_Union[Event.RunStart, _Mapping]] = ..., pose_change: _Optional[_Union[Event.PoseChange, _Mapping]] = ..., reference_change: _Optional[_Union[Event.ReferenceChange, _Mapping]] = ..., device_change: _Optional[_Union[Event.DeviceChange, _Mapping]] = ..., gap: _Optional[_Union[Event.Gap, _Mapping]] = ..., tick: _Optional[_Union[Event.Tick, _Mapping]] = ...) -> None: ...
+
+class RawBlock(_message.Message):
+    __slots__ = ("event_sequence", "device", "boot_id", "t_utc_ns", "first_index", "nominal_rate_hz", "flags", "temperature_raw", "temperature_degc", "axes", "decimal", "burst_t_monotonic_ns", "burst_count", "x_counts", "y_counts", "z_counts", "x", "y", "z")
+    EVENT_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    T_UTC_NS_FIELD_NUMBER: _ClassVar[int]
+    FIRST_INDEX_FIELD_NUMBER: _ClassVar[int]
+    NOMINAL_RATE_HZ_FIELD_NUMBER: _ClassVar[int]
+    FLAGS_FIELD_NUMBER: _ClassVar[int]
+    TEMPERATURE_RAW_FIELD_NUMBER: _ClassVar[int]
+    TEMPERATURE_DEGC_FIELD_NUMBER: _ClassVar[int]
+    AXES_FIELD_NUMBER: _ClassVar[int]
+    DECIMAL_FIELD_NUMBER: _ClassVar[int]
+    BURST_T_MONOTONIC_NS_FIELD_NUMBER: _ClassVar[int]
+    BURST_COUNT_FIELD_NUMBER: _ClassVar[int]
+    X_COUNTS_FIELD_NUMBER: _ClassVar[int]
+    Y_COUNTS_FIELD_NUMBER: _ClassVar[int]
+    Z_COUNTS_FIELD_NUMBER: _ClassVar[int]
+    X_FIELD_NUMBER: _ClassVar[int]
+    Y_FIELD_NUMBER: _ClassVar[int]
+    Z_FIELD_NUMBER: _ClassVar[int]
+    event_sequence: int
+    device: str
+    boot_id: str
+    t_utc_ns: int
+    first_index: int
+    nominal_rate_hz: float
+    flags: int
+    temperature_raw: int
+    temperature_degc: float
+    axes: int
+    decimal: bool
+    burst_t_monotonic_ns: _containers.RepeatedScalarFieldContainer[int]
+    burst_count: _containers.RepeatedScalarFieldContainer[int]
+    x_counts: _containers.RepeatedScalarFieldContainer[int]
+    y_counts: _containers.RepeatedScalarFieldContainer[int]
+    z_counts: _containers.RepeatedScalarFieldContainer[int]
+    x: _containers.RepeatedScalarFieldContainer[float]
+    y: _containers.RepeatedScalarFieldContainer[float]
+    z: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, event_sequence: _Optional[int] = ..., device: _Optional[str] = ..., boot_id: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., first_index: _Optional[int] = ..., nominal_rate_hz: _Optional[float] = ..., flags: _Optional[int] = ..., temperature_raw: _Optional[int] = ..., temperature_degc: _Optional[float] = ..., axes: _Optional[int] = ..., decimal: _Optional[bool] = ..., burst_t_monotonic_ns: _Optional[_Iterable[int]] = ..., burst_count: _Optional[_Iterable[int]] = ..., x_counts: _Optional[_Iterable[int]] = ..., y_counts: _Optional[_Iterable[int]] = ..., z_counts: _Optional[_Iterable[int]] = ..., x: _Optional[_Iterable[float]] = ..., y: _Optional[_Iterable[float]] = ..., z: _Optional[_Iterable[float]] = ...) -> None: ...
+
+class RawBlockBytes(_message.Message):
+    __slots__ = ("event_sequence", "device", "boot_id", "t_utc_ns", "first_index", "nominal_rate_hz", "flags", "temperature_raw", "temperature_degc", "axes", "decimal", "burst_t_monotonic_ns", "burst_count", "x_counts", "y_counts", "z_counts", "x", "y", "z")
+    EVENT_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_FIELD_NUMBER: _ClassVar[int]
+    BOOT_ID_FIELD_NUMBER: _ClassVar[int]
+    T_UTC_NS_FIELD_NUMBER: _ClassVar[int]
+    FIRST_INDEX_FIELD_NUMBER: _ClassVar[int]
+    NOMINAL_RATE_HZ_FIELD_NUMBER: _ClassVar[int]
+    FLAGS_FIELD_NUMBER: _ClassVar[int]
+    TEMPERATURE_RAW_FIELD_NUMBER: _ClassVar[int]
+    TEMPERATURE_DEGC_FIELD_NUMBER: _ClassVar[int]
+    AXES_FIELD_NUMBER: _ClassVar[int]
+    DECIMAL_FIELD_NUMBER: _ClassVar[int]
+    BURST_T_MONOTONIC_NS_FIELD_NUMBER: _ClassVar[int]
+    BURST_COUNT_FIELD_NUMBER: _ClassVar[int]
+    X_COUNTS_FIELD_NUMBER: _ClassVar[int]
+    Y_COUNTS_FIELD_NUMBER: _ClassVar[int]
+    Z_COUNTS_FIELD_NUMBER: _ClassVar[int]
+    X_FIELD_NUMBER: _ClassVar[int]
+    Y_FIELD_NUMBER: _ClassVar[int]
+    Z_FIELD_NUMBER: _ClassVar[int]
+    event_sequence: int
+    device: str
+    boot_id: str
+    t_utc_ns: int
+    first_index: int
+    nominal_rate_hz: float
+    flags: int
+    temperature_raw: int
+    temperature_degc: float
+    axes: int
+    decimal: bool
+    burst_t_monotonic_ns: bytes
+    burst_count: bytes
+    x_counts: bytes
+    y_counts: bytes
+    z_counts: bytes
+    x: bytes
+    y: bytes
+    z: bytes
+    def __init__(self, event_sequence: _Optional[int] = ..., device: _Optional[str] = ..., boot_id: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., first_index: _Optional[int] = ..., nominal_rate_hz: _Optional[float] = ..., flags: _Optional[int] = ..., temperature_raw: _Optional[int] = ..., temperature_degc: _Optional[float] = ..., axes: _Optional[int] = ..., decimal: _Optional[bool] = ..., burst_t_monotonic_ns: _Optional[bytes] = ..., burst_count: _Optional[bytes] = ..., x_counts: _Optional[bytes] = ..., y_counts: _Optional[bytes] = ..., z_counts: _Optional[bytes] = ..., x: _Optional[bytes] = ..., y: _Optional[bytes] = ..., z: _Optional[bytes] = ...) -> None: ...
+
+class Window(_message.Message):
+    __slots__ = ("event_sequence", "run_id", "sequence", "sensor", "t_utc_ns", "start_s", "stop_s", "position", "used", "reason", "points", "left_out", "numbers")
+    class NumbersEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: float
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[float] = ...) -> None: ...
+    EVENT_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    RUN_ID_FIELD_NUMBER: _ClassVar[int]
+    SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    SENSOR_FIELD_NUMBER: _ClassVar[int]
+    T_UTC_NS_FIELD_NUMBER: _ClassVar[int]
+    START_S_FIELD_NUMBER: _ClassVar[int]
+    STOP_S_FIELD_NUMBER: _ClassVar[int]
+    POSITION_FIELD_NUMBER: _ClassVar[int]
+    USED_FIELD_NUMBER: _ClassVar[int]
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    POINTS_FIELD_NUMBER: _ClassVar[int]
+    LEFT_OUT_FIELD_NUMBER: _ClassVar[int]
+    NUMBERS_FIELD_NUMBER: _ClassVar[int]
+    event_sequence: int
+    run_id: str
+    sequence: int
+    sensor: str
+    t_utc_ns: int
+    start_s: float
+    stop_s: float
+    position: str
+    used: bool
+    reason: str
+    points: int
+    left_out: int
+    numbers: _containers.ScalarMap[str, float]
+    def __init__(self, event_sequence: _Optional[int] = ..., run_id: _Optional[str] = ..., sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., start_s: _Optional[float] = ..., stop_s: _Optional[float] = ..., position: _Optional[str] = ..., used: _Optional[bool] = ..., reason: _Optional[str] = ..., points: _Optional[int] = ..., left_out: _Optional[int] = ..., numbers: _Optional[_Mapping[str, float]] = ...) -> None: ...
+
+class Calibration(_message.Message):
+    __slots__ = ("event_sequence", "run_id", "sequence", "sensor", "t_utc_ns", "sxx", "sxy", "sxz", "syx", "syy", "syz", "szx", "szy", "szz", "qx", "qy", "qz", "u_sxx", "u_sxy", "u_sxz", "u_syx", "u_syy", "u_syz", "u_szx", "u_szy", "u_szz", "u_qx", "u_qy", "u_qz", "coverage_factor", "residual_sd_x", "residual_sd_y", "residual_sd_z", "windows", "method", "uncertainty_kind", "output_unit", "identity", "determined", "covariance")
+    EVENT_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    RUN_ID_FIELD_NUMBER: _ClassVar[int]
+    SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    SENSOR_FIELD_NUMBER: _ClassVar[int]
+    T_UTC_NS_FIELD_NUMBER: _ClassVar[int]
+    SXX_FIELD_NUMBER: _ClassVar[int]
+    SXY_FIELD_NUMBER: _ClassVar[int]
+    SXZ_FIELD_NUMBER: _ClassVar[int]
+    SYX_FIELD_NUMBER: _ClassVar[int]
+    SYY_FIELD_NUMBER: _ClassVar[int]
+    SYZ_FIELD_NUMBER: _ClassVar[int]
+    SZX_FIELD_NUMBER: _ClassVar[int]
+    SZY_FIELD_NUMBER: _ClassVar[int]
+    SZZ_FIELD_NUMBER: _ClassVar[int]
+    QX_FIELD_NUMBER: _ClassVar[int]
+    QY_FIELD_NUMBER: _ClassVar[int]
+    QZ_FIELD_NUMBER: _ClassVar[int]
+    U_SXX_FIELD_NUMBER: _ClassVar[int]
+    U_SXY_FIELD_NUMBER: _ClassVar[int]
+    U_SXZ_FIELD_NUMBER: _ClassVar[int]
+    U_SYX_FIELD_NUMBER: _ClassVar[int]
+    U_SYY_FIELD_NUMBER: _ClassVar[int]
+    U_SYZ_FIELD_NUMBER: _ClassVar[int]
+    U_SZX_FIELD_NUMBER: _ClassVar[int]
+    U_SZY_FIELD_NUMBER: _ClassVar[int]
+    U_SZZ_FIELD_NUMBER: _ClassVar[int]
+    U_QX_FIELD_NUMBER: _ClassVar[int]
+    U_QY_FIELD_NUMBER: _ClassVar[int]
+    U_QZ_FIELD_NUMBER: _ClassVar[int]
+    COVERAGE_FACTOR_FIELD_NUMBER: _ClassVar[int]
+    RESIDUAL_SD_X_FIELD_NUMBER: _ClassVar[int]
+    RESIDUAL_SD_Y_FIELD_NUMBER: _ClassVar[int]
+    RESIDUAL_SD_Z_FIELD_NUMBER: _ClassVar[int]
+    WINDOWS_FIELD_NUMBER: _ClassVar[int]
+    METHOD_FIELD_NUMBER: _ClassVar[int]
+    UNCERTAINTY_KIND_FIELD_NUMBER: _ClassVar[int]
+    OUTPUT_UNIT_FIELD_NUMBER: _ClassVar[int]
+    IDENTITY_FIELD_NUMBER: _ClassVar[int]
+    DETERMINED_FIELD_NUMBER: _ClassVar[int]
+    COVARIANCE_FIELD_NUMBER: _ClassVar[int]
+    event_sequence: int
+    run_id: str
+    sequence: int
+    sensor: str
+    t_utc_ns: int
+    sxx: float
+    sxy: float
+    sxz: float
+    syx: float
+    syy: float
+    syz: float
+    szx: float
+    szy: float
+    szz: float
+    qx: float
+    qy: float
+    qz: float
+    u_sxx: float
+    u_sxy: float
+    u_sxz: float
+    u_syx: float
+    u_syy: float
+    u_syz: float
+    u_szx: float
+    u_szy: float
+    u_szz: float
+    u_qx: float
+    u_qy: float
+    u_qz: float
+    coverage_factor: float
+    residual_sd_x: float
+    residual_sd_y: float
+    residual_sd_z: float
+    windows: int
+    method: str
+    uncertainty_kind: str
+    output_unit: str
+    identity: str
+    determined: _containers.RepeatedScalarFieldContainer[bool]
+    covariance: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, event_sequence: _Optional[int] = ..., run_id: _Optional[str] = ..., sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., sxx: _Optional[float] = ..., sxy: _Optional[float] = ..., sxz: _Optional[float] = ..., syx: _Optional[float] = ..., syy: _Optional[float] = ..., syz: _Optional[float] = ..., szx: _Optional[float] = ..., szy: _Optional[float] = ..., szz: _Optional[float] = ..., qx: _Optional[float] = ..., qy: _Optional[float] = ..., qz: _Optional[float] = ..., u_sxx: _Optional[float] = ..., u_sxy: _Optional[float] = ..., u_sxz: _Optional[float] = ..., u_syx: _Optional[float] = ..., u_syy: _Optional[float] = ..., u_syz: _Optional[float] = ..., u_szx: _Optional[float] = ..., u_szy: _Optional[float] = ..., u_szz: _Optional[float] = ..., u_qx: _Optional[float] = ..., u_qy: _Optional[float] = ..., u_qz: _Optional[float] = ..., coverage_factor: _Optional[float] = ..., residual_sd_x: _Optional[float] = ..., residual_sd_y: _Optional[float] = ..., residual_sd_z: _Optional[float] = ..., windows: _Optional[int] = ..., method: _Optional[str] = ..., uncertainty_kind: _Optional[str] = ..., output_unit: _Optional[str] = ..., identity: _Optional[str] = ..., determined: _Optional[_Iterable[bool]] = ..., covariance: _Optional[_Iterable[float]] = ...) -> None: ...
+
+class Status(_message.Message):
+    __slots__ = ("event_sequence", "run_id", "sequence", "sensor", "t_utc_ns", "status", "before", "reason")
+    EVENT_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    RUN_ID_FIELD_NUMBER: _ClassVar[int]
+    SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    SENSOR_FIELD_NUMBER: _ClassVar[int]
+    T_UTC_NS_FIELD_NUMBER: _ClassVar[int]
+    STATUS_FIELD_NUMBER: _ClassVar[int]
+    BEFORE_FIELD_NUMBER: _ClassVar[int]
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    event_sequence: int
+    run_id: str
+    sequence: int
+    sensor: str
+    t_utc_ns: int
+    status: str
+    before: str
+    reason: str
+    def __init__(self, event_sequence: _Optional[int] = ..., run_id: _Optional[str] = ..., sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., status: _Optional[str] = ..., before: _Optional[str] = ..., reason: _Optional[str] = ...) -> None: ...

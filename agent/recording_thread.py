@@ -1,0 +1,87 @@
+"""The one thread that owns the recording, and hands results on once the disk has them."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Callable, Sequence
+
+from agent.events import Event, Result, RunStart
+from agent.recording import Recorder
+
+FLUSH_S = 2.0  # s; a power cut costs at most this much of the recording, for 11 % more disk than one long chunk
+CAPACITY = 256  # events; half a minute of two devices and ticks, while a slow card takes its time
+
+Deliver = Callable[[int, Sequence[Result], bool], None]
+
+
+class RecordingThread:
+    """Takes events with their results from the main loop, in order, and records them.
+
+    `deliver(event_sequence, results, recorded)` is called in this thread after the results are on disk (or, with
+    `recorded` false, could not be); it must not raise. What is raised nevertheless comes out of the next `put`.
+    """
+
+    def __init__(self, recorder: Recorder, deliver: Deliver, *, flush_s: float = FLUSH_S) -> None:
+        self._recorder = recorder
+        self._deliver = deliver
+        self._flush_s = flush_s
+        self._queue: queue.Queue[tuple[int, Event, Sequence[Result]] | None] = queue.Queue(CAPACITY)
+        self._starts_sent = self._starts_done = 0
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, name="recording", daemon=True)
+        self._thread.start()
+
+    @property
+    def wants_rotation(self) -> bool:
+        """Whether the next event should be a RunStart; false while one is on its way."""
+        return self._starts_sent == self._starts_done and self._recorder.wants_rotation
+
+    def put(self, event_sequence: int, event: Event, results: Sequence[Result]) -> None:
+        """Hand over an event and what came of it; waits while the disk is far behind."""
+        if isinstance(event, RunStart):
+            self._starts_sent += 1
+        self._hand_over((event_sequence, event, results))
+
+    def close(self) -> None:
+        """Record what is waiting and finish the file."""
+        self._hand_over(None)
+        self._thread.join()
+        self._raise()
+
+    def _hand_over(self, entry: tuple[int, Event, Sequence[Result]] | None) -> None:
+        while True:
+            self._raise()
+            try:
+                return self._queue.put(entry, timeout=1.0)
+            except queue.Full:
+                continue  # look again whether the thread still lives
+
+    def _raise(self) -> None:
+        if self._error is not None:
+            raise self._error
+
+    def _run(self) -> None:
+        try:
+            self._loop()
+        except BaseException as error:
+            self._error = error
+
+    def _loop(self) -> None:
+        flush_at = time.monotonic() + self._flush_s
+        while True:
+            if time.monotonic() >= flush_at:
+                self._recorder.sync()
+                flush_at = time.monotonic() + self._flush_s
+            try:
+                entry = self._queue.get(timeout=max(0.0, flush_at - time.monotonic()))
+            except queue.Empty:
+                continue
+            if entry is None:
+                return self._recorder.close()
+            event_sequence, event, results = entry
+            recorded = self._recorder.record(event_sequence, event, results)
+            self._starts_done += isinstance(event, RunStart)
+            if results:
+                self._deliver(event_sequence, results, recorded)
