@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -28,7 +29,7 @@ def test_chunks_make_no_difference(cuts, backwards) -> None:
     counts, reference = whole.sensor_counts(0, 4 * BLOCK), whole.reference_values(0, 4 * BLOCK)
     parts = Bench(COLOURED, 3)
     edges = sorted({0, *cuts, 4 * BLOCK})
-    pieces = list(zip(edges, edges[1:], strict=False))
+    pieces = list(pairwise(edges))
     for first, last in reversed(pieces) if backwards else pieces:
         assert np.array_equal(parts.sensor_counts(first, last - first), counts[first:last])
         assert np.array_equal(parts.reference_values(first, last - first), reference[first:last])
