@@ -6,7 +6,9 @@ unit. S has a row an output axis and a column a direction, so S[0, 1] is S_xy: o
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +24,8 @@ class Pose:
     The input acceleration in the sensor's frame is `a(t) = direction @ u(t) + gravity_mps2`, u being the reference's
     m channels in m/s2 (m = 0 at rest, 1 for a uniaxial reference, 3 for a tri-axial one).
     `direction` is (3, m); `gravity_mps2` (3,) is what an ideal sensor reads at rest there (zeros where the sensor or
-    the equation does not feel it). `theta_rad`, `alpha_rad` are kept where the pose came from the clamp (Eqs. 9-11).
+    the equation does not feel it; NaN where a sensor feels a gravity that nobody stated: such a window's mean then says
+    nothing). `theta_rad`, `alpha_rad` are kept where the pose came from the clamp (Eqs. 9-11).
     `position` names the pose: windows of one position share its angle and offset errors.
     """
 
@@ -50,7 +53,11 @@ class WindowSums:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Window:
-    """One window of known excitation: where the sensor stood, its sums, and the verdict on it."""
+    """One window of known excitation: where the sensor stood, its sums, and the verdict on it.
+
+    `kind`: the reference moved, the sensor rested under a known gravity, or the reference was calm (not used by itself;
+    it measures the noise of the reference). `numbers` are the statistics behind the verdict, unit in the name.
+    """
 
     start_s: float
     stop_s: float
@@ -60,6 +67,8 @@ class Window:
     reason: str  # why it is not used, "" where it is
     points: int
     left_out: int
+    kind: Literal["motion", "rest", "quiet"] = "motion"
+    numbers: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
