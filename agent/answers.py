@@ -1,0 +1,53 @@
+"""Answers to queries on a gateway's keys, from its store: the value in force, or all after a sequence number."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import zenoh
+
+from agent.history import History, Record, StoreError
+from agent.keys import result_key
+
+REPLIES_MAX = 500  # per query, about 1 MB; who asks goes on from the last number until nothing comes
+
+_log = logging.getLogger(__name__)
+_Queryable = zenoh.Queryable[zenoh.Handler[zenoh.Query]]
+
+
+def answer_queries(queryable: _Queryable, gateway: str, store: Path) -> None:
+    """Answer until the queryable is undeclared or its session closes. Runs in a thread of its own.
+
+    `<keys>`: the newest result of each channel that matches; a calibration only where it is in force.
+    `<keys>?after=<sequence>`: the first REPLIES_MAX results after that number, in order. Several come on one key, so
+    the query must be sent with consolidation NONE, else Zenoh keeps the last of each key.
+    """
+    for query in queryable:
+        with query:  # a query that stays alive makes the one who asked wait for its whole time
+            try:
+                for record in _answers(query, gateway, store):
+                    query.reply(
+                        result_key(gateway, record.sensor, record.what),
+                        record.payload,
+                        encoding=zenoh.Encoding.APPLICATION_JSON,
+                    )
+            except (StoreError, ValueError) as error:
+                query.reply_err(str(error))
+            except zenoh.ZError as error:
+                _log.warning("a query could not be answered: %s", error)
+
+
+def _answers(query: zenoh.Query, gateway: str, store: Path) -> list[Record]:
+    after = query.parameters.get("after")
+    with History(store) as history:
+        wanted = [
+            (sensor, what)
+            for sensor, what in history.channels()
+            if query.key_expr.intersects(result_key(gateway, sensor, what))
+        ]
+        if after is None:
+            return [record for record in history.latest() if (record.sensor, record.what) in wanted]
+        if not after.isascii() or not after.isdigit() or int(after) >= 2**63:
+            raise ValueError(f"after={after}: not a sequence number")
+        return history.after(int(after), wanted, limit=REPLIES_MAX)

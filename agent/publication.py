@@ -1,0 +1,165 @@
+"""What leaves the gateway: results in order, from the outbox, over Zenoh. Nothing here can hold the agent up."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import deque
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+
+import zenoh
+from zenoh.ext import AdvancedPublisher, CacheConfig, MissDetectionConfig, declare_advanced_publisher
+
+from agent.answers import answer_queries
+from agent.history import History, Record, StoreError
+from agent.keys import gateway_key, result_key
+from agent.session import session_config
+from agent.store import Store
+
+BATCH = 100  # results read from the store at a time
+POLL_S = 0.5  # how soon a router that came back is seen; asking costs a microsecond
+REOPEN_S = 5.0  # between attempts to open a session that the machine refuses
+CACHE_SAMPLES = 100  # per channel, for subscribers that come late; all before is in the store
+HEARTBEAT_S = 10.0  # tells a subscriber that it missed the last sample; 40 bytes each, only where one listens
+RECENT_MAX = 1000  # results handed over last: those that the store refused go out from here
+CLOSE_S = 1.2  # a frozen router blocks a put for 5 s; leaving must not wait for it
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class PublicationState:
+    """What the publisher is doing: endpoints it knows, whether a router is there, up to which result all are out."""
+
+    key: str
+    endpoints: tuple[str, ...]
+    connected: bool
+    published: int
+    fault: str  # "" where there is none
+
+
+class Publisher:
+    """Publishes the results of a gateway, in the order of their sequence, each once the store has it.
+
+    The store is the outbox: Zenoh acknowledges nothing, so a result counts as published when it was put while a router
+    was connected, and what is lost with a dying link is still in the publisher's cache and behind the queryable
+    (`?after=<sequence>`, see agent.answers). Each sample's attachment is the number of the result put before it, "0"
+    for one that is put again at the start: a consumer whose last number is another has missed something.
+    The session is a peer that does not listen; it connects when a router appears.
+    Raises ValueError on a bad name, EndpointError on a bad endpoint; after that no method raises.
+    """
+
+    def __init__(self, site: str, gateway: str, connect: Sequence[str], store: Store) -> None:
+        self._key = gateway_key(site, gateway)
+        self._endpoints = tuple(connect)
+        self._config = session_config("peer", connect=connect)
+        self._store = store
+        self._recent: deque[Record] = deque(maxlen=RECENT_MAX)
+        self._wake = threading.Event()
+        self._stop = threading.Event()
+        self._connected = False
+        self._fault = ""
+        self._said = ""
+        self._previous = store.published()
+        self._publishers: dict[str, AdvancedPublisher] = {}
+        self._thread = threading.Thread(target=self._run, name="publication", daemon=True)
+
+    def start(self) -> None:
+        """Begin in a thread of its own; opening a session takes half a second without a router."""
+        self._thread.start()
+
+    def publish(self, record: Record) -> None:
+        """A result was committed, or could not be: send it when its turn comes. Returns at once."""
+        self._recent.append(record)
+        self._wake.set()
+
+    def state(self) -> PublicationState:
+        """What is being done, for a view."""
+        return PublicationState(self._key, self._endpoints, self._connected, self._store.published(), self._fault)
+
+    def close(self, timeout_s: float = CLOSE_S) -> None:
+        """Send what waits if a router is there, undeclare, close; give up after `timeout_s`. May be called twice."""
+        self._stop.set()
+        self._wake.set()
+        if self._thread.is_alive():
+            self._thread.join(timeout_s)
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            try:
+                self._serve()
+            except (zenoh.ZError, StoreError) as error:
+                self._fail(str(error))
+                self._stop.wait(REOPEN_S)
+            self._connected = False
+
+    def _serve(self) -> None:
+        with ExitStack() as open_things:
+            session = open_things.enter_context(zenoh.open(self._config))
+            history = open_things.enter_context(History(self._store.path))
+            queryable = session.declare_queryable(f"{self._key}/**", zenoh.handlers.FifoChannel(64), complete=True)
+            open_things.callback(queryable.undeclare)
+            threading.Thread(
+                target=answer_queries,
+                args=(queryable, self._key, self._store.path),
+                name="answers",
+                daemon=True,
+            ).start()
+            token = session.liveliness().declare_token(f"{self._key}/alive")
+            open_things.callback(token.undeclare)
+            # A session that closes with a publisher still declared leaks a file descriptor and 30 kB.
+            open_things.callback(self._undeclare_publishers)
+            for record in history.latest():
+                if record.sequence <= self._store.published():
+                    self._put(session, record, previous=0)
+            stopping = False
+            while not stopping:
+                self._wake.wait(POLL_S)
+                self._wake.clear()
+                stopping = self._stop.is_set()  # asked before the last round, so that nothing handed over is left
+                self._connected = bool(session.info.routers_zid())
+                if self._connected:
+                    self._send_waiting(session, history)
+
+    def _send_waiting(self, session: zenoh.Session, history: History) -> None:
+        self._fault = ""
+        try:
+            while records := history.after(self._store.published(), limit=BATCH):
+                for record in records:
+                    if not session.info.routers_zid():
+                        return
+                    self._put(session, record, self._previous)
+                    self._store.mark_published(record.sequence)
+        except StoreError as error:
+            self._fail(str(error))
+        while self._recent:
+            record = self._recent.popleft()
+            if record.sequence > self._previous:
+                self._put(session, record, self._previous)
+
+    def _put(self, session: zenoh.Session, record: Record, previous: int) -> None:
+        key = result_key(self._key, record.sensor, record.what)
+        if key not in self._publishers:
+            self._publishers[key] = declare_advanced_publisher(
+                session,
+                key,
+                encoding=zenoh.Encoding.APPLICATION_JSON,
+                # Only this thread waits, and on one link a later result cannot then overtake an earlier one.
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                cache=CacheConfig(max_samples=CACHE_SAMPLES),
+                sample_miss_detection=MissDetectionConfig(heartbeat=HEARTBEAT_S),  # type: ignore[call-arg]
+                publisher_detection=True,
+            )
+        self._publishers[key].put(record.payload, attachment=str(previous))
+        self._previous = max(self._previous, record.sequence)
+
+    def _undeclare_publishers(self) -> None:
+        while self._publishers:
+            self._publishers.popitem()[1].undeclare()
+
+    def _fail(self, fault: str) -> None:
+        if fault != self._said:
+            _log.warning("publication: %s", fault)
+        self._fault = self._said = fault

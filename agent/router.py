@@ -1,0 +1,91 @@
+"""`fieldcal router`: a Zenoh router in one process, for tests and small sites."""
+
+from __future__ import annotations
+
+import json
+import signal
+import threading
+from pathlib import Path
+
+import click
+import zenoh
+
+from agent.session import EndpointError, session_config
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+ANSWER_S = 0.5  # a router on the same machine answers within milliseconds
+
+
+def router_running(endpoint: str) -> bool:
+    """True if a Zenoh router answers at `endpoint`. Raises EndpointError where it is not an endpoint."""
+    config = session_config("client", connect=[endpoint])
+    config.insert_json5("connect/timeout_ms", json.dumps(int(ANSWER_S * 1000)))
+    try:
+        session = zenoh.open(config)
+    except zenoh.ZError:
+        return False
+    try:
+        return bool(session.info.routers_zid())
+    finally:
+        session.close()
+
+
+def open_router(listen: str | None, config_file: Path | None = None) -> tuple[zenoh.Session, list[str]]:
+    """A router and the endpoints it listens at, with the port that the system chose where `listen` says port 0.
+
+    Without `listen` it is what the file says, or DEFAULT_ENDPOINT. Raises EndpointError naming the endpoint or file.
+    """
+    endpoint = listen or (None if config_file else DEFAULT_ENDPOINT)
+    if config_file:
+        try:
+            config = zenoh.Config.from_file(config_file)
+        except zenoh.ZError as error:
+            raise EndpointError(f"{config_file}: {_first_line(error)}") from None
+        config.insert_json5("mode", '"router"')
+        if endpoint:
+            config.insert_json5("listen/endpoints", json.dumps([endpoint]))
+    else:
+        config = session_config("router", listen=[endpoint or DEFAULT_ENDPOINT])
+    config.insert_json5("adminspace/enabled", "true")  # it alone tells the real port
+    try:
+        session = zenoh.open(config)
+    except zenoh.ZError as error:
+        where = endpoint or str(config_file)
+        taken = "Address already in use" in str(error)
+        raise EndpointError(f"{where}: {'the port is taken' if taken else _first_line(error)}") from None
+    for reply in session.get(f"@/{session.zid()}/router"):
+        if reply.ok:
+            return session, list(json.loads(reply.ok.payload.to_string())["locators"])
+    return session, [endpoint] if endpoint else []
+
+
+def _first_line(error: zenoh.ZError) -> str:
+    # What follows " at /" is a place in Zenoh's own source.
+    return str(error).splitlines()[0].split(" at /", 1)[0]
+
+
+@click.command(help="A Zenoh router, for tests and small sites. Prints its endpoint and runs until it is interrupted.")
+@click.option(
+    "--listen", metavar="ENDPOINT", help=f"Where to listen; port 0 takes a free one.  [default: {DEFAULT_ENDPOINT}]"
+)
+@click.option(
+    "--config",
+    "config_file",
+    metavar="F",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="A Zenoh configuration (JSON5), for TLS and access control.",
+)
+def router(listen: str | None, config_file: Path | None) -> int:
+    """Serve until SIGINT or SIGTERM."""
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    try:
+        session, endpoints = open_router(listen, config_file)
+    except EndpointError as error:
+        click.echo(f"fieldcal router: {error}", err=True)
+        return 1
+    click.echo(f"router at {', '.join(endpoints)}")
+    stop.wait()
+    session.close()
+    return 0

@@ -1,0 +1,35 @@
+"""How a Zenoh session of this project is set: nothing found by multicast or gossip, nothing opened to the network."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import Literal
+
+import zenoh
+
+
+class EndpointError(Exception):
+    """An endpoint that Zenoh cannot use. The message names it."""
+
+
+def session_config(
+    mode: Literal["peer", "client", "router"], *, connect: Sequence[str] = (), listen: Sequence[str] = ()
+) -> zenoh.Config:
+    """A configuration with explicit end points only. Raises EndpointError where one is not an endpoint."""
+    config = zenoh.Config()
+    for key, value in {
+        "mode": mode,
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        # Two files of 16 MiB in /dev/shm, left behind by a kill, for payloads that are never that large.
+        "transport/shared_memory/enabled": False,
+    }.items():
+        config.insert_json5(key, json.dumps(value))
+    for key, endpoints in (("connect/endpoints", connect), ("listen/endpoints", listen)):
+        try:
+            config.insert_json5(key, json.dumps(list(endpoints)))
+        except zenoh.ZError:
+            shown = ", ".join(endpoints)
+            raise EndpointError(f"not an endpoint such as tcp/192.0.2.1:7447: {shown}") from None
+    return config
