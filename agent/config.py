@@ -126,15 +126,6 @@ class Zenoh(Section):
     connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
 
 
-class VirtualBench(Section):
-    """The virtual bench under this run: its devices take the place of the ones named here."""
-
-    preset: Literal["plain", "faulty"] = "plain"
-    seed: int = 1
-    sensor: Name = "mems"
-    reference: Name = "ldv"
-
-
 class Config(Section):
     """All of it."""
 
@@ -143,7 +134,6 @@ class Config(Section):
     channels: Annotated[tuple[Channel, ...], Field(min_length=1)]
     recording: Recording = Recording()
     zenoh: Zenoh = Zenoh()
-    virtual_bench: VirtualBench | None = None
 
     @model_validator(mode="after")
     def _names(self) -> Config:
