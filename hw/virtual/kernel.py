@@ -1,0 +1,168 @@
+"""Stands in for the kernel's i2c-dev under the real smbus2: only its open, close and ioctl are replaced.
+
+errno values and limits are those of Linux 6.1: at most 42 messages a transfer and 8192 bytes a message (EINVAL), an
+absent address ENXIO or EREMOTEIO by adapter, an address that a kernel driver holds EBUSY, an adapter that went away
+EIO while it is open and ENOENT afterwards.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import errno
+import os
+import threading
+from collections.abc import Iterator, Mapping
+from types import SimpleNamespace
+from typing import Any, Protocol
+
+import smbus2.smbus2 as s2
+
+MAX_MESSAGES = 42
+MAX_MESSAGE_BYTES = 8192
+READ = 1  # I2C_M_RD
+FUNCTIONS = 0x0EFF0009  # I2C and what the kernel makes of it for SMBus
+
+
+class I2CTarget(Protocol):
+    """A device on the bus. Both methods may raise OSError, as a device that does not acknowledge."""
+
+    def write(self, data: bytes) -> None:
+        """One write message."""
+
+    def read(self, count: int) -> bytes:
+        """One read message."""
+
+
+class I2CBus:
+    """An adapter with its targets by address; `claimed` addresses belong to a kernel driver."""
+
+    def __init__(
+        self,
+        targets: Mapping[int, I2CTarget],
+        *,
+        absent_errno: int = errno.EREMOTEIO,
+        functions: int = FUNCTIONS,
+    ) -> None:
+        self.targets = dict(targets)
+        self.claimed: set[int] = set()
+        self.functions = functions
+        self.plugged = True
+        self.generation = 0  # rises with each unplug: files opened before are dead
+        self.transfers = 0
+        self._absent_errno = absent_errno
+        self._lock = threading.Lock()
+
+    def unplug(self) -> None:
+        """Take the adapter away."""
+        self.plugged = False
+        self.generation += 1
+
+    def replug(self) -> None:
+        """Bring it back."""
+        self.plugged = True
+
+    def transfer(self, messages: list[tuple[int, int | bytes]]) -> list[bytes | None]:
+        """Messages (address, bytes to write or number of bytes to read) in one go; what was read, by message."""
+        with self._lock:
+            self.transfers += 1
+            return [self._message(address, content) for address, content in messages]
+
+    def _message(self, address: int, content: int | bytes) -> bytes | None:
+        target = self.targets.get(address)
+        if target is None:
+            raise _error(self._absent_errno)
+        if isinstance(content, int):
+            return target.read(content)
+        target.write(content)
+        return None
+
+
+class _Kernel:
+    def __init__(self, nodes: Mapping[str, I2CBus]) -> None:
+        self._nodes = nodes
+        self._files: dict[int, tuple[I2CBus, int]] = {}
+        self._address: dict[int, int] = {}
+
+    def open(self, path: str, flags: int) -> int:
+        bus = self._nodes.get(path)
+        if bus is None or not bus.plugged:
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), path)
+        file = os.open(os.devnull, flags)
+        self._files[file] = bus, bus.generation
+        return file
+
+    def close(self, file: int) -> None:
+        self._files.pop(file)
+        self._address.pop(file, None)
+        os.close(file)
+
+    def ioctl(self, file: int, request: int, argument: Any) -> int:
+        bus, generation = self._files[file]
+        if generation != bus.generation:
+            raise _error(errno.EIO)
+        match request:
+            case s2.I2C_FUNCS:
+                argument.value = bus.functions
+            case s2.I2C_SLAVE | s2.I2C_SLAVE_FORCE:
+                if request == s2.I2C_SLAVE and argument in bus.claimed:
+                    raise _error(errno.EBUSY)
+                self._address[file] = argument
+            case s2.I2C_SMBUS:
+                _smbus(bus, self._address[file], argument)
+            case s2.I2C_RDWR:
+                return _rdwr(bus, argument)
+            case _:
+                raise _error(errno.ENOTTY)
+        return 0
+
+
+def _rdwr(bus: I2CBus, argument: Any) -> int:
+    if not bus.functions & s2.I2cFunc.I2C:
+        raise _error(errno.EOPNOTSUPP)
+    messages = [argument.msgs[i] for i in range(min(argument.nmsgs, MAX_MESSAGES + 1))]
+    if len(messages) > MAX_MESSAGES or any(message.len > MAX_MESSAGE_BYTES for message in messages):
+        raise _error(errno.EINVAL)
+    results = bus.transfer([(m.addr, m.len if m.flags & READ else ctypes.string_at(m.buf, m.len)) for m in messages])
+    for message, result in zip(messages, results, strict=True):
+        if result is not None:
+            ctypes.memmove(message.buf, result, len(result))
+    return len(messages)
+
+
+def _smbus(bus: I2CBus, address: int, argument: Any) -> None:
+    """Byte data and I2C block data, which is what drivers use; the adapter makes them of plain messages."""
+    block = argument.data.contents.block
+    command = bytes([argument.command])
+    reading = argument.read_write == s2.I2C_SMBUS_READ
+    if argument.size == s2.I2C_SMBUS_BYTE_DATA:
+        first, count = 0, 1
+    elif argument.size == s2.I2C_SMBUS_I2C_BLOCK_DATA:
+        first, count = 1, block[0]
+        if not 1 <= count <= s2.I2C_SMBUS_BLOCK_MAX:
+            raise _error(errno.EINVAL)
+    else:
+        raise _error(errno.EOPNOTSUPP)
+    if not reading:
+        bus.transfer([(address, command + bytes(block[first : first + count]))])
+        return
+    result = bus.transfer([(address, command), (address, count)])[1]
+    block[first : first + count] = list(result or b"")
+
+
+def _error(number: int) -> OSError:
+    return OSError(number, os.strerror(number))
+
+
+@contextlib.contextmanager
+def installed(nodes: Mapping[str, I2CBus]) -> Iterator[None]:
+    """Within, smbus2 finds these adapters (by path, e.g. /dev/i2c-1) and no others."""
+    kernel = _Kernel(nodes)
+    module = vars(s2)
+    before = module["ioctl"], module["os"]
+    module["ioctl"] = kernel.ioctl
+    module["os"] = SimpleNamespace(open=kernel.open, close=kernel.close, O_RDWR=os.O_RDWR)
+    try:
+        yield
+    finally:
+        module["ioctl"], module["os"] = before
