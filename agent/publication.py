@@ -20,6 +20,7 @@ from agent.store import Store
 
 BATCH = 100  # results read from the store at a time
 POLL_S = 0.5  # how soon a router that came back is seen; asking costs a microsecond
+SETTLE_S = 0.2  # a router tells who subscribes just after it connects; what is put before goes only to the cache
 REOPEN_S = 5.0  # between attempts to open a session that the machine refuses
 CACHE_SAMPLES = 100  # per channel, for subscribers that come late; all before is in the store
 HEARTBEAT_S = 10.0  # tells a subscriber that it missed the last sample; 40 bytes each, only where one listens
@@ -116,12 +117,18 @@ class Publisher:
                     self._put(session, record, previous=0)
             stopping = False
             while not stopping:
-                self._wake.wait(POLL_S)
-                self._wake.clear()
                 stopping = self._stop.is_set()  # asked before the last round, so that nothing handed over is left
-                self._connected = bool(session.info.routers_zid())
-                if self._connected:
+                if self._find_router(session):
                     self._send_waiting(session, history)
+                self._wake.wait(0 if stopping else POLL_S)
+                self._wake.clear()
+
+    def _find_router(self, session: zenoh.Session) -> bool:
+        connected = bool(session.info.routers_zid())
+        if connected and not self._connected:
+            self._stop.wait(SETTLE_S)
+        self._connected = connected
+        return connected
 
     def _send_waiting(self, session: zenoh.Session, history: History) -> None:
         self._fault = ""

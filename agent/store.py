@@ -7,7 +7,6 @@ import os
 import sqlite3
 import threading
 import time
-from collections import deque
 from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
@@ -49,7 +48,7 @@ class Store:
     def __init__(self, data_dir: Path) -> None:
         self.path = data_dir / FILE_NAME
         self._mutex = threading.Lock()
-        self._waiting: deque[Record] = deque(maxlen=WAITING_MAX)
+        self._waiting: list[Record] = []
         self._lock = _lock(data_dir)
         try:
             self.set_aside, self._connection = _open_or_set_aside(self.path)
@@ -75,8 +74,9 @@ class Store:
             try:
                 with self._connection:
                     self._connection.execute("BEGIN IMMEDIATE")
-                    self._write(list(self._waiting))
+                    self._write(self._waiting)
             except sqlite3.Error as error:
+                del self._waiting[:-WAITING_MAX]
                 raise StoreError(f"{self.path}: {error}") from None
             self._waiting.clear()
 
@@ -96,7 +96,7 @@ class Store:
             try:
                 with self._connection:
                     self._connection.execute("BEGIN IMMEDIATE")
-                    self._write(list(self._waiting))
+                    self._write(self._waiting)
                     self._mark("clean", 1)
             except sqlite3.Error as error:
                 raise StoreError(f"{self.path}: {error}") from None

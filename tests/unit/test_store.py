@@ -14,7 +14,7 @@ import pytest
 
 from agent.events import CalibrationUpdate, StatusChange
 from agent.history import FILE_NAME, History, Record, StoreError
-from agent.store import UNKEPT_MAX, Store
+from agent.store import UNKEPT_MAX, WAITING_MAX, Store
 
 
 def record(sequence: int, what: str = "window", sensor: str = "mems", **fields: object) -> Record:
@@ -48,6 +48,14 @@ def test_what_is_committed_is_read_back_whole_and_in_order(tmp_path: Path) -> No
         assert history.after(0, [], limit=10) == []
         assert history.channels() == [("mems", "calibration"), ("mems", "window"), ("other", "window")]
         assert sequences(history.newest("mems", "window", limit=1)) == [7]
+    store.close()
+
+
+def test_one_commit_may_be_larger_than_what_waits_for_a_failing_disk(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    store.commit([record(n) for n in range(1, WAITING_MAX + 100)])
+    with History(store.path) as history:
+        assert sequences(history.after(0, limit=2 * WAITING_MAX)) == list(range(1, WAITING_MAX + 100))
     store.close()
 
 

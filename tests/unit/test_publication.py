@@ -1,0 +1,306 @@
+"""Publication through real Zenoh sessions and a real router on loopback."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+import zenoh
+from zenoh.ext import AdvancedSubscriber, HistoryConfig, declare_advanced_subscriber
+
+from agent.history import StoreError
+from agent.publication import Publisher
+from agent.session import EndpointError
+from agent.store import Store
+from tests.unit.zenoh_site import KEY, Site, record, router_process, sequence_of, wait_for
+
+ALL = zenoh.ConsolidationMode.NONE
+
+
+@pytest.fixture
+def site() -> Iterator[Site]:
+    site = Site()
+    yield site
+    site.kill()
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store]:
+    store = Store(tmp_path)
+    yield store
+    store.close()
+
+
+@pytest.fixture
+def publisher(site: Site, store: Store) -> Iterator[Publisher]:
+    publisher = Publisher("site", "gw", [site.endpoint], store)
+    yield publisher
+    publisher.close()
+
+
+def send(publisher: Publisher, store: Store, *numbers: int, what: str = "window") -> None:
+    for number in numbers:
+        store.commit([record(number, what)])
+        publisher.publish(record(number, what))
+
+
+def get(client: zenoh.Session, selector: str) -> list[int]:
+    return [sequence_of(reply.ok) for reply in client.get(selector, consolidation=ALL) if reply.ok]
+
+
+Subscriber = zenoh.Subscriber[zenoh.Handler[zenoh.Sample]] | AdvancedSubscriber[zenoh.Handler[zenoh.Sample]]
+
+
+def received(subscriber: Subscriber, last: int, timeout_s: float = 10) -> list[int]:
+    """All numbers up to the one named `last`."""
+    numbers: list[int] = []
+
+    def last_is_there() -> bool:
+        while (sample := subscriber.try_recv()) is not None:
+            numbers.append(sequence_of(sample))
+        return last in numbers
+
+    wait_for(last_is_there, timeout_s)
+    return numbers
+
+
+def test_what_is_published_arrives_in_order_as_json_with_the_number_before(
+    site: Site, store: Store, publisher: Publisher
+) -> None:
+    publisher.start()
+    with site.client() as client:
+        subscriber = client.declare_subscriber("fieldcal/v1/**", zenoh.handlers.RingChannel(100))
+        wait_for(lambda: publisher.state().connected)
+        send(publisher, store, 1, 2)
+        send(publisher, store, 3, what="calibration")
+        samples = [subscriber.recv() for _ in range(3)]
+    assert [sequence_of(s) for s in samples] == [1, 2, 3]
+    assert [str(s.key_expr) for s in samples] == [f"{KEY}/mems/{w}" for w in ("window", "window", "calibration")]
+    assert {str(s.encoding) for s in samples} == {"application/json"}
+    assert [s.attachment.to_string() for s in samples if s.attachment] == ["0", "1", "2"]
+    wait_for(lambda: store.published() == 3)
+
+
+def test_the_gateway_speaks_for_itself_under_its_own_key(site: Site, store: Store, publisher: Publisher) -> None:
+    store.commit([record(1, "status", sensor="")])
+    publisher.start()
+    with site.client() as client:
+        subscriber = client.declare_subscriber(f"{KEY}/status", zenoh.handlers.RingChannel(10))
+        assert received(subscriber, 1) == [1]
+        assert get(client, f"{KEY}/status") == [1]
+
+
+def test_a_late_subscriber_gets_the_calibration_in_force_also_of_a_run_before(
+    site: Site, store: Store, publisher: Publisher
+) -> None:
+    store.commit([record(1, "calibration"), record(2, "calibration"), record(3, "status", status="VALID")])
+    store.mark_published(3)
+    publisher.start()
+    wait_for(lambda: publisher.state().connected)
+    with site.client() as client:
+        history = HistoryConfig(detect_late_publishers=True, max_samples=1)
+        subscriber = declare_advanced_subscriber(
+            client, f"{KEY}/*/calibration", zenoh.handlers.RingChannel(10), history=history
+        )
+        sample = subscriber.recv()
+        assert sequence_of(sample) == 2
+        subscriber.undeclare()
+
+
+def test_a_plain_get_gives_the_value_in_force_and_nothing_when_uncalibrated(
+    site: Site, store: Store, publisher: Publisher
+) -> None:
+    publisher.start()
+    wait_for(lambda: publisher.state().connected)
+    store.commit([record(1, "calibration"), record(2), record(3, "calibration"), record(4, "status", status="VALID")])
+    with site.client() as client:
+        assert get(client, f"{KEY}/mems/calibration") == [3]
+        assert get(client, f"{KEY}/**") == [2, 3, 4]
+        assert get(client, "fieldcal/v1/*/*/*/status") == [4]
+        assert get(client, "fieldcal/v1/other/**") == []
+        store.commit([record(5, "status", status="UNCALIBRATED")])
+        assert get(client, f"{KEY}/mems/calibration") == []
+
+
+def test_after_gives_all_later_results_of_the_keys_in_order_bounded(
+    site: Site, store: Store, publisher: Publisher
+) -> None:
+    store.commit([record(n, "calibration" if n % 100 == 0 else "window") for n in range(1, 1202)])
+    store.mark_published(1201)
+    publisher.start()
+    wait_for(lambda: publisher.state().connected)
+    with site.client() as client:
+        assert get(client, f"{KEY}/**?after=1100") == list(range(1101, 1202))
+        assert get(client, f"{KEY}/**?after=0") == list(range(1, 501))
+        assert get(client, f"{KEY}/mems/calibration?after=250") == list(range(300, 1201, 100))
+        assert get(client, f"{KEY}/**?after=1201") == []
+        for bad in ("", "-1", "x", "9" * 30):
+            (reply,) = client.get(f"{KEY}/**?after={bad}")
+            assert reply.err is not None
+            assert reply.err.payload.to_string() == f"after={bad}: not a sequence number"
+
+
+def test_without_a_router_results_wait_in_the_outbox_and_leave_in_order(
+    site: Site, store: Store, publisher: Publisher
+) -> None:
+    publisher.start()
+    wait_for(lambda: publisher.state().connected)
+    send(publisher, store, 1)
+    wait_for(lambda: store.published() == 1)
+    site.kill()
+    wait_for(lambda: not publisher.state().connected)
+    send(publisher, store, *range(2, 60), what="window")
+    send(publisher, store, 60, what="calibration")
+    assert store.published() == 1
+    site.restart()
+    with site.client() as client:
+        # The agent may be back before this client: history brings what it put by then.
+        subscriber = declare_advanced_subscriber(
+            client, f"{KEY}/mems/window", zenoh.handlers.RingChannel(100), history=HistoryConfig()
+        )
+        assert [number for number in received(subscriber, 59) if number > 1] == list(range(2, 60))
+        wait_for(lambda: store.published() == 60)
+        assert get(client, f"{KEY}/**?after=1") == list(range(2, 61))
+        subscriber.undeclare()
+
+
+def test_a_result_that_the_store_refuses_still_leaves(site: Site, store: Store, publisher: Publisher) -> None:
+    publisher.start()
+    wait_for(lambda: publisher.state().connected)
+    with site.client() as client:
+        subscriber = client.declare_subscriber("fieldcal/v1/**", zenoh.handlers.RingChannel(1000))
+        send(publisher, store, 1)
+        store._connection.execute("PRAGMA max_page_count = 1")
+        refused = record(2, text="x" * 20_000)
+        with pytest.raises(StoreError, match="full"):
+            store.commit([refused])
+        publisher.publish(refused)
+        assert received(subscriber, 2) == [1, 2]
+        assert store.published() == 1
+        store._connection.execute("PRAGMA max_page_count = 100000")
+        send(publisher, store, 3)
+        assert received(subscriber, 3) == [2, 3], "what is kept late goes out again, in order"
+
+
+def test_the_liveliness_token_is_there_while_the_agent_is(site: Site, publisher: Publisher) -> None:
+    with site.client() as client:
+        watch = client.liveliness().declare_subscriber("fieldcal/v1/*/*/alive", zenoh.handlers.RingChannel(10))
+        publisher.start()
+        here = watch.recv()
+        publisher.close()
+        gone = watch.recv()
+    assert [str(here.key_expr), str(gone.key_expr)] == [f"{KEY}/alive"] * 2
+    assert [here.kind, gone.kind] == [zenoh.SampleKind.PUT, zenoh.SampleKind.DELETE]
+
+
+def test_publish_does_not_wait_and_close_is_bounded_without_a_router(store: Store) -> None:
+    publisher = Publisher("site", "gw", ["tcp/127.0.0.1:9"], store)
+    publisher.start()
+    begin = time.monotonic()
+    for number in range(1, 2001):
+        publisher.publish(record(number))
+    assert time.monotonic() - begin < 0.5
+    begin = time.monotonic()
+    publisher.close()
+    assert time.monotonic() - begin < 1.5
+
+
+def test_an_agent_leaves_nothing_open_behind(site: Site, store: Store) -> None:
+    def once() -> int:
+        publisher = Publisher("site", "gw", [site.endpoint], store)
+        publisher.start()
+        wait_for(lambda: publisher.state().connected)
+        publisher.close()
+        return psutil.Process().num_fds()
+
+    store.commit([record(1)])
+    once()
+    before = once()
+    assert [once() for _ in range(3)][-1] <= before
+
+
+@pytest.mark.parametrize("name", ["", "a/b", "a*", "$x", "@gw", "ä", "a b", ".", "x" * 64])
+def test_a_name_that_cannot_be_in_a_key_is_refused(store: Store, name: str) -> None:
+    with pytest.raises(ValueError, match="cannot be part of a Zenoh key"):
+        Publisher("site", name, [], store)
+
+
+def test_an_endpoint_that_is_none_is_refused(store: Store) -> None:
+    with pytest.raises(EndpointError, match=r"not an endpoint such as .*: router7447$"):
+        Publisher("site", "gw", ["router7447"], store)
+
+
+def test_an_endpoint_of_an_unknown_protocol_is_a_fault_that_is_told(store: Store) -> None:
+    publisher = Publisher("site", "gw", ["carrier/pigeon:1"], store)
+    publisher.start()
+    wait_for(lambda: "carrier" in publisher.state().fault)
+    publisher.close()
+
+
+_AGENT = """
+import sys, time
+from pathlib import Path
+from agent.history import StoreError
+from agent.publication import Publisher
+from agent.store import Store
+from tests.unit.zenoh_site import record, wait_for
+store = Store(Path(sys.argv[1]))
+publisher = Publisher("site", "gw", [sys.argv[2]], store)
+publisher.start()
+wait_for(lambda: publisher.state().connected)
+store.commit([record(1)])
+publisher.publish(record(1))
+wait_for(lambda: store.published() == 1)
+print("ready", flush=True)
+sys.stdin.readline()
+if sys.argv[3] == "raise":
+    raise RuntimeError("an agent that fails")
+for n in range(2, 400):
+    big = record(n, text="x" * 60_000)
+    store.commit([big])
+    publisher.publish(big)
+begin = time.monotonic()
+publisher.close()
+print(time.monotonic() - begin, flush=True)
+"""
+
+
+def agent_process(tmp_path: Path, endpoint: str, way: str) -> subprocess.Popen[str]:
+    process = subprocess.Popen(
+        [sys.executable, "-c", _AGENT, str(tmp_path), endpoint, way],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n"
+    return process
+
+
+def test_the_interpreter_exits_though_the_publisher_was_never_closed(site: Site, tmp_path: Path) -> None:
+    agent = agent_process(tmp_path, site.endpoint, "raise")
+    _, faults = agent.communicate("\n", timeout=5)
+    assert agent.returncode == 1
+    assert "RuntimeError: an agent that fails" in faults
+
+
+def test_close_and_exit_are_bounded_while_the_router_is_frozen(tmp_path: Path) -> None:
+    router = router_process("--listen", "tcp/127.0.0.1:0")
+    assert router.stdout is not None
+    endpoint = router.stdout.readline().split()[-1]
+    try:
+        agent = agent_process(tmp_path, endpoint, "close")
+        os.kill(router.pid, signal.SIGSTOP)
+        begin = time.monotonic()
+        said, _ = agent.communicate("\n", timeout=20)
+        assert float(said) < 1.5
+        assert time.monotonic() - begin < 5
+        assert agent.returncode == 0
+    finally:
+        router.kill()
+        router.communicate()

@@ -1,0 +1,66 @@
+"""`fieldcal router` as a process, and whether one is there."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import time
+from pathlib import Path
+
+import pytest
+
+from agent.router import open_router, router_running
+from agent.session import EndpointError
+from tests.unit.zenoh_site import Site, router_process
+
+
+@pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
+def test_it_says_its_real_endpoint_and_ends_within_a_second(ending: signal.Signals) -> None:
+    router = router_process("--listen", "tcp/127.0.0.1:0")
+    assert router.stdout is not None
+    endpoint = router.stdout.readline().removeprefix("router at ").strip()
+    assert endpoint.startswith("tcp/127.0.0.1:")
+    assert router_running(endpoint)
+    begin = time.monotonic()
+    router.send_signal(ending)
+    _, faults = router.communicate(timeout=5)
+    assert time.monotonic() - begin < 1.0
+    assert (router.returncode, faults) == (0, "")
+    assert not router_running(endpoint)
+
+
+def test_a_taken_port_is_one_clear_line_and_status_1() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        endpoint = f"tcp/127.0.0.1:{other.getsockname()[1]}"
+        router = router_process("--listen", endpoint)
+        said, faults = router.communicate(timeout=5)
+        assert router.returncode == 1
+        assert (said, faults) == ("", f"fieldcal router: {endpoint}: the port is taken\n")
+        assert not router_running(endpoint), "what listens there is no router"
+
+
+def test_a_router_that_is_there_is_found() -> None:
+    site = Site()
+    assert router_running(site.endpoint)
+    with pytest.raises(EndpointError, match="the port is taken"):
+        open_router(site.endpoint)
+    site.kill()
+
+
+def test_a_configuration_file_is_used_and_its_faults_are_one_line(tmp_path: Path) -> None:
+    good = tmp_path / "router.json5"
+    good.write_text('{listen: {endpoints: ["tcp/127.0.0.1:0"]}, scouting: {multicast: {enabled: false}}}')
+    session, (endpoint,) = open_router(None, good)
+    assert router_running(endpoint)
+    session.close()
+    for text in ("{listen: 5}", "{nonsense: true}", "{", "{listen: {endpoints: ['nowhere']}}"):
+        good.write_text(text)
+        with pytest.raises(EndpointError, match=r"router\.json5: .+") as caught:
+            open_router(None, good)
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("endpoint", ["7447", "tcp/127.0.0.1:99999", "pigeon/1:2"])
+def test_a_bad_endpoint_is_named(endpoint: str) -> None:
+    with pytest.raises(EndpointError, match=endpoint):
+        open_router(endpoint)

@@ -1,0 +1,66 @@
+"""A router on loopback that can be killed and comes back at the same endpoint, and records to publish."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+import zenoh
+
+from agent.history import Record
+from agent.router import open_router
+from agent.session import session_config
+
+KEY = "fieldcal/v1/site/gw"
+
+
+def router_process(*options: str) -> subprocess.Popen[str]:
+    """`fieldcal router` in a process of its own."""
+    command = "import sys; from agent.router import router; sys.exit(router(sys.argv[1:], standalone_mode=False))"
+    return subprocess.Popen(
+        [sys.executable, "-c", command, *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+class Site:
+    """The router of a test."""
+
+    def __init__(self) -> None:
+        self._router, (self.endpoint,) = open_router("tcp/127.0.0.1:0")
+
+    def kill(self) -> None:
+        """The router is gone."""
+        self._router.close()
+
+    def restart(self) -> None:
+        """A new router at the same endpoint."""
+        self._router, _ = open_router(self.endpoint)
+
+    def client(self) -> zenoh.Session:
+        """A plain client session."""
+        return zenoh.open(session_config("client", connect=[self.endpoint]))
+
+
+def record(sequence: int, what: str = "window", sensor: str = "mems", **fields: Any) -> Record:
+    """A result; `fields` are added to its payload."""
+    payload = {"run_id": "run-1", "sequence": sequence, "sensor": sensor, "recorded": True, **fields}
+    return Record(sequence, "run-1", sensor, what, msgspec.json.encode(payload), 1000 + sequence, True, "f.mcap")
+
+
+def sequence_of(sample: zenoh.Sample) -> int:
+    """The number in a sample's payload."""
+    number = msgspec.json.decode(sample.payload.to_bytes())["sequence"]
+    assert isinstance(number, int)
+    return number
+
+
+def wait_for(condition: Callable[[], bool], timeout_s: float = 10.0) -> None:
+    """Until the condition holds; an AssertionError after `timeout_s`."""
+    end = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < end, f"{condition} did not come true within {timeout_s} s"
+        time.sleep(0.01)
