@@ -34,7 +34,7 @@ from mcap.records import (
 )
 
 MAGIC = b"\x89MCAP0\r\n"
-RECORD_LIMIT = 64 << 20  # bytes of a record or an unpacked chunk, so that memory is bounded; ours: 1 MiB and a snapshot
+RECORD_LIMIT = 32 << 20  # bytes of a record or an unpacked chunk, so that memory is bounded; ours: 1 MiB and a snapshot
 _HEAD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
 _CHUNK = struct.Struct("<QQQII")

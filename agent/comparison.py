@@ -1,0 +1,117 @@
+"""Do results that were recorded equal those computed again? Exactly, or within what another CPU may do."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import msgspec
+
+from agent.events import Result, WindowReport
+from agent.messages import topic_of
+
+OTHER_CPU = (
+    1e-9  # relative; kernels of two CPUs differ by 7e-16 a solve, a condition number of 1.2e4 and recursion on top
+)
+FLOOR = 1e-12  # in the value's own unit: what is left where numbers of order one cancel
+THRESHOLD = "_threshold"  # numbers["x"] was held against numbers["x_threshold"]
+
+
+class Difference(msgspec.Struct, frozen=True, kw_only=True):
+    """Where recorded and computed results part. `undecidable`: a decision so close that another CPU may turn it."""
+
+    file: str
+    event_sequence: int
+    what: str  # topic, or "snapshot"
+    field: str
+    recorded: str
+    computed: str
+    undecidable: bool = False
+
+    def __str__(self) -> str:
+        return f"event {self.event_sequence}, {self.what}, {self.field}: recorded {self.recorded}, computed {self.computed}"
+
+
+def compare(
+    file: str,
+    event_sequence: int,
+    recorded: Sequence[Result],
+    computed: Sequence[Result],
+    tolerance: float,
+    *,
+    complete: bool = True,
+) -> Difference | None:
+    """The first difference between the results of one event, or None.
+
+    `tolerance` 0 compares floats by their bits, so that NaN equals NaN and 0.0 differs from -0.0; above it is relative
+    to the largest of a list. Where `complete` is false the recording may end before the last results.
+    """
+
+    def difference(what: str, field: str, before: Any, now: Any, *, decision: bool) -> Difference:
+        return Difference(
+            file=file,
+            event_sequence=event_sequence,
+            what=what,
+            field=field,
+            recorded=_short(before),
+            computed=_short(now),
+            undecidable=decision and tolerance > 0 and _on_the_edge([*recorded, *computed]),
+        )
+
+    for before, now in zip(recorded, computed, strict=False):
+        if type(before) is not type(now) or topic_of(before) != topic_of(now):
+            return difference(topic_of(before), "kind", topic_of(before), topic_of(now), decision=True)
+        pair = (msgspec.structs.asdict(before), msgspec.structs.asdict(now))
+        for field, a, b in differences(*pair, tolerance):
+            return difference(topic_of(before), field, a, b, decision=not isinstance(a, float))
+    if len(recorded) > len(computed) or (complete and len(recorded) < len(computed)):
+        kinds = ([topic_of(result) for result in results] for results in (recorded, computed))
+        return difference("results", "count", *kinds, decision=True)
+    return None
+
+
+def differences(
+    a: Any, b: Any, tolerance: float, where: str = "", scale: float = 0.0
+) -> Iterator[tuple[str, Any, Any]]:
+    """(field, a, b) of every place where two nests of dict, list and plain values differ."""
+    if isinstance(a, dict) and isinstance(b, dict):
+        for name in sorted(a.keys() | b.keys()):
+            inside = f"{where}.{name}" if where else name
+            yield from differences(a.get(name), b.get(name), tolerance, inside)
+    elif isinstance(a, list | tuple) and isinstance(b, list | tuple) and len(a) == len(b):
+        scale = max((abs(x) for x in (*a, *b) if isinstance(x, float) and math.isfinite(x)), default=0.0)
+        for i, (x, y) in enumerate(zip(a, b, strict=True)):
+            yield from differences(x, y, tolerance, f"{where}[{i}]", scale)
+    elif isinstance(a, float) and isinstance(b, float):
+        if not _same(a, b, tolerance, scale):
+            yield where, a, b
+    elif type(a) is not type(b) or a != b:
+        yield where, a, b
+
+
+def _same(a: float, b: float, tolerance: float, scale: float) -> bool:
+    if struct.pack("<d", a) == struct.pack("<d", b):
+        return True
+    if tolerance == 0 or not (math.isfinite(a) and math.isfinite(b)):
+        return tolerance > 0 and math.isnan(a) and math.isnan(b)
+    return abs(a - b) <= max(tolerance * max(abs(a), abs(b), scale), FLOOR)
+
+
+def _on_the_edge(results: Sequence[Result]) -> bool:
+    """Whether a statistic of these windows lies within OTHER_CPU of what it was held against."""
+    for result in results:
+        if isinstance(result, WindowReport):
+            for name, threshold in result.numbers.items():
+                statistic = result.numbers.get(name.removesuffix(THRESHOLD))
+                if not name.endswith(THRESHOLD) or statistic is None:
+                    continue
+                if abs(statistic - threshold) <= OTHER_CPU * abs(threshold):
+                    return True
+    return False
+
+
+def _short(value: Any) -> str:
+    text = value.hex() + f" ({value!r})" if isinstance(value, float) else repr(value)
+    return text if len(text) <= 200 else text[:197] + "..."

@@ -1,0 +1,107 @@
+"""Reads a recording back: its events in order, each with the results recorded for it.
+
+Linear and without trust: the summary is not used, a torn tail ends the reading where the last good record ends.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO
+
+from mcap.opcode import Opcode
+from mcap.records import Channel, Schema
+
+from agent.events import CalibrationUpdate, Event, Result, RunStart, StatusChange, WindowReport
+from agent.mcap_records import ChunkMessage, Fault, Record, RecordError, content, unpack, walk
+from agent.messages import MessageError, decode, topic_of
+
+RESULTS = (WindowReport, CalibrationUpdate, StatusChange)
+
+
+@dataclass(slots=True)
+class Step:
+    """An event and the results recorded for it; `complete` when the recording went on after them."""
+
+    event_sequence: int
+    event: Event
+    results: list[Result] = field(default_factory=list)
+    complete: bool = False
+
+
+class RecordingReader:
+    """One pass over a recording. `fault` says afterwards why it ended early (None: it reached the footer).
+
+    `good_bytes` is the end of the last record that was read and understood.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.fault: Fault | None = None
+        self.good_bytes = 0
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Channel] = {}
+
+    def steps(self) -> Iterator[Step]:
+        """Events in recorded order, the first a RunStart, numbers without a gap. Raises OSError."""
+        step: Step | None = None
+        try:
+            with open(self.path, "rb") as file:
+                for record, number, item in self._items(file):
+                    if isinstance(item, RESULTS):
+                        if step is None or number != step.event_sequence:
+                            raise _refusal(record, f"a result of event {number} does not follow it")
+                        step.results.append(item)
+                        continue
+                    self._check_order(record, step, number, item)
+                    if step is not None:
+                        step.complete = True
+                        yield step
+                    step = Step(number, item)
+        except RecordError as error:
+            self.fault = error.fault
+        if step is not None:
+            step.complete = self.fault is None
+            yield step
+
+    @staticmethod
+    def _check_order(record: Record, before: Step | None, number: int, event: Event) -> None:
+        if isinstance(event, RunStart) != (before is None):
+            where = "does not begin with" if before is None else "has a second"
+            raise _refusal(record, f"the recording {where} RunStart")
+        if before is not None and number != before.event_sequence + 1:
+            raise _refusal(record, f"event {number} follows event {before.event_sequence}")
+
+    def _items(self, file: BinaryIO) -> Iterator[tuple[Record, int, Event | Result]]:
+        """(chunk, event sequence, event or result) of every message."""
+        for record in walk(file, os.fstat(file.fileno()).st_size):
+            if record.opcode == Opcode.CHUNK:
+                for part in content(record, unpack(record)):
+                    if isinstance(part, ChunkMessage):
+                        yield record, *self._item(record, part)
+                    elif isinstance(part, Schema):
+                        self._schemas[part.id] = part
+                    elif isinstance(part, Channel):
+                        self._channels[part.id] = part
+            elif record.opcode == Opcode.MESSAGE:
+                raise _refusal(record, "a message outside a chunk")
+            self.good_bytes = record.end
+
+    def _item(self, record: Record, message: ChunkMessage) -> tuple[int, Event | Result]:
+        channel = self._channels.get(message.channel_id)
+        schema = self._schemas.get(channel.schema_id) if channel else None
+        if channel is None or schema is None:
+            raise _refusal(record, f"message on channel {message.channel_id}, which is not declared")
+        try:
+            number, item = decode(schema.name, message.data)
+        except MessageError as error:
+            raise _refusal(record, f"{channel.topic}: {error}") from None
+        if topic_of(item) != channel.topic or number & 0xFFFFFFFF != message.sequence:
+            raise _refusal(record, f"{channel.topic}: the message says {topic_of(item)}, event {number}")
+        return number, item
+
+
+def _refusal(record: Record, reason: str) -> RecordError:
+    return RecordError("corrupt", record.offset, record.name, reason)
