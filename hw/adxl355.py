@@ -108,6 +108,7 @@ class Adxl355:
         self._settings = chip.settings(options.rate_hz, options.range_g)
         self._cutter = Cutter(name, options.rate_hz, chip.COUNTS_MIN, chip.COUNTS_MAX)
         self._ready: deque[SampleBlock] = deque()
+        self._loss: DeviceLost | None = None
         self._dropped_entries = 0
         self._rest = b""
         self._next_poll_ns = 0
@@ -127,6 +128,7 @@ class Adxl355:
         except BaseException:
             self.close()
             raise
+        self._loss = None
         self._rest = b""
         self._cutter.flag(BlockFlags.RESTART)
         self._next_poll_ns = self._clock()[0]
@@ -155,9 +157,13 @@ class Adxl355:
 
     def read_block(self) -> SampleBlock | None:
         """The next block, or None. Raises DeviceLost."""
-        if not self._ready:
+        if not self._ready and self._loss is None:
             self._gather()
-        return self._ready.popleft() if self._ready else None
+        if self._ready:
+            return self._ready.popleft()
+        if self._loss is not None:
+            raise self._loss
+        return None
 
     def _gather(self) -> None:
         """Poll for BLOCK_S; a loss, of samples or of the device, ends it earlier."""
@@ -178,13 +184,9 @@ class Adxl355:
                 bursts.append(burst)
             if not any(burst.entries for burst in bursts):
                 self._check_settings(DeviceLost)
-        except DeviceLost:
-            self.close()
-            self._finish(bursts, raw_degc)
-            if not self._ready:  # else what came before the loss goes first; the next call finds the device closed
-                raise
-        else:
-            self._finish(bursts, raw_degc)
+        except DeviceLost as loss:
+            self._loss = loss  # raised once all that came before it has been returned
+        self._finish(bursts, raw_degc)
 
     def _wait(self) -> None:
         """Sleep to the next poll; spread over a sample period by the golden ratio, so that poll and sample clock do
