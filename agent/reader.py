@@ -53,10 +53,6 @@ class EventQueue:
             for d, n in sorted(dropped.items())
         ]
 
-    def depth(self) -> int:
-        """How many events wait."""
-        return self._queue.qsize()
-
 
 class Reader(threading.Thread):
     """Opens a device, reads it until told to stop, reopens it with back-off when it is lost."""

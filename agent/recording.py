@@ -166,6 +166,12 @@ class Recorder:
         return self._file.path if self._file else None
 
     @property
+    def size_bytes(self) -> int:
+        """Bytes of the file being written that are on disk."""
+        file = self._file
+        return file.size if file is not None else 0
+
+    @property
     def next_file_sequence(self) -> int:
         """The number for the next RunStart: one above all files in the directory, finished or not."""
         return max((number for number, _ in recordings(self._directory)), default=0) + 1

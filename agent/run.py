@@ -45,7 +45,7 @@ def run(
                 click.echo(fault, err=True)
             return 2
         said = [stack.enter_context(router(LOOPBACK))] if with_router else []
-        watch = stack.enter_context(Watch(settings, data_dir, f"virtual bench, {preset}" if truth else str(config), truth))
+        watch = stack.enter_context(Watch(settings, f"virtual bench, {preset}" if truth else str(config), truth))
         for line in said:
             watch.say(line)
         return serve(settings, data_dir, watch, duration)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import threading
 import time
 import uuid
 from collections.abc import Sequence
 from pathlib import Path
+
+import msgspec
 
 from agent import __version__
 from agent.config import Config
@@ -21,7 +22,7 @@ from agent.recording import Recorder
 from agent.recording_thread import RecordingThread
 from agent.store import Store
 from agent.watch import Watch
-from hw.sensor import boot_id, load_driver
+from hw.sensor import Sensor, boot_id, load_driver
 
 TICK_S = 1.0
 POLL_S = 0.2  # how soon a signal is seen when no device speaks
@@ -139,7 +140,7 @@ class Service:
             if time.monotonic() >= next_tick:
                 next_tick += TICK_S
                 self._step(Tick(t_monotonic_ns=time.monotonic_ns(), t_utc_ns=time.time_ns()), writer)
-                self._watch.health(events.depth(), self._recorder, self._publisher and self._publisher.state())
+                self._watch.health(self._recorder, self._publisher and self._publisher.state())
             if writer.wants_rotation:
                 self._sequence += 1
                 writer.put(self._sequence, self._run_start(continuation=True), [])
@@ -165,8 +166,6 @@ class Service:
 
 def calibration_of(record: Record) -> CalibrationUpdate:
     """The calibration a record holds. Raises ValueError where it is none of this version."""
-    import msgspec
-
     fields = dict(record.fields)
     fields.pop("recorded", None)
     try:
@@ -175,6 +174,6 @@ def calibration_of(record: Record) -> CalibrationUpdate:
         raise ValueError(f"result {record.sequence}: {error}") from None
 
 
-def _sensor(name: str, driver: str, options: dict[str, object]):  # type: ignore[no-untyped-def]
+def _sensor(name: str, driver: str, options: dict[str, object]) -> Sensor:
     factory = load_driver(driver)
     return factory(name, factory.options_model.model_validate(options))

@@ -1,0 +1,105 @@
+"""Turns what passes through the service into what the terminal shows."""
+
+from __future__ import annotations
+
+import logging
+import queue
+import sys
+import time
+from collections import deque
+from pathlib import Path
+
+from agent.config import Config
+from agent.events import DeviceChange, Event, Gap, Result
+from agent.publication import PublicationState
+from agent.recording import Recorder
+from agent.view import DeviceState, RecordingState, Truth, ViewState, open_view
+from hw.block import BlockFlags, SampleBlock
+
+RATE_OVER_BLOCKS = 20  # the rate shown is over this many blocks, ten seconds
+
+
+class Watch(logging.Handler):
+    """The view of a run. `update` and `health` belong to the main loop; `say` and log records may come from any thread."""
+
+    def __init__(self, config: Config, title: str, truth: Truth | None) -> None:
+        super().__init__(logging.WARNING)
+        gateway = config.gateway
+        self._state = ViewState(title=title, gateway=f"{gateway.site}/{gateway.name}")
+        self._state.devices = {d.name: DeviceState(kind=d.driver) for d in config.devices}
+        if truth is not None:
+            self._state.truths = {channel.sensor: truth for channel in config.channels}
+        self._arrivals: dict[str, deque[tuple[int, int]]] = {
+            d.name: deque(maxlen=RATE_OVER_BLOCKS) for d in config.devices
+        }
+        self._said: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self._began_s = time.monotonic()
+
+    def __enter__(self) -> Watch:
+        self._view = open_view(self._state, sys.stdout)
+        logging.getLogger("agent").addHandler(self)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        logging.getLogger("agent").removeHandler(self)
+        self._take_said()
+        self._view.close()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """A log record of ours becomes a line."""
+        self.say(record.getMessage())
+
+    def say(self, line: str) -> None:
+        """A line for whoever watches."""
+        self._said.put(line)
+
+    def update(self, event: Event, results: list[Result]) -> None:
+        """An event and what came of it."""
+        if isinstance(event, SampleBlock):
+            self._take_block(event)
+        elif isinstance(event, DeviceChange):
+            self._take_change(event)
+        elif isinstance(event, Gap):
+            self._state.devices[event.device].gaps += 1
+            self.say(f"{event.device}: {event.dropped} {event.unit} dropped, {event.reason}")
+        self._state.take(results)
+        self._take_said()
+        self._view.refresh(now=bool(results))
+
+    def health(self, recorder: Recorder, publication: PublicationState | None) -> None:
+        """Once a second: what is recorded and published."""
+        self._state.uptime_s = time.monotonic() - self._began_s
+        self._state.publication = publication
+        path = recorder.path
+        if path is not None:
+            self._state.recording = RecordingState(str(path), recorder.size_bytes, recording=True)
+        elif self._state.recording is not None:
+            self._state.recording.recording = False
+        self._view.refresh()
+
+    def _take_said(self) -> None:
+        while not self._said.empty():
+            self._state.say(self._said.get())
+
+    def _take_block(self, block: SampleBlock) -> None:
+        device = self._state.devices[block.device]
+        arrivals = self._arrivals[block.device]
+        device.blocks += 1
+        if block.flags & (BlockFlags.GAP | BlockFlags.OVERRUN) or (block.flags & BlockFlags.RESTART and arrivals):
+            device.gaps += 1
+        if block.flags & BlockFlags.RESTART:
+            arrivals.clear()
+        arrivals.append((block.first_index + block.n, block.t_monotonic_ns))
+        elapsed_ns = arrivals[-1][1] - arrivals[0][1]
+        if elapsed_ns:
+            device.rate_hz = (arrivals[-1][0] - arrivals[0][0]) * 1e9 / elapsed_ns
+
+    def _take_change(self, change: DeviceChange) -> None:
+        device = self._state.devices[change.device]
+        device.state = "lost" if change.state == "lost" else "open"
+        if change.state == "open":
+            device.kind = change.message
+            self._arrivals[change.device].clear()
+        else:
+            device.rate_hz = 0.0
+            self.say(f"{change.device}: {change.message}")
