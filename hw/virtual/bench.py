@@ -200,10 +200,10 @@ class Bench:
 
 
 def _cut(block_of: Callable[[int], Array], first: int, n: int) -> Array:
-    """Rows first .. first + n - 1 out of blocks."""
-    start = first // BLOCK
-    blocks = [block_of(block) for block in range(start, max(start, (first + n - 1) // BLOCK) + 1)]
-    return np.concatenate(blocks)[first - start * BLOCK :][:n]
+    """Rows first .. first + n - 1 out of blocks, as a copy."""
+    last = first + n
+    blocks = range(first // BLOCK, max(first, last - 1) // BLOCK + 1)
+    return np.concatenate([block_of(b)[max(first - b * BLOCK, 0) : max(last - b * BLOCK, 0)] for b in blocks])
 
 
 def _quantised(values: Array, resolution: float) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -90,3 +91,26 @@ class Bursts:
         late = self.least_late_s + random.exponential(self.mean_late_s, BLOCK)
         stalled = random.random(BLOCK) < self.stall_probability
         return np.asarray(late + stalled * random.uniform(0.3, 1.0, BLOCK) * self.longest_stall_s)
+
+
+class BenchTime:
+    """Seconds of the bench's clock out of those of the machine's; until `begin` -1, when nothing is sampled yet."""
+
+    def __init__(self) -> None:
+        self._zero_s: float | None = None
+
+    @property
+    def begun(self) -> bool:
+        """Whether time runs."""
+        return self._zero_s is not None
+
+    def begin(self, t_s: float) -> None:
+        """The machine's `t_s` is the bench's zero."""
+        self._zero_s = t_s
+
+    def __call__(self, t_s: float) -> float:
+        return -1.0 if self._zero_s is None else t_s - self._zero_s
+
+    def gated(self, samples_due: Callable[[float], int]) -> Callable[[float], int]:
+        """`samples_due` of the bench's clock as a function of the machine's."""
+        return lambda t_s: samples_due(self(t_s))

@@ -1,0 +1,88 @@
+"""A bench preset in real time: the sensor an ADXL355 under the real smbus2, the reference on a pseudo-terminal."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from typing import Any
+
+import numpy as np
+
+from hw.adxl355_registers import COUNTS_PER_G
+from hw.virtual.adxl355_twin import Adxl355Twin
+from hw.virtual.bench import Bench
+from hw.virtual.kernel import I2CBus, installed
+from hw.virtual.parameters import BenchParameters
+from hw.virtual.schedule import STANDARD_GRAVITY_MPS2
+from hw.virtual.serial_bench import serial_lines, serial_options
+from hw.virtual.serial_port import PtyDevice
+from hw.virtual.timebase import BenchTime
+
+ADDRESS = 0x1D
+
+
+class LiveBench:
+    """Context manager: within it `adxl355` and `serial-csv` find the bench's devices with the options given here.
+
+    The bench's zero is the moment at which the sensor is first set to measure, so that poses in seconds since the
+    sensor's first sample are poses of the bench's clock. `bus` and `port` take faults (unplug). Only for a bench whose
+    sensor counts as an ADXL355 does; raises ValueError for any other.
+    """
+
+    def __init__(
+        self, parameters: BenchParameters, seed: int, *, bus: int = 1, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self.bench = Bench(parameters, seed)
+        self.time = BenchTime()
+        twin = Adxl355Twin(
+            self.bench.sensor_counts,
+            self._sensor_samples_due,
+            clock,
+            temperature_raw=self._temperature_raw,
+        )
+        self.bus = I2CBus({ADDRESS: twin})
+        self.sensor_options: dict[str, Any] = {
+            "bus": bus,
+            "address": ADDRESS,
+            "rate_hz": parameters.sensor.clock.nominal_rate_hz,
+            "range_g": _range_g(parameters.sensor.nominal_sensitivity),
+        }
+        self._lines = serial_lines(self.bench, "reference", self.time)
+        self._clock = clock
+        self._open = ExitStack()
+
+    def __enter__(self) -> LiveBench:
+        # The first numbers cost 20 ms of loading, and the FIFO holds 32: pay before anybody reads.
+        self.bench.sensor_counts(0, 1)
+        self.bench.reference_values(0, 1)
+        self.port = PtyDevice(self._lines, self._clock)
+        self._open.callback(self.port.stop)
+        self._open.enter_context(installed({f"/dev/i2c-{self.sensor_options['bus']}": self.bus}))
+        self.port.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._open.close()
+
+    @property
+    def reference_options(self) -> dict[str, Any]:
+        """Options of `serial-csv` for the reference."""
+        return serial_options(self.bench, "reference") | {"port": str(self.port.path)}
+
+    def _sensor_samples_due(self, t_s: float) -> int:
+        # The twin asks for the first time when it is set to measure.
+        if not self.time.begun:
+            self.time.begin(t_s)
+        return self.bench.sensor_samples_due(self.time(t_s))
+
+    def _temperature_raw(self, t_s: float) -> int:
+        degc = float(self.bench.parameters.temperature.at(np.array(self.time(t_s))))
+        return round(1885 - 9.05 * (degc - 25))  # ADXL355 data sheet
+
+
+def _range_g(nominal_sensitivity: float) -> int:
+    for range_g, counts in COUNTS_PER_G.items():
+        if abs(nominal_sensitivity * STANDARD_GRAVITY_MPS2 - counts) < 1e-6 * counts:
+            return range_g
+    raise ValueError(f"no range of an ADXL355 has {nominal_sensitivity:g} counts per m/s2")
