@@ -22,7 +22,8 @@ from hw.virtual.serial_port import PtyDevice
 from hw.virtual.timebase import BenchTime
 
 ROLES: tuple[Role, ...] = ("sensor", "reference")
-POLL_S = 0.02
+ENDING = (signal.SIGINT, signal.SIGTERM)
+POLL_S = 0.05
 # A reader opens a port, sets it up and throws away what came until then: pyserial needs a few ms for it.
 SETTLE_S = 0.25
 LINGER_S = 1.0  # after the last sample, so that a reader gets it before the port hangs up
@@ -32,7 +33,7 @@ LINGER_S = 1.0  # after the last sample, so that a reader gets it before the por
 @click.option("--preset", type=click.Choice(list(PRESETS)), help="A virtual bench: sensor and reference.")
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=1, show_default=True, help="Of the bench.")
 @click.option("--csv", "directory", type=click.Path(path_type=Path, file_okay=False), help="Write files there instead.")
-@click.option("--duration", "duration_s", type=click.FloatRange(1, 1e6), help="Seconds to write; three repetitions.")
+@click.option("--duration", "duration_s", type=click.FloatRange(1, 1e6), help="Seconds to write, three repetitions.")
 @click.option("--play", type=click.Path(path_type=Path), help="Serve this sensor.csv or reference.csv.")
 @click.option("--rate-hz", type=click.FloatRange(1e-3, 1e5), help="Play at this rate instead of by column time_s.")
 @click.option("--axes", help="Columns to play, as vx,vy,vz; by default those of sensor.csv or reference.csv.")
@@ -79,12 +80,15 @@ def simulate(
         if directory is None:
             return _serve_bench(bench, link)
         write_files(bench, directory, duration_s, {"preset": preset, "seed": seed})
-    except (PlaybackError, FileExistsError) as error:
+    except PlaybackError as error:
         click.echo(str(error), err=True)
+        return 2
+    except (FileExistsError, FileNotFoundError, NotADirectoryError, PermissionError) as error:
+        click.echo(f"{error.filename2 or error.filename}: {error.strerror}", err=True)
         return 2
     click.echo(
         f"fieldcal calibrate --sensor {directory}/sensor.csv --reference {directory}/reference.csv"
-        f" --poses {directory}/poses.csv --nominal {bench.parameters.sensor.nominal_sensitivity:.6g}"
+        f" --poses {directory}/poses.csv --nominal {bench.parameters.sensor.nominal_sensitivity:.6g} --u-nominal-pct 20"
     )
     return 0
 
@@ -92,7 +96,8 @@ def simulate(
 def write_files(bench: Bench, directory: Path, duration_s: float | None, origin: dict[str, Any]) -> None:
     """Write sensor.csv, reference.csv, poses.csv (formats of `fieldcal calibrate`) and truth.json.
 
-    `duration_s` of the bench's clock, by default three repetitions of its schedule.
+    `duration_s` of the bench's clock, by default three repetitions of its schedule, which is one on the clamp. `origin`
+    goes into truth.json.
     """
     p = bench.parameters
     recording = bench.recording(p.schedule.duration_s(3) if duration_s is None else duration_s)
@@ -111,8 +116,8 @@ def write_files(bench: Bench, directory: Path, duration_s: float | None, origin:
         ["%.6f", *[number] * p.reference.channels],
         np.column_stack([recording.reference_stamp_s, recording.reference]),
     )
-    clamp = np.array([[q.start_s, q.stop_s, q.theta_deg, q.alpha_deg] for q in recording.poses])
-    _write_csv(directory / "poses.csv", "start_s,stop_s,theta_deg,alpha_deg", ["%.6f", "%.6f", "%g", "%g"], clamp)
+    poses = np.array([pose[:4] for pose in recording.poses], dtype=float).reshape(-1, 4)
+    _write_csv(directory / "poses.csv", "start_s,stop_s,theta_deg,alpha_deg", ["%.6f", "%.6f", "%g", "%g"], poses)
     truth = origin | {
         "unit": p.sensor.unit,
         "nominal_sensitivity": p.sensor.nominal_sensitivity,
@@ -166,8 +171,7 @@ class _Serving:
         self._stopped = threading.Event()
 
     def __enter__(self) -> _Serving:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: self._stopped.set())
+        self._before = {number: signal.signal(number, lambda *_: self._stopped.set()) for number in ENDING}
         for device in self._devices:
             device.start()
         return self
@@ -175,6 +179,8 @@ class _Serving:
     def __exit__(self, *_: object) -> None:
         for device in self._devices:
             device.stop()
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
 
     def goes_on(self) -> bool:
         """Wait a moment; False once told to stop."""
