@@ -46,10 +46,8 @@ def running(*arguments: str) -> Iterator[subprocess.Popen[str]]:
 def test_files_hold_the_recording_and_its_truth(preset, tmp_path, capsys) -> None:
     directory = tmp_path / "example"
     assert run_cli(["simulate", "--preset", preset, "--seed", "3", "--csv", str(directory), "--duration", "30"]) == 0
-    command = capsys.readouterr().out
-    assert command.startswith(
-        f"fieldcal calibrate --sensor {directory}/sensor.csv --reference {directory}/reference.csv"
-    )
+    files = " ".join(f"--{name} {directory}/{name}.csv" for name in ("sensor", "reference", "poses"))
+    assert capsys.readouterr().out == f"fieldcal calibrate {files} --nominal 26104.7 --u-nominal-pct 20\n"
     recording = Bench(PRESETS[preset](3), 3).recording(30.0)
     half_microsecond = {"rtol": 0, "atol": 0.5001e-6}
     sensor = np.loadtxt(directory / "sensor.csv", delimiter=",", skiprows=1)
