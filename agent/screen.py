@@ -1,0 +1,147 @@
+"""The live screen of a run, drawn with rich: made of plain text lines, which cost a third of rich's tables."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from typing import TextIO
+
+from rich.console import Console, ConsoleOptions
+from rich.live import Live
+from rich.text import Text
+
+from agent.events import CalibrationUpdate
+from agent.quantity import duration
+from agent.view import (
+    ViewState,
+    calibration_cells,
+    publication_line,
+    recording_line,
+    truth_line,
+    uncertainty_words,
+    verdict,
+    window_span,
+)
+
+REFRESH_S = 0.5  # news comes a few times a minute, the clock once a second
+_STATUS = {"VALID": "bold green", "HELD": "yellow", "RECALIBRATING": "yellow", "INVALID": "bold red"}
+
+
+class Screen:
+    """Redraws in place; leaves the last picture on the terminal when closed."""
+
+    def __init__(self, state: ViewState, stream: TextIO) -> None:
+        self._live = Live(
+            Picture(state),
+            console=Console(file=stream, highlight=False),
+            auto_refresh=False,
+            vertical_overflow="crop",
+        )
+        self._drawn_s = time.monotonic()
+        self._open = True
+        self._live.start(refresh=True)
+
+    def refresh(self, *, now: bool = False) -> None:
+        """Draw, unless it was drawn less than REFRESH_S ago."""
+        if now or time.monotonic() - self._drawn_s >= REFRESH_S:
+            self._drawn_s = time.monotonic()
+            self._live.refresh()
+
+    def close(self) -> None:
+        """Draw a last time and let go of the terminal."""
+        if self._open:
+            self._open = False
+            self._live.stop()
+
+
+class Picture:
+    """The state as lines for a console of any width and height; windows and messages share the room that is left."""
+
+    def __init__(self, state: ViewState) -> None:
+        self._state = state
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Text]:
+        height = (options.height or options.size.height) - 1  # the cursor's line
+        top, bottom = self._top(), self._bottom()
+        room = max(0, height - len(top) - len(bottom))
+        messages = list(self._state.messages)[-max(1, room // 3) :] if self._state.messages else []
+        lines = [*top, *self._windows(room - len(messages)), *bottom, *(Text(f"› {m}", "magenta") for m in messages)]
+        for line in lines[:height]:
+            line.no_wrap = True
+            line.overflow = "ellipsis"
+            yield line
+
+    def _top(self) -> list[Text]:
+        state = self._state
+        lines = [
+            Text.assemble(
+                ("fieldcal", "bold"),
+                f"  {state.title}  ",
+                (f"gateway {state.gateway}  up {duration(state.uptime_s)}", "dim"),
+            )
+        ]
+        for sensor in sorted(state.statuses.keys() | state.calibrations.keys()):
+            lines += [Text(), *self._sensor(sensor)]
+        lines += [Text(), _heading("device", "kind", "state", "rate", "blocks", "gaps", widths=_DEVICE)]
+        for name, device in state.devices.items():
+            style = "" if device.state == "open" else "red" if device.state == "lost" else "dim"
+            cells = (name, device.kind, device.state, f"{device.rate_hz:.1f} Hz", f"{device.blocks}", f"{device.gaps}")
+            lines.append(Text(_row(cells, _DEVICE), style))
+        return lines
+
+    def _sensor(self, sensor: str) -> list[Text]:
+        status, calibration = self._state.statuses.get(sensor), self._state.calibrations.get(sensor)
+        name = status.status if status else ""
+        reason = f"  {status.reason}" if status else ""
+        lines = [Text.assemble((sensor, "bold"), "  ", (name, _STATUS.get(name, "cyan")), (reason, "dim"))]
+        if calibration is None:
+            return lines
+        return lines + self._calibration(calibration)
+
+    def _calibration(self, calibration: CalibrationUpdate) -> list[Text]:
+        unit = calibration.output_unit.replace("m/s2", "m/s²")
+        lines = [_heading("", "Sx", "Sy", "Sz", "Q", widths=_PARAMETERS)]
+        for axis, cells in zip("xyz", calibration_cells(calibration), strict=True):
+            lines.append(Text(_row((axis, *cells), _PARAMETERS)))
+        lines.append(Text(f"  S in {unit} per m/s², Q in {unit}, {uncertainty_words(calibration)}", "dim"))
+        lines.append(Text(f"  {calibration.method}, {calibration.windows} windows", "dim"))
+        truth = self._state.truths.get(calibration.sensor)
+        if truth is not None:
+            lines.append(Text(f"  {truth_line(calibration, truth)}", "cyan"))
+        return lines
+
+    def _windows(self, room: int) -> list[Text]:
+        state = self._state
+        title = f"windows: {state.windows_used} used, {state.windows_refused} refused"
+        lines = [Text(), Text(title, "dim")]
+        for window in list(state.windows)[-max(0, room - len(lines)) :] if room > len(lines) else []:
+            cells = (window.sensor, window.position, window_span(window), verdict(window))
+            lines.append(Text(_row(cells, _WINDOW), "" if window.used else "yellow"))
+        return lines[: max(0, room)]
+
+    def _bottom(self) -> list[Text]:
+        state = self._state
+        lines = [Text()]
+        if state.publication:
+            well = state.publication.connected and not state.publication.fault
+            lines.append(Text(f"publishes  {publication_line(state.publication)}", "" if well else "yellow"))
+        if state.recording:
+            style = "" if state.recording.recording else "bold red"
+            lines.append(Text(f"records    {recording_line(state.recording)}", style))
+        return lines
+
+
+# Widths of columns, negative to the right; every row but the verdict fits 80.
+_DEVICE = (16, 28, 9, -10, -9, -6)
+_PARAMETERS = (3, -18, -18, -18, -18)
+_WINDOW = (12, 14, 20, 0)
+
+
+def _row(cells: tuple[str, ...], widths: tuple[int, ...]) -> str:
+    return "".join(
+        f"{cell:{'<' if width >= 0 else '>'}{abs(width)}}" for cell, width in zip(cells, widths, strict=True)
+    )
+
+
+def _heading(*cells: str, widths: tuple[int, ...]) -> Text:
+    return Text(_row(cells, widths), "dim")
