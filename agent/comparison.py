@@ -31,7 +31,8 @@ class Difference(msgspec.Struct, frozen=True, kw_only=True):
     undecidable: bool = False
 
     def __str__(self) -> str:
-        return f"event {self.event_sequence}, {self.what}, {self.field}: recorded {self.recorded}, computed {self.computed}"
+        place = f"event {self.event_sequence}, {self.what}, {self.field}"
+        return f"{place}: recorded {self.recorded}, computed {self.computed}"
 
 
 def compare(

@@ -127,6 +127,11 @@ class ChunkMessage:
     data: bytes
 
 
+def refusal(record: Record, reason: str) -> RecordError:
+    """A RecordError for a record that is there but wrong."""
+    return RecordError("corrupt", record.offset, record.name, reason)
+
+
 def record_name(opcode: int) -> str:
     """Kind of record for people: `Chunk`, `MessageIndex`.."""
     if opcode not in _KNOWN:
@@ -175,16 +180,16 @@ def parse(record: Record) -> McapRecord:
     """
     kind = _READERS.get(record.opcode)
     if kind is None:
-        raise RecordError("corrupt", record.offset, record.name, "does not belong here")
+        raise refusal(record, "does not belong here")
     again = RecordBuilder()
     try:
         parsed: McapRecord = kind.read(ReadDataStream(io.BytesIO(record.body)))
         parsed.write(again)
     except (McapError, ValueError, OverflowError, struct.error) as error:
         reason = str(error) or "its parts do not add up"
-        raise RecordError("corrupt", record.offset, record.name, reason) from None
+        raise refusal(record, reason) from None
     if again.end() != record.head + record.body:
-        raise RecordError("corrupt", record.offset, record.name, "its parts do not add up")
+        raise refusal(record, "its parts do not add up")
     return parsed
 
 
@@ -193,7 +198,7 @@ def unpack(record: Record) -> Chunk:
     try:
         return _unpack(record.body)
     except (ValueError, zstandard.ZstdError) as error:
-        raise RecordError("corrupt", record.offset, record.name, str(error)) from None
+        raise refusal(record, str(error)) from None
 
 
 def _unpack(body: bytes) -> Chunk:
@@ -231,7 +236,7 @@ def content(record: Record, chunk: Chunk) -> Iterator[ChunkMessage | McapRecord]
         opcode, length = _HEAD.unpack_from(data, offset) if body_at <= size else (0, 0)
         if length > size - body_at:
             reason = f"{record_name(opcode)} inside, at {offset}, is too long"
-            raise RecordError("corrupt", record.offset, record.name, reason)
+            raise refusal(record, reason)
         if opcode == Opcode.MESSAGE and length >= _MESSAGE.size:
             channel_id, sequence, log_time, publish_time = _MESSAGE.unpack_from(data, body_at)
             payload = data[body_at + _MESSAGE.size : body_at + length]
@@ -240,5 +245,5 @@ def content(record: Record, chunk: Chunk) -> Iterator[ChunkMessage | McapRecord]
             yield parse(Record(record.offset, opcode, data[body_at : body_at + length]))
         else:
             reason = f"{record_name(opcode)} of {length} bytes inside, at {offset}"
-            raise RecordError("corrupt", record.offset, record.name, reason)
+            raise refusal(record, reason)
         offset = body_at + length

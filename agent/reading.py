@@ -15,7 +15,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
 from agent.events import CalibrationUpdate, Event, Result, RunStart, StatusChange, WindowReport
-from agent.mcap_records import ChunkMessage, Fault, Record, RecordError, content, unpack, walk
+from agent.mcap_records import ChunkMessage, Fault, Record, RecordError, content, refusal, unpack, walk
 from agent.messages import MessageError, decode, topic_of
 
 RESULTS = (WindowReport, CalibrationUpdate, StatusChange)
@@ -52,7 +52,7 @@ class RecordingReader:
                 for record, number, item in self._items(file):
                     if isinstance(item, RESULTS):
                         if step is None or number != step.event_sequence:
-                            raise _refusal(record, f"a result of event {number} does not follow it")
+                            raise refusal(record, f"a result of event {number} does not follow it")
                         step.results.append(item)
                         continue
                     self._check_order(record, step, number, item)
@@ -70,9 +70,9 @@ class RecordingReader:
     def _check_order(record: Record, before: Step | None, number: int, event: Event) -> None:
         if isinstance(event, RunStart) != (before is None):
             where = "does not begin with" if before is None else "has a second"
-            raise _refusal(record, f"the recording {where} RunStart")
+            raise refusal(record, f"the recording {where} RunStart")
         if before is not None and number != before.event_sequence + 1:
-            raise _refusal(record, f"event {number} follows event {before.event_sequence}")
+            raise refusal(record, f"event {number} follows event {before.event_sequence}")
 
     def _items(self, file: BinaryIO) -> Iterator[tuple[Record, int, Event | Result]]:
         """(chunk, event sequence, event or result) of every message."""
@@ -86,22 +86,27 @@ class RecordingReader:
                     elif isinstance(part, Channel):
                         self._channels[part.id] = part
             elif record.opcode == Opcode.MESSAGE:
-                raise _refusal(record, "a message outside a chunk")
+                raise refusal(record, "a message outside a chunk")
             self.good_bytes = record.end
 
     def _item(self, record: Record, message: ChunkMessage) -> tuple[int, Event | Result]:
         channel = self._channels.get(message.channel_id)
         schema = self._schemas.get(channel.schema_id) if channel else None
         if channel is None or schema is None:
-            raise _refusal(record, f"message on channel {message.channel_id}, which is not declared")
+            raise refusal(record, f"message on channel {message.channel_id}, which is not declared")
         try:
             number, item = decode(schema.name, message.data)
         except MessageError as error:
-            raise _refusal(record, f"{channel.topic}: {error}") from None
+            raise refusal(record, f"{channel.topic}: {error}") from None
         if topic_of(item) != channel.topic or number & 0xFFFFFFFF != message.sequence:
-            raise _refusal(record, f"{channel.topic}: the message says {topic_of(item)}, event {number}")
+            raise refusal(record, f"{channel.topic}: the message says {topic_of(item)}, event {number}")
         return number, item
 
 
-def _refusal(record: Record, reason: str) -> RecordError:
-    return RecordError("corrupt", record.offset, record.name, reason)
+def first_event(path: Path) -> RunStart | None:
+    """The RunStart of a recording; None where there is none or the file cannot be read."""
+    try:
+        step = next(RecordingReader(path).steps(), None)
+    except OSError:
+        return None
+    return step.event if step is not None and isinstance(step.event, RunStart) else None

@@ -22,6 +22,7 @@ from agent.events import (
     Tick,
     WindowReport,
 )
+from agent.fingerprint import fingerprint
 from agent.recording import Recorder
 from hw.block import BlockFlags, SampleBlock
 
@@ -165,7 +166,7 @@ def run_start(pipeline: StandIn, event_sequence: int, file_sequence: int, now_ns
         t_utc_ns=EPOCH_NS + now_ns,
         config_json=pipeline.config_json,
         versions={"fieldcal": "0.1.0"},
-        fingerprint={"machine": "test"},
+        fingerprint=fingerprint(),
         snapshot=pipeline.snapshot(),
         file_sequence=file_sequence,
         event_sequence=event_sequence,

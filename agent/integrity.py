@@ -1,0 +1,177 @@
+"""Is a recording, byte for byte, what a writer would have left?
+
+Magic, boundaries, every CRC, and a summary that agrees with the data. Messages' meaning is not looked at.
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass, field
+from typing import Any, BinaryIO, cast
+
+from mcap.opcode import Opcode
+from mcap.records import Attachment, DataEnd, Footer, MessageIndex, Metadata
+
+from agent.crc_location import changed_byte
+from agent.mcap_records import MAGIC, Fault, Record, RecordError, parse, record_name, refusal, walk
+from agent.summary import KINDS, DerivedSummary
+
+FAULTS_KEPT = 20  # of one file; the first tells where, the count how bad
+
+
+@dataclass(slots=True)
+class Integrity:
+    """What the check found. `good_bytes`: end of the last record whose boundaries were sound."""
+
+    faults: list[Fault] = field(default_factory=list)
+    fault_count: int = 0
+    finished: bool = False
+    good_bytes: int = 0
+    chunks: int = 0
+    messages: int = 0
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+
+    def add(self, fault: Fault) -> None:
+        """Count a fault; keep it if it is among the first."""
+        self.fault_count += 1
+        if len(self.faults) < FAULTS_KEPT:
+            self.faults.append(fault)
+
+
+def check_integrity(file: BinaryIO, size: int) -> Integrity:
+    """Check an MCAP file of `size` bytes from its beginning. Raises OSError."""
+    found = Integrity()
+    check = _Check(found)
+    try:
+        for record in walk(file, size):
+            check.take(record)
+            found.good_bytes = record.end
+        found.finished = True
+        found.good_bytes = size
+    except RecordError as error:
+        found.add(error.fault)
+    for broken in check.broken_sums:
+        found.add(broken.fault if found.faults else _located(file, size, broken))
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class _BrokenSum:
+    """A CRC over bytes start to end that does not fit them."""
+
+    start: int
+    end: int
+    recorded: int
+    computed: int
+    fault: Fault
+
+
+def _located(file: BinaryIO, size: int, broken: _BrokenSum) -> Fault:
+    """The fault at the one byte that explains a CRC, if there is such a byte."""
+    at = changed_byte(broken.recorded, broken.computed, broken.end - broken.start)
+    if at is None:
+        return broken.fault
+    at += broken.start
+    file.seek(0)
+    kind = next((record.name for record in walk(file, size) if record.offset <= at < record.end), "magic")
+    return Fault("corrupt", at, kind, f"this one byte changed, by the CRC of bytes {broken.start} to {broken.end}")
+
+
+class _Check:
+    """The state of one pass over the records."""
+
+    def __init__(self, found: Integrity) -> None:
+        self._found = found
+        self._crc = zlib.crc32(MAGIC)
+        self._take = self._header
+        self._summary_start = 0
+        self._derived = DerivedSummary()
+        self._groups: dict[int, list[tuple[Record, Any]]] = {}
+        self.broken_sums: list[_BrokenSum] = []
+
+    def take(self, record: Record) -> None:
+        """Check one record in its place; what is wrong with it is added to the faults."""
+        before = self._crc
+        self._crc = zlib.crc32(record.body, zlib.crc32(record.head, before))
+        try:
+            if record.opcode == Opcode.FOOTER:
+                self._footer(record, before)
+            elif record.opcode == Opcode.DATA_END and not self._summary_start:
+                self._data_end(record, before)
+            else:
+                self._take(record)
+        except RecordError as error:
+            self._found.add(error.fault)
+
+    def _header(self, record: Record) -> None:
+        self._take = self._data
+        if record.opcode != Opcode.HEADER:
+            raise refusal(record, "the first record must be a Header")
+        parse(record)
+
+    def _data(self, record: Record) -> None:
+        if record.opcode == Opcode.MESSAGE_INDEX:
+            return self._derived.add_message_index(record, cast(MessageIndex, parse(record)))
+        self._derived.end_of_indexes(record)
+        if record.opcode == Opcode.CHUNK:
+            self._derived.add_chunk(record)
+            self._found.chunks, self._found.messages = len(self._derived.chunks), self._derived.messages
+            return None
+        parsed = parse(record)
+        if isinstance(parsed, Metadata):
+            self._found.metadata.setdefault(parsed.name, parsed.metadata)
+            return self._derived.add_metadata(record, parsed)
+        if isinstance(parsed, Attachment):
+            return self._derived.add_attachment(record, parsed)
+        raise refusal(record, "does not belong here")
+
+    def _data_end(self, record: Record, crc: int) -> None:
+        self._take = self._summary
+        self._crc = 0
+        self._summary_start = record.end
+        self._derived.end_of_indexes(record)
+        recorded = cast(DataEnd, parse(record)).data_section_crc
+        self._compare_sums(0, record.offset, recorded, crc, record)
+
+    def _compare_sums(self, start: int, end: int, recorded: int, computed: int, record: Record) -> None:
+        if recorded == 0:
+            raise refusal(record, f"has no CRC of bytes {start} to {end}")
+        if recorded != computed:
+            reason = f"its CRC of bytes {start} to {end} does not fit them"
+            fault = Fault("corrupt", record.offset, record.name, reason)
+            self.broken_sums.append(_BrokenSum(start, end, recorded, computed, fault))
+
+    def _summary(self, record: Record) -> None:
+        if record.opcode not in KINDS:
+            raise refusal(record, "does not belong here")
+        group = self._groups.setdefault(record.opcode, [])
+        group.append((record, parse(record)))
+        if len(group) > 1 and group[-2][0].end != record.offset:
+            raise refusal(record, "stands apart from its kind")
+
+    def _footer(self, record: Record, crc: int) -> None:
+        if not self._summary_start:
+            raise refusal(record, "no DataEnd before it")
+        footer = cast(Footer, parse(record))
+        covered = record.head + record.body[:16]
+        end = record.offset + len(covered)
+        self._compare_sums(self._summary_start, end, footer.summary_crc, zlib.crc32(covered, crc), record)
+        if self._found.faults or self.broken_sums:
+            return  # what the summary must say is not known where the data are damaged
+        offsets = self._groups.get(Opcode.SUMMARY_OFFSET)
+        if not offsets or footer.summary_start != self._summary_start:
+            raise refusal(record, f"the summary begins at {self._summary_start} and has offsets at its end")
+        if footer.summary_offset_start != offsets[0][0].offset or offsets[-1][0].end != record.offset:
+            raise refusal(record, f"the summary's offsets begin at {offsets[0][0].offset} and go up to here")
+        for kind in KINDS:
+            self._compare_group(record, kind)
+
+    def _compare_group(self, footer: Record, kind: Opcode) -> None:
+        """Hold the summary's records of one kind against what the data section says."""
+        present, expected = self._groups.get(kind, []), self._derived.expected(kind, self._groups)
+        for (record, parsed), wanted in zip(present, expected, strict=False):
+            if parsed != wanted:
+                raise refusal(record, "does not agree with the data")
+        if len(present) != len(expected):
+            at = present[-1][0] if present else footer
+            raise refusal(at, f"{len(present)} of {record_name(kind)} in the summary, {len(expected)} by the data")

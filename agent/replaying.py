@@ -1,0 +1,147 @@
+"""Runs recordings through the pipeline again, and holds what comes out against what was recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Protocol
+
+import msgspec
+
+from agent.comparison import Difference, compare
+from agent.events import CalibrationUpdate, Event, Result, RunStart, WindowReport
+from agent.mcap_records import Fault
+from agent.reading import RecordingReader, Step
+
+
+class PipelineLike(Protocol):
+    """What is replayed: agent.pipeline.Pipeline."""
+
+    def step(self, event: Event) -> list[Result]: ...
+    def snapshot(self) -> bytes: ...
+
+
+Restore = Callable[[str, bytes], PipelineLike]
+
+
+class ReplayedFile(msgspec.Struct, kw_only=True):
+    """What became of one file."""
+
+    path: str
+    run_id: str = ""
+    file_sequence: int = 0
+    in_chain: bool = False  # went on from the file before, whose state at its end equals the snapshot here
+    events: int = 0
+    results: int = 0  # computed
+    fault: Fault | None = None
+    good_bytes: int = 0
+    refused: str = ""  # why the pipeline would not take it
+    different: int = 0  # events after which results differ
+    first_difference: Difference | None = None
+    undecidable: int = 0
+    tolerance: float = 0.0
+    notes: list[str] = []
+
+    @property
+    def equal(self) -> bool:
+        """Whether all that was recorded here follows from the events recorded here."""
+        return not self.different and not self.refused and self.events > 0
+
+
+class Replay:
+    """Replays files one after the other; one that goes on where the last ended is replayed without restoring.
+
+    `restore(config_json, snapshot)` makes the pipeline. Results equal in every bit, but where the recording has another
+    numeric fingerprint than `here`: there within the relative tolerance `elsewhere`. `files`, `calibrations`,
+    `windows` hold what came out.
+    """
+
+    def __init__(self, restore: Restore, here: dict[str, str], elsewhere: float) -> None:
+        self._restore = restore
+        self._here = here
+        self._elsewhere = elsewhere
+        self._pipeline: PipelineLike | None = None  # as the last file left it, if the next may go on with it
+        self._next_event = 0
+        self.files: list[ReplayedFile] = []
+        self.calibrations: list[CalibrationUpdate] = []
+        self.windows: list[WindowReport] = []
+
+    @property
+    def first_difference(self) -> Difference | None:
+        """The first difference in any file."""
+        return next((file.first_difference for file in self.files if file.first_difference), None)
+
+    def run(self, path: Path) -> ReplayedFile:
+        """Replay one more file. Raises OSError where it cannot be read."""
+        file = ReplayedFile(path=str(path))
+        self.files.append(file)
+        reader = RecordingReader(path)
+        for step in reader.steps():
+            if isinstance(step.event, RunStart):
+                self._begin(file, step.event)
+            file.events += 1
+            if not file.refused and not file.undecidable:
+                self._step(file, step)
+            self._next_event = step.event_sequence + 1
+        file.fault, file.good_bytes = reader.fault, reader.good_bytes
+        if not file.equal or file.fault or file.undecidable:
+            self._pipeline = None
+        return file
+
+    def _begin(self, file: ReplayedFile, start: RunStart) -> None:
+        file.run_id, file.file_sequence = start.run_id, start.file_sequence
+        other = sorted(name for name, value in self._here.items() if start.fingerprint.get(name) != value)
+        if other:
+            file.tolerance = self._elsewhere
+            file.notes.append(f"recorded with another {', '.join(other)} than is here: the last bits may differ")
+        before = self.files[-2] if len(self.files) > 1 else None
+        follows = before is not None and before.run_id == start.run_id and start.continuation
+        if follows and start.event_sequence > self._next_event:
+            file.notes.append(f"events {self._next_event} to {start.event_sequence - 1} are in none of these files")
+        if follows and self._pipeline is not None and start.event_sequence == self._next_event and not file.tolerance:
+            if self._pipeline.snapshot() == start.snapshot:
+                file.in_chain = True
+                return
+            self._differ(file, _snapshot_difference(file, start))
+        try:
+            self._pipeline = self._restore(start.config_json, start.snapshot)
+        except Exception as error:  # whatever stands in the file: a hostile snapshot may raise anything
+            file.refused = f"its configuration or snapshot does not restore: {type(error).__name__}: {error}"
+
+    def _step(self, file: ReplayedFile, step: Step) -> None:
+        assert self._pipeline is not None
+        try:
+            computed = self._pipeline.step(step.event)
+        except Exception as error:  # as above; live, the same event would have ended the agent
+            file.refused = f"event {step.event_sequence} fails: {type(error).__name__}: {error}"
+            return
+        file.results += len(computed)
+        self.calibrations += [result for result in computed if isinstance(result, CalibrationUpdate)]
+        self.windows += [result for result in computed if isinstance(result, WindowReport)]
+        if computed or step.results:
+            found = compare(
+                file.path, step.event_sequence, step.results, computed, file.tolerance, complete=step.complete
+            )
+            if found is not None:
+                self._differ(file, found)
+
+    @staticmethod
+    def _differ(file: ReplayedFile, difference: Difference) -> None:
+        if difference.undecidable:
+            # From here on the other branch was taken; the next file's snapshot leads back.
+            file.undecidable += 1
+            file.notes.append(f"undecidable here: {difference}")
+            return
+        file.different += 1
+        file.first_difference = file.first_difference or difference
+
+
+def _snapshot_difference(file: ReplayedFile, start: RunStart) -> Difference:
+    return Difference(
+        file=file.path,
+        event_sequence=start.event_sequence,
+        what="snapshot",
+        field="state at the end of the file before",
+        recorded=f"{len(start.snapshot)} bytes",
+        computed="other bytes",
+    )
