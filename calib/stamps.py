@@ -1,0 +1,142 @@
+"""The clock behind a file's time stamps, whatever they are: a grid, arrivals of bursts, spread or jittery ones."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from calib.model import Array
+from calib.timing import HORIZON_S, ClockFit, Edge, IntArray, parabola
+
+Kind = Literal["grid", "bursts", "spread", "jittery"]
+SAME_BURST = 0.3  # of the mean period: samples cannot have been taken that close together
+MANY = 0.3  # of all steps: so many short ones are no accident
+GRID = 0.02  # of the mean period: what a step may differ from the usual one on a grid
+FEW = 1e-3  # of all steps: odd steps of a grid (samples missing)
+NEIGHBOURS = 32  # bursts on each side that tell a gap (all later ones stay late) from a stall (they catch up)
+# Of the usual period. Less cannot be told from the scatter of bursts, and then costs less than it does; exact stamps
+# show each missing sample.
+LEAST_GAP, LEAST_GAP_ON_GRID = 5.0, 0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Arrivals:
+    """What stamps say: the newest sample of each burst (B,) and when it arrived (B,), and how the stamps were made."""
+
+    kind: Kind
+    index: IntArray
+    arrival_s: Array
+
+
+def clock_from_stamps(stamp_s: Array) -> ClockFit:
+    """The clock of a device from the stamps (n,) of its consecutive samples, n >= 2.
+
+    Pieces of a minute, joined; anew after each gap. Raises ValueError where time does not pass at all.
+    """
+    arrivals = arrivals_from_stamps(stamp_s)
+    period = _usual_period(arrivals)
+    gaps = _gaps(arrivals, period)
+    cuts = [0, *np.searchsorted(arrivals.index, gaps).tolist(), len(arrivals.index)]
+    parts = [(arrivals.index[a:b], arrivals.arrival_s[a:b]) for a, b in itertools.pairwise(cuts)]
+    edge = _edge(arrivals.kind, *max(parts, key=lambda part: len(part[0])))
+    firsts, lasts = [0, *gaps.tolist()], [*(gaps - 1).tolist(), len(stamp_s) - 1]
+    pieces = [
+        _piece(index, arrival_s, first, last, 1.0 / period, edge)
+        for (index, arrival_s), first, last in zip(parts, firsts, lasts, strict=True)
+    ]
+    return replace(
+        pieces[-1],
+        knot_index=np.concatenate([p.knot_index for p in pieces]),
+        knot_time_s=np.concatenate([p.knot_time_s for p in pieces]),
+        knot_period_s=np.concatenate([p.knot_period_s for p in pieces]),
+        gaps=gaps,
+    )
+
+
+def arrivals_from_stamps(stamp_s: Array) -> Arrivals:
+    """Bursts out of stamps: equal or close ones are one, so are those spread at a nominal rate; else each its own."""
+    t = np.asarray(stamp_s, dtype=float)
+    steps = np.diff(t)
+    period = (t[-1] - t[0]) / len(steps) if len(steps) else 0.0
+    if not period > 0:
+        raise ValueError(f"time must pass between the first stamp and the last, from {t[0]} s to {t[-1]} s")
+    short = steps < SAME_BURST * period
+    usual = float(np.median(steps))
+    if np.mean(short) >= MANY and usual < SAME_BURST * period:
+        return _cut("bursts", t, ~short)
+    odd = np.abs(steps - usual) > max(GRID * usual, 1.5 * _resolution(t))
+    if np.mean(odd) < FEW or np.count_nonzero(odd) < 2:
+        return _cut("grid", t, np.ones(len(steps), dtype=bool))
+    if np.mean(odd) < 0.5:
+        return _cut("spread", t, odd)
+    return _cut("jittery", t, np.ones(len(steps), dtype=bool))
+
+
+def _cut(kind: Kind, t: Array, last_of_burst: np.ndarray) -> Arrivals:
+    index = np.append(np.nonzero(last_of_burst)[0], len(t) - 1)
+    return Arrivals(kind, index, t[index])
+
+
+def _resolution(t: Array) -> float:
+    """The decimal step the stamps are rounded to, 0 where finer than a microsecond."""
+    some = t[:4096] - t[0]
+    for decimals in range(2, 7):
+        if np.abs(some - np.round(some, decimals)).max() < 1e-9:
+            return float(10.0**-decimals)
+    return 0.0
+
+
+def _edge(kind: Kind, index: IntArray, arrival_s: Array) -> Edge:
+    """Exact or symmetrically scattering stamps stand for the sample itself; all others come after it.
+
+    Scatter is symmetrical where its lower tail is at least half as long as its upper one.
+    """
+    if kind != "jittery":
+        return "mean" if kind == "grid" else "early"
+    x, y = (index - index[0])[:20_000], (arrival_s - arrival_s[0])[:20_000]
+    low, middle, high = np.quantile(y - np.polyval(np.polyfit(x, y, 1), x), [0.02, 0.5, 0.98])
+    return "mean" if middle - low > 0.5 * (high - middle) else "early"
+
+
+def _usual_period(arrivals: Arrivals) -> float:
+    """Median of the mean periods over neighbouring bursts: gaps do not move it."""
+    span = min(NEIGHBOURS, len(arrivals.index) - 1)
+    index, arrival_s = arrivals.index, arrivals.arrival_s
+    return float(np.median((arrival_s[span:] - arrival_s[:-span]) / (index[span:] - index[:-span])))
+
+
+def _gaps(arrivals: Arrivals, period: float) -> IntArray:
+    """Sample numbers before which samples are missing: all bursts from there on are later than those before."""
+    late = arrivals.arrival_s - period * arrivals.index
+    least = period * (LEAST_GAP_ON_GRID if arrivals.kind == "grid" else LEAST_GAP)
+    gaps: list[int] = []
+    start = 0
+    for b in (np.nonzero(np.diff(late) > least)[0] + 1).tolist():
+        before, after = late[max(start, b - NEIGHBOURS) : b], late[b : b + NEIGHBOURS]
+        if min(after.min() - before.min(), np.median(after) - np.median(before)) > least:
+            start = b
+            gaps.append(int(arrivals.index[b - 1]) + 1)
+    return np.array(gaps, dtype=np.int64)
+
+
+def _piece(index: IntArray, arrival_s: Array, first: int, last: int, nominal_hz: float, edge: Edge) -> ClockFit:
+    """Samples `first` to `last` without a gap: a parabola over each minute, knots half a minute apart."""
+    begin, end = float(arrival_s[0]), float(arrival_s[-1])
+    if end - begin <= HORIZON_S:
+        return parabola(index, arrival_s, nominal_hz, edge).clock(first, last)
+    centres = np.linspace(begin, end, max(3, round(2 * (end - begin) / HORIZON_S) + 1))[1:-1]
+    fits = []
+    for centre in centres:
+        a, b = np.searchsorted(arrival_s, [centre - HORIZON_S / 2, centre + HORIZON_S / 2])
+        fits.append(parabola(index[a:b], arrival_s[a:b], nominal_hz, edge))
+    knots = np.array([first, *np.interp(centres, arrival_s, index), last], dtype=float)
+    at = [fits[0], *fits, fits[-1]]
+    return replace(
+        fits[-1].clock(first, last),
+        knot_index=knots,
+        knot_time_s=np.array([float(f.at(k)) for f, k in zip(at, knots, strict=True)]),
+        knot_period_s=np.array([float(f.period_at(k)) for f, k in zip(at, knots, strict=True)]),
+    )

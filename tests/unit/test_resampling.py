@@ -1,0 +1,75 @@
+"""Resampling and differentiation against sines known at any time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib.resampling import differentiate, resample
+from calib.stamps import clock_from_stamps
+
+RATE_HZ = 1000.0
+t_ref = 0.0123 + np.arange(5000) / RATE_HZ
+CLOCK = clock_from_stamps(t_ref)
+t_sensor = np.arange(0.0, 5.2, 1 / 1013.0)
+
+
+@pytest.mark.parametrize("frequency_hz", [0.2, 3.0, 8.0, 50.0, 200.0, 250.0])
+def test_value_and_derivative(frequency_hz: float) -> None:
+    omega = 2 * np.pi * frequency_hz
+    out = resample(np.sin(omega * t_ref + 0.3)[:, None], CLOCK, t_sensor)
+    t = t_sensor[out.usable]
+    assert np.abs(out.u[out.usable, 0] - np.sin(omega * t + 0.3)).max() < 1e-5
+    assert np.abs(out.du[out.usable, 0] - omega * np.cos(omega * t + 0.3)).max() < 1e-4 * omega
+
+
+def test_channels_do_not_mix_and_cubics_are_exact() -> None:
+    x = np.column_stack([np.ones_like(t_ref), t_ref, t_ref**3])
+    out = resample(x, CLOCK, t_sensor)
+    t = t_sensor[out.usable]
+    np.testing.assert_allclose(out.u[out.usable], np.column_stack([np.ones_like(t), t, t**3]), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(out.du[out.usable], np.column_stack([0 * t, t**0, 3 * t**2]), rtol=0, atol=1e-6)
+
+
+def test_edges_without_support_are_marked() -> None:
+    out = resample(np.zeros((5000, 1)), CLOCK, t_sensor)
+    inside = (t_sensor > t_ref[8]) & (t_sensor < t_ref[-9])
+    assert out.usable[inside].all()
+    assert not out.usable[(t_sensor < t_ref[6]) | (t_sensor > t_ref[-7])].any()
+    assert (out.u[~out.usable] == 0).all()
+
+
+def test_part_of_a_recording_is_the_same_as_the_whole() -> None:
+    x = np.sin(2 * np.pi * 7 * t_ref)[:, None]
+    t = np.arange(2.0, 3.0, 1 / 1013.0)
+    whole, part = resample(x, CLOCK, t), resample(x[1500:3500], CLOCK, t, first_index=1500)
+    assert part.usable.all()
+    np.testing.assert_allclose(part.u, whole.u, rtol=0, atol=1e-13)
+
+
+def test_nothing_is_interpolated_across_a_gap() -> None:
+    kept = np.r_[0:2000, 2100:5000]
+    clock = clock_from_stamps(t_ref[kept])
+    x = np.sin(2 * np.pi * 5 * t_ref[kept])[:, None]
+    out = resample(x, clock, t_sensor)
+    in_gap = (t_sensor > t_ref[2000] - 0.008) & (t_sensor < t_ref[2100] + 0.008)
+    assert not out.usable[in_gap].any()
+    t = t_sensor[out.usable]
+    assert np.abs(out.u[out.usable, 0] - np.sin(2 * np.pi * 5 * t)).max() < 1e-5
+    assert out.usable.mean() > 0.9
+
+
+@pytest.mark.parametrize(("rate_hz", "frequency_hz"), [(1000.0, 1.0), (1000.0, 8.0), (1000.0, 50.0), (200.0, 8.0)])
+def test_velocity_becomes_acceleration(rate_hz: float, frequency_hz: float) -> None:
+    t = np.arange(4000) / rate_hz
+    omega = 2 * np.pi * frequency_hz
+    acceleration, lost = differentiate(np.sin(omega * t)[:, None] / omega, rate_hz)
+    assert lost <= 80
+    inner = slice(lost, -lost)
+    assert np.abs(acceleration[inner, 0] - np.cos(omega * t[inner])).max() < 1e-4
+
+
+def test_differentiation_damps_what_is_above_the_band() -> None:
+    t = np.arange(4000) / 1000.0
+    acceleration, lost = differentiate(np.sin(2 * np.pi * 130 * t)[:, None], 1000.0)
+    assert np.abs(acceleration[lost:-lost]).max() < 1e-3 * 2 * np.pi * 130

@@ -1,0 +1,85 @@
+"""Clocks from a file's stamps: every way of stamping the same samples leads to their true times."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from calib.stamps import arrivals_from_stamps, clock_from_stamps
+from tests.unit.test_timing import polled, sample_times
+
+TRUE, NEWEST, ARRIVAL = polled(100.0, 1013.0, 0.016, seed=1, wander=50e-6)
+TRUE = TRUE[: NEWEST[-1] + 1]
+EQUAL = np.repeat(ARRIVAL, np.diff(NEWEST, prepend=-1))
+AGE = np.repeat(NEWEST, np.diff(NEWEST, prepend=-1)) - np.arange(len(TRUE))
+RNG = np.random.default_rng(2)
+
+
+@pytest.mark.parametrize(
+    ("stamps", "kind", "limit_s"),
+    [
+        (EQUAL, "bursts", 100e-6),
+        (EQUAL - 5e-6 * AGE, "bursts", 100e-6),
+        (EQUAL - 1e-3 * AGE, "spread", 100e-6),
+        (TRUE + RNG.exponential(1e-3, len(TRUE)), "jittery", 50e-6),
+        (TRUE + RNG.normal(0.0, 2e-3, len(TRUE)), "jittery", 300e-6),
+        (TRUE, "grid", 5e-6),
+        (np.round(TRUE, 6), "grid", 5e-6),
+    ],
+)
+def test_true_times_from_any_stamps(stamps: np.ndarray, kind: str, limit_s: float) -> None:
+    assert arrivals_from_stamps(stamps).kind == kind
+    error = clock_from_stamps(stamps).time_of(np.arange(len(TRUE))) - TRUE
+    assert np.abs(error).max() < limit_s
+
+
+@pytest.mark.parametrize("rate_hz", [10.0, 204.8, 1000.0])
+@pytest.mark.parametrize("decimals", [6, 9])
+def test_exact_grids_are_left_alone(rate_hz: float, decimals: int) -> None:
+    t = 5.0 + np.arange(20_000) / rate_hz
+    clock = clock_from_stamps(np.round(t, decimals))
+    assert np.abs(clock.time_of(np.arange(len(t))) - t).max() < 1e-6
+    np.testing.assert_allclose(clock.rate_hz, rate_hz, rtol=1e-7)
+
+
+def test_rounding_to_milliseconds_averages_out() -> None:
+    t = np.arange(6000) / 204.8
+    assert np.abs(clock_from_stamps(np.round(t, 3)).time_of(np.arange(6000)) - t).max() < 20e-6
+
+
+@pytest.mark.parametrize(("missing", "stamped"), [(3, "exact"), (300, "exact"), (700, "bursts")])
+def test_missing_samples_are_found(missing: int, stamped: str) -> None:
+    kept = np.r_[0:50_000, 50_000 + missing : len(TRUE)]
+    clock = clock_from_stamps((TRUE if stamped == "exact" else EQUAL)[kept])
+    error = np.abs(clock.time_of(np.arange(len(kept))) - TRUE[kept])
+    near = np.abs(np.arange(len(kept)) - 50_000) < 64  # the burst in which samples were lost may stand on either side
+    assert error[~near].max() < 100e-6
+    assert len(clock.gaps) >= 1
+    assert np.abs(clock.gaps - 50_000).max() < 200
+    if stamped == "exact":
+        np.testing.assert_array_equal(clock.gaps, [50_000])
+
+
+def test_a_stall_is_no_gap() -> None:
+    assert len(clock_from_stamps(EQUAL).gaps) == 0
+    assert len(clock_from_stamps(TRUE + RNG.normal(0.0, 2e-3, len(TRUE))).gaps) == 0
+
+
+def test_an_hour_with_thermal_wander() -> None:
+    t = sample_times(3600.0, 100.3)
+    error = clock_from_stamps(t + RNG.exponential(1e-3, len(t))).time_of(np.arange(len(t))) - t
+    assert np.abs(error).max() < 100e-6
+
+
+@pytest.mark.parametrize("n", [2, 3, 5, 30])
+def test_few_rows(n: int) -> None:
+    t = np.arange(n) / 50.0
+    np.testing.assert_allclose(clock_from_stamps(t).time_of(np.arange(n)), t, atol=1e-9)
+
+
+@pytest.mark.parametrize("make", [lambda: np.zeros(10), lambda: -np.arange(10.0), lambda: np.zeros(1)])
+def test_time_that_does_not_pass_is_refused(make: Callable[[], np.ndarray]) -> None:
+    with pytest.raises(ValueError, match="time must pass"):
+        clock_from_stamps(make())
