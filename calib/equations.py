@@ -1,0 +1,138 @@
+"""The window equations of the adjustment: what slopes and means should be, and how they move with every unknown.
+
+For output axis i, with D and G of the pose (calib.nuisances) and S_i a row of S,
+
+    slope on u      S_i D (1 - (lag_i^2 omega^2 + c_s^2 / omega^2) / 2)
+    slope on du/dt  S_i D (-lag_i - c_r / omega^2 + c_s / omega^2)
+    mean of V       S_i (D mean(u) + G) + Q_i - lag_i S_i D mean(du/dt) + offset of the position
+
+The terms in omega^2 = <du^2> / <u^2> are the projections of d2u/dt2 and of the integral of u (a first-order corner c_r
+of the reference, c_s of the sensor, rad/s) on u and du/dt: exact for a sine, and for any
+motion once the front end has taken out what was found.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.condense import Condensed
+from calib.model import Array
+from calib.nuisances import Inputs, Nuisances
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rows:
+    """Whitened residuals (observed less predicted) and Jacobian with respect to [S row by row, Q, nuisances].
+
+    Slopes: `slope` (B, 2M, 3) and `d_slope` (B, 2M, 3, N); means: `mean` (W, 3) and `d_mean` (W, 3, N).
+    """
+
+    slope: Array
+    d_slope: Array
+    mean: Array
+    d_mean: Array
+
+    def stacked(self) -> tuple[Array, Array]:
+        """Residuals (rows,) and Jacobian (rows, N): slopes first."""
+        n = self.d_mean.shape[-1]
+        residual = np.concatenate([self.slope.ravel(), self.mean.ravel()])
+        return residual, np.vstack([self.d_slope.reshape(-1, n), self.d_mean.reshape(-1, n)])
+
+
+class Equations:
+    """Condensed windows, the pose of each, and the weights: the functions that Gauss-Newton needs."""
+
+    def __init__(self, data: Condensed, nuisances: Nuisances, pose_of: list[int], offset_scatter_mps2: float) -> None:
+        """`pose_of` (W,) the nuisances' pose of a window; `offset_scatter_mps2` between windows, as stated."""
+        self.data, self.nuisances = data, nuisances
+        self.pose_of_window = np.array(pose_of)
+        self.pose_of_block = self.pose_of_window[data.block_window]
+        known = np.isfinite(nuisances.gravity).all(axis=1)[self.pose_of_window]
+        self.known = known
+        self.output_per_mps2 = self._output_per_mps2()
+        noise2 = data.type_a.noise**2 / data.count[:, None]
+        variance = noise2 + (offset_scatter_mps2 * self.output_per_mps2) ** 2
+        # A mean whose gravity nobody stated says nothing: no weight.
+        self.mean_weight = np.where(known[:, None], 1.0 / np.sqrt(variance), 0.0)
+        self.white_share = np.where(known[:, None], noise2 / variance, 0.0)
+
+    def _output_per_mps2(self) -> float:
+        """The sensor's scale: root mean square of output over input, of all slopes and means."""
+        data, m = self.data, self.data.channels
+        moved = np.einsum("brc,bkc->brk", data.root[:, :m, :m], self.nuisances.direction[self.pose_of_block])
+        gravity, n = self.nuisances.gravity[self.pose_of_window][self.known], data.count[self.known]
+        held, level = np.zeros((1, 3)), np.zeros((1, 3))
+        if n.size:
+            held = np.sqrt(n)[:, None] * (gravity - n @ gravity / n.sum())
+            level = np.sqrt(n)[:, None] * (data.mean_v[self.known] - n @ data.mean_v[self.known] / n.sum())
+        inputs = float((moved**2).sum() + (held**2).sum())
+        outputs = float((data.slopes[:, :m] ** 2).sum() + (level**2).sum())
+        return float(np.sqrt(outputs / inputs)) if inputs > 0.0 and outputs > 0.0 else 1.0
+
+    def at(self, x: Array) -> Rows:
+        """Rows at x = [S row by row, Q, nuisances]."""
+        S, Q, z = x[:9].reshape(3, 3), x[9:12], x[12:]
+        inputs = self.nuisances.at(z)
+        return Rows(*self._slopes(S, inputs), *self._means(S, Q, z, inputs))
+
+    def split(self, rows: Array) -> tuple[Array, Array]:
+        """Stacked rows (rows, ...) back into slopes (B, 2M, 3, ...) and means (W, 3, ...)."""
+        slopes = self.data.slopes
+        return (
+            rows[: slopes.size].reshape(*slopes.shape, *rows.shape[1:]),
+            rows[slopes.size :].reshape(*self.data.mean_v.shape, *rows.shape[1:]),
+        )
+
+    def _slopes(self, S: Array, inputs: Inputs) -> tuple[Array, Array]:
+        data, D = self.data, inputs.direction[self.pose_of_block]
+        omega2 = data.omega2[:, None]
+        inverse = np.divide(1.0, omega2, out=np.zeros_like(omega2), where=omega2 > 0.0)
+        c = inputs.sensor_corner
+        on_u = 1.0 - 0.5 * (inputs.lag_s**2 * omega2 + c**2 * inverse)  # (B, 3)
+        on_du = -inputs.lag_s + (c - inputs.reference_corner) * inverse
+        ideal = np.einsum("ik,bkm->bim", S, D)
+        slopes = np.concatenate([ideal * on_u[..., None], ideal * on_du[..., None]], axis=2)  # (B, 3, 2M)
+        residual = data.slopes - np.einsum("brc,bic->bri", data.root, slopes)
+
+        nuisances = self.nuisances
+        d_ideal = np.einsum("ik,jbkm->bimj", S, inputs.d_direction[:, self.pose_of_block])
+        d_on_u = -inputs.lag_s[:, None] * omega2[..., None] * nuisances.lag.T
+        d_on_u = d_on_u - c * inverse[..., None] * nuisances.sensor_corner
+        d_on_du = -nuisances.lag.T + inverse[..., None] * (nuisances.sensor_corner - nuisances.reference_corner)
+        d_z = np.concatenate(
+            [
+                d_ideal * on_u[..., None, None] + ideal[..., None] * d_on_u[:, :, None, :],
+                d_ideal * on_du[..., None, None] + ideal[..., None] * d_on_du[:, :, None, :],
+            ],
+            axis=2,
+        )
+        n = 12 + len(nuisances)
+        jacobian = np.zeros((*data.slopes.shape, n))  # (B, 2M, 3, N)
+        per_row = np.concatenate([D[:, None] * on_u[..., None, None], D[:, None] * on_du[..., None, None]], axis=3)
+        for i in range(3):
+            jacobian[:, :, i, 3 * i : 3 * i + 3] = np.einsum("brc,bkc->brk", data.root, per_row[:, i])
+        jacobian[..., 12:] = np.einsum("brc,bicj->brij", data.root, d_z)
+        noise = data.type_a.noise
+        return residual / noise, jacobian / noise[:, None]
+
+    def _means(self, S: Array, Q: Array, z: Array, inputs: Inputs) -> tuple[Array, Array]:
+        data, nuisances, m = self.data, self.nuisances, self.data.channels
+        D = inputs.direction[self.pose_of_window]
+        moved = np.einsum("wkm,wm->wk", D, data.mean_x[:, :m])
+        rate = np.einsum("wkm,wm->wk", D, data.mean_x[:, m:])
+        G = np.nan_to_num(inputs.gravity[self.pose_of_window])
+        felt = moved[:, None] + G[:, None] - inputs.lag_s[:, None] * rate[:, None]  # (W, 3, 3): axis, direction
+        predicted = np.einsum("ik,wik->wi", S, felt) + Q
+        predicted += self.output_per_mps2 * np.einsum("j,jwi->wi", z, nuisances.offset[:, self.pose_of_window])
+        jacobian = np.zeros((*data.mean_v.shape, 12 + len(nuisances)))
+        for i in range(3):
+            jacobian[:, i, 3 * i : 3 * i + 3] = felt[:, i]
+            jacobian[:, i, 9 + i] = 1.0
+        d_input = np.einsum("jwkm,wm->jwk", inputs.d_direction[:, self.pose_of_window], data.mean_x[:, :m])
+        d_input = d_input + np.nan_to_num(inputs.d_gravity[:, self.pose_of_window])
+        jacobian[..., 12:] = np.einsum("ik,jwk->wij", S, d_input)
+        jacobian[..., 12:] += self.output_per_mps2 * nuisances.offset[:, self.pose_of_window].transpose(1, 2, 0)
+        jacobian[..., 12:] -= np.einsum("wi,ij->wij", rate @ S.T, nuisances.lag.T)
+        return (data.mean_v - predicted) * self.mean_weight, jacobian * self.mean_weight[..., None]

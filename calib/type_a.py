@@ -1,0 +1,137 @@
+"""Type A: how much slopes and means of a window scatter, from segment to segment, pooled over all windows.
+
+Residuals are not white (AR(1) 0.99: the true uncertainty is 11 times the white one), so a segment's residual sums
+(its scores) are the unit that scatters; the correlation of neighbouring segments is taken into account as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.model import Array
+
+# Correlation of neighbours above which segments are joined in pairs: they are shorter than 3 correlation times.
+RHO_COARSEN = 0.35
+NOISE_FLOOR = 1e-12  # of the signal: exact data would have no noise to weigh by (float64 sums round at 1e-13)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Segments:
+    """Sums of K segments about one centre: counts (K,), x x' (K, 2M, 2M), x V' (K, 2M, 3), V V' (K, 3, 3), sums of
+    [x, V] (K, 2M + 3); `mean` (2M + 3,) is that centre."""
+
+    count: Array
+    xx: Array
+    xv: Array
+    vv: Array
+    total: Array
+    mean: Array
+
+    def sums(self) -> tuple[Array, Array, Array, Array, Array]:
+        """All that adds up, in the order of the fields."""
+        return self.count, self.xx, self.xv, self.vv, self.total
+
+    def scaled(self, factor: float) -> Segments:
+        """The same segments with another weight."""
+        return Segments(
+            factor * self.count, factor * self.xx, factor * self.xv, factor * self.vv, factor * self.total, self.mean
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TypeA:
+    """`noise` (3,): SD of the residuals within windows, output unit. `slopes` (6M, 6M) in the order basis, axis and
+    `means` (3, 3): covariance of the whitened slopes and means, identities if the residuals were white and
+    independent between axes. `degrees_of_freedom` of both, inf where single segments allow no such estimate."""
+
+    noise: Array
+    slopes: Array
+    means: Array
+    degrees_of_freedom: float
+
+
+def pooled(
+    windows: Sequence[Segments],
+    blocks: Sequence[Segments],
+    window_block: Sequence[int],
+    roots: Sequence[Array],
+    whiteners: Sequence[Array],
+) -> TypeA:
+    """Scatter of the whitened scores over all windows (means) and blocks (slopes, whitened by T = `whiteners`)."""
+    slopes = [t.T @ (t @ b.xv.sum(0)) for t, b in zip(whiteners, blocks, strict=True)]
+    noise = _noise(blocks, slopes, roots)
+    size = roots[0].shape[0]
+    slope_scores, mean_scores = [], []
+    for block, beta, t in zip(blocks, slopes, whiteners, strict=True):
+        score = np.einsum("rc,kci->kri", t, block.xv - block.xx @ beta) / noise
+        slope_scores.append(score.reshape(len(score), 3 * size))
+    for window, block_index in zip(windows, window_block, strict=True):
+        score = (window.total[:, -3:] - window.total[:, :-3] @ slopes[block_index]) / noise
+        mean_scores.append(score / np.sqrt(window.count.sum()))
+    live = np.repeat([any(r[j, j] > 0.0 for r in roots) for j in range(size)], 3)
+    slope_cov, slope_dof = _scatter(slope_scores, live)
+    mean_cov, mean_dof = _scatter(mean_scores, np.ones(3, dtype=bool))
+    return TypeA(noise, slope_cov, mean_cov, min(slope_dof, mean_dof))
+
+
+def _noise(blocks: Sequence[Segments], slopes: Sequence[Array], roots: Sequence[Array]) -> Array:
+    power, freedom, signal = np.zeros(3), 0.0, np.zeros(3)
+    for block, beta, root in zip(blocks, slopes, roots, strict=True):
+        total = np.einsum("kii->i", block.vv)
+        signal += total + block.count.sum() * block.mean[-3:] ** 2
+        power += total - np.einsum("ci,ci->i", beta, block.xv.sum(0))
+        freedom += block.count.sum() - 1 - np.count_nonzero(np.diag(root))
+    counts = sum(float(b.count.sum()) for b in blocks)
+    floor = NOISE_FLOOR * np.sqrt(signal.max() / counts) or 1.0
+    return np.asarray(np.sqrt(np.maximum(power, 0.0) / max(freedom, 1.0)).clip(min=floor))
+
+
+def _scatter(scores: list[Array], live: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> tuple[Array, float]:
+    """Covariance (D, D) of a window's summed scores and its degrees of freedom; `live` (D,) are those with data."""
+    lengths = np.array([len(s) for s in scores])
+    freedom = float(np.sum(lengths - 1))
+    if freedom < 1 or not live.any():
+        return np.eye(len(live)), np.inf
+    covariance = np.sum([len(s) * s.T @ s for s in scores], axis=0) / freedom
+    gamma0, gamma1 = _neighbours([s[:, live] for s in scores])
+    if gamma0 <= 0.0:
+        return covariance, freedom
+    rho = gamma1 / gamma0
+    if rho > RHO_COARSEN and lengths.max() >= 4:
+        return _scatter([_paired(s) for s in scores], live)
+    typical = float(lengths.mean())
+    naive = gamma0 - 2.0 * gamma1 / typical  # what the covariance above expects, neighbours being correlated
+    inflation = max(1.0, (gamma0 + 2.0 * (1.0 - 1.0 / typical) * gamma1) / naive)
+    return covariance * inflation, freedom / (1.0 + 0.5 * inflation * (inflation > 1.0))
+
+
+def _neighbours(scores: list[Array]) -> tuple[float, float]:
+    """Variance of a score and covariance of two neighbours, unbiased though each window's scores sum to zero.
+
+    With K scores g and r = g - mean(g): E sum r_k^2 and E sum r_k r_{k+1} are linear in both; solved over all windows.
+    """
+    matrix, observed = np.zeros((2, 2)), np.zeros(2)
+    for s in scores:
+        k = len(s)
+        if k < 3:
+            continue
+        r = s * np.sqrt(k)
+        mean_square = np.array([k, 2.0 * (k - 1)]) / k**2  # of mean(g), in terms of gamma0, gamma1
+        matrix[0] += np.array([k, 0.0]) - k * mean_square
+        matrix[1] += np.array([0.0, k - 1.0]) - (k + 1) * mean_square + np.array([2.0, 2.0]) / k
+        observed += [np.mean(np.sum(r * r, axis=0)), np.mean(np.sum(r[1:] * r[:-1], axis=0))]
+    if abs(np.linalg.det(matrix)) < 1e-9:
+        return 0.0, 0.0
+    gamma0, gamma1 = np.linalg.solve(matrix, observed)
+    return float(gamma0), float(gamma1)
+
+
+def _paired(scores: Array) -> Array:
+    even = scores[: len(scores) // 2 * 2]
+    pairs = np.asarray(even.reshape(-1, 2, even.shape[1]).sum(1))
+    if len(even) < len(scores):
+        pairs[-1] += scores[-1]
+    return pairs

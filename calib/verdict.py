@@ -1,0 +1,168 @@
+"""Whether an adjustment may be used: rank, contradictions with what was known, signs that fit better turned, misfit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from calib.budget import Budget
+from calib.distributions import chi2_quantile
+from calib.equations import Equations
+from calib.gauss_newton import Flags, Solution
+from calib.model import PARAMETERS, Window
+
+# Below this part of the largest singular value (columns scaled to one) a direction was not excited: positions 0/1/2 deg
+# stand at 3e-6, what rounding leaves of an unseen direction at 1e-15.
+RANK_TOLERANCE = 1e-10
+CONTRADICTED = 0.999  # probability: one sound calibration in a thousand is refused as contradicting what was known
+PRIOR_SHARE = 0.01  # of a direction's prior variance that the data must have removed for it to be a test of the prior
+# A turned sign "fits decisively better": the likelihood ratio exp(25 / 2) is 3e5 to 1, and it explains most of the
+# misfit, so that no residual systematic effect of a right sign is taken for a wrong one.
+DECISIVE_CHI2 = 25.0
+DECISIVE_RATIO = 0.25
+MISFIT_LIMIT = 0.1  # of the signal; the worst geometry met with right signs leaves 0.01
+CONFOUNDED_LAG = 0.01  # of the largest sensitivity, that an undetermined lag puts into one of the others
+
+
+def rank(equations: Equations) -> int:
+    """Rank of the input vectors (a_x, a_y, a_z, 1), 4 where Method 3 can tell all parameters."""
+    data, nuisances = equations.data, equations.nuisances
+    m = data.channels
+    moved = np.einsum("brc,bkc->brk", data.root[:, :m, :m], nuisances.direction[equations.pose_of_block])
+    rows = [np.pad(moved.reshape(-1, 3), ((0, 0), (0, 1)))]
+    held = np.einsum("wkm,wm->wk", nuisances.direction[equations.pose_of_window], data.mean_x[:, :m])
+    held = held + nuisances.gravity[equations.pose_of_window]
+    rows.append((np.sqrt(data.count)[:, None] * np.pad(held, ((0, 0), (0, 1)), constant_values=1.0))[equations.known])
+    stacked = np.vstack(rows)
+    scale = np.linalg.norm(stacked, axis=0)
+    singular = np.linalg.svd(stacked / np.where(scale > 0.0, scale, 1.0), compute_uv=False)
+    return int((singular > RANK_TOLERANCE * singular[0]).sum())
+
+
+def reasons(
+    windows: Sequence[Window],
+    solution: Solution,
+    shares: Budget,
+    determined: Flags,
+    turned: Callable[[int, int], Solution],
+) -> list[str]:
+    """Why the adjustment is refused, each with its numbers; empty where it is not.
+
+    `turned(static, polarity)` solves again with gravity times `static` and the reference times `polarity`.
+    """
+    found = [*_rank_reasons(windows, solution, determined), *_lag_reasons(solution, shares)]
+    if found:
+        return found
+    sign = _sign_reasons(solution, shares, turned)
+    return sign or [*_prior_reasons(solution), *_misfit_reasons(solution)]
+
+
+def _rank_reasons(windows: Sequence[Window], solution: Solution, determined: Flags) -> list[str]:
+    found, full = rank(solution.equations), 4
+    clamped = all(w.pose.theta_rad is not None for w in windows)
+    static = bool(solution.equations.known.any() and np.any(np.nan_to_num(solution.equations.nuisances.gravity)))
+    if clamped and static and found < full:
+        angles = len({(w.pose.theta_rad, w.pose.alpha_rad) for w in windows})
+        return [
+            f"rank {found} of {full}: {angles} clamp positions leave a direction unseen; three or more distinct alphas "
+            "and a motion are needed"
+        ]
+    if not determined.any():
+        return [f"rank {found} of {full}: the data determine none of the 12 parameters"]
+    return []
+
+
+def _lag_reasons(solution: Solution, shares: Budget) -> list[str]:
+    terms = solution.equations.nuisances.terms
+    names = [t.name for t in terms]
+    if "lag" not in names:
+        return []
+    j = names.index("lag")
+    after, before = float(np.sqrt(shares.covariance[12 + j, 12 + j])), terms[j].uncertainty
+    moved = float(shares.contributions["lag"][:9].max()) / solution.equations.output_per_mps2
+    if after <= 0.5 * before or moved <= CONFOUNDED_LAG:
+        return []
+    return [
+        f"rank {rank(solution.equations)} of 4 with the lag fixed, one less with it: the motion cannot tell the lag "
+        f"(u {after * 1e3:.3g} ms of {before * 1e3:.3g} ms before) from a rotation; it puts {moved:.1%} into S. "
+        "Motion in a plane at one frequency does that: excite another frequency or direction, or state the lag"
+    ]
+
+
+def _sign_reasons(solution: Solution, shares: Budget, turned: Callable[[int, int], Solution]) -> list[str]:
+    statistic, freedom = shares.consistency
+    if statistic <= chi2_quantile(CONTRADICTED, freedom) and not _prior_reasons(solution):
+        return []
+    tried = {
+        "the static sign (gravity)": turned(-1, 1).chi2,
+        "the polarity of the reference": turned(1, -1).chi2,
+        "the static sign and the polarity of the reference": turned(-1, -1).chi2,
+    }
+    name, best = min(tried.items(), key=lambda item: item[1])
+    if best > solution.chi2 - DECISIVE_CHI2 or best > DECISIVE_RATIO * solution.chi2:
+        return []
+    return [f"the data fit decisively better with {name} turned: chi-squared {best:.4g}, as stated {solution.chi2:.4g}"]
+
+
+def _prior_reasons(solution: Solution) -> list[str]:
+    """Does the estimate lie where what was known of S and Q allows? Tested where the data outweigh the prior."""
+    known = np.flatnonzero(solution.bounded)
+    if not known.size:
+        return []
+    before = np.linalg.inv(solution.prior_precision[np.ix_(known, known)])
+    root = np.linalg.cholesky(before)
+    pull = np.linalg.solve(root, solution.x[known] - solution.prior_mean[known])
+    left = np.linalg.solve(root, np.linalg.solve(root, solution.inverse[np.ix_(known, known)]).T)
+    removed, ways = np.linalg.eigh(np.eye(len(known)) - left)
+    tested = removed > PRIOR_SHARE
+    statistic = float(np.sum((ways.T @ pull)[tested] ** 2 / removed[tested]))
+    limit = chi2_quantile(CONTRADICTED, float(tested.sum()))
+    if statistic <= limit or not tested.any():
+        return []
+    u = np.sqrt(np.diag(before))
+    worst = int(np.argmax(np.abs(solution.x[known] - solution.prior_mean[known]) / u))
+    p = known[worst]
+    return [
+        f"the data contradict what was known: chi-squared {statistic:.4g}, limit {limit:.4g} (of {int(tested.sum())}); "
+        f"{PARAMETERS[p]} is {solution.x[p]:.5g}, {solution.prior_mean[p]:.5g} with u {u[worst]:.3g} was expected"
+    ]
+
+
+def _misfit_reasons(solution: Solution) -> list[str]:
+    found = misfit(solution)
+    if found <= MISFIT_LIMIT:
+        return []
+    return [f"S a + Q leaves {found:.1%} of the signal between windows unexplained (limit {MISFIT_LIMIT:.0%})"]
+
+
+def misfit(solution: Solution) -> float:
+    """Root mean square of what the solution leaves of slopes and means over that of the signal, beyond noise."""
+    equations = solution.equations
+    data, noise = equations.data, equations.data.type_a.noise
+    slope, mean = equations.split(solution.residual)
+    parts = [(slope * noise, data.slopes, noise)]
+    weight = np.where(equations.mean_weight > 0.0, equations.mean_weight, np.inf)
+    root = np.sqrt(data.count)[:, None]
+    held = equations.known
+    if np.ptp(np.nan_to_num(equations.nuisances.gravity)[equations.pose_of_window], axis=0).any():
+        centred = data.mean_v - data.count @ data.mean_v / data.count.sum()
+        parts.append(((mean / weight * root)[held], (centred * root)[held], noise))
+    shares = [0.0]
+    for left, signal, sd in parts:
+        power = float((signal**2).sum())
+        if power > 0.0:
+            shares.append(max(float((left**2 - sd**2).sum()), 0.0) / power)
+    return float(np.sqrt(max(shares)))
+
+
+def turned_windows(windows: Sequence[Window], static: int, polarity: int) -> list[Window]:
+    """The same windows with gravity and the reference's direction in every pose multiplied by these signs."""
+    return [
+        replace(
+            w,
+            pose=replace(w.pose, direction=polarity * w.pose.direction, gravity_mps2=static * w.pose.gravity_mps2),
+        )
+        for w in windows
+    ]
