@@ -134,6 +134,8 @@ def _root(power: Array, floor: Array) -> tuple[Array, Array]:
     half = size // 2
     strongest = np.repeat([power.diagonal()[:half].max(initial=0.0), power.diagonal()[half:].max(initial=0.0)], half)
     limit = np.maximum.reduce([PIVOT_FLOOR * power.diagonal(), EXCITED * strongest, floor])
+    moved = power.diagonal() > limit  # a channel of noise alone must not tie its unknown column to the known ones
+    power = np.where(np.outer(moved, moved), power, 0.0)
     work = np.hstack([power, np.eye(size)])
     rows = np.zeros_like(work)
     for j in range(size):

@@ -13,7 +13,8 @@ from calib.nuisances import Priors
 
 Flags = NDArray[np.bool_]
 MAX_STEPS = 30
-CONVERGED = 1e-6  # of a standard uncertainty: a step below it changes nothing that is stated
+MAX_HALVINGS = 8
+CONVERGED = 1e-3  # of a standard uncertainty: the step after it, still taken, is smaller by about as much again
 ROUNDING = 1e-13  # of the scale: a step below it is rounding
 # What nothing is known of beforehand is held by this many times its scale: weak enough to move what is known to 1 % by
 # 1e-12 of it, strong enough that a direction nobody excited leaves nothing singular.
@@ -23,14 +24,16 @@ OFFSET_SCALE_MPS2 = 10.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """Where it ended: x = [S row by row, Q, nuisances] (N,), H^-1 (N, N), whitened residuals and Jacobian there.
+    """Where it ended: x = [S row by row, Q, nuisances] (N,), and the whitened residuals (rows,) there.
 
-    `prior_mean` (N,), `prior_precision` (N, N); `bounded` (12,) tells which of S, Q had a prior of their own.
+    `half` (N, N): half half' = H^-1. `jacobian` (rows, N) is J half, in coordinates in which H is the identity: only
+    there can sums over a direction that nobody excited be taken without losing all digits. `prior_mean` (N,),
+    `prior_precision` (N, N); `bounded` (12,) tells which of S, Q had a prior of their own.
     """
 
     equations: Equations
     x: Array
-    inverse: Array
+    half: Array
     residual: Array
     jacobian: Array
     prior_mean: Array
@@ -46,25 +49,45 @@ class Solution:
     @property
     def leverage(self) -> Array:
         """(rows,) how much of each row's own scatter the fit takes up, 0 to 1."""
-        return np.asarray(np.einsum("rn,rn->r", self.jacobian @ self.inverse, self.jacobian))
+        return np.asarray(np.einsum("rn,rn->r", self.jacobian, self.jacobian))
 
 
 def solve(equations: Equations, priors: Priors) -> Solution:
     """Minimise chi2 from the priors' means; the first step alone solves S and Q where every nuisance is fixed."""
     scale, mean, precision, bounded = _priors(equations, priors)
-    root = np.linalg.cholesky(precision * np.outer(scale, scale)).T
+    root: Array = np.asarray(np.linalg.cholesky(precision * np.outer(scale, scale)).T, dtype=np.float64)
     x = mean.copy()
+    residual, jacobian = _stacked(equations, x, mean, scale, root)
     for _ in range(MAX_STEPS):
-        residual, jacobian = equations.at(x).stacked()
-        q, r = np.linalg.qr(np.vstack([jacobian * scale, root]))
-        step = np.linalg.solve(r, q.T @ np.concatenate([residual, root @ ((mean - x) / scale)]))
-        x = x + step * scale
-        uncertainty = np.linalg.norm(np.linalg.inv(r), axis=1)
-        if np.all(np.abs(step) < np.maximum(CONVERGED * uncertainty, ROUNDING)):
+        # The factor of [J, r] holds that of J and Q'r: Q itself is never needed.
+        factor = np.asarray(np.linalg.qr(np.column_stack([jacobian, residual]), mode="r"), dtype=np.float64)
+        half = np.asarray(np.linalg.inv(factor[: len(x), : len(x)]), dtype=np.float64)
+        step = half @ factor[: len(x), len(x)]
+        if np.all(np.abs(step) < np.maximum(CONVERGED * np.linalg.norm(half, axis=1), ROUNDING)):
             break
+        x, residual, jacobian = _shortened(equations, x, step, mean, scale, root, float(residual @ residual))
+    x = x + step * scale
     residual, jacobian = equations.at(x).stacked()
-    half = np.linalg.inv(r) * scale[:, None]
-    return Solution(equations, x, half @ half.T, residual, jacobian, mean, precision, bounded)
+    half = half * scale[:, None]
+    return Solution(equations, x, half, residual, jacobian @ half, mean, precision, bounded)
+
+
+def _stacked(equations: Equations, x: Array, mean: Array, scale: Array, root: Array) -> tuple[Array, Array]:
+    """Residuals and scaled Jacobian of the window equations and of the priors below them."""
+    residual, jacobian = equations.at(x).stacked()
+    return np.concatenate([residual, root @ ((mean - x) / scale)]), np.vstack([jacobian * scale, root])
+
+
+def _shortened(
+    equations: Equations, x: Array, step: Array, mean: Array, scale: Array, root: Array, before: float
+) -> tuple[Array, Array, Array]:
+    """The full step, or the first halving of it that does not make chi2 larger; with residuals and Jacobian there."""
+    for halving in range(MAX_HALVINGS):
+        tried = x + step * scale * 0.5**halving
+        residual, jacobian = _stacked(equations, tried, mean, scale, root)
+        if float(residual @ residual) <= before * (1.0 + ROUNDING):
+            break
+    return tried, residual, jacobian
 
 
 def _priors(equations: Equations, priors: Priors) -> tuple[Array, Array, Array, Flags]:

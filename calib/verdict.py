@@ -52,14 +52,16 @@ def reasons(
 
     `turned(static, polarity)` solves again with gravity times `static` and the reference times `polarity`.
     """
-    found = [*_rank_reasons(windows, solution, determined), *_lag_reasons(solution, shares)]
-    if found:
-        return found
-    sign = _sign_reasons(solution, shares, turned)
-    return sign or [*_prior_reasons(solution), *_misfit_reasons(solution)]
+    return (
+        _rank_reasons(windows, solution)
+        or _sign_reasons(solution, shares, turned)
+        or _lag_reasons(solution, shares)
+        or [*_prior_reasons(solution), *_misfit_reasons(solution)]
+        or _nothing_determined(solution, determined)
+    )
 
 
-def _rank_reasons(windows: Sequence[Window], solution: Solution, determined: Flags) -> list[str]:
+def _rank_reasons(windows: Sequence[Window], solution: Solution) -> list[str]:
     found, full = rank(solution.equations), 4
     clamped = all(w.pose.theta_rad is not None for w in windows)
     static = bool(solution.equations.known.any() and np.any(np.nan_to_num(solution.equations.nuisances.gravity)))
@@ -69,9 +71,13 @@ def _rank_reasons(windows: Sequence[Window], solution: Solution, determined: Fla
             f"rank {found} of {full}: {angles} clamp positions leave a direction unseen; three or more distinct alphas "
             "and a motion are needed"
         ]
-    if not determined.any():
-        return [f"rank {found} of {full}: the data determine none of the 12 parameters"]
     return []
+
+
+def _nothing_determined(solution: Solution, determined: Flags) -> list[str]:
+    if determined.any():
+        return []
+    return [f"rank {rank(solution.equations)} of 4: the data determine none of the 12 parameters"]
 
 
 def _lag_reasons(solution: Solution, shares: Budget) -> list[str]:
@@ -96,11 +102,14 @@ def _sign_reasons(solution: Solution, shares: Budget, turned: Callable[[int, int
     if statistic <= chi2_quantile(CONTRADICTED, freedom) and not _prior_reasons(solution):
         return []
     tried = {
-        "the static sign (gravity)": turned(-1, 1).chi2,
-        "the polarity of the reference": turned(1, -1).chi2,
-        "the static sign and the polarity of the reference": turned(-1, -1).chi2,
+        "the static sign (gravity)": turned(-1, 1),
+        "the polarity of the reference": turned(1, -1),
+        "the static sign and the polarity of the reference": turned(-1, -1),
     }
-    name, best = min(tried.items(), key=lambda item: item[1])
+    best = min(other.chi2 for other in tried.values())
+    # Where nothing was known of S, turning gravity and turning the reference fit alike; one of them leaves S positive.
+    alike = [name for name, other in tried.items() if other.chi2 < best + DECISIVE_CHI2]
+    name = max(alike, key=lambda n: float(tried[n].x[[0, 4, 8]].sum()))
     if best > solution.chi2 - DECISIVE_CHI2 or best > DECISIVE_RATIO * solution.chi2:
         return []
     return [f"the data fit decisively better with {name} turned: chi-squared {best:.4g}, as stated {solution.chi2:.4g}"]
@@ -114,7 +123,7 @@ def _prior_reasons(solution: Solution) -> list[str]:
     before = np.linalg.inv(solution.prior_precision[np.ix_(known, known)])
     root = np.linalg.cholesky(before)
     pull = np.linalg.solve(root, solution.x[known] - solution.prior_mean[known])
-    left = np.linalg.solve(root, np.linalg.solve(root, solution.inverse[np.ix_(known, known)]).T)
+    left = np.linalg.solve(root, np.linalg.solve(root, (solution.half[known] @ solution.half[known].T)).T)
     removed, ways = np.linalg.eigh(np.eye(len(known)) - left)
     tested = removed > PRIOR_SHARE
     statistic = float(np.sum((ways.T @ pull)[tested] ** 2 / removed[tested]))
