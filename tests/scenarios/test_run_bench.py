@@ -1,0 +1,133 @@
+"""`fieldcal run` on the virtual bench: one real run of a minute, looked at from all sides."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+
+from agent.router import open_router
+from hw.virtual.bench import Bench, Truth
+from hw.virtual.presets import COUNTS_PER_MPS2, PRESETS
+from tests.scenarios.processes import fieldcal, interrupt, recordings, results, started, wait_until
+
+ENDPOINT = "tcp/127.0.0.1:7447"
+KEY = "fieldcal/v1/virtual/bench/mems/calibration"
+SEED = 1
+THROUGH_S = 60.0  # of bench time: the four positions are through, S and Q in force
+
+
+@dataclass(frozen=True)
+class Run:
+    data_dir: Path
+    output: str
+    live: list[dict[str, Any]]  # calibrations that a plain Zenoh client saw, from before the start on
+    late: list[dict[str, Any]]  # what one that came later got from a plain get
+    stopped_in_s: float
+    exit_status: int
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
+    directory = tmp_path_factory.mktemp("bench")
+    data_dir, output = directory / "data", directory / "output"
+    live: list[dict[str, Any]] = []
+    with open_client() as session:
+        subscriber = session.declare_subscriber(KEY, zenoh.handlers.FifoChannel(100))
+        taker = threading.Thread(target=lambda: live.extend(payload(sample) for sample in subscriber), daemon=True)
+        taker.start()
+        with started("run", "--seed", str(SEED), "--data-dir", data_dir, output=output) as process:
+            # Positions end after 13, 26, 39 and 52 s; three alphas determine all twelve parameters, the fourth improves.
+            wait_until(lambda: len(results(data_dir, "calibration")) >= 2, THROUGH_S + 10, "two calibrations")
+            late = late_client()
+            stopped_in_s = interrupt(process)
+        subscriber.undeclare()
+        taker.join(5.0)
+    yield Run(data_dir, output.read_text(), live, late, stopped_in_s, process.returncode)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def router() -> Iterator[None]:
+    session, _ = open_router(ENDPOINT)
+    yield
+    session.close()
+
+
+def open_client() -> zenoh.Session:
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("connect/endpoints", json.dumps([ENDPOINT]))
+    return zenoh.open(config)
+
+
+def late_client() -> list[dict[str, Any]]:
+    with open_client() as session:
+        return [payload(reply.ok) for reply in session.get(KEY) if reply.ok is not None]
+
+
+def payload(sample: zenoh.Sample) -> dict[str, Any]:
+    fields: dict[str, Any] = json.loads(sample.payload.to_string())
+    return fields
+
+
+def truth(preset: str) -> Truth:
+    return Bench(PRESETS[preset](SEED), SEED).truth
+
+
+def test_s_and_q_are_right_within_a_minute(run: Run) -> None:
+    last = results(run.data_dir, "calibration")[-1]
+    true = truth("plain")
+    full = np.abs(np.diag(true.sensitivity))[:, None]
+    assert np.abs((np.array(last["sensitivity"]) - true.sensitivity) / full).max() < 0.005
+    assert np.abs(np.array(last["offset"]) - true.offset).max() / COUNTS_PER_MPS2 < 0.03
+    assert last["uncertainty_kind"] == "type A, white"
+    first_ns, last_ns = results(run.data_dir, "status")[0]["t_utc_ns"], last["t_utc_ns"]
+    assert (last_ns - first_ns) * 1e-9 < THROUGH_S
+
+
+def test_every_calibration_reached_a_plain_client(run: Run) -> None:
+    assert run.live == results(run.data_dir, "calibration")
+    assert len(run.live) >= 2
+
+
+def test_a_client_that_comes_later_gets_the_one_in_force(run: Run) -> None:
+    assert run.late == results(run.data_dir, "calibration")[-1:]
+
+
+def test_ctrl_c_ends_it_in_two_seconds_with_files_closed(run: Run) -> None:
+    assert run.exit_status == 0
+    assert run.stopped_in_s < 2.0
+    assert [path.suffix for path in recordings(run.data_dir)] == [".mcap"]
+
+
+def test_output_says_what_was_found_published_and_recorded(run: Run) -> None:
+    assert "Traceback" not in run.output
+    for part in ("fieldcal/v1/virtual/bench", "fieldcal-000001.mcap", "type A, white", "VALID"):
+        assert part in run.output, part
+
+
+def test_replay_and_audit_agree_with_the_run(run: Run) -> None:
+    files = recordings(run.data_dir)
+    replayed = fieldcal("replay", *files, "--json", "-")
+    assert replayed.returncode == 0, replayed.stderr
+    told = json.loads(replayed.stdout)
+    assert told["equal"] is True
+    kept = results(run.data_dir, "calibration")
+    assert [c["sensitivity"] for c in told["calibrations"]] == [c["sensitivity"] for c in kept]
+    audited = fieldcal("audit", *files)
+    assert audited.returncode == 0, audited.stdout + audited.stderr
+
+
+def test_show_tells_the_calibration_in_force(run: Run) -> None:
+    shown = fieldcal("show", "--data-dir", run.data_dir, "--json", "-")
+    assert shown.returncode == 0, shown.stderr
+    assert results(run.data_dir, "calibration")[-1]["sensitivity"][0][0] == pytest.approx(
+        json.loads(shown.stdout)["sensors"][0]["calibration"]["sensitivity"][0][0], rel=1e-15
+    )
