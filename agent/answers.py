@@ -11,6 +11,7 @@ from agent.history import History, Record, StoreError
 from agent.keys import result_key
 
 REPLIES_MAX = 500  # per query, about 1 MB; who asks goes on from the last number until nothing comes
+NOTHING = b"nothing to tell"
 
 _log = logging.getLogger(__name__)
 _Queryable = zenoh.Queryable[zenoh.Handler[zenoh.Query]]
@@ -22,11 +23,15 @@ def answer_queries(queryable: _Queryable, gateway: str, store: Path) -> None:
     `<keys>`: the newest result of each channel that matches; a calibration only where it is in force.
     `<keys>?after=<sequence>`: the first REPLIES_MAX results after that number, in order. Several come on one key, so
     the query must be sent with consolidation NONE, else Zenoh keeps the last of each key.
+    Where there is none the answer is the error NOTHING, since silence also comes from a gateway that is not there.
     """
     for query in queryable:
         with query:  # a query that stays alive makes the one who asked wait for its whole time
             try:
-                for record in _answers(query, gateway, store):
+                records = _answers(query, gateway, store)
+                if not records:
+                    query.reply_err(NOTHING)
+                for record in records:
                     query.reply(
                         result_key(gateway, record.sensor, record.what),
                         record.payload,

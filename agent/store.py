@@ -20,7 +20,7 @@ UNKEPT_MAX = 1_000_000
 # Results that a failing disk refused wait in memory for the next commit; beyond this the oldest are given up.
 WAITING_MAX = 1000
 _CORRUPT = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
-_SCHEMA = f"""
+_SCHEMA = """
 BEGIN;
 CREATE TABLE results (
     sequence INTEGER PRIMARY KEY, run_id TEXT NOT NULL, sensor TEXT NOT NULL, what TEXT NOT NULL,
@@ -30,8 +30,8 @@ CREATE INDEX results_of_channel ON results (sensor, what, sequence);
 CREATE TABLE latest (
     sensor TEXT NOT NULL, what TEXT NOT NULL, sequence INTEGER NOT NULL, PRIMARY KEY (sensor, what)) STRICT;
 CREATE TABLE marks (name TEXT PRIMARY KEY, value INTEGER NOT NULL) STRICT;
-INSERT INTO marks VALUES ('floor', 0), ('published', 0), ('clean', 1);
-PRAGMA user_version = {SCHEMA_VERSION};
+INSERT INTO marks VALUES ('floor', {first}), ('published', {first}), ('clean', 1);
+PRAGMA user_version = {version};
 COMMIT;
 """
 
@@ -40,18 +40,20 @@ class Store:
     """Commits results durably (WAL, synchronous FULL) and remembers up to where they are published.
 
     May be called from any thread; reading is done by a `History` of one's own on `path`.
-    `set_aside` names the corrupt file that was found and renamed, None where there was none. The numbers used before
-    are then unknown, and the count goes on from the UTC milliseconds, which lie beyond them.
+    `set_aside` names the corrupt file that was found and renamed, None where there was none.
+    A new store cannot know which numbers were used before it, by a store that is corrupt or was deleted; it counts on
+    from `count_from`, by default the UTC milliseconds, which lie beyond them and still fit a number of JavaScript.
     Raises StoreError where the directory cannot be written or another process has the store.
     """
 
-    def __init__(self, data_dir: Path) -> None:
+    def __init__(self, data_dir: Path, count_from: int | None = None) -> None:
+        first = time.time_ns() // 1_000_000 if count_from is None else count_from
         self.path = data_dir / FILE_NAME
         self._mutex = threading.Lock()
         self._waiting: list[Record] = []
         self._lock = _lock(data_dir)
         try:
-            self.set_aside, self._connection = _open_or_set_aside(self.path)
+            self.set_aside, self._connection = _open_or_set_aside(self.path, first)
             self._last, self._published = self._begin_run()
         except sqlite3.Error as error:
             os.close(self._lock)
@@ -134,9 +136,7 @@ class Store:
         marks = dict(self._connection.execute("SELECT name, value FROM marks").fetchall())
         (kept,) = self._connection.execute("SELECT coalesce(max(sequence), 0) FROM results").fetchone()
         last = max(kept, marks["floor"])
-        if self.set_aside:
-            last = time.time_ns() // 1_000_000
-        elif not marks["clean"]:
+        if not marks["clean"]:
             last += UNKEPT_MAX
         with self._connection:
             self._mark("floor", last)
@@ -158,9 +158,9 @@ def _lock(data_dir: Path) -> int:
     return descriptor
 
 
-def _open_or_set_aside(path: Path) -> tuple[Path | None, sqlite3.Connection]:
+def _open_or_set_aside(path: Path, first: int) -> tuple[Path | None, sqlite3.Connection]:
     if not path.exists() or not _is_corrupt(path):
-        return None, _open(path)
+        return None, _open(path, first)
     number = 1
     while (aside := path.with_name(f"{path.name}.corrupt-{number}")).exists():
         number += 1
@@ -168,7 +168,7 @@ def _open_or_set_aside(path: Path) -> tuple[Path | None, sqlite3.Connection]:
         source = path.with_name(path.name + end)
         if source.exists():
             source.rename(path.with_name(f"{source.name}.corrupt-{number}"))
-    return aside, _open(path)
+    return aside, _open(path, first)
 
 
 def _is_corrupt(path: Path) -> bool:
@@ -182,7 +182,7 @@ def _is_corrupt(path: Path) -> bool:
             raise
 
 
-def _open(path: Path) -> sqlite3.Connection:
+def _open(path: Path, first: int) -> sqlite3.Connection:
     # Any thread: a mutex guards the connection, and the thread that opens is not the one that commits.
     connection = sqlite3.connect(path, timeout=5.0, isolation_level=None, check_same_thread=False)
     try:
@@ -190,7 +190,7 @@ def _open(path: Path) -> sqlite3.Connection:
         connection.execute("PRAGMA synchronous = FULL")
         (version,) = connection.execute("PRAGMA user_version").fetchone()
         if version == 0:
-            connection.executescript(_SCHEMA)
+            connection.executescript(_SCHEMA.format(version=SCHEMA_VERSION, first=first))
         elif version != SCHEMA_VERSION:
             raise StoreError(f"{path}: written in version {version}, this program writes version {SCHEMA_VERSION}")
     except BaseException:

@@ -33,7 +33,7 @@ def site() -> Iterator[Site]:
 
 @pytest.fixture
 def store(tmp_path: Path) -> Iterator[Store]:
-    store = Store(tmp_path)
+    store = Store(tmp_path, 0)
     yield store
     store.close()
 
@@ -251,7 +251,7 @@ from agent.history import StoreError
 from agent.publication import Publisher
 from agent.store import Store
 from tests.unit.zenoh_site import record, wait_for
-store = Store(Path(sys.argv[1]))
+store = Store(Path(sys.argv[1]), 0)
 publisher = Publisher("site", "gw", [sys.argv[2]], store)
 publisher.start()
 wait_for(lambda: publisher.state().connected)

@@ -8,6 +8,7 @@ import signal
 import sqlite3
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -38,7 +39,7 @@ def test_what_is_committed_is_read_back_whole_and_in_order(tmp_path: Path) -> No
         record(3, sensor="other"),
         record(7, recorded=False),
     ]
-    store = Store(tmp_path)
+    store = Store(tmp_path, 0)
     store.commit(kept[:3])
     store.commit(kept[3:])
     with History(store.path) as history:
@@ -52,7 +53,7 @@ def test_what_is_committed_is_read_back_whole_and_in_order(tmp_path: Path) -> No
 
 
 def test_one_commit_may_be_larger_than_what_waits_for_a_failing_disk(tmp_path: Path) -> None:
-    store = Store(tmp_path)
+    store = Store(tmp_path, 0)
     store.commit([record(n) for n in range(1, WAITING_MAX + 100)])
     with History(store.path) as history:
         assert sequences(history.after(0, limit=2 * WAITING_MAX)) == list(range(1, WAITING_MAX + 100))
@@ -60,7 +61,7 @@ def test_one_commit_may_be_larger_than_what_waits_for_a_failing_disk(tmp_path: P
 
 
 def test_a_calibration_is_in_force_until_the_status_is_uncalibrated(tmp_path: Path) -> None:
-    store = Store(tmp_path)
+    store = Store(tmp_path, 0)
     store.commit(
         [record(1, "calibration"), status(2, "VALID"), record(3, "calibration"), record(4, "calibration", "b")]
     )
@@ -78,7 +79,7 @@ def test_a_calibration_is_in_force_until_the_status_is_uncalibrated(tmp_path: Pa
 
 
 def test_only_the_calibration_of_the_same_device_may_be_restored(tmp_path: Path) -> None:
-    store = Store(tmp_path)
+    store = Store(tmp_path, 0)
     store.commit([record(n, "calibration", identity=i) for n, i in ((1, "chip A"), (2, "chip A"), (3, "chip B"))])
     with History(store.path) as history:
         own = history.calibration_of("mems", "chip A")
@@ -105,23 +106,31 @@ def test_record_of_a_result_says_whether_it_is_recorded_and_has_null_for_nan() -
 
 
 def test_numbers_go_on_over_runs_and_jump_after_a_run_that_did_not_close(tmp_path: Path) -> None:
-    store = Store(tmp_path)
+    store = Store(tmp_path, 0)
     assert store.last_sequence() == 0
     store.commit([record(5)])
     store.close()
-    store = Store(tmp_path)
+    store = Store(tmp_path, 0)
     assert store.last_sequence() == 5
     os.close(store._lock)  # a killed process lets go of its lock and does no more
-    after_kill = Store(tmp_path)
+    after_kill = Store(tmp_path, 0)
     assert after_kill.last_sequence() == 5 + UNKEPT_MAX
     after_kill.close()
-    closed_well = Store(tmp_path)
+    closed_well = Store(tmp_path, 0)
     assert closed_well.last_sequence() == 5 + UNKEPT_MAX
     closed_well.close()
 
 
-def test_a_number_that_does_not_rise_is_refused(tmp_path: Path) -> None:
+def test_a_new_store_counts_on_from_the_clock_beyond_all_that_was_used_before(tmp_path: Path) -> None:
+    before = time.time_ns() // 1_000_000
     store = Store(tmp_path)
+    assert before <= store.last_sequence() <= before + 60_000
+    assert store.published() == store.last_sequence()
+    store.close()
+
+
+def test_a_number_that_does_not_rise_is_refused(tmp_path: Path) -> None:
+    store = Store(tmp_path, 0)
     store.commit([record(5)])
     with pytest.raises(StoreError, match="result 5 does not come after 5"):
         store.commit([record(5)])
@@ -129,24 +138,24 @@ def test_a_number_that_does_not_rise_is_refused(tmp_path: Path) -> None:
 
 
 def test_the_outbox_is_what_comes_after_the_published_mark(tmp_path: Path) -> None:
-    store = Store(tmp_path)
+    store = Store(tmp_path, 0)
     store.commit([record(1), record(2)])
     store.mark_published(1)
     store.mark_published(0)
     assert store.published() == 1
     store.close()
-    store = Store(tmp_path)
+    store = Store(tmp_path, 0)
     assert store.published() == 1
     store.close()
 
 
 def test_one_process_has_the_store_and_the_next_gets_one_clear_line(tmp_path: Path) -> None:
-    store = Store(tmp_path)
+    store = Store(tmp_path, 0)
     with pytest.raises(StoreError, match="another process is using it"):
-        Store(tmp_path)
+        Store(tmp_path, 0)
     store.close()
     store.close()
-    Store(tmp_path).close()
+    Store(tmp_path, 0).close()
 
 
 _WRITER = """
@@ -154,7 +163,7 @@ import sys, json
 from pathlib import Path
 from agent.store import Store
 from tests.unit.test_store import record
-store = Store(Path(sys.argv[1]))
+store = Store(Path(sys.argv[1]), 0)
 n = store.last_sequence()
 while True:
     n += 1
@@ -184,14 +193,14 @@ def test_a_committed_result_survives_kill_9_at_any_moment(tmp_path: Path) -> Non
         assert len(kept) % 2 == 0, "a transaction was torn"
         assert calibration is not None
         assert calibration.sequence == kept[-1] - 1
-    store = Store(tmp_path)
+    store = Store(tmp_path, 0)
     assert store.set_aside is None
     store.close()
 
 
 @pytest.mark.parametrize("damage", ["not a database", "a page overwritten", "cut"])
 def test_a_corrupt_file_is_set_aside_with_its_log_and_numbers_stay_unused(tmp_path: Path, damage: str) -> None:
-    store = Store(tmp_path)
+    store = Store(tmp_path, 0)
     store.commit([record(n, payload=b"x" * 900) for n in range(1, 200)])
     store.close()
     path = tmp_path / FILE_NAME
@@ -213,23 +222,23 @@ def test_a_corrupt_file_is_set_aside_with_its_log_and_numbers_stay_unused(tmp_pa
     store.commit([record(store.last_sequence() + 1)])
     store.close()
     path.write_bytes(b"garbage again, longer than a header" * 9)
-    assert Store(tmp_path).set_aside == tmp_path / "state.sqlite.corrupt-2"
+    assert Store(tmp_path, 0).set_aside == tmp_path / "state.sqlite.corrupt-2"
 
 
 def test_a_store_of_a_newer_version_is_left_alone(tmp_path: Path) -> None:
-    Store(tmp_path).close()
+    Store(tmp_path, 0).close()
     connection = sqlite3.connect(tmp_path / FILE_NAME)
     connection.execute("PRAGMA user_version = 99")
     connection.close()
     with pytest.raises(StoreError, match="version 99"):
-        Store(tmp_path)
+        Store(tmp_path, 0)
     with pytest.raises(StoreError, match="version 99"):
         History(tmp_path / FILE_NAME)
     assert not list(tmp_path.glob("*corrupt*"))
 
 
 def test_a_full_disk_is_said_and_what_it_refused_is_kept_when_there_is_room(tmp_path: Path) -> None:
-    store = Store(tmp_path)
+    store = Store(tmp_path, 0)
     store.commit([record(1)])
     (pages,) = store._connection.execute("PRAGMA page_count").fetchone()
     store._connection.execute(f"PRAGMA max_page_count = {pages}")
