@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import sqlite3
 from collections.abc import Collection
@@ -17,7 +18,8 @@ from agent.events import CalibrationUpdate, Result, StatusChange, WindowReport
 
 FILE_NAME = "state.sqlite"
 SCHEMA_VERSION = 1
-_KINDS: dict[type, str] = {CalibrationUpdate: "calibration", WindowReport: "window", StatusChange: "status"}
+_TYPES: dict[str, type[Result]] = {"calibration": CalibrationUpdate, "window": WindowReport, "status": StatusChange}
+_KINDS = {kind: what for what, kind in _TYPES.items()}
 _COLUMNS = "sequence, run_id, sensor, what, payload, t_utc_ns, recorded, recording, identity"
 
 
@@ -68,6 +70,14 @@ class Record:
             return msgspec.json.decode(self.payload, type=dict[str, Any])
         except msgspec.DecodeError as error:
             raise StoreError(f"result {self.sequence} cannot be read: {error}") from None
+
+    @property
+    def result(self) -> Result:
+        """The result again; null becomes NaN. Raises StoreError where the payload is not of this version."""
+        try:
+            return msgspec.convert(_null_to_nan(self.fields), _TYPES[self.what])
+        except (KeyError, msgspec.ValidationError) as error:
+            raise StoreError(f"result {self.sequence}, a {self.what}, cannot be read: {error}") from None
 
 
 class History:
@@ -142,6 +152,14 @@ class History:
                 return cursor.fetchall()
         except sqlite3.Error as error:
             raise StoreError(f"{self._path}: {error}") from None
+
+
+def _null_to_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _null_to_nan(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_null_to_nan(item) for item in value]
+    return math.nan if value is None else value
 
 
 def connect_read_only(path: Path) -> sqlite3.Connection:

@@ -12,8 +12,9 @@ from rich.text import Text
 
 from agent.events import CalibrationUpdate
 from agent.quantity import duration
-from agent.view import (
-    ViewState,
+from agent.view import ViewState
+from agent.wording import (
+    STATUS_STYLES,
     calibration_cells,
     publication_line,
     recording_line,
@@ -24,7 +25,6 @@ from agent.view import (
 )
 
 REFRESH_S = 0.5  # news comes a few times a minute, the clock once a second
-_STATUS = {"VALID": "bold green", "HELD": "yellow", "RECALIBRATING": "yellow", "INVALID": "bold red"}
 
 
 class Screen:
@@ -93,7 +93,7 @@ class Picture:
         status, calibration = self._state.statuses.get(sensor), self._state.calibrations.get(sensor)
         name = status.status if status else ""
         reason = f"  {status.reason}" if status else ""
-        lines = [Text.assemble((sensor, "bold"), "  ", (name, _STATUS.get(name, "cyan")), (reason, "dim"))]
+        lines = [Text.assemble((sensor, "bold"), "  ", (name, STATUS_STYLES.get(name, "cyan")), (reason, "dim"))]
         if calibration is None:
             return lines
         return lines + self._calibration(calibration)

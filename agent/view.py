@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Literal, Protocol, TextIO
-
-import numpy as np
+from typing import TYPE_CHECKING, Literal, Protocol, TextIO
 
 from agent.events import CalibrationUpdate, Result, StatusChange, WindowReport
-from agent.publication import PublicationState
-from agent.quantity import plus_minus, size
+from agent.wording import publication_line, result_lines
 from calib.model import Array
+
+if TYPE_CHECKING:
+    from agent.publication import PublicationState
 
 
 class Truth(Protocol):
@@ -147,84 +147,3 @@ class Lines:
             print(line, file=self._stream, flush=True)
         except (OSError, ValueError):
             return  # whoever read the lines went away; the agent goes on
-
-
-def result_lines(result: Result, truth: Truth | None) -> list[str]:
-    """A result in words."""
-    match result:
-        case WindowReport():
-            return [f"{result.sensor}: window {window_span(result)} at {result.position}: {verdict(result)}"]
-        case StatusChange():
-            return [f"{result.sensor}: {result.status}{f', {result.reason}' if result.reason else ''}"]
-        case CalibrationUpdate():
-            lines = [f"{result.sensor}: calibration from {result.windows} windows, {uncertainty_words(result)}"]
-            lines += [f"  {row}" for row in calibration_rows(result)]
-            return lines + ([f"  {truth_line(result, truth)}"] if truth else [])
-
-
-def verdict(window: WindowReport) -> str:
-    """Used, with its points, or why not."""
-    left_out = f", {window.left_out} left out" if window.left_out else ""
-    return f"used, {window.points} points{left_out}" if window.used else f"refused: {window.reason}"
-
-
-def window_span(window: WindowReport) -> str:
-    """When the window was, in seconds since the sensor's first sample."""
-    return f"{window.start_s:.1f} to {window.stop_s:.1f} s"
-
-
-def uncertainty_words(calibration: CalibrationUpdate) -> str:
-    """What the number after ± is."""
-    return f"U with k = {calibration.coverage_factor:.3g}, {calibration.uncertainty_kind}"
-
-
-def calibration_cells(calibration: CalibrationUpdate) -> list[list[str]]:
-    """Three rows x, y, z of S_x, S_y, S_z and Q, each with its expanded uncertainty."""
-    expanded = [calibration.coverage_factor * u for u in calibration.standard_uncertainty]
-    found = calibration.determined
-    rows = []
-    for i in range(3):
-        cells = [(calibration.sensitivity[i][j], 3 * i + j) for j in range(3)] + [(calibration.offset[i], 9 + i)]
-        rows.append([plus_minus(value, expanded[n]) if found[n] else "not known" for value, n in cells])
-    return rows
-
-
-def calibration_rows(calibration: CalibrationUpdate) -> list[str]:
-    """The cells as text, one line an axis."""
-    names = [(f"S{axis}x", f"S{axis}y", f"S{axis}z", f"Q{axis}") for axis in "xyz"]
-    return [
-        "  ".join(f"{name} {cell}" for name, cell in zip(row_names, cells, strict=True))
-        for row_names, cells in zip(names, calibration_cells(calibration), strict=True)
-    ]
-
-
-def truth_line(calibration: CalibrationUpdate, truth: Truth) -> str:
-    """How far S and Q are from the virtual sensor's, S in percent of the row's main sensitivity, Q in m/s2."""
-    main = np.diag(truth.sensitivity)
-    error = 100 * (np.array(calibration.sensitivity) - truth.sensitivity) / main[:, None]
-    found = np.array(calibration.determined)
-    error[~found[:9].reshape(3, 3)] = np.nan
-    q = np.where(found[9:], (np.array(calibration.offset) - truth.offset) / main, np.nan)
-    main_error, transverse = np.diag(error), error[~np.eye(3, dtype=bool)]
-    return (
-        f"off the truth by at most: S main {_largest(main_error, 3)} %, transverse {_largest(transverse, 3)} %,"
-        f" Q {_largest(q, 4)} m/s²"
-    )
-
-
-def publication_line(publication: PublicationState) -> str:
-    """What is published where."""
-    where = ", ".join(publication.endpoints) or "nowhere"
-    link = "connected" if publication.connected else "no router yet, results wait in the store"
-    return f"{publication.key}/** to {where} ({publication.fault or link})"
-
-
-def recording_line(recording: RecordingState) -> str:
-    """Where the raw data go."""
-    refused = "" if recording.recording else " (the disk refuses: NOT recording)"
-    return f"{recording.path}, {size(recording.size_bytes)}{refused}"
-
-
-def _largest(values: Array, decimals: int) -> str:
-    known = values[np.isfinite(values)]
-    return f"{np.abs(known).max():.{decimals}f}" if known.size else "–"
