@@ -10,7 +10,7 @@ import struct
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, BinaryIO, Literal
+from typing import Any, BinaryIO, Literal, cast
 
 import zstandard
 from mcap.data_stream import ReadDataStream, RecordBuilder
@@ -228,7 +228,7 @@ def _unpack(body: bytes) -> Chunk:
     return Chunk(start_time, end_time, compression.decode(), len(packed), data)
 
 
-def content(record: Record, chunk: Chunk) -> Iterator[ChunkMessage | McapRecord]:
+def content(record: Record, chunk: Chunk) -> Iterator[ChunkMessage | Schema | Channel]:
     """Messages, schemas and channels of a chunk (`record` as unpacked) in order. Raises RecordError."""
     data, offset, size = chunk.data, 0, len(chunk.data)
     while offset < size:
@@ -242,7 +242,8 @@ def content(record: Record, chunk: Chunk) -> Iterator[ChunkMessage | McapRecord]
             payload = data[body_at + _MESSAGE.size : body_at + length]
             yield ChunkMessage(offset, channel_id, sequence, log_time, publish_time, payload)
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            yield parse(Record(record.offset, opcode, data[body_at : body_at + length]))
+            inside = Record(record.offset, opcode, data[body_at : body_at + length])
+            yield cast(Schema | Channel, parse(inside))
         else:
             reason = f"{record_name(opcode)} of {length} bytes inside, at {offset}"
             raise refusal(record, reason)

@@ -83,7 +83,7 @@ class RecordingReader:
                         yield record, *self._item(record, part)
                     elif isinstance(part, Schema):
                         self._schemas[part.id] = part
-                    elif isinstance(part, Channel):
+                    else:
                         self._channels[part.id] = part
             elif record.opcode == Opcode.MESSAGE:
                 raise refusal(record, "a message outside a chunk")

@@ -67,6 +67,8 @@ class RecordingThread:
             self._loop()
         except BaseException as error:
             self._error = error
+        finally:
+            self._recorder.close()
 
     def _loop(self) -> None:
         flush_at = time.monotonic() + self._flush_s
@@ -79,7 +81,7 @@ class RecordingThread:
             except queue.Empty:
                 continue
             if entry is None:
-                return self._recorder.close()
+                return
             event_sequence, event, results = entry
             recorded = self._recorder.record(event_sequence, event, results)
             self._starts_done += isinstance(event, RunStart)

@@ -1,0 +1,110 @@
+"""The recording's thread: order, durability before delivery, flushing, rotation asked for once, faults that surface."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from agent.events import Result
+from agent.reading import RecordingReader
+from agent.recording import Recorder
+from agent.recording_thread import RecordingThread
+from tests.replay.stand_in import CONFIG, SECOND, StandIn, block, happenings, run_start
+
+PATIENCE_S = 10.0  # how long a test waits for another thread on a busy machine
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline, "the other thread did not do it"
+        time.sleep(0.005)
+
+
+def test_results_are_delivered_in_order_when_the_file_has_them(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path, ["acc", "ref"], ["bridge-1"])
+    delivered: list[tuple[int, list[Result]]] = []
+
+    def deliver(number: int, results: Sequence[Result], recorded: bool) -> None:
+        assert recorded
+        assert recorder.path is not None
+        *_, last = RecordingReader(recorder.path).steps()
+        assert (last.event_sequence, len(last.results)) == (number, len(results))
+        delivered.append((number, list(results)))
+
+    thread = RecordingThread(recorder, deliver)
+    pipeline = StandIn(CONFIG)
+    expected = []
+    for number, event in enumerate([run_start(pipeline, 0, 1), *happenings(9, seed=2)]):
+        results = pipeline.step(event)
+        thread.put(number, event, results)
+        if results:
+            expected.append((number, results))
+    thread.close()
+    assert repr(delivered) == repr(expected)
+    assert len(delivered) > 3
+    assert (tmp_path / "fieldcal-000001.mcap").exists()
+
+
+def test_events_without_results_reach_the_disk_by_themselves(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path, ["acc"], [])
+    thread = RecordingThread(recorder, lambda *_: None, flush_s=0.05)
+    thread.put(0, run_start(StandIn(CONFIG), 0, 1), [])
+    rng = np.random.default_rng(1)
+    thread.put(1, block("acc", 0, rng), [])
+    path = tmp_path / "fieldcal-000001.mcap.active"
+    wait_for(lambda: path.exists() and len(list(RecordingReader(path).steps())) == 2)
+    thread.put(2, block("acc", 1, rng), [])
+    wait_for(lambda: len(list(RecordingReader(path).steps())) == 3)
+    thread.close()
+
+
+def test_rotation_is_not_wanted_while_a_run_start_is_on_its_way(tmp_path: Path) -> None:
+    go_on = threading.Event()
+    recorder = Recorder(tmp_path, ["acc"], ["bridge-1"], max_bytes=1)
+    thread = RecordingThread(recorder, lambda *_: assert_(go_on.wait(PATIENCE_S)))
+    pipeline = StandIn(CONFIG)
+    start = run_start(pipeline, 0, 1)
+    thread.put(0, start, [])
+    wait_for(lambda: thread.wants_rotation)
+    status = pipeline.step(start)
+    thread.put(1, block("acc", 0, np.random.default_rng(1)), status)  # delivery holds the thread up
+    thread.put(2, run_start(pipeline, 2, 2, 6 * SECOND), [])
+    assert not thread.wants_rotation
+    go_on.set()
+    wait_for(lambda: thread.wants_rotation)
+    thread.close()
+
+
+def assert_(condition: bool) -> None:
+    assert condition, "delivery"
+
+
+def test_what_delivery_raises_comes_out_of_the_next_put(tmp_path: Path) -> None:
+    thread = RecordingThread(Recorder(tmp_path, [], ["bridge-1"]), lambda *_: assert_(False))
+    pipeline = StandIn(CONFIG)
+    start = run_start(pipeline, 0, 1)
+    thread.put(0, start, pipeline.step(start))
+    final = tmp_path / "fieldcal-000001.mcap"
+    wait_for(final.exists)
+    with pytest.raises(AssertionError, match="delivery"):
+        thread.put(1, block("acc", 0, np.random.default_rng(1)), [])
+    with pytest.raises(AssertionError, match="delivery"):
+        thread.close()
+    assert len(list(RecordingReader(final).steps())) == 1
+
+
+def test_results_that_could_not_be_recorded_are_delivered_as_such(tmp_path: Path) -> None:
+    delivered: list[bool] = []
+    recorder = Recorder(tmp_path / "gone", [], ["bridge-1"])
+    thread = RecordingThread(recorder, lambda _, __, recorded: delivered.append(recorded))
+    pipeline = StandIn(CONFIG)
+    start = run_start(pipeline, 0, 1)
+    thread.put(0, start, pipeline.step(start))
+    thread.close()
+    assert delivered == [False]
