@@ -22,7 +22,7 @@ RNG = np.random.default_rng(2)
     [
         (EQUAL, "bursts", 100e-6),
         (EQUAL - 5e-6 * AGE, "bursts", 100e-6),
-        (EQUAL - 1e-3 * AGE, "spread", 100e-6),
+        (EQUAL - 1e-3 * AGE, "spread", 50e-6),
         (TRUE + RNG.exponential(1e-3, len(TRUE)), "jittery", 50e-6),
         (TRUE + RNG.normal(0.0, 2e-3, len(TRUE)), "jittery", 300e-6),
         (TRUE, "grid", 5e-6),

@@ -73,6 +73,13 @@ def test_a_poll_that_beats_with_the_clock_is_bounded_by_a_period() -> None:
         assert worst < (1e-3 if now < 60.0 else 250e-6)
 
 
+def test_seconds_of_a_busy_gateway_do_not_pull() -> None:
+    t, index, arrival = polled(60.0, 1003.3, 0.020, seed=8)
+    late = arrival + np.where((arrival > 41.0) & (arrival < 46.0), 3e-3, 0.0)  # every burst of five seconds 3 ms late
+    [(_, fit)] = followed((t, index, late), 1000.0, np.array([60.0]))
+    assert np.abs(fit.time_of(index) - t[index]).max() < 150e-6
+
+
 def test_stated_uncertainty_is_of_the_size_of_the_scatter() -> None:
     # 60 independent minutes: the error's own sd, without its mean, within a factor 1.5 of what is stated.
     errors, stated = [], []
