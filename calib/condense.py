@@ -94,10 +94,7 @@ def _segments(window: Window, channels: int) -> Segments:
 def _without_quiet(
     windows: Sequence[Window], segments: list[Segments], quiet: Sequence[Window], channels: int
 ) -> tuple[list[Segments], list[int], Array]:
-    """One block a position with quiet windows, their mean power taken out; the other windows as they are.
-
-    The quiet segments enter with a negative weight, so that the scatter of their sums counts in the uncertainty.
-    """
+    """One block a position with quiet windows, their mean power taken out; the other windows as they are."""
     blocks, first, floors = [], [], []
     positions = dict.fromkeys(w.pose.position for w in windows)
     for position in positions:
@@ -108,11 +105,13 @@ def _without_quiet(
             first += loud
             floors += [np.zeros(2 * channels)] * len(loud)
             continue
-        own, calm_all = _joined([segments[i] for i in loud]), _joined(calm)
-        share = own.count.sum() / calm_all.count.sum()
-        blocks.append(_joined([own, calm_all.scaled(-share)]))
+        own, still = _joined([segments[i] for i in loud]), _joined(calm)
+        n = still.count.sum()
+        xx, xv = still.xx.sum(0) / n, still.xv.sum(0) / n
+        # The calm segments' sum is zero then: they add nothing but the scatter of the mean that is taken.
+        blocks.append(_joined([own.less(xx, xv), still.less(xx, xv, weight=-own.count.sum() / n)]))
         first.append(loud[0])
-        floors.append(QUIET_FACTOR * share * np.diag(calm_all.xx.sum(0)))
+        floors.append(QUIET_FACTOR * own.count.sum() * np.diag(xx))
     return blocks, first, np.array(floors)
 
 

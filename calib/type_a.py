@@ -7,7 +7,7 @@ Residuals are not white (AR(1) 0.99: the true uncertainty is 11 times the white 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -34,11 +34,10 @@ class Segments:
         """All that adds up, in the order of the fields."""
         return self.count, self.xx, self.xv, self.vv, self.total
 
-    def scaled(self, factor: float) -> Segments:
-        """The same segments with another weight."""
-        return Segments(
-            factor * self.count, factor * self.xx, factor * self.xv, factor * self.vv, factor * self.total, self.mean
-        )
+    def less(self, xx: Array, xv: Array, weight: float = 1.0) -> Segments:
+        """`weight` times the same segments, from each of their points these mean x x' and x V' taken."""
+        n = self.count[:, None, None]
+        return replace(self, xx=weight * (self.xx - n * xx), xv=weight * (self.xv - n * xv))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,14 +61,15 @@ def pooled(
 ) -> TypeA:
     """Scatter of the whitened scores over all windows (means) and blocks (slopes, whitened by T = `whiteners`)."""
     slopes = [t.T @ (t @ b.xv.sum(0)) for t, b in zip(whiteners, blocks, strict=True)]
-    noise = _noise(blocks, slopes, roots)
+    own = [(slopes[b], roots[b]) for b in window_block]
+    noise = _noise(windows, own)
     size = roots[0].shape[0]
     slope_scores, mean_scores = [], []
     for block, beta, t in zip(blocks, slopes, whiteners, strict=True):
         score = np.einsum("rc,kci->kri", t, block.xv - block.xx @ beta) / noise
         slope_scores.append(score.reshape(len(score), 3 * size))
-    for window, block_index in zip(windows, window_block, strict=True):
-        score = (window.total[:, -3:] - window.total[:, :-3] @ slopes[block_index]) / noise
+    for window, (beta, _) in zip(windows, own, strict=True):
+        score = (window.total[:, -3:] - window.total[:, :-3] @ beta) / noise
         mean_scores.append(score / np.sqrt(window.count.sum()))
     live = np.repeat([any(r[j, j] > 0.0 for r in roots) for j in range(size)], 3)
     slope_cov, slope_dof = _scatter(slope_scores, live)
@@ -77,16 +77,17 @@ def pooled(
     return TypeA(noise, slope_cov, mean_cov, min(slope_dof, mean_dof))
 
 
-def _noise(blocks: Sequence[Segments], slopes: Sequence[Array], roots: Sequence[Array]) -> Array:
-    power, freedom, signal = np.zeros(3), 0.0, np.zeros(3)
-    for block, beta, root in zip(blocks, slopes, roots, strict=True):
-        total = np.einsum("kii->i", block.vv)
-        signal += total + block.count.sum() * block.mean[-3:] ** 2
-        power += total - np.einsum("ci,ci->i", beta, block.xv.sum(0))
-        freedom += block.count.sum() - 1 - np.count_nonzero(np.diag(root))
-    counts = sum(float(b.count.sum()) for b in blocks)
+def _noise(windows: Sequence[Segments], own: Sequence[tuple[Array, Array]]) -> Array:
+    """SD of the residuals within windows, by each window's (slopes, root)."""
+    left, freedom, signal, counts = np.zeros(3), 0.0, np.zeros(3), 0.0
+    for window, (beta, root) in zip(windows, own, strict=True):
+        xx, xv, vv = window.xx.sum(0), window.xv.sum(0), np.diag(window.vv.sum(0))
+        left += vv - 2.0 * np.einsum("ci,ci->i", beta, xv) + np.einsum("ci,cd,di->i", beta, xx, beta)
+        signal += vv + window.count.sum() * window.mean[-3:] ** 2
+        freedom += window.count.sum() - 1 - np.count_nonzero(np.diag(root))
+        counts += float(window.count.sum())
     floor = NOISE_FLOOR * np.sqrt(signal.max() / counts) or 1.0
-    return np.asarray(np.sqrt(np.maximum(power, 0.0) / max(freedom, 1.0)).clip(min=floor))
+    return np.asarray(np.sqrt(np.maximum(left, 0.0) / max(freedom, 1.0)).clip(min=floor))
 
 
 def _scatter(scores: list[Array], live: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> tuple[Array, float]:
