@@ -26,7 +26,7 @@ WAYS = frozenset({"port", "baud_rate", "bus"})
 class ChannelState:
     """All that is known of one channel; changes with events only.
 
-    A status is UNCALIBRATED (nothing known), COLLECTING (windows used, not all parameters determined), VALID
+    The first status comes with the first news of the sensor. It is UNCALIBRATED (nothing known), COLLECTING (windows used, not all parameters determined), VALID
     (a calibration in force) or INVALID (the sensor is silent or lost).
     """
 
@@ -40,7 +40,7 @@ class ChannelState:
         self._windows: list[Window] = []
         self._in_force: CalibrationUpdate | None = None
         self._kept: CalibrationUpdate | None = None
-        self._status = "UNCALIBRATED"
+        self._status = ""  # nothing said yet
         self._after_s = 0.0  # the schedule is done up to here, seconds since the sensor's first sample
         self._now_ns = 0  # monotonic and UTC of the newest event that carried both
         self._utc_minus_monotonic_ns = 0
