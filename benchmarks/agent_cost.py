@@ -1,0 +1,128 @@
+"""What the live agent costs: CPU against the bare loop that only reads and records, start, memory.
+
+Sensor (1 kHz, three axes) and reference (1 kHz) are served on pseudo-terminals by another process; agent and bare loop
+run one after the other on the same ports, twice.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from agent.reading import RecordingReader
+from benchmarks.page import machine, write_part
+from hw.block import SampleBlock
+
+WARM_UP_S = 6.0  # imports and the first fits are not part of the running cost
+MEASURED_S = 40.0
+CONFIG = """
+[[devices]]
+name = "mems"
+driver = "serial-csv"
+options = {{ port = "{link}-sensor", rate_hz = 1000, axes = 3, sequence = true, unit = "count" }}
+[[devices]]
+name = "reference"
+driver = "serial-csv"
+options = {{ port = "{link}-reference", rate_hz = 1000, axes = 1, sequence = true, unit = "m/s2" }}
+[[channels]]
+sensor = "mems"
+reference = "reference"
+poses_repeat_s = 52
+poses = [
+  {{ start_s = 3, stop_s = 13, theta_deg = 35, alpha_deg = 0 }},
+  {{ start_s = 16, stop_s = 26, theta_deg = 35, alpha_deg = 30 }},
+  {{ start_s = 29, stop_s = 39, theta_deg = 35, alpha_deg = 120 }},
+  {{ start_s = 42, stop_s = 52, theta_deg = 35, alpha_deg = 210 }},
+]
+[zenoh]
+connect = ["tcp/127.0.0.1:7449"]
+"""
+
+
+def cpu_s(pid: int) -> float:
+    """CPU time of a process so far, user and system."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def peak_mb(pid: int) -> float:
+    """Peak resident memory."""
+    line = next(x for x in Path(f"/proc/{pid}/status").read_text().splitlines() if x.startswith("VmHWM"))
+    return int(line.split()[1]) / 1024
+
+
+def measure(command: list[str]) -> tuple[float, float]:
+    """CPU share (s per s) after the warm-up, and peak memory in MB."""
+    process = subprocess.Popen([sys.executable, *command], stdout=subprocess.DEVNULL)
+    try:
+        time.sleep(WARM_UP_S)
+        before, began = cpu_s(process.pid), time.monotonic()
+        time.sleep(MEASURED_S)
+        share = (cpu_s(process.pid) - before) / (time.monotonic() - began)
+        return share, peak_mb(process.pid)
+    finally:
+        process.send_signal(signal.SIGINT)
+        process.wait(20)
+
+
+def first_block_s(config: Path, data_dir: Path) -> float:
+    """From starting the process to the arrival of the first block that is in the recording."""
+    began_ns = time.monotonic_ns()
+    command = [sys.executable, "-m", "agent", "run", str(config), "--data-dir", str(data_dir), "--duration", "3"]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    steps = RecordingReader(next(data_dir.glob("*.mcap"))).steps()
+    first = next(step.event for step in steps if isinstance(step.event, SampleBlock))
+    return (first.t_monotonic_ns - began_ns) * 1e-9
+
+
+def main() -> None:
+    """Measure and write the table."""
+    with tempfile.TemporaryDirectory() as name:
+        directory = Path(name)
+        config = directory / "config.toml"
+        config.write_text(CONFIG.format(link=directory / "port"))
+        serving = [sys.executable, "-m", "agent", "simulate", "--preset", "plain", "--link", str(directory / "port")]
+        twins = subprocess.Popen(serving, stdout=subprocess.DEVNULL)
+        router = subprocess.Popen(
+            [sys.executable, "-m", "agent", "router", "--listen", "tcp/127.0.0.1:7449"], stdout=subprocess.DEVNULL
+        )
+        try:
+            while not (directory / "port-sensor").exists():
+                time.sleep(0.05)
+            starts = sorted(first_block_s(config, directory / f"start{i}") for i in range(5))
+            shares, peaks = {"agent": [], "bare": []}, []
+            for turn in range(2):
+                data = str(directory / f"data{turn}")
+                share, peak = measure(["-m", "agent", "run", str(config), "--data-dir", data])
+                shares["agent"].append(share)
+                peaks.append(peak)
+                share, _ = measure(["-m", "benchmarks.bare_loop", str(config), data + "-bare", "600"])
+                shares["bare"].append(share)
+        finally:
+            for process in (twins, router):
+                process.terminate()
+                process.wait(10)
+    agent, bare = (sum(shares[k]) / len(shares[k]) for k in ("agent", "bare"))
+    write_part(
+        "agent_cost",
+        f"""
+`python -m benchmarks agent_cost` on {machine()}; sensor 1 kHz x 3 and reference 1 kHz on two serial ports (served by
+another process), recorded, windows solved, published to a router; {MEASURED_S:g} s measured after {WARM_UP_S:g} s,
+agent and bare loop in turn, twice.
+
+| figure | measured | goal |
+| --- | --- | --- |
+| CPU of the live agent over that of the bare loop that only reads and records | {agent / bare:.2f} ({agent:.1%} against {bare:.1%} of a core) | 1.3 |
+| from starting the process to the first recorded block, median of {len(starts)} | {starts[len(starts) // 2]:.2f} s | 1.5 s |
+| peak memory of the agent (VmHWM) | {max(peaks):.0f} MB | 130 MB |
+""",
+    )
+
+
+if __name__ == "__main__":
+    main()

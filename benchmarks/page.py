@@ -1,0 +1,30 @@
+"""Keeps docs/performance.md: each benchmark owns the part between its two markers."""
+
+from __future__ import annotations
+
+import os
+import platform
+from pathlib import Path
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "performance.md"
+
+
+def machine() -> str:
+    """What was measured on, in a few words."""
+    model = next(
+        (line.split(":", 1)[1].strip() for line in open("/proc/cpuinfo") if line.startswith("model name")),
+        platform.machine(),
+    )
+    return f"{model}, {os.cpu_count()} cores, Python {platform.python_version()}"
+
+
+def write_part(name: str, text: str) -> None:
+    """Put `text` between the markers of `name`, and print it. Raises ValueError where the page has no such markers."""
+    begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
+    page = PAGE.read_text()
+    if begin not in page or end not in page:
+        raise ValueError(f"{PAGE} has no markers for {name}")
+    head, rest = page.split(begin, 1)
+    tail = rest.split(end, 1)[1]
+    PAGE.write_text(f"{head}{begin}\n{text.strip()}\n{end}{tail}")
+    print(text)
