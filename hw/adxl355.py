@@ -237,7 +237,7 @@ class Adxl355:
 
     def _identify(self) -> int:
         """Check who answers; returns the revision."""
-        found = self._device.read_if_free(chip.DEVID, 4)
+        found = self._device.read(chip.DEVID, 4)
         if found[:3] != chip.IDENTITY:
             raise IdentityError(f"{self._device.name}: expected {chip.IDENTITY.hex(' ')}, found {found[:3].hex(' ')}")
         return found[chip.REVISION]

@@ -52,11 +52,6 @@ class I2CDevice:
             with contextlib.suppress(OSError):
                 bus.close()
 
-    def read_if_free(self, register: int, count: int) -> bytes:
-        """As `read` (up to 32 bytes), but by an SMBus call: the kernel refuses only these while its driver holds the
-        address."""
-        return bytes(self._retry(lambda bus: bus.read_i2c_block_data(self._address, register, count)))
-
     def read(self, register: int, count: int) -> bytes:
         """`count` bytes from `register` on, in one transfer."""
         return self._retry(lambda bus: self._transfer(bus, register, count))
@@ -74,7 +69,8 @@ class I2CDevice:
         return self._retry(stamped)
 
     def write(self, register: int, value: int) -> None:
-        """One byte to a register."""
+        """One byte to a register, as an SMBus call: the kernel refuses these, and only these, while a driver of its own
+        holds the address."""
         self._retry(lambda bus: bus.write_byte_data(self._address, register, value))
 
     def _transfer(self, bus: SMBus, register: int, count: int) -> bytes:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 IDENTITY = bytes([0xAD, 0x1D, 0xED, 0x01])
 FIFO_BYTES = 96 * 3
 EMPTY_ENTRY = b"\x00\x00\x02"
-RESET_S = 0.005  # after a reset the shadow registers are not loaded yet
+RESET_S = 0.005  # so long after a reset the shadow registers are not loaded and settings do not take
 SHADOW = bytes([0x4C, 0x21, 0x9A, 0x05, 0x33])  # trim of this part, any constant does
 STATUS, FIFO_ENTRIES, TEMPERATURE, FIFO_DATA = 0x04, 0x05, 0x06, 0x11
 FIRST_SETTING, LAST_SETTING, POWER_CTL, RESET, RESET_CODE, SHADOW_1 = 0x1E, 0x2E, 0x2D, 0x2F, 0x52, 0x50
@@ -152,6 +152,8 @@ class Adxl355Twin:
     def _set(self, register: int, value: int) -> None:
         if register == RESET and value == RESET_CODE:
             self.power_cycle()
+        elif self._clock() < self._ready_s:
+            return
         elif register == POWER_CTL:
             if self._measuring != (not value & 1):
                 self._fifo.clear()

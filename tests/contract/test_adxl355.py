@@ -137,6 +137,27 @@ class TestAdxl355(SensorContract):
         with pytest.raises(ConfigurationError, match="FILTER is 0x05, not 0x02"):
             rig.sensor.open()
 
+    def test_reset_is_repeated_until_the_trim_is_back(self, rig: Adxl355Rig) -> None:
+        rig.twin.power_cycle()  # just now: the trim that is compared is not loaded yet
+        rig.sensor.open()
+        flags, _ = rig.read()
+        assert flags == BlockFlags.RESTART
+
+    def test_a_part_that_loses_its_trim_is_not_used(self, rig: Adxl355Rig) -> None:
+        class Worn(Adxl355Twin):
+            wear = 0
+
+            def read(self, count: int) -> bytes:
+                data = super().read(count)
+                if self._pointer != 0x55:
+                    return data
+                self.wear += 1
+                return data[:4] + bytes([self.wear])
+
+        rig.bus.targets[0x1D] = Worn(rig.counts, rig.due, lambda: rig.t_s)
+        with pytest.raises(DeviceLost, match="after a reset the shadow registers read .* 0a, not .* 09"):
+            rig.sensor.open()
+
     @pytest.mark.parametrize("number", [errno.ENXIO, errno.EREMOTEIO, errno.EIO, errno.ETIMEDOUT, errno.EAGAIN])
     def test_three_failures_pass_a_fourth_is_a_loss(self, rig: Adxl355Rig, number: int) -> None:
         rig.sensor.open()
