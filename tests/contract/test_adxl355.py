@@ -155,7 +155,7 @@ class TestAdxl355(SensorContract):
                 return data[:4] + bytes([self.wear])
 
         rig.bus.targets[0x1D] = Worn(rig.counts, rig.due, lambda: rig.t_s)
-        with pytest.raises(DeviceLost, match="after a reset the shadow registers read .* 0a, not .* 09"):
+        with pytest.raises(DeviceLost, match=r"after a reset the shadow registers read .* 0a, not .* 09"):
             rig.sensor.open()
 
     @pytest.mark.parametrize("number", [errno.ENXIO, errno.EREMOTEIO, errno.EIO, errno.ETIMEDOUT, errno.EAGAIN])
@@ -243,6 +243,27 @@ class TestAdxl355(SensorContract):
         _, before = rig.read()
         rig.sleep(0.0305)  # the poll that was due meanwhile comes at once
         Stalling.stall_s = 0.01
+        flags, after = rig.read()
+        assert after[0] != before[-1] + 1
+        assert flags == BlockFlags.RESTART | BlockFlags.OVERRUN
+
+    def test_overrun_told_by_a_status_that_got_lost(self, rig: Adxl355Rig) -> None:
+        # STATUS clears by being read, also when the transfer then fails: the full FIFO must tell.
+        class Garbling(Adxl355Twin):
+            garble = False
+
+            def read(self, count: int) -> bytes:
+                data = super().read(count)
+                if self.garble and self._pointer == 0x06:
+                    self.garble = False
+                    raise OSError(errno.EIO, "Input/output error")
+                return data
+
+        twin = rig.bus.targets[0x1D] = Garbling(rig.counts, rig.due, lambda: rig.t_s)
+        rig.sensor.open()
+        _, before = rig.read()
+        rig.sleep(0.0501 + (-rig.t_s) % 0.001)  # no sample is made between the two attempts, which would run over anew
+        twin.garble = True
         flags, after = rig.read()
         assert after[0] != before[-1] + 1
         assert flags == BlockFlags.RESTART | BlockFlags.OVERRUN

@@ -144,9 +144,7 @@ def test_a_silent_device_turns_the_status_invalid_by_tick(tmp_path: Path) -> Non
     assert "no block of imu" in results(data_dir, "status")[-1]["reason"]
 
 
-def test_a_wrong_chip_is_named_and_does_not_stop_the_agent(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_wrong_chip_is_named_and_does_not_stop_the_agent(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     raw = {
         "devices": [{"name": "mems", "driver": "adxl355", "options": {"bus": 1}}],
         "channels": [{"sensor": "mems", "silence_s": 2}],
@@ -181,9 +179,7 @@ FAULTS = [
 
 
 @pytest.mark.parametrize(("old", "new", "named"), FAULTS, ids=[named for _, _, named in FAULTS])
-def test_a_faulty_configuration_is_refused_with_path_and_value(
-    tmp_path: Path, old: str, new: str, named: str
-) -> None:
+def test_a_faulty_configuration_is_refused_with_path_and_value(tmp_path: Path, old: str, new: str, named: str) -> None:
     path = configuration(tmp_path, Path("/dev/ttyUSB0"))
     path.write_text(path.read_text().replace(old, new))
     for command in (["check", path], ["run", path, "--data-dir", tmp_path / "data", "--duration", "5"]):
