@@ -14,6 +14,7 @@ from hw.serial_stream import SerialCsv
 from hw.virtual.live import LiveBench
 from hw.virtual.parameters import BenchParameters
 from hw.virtual.presets import COUNTS_PER_MPS2, faulty, plain
+from hw.virtual.serial_bench import decimals_of
 from hw.virtual.timebase import BenchTime
 
 
@@ -110,6 +111,11 @@ def test_only_an_adxl355_can_be_one() -> None:
     base = plain(1)
     four_g = replace(base, sensor=replace(base.sensor, nominal_sensitivity=COUNTS_PER_MPS2 / 2))
     assert LiveBench(four_g, 1).sensor_options["range_g"] == 4
+
+
+@pytest.mark.parametrize(("resolution", "decimals"), [(1.0, 0), (10.0, 0), (0.5, 1), (0.1, 1), (1e-5, 5), (0.0, 6)])
+def test_decimals_tell_multiples_of_the_resolution_apart(resolution, decimals) -> None:
+    assert decimals_of(resolution) == decimals
 
 
 def test_bench_time_begins_when_told() -> None:

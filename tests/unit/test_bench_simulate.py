@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
+import select
 import signal
 import subprocess
 import sys
+import termios
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -178,6 +181,30 @@ def test_a_recording_is_played_whole_at_its_own_pace_and_the_port_ends_with_it(t
     assert not link.is_symlink()
 
 
+def test_a_reader_that_sets_its_port_up_slowly_and_reads_late_loses_nothing(tmp_path) -> None:
+    path = write(tmp_path, SENSOR)
+    whole = b"# playing\n1,-2.50,3e-1\n4,5,6\n7,8,9\n10,11,12\n"
+    with running("--play", str(path)) as process:
+        assert process.stdout is not None
+        port = os.open(process.stdout.readline().strip(), os.O_RDWR | os.O_NOCTTY)
+        try:
+            assert select.select([port], [], [], 0.1) == ([], [], []), "it must wait for the port to be set up"
+            termios.tcflush(port, termios.TCIFLUSH)  # as pyserial does at the end of opening
+            deadline = time.monotonic() + 5
+            while _waiting(port) < len(whole) and time.monotonic() < deadline:
+                select.select([], [], [], 0.01)
+            with pytest.raises(subprocess.TimeoutExpired):  # it lingers: a hang-up would throw the text away
+                process.wait(timeout=0.3)
+            assert os.read(port, 1000) == whole
+            assert process.wait(timeout=5) == 0
+        finally:
+            os.close(port)
+
+
+def _waiting(port: int) -> int:
+    return int.from_bytes(fcntl.ioctl(port, termios.FIONREAD, bytes(4)), sys.byteorder)
+
+
 def test_a_bench_serves_both_devices_from_one_zero_until_interrupted(tmp_path) -> None:
     with running("--preset", "plain", "--seed", "4", "--link", str(tmp_path / "bench")) as process:
         assert process.stdout is not None
@@ -187,7 +214,11 @@ def test_a_bench_serves_both_devices_from_one_zero_until_interrupted(tmp_path) -
             ["reference", f"{tmp_path}/bench-reference"],
         ]
         with serial.Serial(shown[1][1], timeout=5) as reference, serial.Serial(shown[0][1], timeout=5) as sensor:
-            received = [[port.readline() for _ in range(301)] for port in (sensor, reference)]
+            received = [[sensor.readline()], [reference.readline()]]
+            start = time.monotonic()
+            for lines, port in zip(received, (sensor, reference), strict=True):
+                lines += [port.readline() for _ in range(300)]
+            assert time.monotonic() - start == pytest.approx(0.3, abs=0.15)  # from the zero on, at 1 kHz
         process.send_signal(signal.SIGINT)
         assert process.wait(timeout=5) == 0
     bench = Bench(PRESETS["plain"](4), 4)
