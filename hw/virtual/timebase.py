@@ -40,10 +40,10 @@ class Clock:
     def due(self, t_s: Array | float) -> IntArray:
         """How many samples exist at `t_s`: those taken at or before it."""
         t = np.asarray(t_s, dtype=float)
-        ticks = (t - self.offset_s) * self.rate_hz
-        for _ in range(5):  # the wander is below 1e-2, each turn gains two digits or more
-            ticks = (t - self.offset_s - self._wander_s(ticks / self.rate_hz)) * self.rate_hz
-        count = np.floor(ticks).astype(np.int64) + 1
+        nominal = t - self.offset_s
+        for _ in range(3 if self.wander else 0):  # each turn gains a factor of the wander, 1e-3 at most
+            nominal = t - self.offset_s - self._wander_s(nominal)
+        count = np.floor(nominal * self.rate_hz).astype(np.int64) + 1
         # rounding in the inverse must not contradict times()
         count -= self._time(count - 1) > t
         count += self._time(count) <= t
@@ -53,7 +53,9 @@ class Clock:
         nominal = index / self.rate_hz
         return self.offset_s + nominal + self._wander_s(nominal)
 
-    def _wander_s(self, nominal_s: Array) -> Array:
+    def _wander_s(self, nominal_s: Array) -> Array | float:
+        if not self.wander:
+            return 0.0
         turn = 2 * np.pi / self.wander_period_s
         return self.wander / turn * np.sin(turn * nominal_s)
 
