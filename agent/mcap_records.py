@@ -150,13 +150,13 @@ def walk(file: BinaryIO, size: int) -> Iterator[Record]:
         if len(head) < _HEAD.size or not any(head):  # some file systems fill with zeros what they lost
             raise _ended(file, size, offset, "end of file", "no record follows")
         opcode, length = _HEAD.unpack(head)
-        name = record_name(opcode)
         if opcode not in _KNOWN:
-            raise RecordError("corrupt", offset, name, "no such kind of record")
+            raise RecordError("corrupt", offset, record_name(opcode), "no such kind of record")
         if length > size - offset - _HEAD.size:
-            raise _ended(file, size, offset, name, f"its {length} bytes reach beyond the end of the file")
+            reason = f"its {length} bytes reach beyond the end of the file"
+            raise _ended(file, size, offset, record_name(opcode), reason)
         if length > RECORD_LIMIT:
-            raise RecordError("corrupt", offset, name, f"{length} bytes, more than {RECORD_LIMIT}")
+            raise RecordError("corrupt", offset, record_name(opcode), f"{length} bytes, more than {RECORD_LIMIT}")
         yield Record(offset, opcode, file.read(length))
         offset += _HEAD.size + length
     if file.read(len(MAGIC)) != MAGIC:
