@@ -210,11 +210,7 @@ def _fault_lines(error: ValidationError) -> list[str]:
         path = ".".join(str(part) for part in fault["loc"])
         value = fault.get("input")
         # A whole section as "the offending value" would bury the message.
-        shown = (
-            ""
-            if isinstance(value, (dict, BaseModel, list, tuple)) or fault["type"] == "missing"
-            else f", not {value!r}"
-        )
+        shown = "" if isinstance(value, (dict, BaseModel, list, tuple)) or fault["type"] == "missing" else f", not {value!r}"
         message = fault["msg"].removeprefix("Value error, ")
         lines.append(f"{path}: {message}{shown}" if path else message)
     return lines

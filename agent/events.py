@@ -79,7 +79,7 @@ class Tick(msgspec.Struct, frozen=True, kw_only=True):
     t_utc_ns: int
 
 
-Event = RunStart | SampleBlock | DeviceChange | Gap | Tick
+Event = RunStart | SampleBlock | PoseChange | ReferenceChange | DeviceChange | Gap | Tick
 
 
 class WindowReport(msgspec.Struct, frozen=True, kw_only=True):
