@@ -217,6 +217,8 @@ def refused_by_a_hair(report: WindowReport) -> WindowReport:
 class OnTheEdge(StandIn):
     """The stand-in, whose windows of the first file are used by a hair."""
 
+    first_file = False
+
     @classmethod
     def restore(cls, config_json: str, snapshot: bytes) -> OnTheEdge:
         pipeline = super().restore(config_json, snapshot)

@@ -139,7 +139,7 @@ def test_message_indexes_are_held_against_the_chunk(recording: bytes) -> None:
 def test_files_without_sums_or_indexes_are_refused() -> None:
     for options in ({"enable_data_crcs": False}, {"enable_crcs": False}, {"index_types": IndexType.NONE}):
         out = io.BytesIO()
-        writer = Writer(out, **({"enable_data_crcs": True} | options))  # type: ignore[arg-type]
+        writer = Writer(out, **({"enable_data_crcs": True} | options))
         writer.start()
         schema = writer.register_schema("fieldcal.v1.Event", "protobuf", schema_data("fieldcal.v1.Event"))
         writer.add_message(writer.register_channel("/events", "protobuf", schema), 0, b"", 0)

@@ -109,17 +109,25 @@ def test_calibration_comes_back_as_it_was(numbers: list[float], cells: st.DataOb
 
 
 def test_calibration_scalars_have_the_papers_names() -> None:
-    sensitivity = [[11.0, 12.0, 13.0], [21.0, 22.0, 23.0], [31.0, 32.0, 33.0]]
-    values = {
-        "sensitivity": sensitivity,
-        "offset": [1.0, 2.0, 3.0],
-        "standard_uncertainty": [float(k) for k in range(12)],
-        "covariance": [[0.0] * 12] * 12,
-        "residual_sd": [4.0, 5.0, 6.0],
-    }
-    blank: dict[type, Any] = {str: "", int: 0, float: 0.0, list[bool]: [True] * 12}
-    rest = {name: blank[hint] for name, hint in field_types(CalibrationUpdate).items() if name not in values}
-    message = pb.Calibration.FromString(encode(0, CalibrationUpdate(**values, **rest)))
+    update = CalibrationUpdate(
+        run_id="",
+        sequence=0,
+        sensor="",
+        t_utc_ns=0,
+        sensitivity=[[11.0, 12.0, 13.0], [21.0, 22.0, 23.0], [31.0, 32.0, 33.0]],
+        offset=[1.0, 2.0, 3.0],
+        standard_uncertainty=[float(k) for k in range(12)],
+        covariance=[[0.0] * 12] * 12,
+        coverage_factor=2.0,
+        determined=[True] * 12,
+        method="",
+        uncertainty_kind="",
+        windows=0,
+        residual_sd=[4.0, 5.0, 6.0],
+        output_unit="",
+        identity="",
+    )
+    message = pb.Calibration.FromString(encode(0, update))
     assert (message.sxy, message.syx, message.szz, message.qx, message.qz) == (12.0, 21.0, 33.0, 1.0, 3.0)
     assert (message.u_sxx, message.u_sxy, message.u_qz, message.residual_sd_y) == (0.0, 1.0, 11.0, 5.0)
 
@@ -149,7 +157,7 @@ def test_blocks_come_back_as_they_were(
     rng = np.random.default_rng(seed)
     indications = rng.integers(-(2**31), 2**31, (n, axes), dtype=np.int32)
     if decimal:  # any bits at all, NaN with payload among them
-        indications = rng.integers(0, 2**64, (n, axes), dtype=np.uint64).view(np.float64)  # type: ignore[assignment]
+        indications = rng.integers(0, 2**64, (n, axes), dtype=np.uint64).view(np.float64)
     if transposed:
         indications = np.asfortranarray(indications)
     counts = np.array([n // 2, n], np.int32)
@@ -187,7 +195,7 @@ def test_a_schema_alone_decodes_its_messages(name: str) -> None:
     kind = message_factory.GetMessageClass(pool.FindMessageTypeByName(f"fieldcal.v1.{name}"))
     fields = {field.name: field.number for field in kind.DESCRIPTOR.fields}
     assert fields == {field.name: field.number for field in getattr(pb, name).DESCRIPTOR.fields}
-    assert pool.FindFileByName("agent/proto/fieldcal.proto").message_types_by_name.keys() == [name]
+    assert list(pool.FindFileByName("agent/proto/fieldcal.proto").message_types_by_name) == [name]
 
 
 @given(name=st.sampled_from(["Event", "RawBlock", "Window", "Calibration", "Status"]), data=st.binary(max_size=200))
@@ -217,7 +225,7 @@ def test_what_is_no_event_or_result_is_refused(name: str, message: Any) -> None:
 
 
 def test_indications_of_another_type_are_refused() -> None:
-    odd = SampleBlock("d", "b", 0, 0, 1.0, np.zeros(1, np.int64), np.ones(1, np.int32), np.ones((1, 3), np.int16))
+    odd = SampleBlock("d", "b", 0, 0, 1.0, np.zeros(1, np.int64), np.ones(1, np.int32), np.ones((1, 3), np.int16))  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="int16"):
         encode(0, odd)
 
