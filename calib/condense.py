@@ -16,8 +16,8 @@ from calib.model import Array, Window
 from calib.type_a import Segments, TypeA, pooled
 
 PIVOT_FLOOR = 1e-9  # of a channel's own power; what is left after the channels before it is rounding below that
-# Part of the strongest channel's power below which a direction counts as not excited: 1 % of its amplitude, where noise
-# of a reference 60 dB down would else be taken for motion that the sensor does not feel.
+# Part of the strongest channel's power below which a direction counts as not excited: 1 % of its amplitude, where the
+# noise of a reference would else be taken for motion that the sensor does not feel.
 EXCITED = 1e-4
 QUIET_FACTOR = 1.0  # a channel's power without the quiet power must exceed the quiet power, else it is noise of noise
 

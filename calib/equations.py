@@ -3,7 +3,7 @@
 For output axis i, with D and G of the pose (calib.nuisances) and S_i a row of S,
 
     slope on u      S_i D (1 - (lag_i^2 omega^2 + c_s^2 / omega^2) / 2)
-    slope on du/dt  S_i D (-lag_i - c_r / omega^2 + c_s / omega^2)
+    slope on du/dt  S_i D (-lag_i - c_r / omega^2 + c_s / omega^2) + S_i D' / omega
     mean of V       S_i (D mean(u) + G) + Q_i - lag_i S_i D mean(du/dt) + offset of the position
 
 The terms in omega^2 = <du^2> / <u^2> are the projections of d2u/dt2 and of the integral of u (a first-order corner c_r
@@ -93,7 +93,11 @@ class Equations:
         on_u = 1.0 - 0.5 * (inputs.lag_s**2 * omega2 + c**2 * inverse)  # (B, 3)
         on_du = -inputs.lag_s + (c - inputs.reference_corner) * inverse
         ideal = np.einsum("ik,bkm->bim", S, D)
-        slopes = np.concatenate([ideal * on_u[..., None], ideal * on_du[..., None]], axis=2)  # (B, 3, 2M)
+        per_omega = np.sqrt(inverse)
+        across = inputs.quadrature[self.pose_of_block] * per_omega  # (B, 3), felt by the first channel's du/dt
+        on_rate = ideal * on_du[..., None]
+        on_rate[:, :, :1] += (across @ S.T)[..., None]
+        slopes = np.concatenate([ideal * on_u[..., None], on_rate], axis=2)  # (B, 3, 2M)
         residual = data.slopes - np.einsum("brc,bic->bri", data.root, slopes)
 
         nuisances = self.nuisances
@@ -101,16 +105,16 @@ class Equations:
         d_on_u = -inputs.lag_s[:, None] * omega2[..., None] * nuisances.lag.T
         d_on_u = d_on_u - c * inverse[..., None] * nuisances.sensor_corner
         d_on_du = -nuisances.lag.T + inverse[..., None] * (nuisances.sensor_corner - nuisances.reference_corner)
+        d_on_rate = d_ideal * on_du[..., None, None] + ideal[..., None] * d_on_du[:, :, None, :]
+        d_across = inputs.d_quadrature[:, self.pose_of_block] * per_omega
+        d_on_rate[:, :, :1] += np.einsum("ik,jbk->bij", S, d_across)[:, :, None]
         d_z = np.concatenate(
-            [
-                d_ideal * on_u[..., None, None] + ideal[..., None] * d_on_u[:, :, None, :],
-                d_ideal * on_du[..., None, None] + ideal[..., None] * d_on_du[:, :, None, :],
-            ],
-            axis=2,
+            [d_ideal * on_u[..., None, None] + ideal[..., None] * d_on_u[:, :, None, :], d_on_rate], axis=2
         )
         n = 12 + len(nuisances)
         jacobian = np.zeros((*data.slopes.shape, n))  # (B, 2M, 3, N)
         per_row = np.concatenate([D[:, None] * on_u[..., None, None], D[:, None] * on_du[..., None, None]], axis=3)
+        per_row[:, :, :, D.shape[2] : D.shape[2] + 1] += across[:, None, :, None]
         for i in range(3):
             jacobian[:, :, i, 3 * i : 3 * i + 3] = np.einsum("brc,bkc->brk", data.root, per_row[:, i])
         jacobian[..., 12:] = np.einsum("brc,bicj->brij", data.root, d_z)

@@ -4,9 +4,11 @@ An error of a pose is a small rotation of the sensor's whole surroundings: direc
 pair. Alpha turns it about the sensor's z axis, theta about the horizontal normal of the motion (Eqs. 9-11). The input
 acceleration in the sensor's frame is then, P poses and M reference channels,
 
-    a(t) = D u(t - lag) + G        D = R(turn) (D0 + t L) / (1 + r)        G = R(turn') G0 (1 + dg / |G0|)
+    a(t) = D u(t - lag) + D' u'(t) / omega + G
+    D = R(turn) (D0 + t L) / (1 + r)        D' = R(turn) q L        G = R(turn') G0 (1 + dg / |G0|)
 
-t being motion along L that a uniaxial reference does not see and r the reference's relative error.
+t and q being motion along L that a uniaxial reference does not see, in phase with the motion and 90 deg ahead of it (a
+table that rocks does both), and r the reference's relative error.
 """
 
 from __future__ import annotations
@@ -71,8 +73,8 @@ class Applied:
 class Term:
     """One nuisance: its name, the source it belongs to in a budget, and per unit of it what it moves.
 
-    Turns (P, 3) in rad, `transverse` (P, 3), `reference` (M,), `gravity` in m/s2, `offset` (P, 3) in m/s2, `lag` (3,)
-    in s, corners in rad/s. None moves nothing. `applied` is added when the value is reported.
+    Turns (P, 3) in rad, `transverse` and `quadrature` (P, 3), `reference` (M,), `gravity` in m/s2, `offset` (P, 3) in
+    m/s2, `lag` (3,) in s, corners in rad/s. None moves nothing. `applied` is added when the value is reported.
     """
 
     name: str
@@ -82,6 +84,7 @@ class Term:
     turn_direction: Array | None = None
     turn_gravity: Array | None = None
     transverse: Array | None = None
+    quadrature: Array | None = None
     reference: Array | None = None
     gravity: Array | None = None
     offset: Array | None = None
@@ -95,16 +98,18 @@ class Term:
 class Inputs:
     """Input accelerations at one value of the J nuisances and their derivatives with respect to each.
 
-    `direction` (P, 3, M), `gravity` (P, 3), `lag_s` (3,), `reference_corner` and `sensor_corner` in rad/s; `d_...` the
-    same with J in front.
+    `direction` (P, 3, M), `quadrature` (P, 3), `gravity` (P, 3), `lag_s` (3,), `reference_corner` and `sensor_corner`
+    in rad/s; `d_...` the same with J in front.
     """
 
     direction: Array
+    quadrature: Array
     gravity: Array
     lag_s: Array
     reference_corner: float
     sensor_corner: float
     d_direction: Array
+    d_quadrature: Array
     d_gravity: Array
 
 
@@ -122,6 +127,7 @@ class Nuisances:
         self._turn_direction = self._stacked("turn_direction", (n, 3))
         self._turn_gravity = self._stacked("turn_gravity", (n, 3))
         self._transverse = self._stacked("transverse", (n, 3))
+        self._quadrature = self._stacked("quadrature", (n, 3))
         self._reference = self._stacked("reference", (channels,))
         self._gravity = self._stacked("gravity", (1,))
         self.offset = self._stacked("offset", (n, 3))
@@ -153,6 +159,8 @@ class Nuisances:
         d_direction -= direction * (self._reference / scale)[:, None, None, :]
         if sideways.shape[2]:
             d_direction[..., 0] += np.einsum("pik,jpk->jpi", turn, self._transverse) / scale[0]
+        # Second order in the turn and the quadrature is left out: 1 % of 0.2 deg.
+        d_quadrature = np.einsum("pik,jpk->jpi", turn, self._quadrature)
         stretch = 1.0 + np.einsum("j,jo->o", z, self._gravity) / self._magnitude
         unstretched = np.einsum("pik,pk->pi", rotations(np.einsum("j,jpk->pk", z, self._turn_gravity)), self.gravity)
         gravity = unstretched * stretch[:, None]
@@ -161,11 +169,13 @@ class Nuisances:
         )
         return Inputs(
             direction,
+            np.einsum("jpk,j->pk", d_quadrature, z),
             gravity,
             z @ self.lag,
             float(z @ self.reference_corner),
             float(z @ self.sensor_corner),
             d_direction,
+            d_quadrature,
             d_gravity,
         )
 
@@ -268,14 +278,18 @@ def _slide_terms(poses: Sequence[Pose], priors: Priors) -> Iterator[Term]:
             free.append(p)
     for name, way in (("lateral", lateral), ("vertical", vertical)):
         if way.any():
-            yield Term(f"transverse_{name}", "transverse motion", "1", priors.transverse, transverse=way)
+            yield from _across(f"transverse_{name}", priors.transverse, way)
     for p in free:
         for name, k in zip("ab", np.linalg.svd(poses[p].direction)[0].T[1:], strict=True):
-            label, way = f"transverse_{name}[{poses[p].position}]", _only(poses, p, k)
-            yield Term(label, "transverse motion", "1", priors.transverse, transverse=way)
+            yield from _across(f"transverse_{name}[{poses[p].position}]", priors.transverse, _only(poses, p, k))
     for name, axis in (("pitch", lateral), ("roll", along)):
         if axis.any():
             yield Term(f"tilt_{name}", "tilt", "rad", priors.tilt_rad, turn_gravity=axis)
+
+
+def _across(name: str, uncertainty: float, way: Array) -> Iterator[Term]:
+    yield Term(name, "transverse motion", "1", uncertainty, transverse=way)
+    yield Term(f"{name}_quadrature", "transverse motion", "1", uncertainty, quadrature=way)
 
 
 def _slide_frame(pose: Pose) -> tuple[Array, Array, Array] | None:
