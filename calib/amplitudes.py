@@ -159,7 +159,7 @@ def combine(
     nuisances = Nuisances(_positions(found)[0], 1, priors, Applied())
     contributions = propagate(_response(_filled(S), found, readings), nuisances)
     u_frequency = float(np.max([r.u_frequency_hz / r.frequency_hz for r in found]))
-    contributions["frequency"] = Contribution("frequency", -u_frequency * _padded(S))  # Eq. (12)
+    contributions[f"frequency, method {method}"] = Contribution("frequency", -u_frequency * _padded(S))  # Eq. (12)
     contributions |= unseen or {}
     statement = Statement(contributions, _padded(u_a), _padded(freedom))
     determined = np.sqrt(np.diag(statement.covariance)) <= DETERMINED_U * np.nanmax(np.abs(np.diag(S)))

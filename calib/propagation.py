@@ -41,7 +41,7 @@ class Statement:
     @property
     def covariance(self) -> Array:
         """(12, 12) combined."""
-        return _outer_sum([c.change for c in self.contributions.values()]) + np.diag(self.u_type_a**2)
+        return joint_covariance([self])
 
     @property
     def by_source(self) -> dict[str, Array]:
@@ -76,26 +76,21 @@ def propagate(response: Response, nuisances: Nuisances) -> dict[str, Contributio
     return found
 
 
-def difference_covariance(one: Statement, other: Statement, shared: Sequence[str]) -> Array:
-    """(12, 12) covariance of the difference of two methods' results.
+def joint_covariance(statements: Sequence[Statement]) -> Array:
+    """(12 M, 12 M) covariance of the results of M methods: of their differences, what they share cancels.
 
-    Nuisances of a source in `shared` are the same quantity in both where their names agree (one reference, one clamp),
-    and partly cancel; the others are independent.
+    Nuisances of one name are one quantity (one reference, one clamp, one mounting: names carry the position).
     """
-    changes = []
-    for name in {**one.contributions, **other.contributions}:
-        a, b = one.contributions.get(name), other.contributions.get(name)
-        if a is not None and b is not None and a.source in shared:
-            changes.append(a.change - b.change)
-        else:
-            changes += [c.change for c in (a, b) if c is not None]
-    return _outer_sum(changes) + np.diag(one.u_type_a**2 + other.u_type_a**2)
+    none = np.zeros(12)
+    names = list(dict.fromkeys(name for s in statements for name in s.contributions))
+    changes = [
+        np.concatenate([s.contributions[name].change if name in s.contributions else none for s in statements])
+        for name in names
+    ]
+    type_a = np.concatenate([s.u_type_a for s in statements])
+    stacked = np.array(changes)
+    return np.asarray(np.einsum("si,sj->ij", stacked, stacked) + np.diag(type_a**2))
 
 
 def _offset(nuisances: Nuisances, z: Array) -> Array:
     return np.asarray(np.einsum("j,jpk->pk", z, nuisances.offset))
-
-
-def _outer_sum(changes: Sequence[Array]) -> Array:
-    stacked = np.array(changes).reshape(-1, 12)
-    return np.asarray(np.einsum("si,sj->ij", stacked, stacked))
