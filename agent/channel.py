@@ -13,7 +13,7 @@ from agent.config import Channel
 from agent.events import CalibrationUpdate, DeviceChange, Result, StatusChange, Tick, WindowReport
 from agent.schedule import Piece, pieces
 from agent.stream import DeviceStream
-from agent.windows import MARGIN_S, make_window, window_of, window_state
+from agent.windows import MARGIN_S, window_of, window_state, windows_in
 from calib.method3 import Fit, fit
 from calib.model import PARAMETERS, Window
 from hw.block import SampleBlock
@@ -149,12 +149,13 @@ class ChannelState:
         first_s = self._streams[self.sensor].first_sample_s
         while self._piece is not None and first_s is not None and self._due(self._piece, first_s):
             piece = self._piece
-            window = make_window(piece, first_s, self._channel, self._streams)
-            yield self._report(piece, window)
+            windows = windows_in(piece, first_s, self._channel, self._streams)
             self._after_s = piece.stop_s
             self._piece = next(self._upcoming, None)
-            if window.used:
-                self._windows = [*self._windows, window][-self._channel.windows :]
+            yield from (self._report(window) for window in windows)
+            used = [window for window in windows if window.used]
+            if used:
+                self._windows = [*self._windows, *used][-self._channel.windows :]
                 yield from self._solve()
         keep_from_s = self._now_s() - MARGIN_S
         if self._piece is not None and first_s is not None:
@@ -172,10 +173,10 @@ class ChannelState:
         newest = [stream.newest_s() for stream in self._streams.values()]
         return all(t is not None and t >= end_s for t in newest)
 
-    def _report(self, piece: Piece, window: Window) -> WindowReport:
+    def _report(self, window: Window) -> WindowReport:
         return WindowReport(
             run_id="", sequence=0, sensor=self.sensor, t_utc_ns=self._utc_ns(),
-            start_s=piece.start_s, stop_s=piece.stop_s, position=piece.pose.position, used=window.used,
+            start_s=window.start_s, stop_s=window.stop_s, position=window.pose.position, used=window.used,
             reason=window.reason, points=window.points, left_out=window.left_out, numbers=dict(window.numbers),
         )  # fmt: skip
 

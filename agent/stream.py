@@ -9,19 +9,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.timing import ClockModel
+from calib.timing import ClockFit, ClockModel
 from hw.block import BlockFlags, SampleBlock
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cut:
-    """Samples between two times: their times in seconds, their indications, and what is wrong with them."""
+    """Samples between two times, one after the other without a hole: what is missing is NaN.
+
+    `indications` (n, C) from sample `first_index` on; `clock` says when each was taken.
+    """
 
     first_index: int
-    time_s: NDArray[np.float64]
     indications: NDArray[np.float64]
-    gap: bool
+    clock: ClockFit
     saturated: bool
+
+    @property
+    def time_s(self) -> NDArray[np.float64]:
+        """(n,) in seconds since the run's origin."""
+        return self.clock.time_of(self.first_index + np.arange(len(self.indications)))
 
 
 class DeviceStream:
@@ -66,20 +73,19 @@ class DeviceStream:
         if not self._blocks or self._clock is None:
             return None
         clock = self._clock.result()
-        index = np.concatenate([block.first_index + np.arange(block.n) for block in self._blocks])
-        time_s = clock.time_of(index)
-        lo, hi = (int(i) for i in np.searchsorted(time_s, (start_s, stop_s)))
-        if hi <= lo:
+        first, stop = (int(np.ceil(i)) for i in clock.index_of(np.array([start_s, stop_s])))
+        first = max(first, self._blocks[0].first_index)
+        stop = min(stop, self._blocks[-1].first_index + self._blocks[-1].n)
+        if stop <= first:
             return None
-        values = np.concatenate([block.indications for block in self._blocks]).astype(np.float64)
-        flags = np.concatenate([np.full(block.n, int(block.flags)) for block in self._blocks])[lo:hi]
-        return Cut(
-            first_index=int(index[lo]),
-            time_s=time_s[lo:hi],
-            indications=values[lo:hi],
-            gap=bool(index[hi - 1] - index[lo] != hi - 1 - lo),
-            saturated=bool(np.any(flags & int(BlockFlags.SATURATED))),
-        )
+        held = np.full((stop - first, self._blocks[0].indications.shape[1]), np.nan)
+        saturated = False
+        for block in self._blocks:
+            a, b = max(first, block.first_index), min(stop, block.first_index + block.n)
+            if a < b:
+                held[a - first : b - first] = block.indications[a - block.first_index : b - block.first_index]
+                saturated |= bool(block.flags & BlockFlags.SATURATED)
+        return Cut(first, held, clock, saturated)
 
     def forget_before(self, time_s: float) -> None:
         """Drop whole blocks that ended before `time_s` (by arrival, which is never early)."""

@@ -2,29 +2,70 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from agent.config import Channel
 from agent.schedule import Piece
-from agent.stream import DeviceStream
+from agent.stream import Cut, DeviceStream
+from calib.excitation import Points, motion_windows, rest_window
 from calib.model import Pose, Window, WindowSums
-from calib.sums import window_sums
+from calib.resampling import differentiate, resample
 
+# Reference samples beyond a window's ends: half the taps of resampling, and of differentiating at 100 Hz and above.
 MARGIN_S = 0.5
 
 
-def make_window(piece: Piece, first_s: float, channel: Channel, streams: dict[str, DeviceStream]) -> Window:
+def windows_in(piece: Piece, first_s: float, channel: Channel, streams: dict[str, DeviceStream]) -> list[Window]:
+    """The windows of a stretch in one pose, each with its verdict; one unused window where there is nothing to judge.
+
+    `first_s` is the time of the sensor's first sample; the windows' times count from it.
+    """
     start_s, stop_s = first_s + piece.start_s, first_s + piece.stop_s
     cut = streams[channel.sensor].cut(start_s, stop_s)
+    if cut is None:
+        return [_refused(piece, f"no samples of {channel.sensor}")]
+    if channel.reference is None:
+        found = _rest(piece, cut)
+    else:
+        reference = streams[channel.reference].cut(start_s - MARGIN_S, stop_s + MARGIN_S)
+        if reference is None:
+            return [_refused(piece, f"no samples of the reference {channel.reference}")]
+        found = _motion(piece, cut, reference, channel)
+    if not found:
+        return [_refused(piece, "the samples of sensor and reference do not meet")]
+    if cut.saturated:
+        found = [replace(w, used=False, reason=w.reason or "the sensor was at the end of its range") for w in found]
+    return [replace(w, start_s=w.start_s - first_s, stop_s=w.stop_s - first_s) for w in found]
+
+
+def _rest(piece: Piece, cut: Cut) -> list[Window]:
+    whole = np.isfinite(cut.indications).all(axis=1)
+    if whole.sum() < 2:
+        return []
+    return [rest_window(piece.pose, cut.time_s[whole], cut.indications[whole], leave_out=False)]
+
+
+def _motion(piece: Piece, cut: Cut, reference: Cut, channel: Channel) -> list[Window]:
+    u, margin = reference.indications / channel.reference_sensitivity, 0
+    if channel.reference_quantity == "velocity":
+        u, margin = differentiate(u, reference.clock.rate_hz)
+    time_s = cut.time_s
+    at = resample(u, reference.clock, time_s, reference.first_index, margin)
+    usable = at.usable & np.isfinite(at.u).all(axis=1) & np.isfinite(cut.indications).all(axis=1)
+    if usable.sum() < 2:
+        return []
+    points = Points(time_s[usable], cut.indications[usable], at.u[usable], at.du[usable])
+    # Method 3 as printed takes all points of a window.
+    return motion_windows(piece.pose, points, leave_out=False)
+
+
+def _refused(piece: Piece, reason: str) -> Window:
     m = piece.pose.direction.shape[1]
-    u = np.zeros((len(cut.time_s), m))
-    if m:
-        ref = streams[channel.reference].cut(start_s - MARGIN_S, stop_s + MARGIN_S)
-        u = np.interp(cut.time_s, ref.time_s, ref.indications[:, 0])[:, None]
-    sums = window_sums(u, np.zeros_like(u), cut.indications, [0, len(u)])
-    return Window(piece.start_s, piece.stop_s, piece.pose, sums, True, "", len(u), 0)
+    nothing = WindowSums(m, np.zeros(0), np.zeros((0, 2 * m + 3)), np.zeros((0, 2 * m + 3, 2 * m + 3)))
+    return Window(piece.start_s, piece.stop_s, piece.pose, nothing, False, reason, 0, 0)
 
 
 def window_state(window: Window) -> dict[str, Any]:
