@@ -24,8 +24,8 @@ def solve(
     S_ii = V_i / (a_ref d_i), d the pose's direction, the mean over runs and their cycles; axes with less than
     `LEAST_SHARE` of the motion in a run are not taken from it. Transverse sensitivities are not seen: each is taken to
     lie anywhere within +- `transverse_limit_pct` of the main one of its row (what the paper has verified by Method 1,
-    see `calib.statistics.transverse_excess`), and is in the uncertainty with that. Two alphas 90 deg apart (45 and 135)
-    take S_xy and S_yx out. Raises ValueError where a run carries no sine or no axis is excited.
+    see `calib.statistics.transverse_excess`), and is in the uncertainty with that. Of the mean of two alphas,
+    45 and 135 deg, only S_xz and S_zx are left. Raises ValueError where a run carries no sine or no axis is excited.
     """
     if not runs:
         raise ValueError("Method 2 needs at least one run")

@@ -18,8 +18,8 @@ from calib.model import Array
 ComplexArray = NDArray[np.complex128]
 
 # Frequencies tried about the highest FFT line, in lines: at one cycle the line is off by up to one (constant and
-# negative frequency leak into it); steps of an eighth leave the quadratic bottom of the residual to Gauss-Newton.
-SCAN_LINES = np.arange(-8, 9) / 8
+# negative frequency leak into it); from an eighth of a line away Gauss-Newton finds the bottom.
+SCAN_LINES = np.arange(-4, 5) / 4
 LEAST_LINES = 0.3  # below a third of a cycle a sine is a parabola, its amplitude is anybody's guess
 MAX_STEPS = 50
 LONGEST_STEP_LINES = 0.25

@@ -1,0 +1,137 @@
+"""Method 1 on signals made here by hand."""
+
+from __future__ import annotations
+
+from math import pi, radians
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from calib import method1
+from calib.amplitudes import Run
+from calib.geometry import along, clamp, on_axis
+from calib.model import Pose
+from calib.nuisances import Priors
+
+S_TRUE = np.array([[1.02, 0.03, -0.02], [0.015, 0.98, 0.025], [-0.03, 0.02, -1.01]])  # z with its polarity turned
+G = 9.81
+F = 3.0
+
+
+def run(
+    pose: Pose,
+    *,
+    amplitude: float = 10.0,
+    lag_s: float = 0.0,
+    velocity: bool = False,
+    noise: float = 0.0,
+    rng: np.random.Generator | None = None,
+    sideways: complex = 0.0,
+    n: int = 2000,
+) -> Run:
+    """V = S a + Q for a sine along the pose; `sideways` is motion along the axis after the first excited one."""
+    t = 20.0 + np.arange(n) / 1000.0
+    omega = 2 * pi * F
+    turning = np.exp(1j * omega * t)
+    direction = pose.direction[:, 0] + sideways * np.roll(pose.direction[:, 0], 1)
+    a = (amplitude * (turning * np.exp(-1j * omega * lag_s))[:, None] * direction).real
+    v = a @ S_TRUE.T + [0.3, -0.1, G]
+    if noise:
+        assert rng is not None
+        v = v + noise * rng.normal(size=v.shape)
+    reference = (amplitude / (1j * omega) * turning).real if velocity else amplitude * turning.real
+    return Run(t, reference, v, pose, "velocity" if velocity else "acceleration")
+
+
+def each_axis(**options: object) -> list[Run]:
+    return [run(on_axis(axis), **options) for axis in "xyz"]  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("velocity", [False, True])
+@pytest.mark.parametrize("lag_s", [0.0, 0.004])
+def test_columns_are_amplitudes_over_amplitude_whatever_the_lag(velocity: bool, lag_s: float) -> None:
+    result = method1.solve(each_axis(velocity=velocity, lag_s=lag_s))
+    assert_allclose(result.calibration.sensitivity, S_TRUE, atol=1e-9)  # Eqs. (2)-(4), transverse ones with their sign
+    assert_allclose(result.magnitude, np.abs(S_TRUE), atol=1e-9)  # Eq. (1)
+    assert_allclose(result.phase_rad, -2 * pi * F * lag_s, atol=1e-8)
+    assert np.isnan(result.calibration.offset).all()
+    assert result.frequency_hz == pytest.approx(F, abs=1e-9)
+    assert result.reasons == ()
+
+
+def test_an_axis_turned_round_and_one_axis_alone() -> None:
+    result = method1.solve([run(along([0.0, -1.0, 0.0]))])
+    assert_allclose(result.calibration.sensitivity[:, 1], S_TRUE[:, 1], atol=1e-9)
+    assert np.isnan(result.calibration.sensitivity[:, [0, 2]]).all()
+    assert list(np.flatnonzero(result.calibration.determined)) == [1, 4, 7]
+    assert np.isnan(result.calibration.covariance[0, 0])
+
+
+def test_what_is_in_quadrature_is_in_the_magnitude_alone() -> None:
+    result = method1.solve([run(on_axis("x"), sideways=0.05j)])  # slide also moves along y, a quarter turn ahead
+    S = result.calibration.sensitivity
+    # the phase of output x itself is turned by S_xy 0.05 / S_xx, 1.5 mrad; its cosine is 1e-6
+    assert S[1, 0] == pytest.approx(S_TRUE[1, 0] + 0.05 * S_TRUE[1, 1] * 0.05 * S_TRUE[0, 1] / S_TRUE[0, 0], abs=1e-6)
+    assert result.magnitude[1, 0] == pytest.approx(np.hypot(S_TRUE[1, 0], 0.05 * S_TRUE[1, 1]), abs=1e-6)
+
+
+def test_six_values_a_run_and_their_statistics() -> None:
+    rng = np.random.default_rng(1)
+    result = method1.solve([run(on_axis("x"), noise=0.02, rng=rng) for _ in range(3)], Priors.none())
+    runs = result.repeatability[0, 0]
+    assert [r.n for r in runs] == [6, 6, 6]
+    # an amplitude from 333 points of SD 0.02: 0.02 sqrt(2/333) / 10 = 0.0155 %; SD of 15 degrees of freedom, 4 SDs
+    assert np.sqrt(np.mean([r.s_rel_pct**2 for r in runs])) == pytest.approx(0.0155 / 1.02, rel=4 / np.sqrt(30))
+
+
+def test_type_a_covers() -> None:
+    # 300 calibrations of 2 runs; z of main and transverse S_xx, S_yx: outputs are independent. Degrees of freedom 10 or
+    # (repetitions scatter more) 1; |z| <= k in 95.45 %: at least 545 of 600, 99.9 % binomial lower limit is 556 - 6.
+    rng = np.random.default_rng(2)
+    inside = 0
+    for _ in range(300):
+        result = method1.solve([run(on_axis("x"), noise=0.5, rng=rng, n=700) for _ in range(2)], Priors.none())
+        u = np.sqrt(np.diag(result.calibration.covariance))
+        off = np.abs(result.calibration.sensitivity[:2, 0] - S_TRUE[:2, 0])
+        inside += int(np.sum(off <= result.coverage_factor * u[[0, 3]]))
+    assert inside >= 550
+
+
+def test_remounted_sensors_average_their_mounting_and_repeated_ones_do_not() -> None:
+    priors = Priors(alpha_common_rad=0.0, transverse=0.0)
+    once = method1.solve([run(on_axis("x", position="once")) for _ in range(4)], priors)
+    anew = method1.solve([run(on_axis("x", position=f"mounting {k}")) for k in range(4)], priors)
+    u_once, u_anew = (r.statement.by_source["direction by position"][3] for r in (once, anew))
+    assert u_once == pytest.approx(radians(0.2) * 1.02, rel=0.01)  # S_yx moves by S_xx (S_yy unknown: as S_xx)
+    assert u_anew == pytest.approx(u_once / 2, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("pose", "message"),
+    [
+        (clamp(radians(35), radians(45)), "one axis along the motion, the direction is"),
+        (along([np.cos(0.005), np.sin(0.005), 0.0]), "one axis along the motion"),
+        (Pose("rest", np.zeros((3, 0)), np.zeros(3)), "uniaxial reference"),
+    ],
+)
+def test_positions_that_are_no_axis_are_refused(pose: Pose, message: str) -> None:
+    t = np.arange(1000) / 1000
+    with pytest.raises(ValueError, match=message):
+        method1.solve([Run(t, np.sin(t), np.zeros((1000, 3)), pose)])
+
+
+def test_data_that_cannot_be_used_are_named() -> None:
+    good = run(on_axis("x"))
+    with pytest.raises(ValueError, match="position axis x: the signal does not move"):
+        method1.solve([Run(good.time_s, np.zeros(2000), good.indications, good.pose)])
+    with pytest.raises(ValueError, match="position axis x: 1 whole cycle, 2 are needed"):
+        method1.solve([run(on_axis("x"), n=500)])
+    with pytest.raises(ValueError, match="at least one run"):
+        method1.solve([])
+    noisy = good.reference + 10 * np.sin(2 * pi * 7.3 * good.time_s)
+    reasons = method1.solve([Run(good.time_s, noisy, good.indications, good.pose)]).reasons
+    assert len(reasons) == 1
+    assert "no sine" in reasons[0]
+    late = method1.solve([run(on_axis("x"), lag_s=0.25 / F)])
+    assert any("its sign cannot be told" in reason for reason in late.reasons)
