@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.model import Array
 from calib.timing import HORIZON_S, ClockFit, Edge, IntArray, parabola
@@ -57,8 +58,20 @@ def clock_from_stamps(stamp_s: Array) -> ClockFit:
 
 
 def arrivals_from_stamps(stamp_s: Array) -> Arrivals:
-    """Bursts out of stamps: equal or close ones are one, so are those spread at a nominal rate; else each its own."""
+    """Bursts out of stamps (n,): equal or close ones are one, so are those spread at a nominal rate; else each is."""
     t = np.asarray(stamp_s, dtype=float)
+    kind, breaks = _classified(t)
+    index = np.append(np.flatnonzero(breaks), len(t) - 1)
+    return Arrivals(kind, index, t[index])
+
+
+def kind_of(stamp_s: Array) -> Kind:
+    """How the stamps (n,) were made. Raises ValueError where time does not pass at all."""
+    return _classified(np.asarray(stamp_s, dtype=float))[0]
+
+
+def _classified(t: Array) -> tuple[Kind, NDArray[np.bool_]]:
+    """The kind of stamps, and after which of them (n - 1,) a burst ends."""
     steps = np.diff(t)
     period = (t[-1] - t[0]) / len(steps) if len(steps) else 0.0
     if not period > 0:
@@ -66,18 +79,12 @@ def arrivals_from_stamps(stamp_s: Array) -> Arrivals:
     short = steps < SAME_BURST * period
     usual = float(np.median(steps))
     if np.mean(short) >= MANY and usual < SAME_BURST * period:
-        return _cut("bursts", t, ~short)
+        return "bursts", ~short
     odd = np.abs(steps - usual) > max(GRID * usual, 1.5 * _resolution(t))
+    each = np.ones(len(steps), dtype=bool)
     if np.mean(odd) < FEW or np.count_nonzero(odd) < 2:
-        return _cut("grid", t, np.ones(len(steps), dtype=bool))
-    if np.mean(odd) < 0.5:
-        return _cut("spread", t, odd)
-    return _cut("jittery", t, np.ones(len(steps), dtype=bool))
-
-
-def _cut(kind: Kind, t: Array, last_of_burst: np.ndarray) -> Arrivals:
-    index = np.append(np.nonzero(last_of_burst)[0], len(t) - 1)
-    return Arrivals(kind, index, t[index])
+        return "grid", each
+    return ("spread", odd) if np.mean(odd) < 0.5 else ("jittery", each)
 
 
 def _resolution(t: Array) -> float:

@@ -1,0 +1,155 @@
+"""Reads poses.csv, and makes of its lines, the reference's kind and the options what the sensor feels."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from agent.tables import TableError, fields_of, header_of, number_of, open_table, require
+from calib.geometry import STANDARD_GRAVITY_MPS2, along, at_rest, beside, clamp, on_axis
+from calib.model import Array, Pose
+
+CLAMP, DIRECTION, AXIS, GRAVITY = ("theta_deg", "alpha_deg"), ("dx", "dy", "dz"), ("axis",), ("gx", "gy", "gz")
+FORMS = (CLAMP, DIRECTION, AXIS, GRAVITY)
+TOGETHER = ([DIRECTION, GRAVITY], [AXIS, GRAVITY])
+NOT_FELT = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class PoseRow:
+    """One line of poses.csv: its number, from when to when in s, and the fields of its form."""
+
+    line: int
+    start_s: float
+    stop_s: float
+    values: dict[str, float]
+    axis: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """What holds in every pose: gravity there, the static sign of Eqs. (9)-(11), who feels gravity, the rotation.
+
+    `rotation` (3, 3): a tri-axial reference stands beside the sensor, a = R a_ref.
+    """
+
+    gravity_mps2: float = STANDARD_GRAVITY_MPS2
+    static_sign: int = 1
+    coupling: Literal["dc", "ac"] = "dc"  # of the sensor
+    reference_coupling: Literal["dc", "ac"] = "ac"
+    reference_channels: int = 1  # 0 without a reference
+    rotation: Array | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class PoseInterval:
+    """The sensor stands in `pose` from `start_s` to `stop_s`."""
+
+    start_s: float
+    stop_s: float
+    pose: Pose
+
+
+def read_poses(path: Path, setting: Setting) -> list[PoseInterval]:
+    """The lines of poses.csv as poses. Raises TableError."""
+    intervals = []
+    for row in read_rows(path):
+        try:
+            intervals.append(PoseInterval(row.start_s, row.stop_s, pose_of(row, setting)))
+        except ValueError as error:
+            raise TableError(f"{path}, line {row.line}: {error}") from None
+    return intervals
+
+
+def pose_of(row: PoseRow, setting: Setting) -> Pose:
+    """One line as a pose. Raises ValueError where it makes no sense with the setting."""
+    stated = [row.values[name] for name in GRAVITY] if GRAVITY[0] in row.values else None
+    gravity = _felt(stated, setting)
+    if setting.reference_channels == 3:
+        if CLAMP[0] in row.values or DIRECTION[0] in row.values or row.axis is not None:
+            raise ValueError(
+                "a tri-axial reference needs no direction: give --rotation, and gx,gy,gz if it is AC-coupled"
+            )
+        return beside_reference(setting, stated)
+    if CLAMP[0] in row.values:
+        felt = setting.gravity_mps2 if setting.coupling == "dc" else 0.0
+        theta, alpha = (float(np.deg2rad(row.values[name])) for name in CLAMP)
+        pose = clamp(theta, alpha, felt, setting.static_sign)
+    elif DIRECTION[0] in row.values:
+        pose = along([row.values[name] for name in DIRECTION], gravity)
+    elif row.axis is not None:
+        pose = on_axis(row.axis.lower(), gravity)
+    else:
+        return _at_rest(stated, setting)
+    if setting.reference_channels == 0:
+        raise ValueError("this pose is one of motion: --reference is needed")
+    return _without_what_the_reference_feels(pose) if setting.reference_coupling == "dc" else pose
+
+
+def beside_reference(setting: Setting, gravity: Sequence[float] | None = None) -> Pose:
+    """The pose beside a tri-axial reference; `gravity` as stated in poses.csv, if it is."""
+    if setting.rotation is None:
+        raise ValueError("a tri-axial reference needs --rotation")
+    if setting.coupling == "dc" and setting.reference_coupling == "dc":
+        return beside(setting.rotation, NOT_FELT)
+    if setting.coupling == "ac" and setting.reference_coupling == "dc":
+        return beside(setting.rotation)  # gravity is in the reference's mean alone
+    return beside(setting.rotation, _felt(gravity, setting))
+
+
+def _felt(stated: Sequence[float] | None, setting: Setting) -> Sequence[float] | None:
+    return NOT_FELT if setting.coupling == "ac" else stated
+
+
+def _at_rest(gravity: Sequence[float] | None, setting: Setting) -> Pose:
+    assert gravity is not None
+    if setting.coupling == "ac":
+        raise ValueError("an AC-coupled sensor does not feel gravity: a static position tells nothing")
+    if setting.reference_channels:
+        raise ValueError("gx,gy,gz alone is a static position, without --reference; add the direction of the motion")
+    return at_rest(gravity)
+
+
+def _without_what_the_reference_feels(pose: Pose) -> Pose:
+    """A DC-coupled uniaxial reference feels gravity along its axis itself."""
+    d = pose.direction[:, 0]
+    return replace(pose, gravity_mps2=pose.gravity_mps2 - d * float(d @ pose.gravity_mps2))
+
+
+def read_rows(path: Path) -> list[PoseRow]:
+    """The lines of poses.csv, in any of its forms. Raises TableError."""
+    with open_table(path) as file:
+        header = header_of(path, file)
+        try:
+            text = io.TextIOWrapper(file, encoding="utf-8", newline="")
+            lines = [(n, row) for n, row in enumerate(csv.reader(text), start=2) if any(f.strip() for f in row)]
+        except (UnicodeDecodeError, csv.Error) as error:
+            raise TableError(f"{path}: not text: {error}") from None
+    require(path, header, ("start_s", "stop_s"))
+    forms = [form for form in FORMS if set(form) & set(header)]
+    if len(forms) != 1 and forms not in TOGETHER:
+        wanted = "; ".join(",".join(form) for form in FORMS)
+        raise TableError(f"{path}, line 1: expected one of {wanted} (gravity may go with a direction or an axis); "
+                         f"the header is {','.join(header)!r}")  # fmt: skip
+    names = [name for form in forms for name in form]
+    require(path, header, names)
+    rows = [_row(path, line, dict(zip(header, fields_of(path, line, row, header), strict=True)), names)
+            for line, row in lines]  # fmt: skip
+    if not rows:
+        raise TableError(f"{path}: no poses")
+    return rows
+
+
+def _row(path: Path, line: int, fields: dict[str, str], names: Sequence[str]) -> PoseRow:
+    axis = fields["axis"] if "axis" in names else None
+    values = {n: number_of(path, line, n, fields[n]) for n in ("start_s", "stop_s", *names) if n != "axis"}
+    start_s, stop_s = values.pop("start_s"), values.pop("stop_s")
+    if not stop_s > start_s:
+        raise TableError(f"{path}, line {line}, column stop_s: {stop_s:g} is not after start_s {start_s:g}")
+    return PoseRow(line, start_s, stop_s, values, axis)

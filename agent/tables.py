@@ -1,0 +1,199 @@
+"""Reads sensor.csv and reference.csv: fast, larger than memory if need be, every fault with its place."""
+
+from __future__ import annotations
+
+import io
+import math
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.decimals import decimals
+from calib.stamps import kind_of
+
+Array = NDArray[np.float64]
+Progress = Callable[[int], Any]  # called with the bytes just read
+
+CHUNK_BYTES = 1 << 18  # stays in the second-level cache while it is parsed
+SENSOR = ("time_s", "vx", "vy", "vz")
+TEMPERATURE = "temperature_degc"
+REFERENCES = (("ax", "ay", "az"), ("a",), ("v",))
+# A stamp may be older than the one before: spread back from a late burst, or jittery. Stalls reach some ten ms.
+LATEST_STAMP_S = 0.1
+ROWS_AT_ONCE = 1 << 20
+
+
+class TableError(Exception):
+    """The file cannot be used; the message names file, line, column and value."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensorTable:
+    """sensor.csv: stamps (n,) in s, indications (n, 3), temperature (n,) in degC or None; on disk, read as needed."""
+
+    path: Path
+    time_s: Array
+    v: Array
+    temperature_degc: Array | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReferenceTable:
+    """reference.csv: stamps (n,) in s, channels (n, 1 or 3) in m/s2, or in m/s where `velocity`."""
+
+    path: Path
+    time_s: Array
+    x: Array
+    velocity: bool
+
+
+def read_sensor(path: Path, progress: Progress | None = None) -> SensorTable:
+    """Read sensor.csv. Raises TableError."""
+    with open_table(path) as file:
+        header = header_of(path, file)
+        require(path, header, SENSOR)
+        names = [*SENSOR, TEMPERATURE] if TEMPERATURE in header else [*SENSOR]
+        rows = _columns(path, file, header, names, progress)
+    _check_time(path, rows[:, 0])
+    return SensorTable(path, rows[:, 0], rows[:, 1:4], rows[:, 4] if len(names) > 4 else None)
+
+
+def read_reference(path: Path, progress: Progress | None = None) -> ReferenceTable:
+    """Read reference.csv: `a` or `v` alone, or `ax,ay,az`. Raises TableError."""
+    with open_table(path) as file:
+        header = header_of(path, file)
+        found = [names for names in REFERENCES if set(names) <= set(header)]
+        if len(found) != 1:
+            wanted = ", ".join(f"time_s,{','.join(names)}" for names in REFERENCES)
+            raise TableError(f"{path}, line 1: expected exactly one of {wanted}; the header is {','.join(header)!r}")
+        require(path, header, ("time_s", *found[0]))
+        rows = _columns(path, file, header, ["time_s", *found[0]], progress)
+    _check_time(path, rows[:, 0])
+    return ReferenceTable(path, rows[:, 0], rows[:, 1:], found[0] == ("v",))
+
+
+def open_table(path: Path) -> IO[bytes]:
+    """The file, opened. Raises TableError."""
+    try:
+        return path.open("rb")
+    except OSError as error:
+        raise TableError(f"{path}: {error.strerror}") from None
+
+
+def header_of(path: Path, file: IO[bytes]) -> list[str]:
+    """Column names in the first line. Raises TableError."""
+    line = file.readline()
+    try:
+        header = [name.strip() for name in line.decode("utf-8-sig").split(",")]
+    except UnicodeDecodeError:
+        raise TableError(f"{path}, line 1: not text") from None
+    if len(set(header)) < len(header):
+        raise TableError(f"{path}, line 1: a column appears twice in {','.join(header)!r}")
+    return header
+
+
+def require(path: Path, header: Sequence[str], names: Sequence[str]) -> None:
+    """All columns are there, and none of them under another unit besides (time_ms, ax_g). Raises TableError."""
+    for name in names:
+        base = name.rsplit("_", 1)[0]
+        others = [n for n in header if n != name and n.rsplit("_", 1)[0] == base and n not in names]
+        if name not in header:
+            hint = f"; {others[0]} is another unit" if others else ""
+            raise TableError(f"{path}, line 1: no column {name} in the header {','.join(header)!r}{hint}")
+        if others:
+            raise TableError(f"{path}, line 1: {name} and {others[0]} in one header: which unit is meant?")
+
+
+def _columns(
+    path: Path, file: IO[bytes], header: Sequence[str], names: Sequence[str], progress: Progress | None
+) -> Array:
+    """The named columns (n, k) of the lines that follow, n >= 2, in a file of their own on disk while they are used."""
+    places = [header.index(name) for name in names]
+    line, rest = 2, b""
+    with tempfile.TemporaryFile() as spool:
+        while data := file.read(CHUNK_BYTES):
+            text, rest = _whole_lines(rest + data)
+            line += _append(spool, path, line, text, header, places)
+            if progress is not None:
+                progress(len(data))
+        line += _append(spool, path, line, rest.rstrip(b"\r\n") + b"\n" if rest.strip() else b"", header, places)
+        if line < 4:
+            raise TableError(f"{path}: {line - 2} rows of data, at least 2 are needed")
+        spool.flush()
+        return np.asarray(np.memmap(spool, dtype=np.float64, mode="r", shape=(line - 2, len(places))))
+
+
+def _whole_lines(data: bytes) -> tuple[bytes, bytes]:
+    """Up to the last line that is followed by another one: what ends a file may be blank lines."""
+    end = data.rstrip(b"\r\n")
+    cut = end.rfind(b"\n") + 1
+    return data[:cut].replace(b"\r\n", b"\n"), data[cut:]
+
+
+def _append(spool: IO[bytes], path: Path, line: int, text: bytes, header: Sequence[str], places: Sequence[int]) -> int:
+    """Parse whole lines, the first of which is number `line`, append their columns; how many."""
+    if not text:
+        return 0
+    rows = decimals(text, len(header))
+    if rows is None:
+        rows = _rows(path, line, text, header)
+    spool.write(np.ascontiguousarray(rows[:, places]).data)
+    return len(rows)
+
+
+def _rows(path: Path, first_line: int, text: bytes, header: Sequence[str]) -> Array:
+    """Any spelling of numbers; raises TableError for the first line that is wrong."""
+    try:
+        rows = np.loadtxt(io.BytesIO(text), delimiter=",", comments=None, ndmin=2)
+    except ValueError:
+        rows = np.empty((0, 0))
+    if rows.shape == (text.count(b"\n"), len(header)) and np.isfinite(rows).all():
+        return rows
+    parsed = []
+    for line, content in enumerate(text.decode("utf-8", "replace").splitlines(), start=first_line):
+        fields = fields_of(path, line, content.split(","), header)
+        parsed.append([number_of(path, line, name, field) for name, field in zip(header, fields, strict=True)])
+    return np.array(parsed)
+
+
+def fields_of(path: Path, line: int, fields: list[str], header: Sequence[str]) -> list[str]:
+    """As many fields as the header has, without blanks around. Raises TableError."""
+    if len(fields) != len(header):
+        raise TableError(f"{path}, line {line}: {len(fields)} fields, the header has {len(header)}")
+    return [field.strip() for field in fields]
+
+
+def number_of(path: Path, line: int, column: str, text: str) -> float:
+    """A finite number. Raises TableError."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise TableError(f"{path}, line {line}, column {column}: {text.strip()!r} is not a finite number")
+    return value
+
+
+def _check_time(path: Path, time_s: Array) -> None:
+    """Time runs forward: on a grid of exact stamps always, else but for what jitter and late bursts explain."""
+    try:
+        allowed = 0.0 if kind_of(np.asarray(time_s[:ROWS_AT_ONCE])) == "grid" else LATEST_STAMP_S
+    except ValueError:
+        allowed = 0.0
+    newest = -math.inf
+    for first in range(0, len(time_s), ROWS_AT_ONCE):
+        part = np.asarray(time_s[first : first + ROWS_AT_ONCE])
+        before = np.maximum.accumulate(np.append(newest, part))
+        newest = float(before[-1])
+        wrong = np.flatnonzero(before[:-1] - part > allowed)
+        if len(wrong):
+            at = int(wrong[0])
+            later = f"{part[at]:.10g} after {before[at]:.10g}"
+            raise TableError(f"{path}, line {first + at + 2}, column time_s: {later}, time runs backwards")
+    if not newest > float(time_s[0]):
+        raise TableError(f"{path}, column time_s: {newest:.10g} in every line, time must pass")

@@ -1,0 +1,113 @@
+"""Where the reference moves, and which points were struck or clipped, found from the data (rests: calib.rests)."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.model import Array
+
+Mask = NDArray[np.bool_]
+Stretch = tuple[int, int]  # [first, stop) of samples
+
+FRAME_S = 0.25  # resolution with which motion begins and ends; three quarters of a cycle at 3 Hz
+BRIDGE_S = 1.0  # motion that pauses for less is one stretch
+# Of the level in the liveliest tenth of the frames: a random motion's slow spells stay above, a pause falls below.
+MOVING_LEVEL = 0.4
+KNOCK_SD = 5.0  # robust SDs: one white-noise point in 1.7 million
+KNOCK_PASSES = 8
+SLOW_BAND_HZ = 50.0  # first band tried for the motion; widened until it holds most of the motion's power
+MOST_POWER = 0.7
+CLIPPED_POINTS = 3  # as many points at the very same extreme, and beyond it by the motion, are no chance
+
+
+def moving(u: Array, rate_hz: float) -> list[Stretch]:
+    """Stretches in which the reference u (n, m) moves, relative to the liveliest part of it."""
+    width = band_width(u, rate_hz)
+    slow = averaged(u - np.median(u, axis=0), width) if len(u) else u
+    size = max(1, round(FRAME_S * rate_hz / width))
+    frames = len(slow) // size
+    if frames < 2:
+        return [(0, len(u))] if len(u) else []
+    level = np.sqrt(np.mean(slow[: frames * size].reshape(frames, -1) ** 2, axis=1))
+    on = level > MOVING_LEVEL * np.quantile(level, 0.9)
+    return _stretches(_bridged(on, round(BRIDGE_S / FRAME_S)), size * width, len(u))
+
+
+def knocked(V: Array, basis: Array) -> Mask:
+    """Points (n,) whose residual about the regression of V (n, 3) on `basis` (n, p) is beyond five robust SDs."""
+    kept = np.ones(len(V), dtype=bool)
+    finest = 0.5 * least_step(V)
+    for _ in range(KNOCK_PASSES):
+        solution, *_ = np.linalg.lstsq(basis[kept], V[kept], rcond=None)
+        away = np.abs(V - basis @ solution)
+        limit = KNOCK_SD * np.maximum(1.4826 * np.median(away[kept], axis=0), finest)
+        now = np.all(away <= limit, axis=1)
+        if np.array_equal(now, kept):
+            break
+        kept = now
+    return ~kept
+
+
+def clipped(V: Array, basis: Array) -> int:
+    """Points of V (n, 3) held at an end of the range: several at the very same extreme while the motion goes beyond."""
+    solution, *_ = np.linalg.lstsq(basis, V, rcond=None)
+    away = V - basis @ solution
+    sd = 1.4826 * np.median(np.abs(away), axis=0)
+    points = 0
+    for sign in (1.0, -1.0):
+        at_end = (sign * V).max(axis=0) * sign == V
+        count = at_end.sum(axis=0)
+        shortfall = -sign * (away * at_end).sum(axis=0) / count
+        held = (count >= CLIPPED_POINTS) & (shortfall > sd + 2.0 * least_step(V))
+        points += int(count[held].sum())
+    return points
+
+
+def band_width(u: Array, rate_hz: float) -> int:
+    """How many samples of u (n, m) may be averaged and leave most of the motion's power; white noise falls."""
+    power = float(np.sum(np.var(u, axis=0)) - np.sum(white_noise(u) ** 2)) if len(u) else 0.0
+    width = max(1, min(int(rate_hz / SLOW_BAND_HZ), len(u)))
+    while width > 1 and float(np.sum(np.var(averaged(u, width), axis=0))) < MOST_POWER * power:
+        width //= 2
+    return width
+
+
+def averaged(x: Array, width: int) -> Array:
+    """Means of every `width` samples of x (n, m); what is left over at the end is dropped."""
+    n = len(x) // width
+    return np.asarray(x[: n * width].reshape(n, width, x.shape[1]).mean(axis=1))
+
+
+def white_noise(x: Array) -> Array:
+    """SD (m,) of white noise in x (n, m), from its third differences: motion well below the rate hardly shows there."""
+    third = np.diff(x, n=3, axis=0)
+    return np.asarray(np.sqrt(np.mean(third**2, axis=0) / 20.0)) if len(third) else np.zeros(x.shape[1])
+
+
+def least_step(V: Array) -> Array:
+    """(3,) the smallest change between neighbouring samples: the resolution of counts, next to nothing of decimals."""
+    steps = np.abs(np.diff(V, axis=0))
+    least = np.where(steps > 0, steps, np.inf).min(axis=0, initial=np.inf)
+    return np.where(np.isfinite(least), least, 0.0)
+
+
+def _bridged(on: Mask, longest: int) -> Mask:
+    """Pauses shorter than `longest` frames between two moving ones count as moving."""
+    out = on.copy()
+    edges = np.flatnonzero(on)
+    for a, b in itertools.pairwise(edges):
+        if 1 < b - a <= longest:
+            out[a:b] = True
+    return out
+
+
+def _stretches(on: Mask, size: int, n: int) -> list[Stretch]:
+    """Frames to samples; what is left after the last whole frame goes with it."""
+    change = np.flatnonzero(np.diff(np.concatenate([[False], on, [False]]).astype(np.int8)))
+    pairs = [(int(a) * size, int(b) * size) for a, b in zip(change[::2], change[1::2], strict=True)]
+    if pairs and pairs[-1][1] == len(on) * size:
+        pairs[-1] = (pairs[-1][0], n)
+    return pairs
