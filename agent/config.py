@@ -143,9 +143,10 @@ class Config(Section):
                 raise ValueError(f"devices: the name {name!r} is used more than once")
         sensors = [c.sensor for c in self.channels]
         for i, channel in enumerate(self.channels):
-            for role, name in (("sensor", channel.sensor), ("reference", channel.reference)):
-                if name is not None and name not in names:
-                    raise ValueError(f"channels.{i}.{role}: no device is called {name!r}; there are {', '.join(names)}")
+            for role, device in (("sensor", channel.sensor), ("reference", channel.reference)):
+                if device is not None and device not in names:
+                    known = ", ".join(names)
+                    raise ValueError(f"channels.{i}.{role}: no device is called {device!r}; there are {known}")
             if channel.reference == channel.sensor:
                 raise ValueError(f"channels.{i}: a sensor cannot be its own reference")
             if sensors.count(channel.sensor) > 1:
@@ -210,7 +211,8 @@ def _fault_lines(error: ValidationError) -> list[str]:
         path = ".".join(str(part) for part in fault["loc"])
         value = fault.get("input")
         # A whole section as "the offending value" would bury the message.
-        shown = "" if isinstance(value, (dict, BaseModel, list, tuple)) or fault["type"] == "missing" else f", not {value!r}"
+        whole = isinstance(value, (dict, BaseModel, list, tuple)) or fault["type"] == "missing"
+        shown = "" if whole else f", not {value!r}"
         message = fault["msg"].removeprefix("Value error, ")
         lines.append(f"{path}: {message}{shown}" if path else message)
     return lines

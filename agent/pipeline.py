@@ -5,8 +5,6 @@ Live, devices feed it; in an audit, a recording does. `restore(snapshot())` equa
 
 from __future__ import annotations
 
-from typing import Any
-
 import msgspec
 
 from agent.channel import ChannelState
@@ -29,10 +27,10 @@ class Pipeline:
     def begin(
         cls, config: Config, run_id: str, origin_ns: int, last_sequence: int, kept: dict[str, CalibrationUpdate]
     ) -> Pipeline:
-        """The pipeline of a new run: results count on from `last_sequence`; `kept` are the calibrations of the run before.
+        """The pipeline of a new run: results count on from `last_sequence`, seconds from `origin_ns` (monotonic).
 
-        A kept calibration comes into force when its sensor opens with the same identity. `origin_ns` is the monotonic
-        time that seconds count from.
+        `kept` are the calibrations of the run before, by sensor; each comes into force again when its sensor opens with
+        the same identity.
         """
         pipeline = cls(config)
         pipeline._run_id = run_id

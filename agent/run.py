@@ -26,11 +26,9 @@ LOOPBACK = "tcp/127.0.0.1:7447"
 @click.option("--duration", type=click.FloatRange(min=0, min_open=True), metavar="S", help="End after S seconds.")
 @click.option("--preset", type=click.Choice(["plain", "faulty"]), default="plain", show_default=True,
               help="Which virtual bench, where there is no CONFIG.")  # fmt: skip
-@click.option("--seed", type=int, default=1, show_default=True, help="Of the virtual bench.")
+@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=1, show_default=True, help="Of the virtual bench.")
 @click.option("--with-router", is_flag=True, help=f"Start a Zenoh router at {LOOPBACK} unless one is there.")
-def run(
-    config: Path | None, data_dir: Path, duration: float | None, preset: str, seed: int, with_router: bool
-) -> int:
+def run(config: Path | None, data_dir: Path, duration: float | None, preset: str, seed: int, with_router: bool) -> int:
     """Read, calibrate, record and publish until Ctrl-C. Without CONFIG on the virtual bench."""
     from agent.watch import Watch
 

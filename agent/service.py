@@ -140,7 +140,7 @@ class Service:
             if time.monotonic() >= next_tick:
                 next_tick += TICK_S
                 self._step(Tick(t_monotonic_ns=time.monotonic_ns(), t_utc_ns=time.time_ns()), writer)
-                self._watch.health(self._recorder, self._publisher and self._publisher.state())
+                self._watch.health(self._recorder, self._publisher.state() if self._publisher else None)
             if writer.wants_rotation:
                 self._sequence += 1
                 writer.put(self._sequence, self._run_start(continuation=True), [])

@@ -12,7 +12,7 @@ _ARRAY = 1  # msgpack extension code for a numpy array
 
 
 def pack(state: dict[str, Any]) -> bytes:
-    """Bytes of a nest of dict, list, str, int, float, bool, None and numpy arrays; the same state gives the same bytes."""
+    """Bytes of nested dicts and lists of str, int, float, bool, None and numpy arrays; equal state, equal bytes."""
     return _ENCODER.encode({"version": VERSION, "state": state})
 
 

@@ -7,7 +7,6 @@ import queue
 import sys
 import time
 from collections import deque
-from pathlib import Path
 
 from agent.config import Config
 from agent.events import DeviceChange, Event, Gap, Result
@@ -20,7 +19,7 @@ RATE_OVER_BLOCKS = 20  # the rate shown is over this many blocks, ten seconds
 
 
 class Watch(logging.Handler):
-    """The view of a run. `update` and `health` belong to the main loop; `say` and log records may come from any thread."""
+    """The view of a run. `update` and `health` are the main loop's; `say` and log records may come from any thread."""
 
     def __init__(self, config: Config, title: str, truth: Truth | None) -> None:
         super().__init__(logging.WARNING)

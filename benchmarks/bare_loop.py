@@ -1,6 +1,6 @@
 """The alternative to the agent: a loop that only reads two devices and records them. Same drivers, same recorder.
 
-    python -m benchmarks.bare_loop CONFIG DATA_DIR SECONDS
+python -m benchmarks.bare_loop CONFIG DATA_DIR SECONDS
 """
 
 from __future__ import annotations

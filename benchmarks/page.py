@@ -11,10 +11,8 @@ PAGE = Path(__file__).resolve().parents[1] / "docs" / "performance.md"
 
 def machine() -> str:
     """What was measured on, in a few words."""
-    model = next(
-        (line.split(":", 1)[1].strip() for line in open("/proc/cpuinfo") if line.startswith("model name")),
-        platform.machine(),
-    )
+    lines = Path("/proc/cpuinfo").read_text().splitlines()
+    model = next((x.split(":", 1)[1].strip() for x in lines if x.startswith("model name")), platform.machine())
     return f"{model}, {os.cpu_count()} cores, Python {platform.python_version()}"
 
 

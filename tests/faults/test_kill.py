@@ -1,4 +1,4 @@
-"""kill -9: the next start goes on with the calibration in force, and the torn recording replays up to its last flush."""
+"""kill -9: the next start goes on with the calibration in force, the torn recording replays up to its last flush."""
 
 from __future__ import annotations
 
@@ -69,13 +69,15 @@ def keep_calibration(data_dir: Path, port: Path) -> CalibrationUpdate:
     store = Store(data_dir)
     sequence = store.last_sequence() + 1
     calibration = CalibrationUpdate(
-        run_id="before", sequence=sequence, sensor="imu", t_utc_ns=1, sensitivity=[[1.01, 0.002, 0.1], [0, 1, 0], [0, 0, 1]],
+        run_id="before", sequence=sequence, sensor="imu", t_utc_ns=1,
+        sensitivity=[[1.01, 0.002, 0.1], [0, 1, 0], [0, 0, 1]],
         offset=[0.1, 0.2, 0.3], standard_uncertainty=[1e-3] * 12, covariance=[[1e-6] * 12] * 12, coverage_factor=2.0,
         determined=[True] * 12, method="3 (plain)", uncertainty_kind="type A, white", windows=4,
         residual_sd=[0.1, 0.1, 0.1], output_unit="m/s2", identity=identity_of(json.dumps(asdict(info))),
     )  # fmt: skip
     status = StatusChange(
-        run_id="before", sequence=sequence + 1, sensor="imu", t_utc_ns=1, status="VALID", before="COLLECTING", reason="",
+        run_id="before", sequence=sequence + 1, sensor="imu", t_utc_ns=1,
+        status="VALID", before="COLLECTING", reason="",
     )  # fmt: skip
     store.commit([Record.of(r, recorded=True, recording="") for r in (calibration, status)])
     store.close()

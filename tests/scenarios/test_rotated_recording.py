@@ -6,7 +6,6 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -44,7 +43,7 @@ enabled = false
 
 
 @pytest.fixture(scope="module")
-def data_dir(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def data_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("rotation")
     link, data_dir = directory / "port", directory / "data"
     config = directory / "config.toml"
@@ -55,7 +54,7 @@ def data_dir(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     ):
         wait_until(lambda: results(data_dir, "calibration"), 60, "a calibration")
         interrupt(agent)
-    yield data_dir
+    return data_dir
 
 
 def test_the_chain_and_each_file_alone_replay_bit_for_bit(data_dir: Path) -> None:

@@ -35,7 +35,7 @@ class Run:
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     directory = tmp_path_factory.mktemp("bench")
     data_dir, output = directory / "data", directory / "output"
     live: list[dict[str, Any]] = []
@@ -44,13 +44,13 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
         taker = threading.Thread(target=lambda: live.extend(payload(sample) for sample in subscriber), daemon=True)
         taker.start()
         with started("run", "--seed", str(SEED), "--data-dir", data_dir, output=output) as process:
-            # Positions end after 13, 26, 39 and 52 s; three alphas determine all twelve parameters, the fourth improves.
+            # Positions end after 13, 26, 39 and 52 s; three alphas determine all parameters, the fourth improves.
             wait_until(lambda: len(results(data_dir, "calibration")) >= 2, THROUGH_S + 10, "two calibrations")
             late = late_client()
             stopped_in_s = interrupt(process)
         subscriber.undeclare()
         taker.join(5.0)
-    yield Run(data_dir, output.read_text(), live, late, stopped_in_s, process.returncode)
+    return Run(data_dir, output.read_text(), live, late, stopped_in_s, process.returncode)
 
 
 @pytest.fixture(scope="module", autouse=True)
