@@ -6,6 +6,7 @@ import json
 import signal
 import threading
 import time
+from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,6 @@ from hw.virtual.serial_port import PtyDevice
 from hw.virtual.timebase import BenchTime
 
 ROLES: tuple[Role, ...] = ("sensor", "reference")
-ENDING = (signal.SIGINT, signal.SIGTERM)
 POLL_S = 0.05
 # A reader opens a port, sets it up and throws away what came until then: pyserial needs a few ms for it.
 SETTLE_S = 0.25
@@ -32,8 +32,8 @@ LINGER_S = 1.0  # after the last sample, so that a reader gets it before the por
 @click.command()
 @click.option("--preset", type=click.Choice(list(PRESETS)), help="A virtual bench: sensor and reference.")
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=1, show_default=True, help="Of the bench.")
-@click.option("--csv", "directory", type=click.Path(path_type=Path, file_okay=False), help="Write files there instead.")
-@click.option("--duration", "duration_s", type=click.FloatRange(1, 1e6), help="Seconds to write, three repetitions.")
+@click.option("--csv", "directory", type=click.Path(path_type=Path, file_okay=False), help="Write files there.")
+@click.option("--duration", "duration_s", type=click.FloatRange(1, 1e6), help="Seconds; else three repetitions.")
 @click.option("--play", type=click.Path(path_type=Path), help="Serve this sensor.csv or reference.csv.")
 @click.option("--rate-hz", type=click.FloatRange(1e-3, 1e5), help="Play at this rate instead of by column time_s.")
 @click.option("--axes", help="Columns to play, as vx,vy,vz; by default those of sensor.csv or reference.csv.")
@@ -135,8 +135,8 @@ def _json_ready(truth: Truth) -> dict[str, Any]:
 
 
 def _serve_track(player: Player, link: Path | None) -> int:
-    device = PtyDevice(player, link=link)
-    with _Serving(device) as serving:
+    with _Serving() as serving:
+        device = serving.start(PtyDevice(player, link=link))
         click.echo(device.path)
         if serving.wait_for_reader(device):
             player.begin(time.monotonic())
@@ -148,11 +148,11 @@ def _serve_track(player: Player, link: Path | None) -> int:
 
 def _serve_bench(bench: Bench, link: Path | None) -> int:
     bench_time = BenchTime()
-    devices = {
-        role: PtyDevice(serial_lines(bench, role, bench_time), link=link and link.with_name(f"{link.name}-{role}"))
-        for role in ROLES
-    }
-    with _Serving(*devices.values()) as serving:
+    with _Serving() as serving:
+        devices: dict[Role, PtyDevice] = {}
+        for role in ROLES:
+            own_link = link and link.with_name(f"{link.name}-{role}")
+            devices[role] = serving.start(PtyDevice(serial_lines(bench, role, bench_time), link=own_link))
         for role, device in devices.items():
             options = ", ".join(f"{name} = {json.dumps(value)}" for name, value in serial_options(bench, role).items())
             click.echo(f"{role} {device.path}  # serial-csv: {options}")
@@ -166,21 +166,23 @@ def _serve_bench(bench: Bench, link: Path | None) -> int:
 class _Serving:
     """Serves ports until told to stop; SIGINT and SIGTERM end it in order, so that links do not stay behind."""
 
-    def __init__(self, *devices: PtyDevice) -> None:
-        self._devices = devices
+    def __init__(self) -> None:
         self._stopped = threading.Event()
+        self._undo = ExitStack()
 
     def __enter__(self) -> _Serving:
-        self._before = {number: signal.signal(number, lambda *_: self._stopped.set()) for number in ENDING}
-        for device in self._devices:
-            device.start()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._undo.callback(signal.signal, number, signal.signal(number, lambda *_: self._stopped.set()))
         return self
 
     def __exit__(self, *_: object) -> None:
-        for device in self._devices:
-            device.stop()
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
+        self._undo.close()
+
+    def start(self, device: PtyDevice) -> PtyDevice:
+        """Serve this port until the end."""
+        self._undo.callback(device.stop)
+        device.start()
+        return device
 
     def goes_on(self) -> bool:
         """Wait a moment; False once told to stop."""

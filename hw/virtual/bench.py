@@ -76,6 +76,7 @@ class Bench:
         p = self.parameters
         sensor, positions = p.sensor, len(p.schedule.stands)
         by_position = sensor.offset_by_position_mps2
+        theta_error_deg, alpha_error_deg = p.clamp.of_positions(positions)
         return Truth(
             sensitivity=sensor.sensitivity.copy(),
             offset=sensor.offset.copy(),
@@ -84,8 +85,8 @@ class Bench:
             reference_rate_hz=p.reference.clock.rate_hz,
             reference_sensitivity=p.reference.sensitivity,
             gravity_mps2=p.gravity_mps2,
-            theta_error_deg=p.clamp.theta_deg + np.array(p.clamp.theta_by_position_deg or np.zeros(positions)),
-            alpha_error_deg=p.clamp.alpha_deg + np.array(p.clamp.alpha_by_position_deg or np.zeros(positions)),
+            theta_error_deg=theta_error_deg,
+            alpha_error_deg=alpha_error_deg,
             offset_by_position=np.zeros((positions, 3))
             if by_position is None
             else sensor.nominal_sensitivity * by_position,

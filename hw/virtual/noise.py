@@ -26,7 +26,12 @@ class Stream(IntEnum):
 
 
 def generator(seed: int, stream: Stream, block: int = 0) -> np.random.Generator:
-    """The generator of one block: Philox, keyed by seed and stream, its counter's high word being the block."""
+    """The generator of one block: Philox, keyed by seed and stream, its counter's high word being the block.
+
+    Raises ValueError for a seed that is no unsigned 64-bit number.
+    """
+    if not 0 <= seed < 2**64:
+        raise ValueError(f"a seed is a whole number from 0 to 2^64 - 1, got {seed}")
     return np.random.Generator(np.random.Philox(key=[seed, int(stream)], counter=[0, 0, 0, block]))
 
 

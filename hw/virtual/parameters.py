@@ -78,6 +78,14 @@ class ClampErrors:
     theta_by_position_deg: tuple[float, ...] = ()
     alpha_by_position_deg: tuple[float, ...] = ()
 
+    def of_positions(self, n: int) -> tuple[Array, Array]:
+        """Errors of theta and alpha, in degrees, each (n,). Raises ValueError where a list has not n entries."""
+        theta = np.array(self.theta_by_position_deg or (0.0,) * n)
+        alpha = np.array(self.alpha_by_position_deg or (0.0,) * n)
+        if theta.shape != (n,) or alpha.shape != (n,):
+            raise ValueError(f"angle errors by position: {len(theta)} and {len(alpha)} given for {n} positions")
+        return self.theta_deg + theta, self.alpha_deg + alpha
+
 
 @dataclass(frozen=True, slots=True)
 class Knocks:

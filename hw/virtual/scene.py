@@ -109,15 +109,11 @@ class Scene:
 def true_schedule(parameters: BenchParameters) -> Schedule:
     """The schedule as the sensor really stands: the nominal one with the errors of the clamp's angles.
 
-    Raises ValueError where an angle error is given for a position that no clamp made.
+    Raises ValueError where an angle error is given for a position that no clamp made, or their number is wrong.
     """
-    nominal, errors = parameters.schedule, parameters.clamp
-    n = len(nominal.stands)
-    theta = errors.theta_deg + np.array(errors.theta_by_position_deg or (0.0,) * n)
-    alpha = errors.alpha_deg + np.array(errors.alpha_by_position_deg or (0.0,) * n)
-    if theta.shape != (n,) or alpha.shape != (n,):
-        raise ValueError(f"angle errors by position: {len(theta)} and {len(alpha)} given for {n} positions")
-    stands = tuple(_displaced(stand, theta[i], alpha[i]) for i, stand in enumerate(nominal.stands))
+    nominal = parameters.schedule
+    theta_deg, alpha_deg = parameters.clamp.of_positions(len(nominal.stands))
+    stands = tuple(map(_displaced, nominal.stands, theta_deg, alpha_deg))
     return Schedule(stands, nominal.turn_s, nominal.start_s)
 
 

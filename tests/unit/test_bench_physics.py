@@ -286,6 +286,8 @@ def test_nothing_moves_before_the_start_and_the_motion_is_full_in_every_hold() -
 def test_contradicting_parameters_are_refused() -> None:
     with pytest.raises(ValueError, match="for 4 positions"):
         Bench(BenchParameters(clamp=ClampErrors(alpha_by_position_deg=(0.1, 0.2))), 1)
+    with pytest.raises(ValueError, match="got -1"):
+        Bench(one_position(sensor=SensorParameters(noise_mps2=0.1)), -1).sensor_values(0, 1)
     with pytest.raises(ValueError, match="positions on the clamp"):
         Bench(replace(one_position(clamp=ClampErrors(0.1)), schedule=Schedule((resting(np.ones(3), 1.0),))), 1)
     with pytest.raises(ValueError, match="measures acceleration"):

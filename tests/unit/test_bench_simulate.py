@@ -139,6 +139,9 @@ def test_a_link_that_exists_or_cannot_be_made_is_named(tmp_path, capsys) -> None
     assert run_cli(["simulate", "--play", str(path), "--link", str(tmp_path / "no" / "port")]) == 2
     assert capsys.readouterr().err == f"{tmp_path}/no/port: No such file or directory\n"
     assert run_cli(["simulate", "--preset", "plain", "--csv", str(path / "in-a-file")]) == 2
+    (tmp_path / "bench-reference").touch()
+    assert run_cli(["simulate", "--preset", "plain", "--link", str(tmp_path / "bench")]) == 2
+    assert not (tmp_path / "bench-sensor").is_symlink(), "the port that could be made must not stay behind"
 
 
 def test_a_player_sends_what_is_due_once(tmp_path) -> None:
