@@ -99,7 +99,7 @@ def test_the_reference_comes_over_its_port_in_real_time() -> None:
         values = np.concatenate([block.indications for block in blocks])
         assert np.array_equal(values, live.bench.reference_values(0, len(values)).round(5))
         last_s = blocks[-1].t_monotonic_ns / 1e9 - start_s
-        assert len(values) == pytest.approx(1000 * last_s, abs=60)  # bursts of 5 + 10 ms, opening, a busy machine
+        assert 1000 * last_s - 300 < len(values) < 1000 * last_s + 60  # bursts, opening; a busy machine reads late
         port = live.port.path
     assert not port.exists()
     assert not port.is_symlink()

@@ -179,8 +179,8 @@ def test_a_recording_is_played_whole_at_its_own_pace_and_the_port_ends_with_it(t
                 arrived.append((port.readline().strip(), time.monotonic()))
         assert process.wait(timeout=5) == 0
     assert [line for line, _ in arrived] == [b"# playing", *(row.split(",", 1)[1].encode() for row in rows)]
-    # 0.79 s from first to last; a burst every 5 ms, and a busy machine may be late at either end
-    assert arrived[-1][1] - arrived[1][1] == pytest.approx(0.79, abs=0.1)
+    # 0.79 s from first to last; bursts, and a busy machine may be late at either end, more so at the last
+    assert 0.6 < arrived[-1][1] - arrived[1][1] < 1.5
     assert not link.is_symlink()
 
 
@@ -221,7 +221,7 @@ def test_a_bench_serves_both_devices_from_one_zero_until_interrupted(tmp_path) -
             start = time.monotonic()
             for lines, port in zip(received, (sensor, reference), strict=True):
                 lines += [port.readline() for _ in range(300)]
-            assert time.monotonic() - start == pytest.approx(0.3, abs=0.15)  # from the zero on, at 1 kHz
+            assert 0.25 < time.monotonic() - start < 0.58  # 0.3 s at 1 kHz from the zero on; a busy machine is late
         process.send_signal(signal.SIGINT)
         assert process.wait(timeout=5) == 0
     bench = Bench(PRESETS["plain"](4), 4)
