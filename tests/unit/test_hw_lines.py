@@ -16,12 +16,17 @@ from hw.line_stream import LineStream
 from hw.lines import decode
 
 # The protocol, said once more: a decimal is sign, digits with at most one point, exponent; spaces around it do no harm.
-DECIMAL = re.compile(rb"[ \t\r]*[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?[ \t\r]*\Z")
+DECIMAL = re.compile(rb"[+-]?(\d*)\.?(\d*)([eE][+-]?\d+)?\Z")
+
+
+def is_decimal(field: bytes) -> bool:
+    match = DECIMAL.match(field.strip(b" \t"))
+    return match is not None and len(match[1] + match[2]) > 0 and len(match[1]) <= 16 and len(match[2]) <= 24
 
 
 def plain_reading(line: bytes, columns: int) -> list[float] | None:
-    fields = line.split(b",")
-    if len(fields) != columns or not all(DECIMAL.match(field) and len(field) <= 33 for field in fields):
+    fields = line.removesuffix(b"\r").split(b",")
+    if len(fields) != columns or not all(map(is_decimal, fields)):
         return None
     values = [float(field) for field in fields]
     return values if all(abs(value) <= 1e12 for value in values) else None
@@ -31,7 +36,25 @@ decimals = st.one_of(
     st.integers(-(10**9), 10**9).map(str),
     st.floats(allow_nan=False, allow_infinity=False, width=32).map(repr),
     st.sampled_from(
-        ["nan", "inf", "-inf", "1_0", "", "-", "1e400", "0x10", "1e13", "9" * 40, " 7", "+.5", "5.", "1 2"]
+        [
+            "nan",
+            "inf",
+            "-inf",
+            "1_0",
+            "",
+            "-",
+            "1e400",
+            "0x10",
+            "1e13",
+            "9" * 40,
+            " 7",
+            "+.5",
+            "5.",
+            "1 2",
+            ".",
+            "0." + "3" * 30,
+            "-1.5E-7",
+        ]
     ),
 )
 lines = st.one_of(
@@ -70,9 +93,11 @@ def test_decimals_come_back_exactly(values: list[float]) -> None:
 
 
 def test_overlong_lines_are_counted_in_bytes() -> None:
-    decoded = decode(b"1,2,3\n" + b"7" * 300 + b"\n4,5,6\n" + b"1,2," + b" " * 260 + b"3\n", 3)
-    assert decoded.line.tolist() == [0, 2]
-    assert (decoded.bad_lines, decoded.bad_bytes, decoded.bad_at) == (0, 301 + 266, [1, 3])
+    overlong = [b"7" * 300, b"1,2," + b" " * 260 + b"3", b"#" * 256, b"x" * 256]
+    decoded = decode(b"1,2,3\n" + b"\n4,5,6\n".join(overlong) + b"\n" + b"x" * 255 + b"\n" + b"#" * 255 + b"\n", 3)
+    assert decoded.line.tolist() == [0, 2, 4, 6]
+    assert decoded.bad_at == [1, 3, 5, 7, 8]
+    assert (decoded.bad_lines, decoded.bad_bytes) == (1, 301 + 266 + 257 + 257)
 
 
 def stream(sequence: bool = True, axes: int = 1) -> LineStream:
