@@ -77,6 +77,18 @@ def test_as_a_plain_reading_line_by_line(texts: list[tuple[bytes, bytes]]) -> No
     assert decoded.bad_lines == len(decoded.bad_at)
 
 
+@pytest.mark.parametrize("field", ["1", "-2.5", "+.5", "5.", "1e-3", "1E12", "0" * 16, "." + "3" * 24, "    7    "])
+def test_a_decimal(field: str) -> None:
+    assert decode(f"{field}\n".encode(), 1).values.tolist() == [[float(field)]]
+
+
+@pytest.mark.parametrize(
+    "field", ["nan", "-inf", "1_0", "-", ".", "1e400", "1.1e12", "0x1", "1 2", "0" * 17, "." + "3" * 25]
+)
+def test_no_decimal(field: str) -> None:
+    assert decode(f"{field}\n".encode(), 1).bad_at == [0]
+
+
 @given(st.binary(max_size=2000), st.integers(1, 4))
 def test_any_bytes_decode(text: bytes, columns: int) -> None:
     decoded = decode(text + b"\n", columns)
