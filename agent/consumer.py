@@ -41,8 +41,9 @@ class Consumer:
 
     Iterating yields the results of each gateway in the order of their sequence, each once. A gateway met for the first
     time begins with the values in force; one named in `last_sequence` (`<site>/<gateway>`: number) with all that came
-    after. Whenever a number is missing, and after every reconnection, the gateway's store is asked with `?after=`;
-    until it answers, what came later is held.
+    after. A result whose number before it is not the last one known shows that something is missing: then the gateway's
+    store is asked with `?after=`, and until it answers what came later is held. After a cut the newest results come
+    again by themselves (history and recovery of the advanced subscriber), so that this is noticed at once.
     `close` may be called from another thread than the one that iterates.
     Raises EndpointError or ConnectionError.
     """
@@ -52,10 +53,10 @@ class Consumer:
     ) -> None:
         self.last_sequence = dict(last_sequence or {})
         self._key = key
-        # None: the router is back, ask everyone; a second None ends the iteration once `close` was called.
-        self._inbox: queue.Queue[zenoh.Sample | None] = queue.Queue(maxsize=INBOX)
+        self._inbox: queue.Queue[zenoh.Sample | None] = queue.Queue(maxsize=INBOX)  # None: closed
         self._held: dict[str, deque[Received]] = {}
-        self._closed = threading.Event()
+        self._mutex = threading.Lock()  # closing a session that another thread uses raises in that moment
+        self._closed = False
         config = session_config("client", connect=endpoints)
         config.insert_json5("connect/timeout_ms", json.dumps(int(CONNECT_S * 1000)))
         self._open = ExitStack()
@@ -71,10 +72,7 @@ class Consumer:
             recovery=RecoveryConfig(heartbeat=True),  # type: ignore[call-arg]
         )
         self._open.callback(subscriber.undeclare)
-        links = self._session.info.declare_transport_events_listener(zenoh.handlers.RingChannel(16), history=True)
-        self._open.callback(links.undeclare)
-        for target, source in ((self._take_samples, subscriber), (self._take_links, links)):
-            threading.Thread(target=target, args=(source,), name="consumer", daemon=True).start()
+        threading.Thread(target=self._take_samples, args=(subscriber,), name="consumer", daemon=True).start()
 
     def __iter__(self) -> Iterator[Received]:
         while True:
@@ -84,22 +82,16 @@ class Consumer:
                 for source in list(self._held):
                     yield from self._ask(source)
                 continue
-            if self._closed.is_set():
-                return
             if sample is None:
-                yield from self._ask_everyone()
-            elif (result := _received(sample)) is not None:
+                return
+            if (result := _received(sample)) is not None:
                 yield from self._follow(result)
 
     def close(self) -> None:
         """End the iteration and the session. May be called twice, from any thread."""
-        if not self._closed.is_set():
-            self._closed.set()
+        with self._mutex:
+            self._closed = True
             self._open.close()
-            try:
-                self._inbox.put_nowait(None)
-            except queue.Full:
-                return  # the iteration is not waiting then
 
     def __enter__(self) -> Self:
         return self
@@ -110,11 +102,7 @@ class Consumer:
     def _take_samples(self, subscriber: Iterable[zenoh.Sample]) -> None:
         for sample in subscriber:
             self._inbox.put(sample)
-
-    def _take_links(self, links: Iterable[zenoh.TransportEvent]) -> None:
-        for link in links:
-            if link.kind == zenoh.SampleKind.PUT:
-                self._inbox.put(None)
+        self._inbox.put(None)  # undeclared
 
     def _follow(self, result: Received) -> Iterator[Received]:
         source = result.address.source
@@ -126,12 +114,6 @@ class Consumer:
             return
         self._held.setdefault(source, deque(maxlen=INBOX)).append(result)
         yield from self._ask(source)
-
-    def _ask_everyone(self) -> Iterator[Received]:
-        # A gateway that was never met and has nothing new to say would stay unknown.
-        met = {result.address.source for result in self._get(self._key)[0]}
-        for source in sorted(met | self.last_sequence.keys()):
-            yield from self._ask(source)
 
     def _ask(self, source: str) -> Iterator[Received]:
         selector = narrow(self._key, source)
@@ -154,16 +136,17 @@ class Consumer:
 
     def _get(self, selector: str) -> tuple[list[Received], bool]:
         """The results in order, and whether anybody answered at all."""
+        with self._mutex:
+            if self._closed:
+                return [], False
+            # Without consolidation, else only the last result of each key would come.
+            replies = self._session.get(selector, consolidation=zenoh.ConsolidationMode.NONE, timeout=ANSWER_S)
         answered = False
         results = []
-        try:
-            # Without consolidation, else only the last result of each key would come.
-            for reply in self._session.get(selector, consolidation=zenoh.ConsolidationMode.NONE, timeout=ANSWER_S):
-                if reply.ok:
-                    results.append(_received(reply.ok))
-                answered |= reply.err is None or reply.err.payload.to_bytes() == NOTHING
-        except zenoh.ZError:
-            pass  # the session was closed meanwhile
+        for reply in replies:
+            if reply.ok:
+                results.append(_received(reply.ok))
+            answered |= reply.err is None or reply.err.payload.to_bytes() == NOTHING
         return sorted((r for r in results if r is not None), key=lambda r: r.sequence), answered
 
 

@@ -28,7 +28,7 @@ def window(sequence: int, *, used: bool = True, reason: str = "", left_out: int 
 def calibration(
     sequence: int, *, sxx: float = 26154.0, qz_known: bool = True, identity: str = "A"
 ) -> CalibrationUpdate:
-    """S near 26000 counts per m/s2 with U = 12, Q = 250 with U = 80."""
+    """S near 26000 counts per m/s2 with U = 12, Q = 250 with U = 80; what is not known is NaN."""
     s = [[sxx, 120.0, 50.0], [-195.0, 26123.0, 67.0], [-81.0, 87.0, 26295.0]]
     u = [6.0] * 9 + [40.0, 40.0, 40.0 if qz_known else math.inf]
     return CalibrationUpdate(

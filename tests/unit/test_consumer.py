@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from agent.answers import NOTHING
 from agent.consumer import Consumer, Received
 from agent.keys import PREFIX, narrow, parse_key
 from agent.publication import Publisher
@@ -173,6 +174,36 @@ def test_what_comes_after_a_hole_is_held_until_the_gateway_answers(site: Site, g
     gateway.store.mark_published(gateway.base + 5)
     gateway.publisher.start()
     assert follower.up_to(5) == [3, 4, 5]
+    follower.stop()
+
+
+def test_what_the_store_does_not_have_comes_when_the_gateway_says_so(site: Site, gateway: Gateway) -> None:
+    gateway.publisher.start()
+    wait_for(lambda: gateway.publisher.state().connected)
+    follower = Follower(Consumer([site.endpoint], last_sequence={"site/gw": gateway.base}), gateway.base)
+    gateway.publisher.publish(record(gateway.base + 1))  # the disk is full, neither is in the store
+    assert follower.up_to(1) == [1]
+    with site.client() as other:  # as if 2 had been lost on the way
+        other.put("fieldcal/v1/site/gw/mems/window", record(gateway.base + 3).payload, attachment=str(gateway.base + 2))
+        assert follower.up_to(3) == [3]
+    follower.stop()
+
+
+def test_a_gateway_that_did_not_answer_is_asked_again(site: Site) -> None:
+    follower = Follower(Consumer([site.endpoint], last_sequence={"site/gw": 2}), 0)
+    with site.client() as other:
+        other.put("fieldcal/v1/site/gw/mems/window", record(4).payload, attachment="3")
+        with pytest.raises(queue.Empty):
+            follower.up_to(4, 0.5)
+        answering = other.declare_queryable("fieldcal/v1/site/gw/**", zenoh.handlers.FifoChannel(8))
+        with answering.recv() as query:
+            assert query.parameters.get("after") == "2"
+            for number in (3, 4):
+                query.reply("fieldcal/v1/site/gw/mems/window", record(number).payload)
+        with answering.recv() as query:
+            assert query.parameters.get("after") == "4"
+            query.reply_err(NOTHING)
+        assert follower.up_to(4) == [3, 4]
     follower.stop()
 
 

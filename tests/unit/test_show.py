@@ -110,16 +110,18 @@ def test_a_result_of_another_version_is_one_line_and_status_2(tmp_path: Path) ->
 @pytest.mark.skipif(os.geteuid() != 0, reason="needs root to become a user who may not write")
 def test_a_reader_who_may_not_write_sees_a_store_that_was_closed(tmp_path: Path) -> None:
     fill(tmp_path, calibration(1), status(2)).close()
-    # Once as root, so that all modules are loaded, which that user might not be allowed to read.
+    # Another one as root first, so that all modules are loaded, which that user might not be allowed to read.
     command = (
-        "import os, sys; from agent.show import show; options = ['--data-dir', sys.argv[1]]; "
-        "show(options, standalone_mode=False); os.setuid(65534); sys.exit(show(options, standalone_mode=False))"
+        "import os, sys; from agent.show import show; show(['--data-dir', sys.argv[2]], standalone_mode=False); "
+        "os.setuid(65534); sys.exit(show(['--data-dir', sys.argv[1]], standalone_mode=False))"
     )
     copy = Path("/var/tmp") / f"fieldcal-show-{os.getpid()}"
     shutil.copytree(tmp_path, copy)
     try:
         copy.chmod(0o555)
-        said = subprocess.run([sys.executable, "-c", command, copy], capture_output=True, text=True, timeout=20)
+        said = subprocess.run(
+            [sys.executable, "-c", command, copy, tmp_path], capture_output=True, text=True, timeout=20
+        )
     finally:
         copy.chmod(0o755)
         shutil.rmtree(copy)

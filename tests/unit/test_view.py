@@ -6,6 +6,7 @@ import io
 import time
 from types import SimpleNamespace
 
+import msgspec
 import numpy as np
 import pytest
 from rich.console import Console
@@ -95,7 +96,20 @@ def test_the_error_against_the_truth_is_the_largest_of_each_kind() -> None:
     state = full_state()
     state.truths["mems"] = truth
     assert any(expected in line for line in picture(state, 80, 24))
-    assert "Q 0.0000 m/s²" in truth_line(calibration(1, qz_known=False), truth), "what is not known is not counted"
+
+
+def test_what_is_not_determined_is_not_held_against_the_truth() -> None:
+    update = calibration(1)
+    truth = SimpleNamespace(sensitivity=np.array(update.sensitivity), offset=np.array(update.offset))
+    prior = msgspec.structs.replace(
+        update,
+        sensitivity=[[1.0, 2.0, 3.0], *update.sensitivity[1:]],
+        offset=[*update.offset[:2], 9999.0],
+        determined=[False] * 3 + [True] * 8 + [False],
+    )
+    assert truth_line(prior, truth).endswith("S main 0.000 %, transverse 0.000 %, Q 0.0000 m/s²")
+    nothing = msgspec.structs.replace(update, determined=[False] * 12)
+    assert truth_line(nothing, truth).endswith("S main – %, transverse – %, Q – m/s²")
 
 
 def test_a_parameter_that_is_not_known_is_not_given_a_number() -> None:
