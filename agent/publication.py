@@ -19,7 +19,7 @@ from agent.session import session_config
 from agent.store import Store
 
 BATCH = 100  # results read from the store at a time
-POLL_S = 0.5  # how soon a router that came back is seen; asking costs a microsecond
+POLL_S = 0.2  # how soon a router that came back is seen; asking costs a microsecond
 SETTLE_S = 0.2  # a router tells who subscribes just after it connects; what is put before goes only to the cache
 REOPEN_S = 5.0  # between attempts to open a session that the machine refuses
 CACHE_SAMPLES = 100  # per channel, for subscribers that come late; all before is in the store
@@ -68,7 +68,7 @@ class Publisher:
         self._thread = threading.Thread(target=self._run, name="publication", daemon=True)
 
     def start(self) -> None:
-        """Begin in a thread of its own; opening a session takes half a second without a router."""
+        """Begin, in a thread of its own."""
         self._thread.start()
 
     def publish(self, record: Record) -> None:

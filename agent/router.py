@@ -46,7 +46,6 @@ def open_router(listen: str | None, config_file: Path | None = None) -> tuple[ze
             config.insert_json5("listen/endpoints", json.dumps([endpoint]))
     else:
         config = session_config("router", listen=[endpoint or DEFAULT_ENDPOINT])
-        config.insert_json5("scouting/delay", "0")  # nothing to wait for: it connects nowhere
     config.insert_json5("adminspace/enabled", "true")  # it alone tells the real port
     try:
         session = zenoh.open(config)

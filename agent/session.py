@@ -22,6 +22,7 @@ def session_config(
         "mode": mode,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
+        "scouting/delay": 0,  # nothing is scouted for: by default opening waits half a second
         # Two files of 16 MiB in /dev/shm, left behind by a kill, for payloads that are never that large.
         "transport/shared_memory/enabled": False,
     }.items():
