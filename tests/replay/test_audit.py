@@ -18,6 +18,7 @@ from agent.comparison import OTHER_CPU
 from agent.events import RunStart
 from agent.fingerprint import environment_for, fingerprint
 from agent.recording import recordings
+from tests.replay.forgery import with_sums
 from tests.replay.stand_in import Recorded, StandIn, record_run
 from tests.replay.test_replay import alter_data, record_again
 
@@ -86,6 +87,15 @@ def test_a_replaced_file_breaks_the_chain(files: list[Path], tmp_path: Path) -> 
     assert any("SHA-256 differs" in reason for reason in third.reasons)
 
 
+def test_a_file_number_that_was_changed_is_found_though_the_sums_fit(files: list[Path]) -> None:
+    data = files[0].read_bytes()
+    at = data.index(b"file_sequence") + len(b"file_sequence") + 4
+    assert data[at : at + 1] == b"1"
+    files[0].write_bytes(with_sums(data[:at] + b"7" + data[at + 1 :]))
+    (file,) = audit_files(files[:1], StandIn.restore)
+    assert file.reasons == ["its metadata says file 7, its RunStart 1"]
+
+
 def test_results_that_do_not_follow_fail_though_every_sum_is_right(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -141,9 +151,12 @@ def test_another_fingerprint_is_compared_within_the_tolerance(tmp_path: Path) ->
     assert file.notes
 
 
-RECORD = (
-    "import sys; from pathlib import Path; from tests.replay.stand_in import record_run; record_run(Path(sys.argv[1]))"
-)
+RECORD = """
+import sys
+from pathlib import Path
+from tests.replay.stand_in import record_run
+record_run(Path(sys.argv[1]))
+"""
 AUDIT = """
 import sys
 from pathlib import Path

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from agent.comparison import OTHER_CPU
-from agent.events import CalibrationUpdate, Event, Result, RunStart, WindowReport
+from agent.events import CalibrationUpdate, Event, Result, RunStart, StatusChange, WindowReport
 from agent.fingerprint import fingerprint
 from agent.mcap_records import walk
 from agent.recording import Recorder, recordings
@@ -158,7 +158,15 @@ def alter_data(entry: Recorded) -> Recorded:
     return number, event, results
 
 
-@pytest.mark.parametrize("alter", [alter_number, drop_result, alter_data])
+def add_result(entry: Recorded) -> Recorded:
+    number, event, results = entry
+    status = StatusChange(
+        run_id="run-1", sequence=99, sensor="bridge-1", t_utc_ns=0, status="VALID", before="COLLECTING", reason=""
+    )
+    return number, event, [*results, status] if number == 1 else results
+
+
+@pytest.mark.parametrize("alter", [alter_number, drop_result, add_result, alter_data])
 def test_altered_recordings_with_sound_sums_do_not_pass(
     tmp_path: Path, alter: Callable[[Recorded], Recorded], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -166,6 +174,13 @@ def test_altered_recordings_with_sound_sums_do_not_pass(
     path = record_again(tmp_path / "again", recorded, alter)
     assert run_replay([path], StandIn.restore, as_json=False) == 3
     assert "results differ after" in capsys.readouterr().out
+
+
+def test_a_file_after_one_that_differs_is_judged_by_itself(tmp_path: Path) -> None:
+    recorded = record_run(tmp_path, blocks=BLOCKS, rotate_at=(9,))
+    record_again(tmp_path / "again", recorded, alter_data)
+    replay = replayed(files_of(tmp_path / "again"))
+    assert [(file.equal, file.in_chain) for file in replay.files] == [(False, False), (True, False)]
 
 
 def test_a_recording_from_elsewhere_is_compared_within_the_tolerance(tmp_path: Path) -> None:

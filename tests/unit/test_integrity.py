@@ -7,19 +7,21 @@ import struct
 import tracemalloc
 import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import zstandard
 from hypothesis import given
 from hypothesis import strategies as st
-from mcap.writer import CompressionType, IndexType, Writer
+from mcap.writer import IndexType, Writer
 
 from agent.crc_location import changed_byte
 from agent.integrity import Integrity, check_integrity
-from agent.mcap_records import MAGIC, RECORD_LIMIT, Record, RecordError, walk
+from agent.mcap_records import MAGIC, RECORD_LIMIT, RecordError
 from agent.messages import encode, schema_data, topic_of
 from agent.reading import RecordingReader
+from tests.replay.forgery import records, with_sums, write_messages
 from tests.replay.stand_in import CONFIG, StandIn, happenings, record_run, run_start
 
 MEMORY_LIMIT = 3 * RECORD_LIMIT  # bytes; a record, its content, and the parts it is taken into
@@ -27,10 +29,6 @@ MEMORY_LIMIT = 3 * RECORD_LIMIT  # bytes; a record, its content, and the parts i
 
 def check(data: bytes) -> Integrity:
     return check_integrity(io.BytesIO(data), len(data))
-
-
-def records(data: bytes) -> list[Record]:
-    return list(walk(io.BytesIO(data), len(data)))
 
 
 @pytest.fixture(scope="module")
@@ -98,16 +96,6 @@ def test_bytes_after_the_end_are_found(recording: bytes) -> None:
     assert check(recording + b"\0").faults[0].offset == len(recording)
 
 
-def with_sums(data: bytes) -> bytes:
-    """The file with data-section and summary CRC made to fit: what somebody does who changes a file on purpose."""
-    parts = records(data)
-    end = next(i for i, record in enumerate(parts) if record.opcode == 0x0F)
-    crc = zlib.crc32(data[: parts[end].offset])
-    footer = parts[-1]
-    body = data[: parts[end].offset + 9] + struct.pack("<I", crc) + data[parts[end].end : footer.offset + 25]
-    return body + struct.pack("<I", zlib.crc32(body[parts[end].end :])) + MAGIC
-
-
 @pytest.mark.parametrize("opcode", [0x03, 0x04, 0x08, 0x0B, 0x0D, 0x0E])
 def test_a_summary_that_contradicts_the_data_is_found_though_the_sums_fit(recording: bytes, opcode: int) -> None:
     start = next(record.end for record in records(recording) if record.opcode == 0x0F)
@@ -121,9 +109,13 @@ def test_a_summary_that_contradicts_the_data_is_found_though_the_sums_fit(record
             assert "agree" in found.faults[0].reason
 
 
-def test_a_record_left_out_of_the_summary_is_found(recording: bytes) -> None:
-    statistics = next(record for record in records(recording) if record.opcode == 0x0B)
-    assert check(with_sums(recording[: statistics.offset] + recording[statistics.end :])).faults
+def test_a_chunk_that_lies_about_its_times_is_found_though_the_sums_fit(recording: bytes) -> None:
+    chunk_record = next(record for record in records(recording) if record.name == "Chunk")
+    changed = bytearray(recording)
+    changed[chunk_record.offset + 9] ^= 1
+    found = check(with_sums(bytes(changed)))
+    assert (found.faults[0].offset, found.faults[0].record) == (chunk_record.offset, "Chunk")
+    assert "times" in found.faults[0].reason
 
 
 def test_message_indexes_are_held_against_the_chunk(recording: bytes) -> None:
@@ -136,15 +128,27 @@ def test_message_indexes_are_held_against_the_chunk(recording: bytes) -> None:
     assert "message index of channels [1]" in without.faults[0].reason
 
 
-def test_files_without_sums_or_indexes_are_refused() -> None:
-    for options in ({"enable_data_crcs": False}, {"enable_crcs": False}, {"index_types": IndexType.NONE}):
-        out = io.BytesIO()
-        writer = Writer(out, **({"enable_data_crcs": True} | options))
-        writer.start()
-        schema = writer.register_schema("fieldcal.v1.Event", "protobuf", schema_data("fieldcal.v1.Event"))
-        writer.add_message(writer.register_channel("/events", "protobuf", schema), 0, b"", 0)
-        writer.finish()
-        assert check(out.getvalue()).faults, options
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"enable_data_crcs": False}, "has no CRC"),
+        ({"enable_crcs": False}, "CRC does not fit"),
+        ({"index_types": IndexType.NONE}, "comes before the message index"),
+        ({"index_types": IndexType.MESSAGE}, "0 of ChunkIndex in the summary, 1 by the data"),
+        ({"use_statistics": False}, "0 of Statistics in the summary, 1 by the data"),
+        ({"repeat_channels": False}, "0 of Channel in the summary, 1 by the data"),
+        ({"use_summary_offsets": False}, "has offsets at its end"),
+        ({"use_chunking": False}, "does not belong here"),
+    ],
+)
+def test_files_written_with_less_are_refused(options: dict[str, Any], reason: str) -> None:
+    out = io.BytesIO()
+    writer = Writer(out, **({"enable_data_crcs": True} | options))
+    writer.start()
+    schema = writer.register_schema("fieldcal.v1.Event", "protobuf", schema_data("fieldcal.v1.Event"))
+    writer.add_message(writer.register_channel("/events", "protobuf", schema), 0, b"", 0)
+    writer.finish()
+    assert any(reason in fault.reason for fault in check(out.getvalue()).faults)
 
 
 @given(data=st.binary(min_size=1, max_size=300), at=st.integers(0, 299), flip=st.integers(1, 255))
@@ -162,9 +166,11 @@ def test_a_crc_that_no_single_byte_explains_names_none() -> None:
     assert changed_byte(zlib.crc32(data), zlib.crc32(changed), len(data)) is None
 
 
-def chunk(announced: int, packed: bytes, compression: bytes = b"zstd", data_length: int | None = None) -> bytes:
+def chunk(
+    announced: int, packed: bytes, compression: bytes = b"zstd", data_length: int | None = None, crc: int = 1
+) -> bytes:
     length = len(packed) if data_length is None else data_length
-    head = struct.pack("<QQQII", 0, 0, announced, 1, len(compression)) + compression + struct.pack("<Q", length)
+    head = struct.pack("<QQQII", 0, 0, announced, crc, len(compression)) + compression + struct.pack("<Q", length)
     return struct.pack("<BQ", 6, len(head + packed)) + head + packed
 
 
@@ -208,6 +214,20 @@ def test_hostile_lengths_are_refused_in_bounded_memory(hostile: bytes, tmp_path:
     assert peak < MEMORY_LIMIT
 
 
+def test_a_record_beyond_the_limit_is_not_read() -> None:
+    data = MAGIC + HEADER + struct.pack("<BQ", 12, RECORD_LIMIT + 1)
+    found = check_integrity(io.BytesIO(data), 1 << 40)
+    assert f"more than {RECORD_LIMIT}" in found.faults[0].reason
+
+
+@pytest.mark.parametrize("opcode", [3, 4, 5])
+def test_a_record_inside_a_chunk_cannot_reach_beyond_it(opcode: int) -> None:
+    inside = struct.pack("<BQ", opcode, 1 << 62) + bytes(30)
+    packed = chunk(len(inside), inside, compression=b"", crc=zlib.crc32(inside))
+    found = check(MAGIC + HEADER + packed + MAGIC)
+    assert "is too long" in found.faults[0].reason
+
+
 def mutated(data: bytes, rng: np.random.Generator) -> bytes:
     """A file spoilt in one to four places: bytes set, cut out, doubled, lengths made large, or the end cut off."""
     out = bytearray(data)
@@ -246,19 +266,11 @@ def test_mutated_messages_in_sound_files_are_refused_cleanly(tmp_path: Path) -> 
     path = tmp_path / "mutated.mcap"
     refused = 0
     for _ in range(200):
-        with open(path, "wb") as file:
-            writer = Writer(file, compression=CompressionType.NONE, enable_data_crcs=True)
-            writer.start()
-            schemas = {
-                name: writer.register_schema(f"fieldcal.v1.{name}", "protobuf", b"") for name in ("Event", "RawBlock")
-            }
-            topics = {"/events": "Event", "/acc/raw": "RawBlock", "/ref/raw": "RawBlock"}
-            ids = {topic: writer.register_channel(topic, "protobuf", schemas[name]) for topic, name in topics.items()}
-            spoilt = int(rng.integers(len(events)))
-            for number, item in enumerate(events):
-                data = encode(number, item)
-                writer.add_message(ids[topic_of(item)], 0, mutated(data, rng) if number == spoilt else data, 0, number)
-            writer.finish()
+        spoilt = int(rng.integers(len(events)))
+        messages = [(topic_of(event), number, encode(number, event)) for number, event in enumerate(events)]
+        topic, _, data = messages[spoilt]
+        messages[spoilt] = (topic, spoilt, mutated(data, rng))
+        write_messages(path, messages)
         reader = RecordingReader(path)
         steps = list(reader.steps())
         refused += reader.fault is not None

@@ -138,8 +138,8 @@ def test_calibration_scalars_have_the_papers_names() -> None:
     decimal=st.booleans(),
     transposed=st.booleans(),
     first_index=st.integers(0, 2**62),
-    temperature=st.none() | NUMBER,
-    raw=st.none() | INTEGER,
+    temperature=st.sampled_from([None, 0.0, -0.0]) | NUMBER,
+    raw=st.sampled_from([None, 0]) | INTEGER,
     flags=st.integers(0, 15),
     seed=st.integers(0, 2**32),
 )

@@ -218,6 +218,21 @@ def test_a_full_disk_ends_the_file_and_a_later_run_start_begins_another(
     assert (metadata["previous_file"], metadata["previous_sha256"]) == ("fieldcal-000001.mcap", "")
 
 
+def test_after_a_failed_file_the_next_does_not_name_the_one_before_it(tmp_path: Path) -> None:
+    recorder = begun(tmp_path)
+    recorder.record(1, run_start(StandIn(CONFIG), 1, 2), [])
+    assert recorder.path is not None
+    with largest_file(recorder.path.stat().st_size):
+        recorder.record(2, tick(6), [])
+        recorder.sync()
+    assert not recorder.recording
+    recorder.record(3, run_start(StandIn(CONFIG), 3, 3), [])
+    recorder.close()
+    with open(tmp_path / "fieldcal-000003.mcap", "rb") as file:
+        metadata = next(make_reader(file).iter_metadata()).metadata
+    assert (metadata["previous_file"], metadata["previous_sha256"]) == ("fieldcal-000002.mcap", "")
+
+
 def test_no_file_is_ever_overwritten(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / "fieldcal-000001.mcap.active").write_bytes(b"kept")
     recorder = Recorder(tmp_path, [], [])
@@ -239,10 +254,12 @@ def test_an_event_that_has_no_form_ends_the_file_properly(tmp_path: Path) -> Non
     recorder.close()
 
 
-def test_a_missing_directory_is_a_fault_and_no_exception(tmp_path: Path) -> None:
+def test_a_missing_directory_is_a_fault_and_no_exception(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     recorder = Recorder(tmp_path / "gone", [], [])
-    assert not recorder.record(0, run_start(StandIn(CONFIG), 0, 1), [])
+    for _ in range(3):
+        assert not recorder.record(0, run_start(StandIn(CONFIG), 0, 1), [])
     assert "No such file" in recorder.fault
+    assert len(caplog.records) == 1  # said once, not every ten seconds
 
 
 KILLED = """

@@ -1,0 +1,43 @@
+"""Files that a careful forger would make: what they say is wrong, every sum in them is right."""
+
+from __future__ import annotations
+
+import io
+import struct
+import zlib
+from collections.abc import Iterable
+from pathlib import Path
+
+from mcap.writer import CompressionType, Writer
+
+from agent.mcap_records import MAGIC, Record, walk
+from agent.messages import schema_data, schema_of
+
+
+def records(data: bytes) -> list[Record]:
+    """All records of a file that can be walked."""
+    return list(walk(io.BytesIO(data), len(data)))
+
+
+def with_sums(data: bytes) -> bytes:
+    """The file with the CRCs of data section and summary made to fit."""
+    parts = records(data)
+    end = next(record for record in parts if record.name == "DataEnd")
+    crc = zlib.crc32(data[: end.offset])
+    body = data[: end.offset + 9] + struct.pack("<I", crc) + data[end.end : parts[-1].offset + 25]
+    return body + struct.pack("<I", zlib.crc32(body[end.end :])) + MAGIC
+
+
+def write_messages(path: Path, messages: Iterable[tuple[str, int, bytes]]) -> None:
+    """A sound file of messages (topic, sequence, data)."""
+    with open(path, "wb") as file:
+        writer = Writer(file, compression=CompressionType.NONE, enable_data_crcs=True)
+        writer.start()
+        channels: dict[str, int] = {}
+        for topic, sequence, data in messages:
+            if topic not in channels:
+                name = schema_of(topic)
+                schema = writer.register_schema(name, "protobuf", schema_data(name))
+                channels[topic] = writer.register_channel(topic, "protobuf", schema)
+            writer.add_message(channels[topic], 0, data, 0, sequence)
+        writer.finish()
