@@ -61,7 +61,7 @@ def _points(raw: NDArray[np.uint8], ends: Positions) -> Positions | None:
     if len(points) == len(ends) and (points < ends).all() and (points[1:] > ends[:-1]).all():
         return points
     of_field = np.searchsorted(ends, points)
-    if len(np.unique(of_field)) < len(of_field):
+    if (of_field[1:] == of_field[:-1]).any():
         return None
     out = ends.copy()
     out[of_field] = points

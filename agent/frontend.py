@@ -1,7 +1,8 @@
-"""From files to windows: clocks out of the stamps, the reference at the sensor's sample times, windows with verdicts."""
+"""From files to windows: clocks out of the stamps, the reference at the sensor's sample times, verdicts."""
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -76,8 +77,8 @@ class FrontEnd:
         for kind, part_start_s, part_stop_s in self._parts(start_s, stop_s):
             pieces = max(1, math.ceil((part_stop_s - part_start_s) / limits.longest_s))
             edges = np.linspace(part_start_s, part_stop_s, pieces + 1)
-            for a, b in zip(edges[:-1], edges[1:], strict=True):
-                points = self._points(float(a), float(b), lag_s)
+            for a, b in itertools.pairwise(edges.tolist()):
+                points = self._points(a, b, lag_s)
                 if len(points.time_s) > 1:
                     yield from judged(kind, pose, points, limits, leave_out=leave_out)
 

@@ -36,33 +36,40 @@ def moving(u: Array, rate_hz: float) -> list[Stretch]:
     return _stretches(_bridged(on, round(BRIDGE_S / FRAME_S)), size * width, len(u))
 
 
-def knocked(V: Array, basis: Array) -> Mask:
-    """Points (n,) whose residual about the regression of V (n, 3) on `basis` (n, p) is beyond five robust SDs."""
-    kept = np.ones(len(V), dtype=bool)
-    finest = 0.5 * least_step(V)
+def knocked(V: Array, basis: Array, finest: Array) -> tuple[Mask, Array]:
+    """Points (n,) whose residual about the regression of V (n, 3) on `basis` (n, p) is beyond five robust SDs.
+
+    Also the residuals (n, 3) about the regression of the others. `finest` (3,): the resolution of V (`least_step`).
+    """
+    struck: Mask = np.zeros(len(V), dtype=bool)
     for _ in range(KNOCK_PASSES):
+        kept = slice(None) if not struck.any() else ~struck
         solution, *_ = np.linalg.lstsq(basis[kept], V[kept], rcond=None)
-        away = np.abs(V - basis @ solution)
-        limit = KNOCK_SD * np.maximum(1.4826 * np.median(away[kept], axis=0), finest)
-        now = np.all(away <= limit, axis=1)
-        if np.array_equal(now, kept):
+        residual = V - basis @ solution
+        away = np.abs(residual)
+        limit = KNOCK_SD * np.maximum(1.4826 * np.median(away[kept], axis=0), 0.5 * finest)
+        now = np.asarray((away > limit).any(axis=1))
+        if np.array_equal(now, struck):
             break
-        kept = now
-    return ~kept
+        struck = now
+    return struck, residual
 
 
-def clipped(V: Array, basis: Array) -> int:
-    """Points of V (n, 3) held at an end of the range: several at the very same extreme while the motion goes beyond."""
-    solution, *_ = np.linalg.lstsq(basis, V, rcond=None)
-    away = V - basis @ solution
-    sd = 1.4826 * np.median(np.abs(away), axis=0)
+def clipped(V: Array, residual: Array, finest: Array) -> int:
+    """Points of V (n, 3) held at an end of the range: several at the very same extreme while the motion goes beyond.
+
+    `residual` (n, 3) of V about the motion, `finest` (3,) the resolution of V.
+    """
     points = 0
-    for sign in (1.0, -1.0):
-        at_end = (sign * V).max(axis=0) * sign == V
-        count = at_end.sum(axis=0)
-        shortfall = -sign * (away * at_end).sum(axis=0) / count
-        held = (count >= CLIPPED_POINTS) & (shortfall > sd + 2.0 * least_step(V))
-        points += int(count[held].sum())
+    for axis in range(V.shape[1]):
+        v, r = V[:, axis], residual[:, axis]
+        for end, sign in ((v.max(), 1.0), (v.min(), -1.0)):
+            held = np.flatnonzero(v == end)
+            if len(held) < CLIPPED_POINTS:
+                continue
+            shortfall = -sign * float(r[held].mean())
+            if shortfall > 1.4826 * float(np.median(np.abs(r))) + 2.0 * finest[axis]:
+                points += len(held)
     return points
 
 
@@ -90,7 +97,7 @@ def white_noise(x: Array) -> Array:
 def least_step(V: Array) -> Array:
     """(3,) the smallest change between neighbouring samples: the resolution of counts, next to nothing of decimals."""
     steps = np.abs(np.diff(V, axis=0))
-    least = np.where(steps > 0, steps, np.inf).min(axis=0, initial=np.inf)
+    least = np.min(steps, axis=0, where=steps > 0, initial=np.inf)
     return np.where(np.isfinite(least), least, 0.0)
 
 

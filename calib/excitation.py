@@ -13,7 +13,6 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from calib import detection
-from calib.detection import Mask
 from calib.model import Array, Pose, Window, WindowSums
 from calib.rests import find_rests
 from calib.sums import factor, pool, window_sums
@@ -98,13 +97,17 @@ def rest_window(
         return _window("rest", pose, time_s, _rest_sums(V, rate_hz, limits), _never(numbers), 0)
     at_rest = np.concatenate([np.arange(a, b) for a, b in rests])
     t, v = time_s[at_rest], V[at_rest]
-    struck = detection.knocked(v, np.ones((len(v), 1))) if leave_out else np.zeros(len(v), dtype=bool)
-    sums = _rest_sums(v[~struck], rate_hz, limits)
+    finest = detection.least_step(v)
+    struck, _ = detection.knocked(v, np.ones((len(v), 1)), finest)
+    clean = sums = _rest_sums(v[~struck], rate_hz, limits)
+    if not leave_out:
+        sums = _rest_sums(v, rate_hz, limits)
     numbers = {"at_rest_pct": 100.0 * len(v) / len(V)}
     if floor is not None:
-        least = np.maximum(np.maximum(floor, detection.least_step(V)), np.finfo(float).tiny)
-        numbers["sd_over_floor"] = float(np.max(_within_sd(sums) / least))
-    return _window("rest", pose, t, sums, judge(sums, struck, numbers, limits), int(struck.sum()))
+        least = np.maximum(np.maximum(floor, finest), np.finfo(float).tiny)
+        numbers["sd_over_floor"] = float(np.max(_within_sd(clean) / least))
+    left_out = int(struck.sum()) if leave_out else 0
+    return _window("rest", pose, t, sums, judge(sums, struck, numbers, limits), left_out)
 
 
 def rest_sd(V: Array, rate_hz: float) -> Array | None:
@@ -114,26 +117,36 @@ def rest_sd(V: Array, rate_hz: float) -> Array | None:
 
 
 def _motion(kind: Kind, pose: Pose, points: Points, limits: Limits, leave_out: bool) -> Window:
-    t, V, u, du = points
+    """One window. It is judged without the knocks, also where they stay in its sums."""
+    t, _, u, du = points
+    V = np.asfortranarray(points.V)  # medians and extremes of an axis are several times faster this way
     rate_hz = _rate(t)
-    basis = np.hstack([np.ones((len(u), 1)), u, du])
-    enough = len(V) >= max(limits.least_points, basis.shape[1] + 1)
-    struck = detection.knocked(V, basis) if leave_out and enough else np.zeros(len(V), dtype=bool)
-    kept = ~struck
-    sums = _sums(V[kept], u[kept], du[kept], rate_hz, limits)
-    numbers = _motion_numbers(sums, basis, V, kept, rate_hz) if enough else {}
+    if len(V) < max(limits.least_points, 2 * u.shape[1] + 2):
+        sums = _sums(V, u, du, rate_hz, limits)
+        return _window(kind, pose, t, sums, judge(sums, np.zeros(len(V), dtype=bool), {}, limits), 0)
+    basis = np.column_stack([np.ones(len(u)), u, du])
+    finest = detection.least_step(V)
+    struck, residual = detection.knocked(V, basis, finest)
+    clean = sums = _sums(V, u, du, rate_hz, limits)
+    if struck.any():
+        kept = ~struck
+        clean = _sums(V[kept], u[kept], du[kept], rate_hz, limits)
+        if leave_out:
+            sums = clean
+    numbers = _motion_numbers(clean, basis[~struck], V[~struck], rate_hz)
+    numbers["clipped_points"] = float(detection.clipped(V, residual, finest))
     verdict = judge(sums, struck, numbers, limits)
-    if kind == "quiet" and (verdict.used or not enough):
+    if kind == "quiet" and verdict.used:
         verdict = Verdict(False, "the reference is calm here", verdict.numbers)
-    return _window(kind, pose, t, sums, verdict, int(struck.sum()))
+    return _window(kind, pose, t, sums, verdict, int(struck.sum()) if leave_out else 0)
 
 
-def _motion_numbers(sums: WindowSums, basis: Array, V: Array, kept: Mask, rate_hz: float) -> dict[str, float]:
-    """Level, noise and coherence in the band of the motion; drift of the mean; clipped points."""
+def _motion_numbers(sums: WindowSums, basis: Array, V: Array, rate_hz: float) -> dict[str, float]:
+    """Level, noise and coherence in the band of the motion; drift of the mean. `basis` (n, 1 + 2 m) is [1, u, du]."""
     m = sums.reference_channels
     u = basis[:, 1 : 1 + m]
-    width = detection.band_width(u[kept], rate_hz)
-    slow, slow_v = detection.averaged(basis[kept], width), detection.averaged(V[kept], width)
+    width = detection.band_width(u, rate_hz)
+    slow, slow_v = detection.averaged(basis, width), detection.averaged(V, width)
     solution, *_ = np.linalg.lstsq(slow, slow_v, rcond=None)
     total = float(np.sum((slow_v - slow_v.mean(axis=0)) ** 2))
     rest = float(np.sum((slow_v - slow @ solution) ** 2))
@@ -143,7 +156,6 @@ def _motion_numbers(sums: WindowSums, basis: Array, V: Array, kept: Mask, rate_h
         "reference_noise_mps2": float(np.sqrt(np.sum(detection.white_noise(u) ** 2) / width)),
         "coherence": 1.0 - rest / total if total > 0 else 0.0,
         "drift_mps2": _drift(sums) / scale if scale > 0 else np.inf,
-        "clipped_points": float(detection.clipped(V, basis)),
     }
 
 
