@@ -67,6 +67,18 @@ def fit(windows: Sequence[Window]) -> Fit:
     return Fit(calibration, np.sqrt(np.maximum(np.diag(residual), 0.0)), rank, condition, points)
 
 
+def refusal(found: Fit, windows: Sequence[Window]) -> list[str]:
+    """Why the points cannot be used, empty where they can: nothing determined, or a clamp's positions that leave a
+    direction unseen (with one theta any two alphas do, section 2.3)."""
+    if not found.calibration.determined.any():
+        return [f"rank {found.rank} of 4: no parameter is determined by these windows"]
+    if found.rank < 4 and any(w.used and w.pose.alpha_rad is not None for w in windows):
+        return [
+            f"rank {found.rank} of 4: the clamp's positions leave a direction unseen; three alphas or more are needed"
+        ]
+    return []
+
+
 def _stack(windows: Sequence[Window]) -> tuple[Array, Array, Array, int, int]:
     """Rows R_w M_w of all windows, their right-hand sides, the scatter within windows, points, and rows that count."""
     rows, rhs, scatter, points, free = [], [], np.zeros((3, 3)), 0, 0

@@ -1,0 +1,157 @@
+"""The outcome of `fieldcal calibrate`: the JSON object of the contract, and the same for people."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from agent import __version__
+from agent.quantity import plus_minus
+from calib.model import Array, Calibration, Window
+
+AXES = "xyz"
+
+
+@dataclass(frozen=True, slots=True)
+class NuisanceValue:
+    """A nuisance after the adjustment."""
+
+    name: str
+    value: float
+    standard_uncertainty: float
+    unit: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outcome:
+    """What the data say; `calibration` is None where they are refused, and `reasons` then say why."""
+
+    calibration: Calibration | None
+    reasons: tuple[str, ...]
+    windows: Sequence[Window]
+    rate_hz: float
+    method: str
+    coverage_factor: float = 2.0
+    uncertainty_kind: str = ""
+    nuisances: Sequence[NuisanceValue] = ()
+    lag_s: float | None = None
+    rank: int | None = None
+    residual_sd: Sequence[float] | None = None
+    statistics: Mapping[str, Any] = field(default_factory=dict)
+    more: Mapping[str, Any] = field(default_factory=dict)  # further members of the JSON object
+
+
+def as_json(outcome: Outcome) -> str:
+    """One JSON object; what is not known is null."""
+    return msgspec.json.encode(_plain(as_object(outcome))).decode()
+
+
+def as_object(outcome: Outcome) -> dict[str, Any]:
+    """The members of the contract, then more."""
+    c = outcome.calibration
+    nothing = np.full(12, np.nan)
+    values = nothing if c is None else np.append(c.sensitivity.ravel(), c.offset)
+    u = nothing if c is None else c.standard_uncertainty
+    expanded = _parts(outcome.coverage_factor * u)
+    return {
+        **_parts(values),
+        "standard_uncertainty": _parts(u),
+        "expanded_uncertainty": {**expanded, "coverage_factor": outcome.coverage_factor},
+        "covariance": np.full((12, 12), np.nan) if c is None else c.covariance,
+        "determined": _parts(np.zeros(12, dtype=bool) if c is None else c.determined),
+        "nuisances": {
+            n.name: {"value": n.value, "standard_uncertainty": n.standard_uncertainty, "unit": n.unit}
+            for n in outcome.nuisances
+        },
+        "lag_s": outcome.lag_s,
+        "rate_hz": outcome.rate_hz,
+        "status": "refused" if outcome.reasons else "valid",
+        "reasons": list(outcome.reasons),
+        "windows": [_window(w) for w in outcome.windows],
+        "statistics": dict(outcome.statistics),
+        "version": __version__,
+        "method": outcome.method,
+        "uncertainty_kind": outcome.uncertainty_kind,
+        "degrees_of_freedom": None if c is None else c.degrees_of_freedom,
+        "rank": outcome.rank,
+        "residual_sd": outcome.residual_sd,
+        **outcome.more,
+    }
+
+
+def _parts(values: Array | np.ndarray[Any, np.dtype[np.bool_]]) -> dict[str, Any]:
+    """(12,) in the order of calib.model.PARAMETERS as S and Q."""
+    return {"sensitivity": values[:9].reshape(3, 3), "offset": values[9:]}
+
+
+def _window(window: Window) -> dict[str, Any]:
+    return {
+        "start_s": window.start_s,
+        "stop_s": window.stop_s,
+        "used": window.used,
+        "reason": window.reason,
+        "points": window.points,
+        "left_out": window.left_out,
+        "kind": window.kind,
+        "position": window.pose.position,
+        "numbers": dict(window.numbers),
+    }
+
+
+def _plain(value: Any) -> Any:
+    """JSON's own types; what is no finite number is null."""
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return _plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def print_outcome(outcome: Outcome) -> None:
+    """S and Q with their expanded uncertainties, the windows and what they were found fit for."""
+    from rich.console import Console
+
+    console = Console(highlight=False, markup=False)
+    _print_windows(console, outcome.windows)
+    if outcome.calibration is not None:
+        _print_calibration(console, outcome)
+    for n in outcome.nuisances:
+        console.print(f"  {n.name}: {plus_minus(n.value, outcome.coverage_factor * n.standard_uncertainty)} {n.unit}")
+    console.print(f"  sampling rate {outcome.rate_hz:.7g} Hz", soft_wrap=True)
+
+
+def _print_calibration(console: Any, outcome: Outcome) -> None:
+    from rich import box
+    from rich.table import Table
+
+    c = outcome.calibration
+    assert c is not None
+    expanded = outcome.coverage_factor * c.standard_uncertainty
+    values = np.append(c.sensitivity.ravel(), c.offset)
+    cells = [
+        plus_minus(float(v), float(e)) if d else "not determined"
+        for v, e, d in zip(values, expanded, c.determined, strict=True)
+    ]
+    table = Table(box=box.SIMPLE_HEAD)
+    for heading in ("", "Sx", "Sy", "Sz", "Q"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for i, axis in enumerate(AXES):
+        table.add_row(axis, *cells[3 * i : 3 * i + 3], cells[9 + i])
+    console.print(table)
+    kind = f", {outcome.uncertainty_kind}" if outcome.uncertainty_kind else ""
+    console.print(f"  S in output unit per m/s², Q in output unit, U with k = {outcome.coverage_factor:.3g}{kind}")
+    console.print(f"  method {outcome.method}, {sum(w.used for w in outcome.windows)} windows", soft_wrap=True)
+
+
+def _print_windows(console: Any, windows: Sequence[Window]) -> None:
+    for w in windows:
+        left = f", {w.left_out} left out" if w.left_out else ""
+        verdict = f"{w.points} points{left}" if w.used else f"not used: {w.reason}"
+        console.print(f"  {w.start_s:10.3f} to {w.stop_s:10.3f} s  {w.pose.position}: {verdict}", soft_wrap=True)
