@@ -7,7 +7,6 @@ run one after the other on the same ports, twice.
 from __future__ import annotations
 
 import os
-import signal
 import subprocess
 import sys
 import tempfile
@@ -66,7 +65,7 @@ def measure(command: list[str]) -> tuple[float, float]:
         share = (cpu_s(process.pid) - before) / (time.monotonic() - began)
         return share, peak_mb(process.pid)
     finally:
-        process.send_signal(signal.SIGINT)
+        process.terminate()
         process.wait(20)
 
 
