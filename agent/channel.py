@@ -26,8 +26,8 @@ WAYS = frozenset({"port", "baud_rate", "bus"})
 class ChannelState:
     """All that is known of one channel; changes with events only.
 
-    The first status comes with the first news of the sensor: UNCALIBRATED (nothing known), COLLECTING (windows used, not
-    all parameters determined), VALID (a calibration in force) or INVALID (the sensor is silent or lost).
+    The first status comes with the first news of the sensor: UNCALIBRATED (nothing known), COLLECTING (windows used,
+    not all parameters determined), VALID (a calibration in force) or INVALID (the sensor is silent or lost).
     """
 
     def __init__(self, channel: Channel) -> None:

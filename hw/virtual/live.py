@@ -47,7 +47,7 @@ class LiveBench:
             "address": ADDRESS,
             "rate_hz": parameters.sensor.clock.nominal_rate_hz,
             "range_g": _range_g(parameters.sensor.nominal_sensitivity),
-            # A quarter of the FIFO: a laptop under load, which also runs the bench itself, is late by 20 ms now and then.
+            # A quarter of the FIFO: a laptop that also runs the bench is late by 20 ms now and then.
             "poll_interval_s": 0.008,
         }
         self._lines = serial_lines(self.bench, "reference", self.time)
