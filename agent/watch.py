@@ -24,10 +24,10 @@ class Watch(logging.Handler):
     def __init__(self, config: Config, title: str, truth: Truth | None) -> None:
         super().__init__(logging.WARNING)
         gateway = config.gateway
-        self._state = ViewState(title=title, gateway=f"{gateway.site}/{gateway.name}")
-        self._state.devices = {d.name: DeviceState(kind=d.driver) for d in config.devices}
+        self.state = ViewState(title=title, gateway=f"{gateway.site}/{gateway.name}")
+        self.state.devices = {d.name: DeviceState(kind=d.driver) for d in config.devices}
         if truth is not None:
-            self._state.truths = {channel.sensor: truth for channel in config.channels}
+            self.state.truths = {channel.sensor: truth for channel in config.channels}
         self._arrivals: dict[str, deque[tuple[int, int]]] = {
             d.name: deque(maxlen=RATE_OVER_BLOCKS) for d in config.devices
         }
@@ -35,7 +35,7 @@ class Watch(logging.Handler):
         self._began_s = time.monotonic()
 
     def __enter__(self) -> Watch:
-        self._view = open_view(self._state, sys.stdout)
+        self._view = open_view(self.state, sys.stdout)
         logging.getLogger("agent").addHandler(self)
         return self
 
@@ -59,29 +59,29 @@ class Watch(logging.Handler):
         elif isinstance(event, DeviceChange):
             self._take_change(event)
         elif isinstance(event, Gap):
-            self._state.devices[event.device].gaps += 1
+            self.state.devices[event.device].gaps += 1
             self.say(f"{event.device}: {event.dropped} {event.unit} dropped, {event.reason}")
-        self._state.take(results)
+        self.state.take(results)
         self._take_said()
         self._view.refresh(now=bool(results))
 
     def health(self, recorder: Recorder, publication: PublicationState | None) -> None:
         """Once a second: what is recorded and published."""
-        self._state.uptime_s = time.monotonic() - self._began_s
-        self._state.publication = publication
+        self.state.uptime_s = time.monotonic() - self._began_s
+        self.state.publication = publication
         path = recorder.path
         if path is not None:
-            self._state.recording = RecordingState(str(path), recorder.size_bytes, recording=True)
-        elif self._state.recording is not None:
-            self._state.recording.recording = False
+            self.state.recording = RecordingState(str(path), recorder.size_bytes, recording=True)
+        elif self.state.recording is not None:
+            self.state.recording.recording = False
         self._view.refresh()
 
     def _take_said(self) -> None:
         while not self._said.empty():
-            self._state.say(self._said.get())
+            self.state.say(self._said.get())
 
     def _take_block(self, block: SampleBlock) -> None:
-        device = self._state.devices[block.device]
+        device = self.state.devices[block.device]
         arrivals = self._arrivals[block.device]
         device.blocks += 1
         if block.flags & (BlockFlags.GAP | BlockFlags.OVERRUN) or (block.flags & BlockFlags.RESTART and arrivals):
@@ -94,7 +94,7 @@ class Watch(logging.Handler):
             device.rate_hz = (arrivals[-1][0] - arrivals[0][0]) * 1e9 / elapsed_ns
 
     def _take_change(self, change: DeviceChange) -> None:
-        device = self._state.devices[change.device]
+        device = self.state.devices[change.device]
         device.state = "lost" if change.state == "lost" else "open"
         if change.state == "open":
             device.kind = change.message

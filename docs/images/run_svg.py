@@ -1,0 +1,36 @@
+"""Makes run.svg, the README's picture: a real run on the virtual bench, as the terminal shows it after a minute.
+
+    .venv/bin/python docs/images/run_svg.py
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+
+os.environ["OPENBLAS_NUM_THREADS"] = "1"
+
+from rich.console import Console
+
+from agent.run import LOOPBACK, router, virtual_bench
+from agent.screen import Picture
+from agent.service import Service
+from agent.watch import Watch
+
+HERE = Path(__file__).parent
+
+
+def main() -> None:
+    """Run for a minute, draw the last state."""
+    with tempfile.TemporaryDirectory() as directory, router(LOOPBACK) as said, virtual_bench("plain", 1) as (config, truth):
+        os.chdir(directory)
+        with Watch(config, "virtual bench, plain", truth) as watch:
+            watch.say(said)
+            Service(config, Path("data"), watch).run(56.0)
+            console = Console(record=True, width=100, height=30, file=open(os.devnull, "w"), force_terminal=True)
+            console.print(Picture(watch.state))
+        console.save_svg(str(HERE / "run.svg"), title="make run")
+
+
+main()
