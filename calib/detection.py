@@ -20,6 +20,7 @@ KNOCK_SD = 5.0  # robust SDs: one white-noise point in 1.7 million
 KNOCK_PASSES = 8
 SLOW_BAND_HZ = 50.0  # first band tried for the motion; widened until it holds most of the motion's power
 MOST_POWER = 0.7
+FEWEST_FOR_SPECTRUM = 16
 CLIPPED_POINTS = 3  # as many points at the very same extreme, and beyond it by the motion, are no chance
 
 
@@ -68,7 +69,7 @@ def clipped(V: Array, residual: Array, finest: Array) -> int:
             if len(held) < CLIPPED_POINTS:
                 continue
             shortfall = -sign * float(r[held].mean())
-            if shortfall > 1.4826 * float(np.median(np.abs(r))) + 2.0 * finest[axis]:
+            if shortfall > 1.4826 * float(np.median(np.abs(r))) + finest[axis]:
                 points += len(held)
     return points
 
@@ -89,9 +90,13 @@ def averaged(x: Array, width: int) -> Array:
 
 
 def white_noise(x: Array) -> Array:
-    """SD (m,) of white noise in x (n, m), from its third differences: motion well below the rate hardly shows there."""
-    third = np.diff(x, n=3, axis=0)
-    return np.asarray(np.sqrt(np.mean(third**2, axis=0) / 20.0)) if len(third) else np.zeros(x.shape[1])
+    """SD (m,) of white noise in x (n, m), by the median of its spectrum: motion in under half the band leaves it."""
+    if len(x) < FEWEST_FOR_SPECTRUM:
+        return np.zeros(x.shape[1])
+    window = np.hanning(len(x))[:, None]
+    power = np.abs(np.fft.rfft((x - x.mean(axis=0)) * window, axis=0)[1:-1]) ** 2 / np.sum(window**2)
+    # The power of a line of white noise is exponentially distributed: its mean is the median over ln 2.
+    return np.asarray(np.sqrt(np.median(power, axis=0) / np.log(2.0)))
 
 
 def least_step(V: Array) -> Array:

@@ -153,7 +153,8 @@ def _motion_numbers(sums: WindowSums, basis: Array, V: Array, rate_hz: float) ->
     scale = float(np.linalg.norm(solution[1 : 1 + m], 2))
     return {
         "reference_rms_mps2": float(np.sqrt(np.sum(np.var(slow[:, 1 : 1 + m], axis=0)))),
-        "reference_noise_mps2": float(np.sqrt(np.sum(detection.white_noise(u) ** 2) / width)),
+        # Of a constant channel rounding alone is left of both; it is silent.
+        "reference_noise_mps2": float(np.sqrt(np.sum(detection.white_noise(u) ** 2) / width) + 1e-12 * np.abs(u).max()),
         "coherence": 1.0 - rest / total if total > 0 else 0.0,
         "drift_mps2": _drift(sums) / scale if scale > 0 else np.inf,
     }

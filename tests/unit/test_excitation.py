@@ -1,0 +1,269 @@
+"""Windows and their verdicts: each fault that a window may have is found, named and counted; a good one is whole."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from calib import detection
+from calib.excitation import Points, motion_parts, motion_windows, rest_sd, rest_window
+from calib.geometry import along, at_rest, beside, clamp
+from calib.model import Window
+
+RATE_HZ = 500.0
+S = np.array([[1.02, 0.01, -0.02], [0.015, 0.98, 0.005], [-0.01, 0.02, 1.01]])
+POSE = clamp(np.radians(35), np.radians(30))
+
+
+def sine(n: int, frequency_hz: float = 3.0, size: float = 5.0) -> tuple[np.ndarray, np.ndarray]:
+    omega = 2 * np.pi * frequency_hz
+    t = np.arange(n) / RATE_HZ
+    return size * np.sin(omega * t)[:, None], size * omega * np.cos(omega * t)[:, None]
+
+
+def points(seconds: float = 8.0, noise: float = 0.02, reference_noise: float = 0.002, seed: int = 1) -> Points:
+    rng = np.random.default_rng(seed)
+    n = int(seconds * RATE_HZ)
+    u, du = sine(n)
+    V = (u @ POSE.direction.T + POSE.gravity_mps2) @ S.T + 0.1 + noise * rng.normal(size=(n, 3))
+    return Points(100.0 + np.arange(n) / RATE_HZ, V, u + reference_noise * rng.normal(size=u.shape), du)
+
+
+def only(windows: list[Window]) -> Window:
+    assert len(windows) == 1, [(w.kind, w.start_s, w.stop_s) for w in windows]
+    return windows[0]
+
+
+def test_a_good_window_is_used_whole() -> None:
+    data = points()
+    window = only(motion_windows(POSE, data))
+    assert window.used, window.reason
+    assert (window.kind, window.points, window.left_out, window.reason) == ("motion", 4000, 0, "")
+    assert (window.start_s, window.stop_s) == (data.time_s[0], data.time_s[-1])
+    assert len(window.sums.count) == 16
+    n = window.numbers
+    assert n["reference_rms_mps2"] == pytest.approx(5 / np.sqrt(2), rel=0.02)
+    assert n["reference_noise_mps2"] == pytest.approx(0.002 / np.sqrt(10), rel=0.2)
+    assert n["coherence"] > 0.999
+    assert n["drift_mps2"] < 0.02
+
+
+def knock(data: Points, at: int, size: float, length: int = 10) -> None:
+    data.V[at : at + length] += size * np.sin(np.pi * np.arange(length) / length)[:, None]
+
+
+def test_knocks_are_left_out_and_counted() -> None:
+    data = points()
+    for at in range(200, 3800, 400):
+        knock(data, at, 6.0)
+    window = only(motion_windows(POSE, data))
+    assert window.used, window.reason
+    assert 9 * 8 <= window.left_out <= 9 * 10 + 3
+    assert window.points == 4000 - window.left_out
+    assert window.numbers["left_out_pct"] == pytest.approx(100 * window.left_out / 4000)
+
+
+def test_knocks_stay_in_plain_sums_but_not_in_the_verdict() -> None:
+    data = points()
+    knock(data, 1000, 15.0, 60)  # 4 m/s2 of drift in its half second, were it not left out
+    window = only(motion_windows(POSE, data, leave_out=False))
+    assert window.used, window.reason
+    assert (window.points, window.left_out) == (4000, 0)
+    assert window.sums.count.sum() == 4000
+
+
+def test_white_noise_is_no_knock() -> None:
+    # 5 robust SDs: 5.7e-7 of normal points a side and axis, so of 3 x 200 000 points 0.34 on average; 6 has p < 1e-5.
+    V = np.random.default_rng(3).normal(size=(200_000, 3))
+    struck, residual = detection.knocked(V, np.ones((len(V), 1)), detection.least_step(V))
+    assert struck.sum() <= 6
+    np.testing.assert_allclose(residual, V - V[~struck].mean(axis=0), atol=1e-12)
+
+
+def test_counts_that_hardly_change_are_no_knocks() -> None:
+    V = np.zeros((5000, 3))
+    V[::100] = 1.0  # one in a hundred a count higher: the median deviation is 0
+    struck, _ = detection.knocked(V, np.ones((len(V), 1)), detection.least_step(V))
+    assert not struck.any()
+
+
+def quantised(data: Points, step: float) -> Points:
+    return data._replace(V=np.round(data.V / step) * step)
+
+
+@pytest.mark.parametrize("step", [1e-4, 0.04])
+def test_clipping_is_found_at_any_resolution_and_quantisation_is_none(step: float) -> None:
+    good = quantised(points(), step)
+    assert only(motion_windows(POSE, good)).used
+    top = np.quantile(good.V[:, 1], 0.85)
+    bad = good._replace(V=np.minimum(good.V, [np.inf, top, np.inf]))
+    window = only(motion_windows(POSE, bad))
+    assert not window.used
+    assert window.reason.startswith("clipped: ")
+    assert window.numbers["clipped_points"] >= 0.14 * 4000
+
+
+def dead(data: Points) -> Points:
+    rng = np.random.default_rng(5)
+    return data._replace(u=0.01 * rng.normal(size=data.u.shape), du=np.zeros_like(data.du))
+
+
+def constant(data: Points) -> Points:
+    return data._replace(u=np.full_like(data.u, 0.3), du=np.zeros_like(data.du))
+
+
+def unrelated(data: Points) -> Points:
+    other, slope = sine(len(data.u), 2.3)
+    return data._replace(u=other, du=slope)
+
+
+def turned(data: Points) -> Points:
+    half = len(data.V) // 2
+    return data._replace(V=data.V + np.where(np.arange(len(data.V)) > half, 1.5, 0.0)[:, None])
+
+
+def shaken_out(data: Points) -> Points:
+    rng = np.random.default_rng(6)
+    out = rng.random(len(data.V)) < 0.08
+    return data._replace(V=data.V + np.where(out, 5.0, 0.0)[:, None])
+
+
+def short(data: Points) -> Points:
+    return data.part(0, 20)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "reason"),
+    [
+        (dead, "the reference is silent"),
+        (constant, "the reference is silent"),
+        (unrelated, "the sensor does not follow the reference"),
+        (turned, "the sensor's mean moves by"),
+        (shaken_out, "of the points are knocked out"),
+        (short, "too few points: 20, 30 needed"),
+    ],
+)
+def test_a_bad_window_is_refused_with_its_reason(spoil: Callable[[Points], Points], reason: str) -> None:
+    windows = motion_windows(POSE, spoil(points()))
+    assert windows
+    for window in windows:
+        assert not window.used
+        assert reason in window.reason
+
+
+def test_a_sensor_that_lags_still_follows() -> None:
+    data = points()
+    late = data._replace(V=np.roll(data.V, 5, axis=0))  # 10 ms, 11 deg at 3 Hz
+    window = motion_windows(POSE, late)[0]
+    assert window.used, window.reason
+    assert window.numbers["coherence"] > 0.99
+
+
+def test_missing_samples_part_windows() -> None:
+    data = points()
+    kept = np.r_[0:1500, 1700:4000]
+    windows = motion_windows(POSE, Points(*(column[kept] for column in data)))
+    assert [w.points for w in windows] == [1500, 2300]
+    assert all(w.used for w in windows)
+
+
+def test_long_motion_is_cut_into_equal_windows() -> None:
+    windows = motion_windows(POSE, points(150.0))
+    assert [w.points for w in windows] == [25_000] * 3
+
+
+def test_motion_that_begins_late_and_pauses() -> None:
+    moving = np.ones(int(40 * RATE_HZ))
+    for start, stop in ((0, 5), (15, 15.6), (20, 26)):
+        moving[int(start * RATE_HZ) : int(stop * RATE_HZ)] = 0.0
+    u, _ = sine(len(moving))
+    u = u * moving[:, None] + 0.01 * np.random.default_rng(7).normal(size=u.shape)
+    parts = motion_parts(u, RATE_HZ)
+    assert [kind for kind, _, _ in parts] == ["quiet", "motion", "quiet", "motion"]
+    edges = np.array([[a, b] for _, a, b in parts]) / RATE_HZ
+    np.testing.assert_allclose(edges, [[0, 5], [5, 20], [20, 26], [26, 40]], atol=0.26)  # a frame
+
+
+def test_weak_tri_axial_motion_half_of_it_calm() -> None:
+    """Level 0.02 m/s2 rms and a reference noise of 0.006: the calm half is told apart though its noise is a third."""
+    rng = np.random.default_rng(8)
+    n = int(600 * RATE_HZ)
+    level = np.where(np.arange(n) // int(100 * RATE_HZ) % 2 == 0, 1.0, 0.15)
+    t = np.arange(n) / RATE_HZ
+    u = np.zeros((n, 3))
+    for f in (1.3, 2.1, 3.4, 5.2, 7.7):
+        u += np.sin(2 * np.pi * f * t[:, None] + rng.uniform(0, 6.28, 3)) * 0.02 / np.sqrt(15 / 2) * level[:, None]
+    parts = motion_parts(u + 0.006 / np.sqrt(3) * rng.normal(size=u.shape), RATE_HZ)
+    assert [kind for kind, _, _ in parts] == ["motion", "quiet"] * 3
+    np.testing.assert_allclose([a / RATE_HZ for _, a, _ in parts], np.arange(0, 600, 100), atol=1.1)
+    du = np.gradient(u, axis=0) * RATE_HZ
+    quiet = Points(t, u @ S.T, u, du).part(*parts[1][1:])
+    window = motion_windows(beside(np.eye(3)), quiet._replace(u=quiet.u + 0.006 * rng.normal(size=quiet.u.shape)))[0]
+    assert not window.used
+
+
+def test_vibration_above_the_slow_band_is_motion_too() -> None:
+    u, du = sine(2000, 100.0)
+    V = u @ along([1.0, 0.0, 0.0]).direction.T + 0.01 * np.random.default_rng(9).normal(size=(2000, 3))
+    window = only(motion_windows(along([1.0, 0.0, 0.0]), Points(np.arange(2000) / RATE_HZ, V, u, du)))
+    assert window.used, window.reason
+    assert window.numbers["reference_rms_mps2"] == pytest.approx(5 / np.sqrt(2), rel=0.01)
+
+
+# --- rests
+
+
+def resting(hands: bool, noise: float = 0.02, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    n = int(6 * RATE_HZ)
+    V = np.array([0.1, -0.2, 9.8]) + noise * rng.normal(size=(n, 3))
+    if hands:
+        V[: int(1.0 * RATE_HZ)] += 2 * np.sin(np.arange(int(RATE_HZ)) / 9.0)[:, None]
+    return np.arange(n) / RATE_HZ, V
+
+
+REST = at_rest([0.0, 0.0, 9.81])
+
+
+def test_a_rest_is_used_without_the_hands() -> None:
+    t, V = resting(hands=True)
+    window = rest_window(REST, t, V)
+    assert window.used, window.reason
+    assert window.kind == "rest"
+    assert 1.0 < window.start_s < 1.8
+    mean = window.sums.count @ window.sums.mean / window.sums.count.sum()
+    np.testing.assert_allclose(mean, [0.1, -0.2, 9.8], atol=5 * 0.02 / np.sqrt(2000))
+
+
+def test_a_sensor_that_never_rests_is_refused() -> None:
+    t, V = resting(hands=False)
+    V = V + np.cumsum(np.random.default_rng(2).normal(0, 0.05, V.shape), axis=0)
+    window = rest_window(REST, t, V, floor=np.full(3, 0.02))
+    assert not window.used
+    assert "at rest" in window.reason
+
+
+def test_a_sensor_that_shakes_all_the_time_is_told_by_its_other_rests() -> None:
+    t, V = resting(hands=False, noise=0.5)
+    floor = rest_sd(resting(hands=True, seed=4)[1], RATE_HZ)
+    assert floor is not None
+    np.testing.assert_allclose(floor, 0.02, rtol=0.1)
+    assert rest_window(REST, t, V).used
+    window = rest_window(REST, t, V, floor=floor)
+    assert not window.used
+    assert "times the noise it has in other positions" in window.reason
+
+
+def test_a_rest_of_few_points_is_refused() -> None:
+    t, V = resting(hands=False)
+    window = rest_window(REST, t[:40], V[:40])
+    assert not window.used
+
+
+def test_knocks_in_a_rest_are_left_out() -> None:
+    t, V = resting(hands=False)
+    V[1500] += 0.2  # 10 SD, too little for its block to be no rest
+    assert rest_window(REST, t, V).left_out == 1
+    assert rest_window(REST, t, V, leave_out=False).left_out == 0
