@@ -19,7 +19,7 @@ from calib.equations import Equations
 from calib.gauss_newton import Flags, Solution, solve
 from calib.model import Array, Calibration, Pose, Window
 from calib.nuisances import Applied, Nuisances, Priors
-from calib.verdict import misfit, rank, reasons, turned_windows
+from calib.verdict import misfit, reasons, turned_windows
 
 DETERMINED_SHARE = 0.5  # of the prior u, which the data must halve (contract)
 DETERMINED_U = 0.1  # of the largest main sensitivity, where there is no prior (contract)
@@ -99,7 +99,7 @@ def adjust(
         contributions=shares.contributions,
         coverage_factor=coverage_factor(float(np.min(shares.degrees_of_freedom[determined], initial=np.inf))),
         reasons=tuple(reasons(used, solution, shares, determined, turned)),
-        rank=rank(solution.equations),
+        rank=solution.equations.rank,
         chi2=shares.consistency[0],
         chi2_degrees_of_freedom=shares.consistency[1],
         offset_scatter_mps2=shares.offset_scatter_mps2,
@@ -133,7 +133,7 @@ def _determined(solution: Solution, shares: Budget) -> Flags:
         known = np.flatnonzero(solution.bounded)
         before[known] = np.sqrt(np.diag(np.linalg.inv(solution.prior_precision[np.ix_(known, known)])))
     limit = DETERMINED_U * float(np.abs(solution.x[[0, 4, 8]]).max())
-    return np.asarray(np.where(solution.bounded, u < DETERMINED_SHARE * before, u <= limit))
+    return np.asarray(np.where(solution.bounded, u < DETERMINED_SHARE * before, solution.equations.seen & (u <= limit)))
 
 
 def _calibration(solution: Solution, shares: Budget, determined: Flags) -> Calibration:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.model import Array, Window
+from calib.nuisances import own_channels
 from calib.type_a import Segments, TypeA, pooled
 
 PIVOT_FLOOR = 1e-9  # of a channel's own power; what is left after the channels before it is rounding below that
@@ -145,5 +146,8 @@ def _root(power: Array, floor: Array) -> tuple[Array, Array]:
 
 
 def _omega2(power: Array, channels: int) -> float:
-    displacement_free = float(np.trace(power[:channels, :channels]))
-    return float(np.trace(power[channels:, channels:])) / displacement_free if displacement_free > 0.0 else 0.0
+    real = own_channels(channels)
+    moved = float(np.trace(power[:real, :real]))
+    return (
+        float(np.trace(power[channels : channels + real, channels : channels + real])) / moved if moved > 0.0 else 0.0
+    )

@@ -2,13 +2,12 @@
 
 For output axis i, with D and G of the pose (calib.nuisances) and S_i a row of S,
 
-    slope on u      S_i D (1 - (lag_i^2 omega^2 + c_s^2 / omega^2) / 2)
-    slope on du/dt  S_i D (-lag_i - c_r / omega^2 + c_s / omega^2) + S_i D' / omega
+    slope on u      S_i D (1 - lag_i^2 omega^2 / 2)
+    slope on du/dt  -S_i D lag_i + S_i D' / omega
     mean of V       S_i (D mean(u) + G) + Q_i - lag_i S_i D mean(du/dt) + offset of the position
 
-The terms in omega^2 = <du^2> / <u^2> are the projections of d2u/dt2 and of the integral of u (a first-order corner c_r
-of the reference, c_s of the sensor, rad/s) on u and du/dt: exact for a sine, and for any
-motion once the front end has taken out what was found.
+The term in omega^2 = <du^2> / <u^2> is the projection of d2u/dt2 on u: exact for a sine, and for any motion once the
+front end has taken out the lag that was found.
 """
 
 from __future__ import annotations
@@ -16,10 +15,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.condense import Condensed
 from calib.model import Array
 from calib.nuisances import Inputs, Nuisances
+
+# Below this part of the largest singular value (columns scaled to one) a direction was not excited: positions 0/1/2 deg
+# stand at 3e-6, what rounding leaves of an unseen direction at 1e-15.
+RANK_TOLERANCE = 1e-10
+UNSEEN_SHARE = 1e-3  # of an unseen direction that a parameter may have and still count as seen
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,11 +57,34 @@ class Equations:
         known = np.isfinite(nuisances.gravity).all(axis=1)[self.pose_of_window]
         self.known = known
         self.output_per_mps2 = self._output_per_mps2()
+        self.unseen = self._unseen_inputs()
+        self.rank = 4 - len(self.unseen)
+        self.seen = self._seen()
         noise2 = data.type_a.noise**2 / data.count[:, None]
         variance = noise2 + (offset_scatter_mps2 * self.output_per_mps2) ** 2
         # A mean whose gravity nobody stated says nothing: no weight.
         self.mean_weight = np.where(known[:, None], 1.0 / np.sqrt(variance), 0.0)
         self.white_share = np.where(known[:, None], noise2 / variance, 0.0)
+
+    def _unseen_inputs(self) -> Array:
+        """Directions (k, 4) of (a_x, a_y, a_z, 1) square to every input vector, angles as stated; 4 - k is the rank."""
+        data, nuisances, m = self.data, self.nuisances, self.data.channels
+        moved = np.einsum("brc,bkc->brk", data.root[:, :m, :m], nuisances.direction[self.pose_of_block])
+        held = np.einsum("wkm,wm->wk", nuisances.direction[self.pose_of_window], data.mean_x[:, :m])
+        held = np.pad(held + nuisances.gravity[self.pose_of_window], ((0, 0), (0, 1)), constant_values=1.0)
+        rows = np.vstack(
+            [np.pad(moved.reshape(-1, 3), ((0, 0), (0, 1))), (np.sqrt(data.count)[:, None] * held)[self.known]]
+        )
+        scale = np.linalg.norm(rows, axis=0)
+        scale[scale == 0.0] = 1.0
+        _, singular, ways = np.linalg.svd(np.vstack([rows / scale, np.zeros((4, 4))]), full_matrices=False)
+        return np.asarray(ways[singular <= RANK_TOLERANCE * singular[0]] / scale)
+
+    def _seen(self) -> NDArray[np.bool_]:
+        """(12,) which of S row by row and Q have no part in a direction that nobody excited."""
+        parts = np.abs(self.unseen) / np.linalg.norm(self.unseen, axis=1, keepdims=True)
+        free = parts.max(axis=0, initial=0.0) > UNSEEN_SHARE
+        return ~np.concatenate([np.tile(free[:3], 3), np.repeat(free[3], 3)])
 
     def _output_per_mps2(self) -> float:
         """The sensor's scale: root mean square of output over input, of all slopes and means."""
@@ -88,12 +116,10 @@ class Equations:
     def _slopes(self, S: Array, inputs: Inputs) -> tuple[Array, Array]:
         data, D = self.data, inputs.direction[self.pose_of_block]
         omega2 = data.omega2[:, None]
-        inverse = np.divide(1.0, omega2, out=np.zeros_like(omega2), where=omega2 > 0.0)
-        c = inputs.sensor_corner
-        on_u = 1.0 - 0.5 * (inputs.lag_s**2 * omega2 + c**2 * inverse)  # (B, 3)
-        on_du = -inputs.lag_s + (c - inputs.reference_corner) * inverse
+        on_u = 1.0 - 0.5 * inputs.lag_s**2 * omega2  # (B, 3)
+        on_du = np.broadcast_to(-inputs.lag_s, on_u.shape)
         ideal = np.einsum("ik,bkm->bim", S, D)
-        per_omega = np.sqrt(inverse)
+        per_omega = np.divide(1.0, np.sqrt(omega2), out=np.zeros_like(omega2), where=omega2 > 0.0)
         across = inputs.quadrature[self.pose_of_block] * per_omega  # (B, 3), felt by the first channel's du/dt
         on_rate = ideal * on_du[..., None]
         on_rate[:, :, :1] += (across @ S.T)[..., None]
@@ -103,8 +129,7 @@ class Equations:
         nuisances = self.nuisances
         d_ideal = np.einsum("ik,jbkm->bimj", S, inputs.d_direction[:, self.pose_of_block])
         d_on_u = -inputs.lag_s[:, None] * omega2[..., None] * nuisances.lag.T
-        d_on_u = d_on_u - c * inverse[..., None] * nuisances.sensor_corner
-        d_on_du = -nuisances.lag.T + inverse[..., None] * (nuisances.sensor_corner - nuisances.reference_corner)
+        d_on_du = np.broadcast_to(-nuisances.lag.T, d_on_u.shape)
         d_on_rate = d_ideal * on_du[..., None, None] + ideal[..., None] * d_on_du[:, :, None, :]
         d_across = inputs.d_quadrature[:, self.pose_of_block] * per_omega
         d_on_rate[:, :, :1] += np.einsum("ik,jbk->bij", S, d_across)[:, :, None]

@@ -20,6 +20,7 @@ ROUNDING = 1e-13  # of the scale: a step below it is rounding
 # 1e-12 of it, strong enough that a direction nobody excited leaves nothing singular.
 UNBOUNDED = 1e4
 OFFSET_SCALE_MPS2 = 10.0
+PARAMETER_ROWS = [[3 * i, 3 * i + 1, 3 * i + 2, 9 + i] for i in range(3)]  # S_ix, S_iy, S_iz, Q_i
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,7 +95,7 @@ def _priors(equations: Equations, priors: Priors) -> tuple[Array, Array, Array, 
     """Scale (N,), mean (N,), precision (N, N) of all unknowns, and which of S, Q (12,) are bounded by a prior."""
     nuisances, s = equations.nuisances, equations.output_per_mps2
     scale = np.concatenate([np.full(9, s), np.full(3, OFFSET_SCALE_MPS2 * s), nuisances.uncertainty])
-    mean = np.concatenate([np.zeros(12), [-t.applied for t in nuisances.terms]])
+    mean = np.concatenate([np.zeros(12), [t.expected - t.applied for t in nuisances.terms]])
     precision = np.diag(1.0 / scale**2)
     precision[range(12), range(12)] /= UNBOUNDED**2
     bounded = np.zeros(12, dtype=bool)
@@ -103,4 +104,10 @@ def _priors(equations: Equations, priors: Priors) -> tuple[Array, Array, Array, 
         known = np.flatnonzero(bounded)
         mean[known] = priors.parameters[known]
         precision[np.ix_(known, known)] = np.linalg.inv(priors.covariance[np.ix_(known, known)])
+    if not bounded[:9].all():
+        # What nobody excited is held at its scale: nuisances times a wandering column would else explain noise.
+        for way in equations.unseen * np.array([1.0, 1.0, 1.0, 1.0 / OFFSET_SCALE_MPS2]):
+            for row in PARAMETER_ROWS:
+                held = way / np.linalg.norm(way) / scale[row]
+                precision[np.ix_(row, row)] += np.outer(held, held)
     return scale, mean, precision, bounded

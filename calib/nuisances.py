@@ -32,7 +32,7 @@ class Priors:
     `theta_position` by position, `offset` between windows, `offset_position` between positions, `reference` relative
     per channel, `transverse` motion relative to the one measured, `tilt` of gravity against the motion, `rotation` of
     a tri-axial reference about each axis, `lag` common and `lag_axis` between axes, corner frequencies of an
-    AC-coupled reference or sensor (first order). `parameters` (12,) and `covariance` (12, 12): what was known of S, Q
+    AC-coupled reference or sensor (first order; seen where the windows carry the integral too, see calib.corner). `parameters` (12,) and `covariance` (12, 12): what was known of S, Q
     in the order of calib.model.PARAMETERS, inf on the diagonal where nothing was.
     """
 
@@ -51,6 +51,8 @@ class Priors:
     lag_axis_s: float = 2e-4  # axes share filter and clock; multiplexed converters differ by 0.1 ms
     reference_corner_hz: float = 0.0
     sensor_corner_hz: float = 0.0
+    reference_corner_at_hz: float = 0.0  # where the corner is expected, 0 for an instrument that feels constants
+    sensor_corner_at_hz: float = 0.0
     parameters: Array | None = field(default=None, compare=False)
     covariance: Array | None = field(default=None, compare=False)
 
@@ -74,7 +76,8 @@ class Term:
     """One nuisance: its name, the source it belongs to in a budget, and per unit of it what it moves.
 
     Turns (P, 3) in rad, `transverse` and `quadrature` (P, 3), `reference` (M,), `gravity` in m/s2, `offset` (P, 3) in
-    m/s2, `lag` (3,) in s, corners in rad/s. None moves nothing. `applied` is added when the value is reported.
+    m/s2, `lag` (3,) in s, `corner_hz` of the reference (less the sensor's) in Hz. None moves nothing. `expected` is the prior's mean, `applied`
+    what the front end took out: the unknown is what is left.
     """
 
     name: str
@@ -89,8 +92,8 @@ class Term:
     gravity: Array | None = None
     offset: Array | None = None
     lag: Array | None = None
-    reference_corner: Array | None = None
-    sensor_corner: Array | None = None
+    corner_hz: float | None = None
+    expected: float = 0.0
     applied: float = 0.0
 
 
@@ -98,16 +101,13 @@ class Term:
 class Inputs:
     """Input accelerations at one value of the J nuisances and their derivatives with respect to each.
 
-    `direction` (P, 3, M), `quadrature` (P, 3), `gravity` (P, 3), `lag_s` (3,), `reference_corner` and `sensor_corner`
-    in rad/s; `d_...` the same with J in front.
+    `direction` (P, 3, M), `quadrature` (P, 3), `gravity` (P, 3), `lag_s` (3,); `d_...` the same with J in front.
     """
 
     direction: Array
     quadrature: Array
     gravity: Array
     lag_s: Array
-    reference_corner: float
-    sensor_corner: float
     d_direction: Array
     d_quadrature: Array
     d_gravity: Array
@@ -123,6 +123,7 @@ class Nuisances:
         for p, pose in enumerate(poses):
             self.direction[p, :, : pose.direction.shape[1]] = pose.direction
         self.gravity = np.array([pose.gravity_mps2 for pose in poses])
+        self._real = own_channels(channels)
         self._magnitude = np.maximum(np.linalg.norm(self.gravity, axis=1), np.finfo(float).tiny)
         self._turn_direction = self._stacked("turn_direction", (n, 3))
         self._turn_gravity = self._stacked("turn_gravity", (n, 3))
@@ -132,8 +133,7 @@ class Nuisances:
         self._gravity = self._stacked("gravity", (1,))
         self.offset = self._stacked("offset", (n, 3))
         self.lag = self._stacked("lag", (3,))
-        self.reference_corner = self._stacked("reference_corner", (1,))[:, 0]
-        self.sensor_corner = self._stacked("sensor_corner", (1,))[:, 0]
+        self._corner_hz = np.array([t.corner_hz or 0.0 for t in self.terms])
 
     def __len__(self) -> int:
         return len(self.terms)
@@ -154,11 +154,17 @@ class Nuisances:
         sideways = self.direction.copy()
         if sideways.shape[2]:
             sideways[:, :, 0] += np.einsum("j,jpk->pk", z, self._transverse)
-        direction = turn @ sideways / scale
+        real = self._real
+        felt = turn @ sideways[:, :, :real]
+        # A corner of c Hz took c times the integral (in units of 1 / (2 pi) s) from the reference: a share of its channel.
+        direction = np.concatenate([felt, float(z @ self._corner_hz) * felt], axis=2)[:, :, : sideways.shape[2]] / scale
         d_direction = np.cross(self._turn_direction[..., None], direction, axisa=2, axisb=1, axisc=2)
         d_direction -= direction * (self._reference / scale)[:, None, None, :]
-        if sideways.shape[2]:
+        if real:
             d_direction[..., 0] += np.einsum("pik,jpk->jpi", turn, self._transverse) / scale[0]
+            d_direction[..., real:] += (
+                self._corner_hz[:, None, None, None] * (felt / scale[:real])[..., : sideways.shape[2] - real]
+            )
         # Second order in the turn and the quadrature is left out: 1 % of 0.2 deg.
         d_quadrature = np.einsum("pik,jpk->jpi", turn, self._quadrature)
         stretch = 1.0 + np.einsum("j,jo->o", z, self._gravity) / self._magnitude
@@ -172,8 +178,6 @@ class Nuisances:
             np.einsum("jpk,j->pk", d_quadrature, z),
             gravity,
             z @ self.lag,
-            float(z @ self.reference_corner),
-            float(z @ self.sensor_corner),
             d_direction,
             d_quadrature,
             d_gravity,
@@ -202,29 +206,35 @@ def _terms(poses: Sequence[Pose], channels: int, priors: Priors, applied: Applie
         yield Term("gravity", "gravity", "m/s2", priors.gravity_mps2, gravity=np.ones(1))
     if channels == 0:
         return
-    for m in range(channels):
-        name = "reference" if channels == 1 else f"reference_{AXES[m]}"
-        yield Term(name, "reference sensitivity", "1", priors.reference, reference=np.eye(channels)[m])
+    real = own_channels(channels)
+    for m in range(real):
+        name = "reference" if real == 1 else f"reference_{AXES[m]}"
+        felt = np.eye(real)[m]
+        yield Term(name, "reference sensitivity", "1", priors.reference, reference=np.resize(felt, channels))
     yield Term("lag", "lag", "s", priors.lag_s, lag=np.ones(3), applied=applied.lag_s)
     for name, k in zip(_axes("lag"), np.eye(3), strict=True):
         yield Term(name, "lag", "s", priors.lag_axis_s, lag=k)
-    turn = np.full(1, 2.0 * np.pi)
-    yield Term(
-        "reference_corner",
-        "corner frequency",
-        "Hz",
-        priors.reference_corner_hz,
-        reference_corner=turn,
-        applied=applied.reference_corner_hz,
-    )
-    yield Term(
-        "sensor_corner",
-        "corner frequency",
-        "Hz",
-        priors.sensor_corner_hz,
-        sensor_corner=turn,
-        applied=applied.sensor_corner_hz,
-    )
+    if channels > real:
+        yield from _corner_terms(priors, applied)
+
+
+def _corner_terms(priors: Priors, applied: Applied) -> Iterator[Term]:
+    for name, sign, u, expected, taken in (
+        (
+            "reference_corner",
+            1.0,
+            priors.reference_corner_hz,
+            priors.reference_corner_at_hz,
+            applied.reference_corner_hz,
+        ),
+        ("sensor_corner", -1.0, priors.sensor_corner_hz, priors.sensor_corner_at_hz, applied.sensor_corner_hz),
+    ):
+        yield Term(name, "corner frequency", "Hz", u, corner_hz=sign, expected=expected, applied=taken)
+
+
+def own_channels(channels: int) -> int:
+    """Channels of a reference itself: 1 or 3, where their integrals follow them (2 or 6) as well."""
+    return {0: 0, 1: 1, 2: 1, 3: 3, 6: 3}[channels]
 
 
 def _clamp_terms(poses: Sequence[Pose], priors: Priors) -> Iterator[Term]:
@@ -248,8 +258,8 @@ def _clamp_terms(poses: Sequence[Pose], priors: Priors) -> Iterator[Term]:
 
 def _pose_terms(poses: Sequence[Pose], priors: Priors) -> Iterator[Term]:
     """Stated directions, common and by position, and the mounting of a tri-axial reference."""
-    stated = [p for p, pose in enumerate(poses) if pose.theta_rad is None and pose.direction.shape[1] < 3]
-    beside = [p for p, pose in enumerate(poses) if pose.direction.shape[1] == 3]
+    stated = [p for p, pose in enumerate(poses) if pose.theta_rad is None and own_channels(pose.direction.shape[1]) < 3]
+    beside = [p for p, pose in enumerate(poses) if own_channels(pose.direction.shape[1]) == 3]
     for axis, k in zip(AXES, np.eye(3), strict=True):
         if stated:
             yield _turned(f"direction_{axis}", "direction common", priors.alpha_common_rad, _only(poses, stated, k))
@@ -274,13 +284,13 @@ def _slide_terms(poses: Sequence[Pose], priors: Priors) -> Iterator[Term]:
         frame = _slide_frame(pose)
         if frame is not None:
             along[p], vertical[p], lateral[p] = frame
-        elif pose.direction.shape[1] == 1:
+        elif own_channels(pose.direction.shape[1]) == 1:
             free.append(p)
     for name, way in (("lateral", lateral), ("vertical", vertical)):
         if way.any():
             yield from _across(f"transverse_{name}", priors.transverse, way)
     for p in free:
-        for name, k in zip("ab", np.linalg.svd(poses[p].direction)[0].T[1:], strict=True):
+        for name, k in zip("ab", np.linalg.svd(poses[p].direction[:, :1])[0].T[1:], strict=True):
             yield from _across(f"transverse_{name}[{poses[p].position}]", priors.transverse, _only(poses, p, k))
     for name, axis in (("pitch", lateral), ("roll", along)):
         if axis.any():
@@ -297,7 +307,7 @@ def _slide_frame(pose: Pose) -> tuple[Array, Array, Array] | None:
     if pose.theta_rad is not None:
         motion, gravity = _clamp_frame(pose)
         return motion, gravity, np.cross(gravity, motion)
-    if pose.direction.shape[1] != 1:
+    if own_channels(pose.direction.shape[1]) != 1:
         return None
     motion = pose.direction[:, 0]
     gravity = np.nan_to_num(pose.gravity_mps2)

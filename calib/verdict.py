@@ -9,13 +9,9 @@ import numpy as np
 
 from calib.budget import Budget
 from calib.distributions import chi2_quantile
-from calib.equations import Equations
 from calib.gauss_newton import Flags, Solution
 from calib.model import PARAMETERS, Window
 
-# Below this part of the largest singular value (columns scaled to one) a direction was not excited: positions 0/1/2 deg
-# stand at 3e-6, what rounding leaves of an unseen direction at 1e-15.
-RANK_TOLERANCE = 1e-10
 CONTRADICTED = 0.999  # probability: one sound calibration in a thousand is refused as contradicting what was known
 PRIOR_SHARE = 0.01  # of a direction's prior variance that the data must have removed for it to be a test of the prior
 # A turned sign "fits decisively better": the likelihood ratio exp(25 / 2) is 3e5 to 1, and it explains most of the
@@ -24,21 +20,6 @@ DECISIVE_CHI2 = 25.0
 DECISIVE_RATIO = 0.25
 MISFIT_LIMIT = 0.1  # of the signal; the worst geometry met with right signs leaves 0.01
 CONFOUNDED_LAG = 0.01  # of the largest sensitivity, that an undetermined lag puts into one of the others
-
-
-def rank(equations: Equations) -> int:
-    """Rank of the input vectors (a_x, a_y, a_z, 1), 4 where Method 3 can tell all parameters."""
-    data, nuisances = equations.data, equations.nuisances
-    m = data.channels
-    moved = np.einsum("brc,bkc->brk", data.root[:, :m, :m], nuisances.direction[equations.pose_of_block])
-    rows = [np.pad(moved.reshape(-1, 3), ((0, 0), (0, 1)))]
-    held = np.einsum("wkm,wm->wk", nuisances.direction[equations.pose_of_window], data.mean_x[:, :m])
-    held = held + nuisances.gravity[equations.pose_of_window]
-    rows.append((np.sqrt(data.count)[:, None] * np.pad(held, ((0, 0), (0, 1)), constant_values=1.0))[equations.known])
-    stacked = np.vstack(rows)
-    scale = np.linalg.norm(stacked, axis=0)
-    singular = np.linalg.svd(stacked / np.where(scale > 0.0, scale, 1.0), compute_uv=False)
-    return int((singular > RANK_TOLERANCE * singular[0]).sum())
 
 
 def reasons(
@@ -62,7 +43,7 @@ def reasons(
 
 
 def _rank_reasons(windows: Sequence[Window], solution: Solution) -> list[str]:
-    found, full = rank(solution.equations), 4
+    found, full = solution.equations.rank, 4
     clamped = all(w.pose.theta_rad is not None for w in windows)
     static = bool(solution.equations.known.any() and np.any(np.nan_to_num(solution.equations.nuisances.gravity)))
     if clamped and static and found < full:
@@ -77,7 +58,7 @@ def _rank_reasons(windows: Sequence[Window], solution: Solution) -> list[str]:
 def _nothing_determined(solution: Solution, determined: Flags) -> list[str]:
     if determined.any():
         return []
-    return [f"rank {rank(solution.equations)} of 4: the data determine none of the 12 parameters"]
+    return [f"rank {solution.equations.rank} of 4: the data determine none of the 12 parameters"]
 
 
 def _lag_reasons(solution: Solution, shares: Budget) -> list[str]:
@@ -87,11 +68,12 @@ def _lag_reasons(solution: Solution, shares: Budget) -> list[str]:
         return []
     j = names.index("lag")
     after, before = float(np.sqrt(shares.covariance[12 + j, 12 + j])), terms[j].uncertainty
-    moved = float(shares.contributions["lag"][:9].max()) / solution.equations.output_per_mps2
+    seen = solution.equations.seen[:9]
+    moved = float(shares.contributions["lag"][:9][seen].max(initial=0.0)) / solution.equations.output_per_mps2
     if after <= 0.5 * before or moved <= CONFOUNDED_LAG:
         return []
     return [
-        f"rank {rank(solution.equations)} of 4 with the lag fixed, one less with it: the motion cannot tell the lag "
+        f"rank {solution.equations.rank} of 4 with the lag fixed, one less with it: the motion cannot tell the lag "
         f"(u {after * 1e3:.3g} ms of {before * 1e3:.3g} ms before) from a rotation; it puts {moved:.1%} into S. "
         "Motion in a plane at one frequency does that: excite another frequency or direction, or state the lag"
     ]

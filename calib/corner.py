@@ -1,0 +1,35 @@
+"""What a first-order high-pass filter (an AC-coupled instrument) took out of a recording, put back in.
+
+With the corner c in rad/s, the filter's inverse is exact: true = x + c * integral of x. A corner of 0.16 Hz costs
+0.56 % between 0.5 and 8 Hz and is no lag: it leads, and less at higher frequencies. Where a corner is to be found from
+the data, the integral goes into the windows as channels of its own behind the reference's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from calib.model import Array, Pose
+
+
+def integral(x: Array, rate_hz: float) -> Array:
+    """2 pi times the integral of samples x (n, m) of a whole recording, in m/s2 s: as large as x itself at 1 Hz.
+
+    It is held to no mean and no trend: an instrument's own zero would else run away in it.
+    """
+    rising = (np.cumsum(x, axis=0) - 0.5 * x) / rate_hz
+    line = np.linspace(-1.0, 1.0, len(x))[:, None]
+    trend = np.sum(line * rising, axis=0) / np.sum(line * line)
+    return np.asarray(2.0 * np.pi * (rising - rising.mean(axis=0) - line * trend))
+
+
+def without_corner(x: Array, rate_hz: float, corner_hz: float) -> Array:
+    """Samples x (n, m) of a whole recording before the filter."""
+    return x + corner_hz * integral(x, rate_hz) if corner_hz else x
+
+
+def with_integral(pose: Pose) -> Pose:
+    """The pose for windows whose channels are the reference's and then their integrals; these move nothing by themselves."""
+    return replace(pose, direction=np.hstack([pose.direction, np.zeros_like(pose.direction)]))
