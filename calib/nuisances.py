@@ -32,8 +32,9 @@ class Priors:
     `theta_position` by position, `offset` between windows, `offset_position` between positions, `reference` relative
     per channel, `transverse` motion relative to the one measured, `tilt` of gravity against the motion, `rotation` of
     a tri-axial reference about each axis, `lag` common and `lag_axis` between axes, corner frequencies of an
-    AC-coupled reference or sensor (first order; seen where the windows carry the integral too, see calib.corner). `parameters` (12,) and `covariance` (12, 12): what was known of S, Q
-    in the order of calib.model.PARAMETERS, inf on the diagonal where nothing was.
+    AC-coupled reference or sensor (first order; seen where the windows carry the integral too, see calib.corner).
+    `parameters` (12,) and `covariance` (12, 12): what was known of S, Q in the order of calib.model.PARAMETERS, inf on
+    the diagonal where nothing was.
     """
 
     angle_rad: float = float(np.deg2rad(0.2))
@@ -76,8 +77,8 @@ class Term:
     """One nuisance: its name, the source it belongs to in a budget, and per unit of it what it moves.
 
     Turns (P, 3) in rad, `transverse` and `quadrature` (P, 3), `reference` (M,), `gravity` in m/s2, `offset` (P, 3) in
-    m/s2, `lag` (3,) in s, `corner_hz` of the reference (less the sensor's) in Hz. None moves nothing. `expected` is the prior's mean, `applied`
-    what the front end took out: the unknown is what is left.
+    m/s2, `lag` (3,) in s, corners in rad/s. None moves nothing. `expected` is the prior's mean, `applied` what the
+    front end took out: the unknown is what is left.
     """
 
     name: str
@@ -92,7 +93,8 @@ class Term:
     gravity: Array | None = None
     offset: Array | None = None
     lag: Array | None = None
-    corner_hz: float | None = None
+    reference_corner: Array | None = None
+    sensor_corner: Array | None = None
     expected: float = 0.0
     applied: float = 0.0
 
@@ -101,13 +103,16 @@ class Term:
 class Inputs:
     """Input accelerations at one value of the J nuisances and their derivatives with respect to each.
 
-    `direction` (P, 3, M), `quadrature` (P, 3), `gravity` (P, 3), `lag_s` (3,); `d_...` the same with J in front.
+    `direction` (P, 3, M), `quadrature` (P, 3), `gravity` (P, 3), `lag_s` (3,), `reference_corner` and `sensor_corner`
+    in rad/s; `d_...` the same with J in front.
     """
 
     direction: Array
     quadrature: Array
     gravity: Array
     lag_s: Array
+    reference_corner: float
+    sensor_corner: float
     d_direction: Array
     d_quadrature: Array
     d_gravity: Array
@@ -133,7 +138,9 @@ class Nuisances:
         self._gravity = self._stacked("gravity", (1,))
         self.offset = self._stacked("offset", (n, 3))
         self.lag = self._stacked("lag", (3,))
-        self._corner_hz = np.array([t.corner_hz or 0.0 for t in self.terms])
+        self.reference_corner = self._stacked("reference_corner", (1,))[:, 0]
+        self.sensor_corner = self._stacked("sensor_corner", (1,))[:, 0]
+        self._corner_hz = (self.reference_corner - self.sensor_corner) / (2.0 * np.pi)
 
     def __len__(self) -> int:
         return len(self.terms)
@@ -156,7 +163,7 @@ class Nuisances:
             sideways[:, :, 0] += np.einsum("j,jpk->pk", z, self._transverse)
         real = self._real
         felt = turn @ sideways[:, :, :real]
-        # A corner of c Hz took c times the integral (in units of 1 / (2 pi) s) from the reference: a share of its channel.
+        # A corner of c Hz took c times the integral, which has channels of its own (calib.corner).
         direction = np.concatenate([felt, float(z @ self._corner_hz) * felt], axis=2)[:, :, : sideways.shape[2]] / scale
         d_direction = np.cross(self._turn_direction[..., None], direction, axisa=2, axisb=1, axisc=2)
         d_direction -= direction * (self._reference / scale)[:, None, None, :]
@@ -178,6 +185,8 @@ class Nuisances:
             np.einsum("jpk,j->pk", d_quadrature, z),
             gravity,
             z @ self.lag,
+            float(z @ self.reference_corner),
+            float(z @ self.sensor_corner),
             d_direction,
             d_quadrature,
             d_gravity,
@@ -214,22 +223,11 @@ def _terms(poses: Sequence[Pose], channels: int, priors: Priors, applied: Applie
     yield Term("lag", "lag", "s", priors.lag_s, lag=np.ones(3), applied=applied.lag_s)
     for name, k in zip(_axes("lag"), np.eye(3), strict=True):
         yield Term(name, "lag", "s", priors.lag_axis_s, lag=k)
-    if channels > real:
-        yield from _corner_terms(priors, applied)
-
-
-def _corner_terms(priors: Priors, applied: Applied) -> Iterator[Term]:
-    for name, sign, u, expected, taken in (
-        (
-            "reference_corner",
-            1.0,
-            priors.reference_corner_hz,
-            priors.reference_corner_at_hz,
-            applied.reference_corner_hz,
-        ),
-        ("sensor_corner", -1.0, priors.sensor_corner_hz, priors.sensor_corner_at_hz, applied.sensor_corner_hz),
-    ):
-        yield Term(name, "corner frequency", "Hz", u, corner_hz=sign, expected=expected, applied=taken)
+    turn, source = np.full(1, 2.0 * np.pi), "corner frequency"
+    u, expected, taken = priors.reference_corner_hz, priors.reference_corner_at_hz, applied.reference_corner_hz
+    yield Term("reference_corner", source, "Hz", u, reference_corner=turn, expected=expected, applied=taken)
+    u, expected, taken = priors.sensor_corner_hz, priors.sensor_corner_at_hz, applied.sensor_corner_hz
+    yield Term("sensor_corner", source, "Hz", u, sensor_corner=turn, expected=expected, applied=taken)
 
 
 def own_channels(channels: int) -> int:
