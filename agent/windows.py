@@ -48,7 +48,8 @@ def _rest(piece: Piece, cut: Cut) -> list[Window]:
     return [rest_window(piece.pose, cut.time_s[whole], cut.indications[whole], leave_out=False)]
 
 
-def _motion(piece: Piece, cut: Cut, reference: Cut, channel: Channel) -> list[Window]:
+def motion_points(cut: Cut, reference: Cut, channel: Channel) -> Points | None:
+    """Samples of the sensor that have a reference, with it in m/s2 at their times; None where there are not two."""
     u, margin = reference.indications / channel.reference_sensitivity, 0
     if channel.reference_quantity == "velocity":
         u, margin = differentiate(u, reference.clock.rate_hz)
@@ -56,10 +57,14 @@ def _motion(piece: Piece, cut: Cut, reference: Cut, channel: Channel) -> list[Wi
     at = resample(u, reference.clock, time_s, reference.first_index, margin)
     usable = at.usable & np.isfinite(at.u).all(axis=1) & np.isfinite(cut.indications).all(axis=1)
     if usable.sum() < 2:
-        return []
-    points = Points(time_s[usable], cut.indications[usable], at.u[usable], at.du[usable])
+        return None
+    return Points(time_s[usable], cut.indications[usable], at.u[usable], at.du[usable])
+
+
+def _motion(piece: Piece, cut: Cut, reference: Cut, channel: Channel) -> list[Window]:
+    points = motion_points(cut, reference, channel)
     # Method 3 as printed takes all points of a window.
-    return motion_windows(piece.pose, points, leave_out=False)
+    return [] if points is None else motion_windows(piece.pose, points, leave_out=False)
 
 
 def _refused(piece: Piece, reason: str) -> Window:
