@@ -42,18 +42,18 @@ def _stretches(channel: Channel, after_s: float) -> Iterator[tuple[float, float,
     period_s = channel.poses_repeat_s
     for cycle in itertools.count(int(after_s // period_s)) if period_s and channel.poses else (0,):
         base_s = cycle * period_s if period_s else 0.0
-        for i, interval in enumerate(channel.poses):
-            yield base_s + interval.start_s, base_s + interval.stop_s, _pose(interval, channel, str(i + 1))
+        for interval in channel.poses:
+            yield base_s + interval.start_s, base_s + interval.stop_s, _pose(interval, channel)
 
 
-def _pose(interval: PoseInterval, channel: Channel, position: str) -> Pose:
+def _pose(interval: PoseInterval, channel: Channel) -> Pose:
     feels_gravity = channel.coupling == "dc"
     if interval.theta_deg is not None and interval.alpha_deg is not None:
         theta_rad, alpha_rad = math.radians(interval.theta_deg), math.radians(interval.alpha_deg)
         g = channel.gravity_mps2 if feels_gravity else 0.0
-        return clamp(theta_rad, alpha_rad, g, channel.static_sign, position)
+        return clamp(theta_rad, alpha_rad, g, channel.static_sign)
     if interval.direction is not None:
         gravity = interval.gravity_mps2 if feels_gravity else (0.0, 0.0, 0.0)
-        return along(interval.direction, gravity, position)
+        return along(interval.direction, gravity)
     assert interval.gravity_mps2 is not None  # the configuration allows no other form
-    return at_rest(interval.gravity_mps2, position)
+    return at_rest(interval.gravity_mps2)

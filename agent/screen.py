@@ -104,7 +104,7 @@ class Picture:
         for axis, cells in zip("xyz", calibration_cells(calibration), strict=True):
             lines.append(Text(_row((axis, *cells), _PARAMETERS)))
         lines.append(Text(f"  S in {unit} per m/s², Q in {unit}, {uncertainty_words(calibration)}", "dim"))
-        lines.append(Text(f"  {calibration.method}, {calibration.windows} windows", "dim"))
+        lines.append(Text(f"  method {calibration.method}, {calibration.windows} windows", "dim"))
         truth = self._state.truths.get(calibration.sensor)
         if truth is not None:
             lines.append(Text(f"  {truth_line(calibration, truth)}", "cyan"))

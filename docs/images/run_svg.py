@@ -1,12 +1,13 @@
 """Makes run.svg, the README's picture: a real run on the virtual bench, as the terminal shows it after a minute.
 
-    .venv/bin/python docs/images/run_svg.py
+.venv/bin/python docs/images/run_svg.py
 """
 
 from __future__ import annotations
 
 import os
 import tempfile
+from contextlib import ExitStack
 from pathlib import Path
 
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
@@ -23,13 +24,16 @@ HERE = Path(__file__).parent
 
 def main() -> None:
     """Run for a minute, draw the last state."""
-    with tempfile.TemporaryDirectory() as directory, router(LOOPBACK) as said, virtual_bench("plain", 1) as (config, truth):
-        os.chdir(directory)
-        with Watch(config, "virtual bench, plain", truth) as watch:
-            watch.say(said)
-            Service(config, Path("data"), watch).run(56.0)
-            console = Console(record=True, width=100, height=30, file=open(os.devnull, "w"), force_terminal=True)
-            console.print(Picture(watch.state))
+    with ExitStack() as stack:
+        os.chdir(stack.enter_context(tempfile.TemporaryDirectory()))
+        said = stack.enter_context(router(LOOPBACK))
+        config, truth = stack.enter_context(virtual_bench("plain", 1))
+        watch = stack.enter_context(Watch(config, "virtual bench, plain", truth))
+        watch.say(said)
+        Service(config, Path("data"), watch).run(56.0)
+        nowhere = stack.enter_context(open(os.devnull, "w"))
+        console = Console(record=True, width=100, height=30, file=nowhere, force_terminal=True)
+        console.print(Picture(watch.state))
         console.save_svg(str(HERE / "run.svg"), title="make run")
 
 
