@@ -1,0 +1,14 @@
+"""Settings of all tests."""
+
+from __future__ import annotations
+
+import os
+
+# As every entry point does, and for the same reason: one thread, the same bits on every machine.
+os.environ["OPENBLAS_NUM_THREADS"] = "1"
+
+from hypothesis import settings
+
+# Examples follow from the test's own code, so that a failure comes again; time limits fail on a machine under load.
+settings.register_profile("fieldcal", deadline=None, derandomize=True)
+settings.load_profile("fieldcal")
