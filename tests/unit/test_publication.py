@@ -74,9 +74,9 @@ def received(subscriber: Subscriber, last: int, timeout_s: float = 10) -> list[i
 def test_what_is_published_arrives_in_order_as_json_with_the_number_before(
     site: Site, store: Store, publisher: Publisher
 ) -> None:
-    publisher.start()
     with site.client() as client:
         subscriber = client.declare_subscriber("fieldcal/v1/**", zenoh.handlers.RingChannel(100))
+        publisher.start()  # the subscriber is known then before the first result leaves
         wait_for(lambda: publisher.state().connected)
         send(publisher, store, 1, 2)
         send(publisher, store, 3, what="calibration")
@@ -90,9 +90,9 @@ def test_what_is_published_arrives_in_order_as_json_with_the_number_before(
 
 def test_the_gateway_speaks_for_itself_under_its_own_key(site: Site, store: Store, publisher: Publisher) -> None:
     store.commit([record(1, "status", sensor="")])
-    publisher.start()
     with site.client() as client:
         subscriber = client.declare_subscriber(f"{KEY}/status", zenoh.handlers.RingChannel(10))
+        publisher.start()
         assert received(subscriber, 1) == [1]
         assert get(client, f"{KEY}/status") == [1]
 
@@ -181,10 +181,9 @@ def test_what_a_dying_router_did_not_take_stays_in_the_outbox(site: Site, store:
 
 
 def test_a_result_that_the_store_refuses_still_leaves(site: Site, store: Store, publisher: Publisher) -> None:
-    publisher.start()
-    wait_for(lambda: publisher.state().connected)
     with site.client() as client:
         subscriber = client.declare_subscriber("fieldcal/v1/**", zenoh.handlers.RingChannel(1000))
+        publisher.start()
         send(publisher, store, 1)
         store._connection.execute("PRAGMA max_page_count = 1")
         refused = record(2, text="x" * 20_000)
