@@ -131,16 +131,22 @@ class Picture:
         return lines
 
 
-# Widths of columns, negative to the right; every row but the verdict fits 80.
+# Widths of columns, negative to the right, 0 for the rest of the line; every row but the verdict fits 80.
 _DEVICE = (16, 28, 9, -10, -9, -6)
 _PARAMETERS = (3, -18, -18, -18, -18)
-_WINDOW = (12, 14, 20, 0)
+_WINDOW = (8, 29, 18, 0)
 
 
 def _row(cells: tuple[str, ...], widths: tuple[int, ...]) -> str:
-    return "".join(
-        f"{cell:{'<' if width >= 0 else '>'}{abs(width)}}" for cell, width in zip(cells, widths, strict=True)
-    )
+    return "".join(_fit(cell, width) for cell, width in zip(cells, widths, strict=True))
+
+
+def _fit(cell: str, width: int) -> str:
+    if width == 0:
+        return cell
+    if len(cell) >= abs(width):
+        cell = f"{cell[: abs(width) - 2]}…"
+    return f"{cell:<{width}}" if width > 0 else f"{cell:>{-width}}"
 
 
 def _heading(*cells: str, widths: tuple[int, ...]) -> Text:

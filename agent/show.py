@@ -132,7 +132,8 @@ def _print_sensor(console: Console, sensor: str, held: SensorHistory) -> None:
     name, said = "UNCALIBRATED", "no status yet"
     if held.status and isinstance(status := held.status.result, StatusChange):
         name, said = status.status, f"since {_time(status.t_utc_ns)}  {status.reason}"
-    console.print(Text.assemble((sensor, "bold"), "  ", (name, STATUS_STYLES.get(name, "cyan")), f"  {said}"))
+    heading = Text.assemble((sensor, "bold"), "  ", (name, STATUS_STYLES.get(name, "cyan")), f"  {said}")
+    console.print(heading, soft_wrap=True)
     if held.calibration and isinstance(calibration := held.calibration.result, CalibrationUpdate):
         _print_calibration(console, calibration)
     else:

@@ -79,6 +79,12 @@ def test_the_newest_windows_are_shown_with_the_reason_of_a_refusal() -> None:
     assert 3 <= len(shown) < 20
 
 
+def test_a_long_name_does_not_run_into_the_next_column() -> None:
+    state = ViewState("t", "s/g", devices={"d" * 60: DeviceState("k" * 60, "open", 100.0, 1, 0)})
+    row = next(line for line in picture(state, 100, 30) if line.startswith("dd"))
+    assert row == "d" * 14 + "… " + "k" * 26 + "… open       100.0 Hz        1     0"
+
+
 def test_names_with_markup_are_shown_as_they_are() -> None:
     state = full_state()
     state.say("reference: a line could not be read: '[bold]x[/]'")
