@@ -134,7 +134,7 @@ class Picture:
 # Widths of columns, negative to the right, 0 for the rest of the line; every row but the verdict fits 80.
 _DEVICE = (16, 28, 9, -10, -9, -6)
 _PARAMETERS = (3, -18, -18, -18, -18)
-_WINDOW = (8, 29, 18, 0)
+_WINDOW = (8, 29, 22, 0)
 
 
 def _row(cells: tuple[str, ...], widths: tuple[int, ...]) -> str:
