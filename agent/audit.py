@@ -150,12 +150,9 @@ def _chain_reasons(integrity: Integrity, replay: ReplayedFile, before: AuditedFi
 def describe(file: AuditedFile) -> str:
     """The verdict in a line, and a line more for each reason and note."""
     replay = file.replay
-    lines = [
-        f"{file.path}: {'passed' if file.ok else 'FAILED'}, {file.size} bytes, {file.chunks} chunks, "
-        f"{replay.events} events replayed, {replay.results} results"
-        + (f" equal within {replay.tolerance:g}" if file.ok and replay.tolerance else "")
-        + (" equal bit for bit" if file.ok and not replay.tolerance else "")
-    ]
+    how = f"equal within {replay.tolerance:g}" if replay.tolerance else "equal bit for bit"
+    verdict = f"passed, {replay.results} results {how}" if file.ok else "FAILED"
+    lines = [f"{file.path}: {verdict}; {file.size} bytes, {file.chunks} chunks, {replay.events} events replayed"]
     lines += [f"  {reason}" for reason in file.reasons]
     lines += [f"  note: {note}" for note in file.notes if note not in file.reasons]
     return "\n".join(lines)

@@ -1,7 +1,7 @@
 """Events and results as protobuf messages (agent/proto/fieldcal.proto), bit for bit both ways.
 
 A message is known by its schema name; the topic is where it stands in a recording. Floats keep every bit (NaN, -0.0,
-infinities); sample arrays pass as the little-endian arrays they are.
+infinities).
 """
 
 from __future__ import annotations
@@ -28,8 +28,9 @@ from agent.events import (
     WindowReport,
 )
 from agent.proto import fieldcal_pb2 as pb
+from agent.raw_block import decode_block, encode_block
 from calib.model import PARAMETERS
-from hw.block import BlockFlags, SampleBlock
+from hw.block import SampleBlock
 
 PACKAGE = "fieldcal.v1"
 EVENTS_TOPIC = "/events"
@@ -47,7 +48,6 @@ _EVENT_KINDS = {field: kind for kind, field in _EVENT_FIELDS.items()}
 _S_AND_Q = [name.lower() for name in PARAMETERS]
 _U = [f"u_{name}" for name in _S_AND_Q]
 _RESIDUALS = ["residual_sd_x", "residual_sd_y", "residual_sd_z"]
-_COUNTS, _DECIMALS = ("x_counts", "y_counts", "z_counts"), ("x", "y", "z")
 
 
 class MessageError(ValueError):
@@ -85,7 +85,7 @@ def encode(event_sequence: int, item: Event | Result) -> bytes:
     Raises ValueError where the item does not fit the format (shapes, text that is no Unicode).
     """
     if isinstance(item, SampleBlock):
-        return _encode_block(event_sequence, item)
+        return encode_block(event_sequence, item)
     if isinstance(item, CalibrationUpdate):
         message: Message = _calibration_message(event_sequence, item)
     elif isinstance(item, WindowReport):
@@ -134,14 +134,14 @@ def _decode_event(data: bytes) -> tuple[int, Event]:
 
 
 def _values(message: Message) -> dict[str, Any]:
-    """Fields of a message as Python values; what is optional and absent is left out."""
+    """Fields of a message as Python values, maps by key; what is optional and absent is left out."""
     values: dict[str, Any] = {}
     for field in message.DESCRIPTOR.fields:
         if field.has_presence and not message.HasField(field.name):
             continue
         value = getattr(message, field.name)
         is_map = field.message_type is not None and field.message_type.GetOptions().map_entry
-        values[field.name] = dict(value) if is_map else value
+        values[field.name] = dict(sorted(value.items())) if is_map else value
     return values
 
 
@@ -179,64 +179,9 @@ def _decode_calibration(data: bytes) -> tuple[int, Result]:
     return values.pop("event_sequence"), msgspec.convert(values, CalibrationUpdate)
 
 
-def _encode_block(event_sequence: int, block: SampleBlock) -> bytes:
-    """A block through RawBlockBytes, whose bytes are those of RawBlock."""
-    decimal = block.indications.dtype == np.float64
-    if not decimal and block.indications.dtype != np.int32:
-        raise ValueError(f"indications of {block.device} are {block.indications.dtype}, not int32 or float64")
-    columns = np.ascontiguousarray(block.indications.T, "<f8" if decimal else "<i4")
-    message = pb.RawBlockBytes(
-        event_sequence=event_sequence,
-        device=block.device,
-        boot_id=block.boot_id,
-        t_utc_ns=block.t_utc_ns,
-        first_index=block.first_index,
-        nominal_rate_hz=block.nominal_rate_hz,
-        flags=int(block.flags),
-        temperature_raw=block.temperature_raw,
-        temperature_degc=block.temperature_degc,
-        axes=len(columns),
-        decimal=decimal,
-        burst_t_monotonic_ns=block.burst_t_monotonic_ns.astype("<i8", copy=False).tobytes(),
-        burst_count=block.burst_count.astype("<i4", copy=False).tobytes(),
-    )
-    for name, column in zip(_DECIMALS if decimal else _COUNTS, columns, strict=False):
-        setattr(message, name, column.tobytes())
-    return message.SerializeToString(deterministic=True)
-
-
-def _decode_block(data: bytes) -> tuple[int, SampleBlock]:
-    m = pb.RawBlockBytes.FromString(data)
-    if m.axes not in (1, 3):
-        raise MessageError(f"raw block: axes {m.axes}, not 1 or 3")
-    arrival = np.frombuffer(m.burst_t_monotonic_ns, "<i8")
-    count = np.frombuffer(m.burst_count, "<i4")
-    names, kind = (_DECIMALS, "<f8") if m.decimal else (_COUNTS, "<i4")
-    columns = [np.frombuffer(getattr(m, name), kind) for name in names[: m.axes]]
-    n = len(columns[0])
-    if len(arrival) != len(count) or not len(count) or count[-1] != n or any(len(c) != n for c in columns):
-        raise MessageError(f"raw block: {n} samples, but bursts and axes of other lengths")
-    indications = np.empty((n, m.axes), columns[0].dtype)
-    for axis, column in enumerate(columns):
-        indications[:, axis] = column
-    return m.event_sequence, SampleBlock(
-        device=m.device,
-        boot_id=m.boot_id,
-        t_utc_ns=m.t_utc_ns,
-        first_index=m.first_index,
-        nominal_rate_hz=m.nominal_rate_hz,
-        burst_t_monotonic_ns=arrival,
-        burst_count=count,
-        indications=indications,
-        flags=BlockFlags(m.flags),
-        temperature_raw=m.temperature_raw if m.HasField("temperature_raw") else None,
-        temperature_degc=m.temperature_degc if m.HasField("temperature_degc") else None,
-    )
-
-
 _DECODERS: dict[str, Callable[[bytes], tuple[int, Event | Result]]] = {
     f"{PACKAGE}.Event": _decode_event,
-    f"{PACKAGE}.RawBlock": _decode_block,
+    f"{PACKAGE}.RawBlock": decode_block,
     f"{PACKAGE}.Window": _result_decoder(pb.Window, WindowReport),
     f"{PACKAGE}.Calibration": _decode_calibration,
     f"{PACKAGE}.Status": _result_decoder(pb.Status, StatusChange),

@@ -204,7 +204,7 @@ class Recorder:
                 self._file.sync()
         except OSError as error:
             self._fail(f"{error.strerror or error} ({error.filename or self.path})")
-        except ValueError as error:
+        except (ValueError, TypeError) as error:
             # This event has no form in a recording: the file ends before it, the next begins with a snapshot after it.
             self.close()
             self._fail(f"event {event_sequence} cannot be recorded: {error}")

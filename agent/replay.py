@@ -102,6 +102,8 @@ def describe(file: ReplayedFile) -> str:
         lines.append(f"  cannot be replayed: {file.refused}")
     elif file.first_difference:
         lines.append(f"  results differ after {file.different} events, first {file.first_difference}")
+    elif not file.results:
+        lines.append("  no results, as recorded")
     elif file.tolerance:
         lines.append(f"  results equal the recorded ones within {file.tolerance:g}")
     else:

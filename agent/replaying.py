@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, cast
 
 import msgspec
 
 from agent.comparison import Difference, compare
 from agent.events import CalibrationUpdate, Event, Result, RunStart, WindowReport
 from agent.mcap_records import Fault
+from agent.messages import decode, encode, schema_of, topic_of
 from agent.reading import RecordingReader, Step
 
 
@@ -51,6 +52,7 @@ class ReplayedFile(msgspec.Struct, kw_only=True):
 class Replay:
     """Replays files one after the other; one that goes on where the last ended is replayed without restoring.
 
+    A file begins with its RunStart: the pipeline is restored from the snapshot in it, then steps the RunStart itself.
     `restore(config_json, snapshot)` makes the pipeline. Results equal in every bit, but where the recording has another
     numeric fingerprint than `here`: there within the relative tolerance `elsewhere`. `files`, `calibrations`,
     `windows` hold what came out.
@@ -111,7 +113,7 @@ class Replay:
     def _step(self, file: ReplayedFile, step: Step) -> None:
         assert self._pipeline is not None
         try:
-            computed = self._pipeline.step(step.event)
+            computed = [_as_recorded(step.event_sequence, result) for result in self._pipeline.step(step.event)]
         except Exception as error:  # as above; live, the same event would have ended the agent
             file.refused = f"event {step.event_sequence} fails: {type(error).__name__}: {error}"
             return
@@ -134,6 +136,12 @@ class Replay:
             return
         file.different += 1
         file.first_difference = file.first_difference or difference
+
+
+def _as_recorded(event_sequence: int, result: Result) -> Result:
+    """A result as it would be read from a recording: numpy's scalars become plain ones."""
+    _, read = decode(schema_of(topic_of(result)), encode(event_sequence, result))
+    return cast(Result, read)
 
 
 def _snapshot_difference(file: ReplayedFile, start: RunStart) -> Difference:
