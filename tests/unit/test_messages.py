@@ -240,4 +240,4 @@ def test_the_generated_code_is_that_of_the_proto_file(tmp_path: Path) -> None:
     subprocess.run(command, cwd=REPOSITORY, check=True, timeout=60)
     for name in ("fieldcal_pb2.py", "fieldcal_pb2.pyi"):
         committed = (REPOSITORY / "agent/proto" / name).read_text()
-        assert (tmp_path / "agent/proto" / name).read_text() == committed, "generate it again: the command is in fieldcal.proto"
+        assert (tmp_path / "agent/proto" / name).read_text() == committed, "generate it again, see fieldcal.proto"
