@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,6 +16,7 @@ from agent.quantity import plus_minus
 from calib.model import Array, Calibration, Window
 
 AXES = "xyz"
+FILE_WIDTH = 120  # columns where the output is no terminal and tells none
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +120,7 @@ def print_outcome(outcome: Outcome) -> None:
     """S and Q with their expanded uncertainties, the windows and what they were found fit for."""
     from rich.console import Console
 
-    console = Console(highlight=False, markup=False)
+    console = Console(highlight=False, markup=False, width=None if sys.stdout.isatty() else FILE_WIDTH)
     _print_windows(console, outcome.windows)
     if outcome.calibration is not None:
         _print_calibration(console, outcome)

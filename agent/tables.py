@@ -132,7 +132,8 @@ def _whole_lines(data: bytes) -> tuple[bytes, bytes]:
     """Up to the last line that is followed by another one: what ends a file may be blank lines."""
     end = data.rstrip(b"\r\n")
     cut = end.rfind(b"\n") + 1
-    return data[:cut].replace(b"\r\n", b"\n"), data[cut:]
+    whole = data[:cut]
+    return whole.replace(b"\r\n", b"\n") if b"\r" in whole else whole, data[cut:]
 
 
 def _append(spool: IO[bytes], path: Path, line: int, text: bytes, header: Sequence[str], places: Sequence[int]) -> int:

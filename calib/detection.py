@@ -20,7 +20,7 @@ KNOCK_SD = 5.0  # robust SDs: one white-noise point in 1.7 million
 KNOCK_PASSES = 8
 SLOW_BAND_HZ = 50.0  # first band tried for the motion; widened until it holds most of the motion's power
 MOST_POWER = 0.7
-FEWEST_FOR_SPECTRUM = 16
+SPECTRUM_SAMPLES, SPECTRA, FEWEST_FOR_SPECTRUM = 4096, 4, 16
 CLIPPED_POINTS = 3  # as many points at the very same extreme, and beyond it by the motion, are no chance
 
 
@@ -91,12 +91,16 @@ def averaged(x: Array, width: int) -> Array:
 
 def white_noise(x: Array) -> Array:
     """SD (m,) of white noise in x (n, m), by the median of its spectrum: motion in under half the band leaves it."""
-    if len(x) < FEWEST_FOR_SPECTRUM:
+    size = min(SPECTRUM_SAMPLES, 1 << max(len(x).bit_length() - 1, 0))
+    if size < FEWEST_FOR_SPECTRUM:
         return np.zeros(x.shape[1])
-    window = np.hanning(len(x))[:, None]
-    power = np.abs(np.fft.rfft((x - x.mean(axis=0)) * window, axis=0)[1:-1]) ** 2 / np.sum(window**2)
+    starts = np.unique(np.linspace(0, len(x) - size, SPECTRA).astype(int))
+    parts = np.stack([x[k : k + size] for k in starts])
+    window = np.hanning(size)[:, None]
+    lines = np.fft.rfft((parts - parts.mean(axis=1, keepdims=True)) * window, axis=1)[:, 1:-1]
+    power = np.median(np.abs(lines) ** 2, axis=(0, 1)) / np.sum(window**2)
     # The power of a line of white noise is exponentially distributed: its mean is the median over ln 2.
-    return np.asarray(np.sqrt(np.median(power, axis=0) / np.log(2.0)))
+    return np.asarray(np.sqrt(power / np.log(2.0)))
 
 
 def least_step(V: Array) -> Array:

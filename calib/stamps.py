@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 import itertools
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -18,9 +19,13 @@ MANY = 0.3  # of all steps: so many short ones are no accident
 GRID = 0.02  # of the mean period: what a step may differ from the usual one on a grid
 FEW = 1e-3  # of all steps: odd steps of a grid (samples missing)
 NEIGHBOURS = 32  # bursts on each side that tell a gap (all later ones stay late) from a stall (they catch up)
+FEWEST_NEIGHBOURS = 4  # the last burst of a file may be cut off, its newest sample is then none
 # Of the usual period. Less cannot be told from the scatter of bursts, and then costs less than it does; exact stamps
 # show each missing sample.
 LEAST_GAP, LEAST_GAP_ON_GRID = 5.0, 0.5
+
+
+BLOCK_ROWS = 1 << 20  # looked at in one go: a quarter of an hour at 1 kHz, bounds memory
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,25 +40,30 @@ class Arrivals:
 def clock_from_stamps(stamp_s: Array) -> ClockFit:
     """The clock of a device from the stamps (n,) of its consecutive samples, n >= 2.
 
-    Pieces of a minute, joined; anew after each gap. Raises ValueError where time does not pass at all.
+    Parabolas over a minute each, joined; anew after each gap and every `BLOCK_ROWS` rows. Raises ValueError where time
+    does not pass at all.
     """
-    arrivals = arrivals_from_stamps(stamp_s)
-    period = _usual_period(arrivals)
-    gaps = _gaps(arrivals, period)
-    cuts = [0, *np.searchsorted(arrivals.index, gaps).tolist(), len(arrivals.index)]
-    parts = [(arrivals.index[a:b], arrivals.arrival_s[a:b]) for a, b in itertools.pairwise(cuts)]
-    edge = _edge(arrivals.kind, *max(parts, key=lambda part: len(part[0])))
-    firsts, lasts = [0, *gaps.tolist()], [*(gaps - 1).tolist(), len(stamp_s) - 1]
-    pieces = [
-        _piece(index, arrival_s, first, last, 1.0 / period, edge)
-        for (index, arrival_s), first, last in zip(parts, firsts, lasts, strict=True)
-    ]
+    edges = np.linspace(0, len(stamp_s), -(-len(stamp_s) // BLOCK_ROWS) + 1).astype(int).tolist()
+    pieces: list[ClockFit] = []
+    gaps: list[int] = []
+    edge: Edge | None = None
+    for first, stop in itertools.pairwise(edges):
+        arrivals = arrivals_from_stamps(stamp_s[first:stop])
+        period = _usual_period(arrivals)
+        found = _gaps(arrivals, period)
+        cuts = [0, *np.searchsorted(arrivals.index, found).tolist(), len(arrivals.index)]
+        parts = [(arrivals.index[a:b], arrivals.arrival_s[a:b]) for a, b in itertools.pairwise(cuts)]
+        edge = edge or _edge(arrivals.kind, *max(parts, key=lambda part: len(part[0])))
+        bounds = [0, *found.tolist(), stop - first]
+        for (index, arrival_s), (a, b) in zip(parts, itertools.pairwise(bounds), strict=True):
+            pieces.append(_piece(index + first, arrival_s, first + a, first + b - 1, 1.0 / period, edge))
+        gaps += [first + gap for gap in found.tolist()]
     return replace(
         pieces[-1],
         knot_index=np.concatenate([p.knot_index for p in pieces]),
         knot_time_s=np.concatenate([p.knot_time_s for p in pieces]),
         knot_period_s=np.concatenate([p.knot_period_s for p in pieces]),
-        gaps=gaps,
+        gaps=np.array(gaps, dtype=np.int64),
     )
 
 
@@ -119,14 +129,18 @@ def _gaps(arrivals: Arrivals, period: float) -> IntArray:
     """Sample numbers before which samples are missing: all bursts from there on are later than those before."""
     late = arrivals.arrival_s - period * arrivals.index
     least = period * (LEAST_GAP_ON_GRID if arrivals.kind == "grid" else LEAST_GAP)
-    gaps: list[int] = []
-    start = 0
-    for b in (np.nonzero(np.diff(late) > least)[0] + 1).tolist():
-        before, after = late[max(start, b - NEIGHBOURS) : b], late[b : b + NEIGHBOURS]
+    steps = np.diff(late)
+    found = [0, len(late)]
+    # The largest first: a stall just before a gap would else be taken for it.
+    for b in sorted((np.flatnonzero(steps > least) + 1).tolist(), key=lambda b: -steps[b - 1]):
+        right = bisect.bisect(found, b)
+        before = late[max(found[right - 1], b - NEIGHBOURS) : b]
+        after = late[b : min(found[right], b + NEIGHBOURS)]
+        if min(len(before), len(after)) < FEWEST_NEIGHBOURS:
+            continue
         if min(after.min() - before.min(), np.median(after) - np.median(before)) > least:
-            start = b
-            gaps.append(int(arrivals.index[b - 1]) + 1)
-    return np.array(gaps, dtype=np.int64)
+            found.insert(right, b)
+    return arrivals.index[np.array(found[1:-1], dtype=np.int64) - 1] + 1
 
 
 def _piece(index: IntArray, arrival_s: Array, first: int, last: int, nominal_hz: float, edge: Edge) -> ClockFit:

@@ -182,7 +182,9 @@ def parabola(index: IntArray, arrival_s: Array, nominal_rate_hz: float, edge: Ed
         return Parabola(int(index[-1]), float(arrival_s[-1]), c, np.diag(u**2))
     scale = np.array([1.0, -x[0], x[0] ** 2])[:order]
     covariance = np.zeros((3, 3))
-    for _ in range(3):  # the groups' edges depend on the slope taken out first: settles to some us
+    for _ in range(
+        1 if edge == "mean" else 3
+    ):  # the groups' edges depend on the slope taken out first: settles to some us
         late = y - (c[0] + x * (c[1] + x * c[2]))
         at, value = _edges(
             x[-groups * size :].reshape(groups, size), late[-groups * size :].reshape(groups, size), edge
