@@ -32,6 +32,7 @@ class Comparison:
     one: AmplitudeCalibration
     two: AmplitudeCalibration
     three: method3.Fit
+    windows: Sequence[Window]  # of Method 3, its segments being cycles
     statements: dict[int, Statement]
     sensitivity: dict[int, Array]
     offset: Array  # of Method 3
@@ -74,6 +75,7 @@ def compare(device: Device, runs: Sequence[Run], priors: Priors) -> Comparison:
         one=one,
         two=two,
         three=three,
+        windows=windows,
         statements={1: one.statement, 2: two.statement, 3: method3_budget.statement(three, windows, priors)},
         sensitivity={
             1: one.calibration.sensitivity,
