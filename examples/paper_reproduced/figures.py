@@ -41,8 +41,9 @@ LABEL = {"x": (-0.95, -0.05), "y": (0.95, 0.12), "z": (0.62, 0.95)}
 
 
 def save(figure: Figure, path: Path) -> None:
-    """SVG for the page; a PNG beside it where `path` says so."""
-    figure.savefig(path, metadata={"Date": None} if path.suffix == ".svg" else None, dpi=110)
+    """As the ending of `path` says; an SVG is the same file every time."""
+    with mpl.rc_context(STYLE):
+        figure.savefig(path, metadata={"Date": None} if path.suffix == ".svg" else None, dpi=110)
 
 
 def figure_2(run: Run, a_ref_mps2: Array, unit: str) -> Figure:
@@ -173,7 +174,7 @@ def budgets(found: Mapping[str, Comparison]) -> Figure:
         for axes, method in zip(panels, METHODS, strict=True):
             for k, (c, colour) in enumerate(zip(found.values(), (BLUE, ORANGE), strict=True)):
                 width = [_share(c, method, source).max() for source in sources]
-                axes.barh(place + 0.2 - 0.4 * k, width, height=0.38, color=colour, label=c.device.name)
+                axes.barh(place - 0.2 + 0.4 * k, width, height=0.38, color=colour, label=c.device.name)
             axes.set(title=f"Method {method}", xlabel="largest u / %")
             axes.set_yticks(place, sources)
             axes.grid(visible=False, axis="y")
