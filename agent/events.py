@@ -30,26 +30,6 @@ class RunStart(msgspec.Struct, frozen=True, kw_only=True):
     continuation: bool = False
 
 
-class PoseChange(msgspec.Struct, frozen=True, kw_only=True):
-    """An operator says how a sensor stands from `t_monotonic_ns` on."""
-
-    sensor: str
-    t_monotonic_ns: int
-    position: str
-    theta_deg: float | None = None
-    alpha_deg: float | None = None
-    direction: tuple[float, float, float] | None = None
-    gravity_mps2: tuple[float, float, float] | None = None
-
-
-class ReferenceChange(msgspec.Struct, frozen=True, kw_only=True):
-    """Another reference stands beside a sensor from `t_monotonic_ns` on."""
-
-    sensor: str
-    t_monotonic_ns: int
-    reference: str
-
-
 class DeviceChange(msgspec.Struct, frozen=True, kw_only=True):
     """A device was lost, came back, or was opened; `info` is its identity as read (JSON of DeviceInfo)."""
 
@@ -79,7 +59,7 @@ class Tick(msgspec.Struct, frozen=True, kw_only=True):
     t_utc_ns: int
 
 
-Event = RunStart | SampleBlock | PoseChange | ReferenceChange | DeviceChange | Gap | Tick
+Event = RunStart | SampleBlock | DeviceChange | Gap | Tick
 
 
 class WindowReport(msgspec.Struct, frozen=True, kw_only=True):

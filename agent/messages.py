@@ -19,8 +19,6 @@ from agent.events import (
     DeviceChange,
     Event,
     Gap,
-    PoseChange,
-    ReferenceChange,
     Result,
     RunStart,
     StatusChange,
@@ -38,8 +36,6 @@ RESULT_TOPICS = {WindowReport: "window", CalibrationUpdate: "calibration", Statu
 
 _EVENT_FIELDS: dict[type[Any], str] = {
     RunStart: "run_start",
-    PoseChange: "pose_change",
-    ReferenceChange: "reference_change",
     DeviceChange: "device_change",
     Gap: "gap",
     Tick: "tick",
@@ -114,9 +110,6 @@ def _event_values(event: Any) -> dict[str, Any]:
     values = msgspec.structs.asdict(event)
     if isinstance(event, RunStart):
         del values["event_sequence"]
-    if isinstance(event, PoseChange):
-        for name in ("direction", "gravity_mps2"):
-            values[name] = values[name] and dict(zip("xyz", values[name], strict=True))
     return values
 
 
@@ -128,8 +121,6 @@ def _decode_event(data: bytes) -> tuple[int, Event]:
     values = _values(getattr(message, field))
     if field == "run_start":
         values["event_sequence"] = message.event_sequence
-    for name in {"direction", "gravity_mps2"} & values.keys():
-        values[name] = (values[name].x, values[name].y, values[name].z)
     return message.event_sequence, msgspec.convert(values, _EVENT_KINDS[field], builtin_types=(bytes,))
 
 

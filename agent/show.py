@@ -115,7 +115,7 @@ def _print(overview: Overview) -> None:
 
     console = Console(highlight=False, markup=False)
     if not overview.sensors:
-        console.print(f"{overview.data_dir}: no results yet")
+        console.print(f"{overview.data_dir}: no results yet", soft_wrap=True)
     for sensor, held in overview.sensors.items():
         _print_sensor(console, sensor, held)
     names = [name for name, _ in overview.recordings]

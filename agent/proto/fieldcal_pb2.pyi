@@ -7,16 +7,7 @@ from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
 DESCRIPTOR: _descriptor.FileDescriptor
 
 class Event(_message.Message):
-    __slots__ = ("event_sequence", "run_start", "pose_change", "reference_change", "device_change", "gap", "tick")
-    class Vector3(_message.Message):
-        __slots__ = ("x", "y", "z")
-        X_FIELD_NUMBER: _ClassVar[int]
-        Y_FIELD_NUMBER: _ClassVar[int]
-        Z_FIELD_NUMBER: _ClassVar[int]
-        x: float
-        y: float
-        z: float
-        def __init__(self, x: _Optional[float] = ..., y: _Optional[float] = ..., z: _Optional[float] = ...) -> None: ...
+    __slots__ = ("event_sequence", "run_start", "device_change", "gap", "tick")
     class RunStart(_message.Message):
         __slots__ = ("run_id", "site", "gateway", "boot_id", "t_monotonic_ns", "t_utc_ns", "config_json", "versions", "fingerprint", "snapshot", "file_sequence", "continuation")
         class VersionsEntry(_message.Message):
@@ -58,32 +49,6 @@ class Event(_message.Message):
         file_sequence: int
         continuation: bool
         def __init__(self, run_id: _Optional[str] = ..., site: _Optional[str] = ..., gateway: _Optional[str] = ..., boot_id: _Optional[str] = ..., t_monotonic_ns: _Optional[int] = ..., t_utc_ns: _Optional[int] = ..., config_json: _Optional[str] = ..., versions: _Optional[_Mapping[str, str]] = ..., fingerprint: _Optional[_Mapping[str, str]] = ..., snapshot: _Optional[bytes] = ..., file_sequence: _Optional[int] = ..., continuation: _Optional[bool] = ...) -> None: ...
-    class PoseChange(_message.Message):
-        __slots__ = ("sensor", "t_monotonic_ns", "position", "theta_deg", "alpha_deg", "direction", "gravity_mps2")
-        SENSOR_FIELD_NUMBER: _ClassVar[int]
-        T_MONOTONIC_NS_FIELD_NUMBER: _ClassVar[int]
-        POSITION_FIELD_NUMBER: _ClassVar[int]
-        THETA_DEG_FIELD_NUMBER: _ClassVar[int]
-        ALPHA_DEG_FIELD_NUMBER: _ClassVar[int]
-        DIRECTION_FIELD_NUMBER: _ClassVar[int]
-        GRAVITY_MPS2_FIELD_NUMBER: _ClassVar[int]
-        sensor: str
-        t_monotonic_ns: int
-        position: str
-        theta_deg: float
-        alpha_deg: float
-        direction: Event.Vector3
-        gravity_mps2: Event.Vector3
-        def __init__(self, sensor: _Optional[str] = ..., t_monotonic_ns: _Optional[int] = ..., position: _Optional[str] = ..., theta_deg: _Optional[float] = ..., alpha_deg: _Optional[float] = ..., direction: _Optional[_Union[Event.Vector3, _Mapping]] = ..., gravity_mps2: _Optional[_Union[Event.Vector3, _Mapping]] = ...) -> None: ...
-    class ReferenceChange(_message.Message):
-        __slots__ = ("sensor", "t_monotonic_ns", "reference")
-        SENSOR_FIELD_NUMBER: _ClassVar[int]
-        T_MONOTONIC_NS_FIELD_NUMBER: _ClassVar[int]
-        REFERENCE_FIELD_NUMBER: _ClassVar[int]
-        sensor: str
-        t_monotonic_ns: int
-        reference: str
-        def __init__(self, sensor: _Optional[str] = ..., t_monotonic_ns: _Optional[int] = ..., reference: _Optional[str] = ...) -> None: ...
     class DeviceChange(_message.Message):
         __slots__ = ("device", "state", "t_monotonic_ns", "t_utc_ns", "message", "info_json", "attempt")
         DEVICE_FIELD_NUMBER: _ClassVar[int]
@@ -123,19 +88,15 @@ class Event(_message.Message):
         def __init__(self, t_monotonic_ns: _Optional[int] = ..., t_utc_ns: _Optional[int] = ...) -> None: ...
     EVENT_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     RUN_START_FIELD_NUMBER: _ClassVar[int]
-    POSE_CHANGE_FIELD_NUMBER: _ClassVar[int]
-    REFERENCE_CHANGE_FIELD_NUMBER: _ClassVar[int]
     DEVICE_CHANGE_FIELD_NUMBER: _ClassVar[int]
     GAP_FIELD_NUMBER: _ClassVar[int]
     TICK_FIELD_NUMBER: _ClassVar[int]
     event_sequence: int
     run_start: Event.RunStart
-    pose_change: Event.PoseChange
-    reference_change: Event.ReferenceChange
     device_change: Event.DeviceChange
     gap: Event.Gap
     tick: Event.Tick
-    def __init__(self, event_sequence: _Optional[int] = ..., run_start: _Optional[_Union[Event.RunStart, _Mapping]] = ..., pose_change: _Optional[_Union[Event.PoseChange, _Mapping]] = ..., reference_change: _Optional[_Union[Event.ReferenceChange, _Mapping]] = ..., device_change: _Optional[_Union[Event.DeviceChange, _Mapping]] = ..., gap: _Optional[_Union[Event.Gap, _Mapping]] = ..., tick: _Optional[_Union[Event.Tick, _Mapping]] = ...) -> None: ...
+    def __init__(self, event_sequence: _Optional[int] = ..., run_start: _Optional[_Union[Event.RunStart, _Mapping]] = ..., device_change: _Optional[_Union[Event.DeviceChange, _Mapping]] = ..., gap: _Optional[_Union[Event.Gap, _Mapping]] = ..., tick: _Optional[_Union[Event.Tick, _Mapping]] = ...) -> None: ...
 
 class RawBlock(_message.Message):
     __slots__ = ("event_sequence", "device", "boot_id", "t_utc_ns", "first_index", "nominal_rate_hz", "flags", "temperature_raw", "temperature_degc", "axes", "decimal", "burst_t_monotonic_ns", "burst_count", "x_counts", "y_counts", "z_counts", "x", "y", "z")

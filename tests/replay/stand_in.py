@@ -14,8 +14,6 @@ from agent.events import (
     DeviceChange,
     Event,
     Gap,
-    PoseChange,
-    ReferenceChange,
     Result,
     RunStart,
     StatusChange,
@@ -43,7 +41,6 @@ class StandIn:
         self.window_blocks = int(msgspec.json.decode(config_json)["window_blocks"])
         self.run_id = ""
         self.sequence = self.blocks = self.windows = 0
-        self.position = "first"
         self.sums = np.zeros((3, 3))
 
     @classmethod
@@ -55,15 +52,13 @@ class StandIn:
         return pipeline
 
     def snapshot(self) -> bytes:
-        names = ("run_id", "sequence", "blocks", "windows", "position")
+        names = ("run_id", "sequence", "blocks", "windows")
         return msgspec.msgpack.encode({name: vars(self)[name] for name in names} | {"sums": self.sums.tobytes()})
 
     def step(self, event: Event) -> list[Result]:
         if isinstance(event, RunStart):
             self.run_id = event.run_id
             return [] if event.continuation else [self._status(event.t_utc_ns, "COLLECTING", "UNCALIBRATED")]
-        if isinstance(event, PoseChange):
-            self.position = event.position
         if isinstance(event, DeviceChange) and event.state == "lost":
             return [self._status(event.t_utc_ns, "INVALID", "COLLECTING")]
         return self._block(event) if isinstance(event, SampleBlock) and event.device == "acc" else []
@@ -92,7 +87,7 @@ class StandIn:
             **self._common(block.t_utc_ns),
             start_s=block.first_index / 1000.0,
             stop_s=(block.first_index + block.n) / 1000.0,
-            position=self.position,
+            position="first",
             used=level > 1e3,
             reason="" if level > 1e3 else "too quiet",
             points=block.n,
@@ -149,8 +144,6 @@ def happenings(blocks: int, seed: int) -> Iterator[Event]:
         if number % 2:
             yield Tick(t_monotonic_ns=now_ns, t_utc_ns=EPOCH_NS + now_ns)
         if number == 4:
-            yield PoseChange(sensor="bridge-1", t_monotonic_ns=now_ns, position="second", direction=(0.0, -0.0, 1.0))
-            yield ReferenceChange(sensor="bridge-1", t_monotonic_ns=now_ns, reference="ref")
             yield Gap(device="acc", t_monotonic_ns=now_ns, dropped=32, unit="samples", reason="overrun")
             yield DeviceChange(device="acc", state="lost", t_monotonic_ns=now_ns, t_utc_ns=EPOCH_NS + now_ns)
 

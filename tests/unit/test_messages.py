@@ -21,8 +21,6 @@ from agent.events import (
     CalibrationUpdate,
     DeviceChange,
     Gap,
-    PoseChange,
-    ReferenceChange,
     RunStart,
     StatusChange,
     Tick,
@@ -36,8 +34,6 @@ from tests.replay.stand_in import block
 REPOSITORY = Path(__file__).parents[2]
 STRUCTS = [
     RunStart,
-    PoseChange,
-    ReferenceChange,
     DeviceChange,
     Gap,
     Tick,
