@@ -28,8 +28,8 @@ class Condensed:
     """B blocks of slopes (one a window, or one a position where quiet windows are) and W means.
 
     `root` (B, 2M, 2M) is R, `slopes` (B, 2M, 3) is R b, `block_window` (B,) an index of a window with the block's
-    pose, `omega2` (B,) in rad2/s2 the power ratio of du/dt to u. `mean_x` (W, 2M), `mean_v` (W, 3), `count` (W,).
-    `signal` (3,) is the root mean square of V about its grand mean.
+    pose, `omega2` (B,) in rad2/s2 the power ratio of du/dt to u, `mean_omega2` (W,) that of the windows.
+    `mean_x` (W, 2M), `mean_v` (W, 3), `count` (W,).
     """
 
     channels: int
@@ -39,8 +39,8 @@ class Condensed:
     omega2: Array
     mean_x: Array
     mean_v: Array
+    mean_omega2: Array
     count: Array
-    signal: Array
     type_a: TypeA
 
 
@@ -60,7 +60,6 @@ def condense(windows: Sequence[Window], quiet: Sequence[Window] = ()) -> Condens
     slopes = [t @ b.xv.sum(0) for t, b in zip(whiteners, blocks, strict=True)]
     mean_v = np.array([s.mean[-3:] for s in segments])
     count = np.array([s.count.sum() for s in segments])
-    power = sum(s.vv.sum(0).diagonal() for s in segments) + count @ (mean_v - count @ mean_v / count.sum()) ** 2
     return Condensed(
         channels=channels,
         root=np.array(roots),
@@ -69,8 +68,8 @@ def condense(windows: Sequence[Window], quiet: Sequence[Window] = ()) -> Condens
         omega2=np.array([_omega2(b.xx.sum(0), channels) for b in blocks]),
         mean_x=np.array([s.mean[:-3] for s in segments]),
         mean_v=mean_v,
+        mean_omega2=np.array([_omega2(s.xx.sum(0), channels) for s in segments]),
         count=count,
-        signal=np.sqrt(power / count.sum()),
         type_a=pooled(segments, blocks, _blocks_of(windows, block_window), roots, whiteners),
     )
 

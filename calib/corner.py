@@ -31,5 +31,5 @@ def without_corner(x: Array, rate_hz: float, corner_hz: float) -> Array:
 
 
 def with_integral(pose: Pose) -> Pose:
-    """The pose of windows whose channels are the reference's, then their integrals, which of themselves move nothing."""
+    """Of windows whose channels are the reference's, then their integrals, which of themselves move nothing."""
     return replace(pose, direction=np.hstack([pose.direction, np.zeros_like(pose.direction)]))

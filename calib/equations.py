@@ -4,7 +4,7 @@ For output axis i, with D and G of the pose (calib.nuisances) and S_i a row of S
 
     slope on u      S_i D (1 - lag_i^2 omega^2 / 2)
     slope on du/dt  -S_i D lag_i + S_i D' / omega
-    mean of V       S_i (D mean(u) + G) + Q_i - lag_i S_i D mean(du/dt) + offset of the position
+    mean of V       S_i (D mean(u) + G) + Q_i + S_i (D' / omega - lag_i D) mean(du/dt) + offset of the position
 
 The term in omega^2 = <du^2> / <u^2> is the projection of d2u/dt2 on u: exact for a sine, and for any motion once the
 front end has taken out the lag that was found.
@@ -152,7 +152,13 @@ class Equations:
         moved = np.einsum("wkm,wm->wk", D, data.mean_x[:, :m])
         rate = np.einsum("wkm,wm->wk", D, data.mean_x[:, m:])
         G = np.nan_to_num(inputs.gravity[self.pose_of_window])
-        felt = moved[:, None] + G[:, None] - inputs.lag_s[:, None] * rate[:, None]  # (W, 3, 3): axis, direction
+        # A window of no whole number of cycles has a mean of du/dt, which lag and quadrature pass on.
+        per_omega = np.divide(
+            1.0, np.sqrt(data.mean_omega2), out=np.zeros_like(data.count), where=data.mean_omega2 > 0.0
+        )
+        share = (data.mean_x[:, m] if m else 0.0 * data.count) * per_omega
+        across = inputs.quadrature[self.pose_of_window] * share[:, None]
+        felt = (moved + across + G)[:, None] - inputs.lag_s[:, None] * rate[:, None]  # (W, 3, 3): axis, direction
         predicted = np.einsum("ik,wik->wi", S, felt) + Q
         predicted += self.output_per_mps2 * np.einsum("j,jwi->wi", z, nuisances.offset[:, self.pose_of_window])
         jacobian = np.zeros((*data.mean_v.shape, 12 + len(nuisances)))
@@ -161,6 +167,7 @@ class Equations:
             jacobian[:, i, 9 + i] = 1.0
         d_input = np.einsum("jwkm,wm->jwk", inputs.d_direction[:, self.pose_of_window], data.mean_x[:, :m])
         d_input = d_input + np.nan_to_num(inputs.d_gravity[:, self.pose_of_window])
+        d_input = d_input + inputs.d_quadrature[:, self.pose_of_window] * share[:, None]
         jacobian[..., 12:] = np.einsum("ik,jwk->wij", S, d_input)
         jacobian[..., 12:] += self.output_per_mps2 * nuisances.offset[:, self.pose_of_window].transpose(1, 2, 0)
         jacobian[..., 12:] -= np.einsum("wi,ij->wij", rate @ S.T, nuisances.lag.T)
