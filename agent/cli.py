@@ -16,6 +16,7 @@ COMMANDS = {
     "replay": ("agent.replay", "Run recordings through the same pipeline and print the calibrations."),
     "audit": ("agent.audit", "Check a recording: every byte, and that its results follow from its data."),
     "show": ("agent.show", "Calibration in force, status and history of a data directory."),
+    "report": ("agent.report", "Figures and one page of a calibration."),
     "router": ("agent.router", "A Zenoh router, for tests and small sites."),
     "simulate": ("agent.simulate", "Serve virtual devices on pseudo-terminals, or write a recording with known truth."),
     "check": ("agent.check", "All faults of a configuration at once."),

@@ -1,0 +1,117 @@
+"""Figures of S itself: its rows in space (Figures 6 to 9, 13 to 15), its elements with their U (Figures 10 to 12)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from agent.report.result import CalibrationResult
+from agent.report.style import AXIS_COLOURS, INK, PALE, RESULT_COLOURS, RESULT_MARKERS, WIDTH_IN, bare, figure
+from agent.report.units import labelled, sensitivity_unit
+from calib.model import PARAMETERS, Array
+
+AXES = "xyz"
+TRANSVERSE = [(i, j) for i in range(3) for j in range(3) if i != j]
+
+
+def rows_in_space(result: CalibrationResult) -> Figure | None:
+    """Each row of S as a point, as Figure 6 defines it; its axis is the locus of a sensor without transverse ones.
+
+    None where no row is known.
+    """
+    S = result.sensitivity
+    known = [i for i in range(3) if np.isfinite(S[i]).all()]
+    if not known:
+        return None
+    drawn = figure(WIDTH_IN)
+    axes = drawn.add_subplot(projection="3d")
+    reach = 1.15 * float(np.abs(S[known]).max())
+    low = min(0.0, 1.1 * float(S[known].min()))
+    for j, axis in enumerate(AXES):
+        ends = np.zeros((2, 3))
+        ends[:, j] = (low, reach)
+        axes.plot(*ends.T, color=INK, linewidth=0.8)
+        axes.text(*(1.08 * ends[1]), axis, ha="center", va="center")
+    for i in known:
+        x, y, z = S[i]
+        ideal = np.zeros(3)
+        ideal[i] = S[i, i]
+        axes.plot(*np.stack([np.zeros(3), S[i]]).T, color=AXIS_COLOURS[i], linewidth=1.6)
+        axes.plot(*np.stack([ideal, S[i]]).T, color=AXIS_COLOURS[i], linewidth=1, linestyle=":")
+        name = f"({', '.join(f'$S_{{{AXES[i]}{axis}}}$' for axis in AXES)})"
+        axes.plot([x], [y], [z], "o", color=AXIS_COLOURS[i], markersize=6, label=f"{name} = {_row(S[i])}")
+    axes.set(xlim=(low, reach), ylim=(low, reach), zlim=(low, reach))
+    axes.view_init(elev=22, azim=38)
+    axes.locator_params(nbins=4)
+    axes.tick_params(labelsize=8, pad=0)
+    for side in (axes.xaxis, axes.yaxis, axes.zaxis):
+        side.pane.set(facecolor="none", edgecolor=PALE)
+    axes.set_box_aspect(None, zoom=0.9)
+    drawn.legend(loc="outside lower center", ncols=1, title=labelled("Rows of S", sensitivity_unit(result.unit)))
+    return drawn
+
+
+def main_sensitivities(results: Sequence[CalibrationResult]) -> Figure | None:
+    """S_xx, S_yy, S_zz of each result with their U; None where there is none."""
+    names = [f"$S_{{{axis}{axis}}}$" for axis in AXES]
+    places = [PARAMETERS.index(f"S{axis}{axis}") for axis in AXES]
+    values = [(r.values[places], r.expanded_uncertainty[places]) for r in results]
+    if not any(np.isfinite(v).any() for v, _ in values):
+        return None
+    unit = sensitivity_unit(results[0].unit)
+    drawn = figure(1.2 + 3 * (0.55 + 0.26 * len(results)))
+    for axes, name, k in zip(np.atleast_1d(drawn.subplots(3, 1)), names, range(3), strict=True):
+        for row, (value, expanded) in enumerate(values):
+            _bar(axes, row, value[k], expanded[k], row)
+        axes.set(yticks=range(len(results)), yticklabels=[r.label for r in results], title=labelled(name, unit))
+        axes.set_ylim(len(results) - 0.4, -0.6)
+        axes.margins(x=0.15)
+        axes.locator_params(axis="x", nbins=5)
+        bare(axes)
+    return drawn
+
+
+def transverse_sensitivities(results: Sequence[CalibrationResult]) -> Figure | None:
+    """The six transverse sensitivities in % of the main one of their row (rel_S, Appendix A), with U."""
+    values = [_relative(r) for r in results]
+    if not any(np.isfinite(v).any() for v, _ in values):
+        return None
+    drawn = figure(1.4 + 0.3 * 6 * max(1.0, 0.5 * len(results)))
+    axes = drawn.subplots()
+    step = 0.7 / len(results)
+    for k, (result, (value, expanded)) in enumerate(zip(results, values, strict=True)):
+        shift = (k - 0.5 * (len(results) - 1)) * step
+        for row in range(6):
+            _bar(axes, row + shift, value[row], expanded[row], k, result.label if row == 0 else None)
+    axes.axvline(0, color=INK, linewidth=0.8)
+    axes.set(yticks=range(6), yticklabels=[f"$S_{{{AXES[i]}{AXES[j]}}}$" for i, j in TRANSVERSE])
+    axes.set_xlabel("% of the main sensitivity of the row")
+    axes.set_ylim(5.6, -0.6)
+    bare(axes)
+    if len(results) > 1:
+        drawn.legend(loc="outside lower center", ncols=2)
+    return drawn
+
+
+def _bar(axes: object, row: float, value: float, expanded: float, k: int, label: str | None = None) -> None:
+    """A value with its expanded uncertainty; one whose uncertainty is not known stands alone."""
+    assert hasattr(axes, "errorbar")
+    axes.errorbar(
+        value, row, xerr=expanded if np.isfinite(expanded) else None, label=label, capsize=4, markersize=6,
+        fmt=RESULT_MARKERS[k % len(RESULT_MARKERS)], color=RESULT_COLOURS[k % len(RESULT_COLOURS)],
+    )  # fmt: skip
+
+
+def _relative(result: CalibrationResult) -> tuple[Array, Array]:
+    """(6,) transverse sensitivities and their U in % of the main one of their row."""
+    S, U = result.sensitivity, result.expanded_uncertainty[:9].reshape(3, 3)
+    pick = tuple(np.array(TRANSVERSE).T)
+    main = np.abs(np.diag(S))[pick[0]]
+    return 100 * S[pick] / main, 100 * U[pick] / main
+
+
+def _row(values: Array) -> str:
+    digits = max(0, 3 - int(np.floor(np.log10(np.abs(values).max())))) if np.abs(values).max() > 0 else 3
+    return "(" + ", ".join(f"{v:.{digits}f}".replace("-", "−") for v in values) + ")"

@@ -1,0 +1,61 @@
+"""All figures of a report, made and saved: the one place that draws."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from agent.report import diagrams, signals, style, timelines
+from agent.report.material import Material
+from agent.report.trace import Residuals
+
+
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """A figure that was saved as `name`.svg, .png and .pdf; `svg` is for the page."""
+
+    name: str
+    caption: str
+    svg: str
+
+
+def draw(material: Material, shown: Residuals | None, directory: Path) -> list[Drawn]:
+    """Save all figures that the material gives. Raises OSError."""
+    directory.mkdir(parents=True, exist_ok=True)
+    with style.drawing():
+        return [
+            Drawn(name, caption, style.save(figure, directory, name))
+            for name, caption, figure in _figures(material, shown)
+            if figure is not None
+        ]
+
+
+def _figures(material: Material, shown: Residuals | None) -> Iterator[tuple[str, str, Figure | None]]:
+    results, unit = material.results, material.results[0].unit
+    for k, result in enumerate(results):
+        about = f", {result.label}" if len(results) > 1 else ""
+        number = f"-{k + 1}" if len(results) > 1 else ""
+        caption = f"Rows of S as points{about}; without transverse sensitivities each lies on its axis."
+        yield f"rows{number}", caption, diagrams.rows_in_space(result)
+    yield "main", "Main sensitivities with their expanded uncertainties.", diagrams.main_sensitivities(results)
+    caption = "Transverse sensitivities in percent of the main one of their row, with expanded uncertainties."
+    yield "transverse", caption, diagrams.transverse_sensitivities(results)
+    if shown is not None:
+        where = f"position {shown.position}, {shown.time_s[0]:.1f} to {shown.time_s[-1]:.1f} s"
+        caption = f"Indications (points) against S a + Q (line): some cycles of the window in {where}."
+        yield "indications", caption, signals.indications(shown, unit)
+        caption = f"What S a + Q leaves of the indications, window in {where}."
+        if shown.frequency_hz:
+            caption += f" Dotted: mean frequency of the motion, {shown.frequency_hz:.3g} Hz."
+        yield "residuals", caption, signals.left_over(shown, unit)
+    for k, result in enumerate(results):
+        about = f", {result.label}" if len(results) > 1 else ""
+        number = f"-{k + 1}" if len(results) > 1 else ""
+        caption = f"Where the uncertainty comes from: share of each source in the variance{about}."
+        yield f"budget{number}", caption, timelines.budget(result)
+        yield f"windows{number}", f"Windows and their verdicts{about}.", timelines.windows(result.windows)
+    caption = "Calibrations one after the other, with expanded uncertainties."
+    yield "history", caption, timelines.history(material.history, unit)

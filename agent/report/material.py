@@ -1,0 +1,193 @@
+"""What a report is made of, gathered from results, recordings or a data directory."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from agent.events import CalibrationUpdate, StatusChange, WindowReport
+from agent.history import FILE_NAME, History, StoreError
+from agent.recording import recordings
+from agent.report.recorded import Recorded, RecordingError, read_recordings, sensors_of
+from agent.report.result import (
+    CalibrationResult,
+    ResultError,
+    WindowVerdict,
+    from_update,
+    parse,
+    undetermined,
+)
+from agent.report.trace import Trace
+
+MOST_HISTORY = 1000  # newest calibrations and windows of a data directory
+MOST_RECORDINGS = 2  # newest files read for windows point by point: a second or so of work each
+RECORDING_ENDINGS = (".mcap", ".mcap.active")
+
+
+class MaterialError(Exception):
+    """The input cannot be used. The message names the file, the field and what is wrong."""
+
+
+@dataclass(frozen=True, slots=True)
+class SourceFile:
+    """A file that the report was made from."""
+
+    path: str
+    size_bytes: int
+    sha256: str
+
+
+@dataclass(slots=True)
+class Material:
+    """`results`: what the report is about, more than one where methods are compared. `history`: calibrations in order
+    of time. `traces`: windows point by point, by position. `facts`: who and what, by name. `notices`: what is missing.
+    """
+
+    sensor: str
+    results: list[CalibrationResult]
+    history: list[CalibrationUpdate] = field(default_factory=list)
+    traces: dict[str, Trace] = field(default_factory=dict)
+    facts: dict[str, Any] = field(default_factory=dict)
+    files: list[SourceFile] = field(default_factory=list)
+    notices: list[str] = field(default_factory=list)
+
+
+def gather(inputs: Sequence[Path], sensor: str | None) -> Material:
+    """Read results (JSON), recordings of one sensor, or one data directory. Raises MaterialError."""
+    kinds = {_kind(path) for path in inputs}
+    if len(kinds) > 1 or (kinds == {"directory"} and len(inputs) > 1):
+        raise MaterialError("give results (JSON), or recordings (.mcap), or one data directory, not a mixture")
+    try:
+        if kinds == {"directory"}:
+            return _from_directory(inputs[0], sensor)
+        if kinds == {"recording"}:
+            return _from_recordings(inputs, sensor)
+        return _from_results(inputs, sensor)
+    except (StoreError, RecordingError) as error:
+        raise MaterialError(str(error)) from None
+
+
+def _kind(path: Path) -> str:
+    if path.is_dir():
+        return "directory"
+    return "recording" if path.name.endswith(RECORDING_ENDINGS) else "result"
+
+
+def _from_results(paths: Sequence[Path], sensor: str | None) -> Material:
+    material = Material(sensor or "", [])
+    for path in paths:
+        material.results.append(_read_result(path))
+        material.files.append(_file(path))
+    labels = [result.label for result in material.results]
+    if len(set(labels)) < len(labels):
+        named = [f"{label}, {path.stem}" for label, path in zip(labels, paths, strict=True)]
+        material.results = [replace(result, label=name) for result, name in zip(material.results, named, strict=True)]
+    return material
+
+
+def _read_result(path: Path) -> CalibrationResult:
+    try:
+        fields = msgspec.json.decode(path.read_bytes(), type=dict[str, Any])
+        return parse(fields, path.stem)
+    except OSError as error:
+        raise MaterialError(f"{path}: {error.strerror or error}") from None
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise MaterialError(f"{path}: no JSON object of a calibration: {error}") from None
+    except ResultError as error:
+        raise MaterialError(f"{path}: {error}") from None
+
+
+def _from_recordings(paths: Sequence[Path], sensor: str | None) -> Material:
+    chosen = _chosen(sensor, list(dict.fromkeys(name for path in paths for name in sensors_of(path))), str(paths[0]))
+    recorded = read_recordings(list(paths), chosen)
+    material = _of(recorded, [_verdict(window) for window in recorded.windows], recorded.calibrations)
+    material.history = recorded.calibrations
+    material.files = [_file(path) for path in paths]
+    return material
+
+
+def _from_directory(directory: Path, sensor: str | None) -> Material:
+    with History(directory / FILE_NAME) as history:
+        names = sorted({name for name, what in history.channels() if name and what in ("window", "calibration")})
+        chosen = _chosen(sensor, names, str(directory))
+        in_force = history.in_force(chosen)
+        kept = history.newest(chosen, "calibration", limit=MOST_HISTORY)[::-1]
+        seen = history.newest(chosen, "window", limit=MOST_HISTORY)[::-1]
+        status = next(iter(history.newest(chosen, "status", limit=1)), None)
+    run_id = in_force.run_id if in_force else seen[-1].run_id if seen else ""
+    of_run = [w.result for w in seen if w.run_id == run_id]
+    windows = [_verdict(w) for w in of_run if isinstance(w, WindowReport)]
+    wanted = list(dict.fromkeys(w.recording for w in seen if w.run_id == run_id and w.fields.get("used")))
+    paths, lost = _present(directory, wanted[-MOST_RECORDINGS:])
+    recorded = read_recordings(paths, chosen) if paths else Recorded(chosen)
+    recorded.status = status.result if status and isinstance(status.result, StatusChange) else recorded.status
+    updates = [record.result for record in kept if isinstance(record.result, CalibrationUpdate)]
+    newest = [in_force.result] if in_force and isinstance(in_force.result, CalibrationUpdate) else []
+    material = _of(recorded, windows, newest)
+    material.history = updates
+    material.files = [_file(path) for path in paths]
+    material.notices += [f"the recording {name} is not there any more" for name in lost]
+    return material
+
+
+def _present(directory: Path, names: Sequence[str]) -> tuple[list[Path], list[str]]:
+    """The recordings of these names, finished or not, and the names of those that are gone."""
+    there = {path.name.removesuffix(".active"): path for _, path in recordings(directory)}
+    names = [name.removesuffix(".active") for name in names]
+    return [there[name] for name in names if name in there], [name for name in names if name not in there]
+
+
+def _of(recorded: Recorded, windows: list[WindowVerdict], calibrations: list[CalibrationUpdate]) -> Material:
+    """The material of a sensor's newest calibration, or of why there is none."""
+    versions = recorded.starts[-1].versions if recorded.starts else {}
+    if calibrations:
+        fields = from_update(calibrations[-1], tuple(windows), versions)
+    else:
+        reason = recorded.status.reason if recorded.status else "no calibration in the data"
+        refused = [f"window {w.start_s:.1f} to {w.stop_s:.1f} s: {w.reason}" for w in windows if not w.used]
+        fields = undetermined((reason, *refused), tuple(windows))
+    result = parse(fields, "no calibration")
+    facts = _facts(recorded)
+    if recorded.status:
+        facts["status"] = f"{recorded.status.status}: {recorded.status.reason}"
+    notices = [f"{path}: ends early, at {fault}; what stands before it is used" for path, fault in recorded.faults]
+    return Material(recorded.sensor, [result], traces=recorded.traces, facts=facts, notices=notices)
+
+
+def _facts(recorded: Recorded) -> dict[str, Any]:
+    facts: dict[str, Any] = {}
+    if recorded.starts:
+        start = recorded.starts[-1]
+        facts |= {"site": start.site, "gateway": start.gateway, "versions": start.versions}
+        facts["numeric fingerprint"] = start.fingerprint
+    for name, info in recorded.devices.items():
+        facts[f"device {name}"] = msgspec.json.decode(info)
+    return facts
+
+
+def _verdict(window: WindowReport) -> WindowVerdict:
+    return WindowVerdict(
+        window.start_s, window.stop_s, window.used, window.reason, window.points, window.left_out, window.position
+    )
+
+
+def _chosen(sensor: str | None, names: Sequence[str], where: str) -> str:
+    if sensor is not None:
+        if sensor not in names:
+            raise MaterialError(f"{where}: no sensor {sensor!r}; there are {', '.join(names) or 'none'}")
+        return sensor
+    if len(names) != 1:
+        held = f"the sensors {', '.join(names)}: choose one with --sensor" if names else "no results of any sensor"
+        raise MaterialError(f"{where}: holds {held}")
+    return names[0]
+
+
+def _file(path: Path) -> SourceFile:
+    with open(path, "rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    return SourceFile(path.name, path.stat().st_size, digest)

@@ -1,0 +1,98 @@
+"""The report as one HTML page that needs nothing else: its style, its figures and all numbers are in it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from html import escape
+from importlib.resources import files
+
+from agent import __version__
+from agent.report import tables
+from agent.report.figures import Drawn
+from agent.report.material import Material
+from agent.report.result import CalibrationResult
+from agent.report.trace import Residuals
+from agent.report.units import ACCELERATION, output_unit, sensitivity_unit
+
+
+def page(material: Material, figures: Sequence[Drawn], seen: Sequence[Residuals]) -> str:
+    """The whole page. `seen`: residuals of the windows at hand, for the first result."""
+    style = files("agent.report").joinpath("page.css").read_text(encoding="utf-8")
+    title = f"Calibration of {material.sensor}" if material.sensor else "Calibration"
+    body = "\n".join([*_head(title, material), *_figures(figures), *_numbers(material, seen), *_origin(material)])
+    return (
+        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{escape(title)}</title>\n<style>\n{style}</style>\n</head>\n<body>\n{body}\n</body>\n</html>\n"
+    )
+
+
+def _head(title: str, material: Material) -> Iterator[str]:
+    yield f"<h1>{escape(title)}</h1>"
+    for notice in material.notices:
+        yield f'<div class="box">{escape(notice)}</div>'
+    for result in material.results:
+        several = len(material.results) > 1
+        if several:
+            yield f"<h2>{escape(result.label)}</h2>"
+        yield from _summary(result, several=several)
+
+
+def _summary(result: CalibrationResult, *, several: bool) -> Iterator[str]:
+    status = "refused" if result.refused else "valid"
+    method = "" if several or not result.fields.get("method") else f", {escape(result.label)}"
+    yield f'<p><span class="status {status}">{status.upper()}</span>{method}</p>'
+    if identity := result.fields.get("identity"):
+        yield f'<p class="soft">of {escape(str(identity))}</p>'
+    if result.reasons:
+        reasons = "".join(f"<li>{escape(reason)}</li>" for reason in result.reasons)
+        yield f'<div class="box">{"Refused, because" if result.refused else "To know"}<ul>{reasons}</ul></div>'
+    if not result.determined.any():
+        return
+    yield tables.matrix(result)
+    unit, kind = output_unit(result.unit), result.fields.get("uncertainty_kind")
+    s_unit = sensitivity_unit(result.unit)
+    s_words = f"S without a dimension, in {unit} per {ACCELERATION}" if s_unit == "1" else f"S in {s_unit}"
+    factors = sorted({f"{k:.3g}" for k in result.coverage_factor[result.determined]})
+    words = f"{s_words}, Q in {unit}. After ±: expanded uncertainty U with k = {' or '.join(factors)}"
+    yield f'<p class="soft">{escape(words)}{f", {escape(str(kind))}" if kind else ""}.</p>'
+
+
+def _figures(figures: Sequence[Drawn]) -> Iterator[str]:
+    if figures:
+        yield '<h2>Figures</h2>\n<div class="figures">'
+        for drawn in figures:
+            svg = drawn.svg.replace("<svg ", f'<svg role="img" aria-label="{escape(drawn.caption)}" ', 1)
+            yield f"<figure>{svg}<figcaption>{escape(drawn.caption)}</figcaption></figure>"
+        yield "</div>"
+
+
+def _numbers(material: Material, seen: Sequence[Residuals]) -> Iterator[str]:
+    for result in material.results:
+        about = f", {escape(result.label)}" if len(material.results) > 1 else ""
+        yield f"<h2>Numbers{about}</h2>"
+        if result.determined.any():
+            yield "<h3>Parameters</h3>" + tables.parameters(result)
+        if result.budget:
+            yield "<h3>Uncertainty budget: u by source</h3>" + tables.budget(result)
+        if result.fields.get("nuisances"):
+            yield "<h3>Nuisances</h3>" + tables.nuisances(result)
+        if statistics := result.fields.get("statistics"):
+            yield "<h3>Statistics (Appendix A)</h3>" + tables.facts(statistics)
+        if result is material.results[0] and seen:
+            yield "<h3>Residuals, root mean square</h3>" + tables.left_over(seen, result)
+        if result.windows:
+            yield "<h3>Windows</h3>" + tables.windows(result)
+        if more := tables.facts(result.more):
+            yield "<h3>Further</h3>" + more
+        if result.determined.any():
+            yield "<h3>Covariance</h3>" + tables.covariance(result)
+
+
+def _origin(material: Material) -> Iterator[str]:
+    yield "<h2>Origin</h2>"
+    yield tables.facts(material.facts)
+    rows = [[file.path, str(file.size_bytes), file.sha256] for file in material.files]
+    if rows:
+        yield tables.table(["made from", "bytes", "SHA-256"], rows, "words", frozenset({2}))
+    yield f'<p class="soft">Written by fieldcal {escape(__version__)}. The numbers are in report.json too.</p>'

@@ -1,0 +1,153 @@
+"""A recording read for a report: its results, who was there, and its windows rebuilt from the raw blocks."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from agent.config import Channel, Config
+from agent.events import CalibrationUpdate, DeviceChange, Event, Result, RunStart, StatusChange, WindowReport
+from agent.mcap_records import Fault
+from agent.reading import RecordingReader
+from agent.report.trace import Trace
+from agent.schedule import WINDOW_S, pieces
+from agent.snapshot import unpack
+from agent.stream import DeviceStream
+from agent.windows import MARGIN_S, motion_points
+from calib.model import Pose
+from hw.block import SampleBlock
+
+MOST_TRACES = 24  # windows kept point by point: the newest of as many positions
+
+
+@dataclass(slots=True)
+class Recorded:
+    """What recordings hold of one sensor; `traces` by position, the newest last."""
+
+    sensor: str
+    calibrations: list[CalibrationUpdate] = field(default_factory=list)
+    windows: list[WindowReport] = field(default_factory=list)
+    status: StatusChange | None = None
+    traces: dict[str, Trace] = field(default_factory=dict)
+    starts: list[RunStart] = field(default_factory=list)
+    devices: dict[str, str] = field(default_factory=dict)  # DeviceInfo as JSON, by name
+    faults: list[tuple[Path, Fault]] = field(default_factory=list)
+
+
+class RecordingError(Exception):
+    """The recording cannot be used. The message names the file and the reason."""
+
+
+def sensors_of(path: Path) -> list[str]:
+    """Names of the sensors whose channels a recording holds. Raises RecordingError."""
+    return [channel.sensor for channel in _config(_start(path)).channels]
+
+
+def read_recordings(paths: list[Path], sensor: str) -> Recorded:
+    """Read files in the order given; each stands alone. Raises RecordingError where one is damaged or not readable."""
+    out = Recorded(sensor)
+    for path in paths:
+        channel = next((c for c in _config(_start(path)).channels if c.sensor == sensor), None)
+        if channel is None:
+            raise RecordingError(f"{path}: no channel of a sensor {sensor!r}")
+        reader = RecordingReader(path)
+        windows: _Windows | None = None
+        for step in reader.steps():
+            if isinstance(step.event, RunStart):
+                out.starts.append(step.event)
+                windows = _Windows(channel, step.event)
+            assert windows is not None  # a recording begins with RunStart, or has no step
+            windows.update(step.event)
+            _take(out, step.event, step.results, windows)
+        if reader.fault is not None:
+            if reader.fault.kind == "corrupt":
+                raise RecordingError(f"{path}: damaged at {reader.fault}")
+            out.faults.append((path, reader.fault))
+    return out
+
+
+def _take(out: Recorded, event: Event, results: list[Result], windows: _Windows) -> None:
+    if isinstance(event, DeviceChange) and event.info_json:
+        out.devices[event.device] = event.info_json
+    for result in results:
+        if result.sensor != out.sensor:
+            continue
+        if isinstance(result, CalibrationUpdate):
+            out.calibrations.append(result)
+        elif isinstance(result, StatusChange):
+            out.status = result
+        else:
+            out.windows.append(result)
+            trace = windows.trace(result) if result.used else None
+            if trace is not None:
+                out.traces.pop(result.position, None)
+                out.traces[result.position] = trace
+                if len(out.traces) > MOST_TRACES:
+                    del out.traces[next(iter(out.traces))]
+
+
+def _start(path: Path) -> RunStart:
+    try:
+        with open(path, "rb"):
+            pass
+        reader = RecordingReader(path)
+        step = next(reader.steps(), None)
+    except OSError as error:
+        raise RecordingError(f"{path}: {error.strerror or error}") from None
+    if step is None or not isinstance(step.event, RunStart):
+        raise RecordingError(f"{path}: {reader.fault or 'no recording of fieldcal'}")
+    return step.event
+
+
+def _config(start: RunStart) -> Config:
+    return Config.model_validate_json(start.config_json)
+
+
+class _Windows:
+    """The streams of a channel as they were when a window was judged."""
+
+    def __init__(self, channel: Channel, start: RunStart) -> None:
+        self._channel = channel
+        held = unpack(start.snapshot)["channels"][channel.sensor]
+        self._streams = {n: DeviceStream.restore(held["origin_ns"], s) for n, s in held["streams"].items()}
+        self._keep_s = WINDOW_S + channel.late_horizon_s + 2 * MARGIN_S
+
+    def update(self, event: Event) -> None:
+        if isinstance(event, SampleBlock) and event.device in self._streams:
+            stream = self._streams[event.device]
+            stream.update(event)
+            stream.forget_before((stream.newest_arrival_s or 0.0) - self._keep_s)
+
+    def trace(self, window: WindowReport) -> Trace | None:
+        """The points of a window; None where its pose or its samples are not to be found."""
+        first_s = self._streams[self._channel.sensor].first_sample_s
+        pose = self._pose(window)
+        if first_s is None or pose is None:
+            return None
+        start_s, stop_s = first_s + window.start_s, first_s + window.stop_s
+        cut = self._streams[self._channel.sensor].cut(start_s, stop_s)
+        if cut is None:
+            return None
+        if self._channel.reference is None:
+            whole = np.isfinite(cut.indications).all(axis=1)
+            nothing = np.empty((int(whole.sum()), 0))
+            return Trace(cut.time_s[whole] - first_s, cut.indications[whole], nothing, nothing, pose)
+        reference = self._streams[self._channel.reference].cut(start_s - MARGIN_S, stop_s + MARGIN_S)
+        points = motion_points(cut, reference, self._channel) if reference is not None else None
+        if points is None:
+            return None
+        return Trace(points.time_s - first_s, points.V, points.u, points.du, pose)
+
+    def _pose(self, window: WindowReport) -> Pose | None:
+        """How the sensor stood in the middle of the window."""
+        middle_s = 0.5 * (window.start_s + window.stop_s)
+        schedule: Iterator[Pose] = (
+            piece.pose
+            for piece in itertools.takewhile(lambda p: p.start_s <= middle_s, pieces(self._channel, 0.0))
+            if middle_s <= piece.stop_s
+        )
+        return next(schedule, None)

@@ -1,0 +1,225 @@
+"""One calibration as the report shows it: the object `fieldcal calibrate --json -` prints, or a recorded result."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.events import CalibrationUpdate
+from calib.model import Array
+
+PLACES = {"sensitivity": (3, 3), "offset": (3,)}
+# What the report has a place of its own for; any further member of the object stands in a table of its own.
+SHOWN = frozenset(
+    {
+        "sensitivity", "offset", "standard_uncertainty", "expanded_uncertainty", "covariance", "determined",
+        "degrees_of_freedom", "nuisances", "budget", "status", "reasons", "windows", "statistics",
+    }
+)  # fmt: skip
+
+
+class ResultError(ValueError):
+    """The object is no calibration result. The message names the field and what is wrong with it."""
+
+
+class WindowVerdict(msgspec.Struct, frozen=True):
+    """One window: seconds since the first sample, used or why not."""
+
+    start_s: float
+    stop_s: float
+    used: bool
+    reason: str
+    points: int
+    left_out: int = 0
+    position: str = ""
+    kind: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationResult:
+    """S, Q and what is known of them. Arrays of 12 are in the order of PARAMETERS; NaN where nothing is determined.
+
+    `unit` is that of the indications, "" where the result does not say it. `degrees_of_freedom` (12,), inf where they
+    do not matter. `budget` {source: (12,) standard uncertainty}. `fields` is the object itself.
+    """
+
+    label: str
+    values: Array
+    standard_uncertainty: Array
+    expanded_uncertainty: Array
+    coverage_factor: Array  # (12,)
+    covariance: Array
+    determined: NDArray[np.bool_]
+    degrees_of_freedom: Array
+    lag_s: Array  # (3,), 0 where it is not known
+    refused: bool
+    reasons: tuple[str, ...]
+    windows: tuple[WindowVerdict, ...]
+    unit: str
+    budget: Mapping[str, Array] = field(default_factory=dict)
+    fields: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def sensitivity(self) -> Array:
+        """(3, 3)."""
+        return self.values[:9].reshape(3, 3)
+
+    @property
+    def offset(self) -> Array:
+        """(3,)."""
+        return self.values[9:]
+
+    @property
+    def more(self) -> dict[str, Any]:
+        """Members of the object that no other table shows."""
+        return {name: value for name, value in self.fields.items() if name not in SHOWN}
+
+
+def parse(fields: Mapping[str, Any], name: str) -> CalibrationResult:
+    """The result in an object of the shape that the contract lays down. Raises ResultError.
+
+    It is labelled by its method, by `name` where it does not say one.
+    """
+    if "sensitivity" not in fields or "status" not in fields:
+        raise ResultError("is no calibration result: it has no sensitivity and status")
+    values, u, expanded = (
+        np.append(*_parts(part, where))
+        for part, where in (
+            (fields, ""),
+            (fields.get("standard_uncertainty"), "standard_uncertainty."),
+            (fields.get("expanded_uncertainty"), "expanded_uncertainty."),
+        )
+    )
+    stated = fields.get("expanded_uncertainty") or {}
+    method = fields.get("method")
+    return CalibrationResult(
+        label=f"Method {method}" if method else name,
+        values=values,
+        standard_uncertainty=u,
+        expanded_uncertainty=expanded,
+        coverage_factor=_array(stated.get("coverage_factor"), (12,), "expanded_uncertainty.coverage_factor"),
+        covariance=_array(fields.get("covariance"), (12, 12), "covariance"),
+        determined=np.append(*_parts(fields.get("determined"), "determined.")) == 1.0,
+        degrees_of_freedom=_freedom(fields.get("degrees_of_freedom")),
+        lag_s=np.nan_to_num(_array(fields.get("lag_s"), (3,), "lag_s")),
+        refused=fields["status"] != "valid",
+        reasons=tuple(str(reason) for reason in fields.get("reasons") or ()),
+        windows=tuple(_windows(fields.get("windows"))),
+        unit=str(fields.get("output_unit") or ""),
+        budget={source: _source(part, f"budget.{source}") for source, part in (fields.get("budget") or {}).items()},
+        fields=fields,
+    )
+
+
+def from_update(
+    update: CalibrationUpdate, windows: tuple[WindowVerdict, ...], versions: Mapping[str, str]
+) -> dict[str, Any]:
+    """A recorded calibration as an object of the contract's shape."""
+    u = np.array(update.standard_uncertainty)
+    found = np.array(update.determined, dtype=bool)
+    values = np.where(found, np.append(np.array(update.sensitivity), update.offset), np.nan)
+    covariance = np.where(np.outer(found, found), np.array(update.covariance), np.nan)
+    fields: dict[str, Any] = {
+        **_split(values),
+        "standard_uncertainty": _split(u),
+        "expanded_uncertainty": _split(update.coverage_factor * u) | {"coverage_factor": update.coverage_factor},
+        "covariance": covariance,
+        "determined": _split(found),
+        "nuisances": {},
+        "lag_s": None,
+        "rate_hz": None,
+        "status": "valid",
+        "reasons": [],
+        "windows": [msgspec.structs.asdict(window) for window in windows],
+        "statistics": {},
+        "version": versions.get("fieldcal", ""),
+        "method": update.method,
+        "uncertainty_kind": update.uncertainty_kind,
+        "output_unit": update.output_unit,
+        "identity": update.identity,
+        "sensor": update.sensor,
+        "windows_in_solution": update.windows,
+        "residual_sd": update.residual_sd,
+        "run_id": update.run_id,
+        "sequence": update.sequence,
+    }
+    return {name: plain(value) for name, value in fields.items()}
+
+
+def undetermined(reasons: tuple[str, ...], windows: tuple[WindowVerdict, ...]) -> dict[str, Any]:
+    """The object of data that were understood and gave no calibration."""
+    nothing = {"sensitivity": None, "offset": None}
+    return {
+        **nothing,
+        "standard_uncertainty": nothing,
+        "expanded_uncertainty": {**nothing, "coverage_factor": None},
+        "covariance": None,
+        "determined": nothing,
+        "status": "refused",
+        "reasons": list(reasons),
+        "windows": [msgspec.structs.asdict(window) for window in windows],
+    }
+
+
+def plain(value: Any) -> Any:
+    """JSON's own types; what is no finite number is null."""
+    if isinstance(value, Mapping):
+        return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _split(values: NDArray[Any]) -> dict[str, Any]:
+    return {"sensitivity": values[:9].reshape(3, 3), "offset": values[9:]}
+
+
+def _parts(part: Any, where: str) -> tuple[Array, Array]:
+    part = part if isinstance(part, Mapping) else {}
+    sensitivity, offset = (_array(part.get(name), shape, where + name) for name, shape in PLACES.items())
+    return sensitivity.ravel(), offset
+
+
+def _array(value: Any, shape: tuple[int, ...], where: str) -> Array:
+    """Numbers of this shape, one standing for all; null, anywhere in it, is NaN. Raises ResultError."""
+    try:
+        array = np.array(np.nan if value is None else value, dtype=object)
+        array = np.where(array == None, np.nan, array).astype(float)  # noqa: E711 - elementwise
+        if array.shape not in (shape, ()):
+            raise ValueError
+    except (TypeError, ValueError):
+        size = " x ".join(str(n) for n in shape)
+        raise ResultError(f"field {where}: expected {size} numbers or null, not {_short(value)}") from None
+    return np.broadcast_to(array, shape).copy()
+
+
+def _freedom(value: Any) -> Array:
+    if isinstance(value, Mapping):
+        freedom = np.append(*_parts(value, "degrees_of_freedom."))
+    else:
+        freedom = _array(value, (12,), "degrees_of_freedom")
+    return np.where(np.isnan(freedom), np.inf, freedom)
+
+
+def _source(value: Any, where: str) -> Array:
+    return np.append(*_parts(value, f"{where}.")) if isinstance(value, Mapping) else _array(value, (12,), where)
+
+
+def _windows(value: Any) -> list[WindowVerdict]:
+    try:
+        return msgspec.convert(value or [], list[WindowVerdict])
+    except msgspec.ValidationError as error:
+        raise ResultError(f"field windows: {error}") from None
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."

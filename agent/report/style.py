@@ -1,0 +1,95 @@
+"""How figures look: narrow enough for a phone, the same colours on screen (light and dark) and on paper."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+WIDTH_IN = 5.0  # 480 px: on a phone of 360 px the 10 pt letters are still 9 px high
+INK, PALE, PAPER = "#1b1e23", "#c9ced6", "#ffffff"
+USED, REFUSED = "#2a7f62", "#b3431b"
+AXIS_COLOURS = ("#0068b5", "#c2500a", "#00805e")  # x, y, z: told apart by colour-blind eyes too
+RESULT_COLOURS = ("#0068b5", "#c2500a", "#00805e", "#8f4f9f", "#7a6a00", "#5a6472")
+RESULT_MARKERS = "osD^vP"
+SHADES = ("#0068b5", "#c2500a", "#00805e", "#8f4f9f", "#b58b00", "#4aa3d8", "#d87a9b", "#7a8796")
+_SETTINGS: Any = {
+    "font.family": "DejaVu Sans",  # comes with matplotlib
+    "font.size": 10,
+    "axes.titlesize": 10,
+    "axes.labelsize": 10,
+    "xtick.labelsize": 9,
+    "ytick.labelsize": 9,
+    "legend.fontsize": 9,
+    "legend.frameon": False,
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": PALE,
+    "grid.linewidth": 0.5,
+    "axes.axisbelow": True,
+    "axes.formatter.useoffset": False,
+    "date.converter": "concise",
+    "lines.linewidth": 1.2,
+    "figure.facecolor": PAPER,
+    "axes.facecolor": PAPER,
+    "savefig.facecolor": PAPER,
+    "svg.hashsalt": "fieldcal",  # the same report gives the same bytes
+}
+# Colours that a page may set anew for dark screens, by the name of its CSS property.
+_VARIABLES = {INK: "--ink", PALE: "--pale", PAPER: "--paper"} | {
+    colour: f"--series-{i}" for i, colour in enumerate((*SHADES, USED, REFUSED))
+}
+NO_DATE: dict[str, dict[str, str | None]] = {"svg": {"Date": None}, "pdf": {"CreationDate": None}, "png": {}}
+
+
+@contextmanager
+def drawing() -> Iterator[None]:
+    """Figures made and saved within look as here."""
+    with matplotlib.rc_context(_SETTINGS):
+        yield
+
+
+def figure(height_in: float) -> Figure:
+    """An empty figure, laid out so that nothing overlaps."""
+    return Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
+
+
+def save(drawn: Figure, directory: Path, name: str) -> str:
+    """Write NAME.svg, .png and .pdf; returns the SVG for a page: its colours and names its own. Raises OSError."""
+    for ending, metadata in NO_DATE.items():
+        drawn.savefig(directory / f"{name}.{ending}", dpi=160, metadata=metadata)
+    buffer = io.StringIO()
+    drawn.savefig(buffer, format="svg", metadata=NO_DATE["svg"])
+    return _inline(buffer.getvalue(), name)
+
+
+def _inline(svg: str, name: str) -> str:
+    """The svg element alone, coloured by the page, with ids that no other figure of the page has."""
+    svg = svg[svg.index("<svg") :]
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
+    svg = re.sub(r'<svg ([^>]*?)width="[^"]*pt" height="[^"]*pt"', r"<svg \1", svg, count=1)
+    svg = re.sub(r"<svg [^>]*?>", lambda m: re.sub(r' (width|height)="[^"]*"', "", m[0]), svg, count=1)
+    svg = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{name}-", svg)
+    for colour, variable in _VARIABLES.items():
+        svg = svg.replace(colour, f"var({variable})")
+    return svg
+
+
+def bare(axes: Axes) -> None:
+    """No grid along y, where rows are names."""
+    axes.grid(visible=False, axis="y")
+    axes.tick_params(axis="y", length=0)

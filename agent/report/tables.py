@@ -1,0 +1,146 @@
+"""Numbers of a result as HTML tables."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from agent.quantity import plus_minus
+from agent.report.result import CalibrationResult, plain
+from agent.report.trace import Residuals
+from agent.report.units import ACCELERATION, output_unit, sensitivity_unit
+from calib.model import PARAMETERS
+
+AXES = "xyz"
+MOST_ROWS = 200  # of windows: more is for the JSON
+NOT_KNOWN = "not determined"
+
+
+def table(
+    heads: Sequence[str], rows: Iterable[Sequence[str]], style: str = "", text: frozenset[int] = frozenset()
+) -> str:
+    """An HTML table of escaped cells; columns `text` may break into lines."""
+
+    def cell(tag: str, k: int, content: str) -> str:
+        return f"<{tag}{' class=text' if k in text else ''}>{escape(content)}</{tag}>"
+
+    head = "".join(cell("th", k, h) for k, h in enumerate(heads))
+    body = "".join("<tr>" + "".join(cell("td", k, c) for k, c in enumerate(row)) + "</tr>" for row in rows)
+    return f'<div class="wide {style}"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+
+
+def number(value: float | None, digits: int = 4) -> str:
+    """A number in few digits; `–` where there is none, `∞` where it is not finite."""
+    if value is None or math.isnan(value):
+        return "–"
+    return ("∞" if value > 0 else "−∞") if math.isinf(value) else f"{value:.{digits}g}".replace("-", "−")
+
+
+def matrix(result: CalibrationResult) -> str:
+    """S and Q, each ± U."""
+    cells = [_cell(result, k) for k in range(12)]
+    rows = [[axis, *cells[3 * i : 3 * i + 3], cells[9 + i]] for i, axis in enumerate(AXES)]
+    return table(["output", "S along x", "S along y", "S along z", "Q"], rows)
+
+
+def parameters(result: CalibrationResult) -> str:
+    """All twelve with u, U, k and degrees of freedom."""
+    units = [sensitivity_unit(result.unit)] * 9 + [output_unit(result.unit)] * 3
+    rows = [
+        [
+            f"{name[0]} {name[1:]}",
+            number(result.values[k], 7),
+            number(result.standard_uncertainty[k]),
+            number(result.expanded_uncertainty[k]),
+            number(result.coverage_factor[k], 3),
+            number(result.degrees_of_freedom[k]),
+            "yes" if result.determined[k] else "no",
+            units[k],
+        ]
+        for k, name in enumerate(PARAMETERS)
+    ]
+    return table(["", "value", "u", "U", "k", "degrees of freedom", "determined", "unit"], rows)
+
+
+def covariance(result: CalibrationResult) -> str:
+    """12 x 12, in the units of the parameters."""
+    rows = [[name, *(number(v, 3) for v in row)] for name, row in zip(PARAMETERS, result.covariance, strict=True)]
+    return table(["", *PARAMETERS], rows, "small")
+
+
+def nuisances(result: CalibrationResult) -> str:
+    """What was estimated or assumed beside S and Q."""
+    rows = []
+    for name, held in (result.fields.get("nuisances") or {}).items():
+        held = held if isinstance(held, Mapping) else {"value": held}
+        value, u = held.get("value"), held.get("standard_uncertainty")
+        rows.append([name, number(value), number(u), str(held.get("unit") or "1")])
+    return table(["nuisance", "value", "u", "unit"], rows)
+
+
+def budget(result: CalibrationResult) -> str:
+    """Standard uncertainty that each source gives to each parameter."""
+    rows = [[name, *(number(u, 3) for u in values)] for name, values in result.budget.items()]
+    rows.append(["all", *(number(u, 3) for u in result.standard_uncertainty)])
+    return table(["source", *PARAMETERS], rows, "small")
+
+
+def windows(result: CalibrationResult) -> str:
+    """Each window with its verdict; the newest where there are very many."""
+    rows = [
+        [
+            f"{w.start_s:.2f}",
+            f"{w.stop_s:.2f}",
+            w.position or "–",
+            "yes" if w.used else "no",
+            str(w.points),
+            str(w.left_out),
+            w.reason,
+        ]
+        for w in result.windows[-MOST_ROWS:]
+    ]
+    text = frozenset({2, 6})
+    return table(["start in s", "stop in s", "position", "used", "points", "left out", "reason"], rows, text=text)
+
+
+def left_over(seen: Sequence[Residuals], result: CalibrationResult) -> str:
+    """Root mean square of the residual, by window, in the output unit and as acceleration."""
+    unit = output_unit(result.unit)
+    main = np.abs(np.diag(result.sensitivity))
+    with_acceleration = unit != ACCELERATION
+    heads = ["position", *(f"{axis} in {unit}" for axis in AXES)]
+    heads += [f"{axis} in {ACCELERATION}" for axis in AXES] if with_acceleration else []
+    rows = [
+        [
+            r.position,
+            *(number(v, 3) for v in r.rms),
+            *((number(v, 3) for v in r.rms / main) if with_acceleration else ()),
+        ]
+        for r in seen
+    ]
+    return table(heads, rows)
+
+
+def facts(pairs: Mapping[str, Any]) -> str:
+    """Names and values; what is nested stands as JSON."""
+    rows = [[name, _words(value)] for name, value in pairs.items() if value not in (None, "", [], {})]
+    return table(["", ""], rows, "words", frozenset({1})) if rows else ""
+
+
+def _cell(result: CalibrationResult, k: int) -> str:
+    if not result.determined[k]:
+        return NOT_KNOWN
+    return plus_minus(float(result.values[k]), float(result.expanded_uncertainty[k])).replace("-", "−")
+
+
+def _words(value: Any) -> str:
+    if isinstance(value, Mapping) and all(not isinstance(item, Mapping | list) for item in value.values()):
+        return ", ".join(f"{name} {_words(item)}" for name, item in value.items() if item not in (None, ""))
+    if isinstance(value, float):
+        return number(value, 7)
+    return value if isinstance(value, str) else msgspec.json.encode(plain(value)).decode()
