@@ -168,10 +168,7 @@ class ChannelState:
         end_s = first_s + piece.stop_s + MARGIN_S
         if self._now_s() > end_s + self._channel.late_horizon_s:
             return True
-        if self._now_s() < end_s:
-            return False
-        newest = [stream.newest_s() for stream in self._streams.values()]
-        return all(t is not None and t >= end_s for t in newest)
+        return all(stream.reaches(end_s) for stream in self._streams.values())
 
     def _report(self, window: Window) -> WindowReport:
         return WindowReport(

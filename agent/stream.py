@@ -42,6 +42,7 @@ class DeviceStream:
         self._origin_ns = origin_ns
         self._blocks: deque[SampleBlock] = deque()
         self._clock: ClockModel | None = None
+        self._fitted: ClockFit | None = None  # the clock model's result, until the next block
         self.newest_arrival_s: float | None = None
         self.first_sample_s: float | None = None
         self.broken_s: float | None = None
@@ -58,21 +59,29 @@ class DeviceStream:
             self._blocks.clear()
             self.broken_s = first_arrival_s
         self._clock.update(block.first_index + block.burst_count.astype(np.int64) - 1, arrivals_s)
+        self._fitted = None
         self._blocks.append(block)
         self.newest_arrival_s = float(arrivals_s[-1])
 
-    def newest_s(self) -> float | None:
-        """Time of the newest sample, None without one."""
-        if not self._blocks or self._clock is None:
-            return None
+    def reaches(self, time_s: float) -> bool:
+        """Whether samples up to `time_s` are there."""
+        # A sample never arrives before it was taken: as long as nothing arrived since, the clock need not be asked.
+        if self.newest_arrival_s is None or self.newest_arrival_s < time_s or not self._blocks:
+            return False
         newest = self._blocks[-1]
-        return float(self._clock.result().time_of(np.array([newest.first_index + newest.n - 1]))[0])
+        return bool(self._fit().time_of(newest.first_index + newest.n - 1) >= time_s)
+
+    def _fit(self) -> ClockFit:
+        if self._fitted is None:
+            assert self._clock is not None  # there are blocks
+            self._fitted = self._clock.result()
+        return self._fitted
 
     def cut(self, start_s: float, stop_s: float) -> Cut | None:
         """All samples with start_s <= t < stop_s by the clock model as it is now; None if there are none."""
-        if not self._blocks or self._clock is None:
+        if not self._blocks:
             return None
-        clock = self._clock.result()
+        clock = self._fit()
         first, stop = (int(np.ceil(i)) for i in clock.index_of(np.array([start_s, stop_s])))
         first = max(first, self._blocks[0].first_index)
         stop = min(stop, self._blocks[-1].first_index + self._blocks[-1].n)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import sys
 
-NAMES = ("agent_cost", "replay_speed")
+NAMES = ("agent_cost", "recording")
 
 
 def main() -> int:

@@ -1,7 +1,4 @@
-"""What recording and reading back cost: CPU a block, and reading against plain decompressing and CRC of the same file.
-
-Run: python -m benchmarks.recording
-"""
+"""What recording and replaying cost: CPU a block, and replay against plain decompressing and CRC of the same file."""
 
 from __future__ import annotations
 
@@ -14,11 +11,14 @@ from pathlib import Path
 import numpy as np
 import zstandard
 
+from agent.config import Config
 from agent.events import Event, RunStart
 from agent.integrity import check_integrity
 from agent.mcap_records import walk
+from agent.pipeline import Pipeline
 from agent.reading import RecordingReader
 from agent.recording import Recorder
+from benchmarks.page import machine, write_part
 from hw.block import SampleBlock
 
 RATE_HZ = 1000.0
@@ -44,35 +44,35 @@ def blocks(seed: int) -> Iterator[SampleBlock]:
             )
 
 
+def configuration() -> Config:
+    """A channel whose sensor stands for ten seconds each at three angles, again and again."""
+    poses = [
+        {"start_s": start_s, "stop_s": start_s + 10, "theta_deg": 35, "alpha_deg": alpha_deg}
+        for start_s, alpha_deg in ((3, 0), (16, 30), (29, 120))
+    ]
+    channel = {"sensor": "mems", "reference": "reference", "poses": poses, "poses_repeat_s": 39}
+    devices = [{"name": name, "driver": "adxl355"} for name in ("mems", "reference")]
+    return Config.model_validate({"devices": devices, "channels": [channel]})
+
+
 def record(directory: Path, events: list[Event]) -> Path:
-    """Record the events, flushed and synced as a live agent does."""
+    """Record the events and what the pipeline makes of them, flushed and synced as a live agent does."""
+    config = configuration()
+    pipeline = Pipeline.begin(config, "r", 0, 0, {})
     recorder = Recorder(directory, ["mems", "reference"], ["mems"], max_bytes=1 << 40)
-    recorder.record(0, run_start(), [])
+    start = RunStart(
+        run_id="r", site="s", gateway="g", boot_id="b", t_monotonic_ns=0, t_utc_ns=0,
+        config_json=config.model_dump_json(), versions={}, fingerprint={}, snapshot=pipeline.snapshot(),
+        file_sequence=1, event_sequence=0,
+    )  # fmt: skip
+    recorder.record(0, start, [])
     flush_each = int(2 * FLUSH_S / BLOCK_S)
     for number, event in enumerate(events, start=1):
-        recorder.record(number, event, [])
+        recorder.record(number, event, pipeline.step(event))
         if number % flush_each == 0:
             recorder.sync()
     recorder.close()
     return directory / "fieldcal-000001.mcap"
-
-
-def run_start() -> RunStart:
-    """A RunStart with nothing in it."""
-    return RunStart(
-        run_id="r",
-        site="s",
-        gateway="g",
-        boot_id="b",
-        t_monotonic_ns=0,
-        t_utc_ns=0,
-        config_json="{}",
-        versions={},
-        fingerprint={},
-        snapshot=b"",
-        file_sequence=1,
-        event_sequence=0,
-    )
 
 
 def decompress_and_check(path: Path) -> None:
@@ -87,6 +87,20 @@ def read(path: Path) -> None:
     """All events, as replay gets them."""
     for _ in RecordingReader(path).steps():
         pass
+
+
+def replay(path: Path) -> None:
+    """All events through the pipeline: `fieldcal replay` without its start."""
+    pipeline: Pipeline | None = None
+    results = 0
+    for step in RecordingReader(path).steps():
+        if isinstance(step.event, RunStart):
+            pipeline = Pipeline.restore(step.event.config_json, step.event.snapshot)
+        assert pipeline is not None
+        computed = pipeline.step(step.event)
+        assert computed == step.results
+        results += len(computed)
+    assert results > DURATION_S / 39
 
 
 def check(path: Path) -> None:
@@ -106,19 +120,36 @@ def cpu_s(work: Callable[[Path], object], path: Path) -> float:
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measure and write the table."""
     events: list[Event] = list(blocks(seed=1))
     with tempfile.TemporaryDirectory() as directory:
         start = time.process_time()
         path = record(Path(directory), events)
         writing_s = time.process_time() - start
         size = path.stat().st_size
-        plain_s, reading_s, checking_s = (cpu_s(work, path) for work in (decompress_and_check, read, check))
+        plain_s = cpu_s(decompress_and_check, path)
+        rows = [(name, cpu_s(work, path)) for name, work in WORK]
     samples = sum(event.indications.size for event in events if isinstance(event, SampleBlock))
-    print(f"written: {writing_s / len(events) * 1e6:.0f} us a block of 0.5 s, {size / samples:.2f} bytes a number")
-    for name, seconds in (("plain", plain_s), ("reading", reading_s), ("integrity", checking_s)):
-        print(f"{name}: {DURATION_S / seconds:.0f} times real time, {seconds / plain_s:.2f} of plain")
+    lines = [f"| {name} | {DURATION_S / s:,.0f} | {s / plain_s:.1f} |" for name, s in [("plain", plain_s), *rows]]
+    write_part(
+        "recording",
+        f"""
+`python -m benchmarks recording` on {machine()}: half an hour of a sensor (1 kHz x 3) and a reference (1 kHz), blocks of
+0.5 s, flushed and synced every {FLUSH_S:g} s. Making the results and writing cost {writing_s / len(events) * 1e6:.0f} us
+of CPU a block; {size / samples:.2f} bytes a number.
 
+| CPU time | times real time | over plain decompress-and-CRC of the same file |
+| --- | --- | --- |
+"""
+        + "\n".join(lines),
+    )
+
+
+WORK = (
+    ("reading: all events and results checked and decoded", read),
+    ("replay: reading, the pipeline, results compared", replay),
+    ("integrity: the audit's pass over every byte", check),
+)
 
 if __name__ == "__main__":
     main()
