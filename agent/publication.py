@@ -47,7 +47,8 @@ class Publisher:
     The store is the outbox: Zenoh acknowledges nothing, so a result counts as published when it was put while a router
     was connected, and what is lost with a dying link is still in the publisher's cache and behind the queryable
     (`?after=<sequence>`, see agent.answers). Each sample's attachment is the number of the result put before it, "0"
-    for one that is put again at the start: a consumer whose last number is another has missed something.
+    where that says nothing (put again at the start, or not kept by the store): a consumer whose last number is another
+    has missed something, or must ask.
     The session is a peer that does not listen; it connects when a router appears.
     Raises ValueError on a bad name, EndpointError on a bad endpoint; after that no method raises.
     """
@@ -144,12 +145,14 @@ class Publisher:
                         return
                     self._put(session, record, self._previous)
                     self._store.mark_published(record.sequence)
+                if self._stop.is_set() and len(records) == BATCH:
+                    return  # a long backlog waits for the next run
         except StoreError as error:
             self._fail(str(error))
         while self._recent:
             record = self._recent.popleft()
             if record.sequence > self._previous:
-                self._put(session, record, self._previous)
+                self._put(session, record, previous=0)  # what the store may hold before it is not known here
 
     def _put(self, session: zenoh.Session, record: Record, previous: int) -> None:
         key = result_key(self._key, record.sensor, record.what)
