@@ -11,6 +11,7 @@ from typing import Any
 import click
 import numpy as np
 
+from agent.adjusting import adjusted, from_rests
 from agent.frontend import FrontEnd, Options
 from agent.outcome import Outcome, as_json, print_outcome
 from agent.poses import PoseInterval, Setting, beside_reference, read_poses
@@ -84,10 +85,10 @@ def calibrate(**options: Any) -> int:
 def calibrated(options: dict[str, Any]) -> Outcome:
     """What the files say. Raises TableError, click.UsageError."""
     _check(options)
+    if not options["reference"] and not options["poses"] and not options["plain"]:
+        return from_rests(read_sensor(options["sensor"]), options)
     front = read_files(options)
-    if options["plain"]:
-        return _plain(front)
-    raise click.UsageError("only --plain is there so far")
+    return _plain(front) if options["plain"] else adjusted(front, options)
 
 
 def read_files(options: dict[str, Any]) -> FrontEnd:

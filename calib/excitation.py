@@ -13,6 +13,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from calib import detection
+from calib.geometry import at_rest
 from calib.model import Array, Pose, Window, WindowSums
 from calib.rests import find_rests
 from calib.sums import factor, pool, window_sums
@@ -108,6 +109,23 @@ def rest_window(
         numbers["sd_over_floor"] = float(np.max(_within_sd(clean) / least))
     left_out = int(struck.sum()) if leave_out else 0
     return _window("rest", pose, t, sums, judge(sums, struck, numbers, limits), left_out)
+
+
+def rests_anywhere(time_s: Array, V: Array, gravity_mps2: float, limits: Limits = DEFAULT_LIMITS) -> list[Window]:
+    """A window for each rest in samples (n,), in positions that nobody stated: only gravity's magnitude is known there.
+
+    Their pose says gravity on z, which is not so: a norm fit does not look at it.
+    """
+    rate_hz = _rate(time_s)
+    windows = []
+    for k, (first, stop) in enumerate(find_rests(V, rate_hz)):
+        pose = at_rest([0.0, 0.0, gravity_mps2], position=f"rest {k + 1}")
+        v = V[first:stop]
+        struck, _ = detection.knocked(v, np.ones((len(v), 1)), detection.least_step(v))
+        sums = _rest_sums(v[~struck], rate_hz, limits)
+        verdict = judge(sums, struck, {}, limits)
+        windows.append(_window("rest", pose, time_s[first:stop], sums, verdict, int(struck.sum())))
+    return windows
 
 
 def rest_sd(V: Array, rate_hz: float) -> Array | None:
