@@ -57,10 +57,15 @@ def serve(config: Config, data_dir: Path, watch: Any, duration_s: float | None) 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: service.stop())
     try:
-        service.run(duration_s)
+        ended = service.run(duration_s)
     except (StoreError, OSError) as error:
         click.echo(f"fieldcal run: {error}", err=True)
         return 1
+    if not ended:
+        # A router that is frozen holds Zenoh's thread; store and files are closed, and nobody can wait for it.
+        watch.__exit__()
+        sys.stdout.flush()
+        os._exit(0)
     return 0
 
 

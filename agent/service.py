@@ -8,8 +8,6 @@ import uuid
 from collections.abc import Sequence
 from pathlib import Path
 
-import msgspec
-
 from agent import __version__
 from agent.config import Config
 from agent.events import CalibrationUpdate, Event, Result, RunStart, Tick
@@ -43,9 +41,10 @@ class Service:
         """End the run; `run` returns within two seconds."""
         self._stop_request.set()
 
-    def run(self, duration_s: float | None) -> None:
+    def run(self, duration_s: float | None) -> bool:
         """Read, calibrate, record and publish until stopped or `duration_s` is over.
 
+        Returns whether all threads have ended; where a frozen router holds one, the process must end by `os._exit`.
         Raises StoreError or OSError where the data directory cannot be used at all.
         """
         self._data_dir.mkdir(parents=True, exist_ok=True)
@@ -78,9 +77,9 @@ class Service:
                 if reader.ident is not None:
                     reader.join(max(0.0, deadline - time.monotonic()))
             writer.close()
-            if self._publisher is not None:
-                self._publisher.close()
+            ended = self._publisher.close() if self._publisher is not None else True
             self._store.close()
+        return ended
 
     def _publication(self) -> Publisher | None:
         if not self._config.zenoh.enabled:
@@ -104,9 +103,9 @@ class Service:
             with History(self._store.path) as history:
                 for channel in self._config.channels:
                     record = history.in_force(channel.sensor)
-                    if record is not None:
-                        kept[channel.sensor] = calibration_of(record)
-        except (StoreError, ValueError) as error:
+                    if record is not None and isinstance(calibration := record.result, CalibrationUpdate):
+                        kept[channel.sensor] = calibration
+        except StoreError as error:
             self._watch.say(f"the calibration in force cannot be restored: {error}")
         return kept
 
@@ -162,16 +161,6 @@ class Service:
         if self._publisher is not None:
             for record in records:
                 self._publisher.publish(record)
-
-
-def calibration_of(record: Record) -> CalibrationUpdate:
-    """The calibration a record holds. Raises ValueError where it is none of this version."""
-    fields = dict(record.fields)
-    fields.pop("recorded", None)
-    try:
-        return msgspec.convert(fields, CalibrationUpdate)
-    except msgspec.ValidationError as error:
-        raise ValueError(f"result {record.sequence}: {error}") from None
 
 
 def _sensor(name: str, driver: str, options: dict[str, object]) -> Sensor:
