@@ -11,10 +11,12 @@ from typing import Any
 import click
 import numpy as np
 
-from agent.adjusting import adjusted, from_rests
+from agent.adjusting import adjusted, norm_fitted
+from agent.amplitude_methods import by_amplitudes
 from agent.frontend import FrontEnd, Options
 from agent.outcome import Outcome, as_json, print_outcome
 from agent.poses import PoseInterval, Setting, beside_reference, read_poses
+from agent.priors import priors_of
 from agent.tables import ReferenceTable, TableError, read_reference, read_sensor
 from calib.geometry import STANDARD_GRAVITY_MPS2
 from calib.method3 import fit, refusal
@@ -86,9 +88,11 @@ def calibrated(options: dict[str, Any]) -> Outcome:
     """What the files say. Raises TableError, click.UsageError."""
     _check(options)
     if not options["reference"] and not options["poses"] and not options["plain"]:
-        return from_rests(read_sensor(options["sensor"]), options)
+        return norm_fitted(read_sensor(options["sensor"]), options)
     front = read_files(options)
-    return _plain(front) if options["plain"] else adjusted(front, options)
+    if options["method"] != "3":
+        return by_amplitudes(front, options)
+    return _plain(front) if options["plain"] else adjusted(front, priors_of(options))
 
 
 def read_files(options: dict[str, Any]) -> FrontEnd:
@@ -133,8 +137,6 @@ def _poses(options: dict[str, Any], setting: Setting, reference: ReferenceTable 
 
 def _check(options: dict[str, Any]) -> None:
     """What click cannot see: options that need or exclude each other."""
-    if options["method"] != "3":
-        raise click.UsageError(f"method {options['method']} is not there yet: use --method 3")
     if (options["nominal"] is None) != (options["u_nominal_pct"] is None):
         raise click.UsageError("--nominal and --u-nominal-pct go together")
     if options["nominal"] is not None and options["prior"]:

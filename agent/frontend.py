@@ -71,7 +71,23 @@ class FrontEnd:
                 progress(interval.stop_s - interval.start_s)
         return windows
 
+    def runs(self) -> Iterator[tuple[Points, Window]]:
+        """Windows in motion with all their samples, for methods that need more than sums."""
+        for interval in self._poses:
+            if interval.pose.direction.shape[1]:
+                start_s, stop_s = interval.start_s + self._options.guard_s, interval.stop_s - self._options.guard_s
+                for points, windows in self._judged(interval.pose, start_s, stop_s, lag_s=0.0):
+                    for window in windows:
+                        first = int(np.searchsorted(points.time_s, window.start_s, side="left"))
+                        stop = int(np.searchsorted(points.time_s, window.stop_s, side="right"))
+                        yield points.part(first, stop), window
+
     def _motion(self, pose: Pose, start_s: float, stop_s: float, lag_s: float) -> Iterator[Window]:
+        for _, windows in self._judged(pose, start_s, stop_s, lag_s):
+            yield from windows
+
+    def _judged(self, pose: Pose, start_s: float, stop_s: float, lag_s: float) -> Iterator[tuple[Points, list[Window]]]:
+        """Samples of each part of a pose, and their windows."""
         assert self.reference_clock is not None
         limits, leave_out = self._options.limits, self._options.leave_out
         for kind, part_start_s, part_stop_s in self._parts(start_s, stop_s):
@@ -80,7 +96,7 @@ class FrontEnd:
             for a, b in itertools.pairwise(edges.tolist()):
                 points = self._points(a, b, lag_s)
                 if len(points.time_s) > 1:
-                    yield from judged(kind, pose, points, limits, leave_out=leave_out)
+                    yield points, judged(kind, pose, points, limits, leave_out=leave_out)
 
     def _parts(self, start_s: float, stop_s: float) -> Iterator[tuple[Any, float, float]]:
         """(kind, start, stop) of where the reference moves and where it is calm."""

@@ -1,0 +1,77 @@
+"""What the options of `fieldcal calibrate` say of the nuisances, and of S and Q beforehand, as priors."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from agent.tables import TableError
+from calib.model import Array
+from calib.nuisances import Priors
+
+# Without a local value gravity is the standard one, which is up to 0.3 % off (poles and equator differ by 0.05 m/s2).
+U_STANDARD_GRAVITY_MPS2 = 0.03
+NOMINAL_TRANSVERSE = 0.03  # of the nominal sensitivity: data sheets of MEMS say 1 to 3 %
+
+
+def priors_of(options: dict[str, Any]) -> Priors:
+    """The options --u-..., --nominal and --prior as priors. Raises TableError where --prior cannot be read."""
+    parameters, covariance = _known(options)
+    return Priors(
+        angle_rad=float(np.deg2rad(options["u_angle_deg"])),
+        theta_rad=float(np.deg2rad(options["u_theta_deg"])),
+        theta_position_rad=float(np.deg2rad(options["u_theta_position_deg"])),
+        alpha_common_rad=float(np.deg2rad(options["u_alpha_common_deg"])),
+        offset_mps2=options["u_offset_mps2"],
+        offset_position_mps2=options["u_offset_position_mps2"],
+        reference=options["u_reference_pct"] / 100.0,
+        transverse=options["u_transverse_motion_pct"] / 100.0,
+        tilt_rad=float(np.deg2rad(options["u_tilt_deg"])),
+        rotation_rad=float(np.deg2rad(options["u_rotation_deg"])),
+        gravity_mps2=u_gravity_mps2(options),
+        parameters=parameters,
+        covariance=covariance,
+    )
+
+
+def u_gravity_mps2(options: dict[str, Any]) -> float:
+    """Standard uncertainty of gravity, m/s2."""
+    stated: float | None = options["u_gravity_mps2"]
+    if stated is not None:
+        return stated
+    return U_STANDARD_GRAVITY_MPS2 if options["gravity_mps2"] is None else 0.0
+
+
+def _known(options: dict[str, Any]) -> tuple[Array | None, Array | None]:
+    """S and Q known beforehand, (12,) and (12, 12), from --nominal or --prior."""
+    if options["nominal"] is not None:
+        main, u = options["nominal"], options["u_nominal_pct"] / 100.0
+        sd = main * np.where(np.eye(3).ravel() > 0, u, NOMINAL_TRANSVERSE)
+        return np.append(main * np.eye(3).ravel(), np.zeros(3)), np.diag(np.append(sd**2, np.full(3, np.inf)))
+    if options["prior"]:
+        return _read_prior(options["prior"])
+    return None, None
+
+
+def _read_prior(path: Path) -> tuple[Array, Array]:
+    """A result of this command: what it has as null is not known."""
+    try:
+        told = json.loads(path.read_text())
+        values = np.append(np.array(told["sensitivity"], dtype=float).ravel(), np.array(told["offset"], dtype=float))
+        covariance = np.array(told["covariance"], dtype=float)
+    except OSError as error:
+        raise TableError(f"{path}: {error.strerror}") from None
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise TableError(f"{path}: not a result of fieldcal calibrate: {error}") from None
+    if values.shape != (12,) or covariance.shape != (12, 12):
+        raise TableError(f"{path}: not a result of fieldcal calibrate: S, Q or covariance of another size")
+    unknown = ~(np.isfinite(values) & np.isfinite(np.diag(covariance)))
+    covariance[unknown, :], covariance[:, unknown] = 0.0, 0.0
+    covariance[unknown, unknown] = np.inf
+    known = covariance[np.ix_(~unknown, ~unknown)]
+    if not np.all(np.isfinite(known)) or (known.size and np.linalg.eigvalsh(known).min() <= 0.0):
+        raise TableError(f"{path}, covariance: not one: it has a direction of no or negative variance")
+    return np.nan_to_num(values), covariance

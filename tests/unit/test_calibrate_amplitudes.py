@@ -1,0 +1,106 @@
+"""`fieldcal calibrate --method 1|2` as a user runs it: files from the virtual bench, clocks and bursts included."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from agent.cli import run_cli
+from agent.simulate import write_files
+from hw.virtual.bench import Bench
+from hw.virtual.motion import multisine, sine
+from hw.virtual.parameters import BenchParameters, ReferenceParameters
+from hw.virtual.presets import plain
+from hw.virtual.schedule import Schedule, Stand, clamped, directed
+
+DOWN = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]])
+ON_AXES = tuple(directed(np.eye(3)[j], DOWN[j], hold_s=4.0) for j in range(3))
+ON_CLAMP = tuple(clamped(35.0, alpha, hold_s=4.0) for alpha in (45.0, 135.0))
+
+
+def files(directory: Path, stands: tuple[Stand, ...], repetitions: int = 1, **changes: Any) -> Bench:
+    parameters: BenchParameters = replace(
+        plain(3), **{"schedule": Schedule(stands, turn_s=1.0), "motion": sine(3.0, 6.0), **changes}
+    )
+    bench = Bench(parameters, seed=3)
+    write_files(bench, directory, parameters.schedule.duration_s(repetitions), {})
+    if stands is ON_AXES:
+        poses = bench.parameters.schedule.poses(parameters.schedule.duration_s(repetitions))
+        rows = [f"{p.start_s},{p.stop_s},{'xyz'[k % 3]}" for k, p in enumerate(poses)]
+        (directory / "poses.csv").write_text("\n".join(["start_s,stop_s,axis", *rows, ""]))
+    return bench
+
+
+def run(
+    directory: Path, capsys: pytest.CaptureFixture[str], method: int, *more: str
+) -> tuple[int, dict[str, Any], str]:
+    paths = [part for n in ("sensor", "reference", "poses") for part in (f"--{n}", str(directory / f"{n}.csv"))]
+    status = run_cli(["calibrate", *paths, "--method", str(method), "--json", "-", *more])
+    captured = capsys.readouterr()
+    return status, json.loads(captured.out) if captured.out else {}, captured.err
+
+
+@pytest.mark.parametrize("quantity", ["acceleration", "velocity"])
+def test_method_1_finds_all_of_s(tmp_path: Path, capsys: pytest.CaptureFixture[str], quantity: Any) -> None:
+    reference = replace(plain(3).reference, quantity=quantity, noise=2e-4, resolution=1e-6)
+    bench = files(tmp_path, ON_AXES, repetitions=2, reference=reference)
+    status, found, said = run(tmp_path, capsys, 1)
+    assert (status, found["status"], said) == (0, "valid", "")
+    nominal = bench.parameters.sensor.nominal_sensitivity
+    off = (np.array(found["sensitivity"]) - bench.truth.sensitivity) / nominal
+    # type A is 2e-5; main ones need no more of the clocks than the rate, transverse ones half a sample's phase of 5 %
+    assert np.abs(off).max() < 2e-4
+    assert found["offset"] == [None] * 3
+    assert found["frequency_hz"] == pytest.approx(3.0, rel=1e-4)
+    assert abs(found["lag_s"]) < 1e-3
+    assert len(found["windows"]) == 6
+    assert [s["n"] for s in found["statistics"]["Sxx"]] == [11, 11]  # 3.8 s without the guard
+    U = np.array(found["expanded_uncertainty"]["sensitivity"]) / nominal
+    assert 0.002 < np.diag(U).max() < 0.003  # the reference, 0.1 %
+    assert found["statistics"]["beyond_5_pct"] == {}
+    transverse = found["sensitivity"][0][1] / found["sensitivity"][0][0] * 100
+    assert found["statistics"]["rel_S_pct"][0][1] == pytest.approx(transverse)
+    assert set(found["budget"]) >= {"type A", "reference sensitivity", "transverse motion"}
+
+
+def test_method_2_finds_main_sensitivities_within_u(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bench = files(tmp_path, ON_CLAMP)
+    status, found, _ = run(tmp_path, capsys, 2)
+    assert status == 0
+    truth = bench.truth.sensitivity
+    S, U = (np.array(part["sensitivity"], dtype=float) for part in (found, found["expanded_uncertainty"]))
+    assert np.all(np.abs(np.diag(S - truth)) <= np.diag(U))
+    assert np.isnan(S[~np.eye(3, dtype=bool)]).all()
+    seen = np.diag(truth) + np.array([truth[0, 2], 0, truth[2, 0]]) * np.array(  # 45 and 135 deg leave S_xz and S_zx
+        [-np.tan(np.deg2rad(35)) * np.sqrt(2), 0, -np.sqrt(0.5) / np.tan(np.deg2rad(35))]
+    )
+    np.testing.assert_allclose(np.diag(S), seen, rtol=1e-4)
+    assert "rel_S_pct" not in found["statistics"]
+
+
+def test_what_the_methods_cannot_use_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files(tmp_path, ON_CLAMP)
+    status, found, said = run(tmp_path, capsys, 1)
+    assert status == 3
+    assert "Method 1 needs one axis along the motion" in said
+    assert found["sensitivity"] == [[None] * 3] * 3
+    status, found, said = run(tmp_path, capsys, 2, "--nominal", "20000", "--u-nominal-pct", "5")
+    assert status == 3
+    assert "Sxx is" in said
+    assert "from the nominal 2e+04" in said
+    status, _, said = run(tmp_path, capsys, 2, "--plain")
+    assert (status, "--plain belongs to Method 3" in said) == (2, True)
+
+    files(tmp_path / "broad", ON_CLAMP, motion=multisine(np.random.default_rng(1), peak_mps2=6.0))
+    status, _, said = run(tmp_path / "broad", capsys, 2)
+    assert status == 3
+    assert "the reference is no sine" in said
+
+    files(tmp_path / "dead", ON_CLAMP, reference=ReferenceParameters(sensitivity=0.0, resolution=1e-5, noise=1e-3))
+    status, _, said = run(tmp_path / "dead", capsys, 2)
+    assert (status, "no window can be used" in said) == (3, True)
