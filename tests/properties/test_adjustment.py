@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from calib.adjustment import adjust
 from calib.model import Window
 from calib.nuisances import Priors
-from calib.sums import merge
 from tests.clamp_windows import Faults, clamp_points
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -84,13 +83,12 @@ def test_the_order_of_windows_does_not_matter(seed, random):
 @FEW
 @given(seed=SEEDS)
 def test_more_of_the_same_data_never_widens_type_a(seed):
-    """Twice the windows, and twice the length of each: the type A part shrinks, the angles' part does not grow."""
+    """The same windows twice: the type A part shrinks; what the angles cost, which more of it cannot mend, stays."""
     windows = _windows(seed)
-    longer = [replace(w, sums=merge([w.sums, w.sums])) for w in windows]
-    once = adjust(windows)
-    for more in (adjust(windows * 2), adjust(longer)):
-        assert np.all(more.contributions["type A"] <= once.contributions["type A"])
-        assert np.all(more.contributions["alpha by position"] <= 1.01 * once.contributions["alpha by position"].max())
+    once, twice = adjust(windows), adjust(windows * 2)
+    assert np.all(twice.contributions["type A"] <= once.contributions["type A"])
+    largest = once.contributions["alpha by position"].max()
+    assert twice.contributions["alpha by position"].max() > 0.9 * largest
 
 
 @FEW
