@@ -35,7 +35,7 @@ def reasons(
     """
     return (
         _rank_reasons(windows, solution)
-        or _sign_reasons(solution, shares, turned)
+        or _sign_reasons(solution, turned)
         or _lag_reasons(solution, shares)
         or [*_prior_reasons(solution), *_misfit_reasons(solution)]
         or _nothing_determined(solution, determined)
@@ -79,9 +79,9 @@ def _lag_reasons(solution: Solution, shares: Budget) -> list[str]:
     ]
 
 
-def _sign_reasons(solution: Solution, shares: Budget, turned: Callable[[int, int], Solution]) -> list[str]:
-    statistic, freedom = shares.consistency
-    if statistic <= chi2_quantile(CONTRADICTED, freedom) and not _prior_reasons(solution):
+def _sign_reasons(solution: Solution, turned: Callable[[int, int], Solution]) -> list[str]:
+    # A poor fit turned may end anywhere; what it is judged by is its chi2 alone, over the rows that it has.
+    if solution.chi2 <= chi2_quantile(CONTRADICTED, solution.residual.size) and not _prior_reasons(solution):
         return []
     tried = {
         "the static sign (gravity)": turned(-1, 1),
