@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from agent.report.result import CalibrationResult
-from agent.report.style import AXIS_COLOURS, INK, PALE, RESULT_COLOURS, RESULT_MARKERS, WIDTH_IN, bare, figure
+from agent.report.style import AXIS_COLOURS, INK, RESULT_COLOURS, RESULT_MARKERS, WIDTH_IN, bare, figure
 from agent.report.units import labelled, sensitivity_unit
 from calib.model import PARAMETERS, Array
 
@@ -19,38 +22,48 @@ TRANSVERSE = [(i, j) for i in range(3) for j in range(3) if i != j]
 def rows_in_space(result: CalibrationResult) -> Figure | None:
     """Each row of S as a point, as Figure 6 defines it; its axis is the locus of a sensor without transverse ones.
 
-    None where no row is known.
+    A row whose transverse sensitivities are not known (Figure 8) is a hollow point on its axis. None where no main
+    sensitivity is known.
     """
-    S = result.sensitivity
-    known = [i for i in range(3) if np.isfinite(S[i]).all()]
+    S = np.where(np.eye(3, dtype=bool), result.sensitivity, np.nan_to_num(result.sensitivity))
+    known = [i for i in range(3) if np.isfinite(S[i, i])]
     if not known:
         return None
-    drawn = figure(WIDTH_IN)
-    axes = drawn.add_subplot(projection="3d")
+    drawn = Figure(figsize=(WIDTH_IN, 4.6))  # placed by hand: automatic layouts leave a diagram in space little room
+    axes: Any = drawn.add_axes((0.0, 0.16, 1.0, 0.84), projection="3d")
     reach = 1.15 * float(np.abs(S[known]).max())
-    low = min(0.0, 1.1 * float(S[known].min()))
-    for j, axis in enumerate(AXES):
-        ends = np.zeros((2, 3))
-        ends[:, j] = (low, reach)
-        axes.plot(*ends.T, color=INK, linewidth=0.8)
-        axes.text(*(1.08 * ends[1]), axis, ha="center", va="center")
+    low = min(0.0, 1.15 * float(S[known].min()))
+    _frame(axes, low, reach)
     for i in known:
-        x, y, z = S[i]
         ideal = np.zeros(3)
         ideal[i] = S[i, i]
         axes.plot(*np.stack([np.zeros(3), S[i]]).T, color=AXIS_COLOURS[i], linewidth=1.6)
         axes.plot(*np.stack([ideal, S[i]]).T, color=AXIS_COLOURS[i], linewidth=1, linestyle=":")
         name = f"({', '.join(f'$S_{{{AXES[i]}{axis}}}$' for axis in AXES)})"
-        axes.plot([x], [y], [z], "o", color=AXIS_COLOURS[i], markersize=6, label=f"{name} = {_row(S[i])}")
+        fill = "full" if np.isfinite(result.sensitivity[i]).all() else "none"
+        label = f"{name} = {_row(result.sensitivity[i])}"
+        axes.plot(*S[i][:, None], "o", color=AXIS_COLOURS[i], markersize=6, fillstyle=fill, label=label)
+    for line in axes.lines:
+        line.set_clip_on(False)
+    drawn.legend(loc="lower center", ncols=1, title=labelled("Rows of S", sensitivity_unit(result.unit)))
+    return drawn
+
+
+def _frame(axes: Any, low: float, reach: float) -> None:
+    """Three axes through the origin, each with its numbers along it."""
+    axes.set_axis_off()
     axes.set(xlim=(low, reach), ylim=(low, reach), zlim=(low, reach))
     axes.view_init(elev=22, azim=38)
-    axes.locator_params(nbins=4)
-    axes.tick_params(labelsize=8, pad=0)
-    for side in (axes.xaxis, axes.yaxis, axes.zaxis):
-        side.pane.set(facecolor="none", edgecolor=PALE)
-    axes.set_box_aspect(None, zoom=0.9)
-    drawn.legend(loc="outside lower center", ncols=1, title=labelled("Rows of S", sensitivity_unit(result.unit)))
-    return drawn
+    axes.set_box_aspect(None, zoom=1.2)
+    ticks = [t for t in MaxNLocator(4).tick_values(low, reach) if low < t < reach and t != 0]
+    beside = -reach * np.array([[0, 0, 0.07], [0, 0, 0.07], [0, 0.13, 0]])  # of each axis: where its numbers stand
+    for j, axis in enumerate(AXES):
+        ends = np.outer((low, reach), np.eye(3)[j])
+        axes.plot(*ends.T, color=INK, linewidth=0.8)
+        axes.text(*(1.07 * ends[1]), axis, ha="center", va="center", fontweight="bold")
+        for tick in ticks:
+            axes.plot(*(tick * np.eye(3)[j])[:, None], "|" if j < 2 else "_", color=INK, markersize=6)
+            axes.text(*(tick * np.eye(3)[j] + beside[j]), f"{tick:g}", fontsize=8, ha="center", va="center")
 
 
 def main_sensitivities(results: Sequence[CalibrationResult]) -> Figure | None:
@@ -82,6 +95,8 @@ def transverse_sensitivities(results: Sequence[CalibrationResult]) -> Figure | N
     axes = drawn.subplots()
     step = 0.7 / len(results)
     for k, (result, (value, expanded)) in enumerate(zip(results, values, strict=True)):
+        if not np.isfinite(value).any():
+            continue
         shift = (k - 0.5 * (len(results) - 1)) * step
         for row in range(6):
             _bar(axes, row + shift, value[row], expanded[row], k, result.label if row == 0 else None)
@@ -95,9 +110,8 @@ def transverse_sensitivities(results: Sequence[CalibrationResult]) -> Figure | N
     return drawn
 
 
-def _bar(axes: object, row: float, value: float, expanded: float, k: int, label: str | None = None) -> None:
+def _bar(axes: Axes, row: float, value: float, expanded: float, k: int, label: str | None = None) -> None:
     """A value with its expanded uncertainty; one whose uncertainty is not known stands alone."""
-    assert hasattr(axes, "errorbar")
     axes.errorbar(
         value, row, xerr=expanded if np.isfinite(expanded) else None, label=label, capsize=4, markersize=6,
         fmt=RESULT_MARKERS[k % len(RESULT_MARKERS)], color=RESULT_COLOURS[k % len(RESULT_COLOURS)],
@@ -113,5 +127,8 @@ def _relative(result: CalibrationResult) -> tuple[Array, Array]:
 
 
 def _row(values: Array) -> str:
-    digits = max(0, 3 - int(np.floor(np.log10(np.abs(values).max())))) if np.abs(values).max() > 0 else 3
-    return "(" + ", ".join(f"{v:.{digits}f}".replace("-", "−") for v in values) + ")"
+    """Numbers to four digits of the largest; – where one is not known."""
+    largest = float(np.nanmax(np.abs(values)))
+    digits = max(0, 3 - int(np.floor(np.log10(largest)))) if largest > 0 else 3
+    texts = [f"{v:.{digits}f}".replace("-", "−") if np.isfinite(v) else "–" for v in values]
+    return f"({', '.join(texts)})"

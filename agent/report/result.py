@@ -45,8 +45,8 @@ class WindowVerdict(msgspec.Struct, frozen=True):
 class CalibrationResult:
     """S, Q and what is known of them. Arrays of 12 are in the order of PARAMETERS; NaN where nothing is determined.
 
-    `unit` is that of the indications, "" where the result does not say it. `degrees_of_freedom` (12,), inf where they
-    do not matter. `budget` {source: (12,) standard uncertainty}. `fields` is the object itself.
+    `unit` is that of the indications, "" where the result does not say it. `degrees_of_freedom` (12,), NaN where they
+    are not stated or without end. `budget` {source: (12,) standard uncertainty}. `fields` is the object itself.
     """
 
     label: str
@@ -203,10 +203,8 @@ def _array(value: Any, shape: tuple[int, ...], where: str) -> Array:
 
 def _freedom(value: Any) -> Array:
     if isinstance(value, Mapping):
-        freedom = np.append(*_parts(value, "degrees_of_freedom."))
-    else:
-        freedom = _array(value, (12,), "degrees_of_freedom")
-    return np.where(np.isnan(freedom), np.inf, freedom)
+        return np.append(*_parts(value, "degrees_of_freedom."))
+    return _array(value, (12,), "degrees_of_freedom")
 
 
 def _source(value: Any, where: str) -> Array:

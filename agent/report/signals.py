@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 
 from agent.report.style import AXIS_COLOURS, INK, figure
 from agent.report.trace import Residuals, by_phase, spans, spectrum
@@ -36,21 +39,28 @@ def indications(seen: Residuals, unit: str) -> Figure:
 
 
 def left_over(seen: Residuals, unit: str) -> Figure:
-    """V - (S a + Q) over time, over the phase of the motion, and its spectrum."""
-    ways = [_over_time, _over_phase, _spectrum] if seen.phase_rad is not None else [_over_time, _spectrum]
-    drawn = figure(0.5 + 2.0 * len(ways))
-    for axes, way in zip(drawn.subplots(len(ways), 1), ways, strict=True):
+    """V - (S a + Q) over time, an axis a strip, over the phase of the motion, and its spectrum."""
+    ways = [_over_phase, _spectrum] if seen.phase_rad is not None else [_spectrum]
+    drawn = figure(3.3 + 2.0 * len(ways))
+    heights = [0.9] * 3 + [2.0] * len(ways)
+    subplots = drawn.subplots(len(heights), 1, gridspec_kw={"height_ratios": heights})
+    _over_time(subplots[:3], seen, output_unit(unit))
+    for axes, way in zip(subplots[3:], ways, strict=True):
         way(axes, seen, output_unit(unit))
-    handles, labels = drawn.axes[0].get_legend_handles_labels()
-    drawn.legend(handles, labels, loc="outside upper center", ncols=3)
+    handles = [Patch(color=colour, label=axis) for axis, colour in zip(AXES, AXIS_COLOURS, strict=True)]
+    drawn.legend(handles=handles, loc="outside upper center", ncols=3)
     return drawn
 
 
-def _over_time(axes: Axes, seen: Residuals, unit: str) -> None:
+def _over_time(strips: Sequence[Axes], seen: Residuals, unit: str) -> None:
     middle, low, high = spans(seen.time_s, seen.residual, COLUMNS)
-    for k in range(3):
-        axes.fill_between(middle, low[:, k], high[:, k], color=AXIS_COLOURS[k], alpha=0.5, linewidth=0, label=AXES[k])
-    axes.set(title="over time: least to largest", xlabel="time in s since the first sample", ylabel=unit)
+    for k, axes in enumerate(strips):
+        axes.fill_between(middle, low[:, k], high[:, k], color=AXIS_COLOURS[k], linewidth=0)
+        axes.locator_params(axis="y", nbins=3)
+        axes.tick_params(labelbottom=k == 2)
+    strips[0].set_title("over time: least to largest")
+    strips[1].set_ylabel(unit)
+    strips[2].set_xlabel("time in s since the first sample")
 
 
 def _over_phase(axes: Axes, seen: Residuals, unit: str) -> None:

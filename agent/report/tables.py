@@ -7,13 +7,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from agent.quantity import plus_minus
-from agent.report.result import CalibrationResult, plain
+from agent.report.result import CalibrationResult
 from agent.report.trace import Residuals
-from agent.report.units import ACCELERATION, output_unit, sensitivity_unit
+from agent.report.units import ACCELERATION, output_unit, position_name, said, sensitivity_unit
 from calib.model import PARAMETERS
 
 AXES = "xyz"
@@ -24,7 +23,7 @@ NOT_KNOWN = "not determined"
 def table(
     heads: Sequence[str], rows: Iterable[Sequence[str]], style: str = "", text: frozenset[int] = frozenset()
 ) -> str:
-    """An HTML table of escaped cells; columns `text` may break into lines."""
+    """An HTML table of escaped cells; columns `text` stand to the left and may break into lines."""
 
     def cell(tag: str, k: int, content: str) -> str:
         return f"<{tag}{' class=text' if k in text else ''}>{escape(content)}</{tag}>"
@@ -45,7 +44,7 @@ def matrix(result: CalibrationResult) -> str:
     """S and Q, each ± U."""
     cells = [_cell(result, k) for k in range(12)]
     rows = [[axis, *cells[3 * i : 3 * i + 3], cells[9 + i]] for i, axis in enumerate(AXES)]
-    return table(["output", "S along x", "S along y", "S along z", "Q"], rows)
+    return table(["", "S along x", "S along y", "S along z", "Q"], rows, "matrix")
 
 
 def parameters(result: CalibrationResult) -> str:
@@ -57,7 +56,7 @@ def parameters(result: CalibrationResult) -> str:
             number(result.values[k], 7),
             number(result.standard_uncertainty[k]),
             number(result.expanded_uncertainty[k]),
-            number(result.coverage_factor[k], 3),
+            number(result.coverage_factor[k], 3) if result.determined[k] else "–",
             number(result.degrees_of_freedom[k]),
             "yes" if result.determined[k] else "no",
             units[k],
@@ -96,7 +95,7 @@ def windows(result: CalibrationResult) -> str:
         [
             f"{w.start_s:.2f}",
             f"{w.stop_s:.2f}",
-            w.position or "–",
+            position_name(w.position),
             "yes" if w.used else "no",
             str(w.points),
             str(w.left_out),
@@ -104,8 +103,9 @@ def windows(result: CalibrationResult) -> str:
         ]
         for w in result.windows[-MOST_ROWS:]
     ]
-    text = frozenset({2, 6})
-    return table(["start in s", "stop in s", "position", "used", "points", "left out", "reason"], rows, text=text)
+    return table(
+        ["start in s", "stop in s", "position", "used", "points", "left out", "reason"], rows, text=frozenset({6})
+    )
 
 
 def left_over(seen: Sequence[Residuals], result: CalibrationResult) -> str:
@@ -117,7 +117,7 @@ def left_over(seen: Sequence[Residuals], result: CalibrationResult) -> str:
     heads += [f"{axis} in {ACCELERATION}" for axis in AXES] if with_acceleration else []
     rows = [
         [
-            r.position,
+            position_name(r.position),
             *(number(v, 3) for v in r.rms),
             *((number(v, 3) for v in r.rms / main) if with_acceleration else ()),
         ]
@@ -127,20 +127,29 @@ def left_over(seen: Sequence[Residuals], result: CalibrationResult) -> str:
 
 
 def facts(pairs: Mapping[str, Any]) -> str:
-    """Names and values; what is nested stands as JSON."""
-    rows = [[name, _words(value)] for name, value in pairs.items() if value not in (None, "", [], {})]
+    """Names and values."""
+    rows = [[said(name), _words(value)] for name, value in pairs.items() if value not in (None, "", [], {})]
     return table(["", ""], rows, "words", frozenset({1})) if rows else ""
 
 
 def _cell(result: CalibrationResult, k: int) -> str:
+    """Value ± U, which may break before ± only."""
     if not result.determined[k]:
         return NOT_KNOWN
-    return plus_minus(float(result.values[k]), float(result.expanded_uncertainty[k])).replace("-", "−")
+    text = plus_minus(float(result.values[k]), float(result.expanded_uncertainty[k])).replace("-", "−")
+    return text.replace("± ", "±\N{NO-BREAK SPACE}")
 
 
 def _words(value: Any) -> str:
-    if isinstance(value, Mapping) and all(not isinstance(item, Mapping | list) for item in value.values()):
-        return ", ".join(f"{name} {_words(item)}" for name, item in value.items() if item not in (None, ""))
-    if isinstance(value, float):
-        return number(value, 7)
-    return value if isinstance(value, str) else msgspec.json.encode(plain(value)).decode()
+    """A value from JSON in words, nests in brackets."""
+    if isinstance(value, Mapping):
+        held = {name: item for name, item in value.items() if item not in (None, "", [], {})}
+        nests = {name for name, item in held.items() if isinstance(item, Mapping | list)}
+        return ", ".join(
+            f"{said(name)} ({_words(v)})" if name in nests else f"{said(name)} {_words(v)}" for name, v in held.items()
+        )
+    if isinstance(value, list | tuple):
+        return ", ".join(f"({_words(v)})" if isinstance(v, list | Mapping) else _words(v) for v in value)
+    if isinstance(value, bool) or value is None:
+        return {True: "yes", False: "no", None: "–"}[value]
+    return number(value, 7) if isinstance(value, float) else str(value)

@@ -12,7 +12,7 @@ from matplotlib.patches import Patch
 from agent.events import CalibrationUpdate
 from agent.report.result import CalibrationResult, WindowVerdict
 from agent.report.style import AXIS_COLOURS, INK, PALE, REFUSED, SHADES, USED, bare, figure
-from agent.report.units import output_unit
+from agent.report.units import output_unit, position_name
 from calib.model import PARAMETERS
 
 AXES = "xyz"
@@ -36,9 +36,11 @@ def windows(verdicts: Sequence[WindowVerdict]) -> Figure | None:
         axes.barh(
             lane, w.stop_s - w.start_s, left=w.start_s, height=0.6, color=_colour(w), edgecolor=INK, linewidth=0.5
         )
-    labels = [_short(name) for name in lanes]
+    labels = [_short(position_name(name)) for name in lanes]
     axes.set(yticks=range(len(lanes)), yticklabels=labels, xlabel="time in s since the first sample")
     axes.set_ylim(len(lanes) - 0.4, -0.6)
+    axes.set_ylabel("position" if by_position else "")
+    axes.margins(x=0.02)
     bare(axes)
     kinds = {"used": USED, "refused": REFUSED, "calm": PALE}
     present = {_colour(w) for w in verdicts}
@@ -54,7 +56,6 @@ def _colour(window: WindowVerdict) -> str:
 
 
 def _short(name: str) -> str:
-    name = name.replace("theta", "θ").replace("alpha", "α").replace(" deg", "°")
     return name if len(name) <= 24 else f"{name[:22]}…"
 
 
