@@ -137,10 +137,7 @@ def _print_calibration(console: Any, outcome: Outcome) -> None:
     assert c is not None
     expanded = outcome.coverage_factor * c.standard_uncertainty
     values = np.append(c.sensitivity.ravel(), c.offset)
-    cells = [
-        plus_minus(float(v), float(e)) if d else "not determined"
-        for v, e, d in zip(values, expanded, c.determined, strict=True)
-    ]
+    cells = [_cell(*each) for each in zip(values.tolist(), expanded.tolist(), c.determined.tolist(), strict=True)]
     table = Table(box=box.SIMPLE_HEAD)
     for heading in ("", "Sx", "Sy", "Sz", "Q"):
         table.add_column(heading, justify="right", no_wrap=True)
@@ -150,6 +147,12 @@ def _print_calibration(console: Any, outcome: Outcome) -> None:
     kind = f", {outcome.uncertainty_kind}" if outcome.uncertainty_kind else ""
     console.print(f"  S in output unit per m/s², Q in output unit, U with k = {outcome.coverage_factor:.3g}{kind}")
     console.print(f"  method {outcome.method}, {sum(w.used for w in outcome.windows)} windows", soft_wrap=True)
+
+
+def _cell(value: float, expanded: float, determined: bool) -> str:
+    if not determined:
+        return "not determined"
+    return "0" if value == expanded == 0.0 else plus_minus(value, expanded)  # 0 by choice of the frame
 
 
 def _print_windows(console: Any, windows: Sequence[Window]) -> None:
