@@ -9,9 +9,12 @@ import sys
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
+import pytest
+
 REPOSITORY = Path(__file__).parents[2]
 
 
+@pytest.mark.slow
 def test_the_example_writes_its_page_and_every_figure_on_it(tmp_path: Path) -> None:
     command = [sys.executable, "examples/paper.py", str(tmp_path), "--benches", "4"]
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}  # also where the packages are not installed
