@@ -21,7 +21,7 @@ run: $(VENV)/runtime  ## the agent on the virtual bench, with a router beside it
 	$(BIN)/fieldcal run --preset $(PRESET) --with-router
 
 test: $(VENV)/development
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist loadscope
 
 lint: $(VENV)/development
 	$(BIN)/ruff check .

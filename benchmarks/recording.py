@@ -130,7 +130,8 @@ def main() -> None:
         plain_s = cpu_s(decompress_and_check, path)
         rows = [(name, cpu_s(work, path)) for name, work in WORK]
     samples = sum(event.indications.size for event in events if isinstance(event, SampleBlock))
-    lines = [f"| {name} | {DURATION_S / s:,.0f} | {s / plain_s:.1f} |" for name, s in [("plain", plain_s), *rows]]
+    rows = [("plain", plain_s), *rows]
+    lines = [f"| {name} | {DURATION_S / s:,.0f} | {s / plain_s:.1f} |" for name, s in rows]
     write_part(
         "recording",
         f"""

@@ -25,15 +25,15 @@ def fieldcal(*arguments: str | Path, timeout_s: float = 60.0) -> subprocess.Comp
 
 
 @contextmanager
-def started(*arguments: str | Path, output: Path) -> Iterator[subprocess.Popen[bytes]]:
+def started(*arguments: str | Path, output: Path, directory: Path = ROOT) -> Iterator[subprocess.Popen[bytes]]:
     """A command that goes on; killed at the end if it still runs. Its output goes to a file."""
     with open(output, "ab") as file:
         process = subprocess.Popen(
             [sys.executable, "-u", "-m", "agent", *map(str, arguments)],
-            cwd=ROOT,
+            cwd=directory,
             stdout=file,
             stderr=subprocess.STDOUT,
-            env=os.environ | {"PYTHONUNBUFFERED": "1"},
+            env=os.environ | {"PYTHONPATH": str(ROOT)},
         )
     try:
         yield process

@@ -1,0 +1,69 @@
+"""Every command in README and docs runs as it stands there."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.scenarios.processes import ROOT, interrupt, started, wait_until
+
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+FENCE = re.compile(r"^```sh\n(.*?)^```", re.MULTILINE | re.DOTALL)
+# These go on until somebody ends them; what they print first says that they run.
+ENDLESS = {"run": "recording", "router": "tcp/", "simulate": "sensor "}
+
+
+def commands(page: Path) -> list[str]:
+    blocks = FENCE.findall(page.read_text())
+    return [line.split("  #")[0].strip() for block in blocks for line in block.splitlines() if line.strip()]
+
+
+@pytest.fixture(scope="module")
+def data_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data directory of a short run, for commands that read one."""
+    directory = tmp_path_factory.mktemp("documented") / "data"
+    with started("run", "--data-dir", directory, "--duration", "4", output=directory.with_name("output")) as process:
+        process.wait(60)
+    return directory
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_documented_commands_run(page: Path, tmp_path: Path, data_dir: Path) -> None:
+    shutil.copytree(ROOT / "examples", tmp_path / "examples")
+    shutil.copytree(data_dir, tmp_path / "data")
+    for line in commands(page):
+        words = shlex.split(line)
+        if words[0] == "make":
+            targets = (ROOT / "Makefile").read_text()
+            assert re.search(rf"^{re.escape(words[1])}:", targets, re.MULTILINE), line
+        elif words[0] == "fieldcal":
+            run_command(words[1:], tmp_path, line)
+        else:
+            raise AssertionError(f"{page.name}: {line!r} is no command that this test knows how to run")
+
+
+def run_command(words: list[str], directory: Path, line: str) -> None:
+    words = [word.replace("/tmp/", f"{directory}/").replace(":7447", ":17447") for word in words]
+    if words[0] in ENDLESS and "--csv" not in words:
+        output = directory / "output"
+        output.unlink(missing_ok=True)
+        with started(*words, output=output, directory=directory) as process:
+            sign = ENDLESS[words[0]]
+            wait_until(lambda: sign in output.read_text() or process.poll() is not None, 20, line)
+            interrupt(process)
+        assert sign in output.read_text(), line
+        assert process.returncode == 0, line
+        return
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", "agent", *words]
+    done = subprocess.run(
+        command, cwd=directory, env=environment, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 0, f"{line}\n{done.stdout}{done.stderr}"
