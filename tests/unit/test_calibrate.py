@@ -74,6 +74,9 @@ def test_plain_bench_is_found(recorded: tuple[Path, Bench], capsys: pytest.Captu
         assert set(window) >= {"start_s", "stop_s", "used", "reason", "points", "left_out"}
         assert window["used"]
         assert window["left_out"] == 0
+    # Nothing is lost at the ends but the guard of 0.1 s (where the motion is not just fading).
+    begun_s = np.array([w["start_s"] for w in found["windows"]]) - [p.start_s for p in bench.poses]
+    assert np.sum(np.abs(begun_s - 0.1) < 0.0025) >= 3
     assert [w["position"] for w in found["windows"]] == [f"theta 35 deg, alpha {a} deg" for a in (0, 30, 120, 210)]
 
 
