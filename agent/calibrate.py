@@ -14,6 +14,7 @@ import numpy as np
 from agent.adjusting import adjusted, norm_fitted
 from agent.amplitude_methods import by_amplitudes
 from agent.frontend import FrontEnd, Options
+from agent.origin import origin
 from agent.outcome import Outcome, as_json, print_outcome
 from agent.poses import PoseInterval, Setting, beside_reference, read_poses
 from agent.priors import priors_of
@@ -76,7 +77,7 @@ def calibrate(**options: Any) -> int:
         click.echo(f"fieldcal calibrate: {error}", err=True)
         return 2
     if options["json_to"]:
-        click.echo(as_json(outcome))
+        click.echo(as_json(replace(outcome, more={**outcome.more, **origin(options)})))
     else:
         print_outcome(outcome)
     for reason in outcome.reasons:

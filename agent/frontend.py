@@ -50,7 +50,7 @@ class FrontEnd:
         self._options = options or Options()
         self.sensor_clock = clock_from_stamps(sensor.time_s)
         self.reference_clock = None if reference is None else clock_from_stamps(reference.time_s)
-        self._poses = poses
+        self.poses = poses
         self._check_overlap()
 
     def windows(self, lag_s: float = 0.0, progress: Callable[[float], Any] | None = None) -> list[Window]:
@@ -60,7 +60,7 @@ class FrontEnd:
         """
         floor = self._rest_floor()
         windows: list[Window] = []
-        for interval in self._poses:
+        for interval in self.poses:
             start_s, stop_s = interval.start_s + self._options.guard_s, interval.stop_s - self._options.guard_s
             if interval.pose.direction.shape[1]:
                 found = list(self._motion(interval.pose, start_s, stop_s, lag_s))
@@ -73,7 +73,7 @@ class FrontEnd:
 
     def runs(self) -> Iterator[tuple[Points, Window]]:
         """Windows in motion with all their samples, for methods that need more than sums."""
-        for interval in self._poses:
+        for interval in self.poses:
             if interval.pose.direction.shape[1]:
                 start_s, stop_s = interval.start_s + self._options.guard_s, interval.stop_s - self._options.guard_s
                 for points, windows in self._judged(interval.pose, start_s, stop_s, lag_s=0.0):
@@ -94,7 +94,7 @@ class FrontEnd:
             pieces = max(1, math.ceil((part_stop_s - part_start_s) / limits.longest_s))
             edges = np.linspace(part_start_s, part_stop_s, pieces + 1)
             for a, b in itertools.pairwise(edges.tolist()):
-                points = self._points(a, b, lag_s)
+                points = self.points(a, b, lag_s)
                 if len(points.time_s) > 1:
                     yield points, judged(kind, pose, points, limits, leave_out=leave_out)
 
@@ -111,12 +111,13 @@ class FrontEnd:
                 edges = clock.time_of([first + a, first + b - 1])
                 yield kind, float(edges[0]), float(edges[1])
 
-    def _points(self, start_s: float, stop_s: float, lag_s: float) -> Points:
-        """Samples of the sensor from `start_s` to `stop_s` that have a reference, at the times they were felt."""
-        assert self._reference is not None
-        assert self.reference_clock is not None
+    def points(self, start_s: float, stop_s: float, lag_s: float = 0.0) -> Points:
+        """Samples of the sensor from `start_s` to `stop_s`; with a reference those that have one, when they felt it."""
         first, stop = _rows(self.sensor_clock, len(self._sensor.time_s), start_s, stop_s)
         time_s = self.sensor_clock.time_of(np.arange(first, stop))
+        if self._reference is None or self.reference_clock is None:
+            nothing = np.empty((len(time_s), 0))
+            return Points(time_s, np.asarray(self._sensor.v[first:stop]), nothing, nothing)
         felt_s = time_s - lag_s
         m = self._reference.x.shape[1]
         if not len(time_s):
@@ -152,7 +153,7 @@ class FrontEnd:
     def _rest_floor(self) -> Array | None:
         """The sensor's usual noise at rest, over all static poses."""
         found = []
-        for interval in self._poses:
+        for interval in self.poses:
             if interval.pose.direction.shape[1] == 0:
                 first, stop = _rows(self.sensor_clock, len(self._sensor.time_s), interval.start_s, interval.stop_s)
                 sd = rest_sd(np.asarray(self._sensor.v[first:stop]), self.sensor_clock.rate_hz)
@@ -167,8 +168,8 @@ class FrontEnd:
         if self._reference is not None:
             other = self._reference
             spans.append((f"{other.path}", float(other.time_s[0]), float(other.time_s[-1])))
-        if self._poses:
-            spans.append(("the poses", min(p.start_s for p in self._poses), max(p.stop_s for p in self._poses)))
+        if self.poses:
+            spans.append(("the poses", min(p.start_s for p in self.poses), max(p.stop_s for p in self.poses)))
         if max(s for _, s, _ in spans) >= min(e for _, _, e in spans):
             told = ", ".join(f"{name} from {start:.10g} s to {stop:.10g} s" for name, start, stop in spans)
             raise TableError(f"no overlap in time: {told}")

@@ -1,0 +1,34 @@
+"""Which files and options a result came from, so that a reader can find them and see that they are the same."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+FILES = ("sensor", "reference", "poses", "prior")  # options of `fieldcal calibrate` that name one
+
+
+class SourceFile(msgspec.Struct, frozen=True):
+    """A file as it was read; `path` as it was given, `sha256` in hexadecimal."""
+
+    path: str
+    size_bytes: int
+    sha256: str
+
+
+def source_file(path: Path) -> SourceFile:
+    """Measure and hash a file. Raises OSError."""
+    with open(path, "rb") as file:
+        return SourceFile(str(path), path.stat().st_size, hashlib.file_digest(file, "sha256").hexdigest())
+
+
+def origin(options: Mapping[str, Any]) -> dict[str, Any]:
+    """`options` as JSON has them, and the `files` that they name. Raises OSError."""
+    return {
+        "options": {name: str(value) if isinstance(value, Path) else value for name, value in options.items()},
+        "files": [msgspec.structs.asdict(source_file(options[name])) for name in FILES if options[name]],
+    }
