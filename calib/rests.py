@@ -13,6 +13,8 @@ GUARD_S = 0.25  # left out at both ends: hands leaving and taking the sensor
 STILL_QUANTILE = 0.25
 # Times that noise which a still block may show: noise alone passes 4 in 3e-5 of the blocks, a turn of 1 deg/s does not.
 STILL_FACTOR = 4.0
+# The quantile of a dozen steps is poorly known; steps as white noise makes them (times this, passed by 3e-4) are still.
+WHITE_FACTOR = 2.6
 
 
 def find_rests(V: Array, rate_hz: float) -> list[tuple[int, int]]:
@@ -27,8 +29,9 @@ def find_rests(V: Array, rate_hz: float) -> list[tuple[int, int]]:
     shaped = V[: blocks * size].reshape(blocks, size, 3)
     sd = np.sqrt(shaped.var(axis=1).sum(axis=1))
     step = np.linalg.norm(np.diff(shaped.mean(axis=1), axis=0), axis=1)
-    calm = sd <= STILL_FACTOR / 2.0 * np.quantile(sd, STILL_QUANTILE)
-    near = step <= STILL_FACTOR * np.quantile(step, STILL_QUANTILE)
+    noise = np.quantile(sd, STILL_QUANTILE)
+    calm = sd <= STILL_FACTOR / 2.0 * noise
+    near = step <= max(STILL_FACTOR * np.quantile(step, STILL_QUANTILE), WHITE_FACTOR * noise * np.sqrt(2.0 / size))
     still = calm & np.concatenate([[True], near]) & np.concatenate([near, [True]])
     edges = np.flatnonzero(np.diff(np.concatenate([[0], still.astype(int), [0]])))
     guard = round(GUARD_S * rate_hz)

@@ -1,0 +1,60 @@
+"""A person turning a real sensor, played over a serial port into the live agent: against the result imucal stored."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from tests.realdata.datasets import dataset
+from tests.realdata.test_calibrate_imucal import as_files
+from tests.scenarios.processes import fieldcal, interrupt, recordings, results, started, wait_until
+
+WITHIN = 1e-3  # of the row's main sensitivity: guards leave out 0.2 s of each rest, imucal takes all of it
+CONFIG = """
+[gateway]
+site = "test"
+name = "recorded"
+[[devices]]
+name = "imu"
+driver = "serial-csv"
+options = {{ port = "{port}", rate_hz = 204.8, axes = 3, sequence = true, unit = "count" }}
+[[channels]]
+sensor = "imu"
+guard_s = 0.2
+poses = [
+{poses}
+]
+[zenoh]
+enabled = false
+"""
+
+
+def test_played_over_a_port_the_agent_finds_what_imucal_found(tmp_path: Path) -> None:
+    as_files(tmp_path)
+    rests = np.loadtxt(tmp_path / "poses.csv", delimiter=",", skiprows=1)
+    rests = rests[np.argsort(rests[:, 0])]
+    stored = json.loads((dataset("imucal_ferraris") / "example_cal.json").read_text())
+    expected = np.array(stored["K_a"]) @ np.array(stored["R_a"])
+    port, data_dir, config = tmp_path / "port", tmp_path / "data", tmp_path / "config.toml"
+    poses = "\n".join(
+        f"  {{ start_s = {start:.6f}, stop_s = {stop:.6f}, gravity_mps2 = {gravity} }},"
+        for start, stop, *gravity in rests.tolist()
+    )
+    config.write_text(CONFIG.format(port=port, poses=poses))
+    playing = ("simulate", "--play", tmp_path / "sensor.csv", "--sequence", "--link", port)
+    with started(*playing, output=tmp_path / "playing"):
+        wait_until(port.is_symlink, 20, "the port")
+        with started("run", config, "--data-dir", data_dir, output=tmp_path / "output") as agent:
+            # The last rest ends after 27.3 s; what follows is turning.
+            wait_until(lambda: len(results(data_dir, "window")) >= len(rests), 60, "six windows")
+            wait_until(lambda: results(data_dir, "calibration")[-1]["windows"] == len(rests), 5, "from all of them")
+            interrupt(agent)
+    in_force = results(data_dir, "calibration")[-1]
+    difference = np.abs(np.array(in_force["sensitivity"]) - expected) / np.diag(expected)[:, None]
+    assert difference.max() < WITHIN, difference
+    assert "Traceback" not in (tmp_path / "output").read_text()
+    told = json.loads(fieldcal("replay", *recordings(data_dir), "--json", "-").stdout)
+    assert told["equal"] is True
+    assert told["calibrations"][-1]["sensitivity"] == in_force["sensitivity"]
