@@ -13,23 +13,23 @@ from agent.priors import priors_of
 from calib import method1, method2
 from calib.amplitudes import AmplitudeCalibration, Run
 from calib.model import PARAMETERS
+from calib.nuisances import Priors
 from calib.statistics import rel_s_pct, transverse_excess
 
 SOLVE = {"1": method1.solve, "2": method2.solve}
-MAIN = (0, 4, 8)
-# A main sensitivity this many standard uncertainties from its nominal value is another sensor, axis or reference; noise
-# and priors alone do it once in 370 times.
+# A sensitivity this many standard uncertainties from what was known is another sensor, axis or reference; noise and
+# priors alone do it once in 370 times.
 CONTRADICTION = 3.0
 
 
 def by_amplitudes(front: FrontEnd, options: dict[str, Any]) -> Outcome:
     """Method 1 or 2 on every used window in motion, windows of one position being repetitions.
 
-    Raises click.UsageError where options belong to Method 3 alone.
+    Raises click.UsageError for --plain, which is Method 3's, TableError where --prior cannot be read.
     """
-    for name in ("plain", "prior"):
-        if options[name]:
-            raise click.UsageError(f"--{name} belongs to Method 3")
+    if options["plain"]:
+        raise click.UsageError("--plain belongs to Method 3")
+    priors = priors_of(options)
     pairs = list(front.runs())
     windows = [window for _, window in pairs]
     # what the front end has made of a velocity is an acceleration already
@@ -38,10 +38,10 @@ def by_amplitudes(front: FrontEnd, options: dict[str, Any]) -> Outcome:
     if not runs:
         return Outcome(None, ("no window can be used",), windows, front.sensor_clock.rate_hz, method)
     try:
-        found = SOLVE[method](runs, priors_of(options))
+        found = SOLVE[method](runs, priors)
     except ValueError as error:
         return Outcome(None, (str(error),), windows, front.sensor_clock.rate_hz, method)
-    reasons = (*found.reasons, *_contradictions(found, options["nominal"], options["u_nominal_pct"]))
+    reasons = (*found.reasons, *_contradictions(found, priors))
     omega = 2 * np.pi * found.frequency_hz
     return Outcome(
         calibration=None if reasons else found.calibration,
@@ -57,18 +57,20 @@ def by_amplitudes(front: FrontEnd, options: dict[str, Any]) -> Outcome:
     )
 
 
-def _contradictions(found: AmplitudeCalibration, nominal: float | None, u_nominal_pct: float | None) -> list[str]:
-    if nominal is None or u_nominal_pct is None:
+def _contradictions(found: AmplitudeCalibration, priors: Priors) -> list[str]:
+    """Sensitivities that what was known of them (--nominal, --prior) contradicts."""
+    if priors.parameters is None or priors.covariance is None:
         return []
+    values, u = found.calibration.sensitivity.ravel(), found.calibration.standard_uncertainty
+    u_known = np.sqrt(np.diag(priors.covariance))
     reasons = []
-    u_nominal = u_nominal_pct / 100 * nominal
-    for k in MAIN:
-        value, u = found.calibration.sensitivity.ravel()[k], found.calibration.standard_uncertainty[k]
-        away = abs(value - nominal) / np.hypot(u, u_nominal)
+    for k in np.flatnonzero(found.calibration.determined & np.isfinite(u_known)):
+        known = priors.parameters[k]
+        away = abs(values[k] - known) / np.hypot(u[k], u_known[k])
         if away > CONTRADICTION:
             reasons.append(
-                f"{PARAMETERS[k]} is {value:.4g}, {away:.1f} standard uncertainties from the nominal {nominal:.4g} "
-                f"(u {u_nominal:.3g}); {CONTRADICTION:g} at most"
+                f"{PARAMETERS[k]} is {values[k]:.4g}, {away:.1f} standard uncertainties from {known:.4g} "
+                f"(u {u_known[k]:.3g}) as known before; {CONTRADICTION:g} at most"
             )
     return reasons
 

@@ -92,7 +92,7 @@ def test_what_the_methods_cannot_use_is_refused(tmp_path: Path, capsys: pytest.C
     status, found, said = run(tmp_path, capsys, 2, "--nominal", "20000", "--u-nominal-pct", "5")
     assert status == 3
     assert "Sxx is" in said
-    assert "from the nominal 2e+04" in said
+    assert "from 2e+04 (u 1e+03) as known before" in said
     status, _, said = run(tmp_path, capsys, 2, "--plain")
     assert (status, "--plain belongs to Method 3" in said) == (2, True)
 
@@ -104,3 +104,16 @@ def test_what_the_methods_cannot_use_is_refused(tmp_path: Path, capsys: pytest.C
     files(tmp_path / "dead", ON_CLAMP, reference=ReferenceParameters(sensitivity=0.0, resolution=1e-5, noise=1e-3))
     status, _, said = run(tmp_path / "dead", capsys, 2)
     assert (status, "no window can be used" in said) == (3, True)
+
+
+def test_an_earlier_result_is_a_prior(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files(tmp_path, ON_AXES)
+    _, earlier, _ = run(tmp_path, capsys, 1)
+    prior = tmp_path / "prior.json"
+    prior.write_text(json.dumps(earlier))
+    assert run(tmp_path, capsys, 1, "--prior", str(prior))[0] == 0
+    earlier["sensitivity"][1][1] *= 1.01  # U is 0.2 %
+    prior.write_text(json.dumps(earlier))
+    status, found, said = run(tmp_path, capsys, 1, "--prior", str(prior))
+    assert (status, len(found["reasons"])) == (3, 1)
+    assert "Syy is" in said
