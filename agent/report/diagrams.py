@@ -54,8 +54,8 @@ def _frame(axes: Any, low: float, reach: float) -> None:
     axes.set_axis_off()
     axes.set(xlim=(low, reach), ylim=(low, reach), zlim=(low, reach))
     axes.view_init(elev=22, azim=38)
-    axes.set_box_aspect(None, zoom=1.2)
-    ticks = [t for t in MaxNLocator(4).tick_values(low, reach) if low < t < reach and t != 0]
+    axes.set_box_aspect(None, zoom=1.15)
+    ticks = [t for t in MaxNLocator(4).tick_values(low, reach) if 0.95 * low < t < 0.95 * reach and t != 0]
     beside = -reach * np.array([[0, 0, 0.07], [0, 0, 0.07], [0, 0.13, 0]])  # of each axis: where its numbers stand
     for j, axis in enumerate(AXES):
         ends = np.outer((low, reach), np.eye(3)[j])
@@ -77,7 +77,10 @@ def main_sensitivities(results: Sequence[CalibrationResult]) -> Figure | None:
     drawn = figure(1.2 + 3 * (0.55 + 0.26 * len(results)))
     for axes, name, k in zip(np.atleast_1d(drawn.subplots(3, 1)), names, range(3), strict=True):
         for row, (value, expanded) in enumerate(values):
-            _bar(axes, row, value[k], expanded[k], row)
+            if np.isfinite(value[k]):
+                _bar(axes, row, value[k], expanded[k], row)
+        if not any(np.isfinite(value[k]) for value, _ in values):
+            axes.set_xticks([])
         axes.set(yticks=range(len(results)), yticklabels=[r.label for r in results], title=labelled(name, unit))
         axes.set_ylim(len(results) - 0.4, -0.6)
         axes.margins(x=0.15)

@@ -48,6 +48,8 @@ def _figures(material: Material, shown: Residuals | None) -> Iterator[tuple[str,
         caption = f"Indications (points) against S a + Q (line): some cycles of the window in {where}."
         yield "indications", caption, signals.indications(shown, unit)
         caption = f"What S a + Q leaves of the indications, window in {where}."
+        if results[0].fields.get("nuisances"):
+            caption += " Poses are taken as stated: what the adjustment gives to the nuisances is still in it."
         if shown.frequency_hz:
             caption += f" Dotted: mean frequency of the motion, {shown.frequency_hz:.3g} Hz."
         yield "residuals", caption, signals.left_over(shown, unit)

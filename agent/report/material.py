@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -12,6 +11,7 @@ import msgspec
 
 from agent.events import CalibrationUpdate, StatusChange, WindowReport
 from agent.history import FILE_NAME, History, StoreError
+from agent.origin import SourceFile, source_file
 from agent.recording import recordings
 from agent.report.recorded import Recorded, RecordingError, read_recordings, sensors_of
 from agent.report.result import (
@@ -22,6 +22,7 @@ from agent.report.result import (
     parse,
     undetermined,
 )
+from agent.report.retraced import retrace
 from agent.report.trace import Trace
 
 MOST_HISTORY = 1000  # newest calibrations and windows of a data directory
@@ -31,15 +32,6 @@ RECORDING_ENDINGS = (".mcap", ".mcap.active")
 
 class MaterialError(Exception):
     """The input cannot be used. The message names the file, the field and what is wrong."""
-
-
-@dataclass(frozen=True, slots=True)
-class SourceFile:
-    """A file that the report was made from."""
-
-    path: str
-    size_bytes: int
-    sha256: str
 
 
 @dataclass(slots=True)
@@ -82,7 +74,10 @@ def _from_results(paths: Sequence[Path], sensor: str | None) -> Material:
     material = Material(sensor or "", [])
     for path in paths:
         material.results.append(_read_result(path))
-        material.files.append(_file(path))
+        material.files.append(source_file(path))
+        material.files += material.results[-1].files
+    material.traces, hindrances = retrace(material.results[0], paths[0].parent)
+    material.notices += hindrances
     labels = [result.label for result in material.results]
     if len(set(labels)) < len(labels):
         named = [f"{label}, {path.stem}" for label, path in zip(labels, paths, strict=True)]
@@ -107,7 +102,7 @@ def _from_recordings(paths: Sequence[Path], sensor: str | None) -> Material:
     recorded = read_recordings(list(paths), chosen)
     material = _of(recorded, [_verdict(window) for window in recorded.windows], recorded.calibrations)
     material.history = recorded.calibrations
-    material.files = [_file(path) for path in paths]
+    material.files = [source_file(path) for path in paths]
     return material
 
 
@@ -130,7 +125,7 @@ def _from_directory(directory: Path, sensor: str | None) -> Material:
     newest = [in_force.result] if in_force and isinstance(in_force.result, CalibrationUpdate) else []
     material = _of(recorded, windows, newest)
     material.history = updates
-    material.files = [_file(path) for path in paths]
+    material.files = [source_file(path) for path in paths]
     material.notices += [f"the recording {name} is not there any more" for name in lost]
     return material
 
@@ -185,9 +180,3 @@ def _chosen(sensor: str | None, names: Sequence[str], where: str) -> str:
         held = f"the sensors {', '.join(names)}: choose one with --sensor" if names else "no results of any sensor"
         raise MaterialError(f"{where}: holds {held}")
     return names[0]
-
-
-def _file(path: Path) -> SourceFile:
-    with open(path, "rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
-    return SourceFile(path.name, path.stat().st_size, digest)

@@ -83,6 +83,8 @@ def _numbers(material: Material, seen: Sequence[Residuals]) -> Iterator[str]:
             yield "<h3>Residuals, root mean square</h3>" + tables.left_over(seen, result)
         if result.windows:
             yield "<h3>Windows</h3>" + tables.windows(result)
+        if options := tables.facts(result.fields.get("options") or {}):
+            yield "<h3>Options</h3>" + options
         if more := tables.facts(result.more):
             yield "<h3>Further</h3>" + more
         if result.determined.any():

@@ -5,21 +5,24 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from agent.events import CalibrationUpdate
-from calib.model import Array
+from agent.origin import SourceFile
+from calib.model import PARAMETERS, Array
+
+Item = TypeVar("Item")
 
 PLACES = {"sensitivity": (3, 3), "offset": (3,)}
 # What the report has a place of its own for; any further member of the object stands in a table of its own.
 SHOWN = frozenset(
     {
         "sensitivity", "offset", "standard_uncertainty", "expanded_uncertainty", "covariance", "determined",
-        "degrees_of_freedom", "nuisances", "budget", "status", "reasons", "windows", "statistics",
+        "degrees_of_freedom", "nuisances", "budget", "status", "reasons", "windows", "statistics", "options", "files",
     }
 )  # fmt: skip
 
@@ -46,7 +49,8 @@ class CalibrationResult:
     """S, Q and what is known of them. Arrays of 12 are in the order of PARAMETERS; NaN where nothing is determined.
 
     `unit` is that of the indications, "" where the result does not say it. `degrees_of_freedom` (12,), NaN where they
-    are not stated or without end. `budget` {source: (12,) standard uncertainty}. `fields` is the object itself.
+    are not stated or without end. `budget` {source: (12,) standard uncertainty}. `files`: what the result was made
+    from. `fields` is the object itself.
     """
 
     label: str
@@ -63,6 +67,7 @@ class CalibrationResult:
     windows: tuple[WindowVerdict, ...]
     unit: str
     budget: Mapping[str, Array] = field(default_factory=dict)
+    files: tuple[SourceFile, ...] = ()
     fields: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -110,9 +115,10 @@ def parse(fields: Mapping[str, Any], name: str) -> CalibrationResult:
         lag_s=np.nan_to_num(_array(fields.get("lag_s"), (3,), "lag_s")),
         refused=fields["status"] != "valid",
         reasons=tuple(str(reason) for reason in fields.get("reasons") or ()),
-        windows=tuple(_windows(fields.get("windows"))),
+        windows=tuple(_list_of(WindowVerdict, fields.get("windows"), "windows")),
         unit=str(fields.get("output_unit") or ""),
         budget={source: _source(part, f"budget.{source}") for source, part in (fields.get("budget") or {}).items()},
+        files=tuple(_list_of(SourceFile, fields.get("files"), "files")),
         fields=fields,
     )
 
@@ -208,14 +214,15 @@ def _freedom(value: Any) -> Array:
 
 
 def _source(value: Any, where: str) -> Array:
-    return np.append(*_parts(value, f"{where}.")) if isinstance(value, Mapping) else _array(value, (12,), where)
+    """Twelve numbers, in order or by name."""
+    return _array([value.get(p) for p in PARAMETERS] if isinstance(value, Mapping) else value, (12,), where)
 
 
-def _windows(value: Any) -> list[WindowVerdict]:
+def _list_of(kind: type[Item], value: Any, where: str) -> list[Item]:
     try:
-        return msgspec.convert(value or [], list[WindowVerdict])
+        return msgspec.convert(value or [], list[kind])  # type: ignore[valid-type]
     except msgspec.ValidationError as error:
-        raise ResultError(f"field windows: {error}") from None
+        raise ResultError(f"field {where}: {error}") from None
 
 
 def _short(value: Any) -> str:

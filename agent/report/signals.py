@@ -34,7 +34,7 @@ def indications(seen: Residuals, unit: str) -> Figure:
         axes.set_title(f"$V_{AXES[k]}$" + (", mean taken off" if seen.centred else ""))
         axes.locator_params(axis="y", nbins=5)
     drawn.supylabel(f"indication in {output_unit(unit)}", fontsize=10)
-    subplots[-1].set_xlabel("time in s since the first sample")
+    subplots[-1].set_xlabel("time in s")
     return drawn
 
 
@@ -60,7 +60,7 @@ def _over_time(strips: Sequence[Axes], seen: Residuals, unit: str) -> None:
         axes.tick_params(labelbottom=k == 2)
     strips[0].set_title("over time: least to largest")
     strips[1].set_ylabel(unit)
-    strips[2].set_xlabel("time in s since the first sample")
+    strips[2].set_xlabel("time in s")
 
 
 def _over_phase(axes: Axes, seen: Residuals, unit: str) -> None:
@@ -83,6 +83,9 @@ def _spectrum(axes: Axes, seen: Residuals, unit: str) -> None:
     frequency_hz, density = spectrum(seen.residual, seen.rate_hz)
     for k in range(3):
         axes.loglog(frequency_hz, density[:, k], color=AXIS_COLOURS[k], linewidth=0.8)
+    known = density[density > 0]
+    if known.size:  # whole decades: numbers at their ends at least
+        axes.set_ylim(10 ** np.floor(np.log10(np.quantile(known, 0.001))), 10 ** np.ceil(np.log10(known.max())))
     if seen.frequency_hz:
         axes.axvline(seen.frequency_hz, color=INK, linewidth=0.8, linestyle=":")
     axes.set(title="spectrum", xlabel="frequency in Hz", ylabel=f"{unit}/√Hz")

@@ -53,7 +53,6 @@ _SETTINGS: Any = {
 _VARIABLES = {INK: "--ink", PALE: "--pale", PAPER: "--paper"} | {
     colour: f"--series-{i}" for i, colour in enumerate((*SHADES, USED, REFUSED))
 }
-NO_DATE: dict[str, dict[str, str | None]] = {"svg": {"Date": None}, "pdf": {"CreationDate": None}, "png": {}}
 
 
 @contextmanager
@@ -70,10 +69,11 @@ def figure(height_in: float) -> Figure:
 
 def save(drawn: Figure, directory: Path, name: str) -> str:
     """Write NAME.svg, .png and .pdf; returns the SVG for a page: its colours and names its own. Raises OSError."""
-    for ending, metadata in NO_DATE.items():
-        drawn.savefig(directory / f"{name}.{ending}", dpi=160, metadata=metadata)
     buffer = io.StringIO()
-    drawn.savefig(buffer, format="svg", metadata=NO_DATE["svg"])
+    drawn.savefig(buffer, format="svg", metadata={"Date": None})
+    (directory / f"{name}.svg").write_text(buffer.getvalue(), encoding="utf-8")
+    drawn.savefig(directory / f"{name}.png", dpi=160)
+    drawn.savefig(directory / f"{name}.pdf", metadata={"CreationDate": None})
     return _inline(buffer.getvalue(), name)
 
 
@@ -81,7 +81,6 @@ def _inline(svg: str, name: str) -> str:
     """The svg element alone, coloured by the page, with ids that no other figure of the page has."""
     svg = svg[svg.index("<svg") :]
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
-    svg = re.sub(r'<svg ([^>]*?)width="[^"]*pt" height="[^"]*pt"', r"<svg \1", svg, count=1)
     svg = re.sub(r"<svg [^>]*?>", lambda m: re.sub(r' (width|height)="[^"]*"', "", m[0]), svg, count=1)
     svg = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{name}-", svg)
     for colour, variable in _VARIABLES.items():

@@ -37,7 +37,7 @@ def windows(verdicts: Sequence[WindowVerdict]) -> Figure | None:
             lane, w.stop_s - w.start_s, left=w.start_s, height=0.6, color=_colour(w), edgecolor=INK, linewidth=0.5
         )
     labels = [_short(position_name(name)) for name in lanes]
-    axes.set(yticks=range(len(lanes)), yticklabels=labels, xlabel="time in s since the first sample")
+    axes.set(yticks=range(len(lanes)), yticklabels=labels, xlabel="time in s")
     axes.set_ylim(len(lanes) - 0.4, -0.6)
     axes.set_ylabel("position" if by_position else "")
     axes.margins(x=0.02)
@@ -89,7 +89,14 @@ def budget(result: CalibrationResult) -> Figure | None:
     axes = drawn.subplots()
     left = np.zeros(12)
     for k, name in enumerate(names):
-        axes.barh(range(12), shares[k], left=left, height=0.7, color=SHADES[k % len(SHADES)], label=name)
+        axes.barh(
+            range(12),
+            np.where(result.determined, shares[k], 0.0),
+            left=left,
+            height=0.7,
+            color=SHADES[k % len(SHADES)],
+            label=name,
+        )
         left += np.nan_to_num(shares[k])
     labels = [f"${p[0]}_{{{p[1:]}}}$" for p in PARAMETERS]
     axes.set(yticks=range(12), yticklabels=labels, xlim=(0, 100), xlabel="% of the variance")

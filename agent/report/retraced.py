@@ -1,0 +1,64 @@
+"""The windows of a result of `fieldcal calibrate` point by point, from the very files that it names."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from agent.calibrate import read_files
+from agent.frontend import FrontEnd
+from agent.origin import SourceFile, source_file
+from agent.report.result import CalibrationResult, WindowVerdict
+from agent.report.trace import Trace
+from agent.tables import TableError
+
+MOST_TRACES = 24  # windows shown in numbers: the newest of as many positions
+
+
+def retrace(result: CalibrationResult, directory: Path) -> tuple[dict[str, Trace], list[str]]:
+    """Traces by position, and what hinders them. Files that were moved are looked for in `directory`, the result's."""
+    options = result.fields.get("options")
+    if not isinstance(options, dict) or not (options.get("poses") or options.get("rotation")):
+        return {}, []
+    found, hindrances = _found(result.files, directory)
+    if hindrances:
+        return {}, [f"{hindrance}: indications and residuals are not shown" for hindrance in hindrances]
+    try:
+        front = read_files(options | {name: found.get(options.get(name)) for name in ("sensor", "reference", "poses")})
+    except (TableError, click.UsageError, KeyError, TypeError, ValueError) as error:
+        return {}, [f"the files cannot be read with the options that the result names: {error}"]
+    return _traces(front, result), []
+
+
+def _found(files: tuple[SourceFile, ...], directory: Path) -> tuple[dict[Any, Path], list[str]]:
+    """Where each file is now, by the path it had, and which ones are gone or changed."""
+    found: dict[Any, Path] = {}
+    hindrances = []
+    for file in files:
+        path = next((p for p in (Path(file.path), directory / Path(file.path).name) if p.is_file()), None)
+        if path is None:
+            hindrances.append(f"{file.path} is not there any more")
+        elif source_file(path).sha256 != file.sha256:
+            hindrances.append(f"{path} has changed since the calibration")
+        else:
+            found[file.path] = path
+    return found, hindrances
+
+
+def _traces(front: FrontEnd, result: CalibrationResult) -> dict[str, Trace]:
+    """The newest used window of each position."""
+    newest: dict[str, WindowVerdict] = {}
+    for window in result.windows:
+        if window.used:
+            newest.pop(window.position, None)
+            newest[window.position] = window
+    traces = {}
+    for position, window in list(newest.items())[-MOST_TRACES:]:
+        middle_s = 0.5 * (window.start_s + window.stop_s)
+        pose = next((p.pose for p in front.poses if p.start_s <= middle_s <= p.stop_s), None)
+        points = front.points(window.start_s, window.stop_s)
+        if pose is not None and len(points.time_s) > 1:
+            traces[position] = Trace(points.time_s, points.V, points.u, points.du, pose)
+    return traces
