@@ -67,7 +67,7 @@ def _read_prior(path: Path) -> tuple[Array, Array]:
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise TableError(f"{path}: not a result of fieldcal calibrate: {error}") from None
     if values.shape != (12,) or covariance.shape != (12, 12):
-        raise TableError(f"{path}: not a result of fieldcal calibrate: S, Q or covariance of another size")
+        raise TableError(f"{path}: sensitivity must be 3 x 3, offset 3, covariance 12 x 12")
     unknown = ~(np.isfinite(values) & np.isfinite(np.diag(covariance)))
     covariance[unknown, :], covariance[:, unknown] = 0.0, 0.0
     covariance[unknown, unknown] = np.inf
