@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import sys
 
-NAMES = ("agent_cost", "recording")
+NAMES = ("agent_cost", "recording", "torture", "torture_shm")
 
 
 def main() -> int:

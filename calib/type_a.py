@@ -103,10 +103,12 @@ def _scatter(scores: list[Array], live: np.ndarray[tuple[int], np.dtype[np.bool_
     rho = gamma1 / gamma0
     if rho > RHO_COARSEN and lengths.max() >= 4:
         return _scatter([_paired(s) for s in scores], live)
+    if rho <= 1.0 / np.sqrt(freedom * live.sum()):  # within its own SD of none at all
+        return covariance, freedom
     typical = float(lengths.mean())
     naive = gamma0 - 2.0 * gamma1 / typical  # what the covariance above expects, neighbours being correlated
     inflation = max(1.0, (gamma0 + 2.0 * (1.0 - 1.0 / typical) * gamma1) / naive)
-    return covariance * inflation, freedom / (1.0 + 0.5 * inflation * (inflation > 1.0))
+    return covariance * inflation, freedom / (1.0 + 0.5 * inflation)  # rho itself is known from as little
 
 
 def _neighbours(scores: list[Array]) -> tuple[float, float]:

@@ -1,0 +1,149 @@
+"""`fieldcal calibrate` on files: the adjustment, the norm fit, priors, refusals and exit statuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from agent.calibrate import calibrate
+from hw.virtual.bench import Bench
+from hw.virtual.parameters import BenchParameters, SensorParameters
+from hw.virtual.schedule import Schedule, clamped
+from hw.virtual.spread import Spread, drawn
+from tests.clamp_windows import Q_TRUE, S_TRUE
+
+SPREAD = Spread(angle_deg=0.2, theta_deg=0.2, offset_mps2=0.05)
+STATED = [
+    "--u-alpha-common-deg",
+    "0",
+    "--u-transverse-motion-pct",
+    "0",
+    "--u-reference-pct",
+    "0",
+    "--u-gravity-mps2",
+    "0",
+]
+NOMINAL = ["--nominal", "1", "--u-nominal-pct", "20"]
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Files of an ordinary session: four alphas, twice, with a lag of 5 ms, angles and offsets drawn from SPREAD."""
+    folder = tmp_path_factory.mktemp("session")
+    stands = tuple(clamped(35.0, alpha, 4.0) for alpha in (0.0, 30.0, 120.0, 210.0))
+    sensor = SensorParameters(sensitivity=S_TRUE, offset=Q_TRUE, noise_mps2=0.02, lag_s=(0.005,) * 3)
+    parameters = BenchParameters(schedule=Schedule(stands, turn_s=1.0), sensor=sensor)
+    parameters = drawn(parameters, SPREAD, np.random.default_rng(41))
+    recording = Bench(parameters, 41).recording(parameters.schedule.duration_s(2))
+    _write(folder / "sensor.csv", "time_s,vx,vy,vz", recording.sensor_stamp_s, recording.v)
+    _write(folder / "reference.csv", "time_s,a", recording.reference_stamp_s, recording.reference)
+    lines = [f"{p.start_s},{p.stop_s},{p.theta_deg},{p.alpha_deg}" for p in recording.poses]
+    (folder / "poses.csv").write_text("\n".join(["start_s,stop_s,theta_deg,alpha_deg", *lines]) + "\n")
+    return folder
+
+
+def _write(path: Path, header: str, stamps: np.ndarray, values: np.ndarray) -> None:
+    np.savetxt(path, np.column_stack([stamps, values]), delimiter=",", header=header, comments="", fmt="%.7f")
+
+
+def _run(folder: Path, *options: str) -> Result:
+    files = ["--sensor", str(folder / "sensor.csv"), "--reference", str(folder / "reference.csv")]
+    return CliRunner().invoke(
+        calibrate, [*files, "--poses", str(folder / "poses.csv"), *options], standalone_mode=False
+    )
+
+
+def _told(result: Result) -> dict:  # type: ignore[type-arg]
+    assert result.exception is None, result.output
+    return json.loads(result.stdout)  # type: ignore[no-any-return]
+
+
+def test_truth_lies_within_the_expanded_uncertainty(session):
+    result = _run(session, *STATED, "--json", "-")
+    told = _told(result)
+    assert result.return_value == 0
+    assert told["status"] == "valid"
+    U = told["expanded_uncertainty"]
+    # All of twelve within k = 2 happens in two of three sessions; this seed was not chosen for it, 1.5 U is for all.
+    assert np.all(np.abs(np.array(told["sensitivity"]) - S_TRUE) < 1.5 * np.array(U["sensitivity"]))
+    assert np.all(np.abs(np.array(told["offset"]) - Q_TRUE) < 1.5 * np.array(U["offset"]))
+    assert told["lag_s"] == pytest.approx(0.005, abs=5e-5)
+    assert np.max(np.abs(np.array(told["sensitivity"]) - S_TRUE)) < 0.01
+    assert {"value", "standard_uncertainty", "unit"} == set(told["nuisances"]["theta"])
+    squares = sum(u["Sxx"] ** 2 for u in told["budget"].values())
+    assert np.sqrt(squares) == pytest.approx(told["standard_uncertainty"]["sensitivity"][0][0], rel=1e-6)
+
+
+def test_a_turned_static_sign_is_refused_with_status_3(session):
+    result = _run(session, *NOMINAL, "--static-sign", "-1", "--json", "-")
+    told = _told(result)
+    assert result.return_value == 3
+    assert told["status"] == "refused"
+    assert "static sign" in told["reasons"][0]
+    assert told["sensitivity"] == [[None] * 3] * 3
+
+
+def test_a_contradicted_nominal_is_refused_with_numbers(session):
+    result = _run(session, "--nominal", "2", "--u-nominal-pct", "5", "--json", "-")
+    assert result.return_value == 3
+    assert "2 with u 0.1 was expected" in _told(result)["reasons"][0]
+
+
+def test_an_earlier_result_serves_as_prior(session, tmp_path):
+    """Known to 2 % before: the session sharpens it, and says where it was contradicted where it is."""
+    first = _told(_run(session, *STATED, "--json", "-"))
+    covariance = np.array(first["covariance"]) + np.diag([4e-4] * 9 + [0.1] * 3)
+    prior = tmp_path / "prior.json"
+    prior.write_text(json.dumps({**first, "covariance": covariance.tolist()}))
+    again = _run(session, *STATED, "--prior", str(prior), "--json", "-")
+    assert again.return_value == 0
+    np.testing.assert_allclose(_told(again)["sensitivity"], first["sensitivity"], rtol=0, atol=2e-3)
+    far = np.array(first["sensitivity"]) + 0.2 * np.eye(3)
+    prior.write_text(json.dumps({**first, "sensitivity": far.tolist(), "covariance": covariance.tolist()}))
+    assert _run(session, *STATED, "--prior", str(prior)).return_value == 3
+
+
+@pytest.mark.parametrize("text", ["", "{}", '{"sensitivity": 1, "offset": 2, "covariance": 3}', "no JSON"])
+def test_a_prior_that_is_none_is_bad_input(session, tmp_path, text):
+    prior = tmp_path / "prior.json"
+    prior.write_text(text)
+    result = _run(session, "--prior", str(prior))
+    assert result.return_value == 2
+    assert result.stderr.count("\n") == 1
+    assert "prior.json" in result.stderr
+
+
+def test_rests_alone_give_a_free_frame(tmp_path):
+    """Fourteen rests of a sensor with known upper-triangular S; between them it is turned."""
+    random = np.random.default_rng(42)
+    S = np.array([[1.02, 0.01, -0.02], [0.0, 0.98, 0.005], [0.0, 0.0, 1.01]])
+    directions = random.normal(size=(14, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    parts = []
+    for before, after in zip(directions, np.roll(directions, -1, axis=0), strict=True):
+        way = np.linspace(0.0, 1.0, 100)[:, None] * (after - before) + before
+        way /= np.linalg.norm(way, axis=1, keepdims=True)
+        parts += [np.repeat(before[None], 400, axis=0), way]
+    a = 9.81 * np.concatenate(parts)
+    V = a @ S.T + Q_TRUE + 0.01 * random.normal(size=a.shape)
+    _write(tmp_path / "sensor.csv", "time_s,vx,vy,vz", np.arange(len(V)) / 100.0, V)
+    options = ["--sensor", str(tmp_path / "sensor.csv"), "--gravity", "9.81", "--json", "-"]
+    result = CliRunner().invoke(calibrate, options, standalone_mode=False)
+    told = _told(result)
+    assert result.return_value == 0
+    assert told["frame"] == "free"
+    # 400 samples of 0.01 a rest: 0.5 mm/s2 a rest, 0.02 % of S after the geometry; four of that
+    np.testing.assert_allclose(told["sensitivity"], S, rtol=0, atol=8e-4)
+    np.testing.assert_allclose(told["offset"], Q_TRUE, rtol=0, atol=3e-3)
+
+
+def test_too_few_rests_are_refused(tmp_path):
+    V = np.tile([0.0, 0.0, 9.81], (3000, 1)) + 0.01 * np.random.default_rng(43).normal(size=(3000, 3))
+    _write(tmp_path / "sensor.csv", "time_s,vx,vy,vz", np.arange(len(V)) / 100.0, V)
+    result = CliRunner().invoke(calibrate, ["--sensor", str(tmp_path / "sensor.csv")], standalone_mode=False)
+    assert result.return_value == 3
+    assert "10 rests" in result.stderr
