@@ -114,11 +114,11 @@ HOW = (
     "Theta 35°, alpha 0, 30, 120, 210°, three repetitions of six cycles at 3 Hz and "
     "10 m/s²; faults drawn anew for every recording from the priors that the adjustment is told. Root mean square "
     "error, worst axis: main / transverse sensitivity in % of 1, Q in mm/s². In brackets the 99.9 % band, Bonferroni "
-    "over the table."
+    "over the table. The bound of the clean row is Cramér-Rao's."
 )
 HEADER = (
-    "| fault in the recording | recordings | plain: main / transverse / Q | adjustment "
-    "| bound (posterior u; clean row: Cramér-Rao) | RMS over bound (band) | coverage, pooled (least–most of 12) |\n| --- | --- | --- | --- | --- | --- | --- |"
+    "| fault in the recording | recordings | plain: main / transverse / Q | adjustment | bound (posterior u) "
+    "| RMS over bound (band) | coverage, pooled (least–most of 12) |\n| --- | --- | --- | --- | --- | --- | --- |"
 )
 
 
