@@ -108,7 +108,7 @@ def read_files(options: dict[str, Any]) -> FrontEnd:
         column = "v" if reference.velocity else "a"
         raise TableError(f"{reference.path}, line 1: column {column} is no {stated}")
     poses = _poses(options, setting_of(options, reference), reference)
-    return FrontEnd(sensor, reference, poses, Options(leave_out=not options["plain"]))
+    return FrontEnd(sensor, reference, poses, Options(leave_out=not options["plain"], align=not options["plain"]))
 
 
 def setting_of(options: dict[str, Any], reference: ReferenceTable | None) -> Setting:

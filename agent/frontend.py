@@ -12,6 +12,7 @@ import numpy as np
 
 from agent.poses import PoseInterval
 from agent.tables import ReferenceTable, SensorTable, TableError
+from calib.alignment import Drift, drift
 from calib.excitation import Points, judged, motion_parts, rest_sd, rest_window
 from calib.model import Array, Pose, Window, WindowSums
 from calib.resampling import HALF, NODES, differentiate, resample
@@ -25,9 +26,11 @@ LEVEL_STRETCH_S = 3600.0  # of reference looked at in one go for where it moves;
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """How windows are made. `leave_out` False keeps every point (Method 3 as printed)."""
+    """How windows are made. Method 3 as printed: `leave_out` False keeps every point, `align` False takes both files'
+    clocks as they are."""
 
     leave_out: bool = True
+    align: bool = True
     guard_s: float = GUARD_S
     limits: Limits = DEFAULT_LIMITS
 
@@ -50,14 +53,28 @@ class FrontEnd:
         self._options = options or Options()
         self.sensor_clock = clock_from_stamps(sensor.time_s)
         self.reference_clock = None if reference is None else clock_from_stamps(reference.time_s)
+        self.drift: Drift | None = None  # of the sensor's clock against the reference's, once windows were made
         self.poses = poses
         self._check_overlap()
 
     def windows(self, lag_s: float = 0.0, progress: Callable[[float], Any] | None = None) -> list[Window]:
         """All windows in order of the poses, used or not. The sensor's indications are taken to lag by `lag_s`.
 
-        `progress` is called with the seconds of recording just done.
+        Where their clocks run apart, that is found the first time and taken out. `progress` is called with the seconds
+        of recording just done.
         """
+        found = self._made(lag_s, progress)
+        if self._options.align and self.drift is None:
+            self.drift = drift(found)
+            if self._runs_apart is not None:
+                found = self._made(lag_s, progress)
+        return found
+
+    @property
+    def _runs_apart(self) -> Drift | None:
+        return self.drift if self.drift is not None and self.drift.significant else None
+
+    def _made(self, lag_s: float, progress: Callable[[float], Any] | None) -> list[Window]:
         floor = self._rest_floor()
         windows: list[Window] = []
         for interval in self.poses:
@@ -119,6 +136,8 @@ class FrontEnd:
             nothing = np.empty((len(time_s), 0))
             return Points(time_s, np.asarray(self._sensor.v[first:stop]), nothing, nothing)
         felt_s = time_s - lag_s
+        if (apart := self._runs_apart) is not None:
+            felt_s -= apart.rate * (time_s - apart.time_s)
         m = self._reference.x.shape[1]
         if not len(time_s):
             return Points(time_s, np.empty((0, 3)), np.empty((0, m)), np.empty((0, m)))

@@ -1,0 +1,127 @@
+"""Two clocks that run apart: the drift is found from the windows, and taken out of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from agent.frontend import FrontEnd, Options
+from agent.poses import PoseInterval
+from agent.tables import ReferenceTable, SensorTable
+from calib.alignment import drift, segment_lags
+from calib.excitation import Points, motion_windows
+from calib.geometry import beside, clamp
+from calib.method3 import fit
+from calib.model import Pose, Window
+
+RATE_HZ = 500.0
+S = np.array([[1.02, 0.01, -0.02], [0.015, 0.98, 0.005], [-0.01, 0.02, 1.01]])
+CLAMPED = clamp(np.radians(35), np.radians(30))
+BESIDE = beside(np.eye(3), [0.0, 0.0, 9.81])
+
+
+def motion(t: np.ndarray, m: int, order: int = 0) -> np.ndarray:
+    """Sum of three sines a channel, 4 m/s2 each at most, or its derivative of an order."""
+    frequencies = 2 * np.pi * np.array([1.3, 2.9, 5.7])
+    phases = np.arange(3) + np.arange(m)[:, None]
+    return np.stack([(4 * w**order * np.sin(np.outer(t, w) + p + order * np.pi / 2)).sum(1)
+                     for p in phases for w in [frequencies]], axis=1)  # fmt: skip
+
+
+def windows(pose: Pose, lag_s: float, rate: float, seed: int = 1, seconds: float = 60.0) -> list[Window]:
+    m = pose.direction.shape[1]
+    t = np.arange(int(seconds * RATE_HZ)) / RATE_HZ
+    felt = t - lag_s - rate * (t - t.mean())
+    V = (motion(felt, m) @ pose.direction.T + pose.gravity_mps2) @ S.T
+    V += 0.02 * np.random.default_rng(seed).normal(size=V.shape)
+    return motion_windows(pose, Points(t, V, motion(t, m), motion(t, m, 1)))
+
+
+@pytest.mark.parametrize("pose", [CLAMPED, BESIDE], ids=["uniaxial", "tri-axial"])
+def test_lag_and_drift_are_found(pose: Pose) -> None:
+    found = drift(windows(pose, 2e-3, 30e-6))
+    assert found is not None
+    assert found.significant
+    # Third order of omega lag: 2 ms at 6 Hz leave 0.2 % of it.
+    assert found.lag_s + found.rate * (30.0 - found.time_s) == pytest.approx(2e-3, rel=5e-3)
+    assert found.rate == pytest.approx(30e-6, abs=5 * found.u_rate + 1e-7)
+
+
+def test_a_constant_lag_is_no_drift() -> None:
+    found = drift(windows(CLAMPED, 2e-3, 0.0))
+    assert found is not None
+    assert not found.significant
+    assert abs(found.rate) < 5 * found.u_rate
+
+
+def test_stated_uncertainties_are_those_of_the_scatter() -> None:
+    # 60 recordings: the ratio of scatter to stated u is within the 99.9 % band of chi with 59 degrees of freedom.
+    z_lag, z_rate = [], []
+    for seed in range(60):
+        made = windows(CLAMPED, 0.0, 0.0, seed, 10.0)
+        lags = np.concatenate([segment_lags(w) for w in made])
+        z_lag.append(lags[:, 1] / lags[:, 2])
+        found = drift(made)
+        assert found is not None
+        z_rate.append(found.rate / found.u_rate)
+    assert 0.72 < np.std(z_rate) < 1.32
+    assert 0.92 < np.std(np.concatenate(z_lag)) < 1.08  # 1200 segments
+
+
+def test_too_little_motion_tells_nothing() -> None:
+    assert drift([]) is None
+    assert drift(windows(CLAMPED, 0.0, 0.0, seconds=2.0)) is None
+
+
+def test_motion_along_one_axis_of_three_is_enough() -> None:
+    t = np.arange(5000) / RATE_HZ
+    u, du, felt = (np.pad(motion(x, 1, k), ((0, 0), (0, 2))) for x, k in ((t, 0), (t, 1), (t - 2e-3, 0)))
+    V = felt @ S.T + 0.02 * np.random.default_rng(3).normal(size=felt.shape)
+    [window] = motion_windows(BESIDE, Points(t, V, u, du))
+    lags = segment_lags(window)
+    assert len(lags) == len(window.sums.count)
+    np.testing.assert_allclose(lags[:, 1], 2e-3, atol=5 * lags[:, 2].max())
+
+
+def test_a_window_at_rest_has_no_lag() -> None:
+    [window] = windows(CLAMPED, 0.0, 0.0, seconds=10.0)
+    window.sums.scatter[:, :2, :] = 0.0
+    window.sums.scatter[:, :, :2] = 0.0
+    assert len(segment_lags(window)) == 0
+
+
+def tables(ppm: float) -> tuple[SensorTable, ReferenceTable, list[PoseInterval]]:
+    """Three minutes in three positions; the reference's stamps are a perfect grid of a clock that runs fast."""
+    rng = np.random.default_rng(5)
+    t = np.arange(int(180 * RATE_HZ)) / RATE_HZ
+    poses = [clamp(np.radians(35), np.radians(a)) for a in (0, 120, 240)]
+    parts = zip(np.split(t, 3), poses, strict=True)
+    V = np.concatenate([(motion(part, 1) @ p.direction.T + p.gravity_mps2) @ S.T + 0.1 for part, p in parts])
+    V += 0.01 * rng.normal(size=V.shape)
+    sensor = SensorTable(Path("sensor.csv"), t, V, None)
+    reference = ReferenceTable(Path("reference.csv"), t * (1 + ppm * 1e-6), motion(t, 1), False)
+    return sensor, reference, [PoseInterval(60.0 * k, 60.0 * (k + 1), p) for k, p in enumerate(poses)]
+
+
+def test_free_running_clocks_cost_nothing_once_aligned() -> None:
+    sensor, reference, poses = tables(40.0)  # 7 ms apart in the end
+    front = FrontEnd(sensor, reference, poses)
+    front.windows()
+    assert front.drift is not None
+    # The reference's stamps run ahead: the sensor's lag behind them less and less.
+    assert front.drift.rate == pytest.approx(-40e-6, abs=5e-7)
+    lag_s = front.drift.lag_s
+    aligned = fit(front.windows(lag_s))
+    as_they_are = fit(FrontEnd(sensor, reference, poses, Options(align=False)).windows(lag_s))
+    assert aligned.residual_sd.max() < 0.015 < 0.1 < as_they_are.residual_sd.max()
+    assert np.abs(aligned.calibration.sensitivity - S).max() < 5e-4
+    assert np.abs(as_they_are.calibration.sensitivity - S).max() > 1e-3
+
+
+def test_clocks_in_step_are_left_alone() -> None:
+    front = FrontEnd(*tables(0.0))
+    front.windows()
+    assert front.drift is not None
+    assert not front.drift.significant
