@@ -44,6 +44,7 @@ def test_lag_and_drift_are_found(pose: Pose) -> None:
     found = drift(windows(pose, 2e-3, 30e-6))
     assert found is not None
     assert found.significant
+    assert found.time_s == pytest.approx(30.0, abs=0.1)
     # Third order of omega lag: 2 ms at 6 Hz leave 0.2 % of it.
     assert found.lag_s + found.rate * (30.0 - found.time_s) == pytest.approx(2e-3, rel=5e-3)
     assert found.rate == pytest.approx(30e-6, abs=5 * found.u_rate + 1e-7)
@@ -66,6 +67,8 @@ def test_stated_uncertainties_are_those_of_the_scatter() -> None:
         found = drift(made)
         assert found is not None
         z_rate.append(found.rate / found.u_rate)
+        assert found.u_rate > 3e-7  # so that noise alone exceeds LEAST_RATE now and then
+        assert not found.significant
     assert 0.72 < np.std(z_rate) < 1.32
     assert 0.92 < np.std(np.concatenate(z_lag)) < 1.08  # 1200 segments
 
