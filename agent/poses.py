@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -143,6 +144,12 @@ def read_rows(path: Path) -> list[PoseRow]:
             for line, row in lines]  # fmt: skip
     if not rows:
         raise TableError(f"{path}: no poses")
+    for before, row in itertools.pairwise(sorted(rows, key=lambda row: row.start_s)):
+        if row.start_s < before.stop_s:
+            both = (
+                f"from {row.start_s:g} s the sensor stands in this pose and, until {before.stop_s:g} s, in that of line"
+            )
+            raise TableError(f"{path}, line {row.line}, column start_s: {both} {before.line}")
     return rows
 
 

@@ -173,6 +173,11 @@ def test_who_feels_gravity(tmp_path: Path) -> None:
         ("start_s,stop_s,dx,dy,dz\n0,1,1,1,0\n", UNIAXIAL, r"line 2: direction must be a unit vector"),
         ("start_s,stop_s,axis\n0,1,x\n2,3,w\n", UNIAXIAL, r"line 3: axis must be x, y or z, is 'w'"),
         ("start_s,stop_s,axis\n1,1,x\n", UNIAXIAL, r"line 2, column stop_s: 1 is not after start_s 1"),
+        (
+            "start_s,stop_s,axis\n5,9,x\n0,5.5,y\n",
+            UNIAXIAL,
+            r"line 2, column start_s: from 5 s .* until 5\.5 s, .*line 3",
+        ),
         ("start_s,stop_s,axis\n0,1\n", UNIAXIAL, r"line 2: 2 fields, the header has 3"),
         ("start_s,stop_s,axis\n0,inf,x\n", UNIAXIAL, r"line 2, column stop_s: 'inf' is not a finite number"),
         ("start_s,stop_s,axis\n", UNIAXIAL, r"no poses"),
