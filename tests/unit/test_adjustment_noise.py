@@ -65,5 +65,6 @@ def test_a_direction_with_no_more_than_the_reference_s_noise_is_not_excited():
         V = level * (a * only_x) @ S_TRUE.T + 0.002 * random.normal(size=a.shape)
         out.append(window_of(BESIDE, level * a * only_x + noise, level * da * only_x + d_noise, V, 30))
     found = adjust(loud, FREE_LAG, quiet=calm)
+    assert found.rank == 1
     assert found.calibration.determined.tolist() == [True, False, False] * 3 + [False] * 3
     np.testing.assert_allclose(found.calibration.sensitivity[:, 0], S_TRUE[:, 0], rtol=0, atol=0.02)
