@@ -35,7 +35,7 @@ def adjusted(recording: Recording, priors: Priors, velocity: bool) -> Adjustment
     for _ in range(PASSES):
         whole = without_corner(x, reference.rate_hz, applied.reference_corner_hz)
         if coupled:
-            whole = np.hstack([whole, integral(whole, reference.rate_hz)])
+            whole = np.hstack([whole, integral(x, reference.rate_hz)])
         moved = resample(whole, reference, times - applied.lag_s, margin=margin)
         windows = []
         for interval in recording.poses:

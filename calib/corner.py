@@ -2,7 +2,8 @@
 
 With the corner c in rad/s, the filter's inverse is exact: true = x + c * integral of x. A corner of 0.16 Hz costs
 0.56 % between 0.5 and 8 Hz and is no lag: it leads, and less at higher frequencies. Where a corner is to be found from
-the data, the integral goes into the windows as channels of its own behind the reference's.
+the data, the integral of what was recorded (not of what a correction made of it) goes into the windows as channels
+of its own behind the reference's: the equation stays exact, whatever was taken out before.
 """
 
 from __future__ import annotations

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from calib.adjustment import adjust
 from calib.model import Pose, Window
@@ -55,16 +56,19 @@ def test_quiet_windows_take_the_attenuation_out_and_u_says_what_is_left():
     assert 0.65 < np.sqrt(np.mean(np.square(pulls))) < 1.38
 
 
-def test_a_direction_with_no_more_than_the_reference_s_noise_is_not_excited():
+@pytest.mark.parametrize("seed", range(6))
+def test_a_direction_with_no_more_than_the_reference_s_noise_is_not_excited(seed):
     """Motion along x alone, a tri-axial reference: the noise of y and z must not pass for motion."""
-    random = np.random.default_rng(31)
+    random = np.random.default_rng([31, seed])
     (a, da), (noise, d_noise) = _band(random, 0.02), _band(random, 0.006)
     only_x = np.array([1.0, 0.0, 0.0])
     loud, calm = [], []
-    for level, out in ((1.0, loud), (0.1, calm)):
-        V = level * (a * only_x) @ S_TRUE.T + 0.002 * random.normal(size=a.shape)
-        out.append(window_of(BESIDE, level * a * only_x + noise, level * da * only_x + d_noise, V, 30))
+    half = len(a) // 2
+    for level, part, out in ((1.0, slice(0, half), loud), (0.1, slice(half, None), calm)):
+        V = level * (a[part] * only_x) @ S_TRUE.T + 0.002 * random.normal(size=a[part].shape)
+        u, du = level * a[part] * only_x + noise[part], level * da[part] * only_x + d_noise[part]
+        out.append(window_of(BESIDE, u, du, V, 30))
     found = adjust(loud, FREE_LAG, quiet=calm)
     assert found.rank == 1
     assert found.calibration.determined.tolist() == [True, False, False] * 3 + [False] * 3
-    np.testing.assert_allclose(found.calibration.sensitivity[:, 0], S_TRUE[:, 0], rtol=0, atol=0.02)
+    np.testing.assert_allclose(found.calibration.sensitivity[:, 0], S_TRUE[:, 0], rtol=0, atol=0.03)
