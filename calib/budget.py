@@ -45,9 +45,10 @@ def budget(solution: Solution, stated_offset_scatter_mps2: float) -> Budget:
         sources["slopes between windows"] = (seen.slope.scatter**2 * seen.slope.term, seen.slope.degrees_of_freedom)
     half = solution.half
     sources["prior of S and Q"] = (half[:12].T @ solution.prior_precision[:12, :12] @ half[:12], np.inf)
-    for j, term in enumerate(solution.equations.nuisances.terms, start=12):
-        before = sources.get(term.source, (np.zeros_like(half), np.inf))[0]
-        sources[term.source] = (before + np.outer(half[j], half[j]) / term.uncertainty**2, np.inf)
+    terms = solution.equations.nuisances.terms
+    for source in dict.fromkeys(t.source for t in terms):
+        own = np.array([half[12 + j] / t.uncertainty for j, t in enumerate(terms) if t.source == source])
+        sources[source] = (own.T @ own, np.inf)
     total = np.sum([middle for middle, _ in sources.values()], axis=0)
     variances = {name: _variances(half[:12], middle) for name, (middle, _) in sources.items()}
     spent = np.sum([variances[name] ** 2 / freedom for name, (_, freedom) in sources.items()], axis=0)

@@ -60,15 +60,16 @@ def condense(windows: Sequence[Window], quiet: Sequence[Window] = ()) -> Condens
     slopes = [t @ b.xv.sum(0) for t, b in zip(whiteners, blocks, strict=True)]
     mean_v = np.array([s.mean[-3:] for s in segments])
     count = np.array([s.count.sum() for s in segments])
+    omega2 = np.array([_omega2(b.xx.sum(0), channels) for b in blocks])
     return Condensed(
         channels=channels,
         root=np.array(roots),
         slopes=np.array(slopes),
         block_window=block_window,
-        omega2=np.array([_omega2(b.xx.sum(0), channels) for b in blocks]),
+        omega2=omega2,
         mean_x=np.array([s.mean[:-3] for s in segments]),
         mean_v=mean_v,
-        mean_omega2=np.array([_omega2(s.xx.sum(0), channels) for s in segments]),
+        mean_omega2=np.array([_omega2(s.xx.sum(0), channels) for s in segments]) if quiet else omega2,
         count=count,
         type_a=pooled(segments, blocks, _blocks_of(windows, block_window), roots, whiteners),
     )

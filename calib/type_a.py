@@ -116,16 +116,18 @@ def _neighbours(scores: list[Array]) -> tuple[float, float]:
 
     With K scores g and r = g - mean(g): E sum r_k^2 and E sum r_k r_{k+1} are linear in both; solved over all windows.
     """
-    matrix, observed = np.zeros((2, 2)), np.zeros(2)
-    for s in scores:
-        k = len(s)
-        if k < 3:
-            continue
-        r = s * np.sqrt(k)
-        mean_square = np.array([k, 2.0 * (k - 1)]) / k**2  # of mean(g), in terms of gamma0, gamma1
-        matrix[0] += np.array([k, 0.0]) - k * mean_square
-        matrix[1] += np.array([0.0, k - 1.0]) - (k + 1) * mean_square + np.array([2.0, 2.0]) / k
-        observed += [np.mean(np.sum(r * r, axis=0)), np.mean(np.sum(r[1:] * r[:-1], axis=0))]
+    scores = [s for s in scores if len(s) > 2]
+    k = np.array([float(len(s)) for s in scores])
+    none, mean_square = np.zeros_like(k), np.array([k, 2.0 * (k - 1.0)]) / k**2  # of mean(g), by gamma0, gamma1
+    matrix = np.array(
+        [
+            (np.array([k, none]) - k * mean_square).sum(axis=1),
+            (np.array([none, k - 1.0]) - (k + 1.0) * mean_square + 2.0 / k).sum(axis=1),
+        ]
+    )
+    own = sum(len(s) * float(np.vdot(s, s)) for s in scores)
+    next_to = sum(len(s) * float(np.vdot(s[1:], s[:-1])) for s in scores)
+    observed = np.array([own, next_to]) / max(scores[0].shape[1] if scores else 1, 1)
     if abs(np.linalg.det(matrix)) < 1e-9:
         return 0.0, 0.0
     gamma0, gamma1 = np.linalg.solve(matrix, observed)
