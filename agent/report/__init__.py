@@ -77,13 +77,20 @@ def write(material: Material, output: Path) -> None:
 
     from agent.report.figures import draw
     from agent.report.page import page
-    from agent.report.trace import residuals
 
-    seen = [residuals(trace, material.results[0]) for trace in material.traces.values()]
+    seen = left_over(material)
     figures = draw(material, seen[-1] if seen else None, output / "figures")
     (output / "report.html").write_text(page(material, figures, seen), encoding="utf-8")
     held = msgspec.json.format(msgspec.json.encode(as_object(material, seen, [drawn.name for drawn in figures])))
     (output / "report.json").write_bytes(held + b"\n")
+
+
+def left_over(material: Material) -> list[Residuals]:
+    """Residuals of the windows at hand, for the first result; none where it determines nothing."""
+    from agent.report.trace import residuals
+
+    result = material.results[0]
+    return [residuals(trace, result) for trace in material.traces.values()] if result.determined.any() else []
 
 
 def as_object(material: Material, seen: list[Residuals], figures: list[str]) -> dict[str, Any]:

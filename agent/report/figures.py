@@ -44,10 +44,11 @@ def _figures(material: Material, shown: Residuals | None) -> Iterator[tuple[str,
     caption = "Transverse sensitivities in percent of the main one of their row, with expanded uncertainties."
     yield "transverse", caption, diagrams.transverse_sensitivities(results)
     if shown is not None:
+        model = f" of {results[0].label}" if len(results) > 1 else ""
         where = f"position {shown.position}, {shown.time_s[0]:.1f} to {shown.time_s[-1]:.1f} s"
-        caption = f"Indications (points) against S a + Q (line): some cycles of the window in {where}."
+        caption = f"Indications (points) against S a + Q{model} (line): some cycles of the window in {where}."
         yield "indications", caption, signals.indications(shown, unit)
-        caption = f"What S a + Q leaves of the indications, window in {where}."
+        caption = f"What S a + Q{model} leaves of the indications, window in {where}."
         if results[0].fields.get("nuisances"):
             caption += " Poses are taken as stated: what the adjustment gives to the nuisances is still in it."
         if shown.frequency_hz:

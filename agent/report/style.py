@@ -69,6 +69,8 @@ def figure(height_in: float) -> Figure:
 
 def save(drawn: Figure, directory: Path, name: str) -> str:
     """Write NAME.svg, .png and .pdf; returns the SVG for a page: its colours and names its own. Raises OSError."""
+    drawn.draw_without_rendering()
+    drawn.set_layout_engine("none")  # laid out once, not again for each format
     buffer = io.StringIO()
     drawn.savefig(buffer, format="svg", metadata={"Date": None})
     (directory / f"{name}.svg").write_text(buffer.getvalue(), encoding="utf-8")

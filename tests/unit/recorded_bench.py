@@ -1,0 +1,91 @@
+"""A run of the virtual bench as an agent records it, without ports and faster than real time."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from agent.config import Config, parse_config
+from agent.events import DeviceChange, Event, Result, RunStart, Tick
+from agent.fingerprint import fingerprint, versions
+from agent.history import Record
+from agent.pipeline import Pipeline
+from agent.recording import Recorder
+from agent.store import Store
+from hw.block import DeviceInfo, SampleBlock
+from hw.virtual.bench import Bench, Truth
+from hw.virtual.presets import plain
+
+EPOCH_NS = 1_790_000_000_000_000_000
+BLOCK, BURST = 500, 25
+
+
+def record(data_dir: Path, duration_s: float, seed: int = 7) -> Truth:
+    """Record the plain preset's first `duration_s` into a data directory with store and one recording."""
+    data_dir.mkdir(parents=True, exist_ok=True)
+    bench = Bench(plain(seed), seed)
+    config = _config(bench)
+    pipeline = Pipeline.begin(config, "run-1", 0, 0, {})
+    recorder, store = Recorder(data_dir, ["mems", "reference"], ["mems"]), Store(data_dir, 0)
+    start = RunStart(
+        run_id="run-1", site="virtual", gateway="bench", boot_id="boot", t_monotonic_ns=0, t_utc_ns=EPOCH_NS,
+        config_json=config.model_dump_json(), versions={"fieldcal": "0.1.0", **versions()}, fingerprint=fingerprint(),
+        snapshot=pipeline.snapshot(), file_sequence=1, event_sequence=0,
+    )  # fmt: skip
+    recorder.record(0, start, [])
+    assert recorder.path is not None
+    name = recorder.path.name.removesuffix(".active")
+    for number, event in enumerate(_events(bench, duration_s), start=1):
+        results: list[Result] = pipeline.step(event)
+        assert recorder.record(number, event, results)
+        store.commit([Record.of(result, recorded=True, recording=name) for result in results])
+    recorder.close()
+    store.close()
+    return bench.truth
+
+
+def _config(bench: Bench) -> Config:
+    poses = [
+        {"start_s": p.start_s, "stop_s": p.stop_s, "theta_deg": p.theta_deg, "alpha_deg": p.alpha_deg}
+        for p in bench.poses
+    ]
+    port = {"port": "/dev/null", "rate_hz": 1000.0, "unit": "count"}
+    raw = {
+        "gateway": {"site": "virtual", "name": "bench"},
+        "devices": [
+            {"name": "mems", "driver": "serial-csv", "options": port | {"axes": 3}},
+            {"name": "reference", "driver": "serial-csv", "options": port | {"axes": 1, "unit": "m/s2"}},
+        ],
+        "channels": [{"sensor": "mems", "reference": "reference", "poses": poses}],
+        "zenoh": {"enabled": False},
+    }
+    return parse_config(raw, "bench")
+
+
+def _events(bench: Bench, duration_s: float) -> Iterator[Event]:
+    """Openings, then the blocks of both devices and the ticks in order of time."""
+    recording = bench.recording(duration_s)
+    for device, axes, unit in (("mems", 3, "count"), ("reference", 1, "m/s2")):
+        info = DeviceInfo("serial-csv", "virtual", f"{device}-1", unit, axes, 1000.0)  # type: ignore[arg-type]
+        held = json.dumps(msgspec.to_builtins(info))
+        yield DeviceChange(device=device, state="open", t_monotonic_ns=0, t_utc_ns=EPOCH_NS, info_json=held)
+    events: list[Event] = [
+        *_blocks("mems", recording.sensor_time_s, recording.v),
+        *_blocks("reference", recording.reference_time_s, recording.reference),
+        *(Tick(t_monotonic_ns=s * 10**9, t_utc_ns=EPOCH_NS + s * 10**9) for s in range(1, int(duration_s))),
+    ]
+    yield from sorted(events, key=lambda event: event.t_monotonic_ns)
+
+
+def _blocks(device: str, time_s: np.ndarray, values: np.ndarray) -> Iterator[SampleBlock]:
+    for first in range(0, len(time_s) - BLOCK + 1, BLOCK):
+        count = np.arange(BURST, BLOCK + 1, BURST, dtype=np.int32)
+        arrival_ns = np.round(time_s[first + count - 1] * 1e9).astype(np.int64)
+        yield SampleBlock(
+            device, "boot", EPOCH_NS + int(arrival_ns[-1]), first, 1000.0, arrival_ns, count,
+            np.ascontiguousarray(values[first : first + BLOCK], dtype=np.float64),
+        )  # fmt: skip
