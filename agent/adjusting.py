@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,7 @@ LEAST_QUIET_S = 5.0  # of calm a position, else its power is known worse than it
 
 def adjusted(front: FrontEnd, priors: Priors) -> Outcome:
     """Solve, take out the lag that was found, repeat until what is left of it is nothing."""
-    applied = Applied()
+    applied = Applied(0.0, priors.reference_corner_at_hz, priors.sensor_corner_at_hz)
     for _ in range(PASSES):
         windows = front.windows(applied.lag_s)
         used = [w for w in windows if w.used]
@@ -40,7 +41,7 @@ def adjusted(front: FrontEnd, priors: Priors) -> Outcome:
         left = _lag(found) - applied.lag_s
         if abs(_omega(used) * left) ** 3 / 6.0 < PHASE_LEFT:
             break
-        applied = Applied(lag_s=_lag(found))
+        applied = replace(applied, lag_s=_lag(found))
     return _outcome(found, windows, front.sensor_clock.rate_hz)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from agent.adjusting import adjusted, norm_fitted
 from agent.amplitude_methods import by_amplitudes
+from agent.corners import has_corner, uncoupled
 from agent.frontend import FrontEnd, Options
 from agent.origin import origin
 from agent.outcome import Outcome, as_json, print_outcome
@@ -21,6 +22,7 @@ from agent.priors import priors_of
 from agent.tables import ReferenceTable, TableError, read_reference, read_sensor
 from calib.geometry import STANDARD_GRAVITY_MPS2
 from calib.method3 import fit, refusal
+from calib.nuisances import Priors
 
 BAR_FROM_BYTES = 30_000_000  # shorter files are read before a bar could be of use
 COVERAGE_FACTOR = 2.0  # of plain Method 3: thousands of points, as the paper has it
@@ -51,6 +53,10 @@ _U = click.FloatRange(0)
     show_default=True,
     help="u of motion across a uniaxial reference.",
 )
+@click.option("--reference-corner-hz", type=_U, default=0.0, show_default=True, help="Of an AC-coupled reference.")
+@click.option("--u-reference-corner-hz", type=_U, default=0.0, show_default=True, help="Its standard uncertainty.")
+@click.option("--sensor-corner-hz", type=_U, default=0.0, show_default=True, help="Of an AC-coupled sensor.")
+@click.option("--u-sensor-corner-hz", type=_U, default=0.0, show_default=True, help="Its standard uncertainty.")
 @click.option("--u-tilt-deg", type=_U, default=0.0, show_default=True, help="u of the mount's tilt.")
 @click.option("--rotation", metavar="R11,...,R33", help="Of a tri-axial reference: a = R a_ref.")
 @click.option("--u-rotation-deg", type=_U, default=0.2, show_default=True, help="u of the rotation, about each axis.")
@@ -90,14 +96,16 @@ def calibrated(options: dict[str, Any]) -> Outcome:
     _check(options)
     if not options["reference"] and not options["poses"] and not options["plain"]:
         return norm_fitted(read_sensor(options["sensor"]), options)
-    front = read_files(options)
     if options["method"] != "3":
-        return by_amplitudes(front, options)
-    return _plain(front) if options["plain"] else adjusted(front, priors_of(options))
+        return by_amplitudes(read_files(options), options)
+    if options["plain"]:
+        return _plain(read_files(options))
+    priors = priors_of(options)
+    return adjusted(read_files(options, priors), priors)
 
 
-def read_files(options: dict[str, Any]) -> FrontEnd:
-    """Tables, clocks and poses of the files named. Raises TableError."""
+def read_files(options: dict[str, Any], priors: Priors | None = None) -> FrontEnd:
+    """Tables, clocks and poses of the files named; corners undone as `priors` state them. Raises TableError."""
     paths = [options[name] for name in ("sensor", "reference") if options[name]]
     size = sum(path.stat().st_size for path in paths if path.is_file())
     with _bar("reading", size if size > BAR_FROM_BYTES else 0) as bar:
@@ -108,6 +116,8 @@ def read_files(options: dict[str, Any]) -> FrontEnd:
         column = "v" if reference.velocity else "a"
         raise TableError(f"{reference.path}, line 1: column {column} is no {stated}")
     poses = _poses(options, setting_of(options, reference), reference)
+    if priors is not None and reference is not None and has_corner(priors):
+        sensor, reference, poses = uncoupled(sensor, reference, poses, priors)
     return FrontEnd(sensor, reference, poses, Options(leave_out=not options["plain"], align=not options["plain"]))
 
 

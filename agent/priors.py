@@ -32,6 +32,10 @@ def priors_of(options: dict[str, Any]) -> Priors:
         tilt_rad=float(np.deg2rad(options["u_tilt_deg"])),
         rotation_rad=float(np.deg2rad(options["u_rotation_deg"])),
         gravity_mps2=u_gravity_mps2(options),
+        reference_corner_hz=options["u_reference_corner_hz"],
+        reference_corner_at_hz=options["reference_corner_hz"],
+        sensor_corner_hz=options["u_sensor_corner_hz"],
+        sensor_corner_at_hz=options["sensor_corner_hz"],
         parameters=parameters,
         covariance=covariance,
     )

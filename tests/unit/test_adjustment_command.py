@@ -1,4 +1,4 @@
-"""`fieldcal calibrate` on files: the adjustment, the norm fit, priors, refusals and exit statuses."""
+"""`fieldcal calibrate` on files: the adjustment, the norm fit, an AC corner, refusals and exit statuses."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ import pytest
 from click.testing import CliRunner, Result
 
 from agent.calibrate import calibrate
-from hw.virtual.bench import Bench
-from hw.virtual.parameters import BenchParameters, SensorParameters
+from hw.virtual.bench import Bench, Recording
+from hw.virtual.motion import multisine
+from hw.virtual.parameters import BenchParameters, ReferenceParameters, SensorParameters
 from hw.virtual.schedule import Schedule, clamped
 from hw.virtual.spread import Spread, drawn
 from tests.clamp_windows import Q_TRUE, S_TRUE
@@ -27,7 +28,6 @@ STATED = [
     "--u-gravity-mps2",
     "0",
 ]
-NOMINAL = ["--nominal", "1", "--u-nominal-pct", "20"]
 
 
 @pytest.fixture(scope="module")
@@ -38,12 +38,15 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     sensor = SensorParameters(sensitivity=S_TRUE, offset=Q_TRUE, noise_mps2=0.02, lag_s=(0.005,) * 3)
     parameters = BenchParameters(schedule=Schedule(stands, turn_s=1.0), sensor=sensor)
     parameters = drawn(parameters, SPREAD, np.random.default_rng(41))
-    recording = Bench(parameters, 41).recording(parameters.schedule.duration_s(2))
+    _files(folder, Bench(parameters, 41).recording(parameters.schedule.duration_s(2)))
+    return folder
+
+
+def _files(folder: Path, recording: Recording) -> None:
     _write(folder / "sensor.csv", "time_s,vx,vy,vz", recording.sensor_stamp_s, recording.v)
     _write(folder / "reference.csv", "time_s,a", recording.reference_stamp_s, recording.reference)
     lines = [f"{p.start_s},{p.stop_s},{p.theta_deg},{p.alpha_deg}" for p in recording.poses]
     (folder / "poses.csv").write_text("\n".join(["start_s,stop_s,theta_deg,alpha_deg", *lines]) + "\n")
-    return folder
 
 
 def _write(path: Path, header: str, stamps: np.ndarray, values: np.ndarray) -> None:
@@ -78,43 +81,23 @@ def test_truth_lies_within_the_expanded_uncertainty(session):
     assert np.sqrt(squares) == pytest.approx(told["standard_uncertainty"]["sensitivity"][0][0], rel=1e-6)
 
 
-def test_a_turned_static_sign_is_refused_with_status_3(session):
-    result = _run(session, *NOMINAL, "--static-sign", "-1", "--json", "-")
-    told = _told(result)
-    assert result.return_value == 3
-    assert told["status"] == "refused"
-    assert "static sign" in told["reasons"][0]
-    assert told["sensitivity"] == [[None] * 3] * 3
-
-
-def test_a_contradicted_nominal_is_refused_with_numbers(session):
-    result = _run(session, "--nominal", "2", "--u-nominal-pct", "5", "--json", "-")
-    assert result.return_value == 3
-    assert "2 with u 0.1 was expected" in _told(result)["reasons"][0]
-
-
-def test_an_earlier_result_serves_as_prior(session, tmp_path):
-    """Known to 2 % before: the session sharpens it, and says where it was contradicted where it is."""
-    first = _told(_run(session, *STATED, "--json", "-"))
-    covariance = np.array(first["covariance"]) + np.diag([4e-4] * 9 + [0.1] * 3)
-    prior = tmp_path / "prior.json"
-    prior.write_text(json.dumps({**first, "covariance": covariance.tolist()}))
-    again = _run(session, *STATED, "--prior", str(prior), "--json", "-")
-    assert again.return_value == 0
-    np.testing.assert_allclose(_told(again)["sensitivity"], first["sensitivity"], rtol=0, atol=2e-3)
-    far = np.array(first["sensitivity"]) + 0.2 * np.eye(3)
-    prior.write_text(json.dumps({**first, "sensitivity": far.tolist(), "covariance": covariance.tolist()}))
-    assert _run(session, *STATED, "--prior", str(prior)).return_value == 3
-
-
-@pytest.mark.parametrize("text", ["", "{}", '{"sensitivity": 1, "offset": 2, "covariance": 3}', "no JSON"])
-def test_a_prior_that_is_none_is_bad_input(session, tmp_path, text):
-    prior = tmp_path / "prior.json"
-    prior.write_text(text)
-    result = _run(session, "--prior", str(prior))
-    assert result.return_value == 2
-    assert result.stderr.count("\n") == 1
-    assert "prior.json" in result.stderr
+def test_a_reference_that_is_ac_coupled_gives_its_corner(tmp_path):
+    """Stated at 0.16 Hz within 0.03, truly 0.13: found to 2 mHz, and S is right to 0.1 % though 0.5 Hz is in it."""
+    stands = tuple(clamped(35.0, alpha, 8.0) for alpha in (0.0, 30.0, 120.0, 210.0))
+    parameters = BenchParameters(
+        schedule=Schedule(stands, turn_s=1.0),
+        motion=multisine(np.random.default_rng(44), 0.5, 8.0, lines=8, peak_mps2=10.0),
+        sensor=SensorParameters(sensitivity=S_TRUE, offset=Q_TRUE, noise_mps2=0.02),
+        reference=ReferenceParameters(highpass_hz=0.13),
+    )
+    _files(tmp_path, Bench(parameters, 44).recording(parameters.schedule.duration_s(1)))
+    exact = ["--u-angle-deg", "0", "--u-theta-deg", "0", *STATED]
+    told = _told(
+        _run(tmp_path, *exact, "--reference-corner-hz", "0.16", "--u-reference-corner-hz", "0.03", "--json", "-")
+    )
+    assert told["status"] == "valid"
+    assert told["nuisances"]["reference_corner"]["value"] == pytest.approx(0.13, abs=2e-3)
+    np.testing.assert_allclose(told["sensitivity"], S_TRUE, rtol=0, atol=1e-3)
 
 
 def test_rests_alone_give_a_free_frame(tmp_path):
