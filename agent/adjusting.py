@@ -80,6 +80,7 @@ def _outcome(found: Adjustment, windows: Sequence[Window], rate_hz: float) -> Ou
             "chi2_degrees_of_freedom": found.chi2_degrees_of_freedom,
             "offset_scatter_mps2": found.offset_scatter_mps2,
             "slope_scatter": found.slope_scatter,
+            "lag_scatter_s": found.lag_scatter_s,
             "misfit": found.misfit,
             "invariant": found.invariant,
         },

@@ -16,12 +16,15 @@ from calib.budget import Budget, budget
 from calib.condense import Condensed, condense
 from calib.distributions import coverage_factor
 from calib.equations import Equations
-from calib.gauss_newton import Flags, Solution, solve
+from calib.gauss_newton import Flags, Solution, slope_residuals, solve
+from calib.jitter import LagScatter, estimated
 from calib.model import Array, Calibration, Pose, Window
 from calib.nuisances import Applied, Nuisances, Priors
 from calib.verdict import misfit, reasons, turned_windows
 
 DETERMINED_SHARE = 0.5  # of the prior u, which the data must halve (contract)
+JITTER_TURNS = 3  # the first solution is bent by what it takes for exact; the estimate settles in two
+JITTER_SETTLED = 0.05
 DETERMINED_U = 0.1  # of the largest main sensitivity, where there is no prior (contract)
 
 
@@ -42,8 +45,8 @@ class Adjustment:
 
     `calibration` has NaN where the data do not determine a parameter. `contributions` {source: (12,) standard
     uncertainties} is the budget. `reasons`: why it is refused, empty if it is not. `rank` of the input vectors, 4 at
-    most. `offset_scatter_mps2` and `slope_scatter` (relative): between windows, as estimated. `misfit`: what S a + Q
-    leaves of the signal. `mean` (N,) and `covariance` (N, N): joint state of [S, Q, nuisances], nothing blanked.
+    most. `offset_scatter_mps2`, `slope_scatter` (relative) and `lag_scatter_s`: between windows, as estimated.
+    `misfit`: what S a + Q leaves of the signal. `mean` (N,) and `covariance` (N, N): joint state of [S, Q, nuisances], nothing blanked.
     """
 
     calibration: Calibration
@@ -56,6 +59,7 @@ class Adjustment:
     chi2_degrees_of_freedom: float
     offset_scatter_mps2: float
     slope_scatter: float
+    lag_scatter_s: float
     misfit: float
     mean: Array
     covariance: Array
@@ -86,12 +90,19 @@ def adjust(
     if not used:
         raise ValueError("no window is used")
     data = condense(used, quiet)
-    solution = _solution(used, data, priors, applied)
+    jitter = LagScatter.of(data, priors.lag_window_s)
+    solution = _solution(used, data, priors, applied, jitter)
+    for _ in range(JITTER_TURNS if priors.lag_s > 0.0 else 0):
+        found = estimated(jitter, *slope_residuals(solution), data.type_a.slopes)
+        if found.scatter_s <= (1.0 + JITTER_SETTLED) * jitter.scatter_s:
+            break
+        jitter = found
+        solution = _solution(used, data, priors, applied, jitter)
     shares = budget(solution, priors.offset_mps2)
     determined = _determined(solution, shares)
 
     def turned(static: int, polarity: int) -> Solution:
-        return _solution(turned_windows(used, static, polarity), data, priors, applied)
+        return _solution(turned_windows(used, static, polarity), data, priors, applied, jitter)
 
     return Adjustment(
         calibration=_calibration(solution, shares, determined),
@@ -104,13 +115,16 @@ def adjust(
         chi2_degrees_of_freedom=shares.consistency[1],
         offset_scatter_mps2=shares.offset_scatter_mps2,
         slope_scatter=shares.slope_scatter,
+        lag_scatter_s=jitter.scatter_s,
         misfit=misfit(solution),
         mean=solution.x,
         covariance=shares.covariance,
     )
 
 
-def _solution(windows: Sequence[Window], data: Condensed, priors: Priors, applied: Applied) -> Solution:
+def _solution(
+    windows: Sequence[Window], data: Condensed, priors: Priors, applied: Applied, jitter: LagScatter
+) -> Solution:
     poses: list[Pose] = []
     index: dict[tuple[str, bytes, bytes], int] = {}
     pose_of = []
@@ -122,7 +136,7 @@ def _solution(windows: Sequence[Window], data: Condensed, priors: Priors, applie
             poses.append(pose)
         pose_of.append(index[key])
     nuisances = Nuisances(poses, data.channels, priors, applied)
-    return solve(Equations(data, nuisances, pose_of, priors.offset_mps2), priors)
+    return solve(Equations(data, nuisances, pose_of, priors.offset_mps2, jitter), priors)
 
 
 def _determined(solution: Solution, shares: Budget) -> Flags:

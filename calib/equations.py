@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.condense import Condensed
+from calib.jitter import LagScatter
 from calib.model import Array
 from calib.nuisances import Inputs, Nuisances
 
@@ -49,9 +50,11 @@ class Rows:
 class Equations:
     """Condensed windows, the pose of each, and the weights: the functions that Gauss-Newton needs."""
 
-    def __init__(self, data: Condensed, nuisances: Nuisances, pose_of: list[int], offset_scatter_mps2: float) -> None:
-        """`pose_of` (W,) the nuisances' pose of a window; `offset_scatter_mps2` between windows, as stated."""
-        self.data, self.nuisances = data, nuisances
+    def __init__(
+        self, data: Condensed, nuisances: Nuisances, pose_of: list[int], offset_scatter_mps2: float, jitter: LagScatter
+    ) -> None:
+        """`pose_of` (W,) the nuisances' pose of a window; `offset_scatter_mps2` and `jitter` between windows."""
+        self.data, self.nuisances, self.jitter = data, nuisances, jitter
         self.pose_of_window = np.array(pose_of)
         self.pose_of_block = self.pose_of_window[data.block_window]
         known = np.isfinite(nuisances.gravity).all(axis=1)[self.pose_of_window]
@@ -144,7 +147,12 @@ class Equations:
             jacobian[:, :, i, 3 * i : 3 * i + 3] = np.einsum("brc,bkc->brk", data.root, per_row[:, i])
         jacobian[..., 12:] = np.einsum("brc,bicj->brij", data.root, d_z)
         noise = data.type_a.noise
-        return residual / noise, jacobian / noise[:, None]
+        return self._whitened(residual / noise), self._whitened(jacobian / noise[:, None])
+
+    def _whitened(self, slopes: Array) -> Array:
+        """Rows (B, 2M, 3, ...) with the scatter of the lag between windows taken into their weight."""
+        flat = slopes.reshape(len(slopes), -1, *slopes.shape[3:])
+        return self.jitter.whiten(flat).reshape(slopes.shape)
 
     def _means(self, S: Array, Q: Array, z: Array, inputs: Inputs) -> tuple[Array, Array]:
         data, nuisances, m = self.data, self.nuisances, self.data.channels

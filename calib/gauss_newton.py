@@ -73,6 +73,13 @@ def solve(equations: Equations, priors: Priors) -> Solution:
     return Solution(equations, x, half, residual, jacobian @ half, mean, precision, bounded)
 
 
+def slope_residuals(solution: Solution) -> tuple[Array, Array]:
+    """Whitened residuals (B, 6M) of the slopes and their rows (B, 6M, N) of J half."""
+    residual, _ = solution.equations.split(solution.residual)
+    rows, _ = solution.equations.split(solution.jacobian)
+    return residual.reshape(len(residual), -1), rows.reshape(len(rows), -1, rows.shape[-1])
+
+
 def _stacked(equations: Equations, x: Array, mean: Array, scale: Array, root: Array) -> tuple[Array, Array]:
     """Residuals and scaled Jacobian of the window equations and of the priors below them."""
     residual, jacobian = equations.at(x).stacked()

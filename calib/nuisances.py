@@ -31,7 +31,8 @@ class Priors:
     `angle` by position (alpha, or a stated direction), `theta` and `alpha_common` of the clamp in all positions,
     `theta_position` by position, `offset` between windows, `offset_position` between positions, `reference` relative
     per channel, `transverse` motion relative to the one measured, `tilt` of gravity against the motion, `rotation` of
-    a tri-axial reference about each axis, `lag` common and `lag_axis` between axes, corner frequencies of an
+    a tri-axial reference about each axis, `lag` common, `lag_axis` between axes and
+    `lag_window` between windows, corner frequencies of an
     AC-coupled reference or sensor (first order; seen where the windows carry the integral too, see calib.corner).
     `parameters` (12,) and `covariance` (12, 12): what was known of S, Q in the order of calib.model.PARAMETERS, inf on
     the diagonal where nothing was.
@@ -50,6 +51,7 @@ class Priors:
     gravity_mps2: float = 0.03
     lag_s: float = 0.02  # a sensor's own low-pass filter and what a clock fit leaves: 0.5 to 15 ms are seen
     lag_axis_s: float = 2e-4  # axes share filter and clock; multiplexed converters differ by 0.1 ms
+    lag_window_s: float = 0.0  # between windows: what clock models leave, if it is more than the data show
     reference_corner_hz: float = 0.0
     sensor_corner_hz: float = 0.0
     reference_corner_at_hz: float = 0.0  # where the corner is expected, 0 for an instrument that feels constants
@@ -60,7 +62,7 @@ class Priors:
     @classmethod
     def none(cls) -> Priors:
         """Every nuisance fixed: the adjustment is then plain Method 3."""
-        return cls(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        return cls(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,100 @@
+"""Lag that differs between windows: with it in the weights S and Q are as uncertain as they are said to be."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib import adjustment
+from calib.adjustment import Adjustment, adjust
+from calib.distributions import chi2_quantile
+from calib.geometry import clamp
+from calib.model import Array, Window
+from calib.nuisances import Priors
+from calib.sums import window_sums
+
+RATE_HZ, SECONDS, NOISE = 200.0, 8.0, 0.01
+FREQUENCIES_HZ = np.array([1.3, 2.9, 4.7, 7.1])
+S_TRUE = np.array([[1.02, 0.01, -0.02], [0.015, 0.98, 0.005], [-0.01, 0.02, 1.01]])
+Q_TRUE = np.array([0.3, -0.1, 0.2])
+DRAWS, SEED = 30, 35
+# Angles are drawn with these, and little else is uncertain: what a wrong weight costs then shows.
+PRIORS = Priors(
+    angle_rad=2e-3,
+    theta_rad=2e-3,
+    alpha_common_rad=0.0,
+    offset_mps2=0.0,
+    reference=0.0,
+    transverse=5e-3,
+    gravity_mps2=0.0,
+)
+
+
+def windows(rng: np.random.Generator, jitter_s: float) -> list[Window]:
+    """Three turns round four positions; angles and sideways motion drawn once, the lag anew for each window."""
+    theta_error, sideways = 2e-3 * rng.normal(), 5e-3 * rng.normal(size=2)
+    alpha_errors = 2e-3 * rng.normal(size=4)
+    t = np.arange(int(RATE_HZ * SECONDS)) / RATE_HZ
+    found = []
+    for turn in range(3):
+        for p, alpha in enumerate(np.deg2rad([0.0, 30.0, 120.0, 210.0])):
+            stated = clamp(np.deg2rad(35.0), alpha)
+            true = clamp(np.deg2rad(35.0) + theta_error, alpha + alpha_errors[p])
+            phase = rng.uniform(0.0, 2.0 * np.pi, len(FREQUENCIES_HZ))
+            u, du = motion(t, phase)
+            felt, _ = motion(t - 5e-3 - jitter_s * rng.normal(), phase)
+            normal = np.cross(true.gravity_mps2, true.direction[:, 0])
+            lateral = normal / np.linalg.norm(normal)
+            vertical = true.gravity_mps2 / np.linalg.norm(true.gravity_mps2)
+            way = true.direction[:, 0] + sideways[0] * lateral + sideways[1] * vertical
+            a = felt[:, None] * way + true.gravity_mps2
+            V = a @ S_TRUE.T + Q_TRUE + NOISE * rng.normal(size=(len(t), 3))
+            sums = window_sums(u[:, None], du[:, None], V, np.arange(0, len(t) + 1, 200))
+            found.append(
+                Window(turn * 40.0 + p * 10.0, turn * 40.0 + p * 10.0 + 8.0, stated, sums, True, "", len(t), 0)
+            )
+    return found
+
+
+def motion(t: Array, phase: Array) -> tuple[Array, Array]:
+    omega = 2.0 * np.pi * FREQUENCIES_HZ
+    angle = omega * t[:, None] + phase
+    return np.asarray(2.0 * np.sin(angle).sum(axis=1)), np.asarray(2.0 * (omega * np.cos(angle)).sum(axis=1))
+
+
+def errors_over_u(found: Adjustment) -> Array:
+    calibration = found.calibration
+    error = np.concatenate([(calibration.sensitivity - S_TRUE).ravel(), calibration.offset - Q_TRUE])
+    return np.asarray(error / calibration.standard_uncertainty)
+
+
+def mean_square(jitter_s: float) -> Array:
+    rng = np.random.default_rng(SEED)
+    return np.asarray(
+        np.mean([errors_over_u(adjust(windows(rng, jitter_s), PRIORS)) ** 2 for _ in range(DRAWS)], axis=0)
+    )
+
+
+@pytest.mark.parametrize("jitter_s", [0.0, 20e-6, 100e-6])
+def test_s_and_q_are_as_uncertain_as_said(jitter_s: float) -> None:
+    highest = chi2_quantile(1.0 - 1e-3 / 12 / 3, DRAWS) / DRAWS  # 99.9 %, Bonferroni over 12 parameters and 3 sizes
+    assert mean_square(jitter_s).max() < highest
+
+
+def test_weighed_as_exact_they_would_not_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(adjustment, "JITTER_TURNS", 0)
+    assert mean_square(100e-6).max() > 4.0
+
+
+def test_the_scatter_found_is_that_put_in() -> None:
+    rng = np.random.default_rng(SEED)
+    found = [adjust(windows(rng, 100e-6), PRIORS).lag_scatter_s for _ in range(DRAWS)]
+    assert np.median(found) == pytest.approx(100e-6, rel=0.2)
+    assert adjust(windows(rng, 0.0), PRIORS).lag_scatter_s < 10e-6
+
+
+def test_a_stated_scatter_that_is_larger_counts() -> None:
+    priors = Priors(lag_window_s=3e-4)
+    found = adjust(windows(np.random.default_rng(SEED), 20e-6), priors)
+    assert found.lag_scatter_s == 3e-4
+    assert found.contributions["lag between windows"].max() > 0.0
