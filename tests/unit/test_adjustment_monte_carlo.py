@@ -16,9 +16,9 @@ from tests.clamp_windows import ALPHAS_DEG, G_MPS2, Q_TRUE, S_TRUE, Faults, clam
 
 DEGREE = np.deg2rad(1.0)
 U_ANGLE, U_THETA, U_OFFSET, U_LAG, U_G, NOISE = 0.2 * DEGREE, 0.2 * DEGREE, 0.05, 0.02, 0.03, 0.01
-CYCLES, RATE_HZ, FREQUENCY_HZ, REPETITIONS = 12, 30.0, 3.0, 1
+CYCLES, RATE_HZ, FREQUENCY_HZ, REPETITIONS = 8, 30.0, 3.0, 1
 POSITIONS = len(ALPHAS_DEG)
-TRIALS = 150
+TRIALS = 100
 PRIOR_U = np.concatenate([[U_THETA, U_LAG, U_G], np.full(POSITIONS, U_ANGLE), np.full(3 * POSITIONS, U_OFFSET)])
 
 
@@ -56,11 +56,11 @@ def test_the_stated_covariance_is_that_of_trials():
         scale = np.concatenate([np.full(12, 1e-2), PRIOR_U])
         trials.append(optimize.least_squares(residual, start, x_scale=scale, method="lm").x[:12])
     sd = np.std(trials, axis=0, ddof=1)
-    # 99.9 % chi-squared band of an SD over 150 trials, Bonferroni over 12: +-24 %. S_zx and S_zy are all type A, known
-    # from 44 degrees of freedom to 11 %; the others hardly have any.
+    # 99.9 % chi-squared band of an SD over 100 trials, Bonferroni over 12: +-30 %. S_zx and S_zy are all type A, known
+    # from 28 degrees of freedom to 13 %; the others hardly have any.
     ratio = sd / stated.calibration.standard_uncertainty
-    assert np.all((ratio > 0.76) & (ratio < 1.24)), ratio
+    assert np.all((ratio > 0.70) & (ratio < 1.30)), ratio
     correlation = np.corrcoef(np.array(trials).T)
     u = stated.calibration.standard_uncertainty
-    # The SD of a correlation coefficient near zero over 150 trials is 0.08: 4.5 of them over 66 pairs.
-    np.testing.assert_allclose(correlation, stated.calibration.covariance / np.outer(u, u), rtol=0, atol=0.37)
+    # The SD of a correlation coefficient near zero over 100 trials is 0.1: four of them over 66 pairs.
+    np.testing.assert_allclose(correlation, stated.calibration.covariance / np.outer(u, u), rtol=0, atol=0.40)
