@@ -1,0 +1,83 @@
+"""The norm fit: its uncertainty against trials, gravity's own uncertainty, and rests that leave parameters open."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib.geometry import at_rest
+from calib.model import Window, WindowSums
+from calib.norm_fit import norm_fit
+from tests.clamp_windows import Q_TRUE
+
+G_MPS2 = 9.81
+S_UPPER = np.array([[1.02, 0.01, -0.02], [0.0, 0.98, 0.005], [0.0, 0.0, 1.01]])
+UPPER = [0, 1, 2, 4, 5, 8, 9, 10, 11]
+
+
+def _rests(random: np.random.Generator, directions: np.ndarray, scatter_mps2: float) -> list[Window]:
+    """Rests whose means scatter by so much; ways up (W, 3) of any length."""
+    unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    means = G_MPS2 * unit @ S_UPPER.T + Q_TRUE + scatter_mps2 * random.normal(size=unit.shape)
+    return [
+        Window(float(k), k + 0.9, at_rest([0.0, 0.0, G_MPS2], f"{k}"),
+               WindowSums(0, np.array([300.0]), m[None], np.zeros((1, 3, 3))), True, "", 300, 0)
+        for k, m in enumerate(means)
+    ]  # fmt: skip
+
+
+def test_u_is_what_trials_scatter_by():
+    """Twenty rests, 200 times: errors over u within the 99.9 % band of an SD (Bonferroni over nine)."""
+    random = np.random.default_rng(70)
+    directions = random.normal(size=(20, 3))
+    truth = np.append(S_UPPER.ravel(), Q_TRUE)
+    pulls = []
+    for _ in range(200):
+        found = norm_fit(_rests(random, directions, 0.003), G_MPS2)
+        value = np.append(found.calibration.sensitivity.ravel(), found.calibration.offset)
+        pulls.append((value - truth)[UPPER] / found.calibration.standard_uncertainty[UPPER])
+    # Student's t with 11 degrees of freedom has an SD of 1.106; the band of 200 is +-21 % at this level.
+    sd = np.std(pulls, axis=0)
+    assert np.all((sd > 1.106 * 0.79) & (sd < 1.106 * 1.25)), sd
+    np.testing.assert_array_equal(found.calibration.sensitivity[[1, 2, 2], [0, 0, 1]], 0.0)
+
+
+def test_gravity_s_uncertainty_goes_into_s_alone():
+    random = np.random.default_rng(71)
+    windows = _rests(random, random.normal(size=(20, 3)), 1e-6)
+    found = norm_fit(windows, G_MPS2, u_gravity_mps2=0.03)
+    u = found.calibration.standard_uncertainty
+    np.testing.assert_allclose(u[[0, 4, 8]], np.diag(S_UPPER) * 0.03 / G_MPS2, rtol=1e-3)
+    assert np.all(u[9:] < 1e-5)
+
+
+def test_rests_in_one_plane_are_refused_with_the_rank():
+    random = np.random.default_rng(72)
+    angles = np.arange(12) * np.pi / 6.0
+    found = norm_fit(_rests(random, np.column_stack([np.cos(angles), np.sin(angles), 0.0 * angles]), 1e-3), G_MPS2)
+    assert any("rank" in reason and "of 9" in reason for reason in found.reasons)
+
+
+def test_a_direction_hardly_tilted_into_is_not_stated():
+    """Twelve rests within 1 deg of one plane: what the third axis is worth, nobody can say; the other two are right."""
+    random = np.random.default_rng(75)
+    angles = np.arange(12) * np.pi / 6.0
+    ways = np.column_stack([np.cos(angles), np.sin(angles), 0.02 * np.cos(3.0 * angles)])
+    found = norm_fit(_rests(random, ways, 1e-3), G_MPS2)
+    assert found.calibration.determined[[0, 4, 8]].tolist() == [True, True, False]
+    assert np.isnan(found.calibration.sensitivity[2, 2])
+    np.testing.assert_allclose(np.diag(found.calibration.sensitivity)[:2], np.diag(S_UPPER)[:2], rtol=0, atol=1e-3)
+
+
+def test_a_rest_that_was_none_is_named():
+    random = np.random.default_rng(73)
+    windows = _rests(random, random.normal(size=(20, 3)), 0.002)
+    windows[7].sums.mean[0] += 3.0
+    found = norm_fit(windows, G_MPS2)
+    assert any("at 7 s" in reason for reason in found.reasons)
+
+
+def test_nine_rests_are_too_few():
+    random = np.random.default_rng(74)
+    with pytest.raises(ValueError, match="10 rests or more"):
+        norm_fit(_rests(random, random.normal(size=(9, 3)), 0.002), G_MPS2)
