@@ -20,8 +20,8 @@ UPPER = np.triu_indices(3)
 PARAMETER = np.array([3 * int(i) + int(j) for i, j in zip(*UPPER, strict=True)] + [9, 10, 11])  # in calib.model order
 MAX_STEPS = 50
 ROUNDING = 1e-12  # of the scale: a step below it is rounding
-# Singular value of the scaled problem, over the largest, below which the rests leave a parameter open: rests in one plane
-# stand at 1e-17, ten at random between 0.01 and 0.14, twenty-two between 0.1 and 0.4.
+# Singular value of the scaled problem, over the largest, below which the rests leave a parameter open: rests in one
+# plane stand at 1e-17, ten at random between 0.01 and 0.14, twenty-two between 0.1 and 0.4.
 RANK_TOLERANCE = 1e-3
 DETERMINED_U = 0.1  # of the largest main sensitivity; a parameter known worse is not stated (contract)
 RESIDUAL_LIMIT = 0.02  # of g; hand-placed rests leave 2e-4, a rest that was none or a clipped axis leaves more
