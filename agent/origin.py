@@ -27,8 +27,10 @@ def source_file(path: Path) -> SourceFile:
 
 
 def origin(options: Mapping[str, Any]) -> dict[str, Any]:
-    """`options` as JSON has them, and the `files` that they name. Raises OSError."""
+    """`options` as JSON has them, without the way the result is printed, and `files` that they name. Raises OSError."""
+    kept = {name: str(value) if isinstance(value, Path) else value for name, value in options.items()}
+    kept.pop("json_to", None)
     return {
-        "options": {name: str(value) if isinstance(value, Path) else value for name, value in options.items()},
+        "options": kept,
         "files": [msgspec.structs.asdict(source_file(options[name])) for name in FILES if options[name]],
     }

@@ -86,11 +86,13 @@ def write(material: Material, output: Path) -> None:
 
 
 def left_over(material: Material) -> list[Residuals]:
-    """Residuals of the windows at hand, for the first result; none where it determines nothing."""
+    """Residuals of the windows at hand, for the first result; those of which it covers no axis are left out."""
+    import numpy as np
+
     from agent.report.trace import residuals
 
-    result = material.results[0]
-    return [residuals(trace, result) for trace in material.traces.values()] if result.determined.any() else []
+    seen = [residuals(trace, material.results[0]) for trace in material.traces.values()]
+    return [r for r in seen if np.isfinite(r.rms).any()]
 
 
 def as_object(material: Material, seen: list[Residuals], figures: list[str]) -> dict[str, Any]:

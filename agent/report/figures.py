@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from agent.report import diagrams, signals, style, timelines
 from agent.report.material import Material
 from agent.report.trace import Residuals
+from agent.report.units import position_name
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +46,7 @@ def _figures(material: Material, shown: Residuals | None) -> Iterator[tuple[str,
     yield "transverse", caption, diagrams.transverse_sensitivities(results)
     if shown is not None:
         model = f" of {results[0].label}" if len(results) > 1 else ""
-        where = f"position {shown.position}, {shown.time_s[0]:.1f} to {shown.time_s[-1]:.1f} s"
+        where = f"position {position_name(shown.position)}, {shown.time_s[0]:.1f} to {shown.time_s[-1]:.1f} s"
         caption = f"Indications (points) against S a + Q{model} (line): some cycles of the window in {where}."
         yield "indications", caption, signals.indications(shown, unit)
         caption = f"What S a + Q{model} leaves of the indications, window in {where}."

@@ -73,12 +73,12 @@ def _numbers(material: Material, seen: Sequence[Residuals]) -> Iterator[str]:
         yield f"<h2>Numbers{about}</h2>"
         if result.determined.any():
             yield "<h3>Parameters</h3>" + tables.parameters(result)
-        if result.budget:
+        if result.budget and result.determined.any():
             yield "<h3>Uncertainty budget: u by source</h3>" + tables.budget(result)
         if result.fields.get("nuisances"):
             yield "<h3>Nuisances</h3>" + tables.nuisances(result)
         if statistics := result.fields.get("statistics"):
-            yield "<h3>Statistics (Appendix A)</h3>" + tables.facts(statistics)
+            yield "<h3>Statistics (Appendix A)</h3>" + tables.statistics(statistics)
         if result is material.results[0] and seen:
             yield "<h3>Residuals, root mean square</h3>" + tables.left_over(seen, result)
         if result.windows:

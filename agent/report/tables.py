@@ -104,8 +104,27 @@ def windows(result: CalibrationResult) -> str:
         for w in result.windows[-MOST_ROWS:]
     ]
     return table(
-        ["start in s", "stop in s", "position", "used", "points", "left out", "reason"], rows, text=frozenset({6})
+        ["start in s", "stop in s", "position", "used", "points", "left out", "reason"], rows, "windows", frozenset({6})
     )
+
+
+def statistics(held: Mapping[str, Any]) -> str:
+    """Appendix A: a row a parameter and run; what has no runs stands below."""
+    runs = {name: value for name, value in held.items() if isinstance(value, list) and _are_runs(value)}
+    rest = facts({name: value for name, value in held.items() if name not in runs})
+    if not runs:
+        return rest
+    heads = list(next(iter(runs.values()))[0])
+    rows = [
+        [name, str(k), *(_words(run.get(head)) for head in heads)]
+        for name, of_name in runs.items()
+        for k, run in enumerate(of_name, start=1)
+    ]
+    return table(["parameter", "run", *(said(head) for head in heads)], rows) + rest
+
+
+def _are_runs(value: list[Any]) -> bool:
+    return bool(value) and all(isinstance(run, Mapping) for run in value)
 
 
 def left_over(seen: Sequence[Residuals], result: CalibrationResult) -> str:

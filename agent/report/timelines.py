@@ -108,7 +108,7 @@ def budget(result: CalibrationResult) -> Figure | None:
 
 def variance_shares(result: CalibrationResult) -> tuple[list[str], np.ndarray[tuple[int, ...], np.dtype[np.float64]]]:
     """Names of the largest sources, and the share (K, 12) in % that each has in the variance of each parameter."""
-    if not result.budget:
+    if not result.budget or not result.determined.any():
         return [], np.empty((0, 12))
     all_names = list(result.budget)
     variances = np.array([result.budget[name] for name in all_names]) ** 2

@@ -21,7 +21,7 @@ from agent.report.page import page
 from agent.report.result import parse
 from hw.virtual.bench import Truth
 from tests.unit.recorded_bench import record
-from tests.unit.test_report_numbers import fields
+from tests.unit.test_report_numbers import fields, moving
 
 SECONDS = 41.0  # three positions of the bench
 VOID = {"meta", "br", "use", "path", "image", "rect", "circle", "line"}
@@ -166,7 +166,7 @@ def test_methods_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     diagonal = [[10.1, None, None], [None, 9.8, None], [None, None, 10.3]]
     flags = {"sensitivity": np.eye(3, dtype=bool).tolist(), "offset": [False] * 3}
     paths = [
-        write(tmp_path / "one.json", method="1"),
+        write(tmp_path / "one.json", method="1", statistics={"Sxx": [{"n": 6, "s_rel_pct": 0.0234}], "rel_S_pct": 1.0}),
         write(tmp_path / "two.json", method="2", sensitivity=diagonal, offset=None, determined=flags),
         write(tmp_path / "three.json", method="3 (adjustment)", budget={"type A": [0.01] * 12}),
     ]
@@ -176,6 +176,7 @@ def test_methods_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     check_alone(seen)
     assert seen.text.count("not determined") == 9
     assert "mV/(m/s²)" in seen.text
+    assert re.search(r"<td>Sxx</td><td>1</td><td>6</td><td>0.0234</td>", seen.source)
     assert "9.800 ±\N{NO-BREAK SPACE}0.020" in seen.text
     assert [r["output_unit"] for r in json.loads((tmp_path / "out" / "report.json").read_text())["results"]] == [
         "mV"
@@ -191,7 +192,7 @@ def test_a_refused_result_shows_its_reasons(tmp_path: Path, capsys: pytest.Captu
     nothing = {"sensitivity": None, "offset": None}
     path = write(
         tmp_path / "r.json", **nothing, determined=nothing, covariance=None, status="refused",
-        reasons=["rank 3 of 4: <two> alphas"],
+        reasons=["rank 3 of 4: <two> alphas"], budget={"type A": [0.1] * 12},
     )  # fmt: skip
     status, said = run(capsys, path, "-o", tmp_path / "out")
     assert (status, said) == (3, "refused: rank 3 of 4: <two> alphas\n")
@@ -305,3 +306,12 @@ def test_what_stands_in_the_data_cannot_break_the_page(tmp_path: Path) -> None:
     path = tmp_path / "page.html"
     path.write_text(page(material, [], []), encoding="utf-8")
     assert "<script" not in Page(path).source
+
+
+def test_a_window_that_the_result_does_not_cover_has_no_residuals() -> None:
+    """Method 2 knows no transverse sensitivities, and all axes move."""
+    diagonal = [[10.1, None, None], [None, 9.8, None], [None, None, 10.3]]
+    known, partly = parse(fields(), "a"), parse(fields(sensitivity=diagonal, offset=None), "b")
+    traces = {"30 deg": moving(0.0)}
+    assert len(left_over(Material("", [known], traces=traces))) == 1
+    assert left_over(Material("", [partly], traces=traces)) == []

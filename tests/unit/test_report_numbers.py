@@ -114,6 +114,7 @@ def test_what_follows_the_model_leaves_nothing_and_a_lag_shows_a_quarter_cycle_o
     middle, mean, _ = by_phase(lagging.phase_rad, lagging.residual)
     quarter = mean[:, 0] @ np.sin(middle), mean[:, 0] @ np.cos(middle)
     assert abs(quarter[1]) < 0.03 * abs(quarter[0])
+    assert quarter[0] * (S @ moving(0.0).pose.direction)[0, 0] > 0  # late: what is left follows the sine
     # With the lag in the result it is gone but for the second order.
     assert np.all(residuals(moving(0.002), result(lag_s=0.002)).rms < 0.03 * expected)
 
