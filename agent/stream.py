@@ -12,18 +12,29 @@ from numpy.typing import NDArray
 from calib.timing import ClockFit, ClockModel
 from hw.block import BlockFlags, SampleBlock
 
+# Times its nominal rate, more than any clock is off: a count in microseconds, say, is none of samples, and the holes
+# in it would fill the memory.
+FASTEST = 10.0
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cut:
     """Samples between two times, one after the other without a hole: what is missing is NaN.
 
-    `indications` (n, C) from sample `first_index` on; `clock` says when each was taken.
+    `indications` (n, C) from sample `first_index` on; `clock` says when each was taken. `in_time` tells whether those
+    times rise and lie where they were asked for: of a device whose count jumps at will no arrivals make a clock.
     """
 
     first_index: int
     indications: NDArray[np.float64]
     clock: ClockFit
     saturated: bool
+    in_time: bool
+
+    @property
+    def axes(self) -> int:
+        """Axes of the device."""
+        return int(self.indications.shape[1])
 
     @property
     def time_s(self) -> NDArray[np.float64]:
@@ -35,7 +46,7 @@ class DeviceStream:
     """Blocks of one device as they come, forgotten when `forget_before` says so.
 
     Times are seconds since the run's origin on the gateway's monotonic clock. A RESTART (the index does not go on in
-    time) empties the buffer and starts the clock model anew; `broken_s` is when that last happened.
+    time) empties the buffer and starts the clock model anew.
     """
 
     def __init__(self, origin_ns: int) -> None:
@@ -45,7 +56,6 @@ class DeviceStream:
         self._fitted: ClockFit | None = None  # the clock model's result, until the next block
         self.newest_arrival_s: float | None = None
         self.first_sample_s: float | None = None
-        self.broken_s: float | None = None
 
     def update(self, block: SampleBlock) -> None:
         """Take the next block."""
@@ -57,7 +67,6 @@ class DeviceStream:
         elif block.flags & BlockFlags.RESTART:
             self._clock = ClockModel(block.nominal_rate_hz)
             self._blocks.clear()
-            self.broken_s = first_arrival_s
         self._clock.update(block.first_index + block.burst_count.astype(np.int64) - 1, arrivals_s)
         self._fitted = None
         self._blocks.append(block)
@@ -81,20 +90,25 @@ class DeviceStream:
         """All samples with start_s <= t < stop_s by the clock model as it is now; None if there are none."""
         if not self._blocks:
             return None
-        clock = self._fit()
-        first, stop = (int(np.ceil(i)) for i in clock.index_of(np.array([start_s, stop_s])))
-        first = max(first, self._blocks[0].first_index)
-        stop = min(stop, self._blocks[-1].first_index + self._blocks[-1].n)
+        clock, rate_hz, axes = self._fit(), self._blocks[-1].nominal_rate_hz, self._blocks[-1].indications.shape[1]
+        oldest, end = self._blocks[0].first_index, self._blocks[-1].first_index + self._blocks[-1].n
+        edges = np.nan_to_num(clock.index_of(np.array([start_s, stop_s])))
+        first, stop = (int(i) for i in np.clip(np.ceil(edges), oldest, end))
         if stop <= first:
             return None
-        held = np.full((stop - first, self._blocks[0].indications.shape[1]), np.nan)
+        if stop - first > FASTEST * rate_hz * (stop_s - start_s) + 1:
+            return Cut(first, np.empty((0, axes)), clock, saturated=False, in_time=False)
+        times_s = clock.time_of(np.arange(first, stop))
+        within = start_s - 1 / rate_hz <= times_s[0] and times_s[-1] <= stop_s + 1 / rate_hz
+        in_time = bool(within and (np.diff(times_s) > 0).all())
+        held = np.full((stop - first, axes), np.nan)
         saturated = False
         for block in self._blocks:
             a, b = max(first, block.first_index), min(stop, block.first_index + block.n)
             if a < b:
                 held[a - first : b - first] = block.indications[a - block.first_index : b - block.first_index]
                 saturated |= bool(block.flags & BlockFlags.SATURATED)
-        return Cut(first, held, clock, saturated)
+        return Cut(first, held, clock, saturated, in_time)
 
     def forget_before(self, time_s: float) -> None:
         """Drop whole blocks that ended before `time_s` (by arrival, which is never early)."""
@@ -105,11 +119,9 @@ class DeviceStream:
         """State for `restore`, bit-exact."""
         return {
             "clock": self._clock.snapshot() if self._clock else None,
-            "nominal_rate_hz": self._blocks[-1].nominal_rate_hz if self._blocks else 0.0,
             "blocks": [_block_state(block) for block in self._blocks],
             "newest_arrival_s": self.newest_arrival_s,
             "first_sample_s": self.first_sample_s,
-            "broken_s": self.broken_s,
         }
 
     @classmethod
@@ -121,7 +133,6 @@ class DeviceStream:
         stream._blocks.extend(_block_of(s) for s in state["blocks"])
         stream.newest_arrival_s = state["newest_arrival_s"]
         stream.first_sample_s = state["first_sample_s"]
-        stream.broken_s = state["broken_s"]
         return stream
 
 

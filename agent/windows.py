@@ -27,18 +27,29 @@ def windows_in(piece: Piece, first_s: float, channel: Channel, streams: dict[str
     cut = streams[channel.sensor].cut(start_s, stop_s)
     if cut is None:
         return [_refused(piece, f"no samples of {channel.sensor}")]
+    if fault := _fault(channel.sensor, cut, axes=3):
+        return [_refused(piece, fault)]
     if channel.reference is None:
         found = _rest(piece, cut)
     else:
         reference = streams[channel.reference].cut(start_s - MARGIN_S, stop_s + MARGIN_S)
         if reference is None:
             return [_refused(piece, f"no samples of the reference {channel.reference}")]
+        if fault := _fault(f"the reference {channel.reference}", reference, axes=piece.pose.direction.shape[1]):
+            return [_refused(piece, fault)]
         found = _motion(piece, cut, reference, channel)
     if not found:
         return [_refused(piece, "the samples of sensor and reference do not meet")]
     if cut.saturated:
         found = [replace(w, used=False, reason=w.reason or "the sensor was at the end of its range") for w in found]
     return [replace(w, start_s=w.start_s - first_s, stop_s=w.stop_s - first_s) for w in found]
+
+
+def _fault(device: str, cut: Cut, axes: int) -> str:
+    """Why a device cannot take part in a pose that needs this many axes of it; "" where it can."""
+    if cut.axes != axes:
+        return f"{device} has {cut.axes} {'axis' if cut.axes == 1 else 'axes'}, this pose needs {axes}"
+    return "" if cut.in_time else f"{device}: its sample numbers and arrivals do not make a clock"
 
 
 def _rest(piece: Piece, cut: Cut) -> list[Window]:

@@ -60,11 +60,12 @@ def fit(windows: Sequence[Window]) -> Fit:
     rest = rhs - design @ solution
     dof = free - rank
     residual = (scatter + rest.T @ rest) / dof if dof > 0 else np.full((3, 3), np.nan)
+    np.fill_diagonal(residual, np.maximum(np.diag(residual), 0.0))  # of exact data rounding may leave less than nothing
     spread = whitened @ whitened.T
     seen = _seen(right[kept])
     calibration = _calibration(solution, residual, spread, seen, float(dof))
     condition = float(singular[0] / singular[-1]) if rank == design.shape[1] else float("inf")
-    return Fit(calibration, np.sqrt(np.maximum(np.diag(residual), 0.0)), rank, condition, points)
+    return Fit(calibration, np.sqrt(np.diag(residual)), rank, condition, points)
 
 
 def refusal(found: Fit, windows: Sequence[Window]) -> list[str]:

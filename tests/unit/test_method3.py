@@ -170,3 +170,9 @@ def test_unused_windows_are_not_used() -> None:
     np.testing.assert_array_equal(solve([*good, refused]).sensitivity, solve(good).sensitivity)
     with pytest.raises(ValueError, match="no window is used"):
         solve([refused])
+
+
+def test_points_without_noise_have_an_uncertainty_all_the_same() -> None:
+    rng = np.random.default_rng(5)
+    windows = [make(pose, rng, noise=0.0)[0] for pose in on_clamp(0, 30, 120, 210)]
+    assert np.all(solve(windows).standard_uncertainty < 1e-9)

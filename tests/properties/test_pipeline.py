@@ -1,0 +1,50 @@
+"""The pipeline over runs as they never should be: it goes on, counts on, and is wholly in its snapshot."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from agent.events import CalibrationUpdate, Result, StatusChange, WindowReport
+from agent.pipeline import Pipeline
+from tests.properties.happenings import EPOCH_NS, ORIGIN_NS, config, happenings
+
+EVENTS = 300
+LONGEST_S = 1.5  # of the schedule's poses, guards taken off, and a sample
+seeds = st.integers(0, 2**32 - 1)
+
+
+@settings(max_examples=25)
+@given(seed=seeds, reference=st.booleans())
+def test_restored_at_any_event_it_goes_on_alike(seed: int, reference: bool) -> None:
+    settings_ = config(reference)
+    config_json = settings_.model_dump_json()
+    going_on = Pipeline.begin(settings_, "run", ORIGIN_NS, 7, {})
+    restored = Pipeline.begin(settings_, "run", ORIGIN_NS, 7, {})
+    places = np.random.default_rng(seed)
+    for event in happenings(seed, EVENTS):
+        if places.random() < 0.2:
+            restored = Pipeline.restore(config_json, restored.snapshot())
+        assert restored.step(event) == going_on.step(event)
+    assert restored.snapshot() == going_on.snapshot()
+
+
+@settings(max_examples=25)
+@given(seed=seeds, reference=st.booleans())
+def test_results_are_numbered_and_follow_from_each_other(seed: int, reference: bool) -> None:
+    pipeline = Pipeline.begin(config(reference), "run", ORIGIN_NS, 7, {})
+    results: list[Result] = [r for event in happenings(seed, EVENTS) for r in pipeline.step(event)]
+    assert [r.sequence for r in results] == list(range(8, 8 + len(results)))
+    assert {(r.run_id, r.sensor) for r in results} == {("run", "s")}
+    assert all(r.t_utc_ns > EPOCH_NS - 10**17 for r in results)
+    statuses = [r for r in results if isinstance(r, StatusChange)]
+    assert [s.before for s in statuses] == ["", *(s.status for s in statuses[:-1])]
+    assert all(s.before != s.status for s in statuses)
+    windows = [r for r in results if isinstance(r, WindowReport)]
+    assert all(a.start_s <= b.start_s for a, b in itertools.pairwise(windows))
+    assert all(w.used != bool(w.reason) for w in windows)
+    assert all(0 < w.stop_s - w.start_s < LONGEST_S for w in windows)
+    assert all(r.identity and all(r.determined) for r in results if isinstance(r, CalibrationUpdate))
