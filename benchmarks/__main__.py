@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import importlib
+import os
 import sys
 
-NAMES = ("agent_cost", "recording", "torture", "torture_shm")
+os.environ["OPENBLAS_NUM_THREADS"] = "1"  # as every entry point of the product, before numpy loads
+
+NAMES = ("agent_cost", "recording", "sums", "torture", "torture_shm")
 
 
 def main() -> int:

@@ -46,7 +46,8 @@ class Adjustment:
     `calibration` has NaN where the data do not determine a parameter. `contributions` {source: (12,) standard
     uncertainties} is the budget. `reasons`: why it is refused, empty if it is not. `rank` of the input vectors, 4 at
     most. `offset_scatter_mps2`, `slope_scatter` (relative) and `lag_scatter_s`: between windows, as estimated.
-    `misfit`: what S a + Q leaves of the signal. `mean` (N,) and `covariance` (N, N): joint state of [S, Q, nuisances], nothing blanked.
+    `misfit`: what S a + Q leaves of the signal. `mean` (N,) and `covariance` (N, N): joint state of [S, Q, nuisances],
+    nothing blanked.
     """
 
     calibration: Calibration
