@@ -1,4 +1,9 @@
-"""Registers of the ADXL355 and what its bytes mean: pure functions, no bus. Source: data sheet ADXL354/ADXL355."""
+"""Registers of the ADXL355, ADXL357 and ADXL359 and what their bytes mean: pure functions, no bus.
+
+Sources: data sheets ADXL354/ADXL355 and ADXL356/ADXL357 (tables of specifications and registers); ADXL359 as in Linux,
+drivers/iio/accel/adxl355_core.c (part ID, 19.5 ug/LSB at 10 g, temperature intercept). The ADXL357's part ID is also
+the ADXL355's (0xED: data sheets, and the public drivers that check it): which one it is only the configuration knows.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +11,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-IDENTITY = bytes([0xAD, 0x1D, 0xED])  # Analog Devices, MEMS, ADXL355
+from hw.fifo import FifoSamples
+
 DEVID, REVISION, STATUS, TEMPERATURE, FIFO_DATA = 0x00, 0x03, 0x04, 0x06, 0x11
-FIRST_SETTING, FILTER, RANGE, POWER_CTL, RESET, SHADOW = 0x1E, 0x28, 0x2C, 0x2D, 0x2F, 0x50
+FIRST_SETTING, FILTER, RANGE, POWER_CTL, SELF_TEST, RESET, SHADOW = 0x1E, 0x28, 0x2C, 0x2D, 0x2E, 0x2F, 0x50
 SHADOW_BYTES = 5
 RESET_CODE = 0x52
 MEASURE = 0x00
@@ -22,15 +27,27 @@ SETTING_NAMES = (
     *("INT_MAP", "SYNC", "RANGE", "POWER_CTL", "SELF_TEST"),
 )
 RATES_HZ = tuple(4000.0 / 2.0**code for code in range(11))  # by the code in FILTER
-RANGE_CODES: Mapping[int, int] = {2: 1, 4: 2, 8: 3}
-COUNTS_PER_G: Mapping[int, int] = {2: 256000, 4: 128000, 8: 64000}
-STANDARD_GRAVITY_MPS2 = 9.80665
 COUNTS_MIN, COUNTS_MAX = -(2**19), 2**19 - 1
 _RANGE_RESET_BITS = 0x80  # I2C high-speed mode, set after a reset and left so
 _X_MARK, _EMPTY = 0x01, 0x02  # in an entry's last byte
 
 
-def settings(rate_hz: float, range_g: int) -> bytes:
+@dataclass(frozen=True, slots=True)
+class Part:
+    """What differs within the family. `counts_per_g` by range in g, lowest range first, its code 1, 2, 3."""
+
+    kind: str
+    identity: bytes  # Analog Devices, MEMS, part
+    counts_per_g: Mapping[int, int]
+    temperature_intercept: int  # LSB at 25 degC; the slope is -9.05 LSB a degree in all of them
+
+
+ADXL355 = Part("ADXL355", bytes([0xAD, 0x1D, 0xED]), {2: 256000, 4: 128000, 8: 64000}, 1885)
+ADXL357 = Part("ADXL357", bytes([0xAD, 0x1D, 0xED]), {10: 51200, 20: 25600, 40: 12800}, 1852)
+ADXL359 = Part("ADXL359", bytes([0xAD, 0x1D, 0xE9]), {10: 51200, 20: 25600, 40: 12800}, 1852)
+
+
+def settings(part: Part, rate_hz: float, range_g: int) -> bytes:
     """Values of the registers FIRST_SETTING .. SELF_TEST while measuring.
 
     Offsets zero and high-pass filter off: S and Q are of untouched counts. No interrupts, internal clock, no self-test.
@@ -38,34 +55,19 @@ def settings(rate_hz: float, range_g: int) -> bytes:
     values = dict.fromkeys(SETTING_NAMES, 0)
     values["FILTER"] = RATES_HZ.index(rate_hz)
     values["FIFO_SAMPLES"] = FIFO_ENTRIES_MAX
-    values["RANGE"] = _RANGE_RESET_BITS | RANGE_CODES[range_g]
+    values["RANGE"] = _RANGE_RESET_BITS | 1 + list(part.counts_per_g).index(range_g)
     values["POWER_CTL"] = MEASURE
     values["ACT_COUNT"] = 1  # its reset value; activity detection is off
     return bytes(values.values())
 
 
-def temperature(data: bytes) -> tuple[int, float]:
+def temperature(part: Part, data: bytes) -> tuple[int, float]:
     """Raw 12 bits and degC from TEMP2, TEMP1. Nominal line; part to part its intercept differs by degrees."""
     raw = (data[0] & 0x0F) << 8 | data[1]
-    return raw, 25.0 + (raw - 1885) / -9.05
+    return raw, 25.0 + (raw - part.temperature_intercept) / -9.05
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Triples:
-    """Whole triples of a run of FIFO entries.
-
-    `counts` (N, 3) int32; `last` (N,) place of each one's Z entry; `breaks` samples before which entries were out of
-    step (rising, may hold N); `dropped` entries that belong to no triple; `rest` bytes of a triple that has only begun.
-    """
-
-    counts: NDArray[np.int32]
-    last: NDArray[np.int64]
-    breaks: list[int]
-    dropped: int
-    rest: bytes
-
-
-def triples(data: bytes) -> Triples:
+def triples(data: bytes) -> FifoSamples:
     """Find the triples in FIFO entries (3 bytes each) by the X marker: X, two others (Y, Z), then X or the end.
 
     Entries that the device marks as empty must not be in `data` (see `without_empty`).
@@ -80,7 +82,7 @@ def triples(data: bytes) -> Triples:
         breaks.append(len(whole))
     words = (entries[:, 0].astype(np.int32) << 12) | (entries[:, 1].astype(np.int32) << 4) | (entries[:, 2] >> 4)
     signed = (words ^ 0x80000) - 0x80000
-    return Triples(
+    return FifoSamples(
         counts=signed[whole[:, None] + np.arange(3)],
         last=whole + 2,
         breaks=breaks,

@@ -37,12 +37,12 @@ class Cutter:
     """Numbers a device's samples through its life and cuts stretches into blocks.
 
     `lowest` and `highest` are the ends of the range, in the indications' unit: an indication there is SATURATED.
-    Flags that no sample could carry yet wait for the next one.
+    Flags that no sample could carry yet wait for the next one. `nominal_rate_hz` may change when a device is opened.
     """
 
     def __init__(self, device: str, nominal_rate_hz: float, lowest: float = -np.inf, highest: float = np.inf) -> None:
         self._device = device
-        self._rate_hz = nominal_rate_hz
+        self.nominal_rate_hz = nominal_rate_hz
         self._lowest = lowest
         self._highest = highest
         self._index = 0
@@ -77,7 +77,7 @@ class Cutter:
             boot_id=boot_id(),
             t_utc_ns=stretch.t_utc_ns - int(stretch.burst_t_monotonic_ns[-1] - arrivals[-1]),
             first_index=self._index,
-            nominal_rate_hz=self._rate_hz,
+            nominal_rate_hz=self.nominal_rate_hz,
             burst_t_monotonic_ns=arrivals,
             burst_count=count[bringing].astype(np.int32),
             indications=indications,

@@ -80,7 +80,12 @@ class DriverFactory(Protocol):
 
 
 BUILT_IN: Mapping[str, str] = {
+    "adxl345": "hw.adxl345:Adxl345",
     "adxl355": "hw.adxl355:Adxl355",
+    "adxl357": "hw.adxl355:Adxl357",
+    "adxl359": "hw.adxl355:Adxl359",
+    "lsm6dso": "hw.lsm6dso:Lsm6dso",
+    "mpu6050": "hw.mpu6050:Mpu6050",
     "serial-csv": "hw.serial_stream:SerialCsv",
 }
 

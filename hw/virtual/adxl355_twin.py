@@ -1,15 +1,15 @@
-"""An ADXL355 at register level with its live FIFO, for `hw.virtual.kernel`; the physics comes from outside."""
+"""An ADXL355, ADXL357 or ADXL359 at register level with its live FIFO."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hw.virtual.fifo_twin import Counts, FifoTwin
+
 IDENTITY = bytes([0xAD, 0x1D, 0xED, 0x01])
-FIFO_BYTES = 96 * 3
 EMPTY_ENTRY = b"\x00\x00\x02"
 RESET_S = 0.005  # so long after a reset the shadow registers are not loaded and settings do not take
 SHADOW = bytes([0x4C, 0x21, 0x9A, 0x05, 0x33])  # trim of this part, any constant does
@@ -25,113 +25,49 @@ def encode(counts: NDArray[np.int32]) -> bytes:
     return words.astype(">u4").view(np.uint8).reshape(-1, 4)[:, 1:].tobytes()
 
 
-class Adxl355Twin:
-    """`source(first, n)` returns (n, 3) int32 counts of samples first .. first + n - 1, at the set range;
-    `samples_due(t_s)` how many samples exist at `t_s` in all; `clock()` is that time, in seconds.
+class Adxl355Twin(FifoTwin):
+    """See FifoTwin. `identity` are the four ID registers."""
 
-    Samples go on being counted in standby, but only those made while measuring reach the FIFO, which holds 32.
-    """
+    fifo_bytes = 96 * 3
+    sample_bytes = 9
+    word_bytes = 3
+    data_register = FIFO_DATA
+    temperature_at_25_degc = 1885
 
     def __init__(
         self,
-        source: Callable[[int, int], NDArray[np.int32]],
+        source: Callable[[int, int], Counts],
         samples_due: Callable[[float], int],
         clock: Callable[[], float],
         *,
         identity: bytes = IDENTITY,
-        temperature_raw: Callable[[float], int] = lambda t_s: 1885,  # noqa: ARG005 - 25 degC at all times
+        temperature_raw: Callable[[float], int] | None = None,
     ) -> None:
-        self._source = source
-        self._samples_due = samples_due
-        self._clock = clock
         self._identity = identity
-        self._temperature_raw = temperature_raw
-        self._failures: list[int] = []
-        self._broken_off: tuple[int, int] | None = None
-        self.power_cycle()
+        super().__init__(source, samples_due, clock, temperature_raw=temperature_raw)
         self._ready_s = clock()  # it was powered long before
 
     def power_cycle(self) -> None:
         """Power fails and comes back: registers as after a reset, standby."""
-        self.registers = bytearray(256)
-        self.registers[: len(self._identity)] = self._identity
-        for register, value in RESET_VALUES.items():
-            self.registers[register] = value
-        self._pointer = 0
-        self._fifo = bytearray()
-        self._overrun = False
-        self._next = 0
+        super().power_cycle()
         self._ready_s = self._clock() + RESET_S
 
-    def steal(self, entry: int = 0, count: int = 1) -> None:
-        """Fault: entries vanish from the FIFO, the first of them at place `entry`."""
-        self._fill()
-        del self._fifo[3 * entry : 3 * (entry + count)]
-
-    def fail(self, number: int, times: int = 1) -> None:
-        """Fault: the next messages end in this errno."""
-        self._failures += [number] * times
-
-    def break_off(self, number: int, entries: int) -> None:
-        """Fault: the next FIFO read ends in this errno after so many entries went out in vain."""
-        self._broken_off = number, entries
-
-    def write(self, data: bytes) -> None:
-        """One I2C write message: register, then values."""
-        self._fail()
-        self._pointer = data[0]
-        for value in data[1:]:
-            self._set(self._pointer, value)
-            self._pointer = (self._pointer + 1) & 0xFF
-
-    def read(self, count: int) -> bytes:
-        """One I2C read message, from the register written last on; FIFO_DATA stays where it is."""
-        self._fail()
-        self._fill()
-        self._break_off()
-        out = bytearray()
-        while len(out) < count:
-            if self._pointer == FIFO_DATA:
-                out += self._take(count - len(out))
-            else:
-                out.append(self._get(self._pointer))
-                self._pointer = (self._pointer + 1) & 0xFF
-        return bytes(out)
-
-    def _fail(self) -> None:
-        if self._failures:
-            raise _error(self._failures.pop(0))
-
-    def _break_off(self) -> None:
-        if self._broken_off and self._pointer == FIFO_DATA:
-            number, entries = self._broken_off
-            self._broken_off = None
-            self._take(3 * entries)
-            raise _error(number)
-
-    def _take(self, count: int) -> bytes:
-        taken = bytes(self._fifo[:count])
-        del self._fifo[:count]
-        missing = count - len(taken)
-        return taken + (EMPTY_ENTRY * (missing // 3 + 1))[:missing]
+    def _reset_registers(self) -> bytearray:
+        registers = bytearray(256)
+        registers[: len(self._identity)] = self._identity
+        for register, value in RESET_VALUES.items():
+            registers[register] = value
+        return registers
 
     @property
-    def _measuring(self) -> bool:
+    def _filling(self) -> bool:
         return not self.registers[POWER_CTL] & 1
 
-    def _fill(self) -> None:
-        if not self._measuring:
-            return
-        due = self._samples_due(self._clock())
-        if due <= self._next:
-            return
-        room = FIFO_BYTES // 9 + 1  # one more than it holds, so that an overflow shows
-        first = max(self._next, due - room)
-        self._fifo += encode(self._source(first, due - first))
-        self._next = due
-        if len(self._fifo) > FIFO_BYTES:
-            self._overrun = True
-            del self._fifo[: len(self._fifo) - FIFO_BYTES]
+    def _encode(self, first: int, counts: Counts) -> bytes:  # noqa: ARG002 - these entries bear no number
+        return encode(counts)
+
+    def _nothing(self, count: int) -> bytes:
+        return (EMPTY_ENTRY * (count // 3 + 1))[:count]
 
     def _get(self, register: int) -> int:
         if register == STATUS:
@@ -155,13 +91,9 @@ class Adxl355Twin:
         elif self._clock() < self._ready_s:
             return
         elif register == POWER_CTL:
-            if self._measuring != (not value & 1):
-                self._fifo.clear()
-                self._next = self._samples_due(self._clock())
+            before = self._filling
             self.registers[register] = value
-        elif FIRST_SETTING <= register <= LAST_SETTING and not self._measuring:
+            if self._filling != before:
+                self._empty()
+        elif FIRST_SETTING <= register <= LAST_SETTING and not self._filling:
             self.registers[register] = value
-
-
-def _error(number: int) -> OSError:
-    return OSError(number, os.strerror(number))

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hw.adxl355_registers import COUNTS_PER_G
+from hw.adxl355_registers import ADXL355
 from hw.virtual.adxl355_twin import Adxl355Twin
 from hw.virtual.bench import Bench
 from hw.virtual.kernel import I2CBus, installed
@@ -84,7 +84,7 @@ class LiveBench:
 
 
 def _range_g(nominal_sensitivity: float) -> int:
-    for range_g, counts in COUNTS_PER_G.items():
+    for range_g, counts in ADXL355.counts_per_g.items():
         if abs(nominal_sensitivity * STANDARD_GRAVITY_MPS2 - counts) < 1e-6 * counts:
             return range_g
     raise ValueError(f"no range of an ADXL355 has {nominal_sensitivity:g} counts per m/s2")

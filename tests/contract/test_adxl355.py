@@ -1,81 +1,32 @@
-"""The contract on the register-level twin under the real smbus2, and the faults only this device has."""
+"""The contract on the twins of the ADXL355, ADXL357 and ADXL359, and the faults only this family has."""
 
 from __future__ import annotations
 
 import errno
-import functools
 from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from hw.adxl355 import Adxl355, Adxl355Options
+from hw.adxl355 import Adxl355, Adxl357, Adxl359
 from hw.block import BlockFlags, Drop
-from hw.sensor import ConfigurationError, DeviceLost, IdentityError
+from hw.sensor import DeviceLost, IdentityError
 from hw.virtual.adxl355_twin import Adxl355Twin
-from hw.virtual.kernel import FUNCTIONS, I2CBus, installed
-from tests.contract.contract import Rig, SensorContract
-
-FULL = 2**19 - 1
-LAP = 1000
+from tests.contract.i2c_contract import I2cContract, I2cRig
 
 
-@functools.cache
-def numbered_counts() -> NDArray[np.int32]:
-    """x and y count samples in laps and laps, z is their negative sum; enough for the longest test."""
-    lap, place = np.divmod(np.arange(1_100_000, dtype=np.int32), LAP)
-    return np.column_stack([place - 500, lap * 7, 500 - place - lap * 7])
+class Adxl355Rig(I2cRig):
+    driver, twin_class, address, full = Adxl355, Adxl355Twin, 0x1D, 2**19 - 1
 
 
-class Adxl355Rig(Rig):
-    def __init__(self) -> None:
-        self.saturated = range(0)
-        self.twin = Adxl355Twin(self.counts, self.due, lambda: self.t_s)
-        self.bus = I2CBus({0x1D: self.twin})
-        self._kernel = installed({"/dev/i2c-1": self.bus})
-        self._kernel.__enter__()
-        self.sensor = Adxl355("sensor", Adxl355Options(), clock=self.clock, sleep=lambda s: self.sleep(s))
+class TestAdxl355(I2cContract):
+    filter_register = 0x28, "FILTER"
+    # offsets somebody trimmed, a high-pass filter somebody turned on, self-test
+    trimmed = {0x1E: 0x11, 0x23: 0x11, 0x2E: 0x03}  # noqa: RUF012
+    late_s = 0.2
+    # Data sheet: 1885 at 25 degC, -9.05 LSB a degree: 181 LSB less are 20 degrees more.
+    temperature = 1704, 45.0
 
-    def build_elsewhere(self) -> Adxl355:
-        return Adxl355("sensor", Adxl355Options(bus=7), clock=self.clock, sleep=self.sleep)
-
-    def counts(self, first: int, n: int) -> NDArray[np.int32]:
-        counts = numbered_counts()[first : first + n]
-        if self.saturated:
-            counts = counts.copy()
-            counts[[i - first for i in self.saturated if first <= i < first + n], 2] = FULL
-        return counts
-
-    def number(self, indications: NDArray[np.generic]) -> NDArray[np.int64]:
-        x, y, z = indications.astype(np.int64).T
-        numbers = y // 7 * LAP + x + 500
-        assert ((x + y + z == 0) | ((z == FULL) & np.isin(numbers, self.saturated))).all()
-        return numbers
-
-    def saturate(self, first: int, last: int) -> None:
-        self.saturated = range(first, last + 1)
-
-    def lose(self) -> None:
-        self.twin.steal(entry=7)
-
-    def unplug(self) -> None:
-        self.bus.unplug()
-
-    def replug(self) -> None:
-        self.bus.replug()
-
-    def close(self) -> None:
-        self.sensor.close()
-        self._kernel.__exit__(None, None, None)
-
-    def read(self) -> tuple[BlockFlags, NDArray[np.int64]]:
-        block = self.sensor.read_block()
-        assert block is not None
-        return block.flags, self.number(block.indications)
-
-
-class TestAdxl355(SensorContract):
     @pytest.fixture
     def rig(self) -> Iterator[Adxl355Rig]:
         rig = Adxl355Rig()
@@ -95,46 +46,10 @@ class TestAdxl355(SensorContract):
         assert info.settings["RANGE"] == f"0x{registers[0x2C]:02X}" == "0x81"
         assert info.settings["POWER_CTL"] == f"0x{registers[0x2D]:02X}" == "0x00"
 
-    def test_touched_registers_are_put_back(self, rig: Adxl355Rig) -> None:
-        rig.twin.registers[0x1E:0x24] = b"\x11" * 6  # offsets somebody trimmed
-        rig.twin.registers[0x28] = 0x32  # a high-pass filter somebody turned on
-        rig.twin.registers[0x2E] = 0x03  # self-test
-        rig.sensor.open()
-        assert rig.twin.registers[0x1E:0x24] == bytes(6)
-        assert rig.twin.registers[0x28] == 0x02
-        assert rig.twin.registers[0x2E] == 0x00
-
-    @pytest.mark.parametrize("number", [errno.ENXIO, errno.EREMOTEIO])
-    def test_nobody_at_the_address(self, rig: Adxl355Rig, number: int) -> None:
-        with installed({"/dev/i2c-1": I2CBus({}, absent_errno=number)}):
-            with pytest.raises(DeviceLost, match=r"ADXL355 at 0x1D on /dev/i2c-1: "):
-                rig.sensor.open()
-            rig.sensor.close()
-
     def test_wrong_identity(self, rig: Adxl355Rig) -> None:
         adxl359 = Adxl355Twin(rig.counts, rig.due, lambda: rig.t_s, identity=b"\xad\x1d\xe9\x01")
-        rig.bus.targets[0x1D] = adxl359
+        rig.put(adxl359)
         with pytest.raises(IdentityError, match=r"0x1D on /dev/i2c-1: expected ad 1d ed, found ad 1d e9"):
-            rig.sensor.open()
-
-    def test_address_of_a_kernel_driver_is_not_forced(self, rig: Adxl355Rig) -> None:
-        rig.bus.claimed.add(0x1D)
-        with pytest.raises(ConfigurationError, match=r"0x1D on /dev/i2c-1: a kernel driver holds the address"):
-            rig.sensor.open()
-        assert rig.twin.registers[0x2D] == 0x01  # nobody touched it
-
-    def test_smbus_only_adapter(self, rig: Adxl355Rig) -> None:
-        rig.bus.functions = FUNCTIONS & ~1
-        with pytest.raises(ConfigurationError, match="plain I2C"):
-            rig.sensor.open()
-
-    def test_setting_that_does_not_take(self, rig: Adxl355Rig) -> None:
-        class Stubborn(Adxl355Twin):
-            def write(self, data: bytes) -> None:
-                super().write(data if data[0] != 0x28 else bytes([0x28, 0x05]))
-
-        rig.bus.targets[0x1D] = Stubborn(rig.counts, rig.due, lambda: rig.t_s)
-        with pytest.raises(ConfigurationError, match="FILTER is 0x05, not 0x02"):
             rig.sensor.open()
 
     def test_reset_is_repeated_until_the_trim_is_back(self, rig: Adxl355Rig) -> None:
@@ -154,37 +69,9 @@ class TestAdxl355(SensorContract):
                 self.wear += 1
                 return data[:4] + bytes([self.wear])
 
-        rig.bus.targets[0x1D] = Worn(rig.counts, rig.due, lambda: rig.t_s)
+        rig.put(Worn(rig.counts, rig.due, lambda: rig.t_s))
         with pytest.raises(DeviceLost, match=r"after a reset the shadow registers read .* 0a, not .* 09"):
             rig.sensor.open()
-
-    @pytest.mark.parametrize("number", [errno.ENXIO, errno.EREMOTEIO, errno.EIO, errno.ETIMEDOUT, errno.EAGAIN])
-    def test_three_failures_pass_a_fourth_is_a_loss(self, rig: Adxl355Rig, number: int) -> None:
-        rig.sensor.open()
-        rig.read()
-        rig.twin.fail(number, 3)
-        flags, _ = rig.read()
-        assert flags == BlockFlags.NONE
-        rig.twin.fail(number, 4)
-        with pytest.raises(DeviceLost, match="0x1D on /dev/i2c-1"):
-            rig.sensor.read_block()
-
-    def test_another_error_is_a_loss_at_once(self, rig: Adxl355Rig) -> None:
-        rig.sensor.open()
-        rig.twin.fail(errno.ENODEV, 1)
-        with pytest.raises(DeviceLost, match="No such device"):
-            rig.sensor.read_block()
-
-    @pytest.mark.parametrize("entries", [1, 9, 48])
-    def test_a_read_that_broke_off_restarts(self, rig: Adxl355Rig, entries: int) -> None:
-        # 9 and 48 entries are whole samples: no marker is missing, and still they are gone.
-        rig.sensor.open()
-        _, before = rig.read()
-        rig.twin.break_off(errno.EIO, entries)
-        flags, after = rig.read()
-        assert flags == BlockFlags.RESTART | BlockFlags.OVERRUN
-        assert after[0] == before[-1] + 1 + -(-entries // 3)
-        assert (np.diff(after) == 1).all()
 
     def test_out_of_step_at_the_front(self, rig: Adxl355Rig) -> None:
         # The X of the oldest sample is gone: its Y and Z are dropped, and each later poll leaves two entries behind.
@@ -218,15 +105,6 @@ class TestAdxl355(SensorContract):
         (drop,) = rig.sensor.take_drops()
         assert drop.count == 3 * (3 * (3 - len(before)) - 1)
 
-    def test_late_poll_is_an_overrun(self, rig: Adxl355Rig) -> None:
-        rig.sensor.open()
-        _, before = rig.read()
-        rig.sleep(0.2)
-        flags, after = rig.read()
-        assert flags == BlockFlags.RESTART | BlockFlags.OVERRUN
-        assert after[0] > before[-1] + 150
-        assert rig.sensor.take_drops() == []
-
     def test_overrun_between_count_and_read(self, rig: Adxl355Rig) -> None:
         # 31 samples are counted, then the process stalls and the oldest go before they are read.
         class Stalling(Adxl355Twin):
@@ -238,7 +116,7 @@ class TestAdxl355(SensorContract):
                     rig.t_s, Stalling.stall_s = rig.t_s + Stalling.stall_s, 0.0
                 return data
 
-        rig.bus.targets[0x1D] = Stalling(rig.counts, rig.due, lambda: rig.t_s)
+        rig.put(Stalling(rig.counts, rig.due, lambda: rig.t_s))
         rig.sensor.open()
         _, before = rig.read()
         rig.sleep(0.0305)  # the poll that was due meanwhile comes at once
@@ -259,7 +137,8 @@ class TestAdxl355(SensorContract):
                     raise OSError(errno.EIO, "Input/output error")
                 return data
 
-        twin = rig.bus.targets[0x1D] = Garbling(rig.counts, rig.due, lambda: rig.t_s)
+        twin = Garbling(rig.counts, rig.due, lambda: rig.t_s)
+        rig.put(twin)
         rig.sensor.open()
         _, before = rig.read()
         rig.sleep(0.0501 + (-rig.t_s) % 0.001)  # no sample is made between the two attempts, which would run over anew
@@ -276,21 +155,30 @@ class TestAdxl355(SensorContract):
         assert flags == BlockFlags.NONE
         assert after[0] == before[-1] + 1
 
-    def test_power_lost_underway(self, rig: Adxl355Rig) -> None:
-        rig.sensor.open()
-        rig.read()
-        rig.twin.power_cycle()
-        with pytest.raises(DeviceLost, match=r"did it lose power\?.*POWER_CTL is 0x01, not 0x00"):
-            rig.sensor.read_block()
-        rig.sensor.open()
-        flags, _ = rig.read()
-        assert flags == BlockFlags.RESTART
 
-    def test_temperature(self, rig: Adxl355Rig) -> None:
-        rig.bus.targets[0x1D] = Adxl355Twin(rig.counts, rig.due, lambda: rig.t_s, temperature_raw=lambda _: 1704)
-        rig.sensor.open()
-        block = rig.sensor.read_block()
-        assert block is not None
-        # Data sheet: 1885 at 25 degC, -9.05 LSB a degree: 181 LSB less are 20 degrees more.
-        assert block.temperature_raw == 1704
-        assert block.temperature_degc == pytest.approx(45.0)
+class Adxl357Rig(Adxl355Rig):
+    driver = Adxl357
+
+
+class Adxl359Rig(Adxl355Rig):
+    driver = Adxl359
+
+    def build_twin(self) -> Adxl355Twin:
+        return Adxl355Twin(self.counts, self.due, lambda: self.t_s, identity=b"\xad\x1d\xe9\x01")
+
+
+@pytest.mark.parametrize(("rig_class", "revision"), [(Adxl357Rig, 0xED), (Adxl359Rig, 0xE9)])
+def test_the_wide_ranges(rig_class: type[Adxl355Rig], revision: int) -> None:
+    rig = rig_class()
+    try:
+        info = rig.open()
+        assert info.kind == rig.driver.part.kind
+        assert rig.twin.registers[2] == revision
+        # Data sheet: 51200 LSB/g at 10 g, and 20 bits make +-10.24 g of that; 1852 LSB at 25 degC.
+        assert info.nominal_sensitivity == pytest.approx(51200 / 9.80665, rel=1e-12)
+        assert info.range_mps2 == pytest.approx(10.24 * 9.80665, rel=1e-12)
+        rig.temperature_raw = 1852
+        (block,) = rig.blocks(0.4)
+        assert (np.diff(rig.number(block.indications)) == 1).all()
+    finally:
+        rig.close()

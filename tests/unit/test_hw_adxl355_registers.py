@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from hw.adxl355 import Adxl355Options
-from hw.adxl355_registers import settings, temperature, triples, without_empty
+from hw.adxl355_registers import ADXL355, ADXL357, ADXL359, settings, temperature, triples, without_empty
 from hw.virtual.adxl355_twin import encode
 
 
@@ -36,16 +36,24 @@ def test_entry(entry: str, count: int) -> None:
 
 def test_temperature_ignores_what_is_above_12_bits() -> None:
     # Data sheet: 1885 at 25 degC, -9.05 LSB a degree.
-    assert temperature(bytes.fromhex("075d")) == (1885, 25.0)
-    raw, degc = temperature(bytes.fromhex("f702"))
+    assert temperature(ADXL355, bytes.fromhex("075d")) == (1885, 25.0)
+    raw, degc = temperature(ADXL355, bytes.fromhex("f702"))
     assert raw == 1794
     assert degc == pytest.approx(25 + 91 / 9.05)
 
 
+def test_the_family() -> None:
+    # Data sheets: ranges and LSB/g; ADXL357/359: 1852 LSB at 25 degC, part ID 0xED as the ADXL355, and 0xE9.
+    assert ADXL357.counts_per_g == ADXL359.counts_per_g == {10: 51200, 20: 25600, 40: 12800}
+    assert (ADXL355.identity[2], ADXL357.identity[2], ADXL359.identity[2]) == (0xED, 0xED, 0xE9)
+    assert temperature(ADXL357, bytes.fromhex("073c")) == (1852, 25.0)
+    assert settings(ADXL357, 1000.0, 40)[0x2C - 0x1E] == 0x83
+
+
 def test_settings_by_register() -> None:
     # 0x1E..0x2E: offsets, activity, filter, FIFO, interrupts, sync, range, power, self-test.
-    assert settings(1000.0, 2).hex() == "0000000000000000000102600000810000"
-    assert settings(3.90625, 8).hex() == "000000000000000000010a600000830000"
+    assert settings(ADXL355, 1000.0, 2).hex() == "0000000000000000000102600000810000"
+    assert settings(ADXL355, 3.90625, 8).hex() == "000000000000000000010a600000830000"
 
 
 def test_empty_entries_are_left_out() -> None:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
 
 from hw.adxl355 import Adxl355
-from hw.sensor import BUILT_IN, ConfigurationError, driver_names, load_driver
+from hw.sensor import BUILT_IN, ConfigurationError, Options, driver_names, load_driver
 from hw.serial_stream import SerialCsv
 
 GOOD = """
@@ -35,14 +36,21 @@ def test_built_in_drivers() -> None:
     assert load_driver("adxl355") is Adxl355
     assert load_driver("serial-csv") is SerialCsv
     assert set(BUILT_IN) <= set(driver_names())
+    for name in BUILT_IN:
+        assert issubclass(load_driver(name).options_model, Options)
+
+
+def test_what_is_built_in_is_what_the_package_declares() -> None:
+    declared = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text("utf-8"))
+    assert declared["project"]["entry-points"]["fieldcal.sensors"] == BUILT_IN
 
 
 def test_an_unknown_name_tells_what_there_is() -> None:
     with pytest.raises(
-        ConfigurationError, match=r"no driver 'adxl345': did you mean 'adxl355'\? there are .*serial-csv"
+        ConfigurationError, match=r"no driver 'axl355': did you mean 'adxl355'\? there are .*serial-csv"
     ):
-        load_driver("adxl345")
-    with pytest.raises(ConfigurationError, match=r"no driver 'zzz': there are adxl355"):
+        load_driver("axl355")
+    with pytest.raises(ConfigurationError, match=r"no driver 'zzz': there are adxl345"):
         load_driver("zzz")
 
 

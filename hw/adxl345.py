@@ -1,0 +1,80 @@
+"""Driver `adxl345`: the ADXL345 on I2C, read through its FIFO."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from hw import adxl345_registers as chip
+from hw.block import DeviceInfo
+from hw.fifo import Burst, FifoSamples, plain_samples
+from hw.fifo_options import FifoOptions
+from hw.fifo_sensor import FifoSensor, Registers
+from hw.i2c import READS_MAX
+from hw.sensor import IdentityError
+
+SAMPLES_A_TRANSFER = READS_MAX - 1  # INT_SOURCE goes before them
+LOST = "FIFO ran over, or a read of it broke off"
+
+
+class Adxl345Options(FifoOptions):
+    """Options of `adxl345`."""
+
+    rates_hz = tuple(chip.RATE_CODES)
+    fifo_samples = chip.FIFO_SAMPLES
+    bytes_a_sample = 9  # address, register, address, six of data: one read a sample
+    bytes_a_poll = 12  # INT_SOURCE, FIFO_STATUS and INT_SOURCE again
+
+    address: Literal[0x53, 0x1D] = Field(0x53, description="83 (0x53), or 29 (0x1D) with ALT ADDRESS high")
+    rate_hz: float = Field(800.0, description=f"one of {', '.join(f'{rate:g}' for rate in chip.RATE_CODES)}")
+    range_g: Literal[2, 4, 8, 16] = Field(16, description="range, plus and minus; the resolution is the same in all")
+
+
+class Adxl345(FifoSensor):
+    """The entry count in one transfer, then a read of six bytes for each sample, which takes it from the FIFO.
+
+    Up to 20 such reads go in one transfer behind INT_SOURCE, whose overrun bit reading data would clear. A sample that
+    is read has no mark: once some are lost, all that this poll found goes with them, and the next one starts anew.
+    """
+
+    options_model = Adxl345Options
+    word_bytes = 6
+
+    def _kind(self) -> str:
+        return "ADXL345"
+
+    def _limits(self) -> tuple[int, int]:
+        return chip.limits(self._options.range_g)
+
+    def _settings(self) -> Registers:
+        return chip.settings(self._options.rate_hz, self._options.range_g)
+
+    def _set_up(self) -> DeviceInfo:
+        (found,) = self._device.read(chip.DEVID, 1)
+        if found != chip.IDENTITY:
+            raise IdentityError(f"{self._device.name}: expected 0x{chip.IDENTITY:02X}, found 0x{found:02X}")
+        self._device.write(chip.POWER_CTL, chip.STANDBY)
+        self._device.write(chip.FIFO_CTL, chip.BYPASS)  # empties the FIFO
+        self._device.read(chip.DATA, 6)  # clears what INT_SOURCE says of an earlier run
+        self._write_settings(last=chip.POWER_CTL)
+        return self._info("adxl345", chip.COUNTS_PER_G, self._options.rate_hz, {"DEVID": found})
+
+    def _poll(self) -> Burst:
+        retries = self._device.retries
+        arrival_ns, utc_ns, (status,) = self._device.read_stamped([(chip.FIFO_STATUS, 1)], self._clock)
+        left = status & chip.ENTRIES_MASK
+        data, lost = b"", False
+        while left:
+            samples = min(left, SAMPLES_A_TRANSFER)
+            answer = self._device.read_each([(chip.INT_SOURCE, 1)] + [(chip.DATA, 6)] * samples)
+            lost |= bool(answer[0] & chip.OVERRUN) or self._device.retries > retries
+            data += answer[1:]
+            left -= samples
+        if lost:
+            self._drop(LOST, len(data) // self.word_bytes)
+            data = b""
+        return Burst(arrival_ns, utc_ns, data, lost)
+
+    def _decode(self, data: bytes) -> FifoSamples:
+        return plain_samples(data, "<")

@@ -1,0 +1,228 @@
+"""What all drivers that poll a FIFO over I2C have in common: polls, blocks, losses. A chip adds its registers."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+
+from hw.block import BlockFlags, DeviceInfo, Drop, SampleBlock
+from hw.cutting import Break, Cutter, Stretch
+from hw.fifo import Burst, FifoSamples
+from hw.i2c import I2CDevice
+from hw.sensor import Clock, ConfigurationError, DeviceError, DeviceLost, Options, system_clock
+
+STANDARD_GRAVITY_MPS2 = 9.80665
+BLOCK_S = 0.5
+GOLDEN = (5**0.5 - 1) / 2
+OUT_OF_STEP = "FIFO entries out of step"
+
+Registers = Mapping[int, tuple[str, int]]
+"""What is set, by register: its name and value."""
+
+
+class FifoSensor(ABC):
+    """Polls a FIFO for half a second and makes blocks of what came.
+
+    How many samples are lost is unknown when the FIFO ran over, when a read broke off and when its entries were out of
+    step: RESTART each time. A subclass gives the abstract methods; `options` must be FifoOptions with an `address`.
+    """
+
+    options_model: ClassVar[type[Options]]
+    word_bytes: ClassVar[int]  # what the FIFO stores at a time
+
+    def __init__(
+        self,
+        name: str,
+        options: Any,
+        *,
+        clock: Clock = system_clock,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._options = options
+        self._clock = clock
+        self._sleep = sleep
+        self._device = I2CDevice(self._kind(), options.bus, options.address, sleep)
+        self._cutter = Cutter(name, options.rate_hz, *self._limits())
+        self._ready: deque[SampleBlock] = deque()
+        self._loss: DeviceLost | None = None
+        self._dropped: Counter[str] = Counter()  # words, by reason
+        self._rest = b""
+        self._next_poll_ns = 0
+        self._phase = 0.0
+
+    @abstractmethod
+    def _kind(self) -> str:
+        """The part's name, for messages."""
+
+    @abstractmethod
+    def _limits(self) -> tuple[int, int]:
+        """Lowest and highest count of the range."""
+
+    @abstractmethod
+    def _set_up(self) -> DeviceInfo:
+        """Identify, reset, configure, read back, start the FIFO."""
+
+    @abstractmethod
+    def _settings(self) -> Registers:
+        """What is set while measuring, in rising order."""
+
+    @abstractmethod
+    def _poll(self) -> Burst:
+        """What the FIFO holds now."""
+
+    @abstractmethod
+    def _decode(self, data: bytes) -> FifoSamples:
+        """Samples in the words of half a second, the rest of the last one included."""
+
+    def _temperature(self) -> tuple[int | None, float | None]:
+        """Raw and degC; called before the first poll of each block."""
+        return None, None
+
+    def _forget(self) -> None:
+        """The next word does not follow the last one."""
+        self._drop(OUT_OF_STEP, len(self._rest) // self.word_bytes)
+        self._rest = b""
+
+    def open(self) -> DeviceInfo:
+        """Identify, reset, configure, read back.
+
+        Raises ConfigurationError (address held by a kernel driver, settings not taken), IdentityError or DeviceLost
+        (no bus, nothing answers).
+        """
+        self._device.open()
+        try:
+            info = self._set_up()
+        except BaseException:
+            self.close()
+            raise
+        self._loss = None
+        self._rest = b""
+        self._forget()
+        self._cutter.nominal_rate_hz = info.nominal_rate_hz
+        self._cutter.flag(BlockFlags.RESTART)
+        self._next_poll_ns = self._clock()[0]
+        return info
+
+    def close(self) -> None:
+        """Release the bus; the device goes on measuring until the next reset."""
+        self._device.close()
+
+    def take_drops(self) -> list[Drop]:
+        """FIFO entries that became no sample since the last call, in bytes."""
+        drops = [Drop(self.word_bytes * words, "bytes", reason) for reason, words in self._dropped.items() if words]
+        self._dropped.clear()
+        return drops
+
+    def read_block(self) -> SampleBlock | None:
+        """The next block, or None. Raises DeviceLost."""
+        if not self._ready and self._loss is None:
+            self._gather()
+        if self._ready:
+            return self._ready.popleft()
+        if self._loss is not None:
+            raise self._loss
+        return None
+
+    def _gather(self) -> None:
+        """Poll for BLOCK_S; a loss, of samples or of the device, ends it earlier."""
+        bursts: list[Burst] = []
+        raw_degc: tuple[int | None, float | None] = None, None
+        end_ns = self._next_poll_ns + round(BLOCK_S * 1e9)
+        try:
+            raw_degc = self._temperature()
+            while self._next_poll_ns < end_ns and not self._ready:
+                self._wait()
+                burst = self._poll()
+                if burst.lost:
+                    self._finish(bursts, raw_degc)
+                    self._forget()
+                    self._cutter.flag(BlockFlags.RESTART | BlockFlags.OVERRUN)
+                    bursts = []
+                    end_ns = self._next_poll_ns + round(BLOCK_S * 1e9)
+                bursts.append(burst)
+            if not any(burst.data for burst in bursts):
+                self._check_settings(DeviceLost)
+        except DeviceLost as loss:
+            self._loss = loss  # raised once all that came before it has been returned
+        self._finish(bursts, raw_degc)
+
+    def _wait(self) -> None:
+        """Sleep to the next poll; spread over a sample period by the golden ratio, so that poll and sample clock do
+        not beat and each second's arrivals sample all of the period."""
+        now_ns, _ = self._clock()
+        self._next_poll_ns += round(self._options.interval_s * 1e9)
+        self._phase = (self._phase + GOLDEN) % 1.0
+        wait_s = (self._next_poll_ns - now_ns) * 1e-9 + self._phase / self._cutter.nominal_rate_hz
+        if wait_s > 0:
+            self._sleep(wait_s)
+        else:
+            self._next_poll_ns = now_ns
+
+    def _finish(self, bursts: list[Burst], raw_degc: tuple[int | None, float | None]) -> None:
+        """Decode what was read and make blocks of it."""
+        if not bursts:
+            return
+        lengths = [len(burst.data) // self.word_bytes for burst in bursts]
+        words_read = len(self._rest) // self.word_bytes + np.cumsum(lengths)
+        found = self._decode(self._rest + b"".join(burst.data for burst in bursts))
+        self._rest = found.rest
+        self._drop(OUT_OF_STEP, found.dropped)
+        stretch = Stretch(
+            indications=found.counts,
+            burst_t_monotonic_ns=np.array([burst.arrival_ns for burst in bursts]),
+            burst_count=np.searchsorted(found.last, words_read),
+            t_utc_ns=bursts[-1].utc_ns,
+            temperature_raw=raw_degc[0],
+            temperature_degc=raw_degc[1],
+        )
+        self._ready.extend(self._cutter.cut(stretch, [Break(at, BlockFlags.RESTART) for at in found.breaks]))
+
+    def _drop(self, reason: str, words: int) -> None:
+        self._dropped[reason] += words
+
+    def _check_settings(self, error: type[DeviceError] = ConfigurationError) -> None:
+        """Read every setting back, neighbours in one read."""
+        settings = self._settings()
+        runs: list[list[int]] = []
+        for register in settings:
+            if runs and register == runs[-1][-1] + 1:
+                runs[-1].append(register)
+            else:
+                runs.append([register])
+        found = self._device.read_each([(run[0], len(run)) for run in runs])
+        wrong = [
+            f"{name} is 0x{value:02X}, not 0x{wanted:02X}"
+            for value, (name, wanted) in zip(found, settings.values(), strict=True)
+            if value != wanted
+        ]
+        if wrong:
+            raise error(f"{self._device.name} is not set as it should be (did it lose power?): {', '.join(wrong)}")
+
+    def _write_settings(self, *, last: int) -> None:
+        """Write all settings, register `last` behind the others, and read them back."""
+        settings = self._settings()
+        for register, (_, value) in settings.items():
+            if register != last:
+                self._device.write(register, value)
+        self._device.write(last, settings[last][1])
+        self._check_settings()
+
+    def _info(self, driver: str, counts_per_g: float, rate_hz: float, found: Mapping[str, int]) -> DeviceInfo:
+        """What `open` returns; `found` are read registers that were not set."""
+        registers = dict(found) | dict(self._settings().values())
+        return DeviceInfo(
+            driver=driver,
+            kind=self._kind(),
+            serial_number="",
+            unit="count",
+            axes=3,
+            nominal_rate_hz=rate_hz,
+            range_mps2=-self._limits()[0] / counts_per_g * STANDARD_GRAVITY_MPS2,
+            nominal_sensitivity=counts_per_g / STANDARD_GRAVITY_MPS2,
+            settings={name: f"0x{value:02X}" for name, value in registers.items()},
+        )

@@ -1,0 +1,79 @@
+"""Registers of the LSM6DSO and LSM6DSOX (the same for what is used here) and what their bytes mean.
+
+Sources: data sheets LSM6DSO and LSM6DSOX, application notes AN5192 and AN5272 (actual output data rate); names and
+bits also in ST's lsm6dsox-pid (lsm6dsox_reg.h) and in Linux, drivers/iio/imu/st_lsm6dsx.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from hw.fifo import FifoSamples
+
+WHO_AM_I, IDENTITY = 0x0F, 0x6C
+FIRST_FIFO_SETTING, FIFO_CTRL3, FIFO_CTRL4, FIFO_STATUS, FIFO_DATA = 0x07, 0x09, 0x0A, 0x3A, 0x78
+CTRL1_XL, CTRL3_C, TEMPERATURE, FREQ_FINE, USER_OFFSET = 0x10, 0x12, 0x20, 0x63, 0x73
+SOFTWARE_RESET = 0x01  # in CTRL3_C, clears itself
+BYPASS, CONTINUOUS = 0x00, 0x06  # FIFO_CTRL4
+OVERRUN = 0x48  # in the second byte of FIFO_STATUS: now, and latched until it is read
+COUNT_MASK = 0x3FF
+FIFO_WORDS = 512
+WORD_BYTES = 7
+LIMITS = -(2**15), 2**15 - 1
+# Data sheet, mg/LSB by range in g, in the order of the range's code.
+MG_PER_COUNT: Mapping[int, float] = {2: 0.061, 16: 0.488, 4: 0.122, 8: 0.244}
+RATES_HZ = (12.5, 26.0, 52.0, 104.0, 208.0, 416.0, 833.0, 1667.0, 3333.0, 6667.0)  # by code, from 1
+_INTERNAL_HZ, _FINE_STEP = 6667.0, 0.0015
+_BLOCK_DATA_UPDATE, _AUTO_INCREMENT, _RESET_CTRL9, _DEVICE_CONF = 0x40, 0x04, 0xE0, 0x02
+_ACCELEROMETER = 2  # tag
+
+
+def actual_rate_hz(rate_hz: float, freq_fine: int) -> float:
+    """What the part says its rate is: 6667 Hz (1 + 0.0015 FREQ_FINE) over a power of two (AN5272, ODR actual)."""
+    signed = freq_fine - 256 if freq_fine > 127 else freq_fine
+    divider = 2 ** (len(RATES_HZ) - 1 - RATES_HZ.index(rate_hz))
+    return float(_INTERNAL_HZ * (1 + _FINE_STEP * signed) / divider)
+
+
+def temperature(data: bytes) -> tuple[int, float]:
+    """Raw and degC: 256 LSB a degree, 0 at 25 degC."""
+    raw = int.from_bytes(data, "little", signed=True)
+    return raw, 25.0 + raw / 256.0
+
+
+def settings(rate_hz: float, range_g: int) -> dict[int, tuple[str, int]]:
+    """Name and value by register while measuring: accelerometer alone, high performance, no second filter, no user
+    offset, no self-test, FIFO in continuous mode."""
+    code = RATES_HZ.index(rate_hz) + 1
+    names = ("FIFO_CTRL1", "FIFO_CTRL2", "FIFO_CTRL3", "FIFO_CTRL4")
+    values = dict.fromkeys(enumerate(names, FIRST_FIFO_SETTING), 0)
+    controls = ("1_XL", "2_G", "3_C", "4_C", "5_C", "6_C", "7_G", "8_XL", "9_XL", "10_C")
+    values |= dict.fromkeys(enumerate((f"CTRL{name}" for name in controls), CTRL1_XL), 0)
+    values |= dict.fromkeys(enumerate(("X_OFS_USR", "Y_OFS_USR", "Z_OFS_USR"), USER_OFFSET), 0)
+    values[FIFO_CTRL3, "FIFO_CTRL3"] = code
+    values[FIFO_CTRL4, "FIFO_CTRL4"] = CONTINUOUS
+    values[CTRL1_XL, "CTRL1_XL"] = code << 4 | list(MG_PER_COUNT).index(range_g) << 2
+    values[CTRL3_C, "CTRL3_C"] = _BLOCK_DATA_UPDATE | _AUTO_INCREMENT
+    values[0x18, "CTRL9_XL"] = _RESET_CTRL9 | _DEVICE_CONF  # AN5192: DEVICE_CONF must be set
+    return {register: (name, value) for (register, name), value in values.items()}
+
+
+def tagged_samples(data: bytes, last_counter: int | None) -> tuple[FifoSamples, int | None]:
+    """Accelerometer words of a run of FIFO words, and the last one's counter.
+
+    A word is a tag (bits 7:3 kind, 2:1 counter, 0 makes the parity even) and three 16 bit numbers. Words of another
+    kind or parity are dropped; where the counter does not go on by one (from `last_counter`, None: from anywhere)
+    there is a break.
+    """
+    words = np.frombuffer(data, np.uint8).reshape(-1, WORD_BYTES)
+    tag = words[:, 0]
+    good = (tag >> 3 == _ACCELEROMETER) & (np.bitwise_count(tag) % 2 == 0)
+    last = np.flatnonzero(good)
+    counter = (tag[last] >> 1 & 3).astype(np.int64)
+    before = counter[:1] - 1 if last_counter is None else last_counter
+    steps = np.diff(counter, prepend=before) % 4 if len(counter) else counter
+    counts = np.ascontiguousarray(words[last, 1:]).view("<i2").astype(np.int32)
+    samples = FifoSamples(counts, last, np.flatnonzero(steps != 1).tolist(), len(words) - len(last), b"")
+    return samples, int(counter[-1]) if len(counter) else last_counter

@@ -1,0 +1,105 @@
+"""Driver `mpu6050`: MPU-6050, MPU-6500 and MPU-9250 on I2C, the accelerometer read through the FIFO."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from hw import mpu6050_registers as chip
+from hw.block import DeviceInfo
+from hw.fifo import Burst, FifoSamples, plain_samples
+from hw.fifo_options import FifoOptions
+from hw.fifo_sensor import FifoSensor, Registers
+from hw.sensor import IdentityError
+
+RESET_WAIT_S = 0.1  # register map: 100 ms; Linux waits as long
+START_WAIT_S = 0.1  # gyroscope and its clock run by then (Linux: 60 to 70 ms)
+FREE_SAMPLES_MIN = 3  # with less room Linux resets the FIFO too: it may run over while it is read
+LOST = "FIFO ran over, or out of step: reset"
+
+
+class Mpu6050Options(FifoOptions):
+    """Options of `mpu6050`."""
+
+    rates_hz = chip.RATES_HZ
+    fifo_samples = 512 // chip.SAMPLE_BYTES  # of the later parts; the MPU-6050's holds twice as much
+    bytes_a_sample = 6
+    bytes_a_poll = 12  # INT_STATUS, FIFO_COUNT, and the beginning of the read
+
+    address: Literal[0x68, 0x69] = Field(0x68, description="104 (0x68), or 105 (0x69) with AD0 high")
+    rate_hz: float = Field(1000.0, description=f"one of {', '.join(f'{rate:g}' for rate in chip.RATES_HZ)}")
+    range_g: Literal[2, 4, 8, 16] = Field(2, description="range, plus and minus")
+    clone: bool = Field(False, description="take a part with an unknown WHO_AM_I for an MPU-6500")
+
+
+class Mpu6050(FifoSensor):
+    """Overflow flag and byte count in one transfer, then as many bytes as make whole samples.
+
+    Samples have no mark, and the FIFO's size is no multiple of theirs: once it ran over, all behind is out of step.
+    So it is reset when it ran over or nearly did, when a read broke off, and when its count is no multiple of a sample
+    twice in a row (once may be a sample that is just being written).
+    """
+
+    options_model = Mpu6050Options
+    word_bytes = chip.SAMPLE_BYTES
+    _part = chip.PARTS[0x68]
+
+    def _kind(self) -> str:
+        return self._part.kind
+
+    def _limits(self) -> tuple[int, int]:
+        return chip.LIMITS
+
+    def _settings(self) -> Registers:
+        return chip.settings(self._part, self._options.rate_hz, self._options.range_g)
+
+    def _set_up(self) -> DeviceInfo:
+        (found,) = self._device.read(chip.WHO_AM_I, 1)
+        if found not in chip.PARTS and not self._options.clone:
+            known = ", ".join(f"0x{identity:02X}" for identity in chip.PARTS)
+            raise IdentityError(
+                f"{self._device.name}: WHO_AM_I is 0x{found:02X}, expected one of {known} (option clone accepts others)"
+            )
+        self._part = chip.PARTS.get(found) or chip.clone(found)
+        self._device.write(chip.POWER_1, chip.DEVICE_RESET)
+        self._sleep(RESET_WAIT_S)
+        self._device.write(chip.POWER_1, chip.CLOCK_FROM_GYRO)  # it is asleep after a reset
+        self._sleep(START_WAIT_S)
+        self._write_settings(last=chip.USER_CTRL)
+        self._reset_fifo()
+        trim = self._device.read(self._part.accel_offset, 8)
+        untouched = {f"ACCEL_OFFSET_{i}": value for i, value in enumerate(trim)}
+        counts_per_g = chip.COUNTS_PER_G[self._options.range_g]
+        return self._info("mpu6050", counts_per_g, self._options.rate_hz, {"WHO_AM_I": found} | untouched)
+
+    def _reset_fifo(self) -> None:
+        self._device.write(chip.USER_CTRL, chip.FIFO_RESET)
+        self._device.write(chip.USER_CTRL, chip.FIFO_ON)
+
+    def _temperature(self) -> tuple[int, float]:
+        return self._part.temperature(self._device.read(chip.TEMPERATURE, 2))
+
+    def _poll(self) -> Burst:
+        retries = self._device.retries
+        arrival_ns, utc_ns, found = self._device.read_stamped([(chip.INT_STATUS, 1), (chip.FIFO_COUNT, 2)], self._clock)
+        count = int.from_bytes(found[1:], "big")
+        lost = bool(found[0] & chip.OVERFLOW) or self._device.retries > retries  # a status read in vain is cleared
+        lost |= count > self._part.fifo_bytes - FREE_SAMPLES_MIN * self.word_bytes
+        if count % self.word_bytes:
+            again = int.from_bytes(self._device.read(chip.FIFO_COUNT, 2), "big")
+            lost |= again % self.word_bytes != 0
+        whole = count - count % self.word_bytes
+        data = b""
+        if whole and not lost:
+            data = self._device.read(chip.FIFO_DATA, whole)
+            (status,) = self._device.read(chip.INT_STATUS, 1)
+            lost = bool(status & chip.OVERFLOW) or self._device.retries > retries
+        if lost:
+            self._drop(LOST, count // self.word_bytes)
+            self._reset_fifo()
+            data = b""
+        return Burst(arrival_ns, utc_ns, data, lost)
+
+    def _decode(self, data: bytes) -> FifoSamples:
+        return plain_samples(data, ">")

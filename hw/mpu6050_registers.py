@@ -1,0 +1,86 @@
+"""Registers of the MPU-6050, MPU-6500 and MPU-9250 and what their bytes mean.
+
+Sources: register maps RM-MPU-6000A, RM-MPU-6500A and RM-MPU-9250A, specification PS-MPU-6000A; identities, FIFO sizes
+and temperature lines also in Linux, drivers/iio/imu/inv_mpu6050 (inv_mpu_iio.h, inv_mpu_core.c).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+SAMPLE_RATE_DIV, CONFIG, GYRO_CONFIG, ACCEL_CONFIG, ACCEL_CONFIG_2, FIFO_EN = 0x19, 0x1A, 0x1B, 0x1C, 0x1D, 0x23
+INT_ENABLE, INT_STATUS, TEMPERATURE, USER_CTRL, POWER_1, POWER_2 = 0x38, 0x3A, 0x41, 0x6A, 0x6B, 0x6C
+FIFO_COUNT, FIFO_DATA, WHO_AM_I = 0x72, 0x74, 0x75
+DEVICE_RESET, CLOCK_FROM_GYRO = 0x80, 0x01
+FIFO_RESET, FIFO_ON = 0x04, 0x40
+OVERFLOW = 0x10  # in INT_STATUS and INT_ENABLE
+SAMPLE_BYTES = 6
+COUNTS_PER_G: Mapping[int, int] = {2: 16384, 4: 8192, 8: 4096, 16: 2048}
+LIMITS = -(2**15), 2**15 - 1
+RATES_HZ = tuple(1000.0 / (divider + 1) for divider in (0, 1, 3, 4, 7, 9, 19, 39, 99, 249))
+_ACCEL_INTO_FIFO = 0x08
+# Bandwidth of the digital low-pass filter by its code; code 0 of the MPU-6050 would run the divider from 8 kHz.
+_BANDWIDTH_HZ: Mapping[int, float] = {1: 184, 2: 94, 3: 44, 4: 21, 5: 10, 6: 5}
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """What differs within the family."""
+
+    kind: str
+    fifo_bytes: int
+    accel_offset: int  # first of the accelerometer's offset registers, which hold the maker's trim
+    accel_config_2: bool
+    counts_per_degc: float
+    zero_count_degc: float
+
+    def temperature(self, data: bytes) -> tuple[int, float]:
+        """Raw and degC from the two bytes of the temperature."""
+        raw = int.from_bytes(data, "big", signed=True)
+        return raw, raw / self.counts_per_degc + self.zero_count_degc
+
+
+_MPU6050 = Part("MPU-6050", 1024, 0x06, False, 340.0, 36.53)
+_MPU6500 = Part("MPU-6500", 512, 0x77, True, 333.87, 21.0)
+PARTS: Mapping[int, Part] = {
+    0x68: _MPU6050,
+    0x70: _MPU6500,
+    0x71: Part("MPU-9250", 512, 0x77, True, 333.87, 21.0),
+    0x73: Part("MPU-9255", 512, 0x77, True, 333.87, 21.0),
+    0x74: Part("MPU-6515", 512, 0x77, True, 333.87, 21.0),
+}
+"""By WHO_AM_I."""
+
+
+def clone(who_am_i: int) -> Part:
+    """What is taken for granted of a part with another WHO_AM_I: the smaller FIFO of the later parts."""
+    return Part(f"MPU clone 0x{who_am_i:02X}", 512, 0x77, True, 333.87, 21.0)
+
+
+def low_pass_code(rate_hz: float) -> int:
+    """The widest filter that ends below half the rate, as Linux chooses it."""
+    return min((code for code, hz in _BANDWIDTH_HZ.items() if hz <= rate_hz / 2), default=6)
+
+
+def settings(part: Part, rate_hz: float, range_g: int) -> dict[int, tuple[str, int]]:
+    """Name and value by register while measuring: accelerometer alone in the FIFO, no self-test.
+
+    The clock is the gyroscope's, steadier than the internal one; so the gyroscope is on. The overflow interrupt is
+    enabled (its pin may stay open) for its status bit.
+    """
+    low_pass = low_pass_code(rate_hz)
+    values = {
+        SAMPLE_RATE_DIV: ("SMPLRT_DIV", round(1000.0 / rate_hz) - 1),
+        CONFIG: ("CONFIG", low_pass),
+        GYRO_CONFIG: ("GYRO_CONFIG", 0),
+        ACCEL_CONFIG: ("ACCEL_CONFIG", list(COUNTS_PER_G).index(range_g) << 3),
+        FIFO_EN: ("FIFO_EN", _ACCEL_INTO_FIFO),
+        INT_ENABLE: ("INT_ENABLE", OVERFLOW),
+        USER_CTRL: ("USER_CTRL", FIFO_ON),
+        POWER_1: ("PWR_MGMT_1", CLOCK_FROM_GYRO),
+        POWER_2: ("PWR_MGMT_2", 0),
+    }
+    if part.accel_config_2:
+        values[ACCEL_CONFIG_2] = ("ACCEL_CONFIG_2", low_pass)
+    return dict(sorted(values.items()))

@@ -1,0 +1,152 @@
+"""What all register-level twins with a live FIFO have in common, for `hw.virtual.kernel`."""
+
+from __future__ import annotations
+
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+Counts = NDArray[np.int32]
+
+
+class FifoTwin(ABC):
+    """`source(first, n)` returns (n, 3) int32 counts of samples first .. first + n - 1, at the set range;
+    `samples_due(t_s)` how many samples exist at `t_s` in all; `clock()` is that time, in seconds.
+    `temperature_raw(t_s)` is the chip's temperature number. All physics comes from outside.
+
+    Samples go on being counted while the FIFO is off, but only those made while it is on reach it.
+    """
+
+    fifo_bytes: ClassVar[int]
+    sample_bytes: ClassVar[int]
+    word_bytes: ClassVar[int]
+    data_register: ClassVar[int]
+    temperature_at_25_degc: ClassVar[int] = 0
+
+    def __init__(
+        self,
+        source: Callable[[int, int], Counts],
+        samples_due: Callable[[float], int],
+        clock: Callable[[], float],
+        *,
+        temperature_raw: Callable[[float], int] | None = None,
+    ) -> None:
+        self._source = source
+        self._samples_due = samples_due
+        self._clock = clock
+        self._temperature_raw = temperature_raw or (lambda _: self.temperature_at_25_degc)
+        self._failures: list[int] = []
+        self._broken_off: tuple[int, int] | None = None
+        self.power_cycle()
+
+    @abstractmethod
+    def _reset_registers(self) -> bytearray:
+        """All 256 registers as after a reset."""
+
+    @property
+    @abstractmethod
+    def _filling(self) -> bool:
+        """Whether new samples go into the FIFO."""
+
+    @abstractmethod
+    def _encode(self, first: int, counts: Counts) -> bytes:
+        """Words of samples first .. first + n - 1."""
+
+    @abstractmethod
+    def _get(self, register: int) -> int:
+        """One register read."""
+
+    @abstractmethod
+    def _set(self, register: int, value: int) -> None:
+        """One register written."""
+
+    def power_cycle(self) -> None:
+        """Power fails and comes back, or a reset: registers as after it, FIFO empty."""
+        self.registers = self._reset_registers()
+        self._pointer = 0
+        self._empty()
+        self._overrun = False
+
+    def steal(self, word: int = 0, count: int = 1) -> None:
+        """Fault: words vanish from the FIFO, the first of them at place `word`."""
+        self._fill()
+        del self._fifo[self.word_bytes * word : self.word_bytes * (word + count)]
+
+    def fail(self, number: int, times: int = 1) -> None:
+        """Fault: the next messages end in this errno."""
+        self._failures += [number] * times
+
+    def break_off(self, number: int, words: int) -> None:
+        """Fault: the next FIFO read ends in this errno after so many words went out in vain."""
+        self._broken_off = number, words
+
+    def write(self, data: bytes) -> None:
+        """One I2C write message: register, then values."""
+        self._fail()
+        self._pointer = data[0]
+        for value in data[1:]:
+            self._set(self._pointer, value)
+            self._pointer = (self._pointer + 1) & 0xFF
+
+    def read(self, count: int) -> bytes:
+        """One I2C read message, from the register written last on."""
+        self._fail()
+        self._fill()
+        if self._broken_off and self._pointer == self.data_register:
+            number, words = self._broken_off
+            self._broken_off = None
+            self._take(self.word_bytes * words)
+            raise error(number)
+        out = bytearray()
+        while len(out) < count:
+            if self._pointer == self.data_register:
+                out += self._read_fifo(count - len(out))
+            else:
+                out.append(self._get(self._pointer))
+                self._pointer = (self._pointer + 1) & 0xFF
+        return bytes(out)
+
+    def _read_fifo(self, count: int) -> bytes:
+        """What a read of so many bytes from the data register returns."""
+        return self._take(count)
+
+    def _take(self, count: int) -> bytes:
+        taken = bytes(self._fifo[:count])
+        del self._fifo[:count]
+        return taken + self._nothing(count - len(taken))
+
+    def _nothing(self, count: int) -> bytes:
+        """What is read from an empty FIFO."""
+        return bytes(count)
+
+    def _empty(self) -> None:
+        """Empty the FIFO; what is made from now on may go into it."""
+        self._fifo = bytearray()
+        self._next = self._samples_due(self._clock()) if self._filling else 0
+
+    def _fill(self) -> None:
+        if not self._filling:
+            return
+        due = self._samples_due(self._clock())
+        if due <= self._next:
+            return
+        room = self.fifo_bytes // self.sample_bytes + 1  # one more than it holds, so that an overflow shows
+        first = max(self._next, due - room)
+        self._fifo += self._encode(first, self._source(first, due - first))
+        self._next = due
+        if len(self._fifo) > self.fifo_bytes:
+            self._overrun = True
+            del self._fifo[: len(self._fifo) - self.fifo_bytes]
+
+    def _fail(self) -> None:
+        if self._failures:
+            raise error(self._failures.pop(0))
+
+
+def error(number: int) -> OSError:
+    """The errno as the kernel's answer."""
+    return OSError(number, os.strerror(number))

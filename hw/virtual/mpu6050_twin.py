@@ -1,0 +1,72 @@
+"""An MPU-6050 or one of its successors at register level with its live FIFO, which runs over byte by byte."""
+
+from __future__ import annotations
+
+from hw.virtual.fifo_twin import Counts, FifoTwin
+
+SMPLRT_DIV, FIFO_EN, INT_ENABLE, INT_STATUS, TEMPERATURE = 0x19, 0x23, 0x38, 0x3A, 0x41
+USER_CTRL, POWER_1, POWER_2, FIFO_COUNT, FIFO_DATA, WHO_AM_I = 0x6A, 0x6B, 0x6C, 0x72, 0x74, 0x75
+TRIM = bytes([0x12, 0x34, 0x56, 0x78, 0x9A, 0xBC, 0xDE, 0xF0])  # the maker's, any constant does
+
+
+class Mpu6050Twin(FifoTwin):
+    """See FifoTwin."""
+
+    fifo_bytes = 1024
+    sample_bytes = 6
+    word_bytes = 1
+    data_register = FIFO_DATA
+    identity = 0x68
+    trim_register = 0x06
+    temperature_at_25_degc = round((25 - 36.53) * 340)
+
+    def _reset_registers(self) -> bytearray:
+        registers = bytearray(256)
+        registers[WHO_AM_I] = self.identity
+        registers[POWER_1] = 0x40  # asleep
+        registers[self.trim_register : self.trim_register + len(TRIM)] = TRIM
+        return registers
+
+    @property
+    def _filling(self) -> bool:
+        awake = not self.registers[POWER_1] & 0x40
+        return awake and bool(self.registers[USER_CTRL] & 0x40) and bool(self.registers[FIFO_EN] & 0x08)
+
+    def _encode(self, first: int, counts: Counts) -> bytes:  # noqa: ARG002 - these samples bear no number
+        return counts.astype(">i2").tobytes()
+
+    def _get(self, register: int) -> int:
+        if register == INT_STATUS:
+            status = (self._overrun and bool(self.registers[INT_ENABLE] & 0x10)) << 4
+            self._overrun = False
+            return status
+        if register in (FIFO_COUNT, FIFO_COUNT + 1):
+            return len(self._fifo).to_bytes(2, "big")[register - FIFO_COUNT]
+        if register in (TEMPERATURE, TEMPERATURE + 1):
+            raw = self._temperature_raw(self._clock())
+            return raw.to_bytes(2, "big", signed=True)[register - TEMPERATURE]
+        return self.registers[register]
+
+    def _set(self, register: int, value: int) -> None:
+        if register == POWER_1 and value & 0x80:
+            self.power_cycle()
+        elif register == USER_CTRL:
+            before = self._filling
+            self.registers[USER_CTRL] = value & ~0x04
+            if value & 0x04 or self._filling != before:
+                self._empty()
+        elif register in (POWER_1, POWER_2) or (SMPLRT_DIV <= register <= INT_ENABLE and self._awake):
+            self.registers[register] = value
+
+    @property
+    def _awake(self) -> bool:
+        return not self.registers[POWER_1] & 0x40
+
+
+class Mpu6500Twin(Mpu6050Twin):
+    """The MPU-6500: another identity, half the FIFO, another temperature line."""
+
+    fifo_bytes = 512
+    identity = 0x70
+    trim_register = 0x77
+    temperature_at_25_degc = round((25 - 21) * 333.87)

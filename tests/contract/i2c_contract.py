@@ -1,0 +1,216 @@
+"""What every driver that polls a FIFO over I2C must do: the contract on a register-level twin under the real smbus2."""
+
+from __future__ import annotations
+
+import errno
+import functools
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from hw.block import BlockFlags
+from hw.fifo_sensor import FifoSensor
+from hw.sensor import ConfigurationError, DeviceLost, IdentityError
+from hw.virtual.fifo_twin import FifoTwin
+from hw.virtual.kernel import FUNCTIONS, I2CBus, installed
+from tests.contract.contract import Rig, SensorContract
+
+LAP = 1000
+
+
+@functools.cache
+def numbered_counts() -> NDArray[np.int32]:
+    """x and y count samples in laps and laps, z is their negative sum; enough for the longest test."""
+    lap, place = np.divmod(np.arange(1_100_000, dtype=np.int32), LAP)
+    return np.column_stack([place - 500, lap - 550, 1050 - place - lap])
+
+
+class I2cRig(Rig):
+    """A subclass names driver, twin, options and what its range ends with."""
+
+    driver: ClassVar[type[FifoSensor]]
+    twin_class: ClassVar[type[FifoTwin]]
+    address: ClassVar[int]
+    full: ClassVar[int]
+    options: ClassVar[dict[str, Any]] = {}
+
+    def __init__(self) -> None:
+        self.saturated = range(0)
+        self.temperature_raw: int | None = None
+        self.twin = self.build_twin()
+        self.bus = I2CBus({self.address: self.twin})
+        self._kernel = installed({"/dev/i2c-1": self.bus})
+        self._kernel.__enter__()
+        self.sensor = self.build()
+        self.name = rf"0x{self.address:02X} on /dev/i2c-1"
+
+    def build_twin(self) -> FifoTwin:
+        return self.twin_class(self.counts, self.due, lambda: self.t_s, temperature_raw=self.temperature)
+
+    def temperature(self, t_s: float) -> int:  # noqa: ARG002
+        return self.twin_class.temperature_at_25_degc if self.temperature_raw is None else self.temperature_raw
+
+    def build(self, **options: Any) -> FifoSensor:
+        given = self.driver.options_model.model_validate(self.options | options)
+        return self.driver("sensor", given, clock=self.clock, sleep=lambda s: self.sleep(s))
+
+    def build_elsewhere(self) -> FifoSensor:
+        return self.build(bus=7)
+
+    def put(self, twin: FifoTwin) -> None:
+        """Another device at the address."""
+        self.twin = self.bus.targets[self.address] = twin
+
+    def counts(self, first: int, n: int) -> NDArray[np.int32]:
+        counts = numbered_counts()[first : first + n]
+        if self.saturated:
+            counts = counts.copy()
+            counts[[i - first for i in self.saturated if first <= i < first + n], 2] = self.full
+        return counts
+
+    def number(self, indications: NDArray[np.generic]) -> NDArray[np.int64]:
+        x, y, z = indications.astype(np.int64).T
+        numbers = (y + 550) * LAP + x + 500
+        assert ((x + y + z == 0) | ((z == self.full) & np.isin(numbers, self.saturated))).all()
+        return numbers
+
+    def saturate(self, first: int, last: int) -> None:
+        self.saturated = range(first, last + 1)
+
+    def lose(self) -> None:
+        self.twin.steal(7)
+
+    def unplug(self) -> None:
+        self.bus.unplug()
+
+    def replug(self) -> None:
+        self.bus.replug()
+
+    def close(self) -> None:
+        self.sensor.close()
+        self._kernel.__exit__(None, None, None)
+
+    def read(self) -> tuple[BlockFlags, NDArray[np.int64]]:
+        block = self.sensor.read_block()
+        assert block is not None
+        return block.flags, self.number(block.indications)
+
+
+class I2cContract(SensorContract):
+    filter_register: ClassVar[tuple[int, str]]  # a setting, and its name in messages
+    trimmed: ClassVar[dict[int, int]]  # offsets, high-pass filter, self-test: what somebody may have left on
+    late_s: ClassVar[float]  # longer than the FIFO holds
+    temperature: ClassVar[tuple[int, float] | None]  # a raw number and its degC
+
+    @pytest.mark.parametrize("number", [errno.ENXIO, errno.EREMOTEIO])
+    def test_nobody_at_the_address(self, rig: I2cRig, number: int) -> None:
+        with installed({"/dev/i2c-1": I2CBus({}, absent_errno=number)}):
+            with pytest.raises(DeviceLost, match=rf" at {rig.name}: "):
+                rig.sensor.open()
+            rig.sensor.close()
+
+    def test_wrong_identity(self, rig: I2cRig) -> None:
+        class Stranger(rig.twin_class):  # type: ignore[name-defined,misc]
+            identity = 0x2A
+
+            def _get(self, register: int) -> int:
+                return 0x2A if register in (0x00, 0x02, 0x0F, 0x75) else super()._get(register)  # type: ignore[no-any-return]
+
+        before = bytes(rig.twin.registers)
+        rig.bus.targets[rig.address] = Stranger(rig.counts, rig.due, lambda: rig.t_s)
+        with pytest.raises(IdentityError, match=rf"{rig.name}: .*(2A|2a)"):
+            rig.sensor.open()
+        assert bytes(rig.twin.registers) == before
+
+    def test_address_of_a_kernel_driver_is_not_forced(self, rig: I2cRig) -> None:
+        rig.bus.claimed.add(rig.address)
+        before = bytes(rig.twin.registers)
+        with pytest.raises(ConfigurationError, match=rf"{rig.name}: a kernel driver holds the address"):
+            rig.sensor.open()
+        assert bytes(rig.twin.registers) == before
+
+    def test_smbus_only_adapter(self, rig: I2cRig) -> None:
+        rig.bus.functions = FUNCTIONS & ~1
+        with pytest.raises(ConfigurationError, match="plain I2C"):
+            rig.sensor.open()
+
+    def test_the_dump_is_what_the_device_holds(self, rig: I2cRig) -> None:
+        info = rig.sensor.open()
+        register, name = self.filter_register
+        assert info.settings[name] == f"0x{rig.twin.registers[register]:02X}"
+        assert len(info.settings) > 8
+        assert (info.unit, info.axes) == ("count", 3)
+
+    def test_touched_registers_are_put_back(self, rig: I2cRig) -> None:
+        for register, value in self.trimmed.items():
+            rig.twin.registers[register] = value
+        rig.sensor.open()
+        assert {register: rig.twin.registers[register] for register in self.trimmed} == dict.fromkeys(self.trimmed, 0)
+
+    def test_setting_that_does_not_take(self, rig: I2cRig) -> None:
+        stubborn_register, name = self.filter_register
+
+        class Stubborn(rig.twin_class):  # type: ignore[name-defined,misc]
+            def _get(self, register: int) -> int:
+                return 0x77 if register == stubborn_register else super()._get(register)  # type: ignore[no-any-return]
+
+        rig.put(Stubborn(rig.counts, rig.due, lambda: rig.t_s))
+        with pytest.raises(ConfigurationError, match=f"{name} is 0x77, not 0x"):
+            rig.sensor.open()
+
+    @pytest.mark.parametrize("number", [errno.ENXIO, errno.EREMOTEIO, errno.EIO, errno.ETIMEDOUT, errno.EAGAIN])
+    def test_three_failures_pass_a_fourth_is_a_loss(self, rig: I2cRig, number: int) -> None:
+        rig.sensor.open()
+        rig.read()
+        rig.twin.fail(number, 3)
+        rig.read()
+        rig.twin.fail(number, 4)
+        with pytest.raises(DeviceLost, match=rig.name):
+            list(rig.blocks(2.0))
+
+    def test_another_error_is_a_loss_at_once(self, rig: I2cRig) -> None:
+        rig.sensor.open()
+        rig.twin.fail(errno.ENODEV, 1)
+        with pytest.raises(DeviceLost, match="No such device"):
+            rig.sensor.read_block()
+
+    @pytest.mark.parametrize("words", [1, 9, 12, 48])
+    def test_a_read_that_broke_off_restarts(self, rig: I2cRig, words: int) -> None:
+        # 12 and 48 words are whole samples and whole rounds of a counter: no mark is missing, and still they are gone.
+        rig.sensor.open()
+        _, before = rig.read()
+        rig.twin.break_off(errno.EIO, words)
+        flags, after = rig.read()
+        assert flags == BlockFlags.RESTART | BlockFlags.OVERRUN
+        assert after[0] > before[-1] + 1
+        assert (np.diff(after) == 1).all()
+
+    def test_late_poll_is_an_overrun(self, rig: I2cRig) -> None:
+        rig.sensor.open()
+        _, before = rig.read()
+        rig.sleep(self.late_s)
+        flags, after = rig.read()
+        assert flags == BlockFlags.RESTART | BlockFlags.OVERRUN
+        assert after[0] > before[-1] + 1
+
+    def test_power_lost_underway(self, rig: I2cRig) -> None:
+        rig.sensor.open()
+        rig.read()
+        rig.twin.power_cycle()
+        rig.sleep(0.02)
+        with pytest.raises(DeviceLost, match=r"did it lose power\?"):
+            rig.sensor.read_block()
+        rig.sensor.open()
+        flags, _ = rig.read()
+        assert flags == BlockFlags.RESTART
+
+    def test_temperature(self, rig: I2cRig) -> None:
+        raw, degc = self.temperature or (None, None)
+        rig.temperature_raw = raw
+        rig.sensor.open()
+        block = rig.sensor.read_block()
+        assert block is not None
+        assert block.temperature_raw == raw
+        assert block.temperature_degc == (None if degc is None else pytest.approx(degc, abs=1e-3))

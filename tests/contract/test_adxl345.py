@@ -1,0 +1,75 @@
+"""The contract on the ADXL345's twin, and what only this part can do wrong."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Iterator
+
+import pytest
+
+from hw.adxl345 import Adxl345
+from hw.block import BlockFlags, Drop
+from hw.virtual.adxl345_twin import Adxl345Twin
+from tests.contract.i2c_contract import I2cContract, I2cRig
+
+
+class Adxl345Rig(I2cRig):
+    driver, twin_class, address, full = Adxl345, Adxl345Twin, 0x53, 4095
+    rate_hz = 800.0
+
+    def lose(self) -> None:
+        # Nothing of a sample says which one it is: entries vanish without a trace only where a read breaks off.
+        self.twin.break_off(errno.EIO, 3)
+
+
+class TestAdxl345(I2cContract):
+    filter_register = 0x2C, "BW_RATE"
+    trimmed = {0x1E: 0x11, 0x20: 0xF0, 0x2E: 0xFF}  # noqa: RUF012 - offsets, interrupts
+    late_s = 0.2
+    temperature = None
+
+    @pytest.fixture
+    def rig(self) -> Iterator[Adxl345Rig]:
+        rig = Adxl345Rig()
+        yield rig
+        rig.close()
+
+    def test_says_who_it_is_and_how_it_is_set(self, rig: Adxl345Rig) -> None:
+        info = rig.sensor.open()
+        # Data sheet: 256 LSB/g in full resolution, 13 bits at 16 g.
+        assert info.nominal_sensitivity == pytest.approx(256 / 9.80665, rel=1e-12)
+        assert info.range_mps2 == pytest.approx(16 * 9.80665, rel=1e-12)
+        assert info.settings["DATA_FORMAT"] == "0x0B"
+        assert info.settings["FIFO_CTL"] == "0x80"
+        assert rig.twin.registers[0x2D] == 0x08
+
+    def test_self_test_left_on_is_taken_back(self, rig: Adxl345Rig) -> None:
+        rig.twin.registers[0x31] = 0x80
+        rig.sensor.open()
+        assert rig.twin.registers[0x31] == 0x0B
+
+    def test_samples_behind_an_overrun_are_dropped_and_counted(self, rig: Adxl345Rig) -> None:
+        rig.sensor.open()
+        rig.read()
+        rig.sleep(0.2)
+        rig.read()
+        assert rig.sensor.take_drops() == [Drop(33 * 6, "bytes", "FIFO ran over, or a read of it broke off")]
+
+    def test_overrun_between_count_and_read(self, rig: Adxl345Rig) -> None:
+        class Stalling(Adxl345Twin):
+            stall_s = 0.0
+
+            def _get(self, register: int) -> int:
+                value = super()._get(register)
+                if register == 0x39 and value >= 28:
+                    rig.t_s, Stalling.stall_s = rig.t_s + Stalling.stall_s, 0.0
+                return value
+
+        rig.put(Stalling(rig.counts, rig.due, lambda: rig.t_s))
+        rig.sensor.open()
+        _, before = rig.read()
+        rig.sleep(0.036)
+        Stalling.stall_s = 0.02
+        flags, after = rig.read()
+        assert flags == BlockFlags.RESTART | BlockFlags.OVERRUN
+        assert after[0] > before[-1] + 30
