@@ -1,6 +1,6 @@
 """A structure that hardly moves: tri-axial reference with noise, half of the time calm; the adjustment and plain.
 
-    python -m benchmarks.torture_shm [--recordings 40] [--write]
+    python -m benchmarks.torture_shm [--recordings 160] [--write]
 
 Motion of rms 0.02 m/s2 from 0.5 to 10 Hz, ten seconds in turn at full level and at 0.15 of it, 600 s; both devices at
 100 Hz, noise of the reference 0.006, of the sensor 0.002 m/s2.
@@ -75,7 +75,7 @@ def one(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
 def main(arguments: Sequence[str] = ("--write",)) -> int:
     """Run the recordings; 0 where the limits hold."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--recordings", type=int, default=40)
+    parser.add_argument("--recordings", type=int, default=160)
     parser.add_argument("--write", action="store_true", help="put the table into docs/performance.md")
     options = parser.parse_args(arguments)
     with multiprocessing.Pool() as pool:
