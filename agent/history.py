@@ -112,11 +112,10 @@ class History:
     def latest(self) -> list[Record]:
         """The newest result of every channel, in order; a calibration only where it is in force."""
         records = self._records("WHERE sequence IN (SELECT sequence FROM latest) ORDER BY sequence")
-        status = {r.sensor: r.fields.get("status") for r in records if r.what == "status"}
-        return [r for r in records if r.what != "calibration" or status.get(r.sensor) != "UNCALIBRATED"]
+        return [r for r in records if r.what != "calibration" or not self._is_withdrawn(r)]
 
     def in_force(self, sensor: str) -> Record | None:
-        """The newest calibration of a sensor; None if it has none, or its status is now UNCALIBRATED."""
+        """The newest calibration of a sensor; None if it has none, or its status was UNCALIBRATED since."""
         return next((r for r in self.latest() if r.sensor == sensor and r.what == "calibration"), None)
 
     def calibration_of(self, sensor: str, identity: str) -> Record | None:
@@ -137,6 +136,12 @@ class History:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def _is_withdrawn(self, calibration: Record) -> bool:
+        """Whether the status was UNCALIBRATED since: what came after it may be COLLECTING, but not with this one."""
+        where = "WHERE sensor = ? AND what = 'status' AND sequence > ?"
+        since = self._records(where, calibration.sensor, calibration.sequence)
+        return any(record.fields.get("status") == "UNCALIBRATED" for record in since)
 
     def _records(self, clause: str, *values: object) -> list[Record]:
         rows = self._rows(f"SELECT {_COLUMNS} FROM results {clause}", *values)

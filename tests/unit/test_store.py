@@ -60,7 +60,7 @@ def test_one_commit_may_be_larger_than_what_waits_for_a_failing_disk(tmp_path: P
     store.close()
 
 
-def test_a_calibration_is_in_force_until_the_status_is_uncalibrated(tmp_path: Path) -> None:
+def test_a_calibration_is_in_force_until_the_status_is_uncalibrated_and_no_more_after(tmp_path: Path) -> None:
     store = Store(tmp_path, 0)
     store.commit(
         [record(1, "calibration"), status(2, "VALID"), record(3, "calibration"), record(4, "calibration", "b")]
@@ -72,8 +72,10 @@ def test_a_calibration_is_in_force_until_the_status_is_uncalibrated(tmp_path: Pa
         store.commit([status(5, "UNCALIBRATED")])
         assert history.in_force("mems") is None
         assert sequences(history.latest()) == [4, 5]
-        store.commit([status(6, "HELD")])
-        assert sequences(history.latest()) == [3, 4, 6]
+        store.commit([status(6, "COLLECTING"), status(7, "INVALID")])
+        assert sequences(history.latest()) == [4, 7]
+        store.commit([record(8, "calibration"), status(9, "VALID"), status(10, "HELD")])
+        assert sequences(history.latest()) == [4, 8, 10]
         assert history.in_force("none") is None
     store.close()
 
