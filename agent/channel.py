@@ -112,12 +112,15 @@ class ChannelState:
             kept, self._kept = self._kept, None
             if kept.identity == identity:
                 self._in_force = msgspec.structs.replace(kept, t_utc_ns=self._utc_ns())
-                results.append(self._in_force)
-                results += self._set_status("VALID", "restored from the run before")
+                results += [self._in_force, *self._opened("restored from the run before")]
             else:
                 reason = f"the calibration kept belongs to {kept.identity}, this is {identity}"
                 results += self._set_status("UNCALIBRATED", reason)
-        return results or self._set_status(self._resting_status(), f"{self.sensor} opened")
+        return results or self._opened(f"{self.sensor} opened")
+
+    def _opened(self, reason: str) -> list[Result]:
+        # A port that opens is no sensor that speaks: one that was INVALID stays so until a block comes.
+        return [] if self._status == "INVALID" else self._set_status(self._resting_status(), reason)
 
     def _resting_status(self) -> str:
         """The status of a sensor that speaks."""

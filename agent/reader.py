@@ -6,10 +6,11 @@ import json
 import queue
 import threading
 import time
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 from agent.events import DeviceChange, Event, Gap
+from hw.block import BlockFlags, SampleBlock
 from hw.sensor import ConfigurationError, DeviceError, Sensor
 
 BLOCKS_A_SECOND = 2
@@ -19,20 +20,27 @@ CONFIGURATION_BACK_OFF_S = 5.0  # somebody has to change something first; no use
 
 
 class EventQueue:
-    """Bounded. When it is full a block is counted as dropped, and the count leaves as a `Gap` before the next event."""
+    """Blocks are bounded. When it is full a block is counted as dropped, and the count leaves as a `Gap` before the
+    next event. Other events, a few a second at the most, always enter."""
 
     def __init__(self, devices: int) -> None:
-        self._queue: queue.Queue[Event] = queue.Queue(maxsize=QUEUE_S * BLOCKS_A_SECOND * devices)
+        self._queue: queue.SimpleQueue[Event] = queue.SimpleQueue()
+        self._size = QUEUE_S * BLOCKS_A_SECOND * devices
         self._dropped: dict[str, int] = {}
+        self._flags: dict[str, BlockFlags] = {}  # of dropped blocks, for the next one: it does not go on in time either
         self._lock = threading.Lock()
 
     def put(self, device: str, event: Event) -> None:
-        """Add an event, or count it as dropped. Never blocks a reader."""
-        try:
-            self._queue.put_nowait(event)
-        except queue.Full:
-            with self._lock:
-                self._dropped[device] = self._dropped.get(device, 0) + 1
+        """Add an event of the device's own thread, or count it as dropped. Never blocks."""
+        if isinstance(event, SampleBlock):
+            flags = self._flags.pop(device, BlockFlags.NONE) | event.flags
+            if self._queue.qsize() >= self._size:
+                self._flags[device] = flags & ~BlockFlags.SATURATED
+                with self._lock:
+                    self._dropped[device] = self._dropped.get(device, 0) + 1
+                return
+            event = replace(event, flags=flags)
+        self._queue.put(event)
 
     def get(self, timeout_s: float) -> Event | None:
         """The next event, or None after `timeout_s`."""
@@ -64,6 +72,7 @@ class Reader(threading.Thread):
         self._events = events
         self._stop_request = threading.Event()
         self._said = ""
+        self._attempt = 0  # since the last block
 
     def stop(self) -> None:
         """Ask the thread to end; it does within one block."""
@@ -71,25 +80,25 @@ class Reader(threading.Thread):
 
     def run(self) -> None:
         """Read until stopped. An error of a driver never ends the thread."""
-        attempt = 0
         while not self._stop_request.is_set():
-            pause_s = min(BACK_OFF_S[1], BACK_OFF_S[0] * 2 ** min(attempt, 10))
+            least_pause_s = 0.0
             try:
                 info = self._sensor.open()
-                self._report("open", f"{info.kind} {info.serial_number}".strip(), json.dumps(asdict(info)), attempt)
-                attempt, self._said = 0, ""
+                self._report("open", f"{info.kind} {info.serial_number}".strip(), json.dumps(asdict(info)))
+                self._said = ""
                 self._read()
             except ConfigurationError as error:
-                pause_s = CONFIGURATION_BACK_OFF_S
-                self._report_lost(str(error), attempt)
+                least_pause_s = CONFIGURATION_BACK_OFF_S
+                self._report_lost(str(error))
             except DeviceError as error:
-                self._report_lost(str(error), attempt)
+                self._report_lost(str(error))
             except Exception as error:  # a driver's own bug must not end the agent
-                self._report_lost(f"fault in the driver: {type(error).__name__}: {error}", attempt)
+                self._report_lost(f"fault in the driver: {type(error).__name__}: {error}")
             finally:
                 self._sensor.close()
-            attempt += 1
-            self._stop_request.wait(pause_s)
+            back_off_s = min(BACK_OFF_S[1], BACK_OFF_S[0] * 2 ** min(self._attempt, 10))
+            self._attempt += 1
+            self._stop_request.wait(max(back_off_s, least_pause_s))
 
     def _read(self) -> None:
         while not self._stop_request.is_set():
@@ -106,15 +115,16 @@ class Reader(threading.Thread):
                     ),
                 )
             if block is not None:
+                self._attempt = 0
                 self._events.put(self.device, block)
 
-    def _report_lost(self, message: str, attempt: int) -> None:
+    def _report_lost(self, message: str) -> None:
         # The same words every few seconds for a month would fill the recording; they are said when they change.
         if message != self._said:
-            self._report("lost", message, "", attempt)
+            self._report("lost", message, "")
             self._said = message
 
-    def _report(self, state: Any, message: str, info_json: str, attempt: int) -> None:
+    def _report(self, state: Any, message: str, info_json: str) -> None:
         self._events.put(
             self.device,
             DeviceChange(
@@ -124,6 +134,6 @@ class Reader(threading.Thread):
                 t_utc_ns=time.time_ns(),
                 message=message,
                 info_json=info_json,
-                attempt=attempt,
+                attempt=self._attempt,
             ),
         )

@@ -146,3 +146,24 @@ def test_a_sequence_that_counts_microseconds_is_a_reason_and_not_a_full_memory()
     windows = [r for r in played(step=10_000) if isinstance(r, WindowReport)]
     assert len(windows) == 3
     assert {w.reason for w in windows} == {"s: its sample numbers and arrivals do not make a clock"}
+
+
+def statuses(results: list[Result]) -> list[str]:
+    return [r.status for r in results if isinstance(r, StatusChange)]
+
+
+def test_an_open_port_is_no_sensor_that_speaks() -> None:
+    found = pipeline(reference=False, rate_hz=100.0)
+    assert statuses(found.step(opened("s", 0.0))) == ["UNCALIBRATED"]
+    assert statuses(found.step(lost("s", 1.0))) == ["INVALID"]
+    for t_s in (2.0, 3.0):  # it opens and is gone, again and again
+        assert statuses(found.step(opened("s", t_s)) + found.step(tick(t_s)) + found.step(lost("s", t_s))) == []
+    spoken = block("s", 400, np.zeros((50, 3)), nominal_hz=100.0, true_hz=100.0)
+    assert statuses(found.step(opened("s", 4.0)) + found.step(spoken)) == ["UNCALIBRATED"]
+
+
+def test_another_device_at_the_port_is_said_before_it_speaks() -> None:
+    found = pipeline(reference=False, rate_hz=100.0)
+    found.step(opened("s", 0.0, serial_number="A"))
+    found.step(lost("s", 1.0))
+    assert statuses(found.step(opened("s", 2.0, serial_number="B"))) == ["UNCALIBRATED"]
