@@ -37,12 +37,18 @@ def adjusted(front: FrontEnd, priors: Priors) -> Outcome:
         if not used:
             nothing = ("no window can be used",)
             return Outcome(None, nothing, windows, front.sensor_clock.rate_hz, "3 (adjustment)")
-        found = adjust(used, priors, applied, _telling([w for w in windows if w.kind == "quiet"], used))
+        calm = _telling([w for w in windows if w.kind == "quiet"], used)
+        if calm and front.band_hz is None and front.limit_band(used, calm):
+            windows = front.windows(applied.lag_s)
+            used = [w for w in windows if w.used]
+            calm = _telling([w for w in windows if w.kind == "quiet"], used)
+        found = adjust(used, priors, applied, calm)
         left = _lag(found) - applied.lag_s
         if abs(_omega(used) * left) ** 3 / 6.0 < PHASE_LEFT:
             break
         applied = replace(applied, lag_s=_lag(found))
-    return _outcome(found, windows, front.sensor_clock.rate_hz)
+    outcome = _outcome(found, windows, front.sensor_clock.rate_hz)
+    return replace(outcome, more={**outcome.more, "band_hz": front.band_hz})
 
 
 def norm_fitted(sensor: SensorTable, options: dict[str, Any]) -> Outcome:

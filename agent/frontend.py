@@ -13,6 +13,7 @@ import numpy as np
 from agent.poses import PoseInterval
 from agent.tables import ReferenceTable, SensorTable, TableError
 from calib.alignment import Drift, drift
+from calib.band import lowpass, lowpass_lost, moving_band_hz
 from calib.excitation import Points, judged, motion_parts, rest_sd, rest_window
 from calib.model import Array, Pose, Window, WindowSums
 from calib.resampling import HALF, NODES, differentiate, resample
@@ -54,6 +55,7 @@ class FrontEnd:
         self.sensor_clock = clock_from_stamps(sensor.time_s)
         self.reference_clock = None if reference is None else clock_from_stamps(reference.time_s)
         self.drift: Drift | None = None  # of the sensor's clock against the reference's, once windows were made
+        self.band_hz: float | None = None  # to which both signals are limited, once `limit_band` found one
         self.poses = poses
         self._check_overlap()
 
@@ -135,6 +137,10 @@ class FrontEnd:
         if self._reference is None or self.reference_clock is None:
             nothing = np.empty((len(time_s), 0))
             return Points(time_s, np.asarray(self._sensor.v[first:stop]), nothing, nothing)
+        if self.band_hz is not None:
+            around = lowpass_lost(self.sensor_clock.rate_hz, self.band_hz)
+            first, stop = max(0, first - around), min(len(self._sensor.time_s), stop + around)
+            time_s = self.sensor_clock.time_of(np.arange(first, stop))
         felt_s = time_s - lag_s
         if (apart := self._runs_apart) is not None:
             felt_s -= apart.rate * (time_s - apart.time_s)
@@ -143,8 +149,23 @@ class FrontEnd:
             return Points(time_s, np.empty((0, 3)), np.empty((0, m)), np.empty((0, m)))
         x, x_first, margin = self._reference_part(float(felt_s[0]), float(felt_s[-1]))
         out = resample(x, self.reference_clock, felt_s, x_first, margin)
-        V = np.asarray(self._sensor.v[first:stop])[out.usable]
-        return Points(time_s[out.usable], V, out.u[out.usable], out.du[out.usable])
+        V = np.asarray(self._sensor.v[first:stop])
+        if self.band_hz is None:
+            return Points(time_s[out.usable], V[out.usable], out.u[out.usable], out.du[out.usable])
+        columns = np.where(out.usable[:, None], np.hstack([V, out.u, out.du]), np.nan)
+        columns = lowpass(columns, self.sensor_clock.rate_hz, self.band_hz)
+        kept = np.isfinite(columns).all(axis=1) & (time_s >= start_s) & (time_s <= stop_s)
+        return Points(time_s[kept], columns[kept, :3], columns[kept, 3 : 3 + m], columns[kept, 3 + m :])
+
+    def limit_band(self, loud: Sequence[Window], quiet: Sequence[Window]) -> bool:
+        """Limit both signals to the band in which the reference moves, as these windows show; whether that is less."""
+        found = moving_band_hz(
+            [self.points(w.start_s, w.stop_s).u for w in loud],
+            [self.points(w.start_s, w.stop_s).u for w in quiet],
+            self.sensor_clock.rate_hz,
+        )
+        self.band_hz = found
+        return found is not None
 
     def _reference_part(self, start_s: float, stop_s: float) -> tuple[Array, int, int]:
         """Acceleration around a stretch of time, the number of its first sample, and how many at its ends are wrong."""

@@ -1,0 +1,85 @@
+"""The band in which a reference moves more than it is noisy, and a low-pass filter for sensor and reference alike.
+
+At the level of a structure's own motion a reference's noise, differentiated, hides the coefficient on du/dt and with it
+the lag. Outside the band of the motion there is nothing to be had but noise, so both signals are limited to it alike:
+V = S a + Q stays true, whatever the filter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from calib.model import Array
+
+SEGMENT_S = 4.0  # of a spectrum: lines 0.25 Hz apart, and still many segments in some minutes
+LEAST_SEGMENTS = 8  # of each kind, else the spectra are known too poorly to choose by
+SIGNIFICANT = 6.0  # standard deviations of a smoothed line, of a hundred of them
+SMOOTHED = 5  # lines
+MARGIN = 1.25  # the filter passes all of the band and a quarter more
+WIDEST = 0.35  # of the sampling rate: beyond, a filter has nothing left to take away
+STOP_BAND_DB = 66.0
+
+
+def moving_band_hz(loud: Sequence[Array], quiet: Sequence[Array], rate_hz: float) -> float | None:
+    """Upper end in Hz of where loud stretches (n, m) of a reference have more power than quiet ones.
+
+    None where nothing is gained by a filter, or too little is known.
+    """
+    size = int(SEGMENT_S * rate_hz)
+    power_loud, loud_segments = _spectrum(loud, size)
+    power_quiet, quiet_segments = _spectrum(quiet, size)
+    if min(loud_segments, quiet_segments) < LEAST_SEGMENTS:
+        return None
+    smooth = np.ones(SMOOTHED) / SMOOTHED
+    ratio = np.convolve(power_loud / power_quiet, smooth, "same")
+    # Each line of m channels is a chi-squared of 2 m degrees a segment.
+    m = loud[0].shape[1]
+    sd = np.sqrt((1.0 / loud_segments + 1.0 / quiet_segments) / (m * SMOOTHED))
+    moving = np.flatnonzero(ratio[SMOOTHED:-SMOOTHED] > 1.0 + SIGNIFICANT * sd)
+    if not len(moving):
+        return None
+    band_hz = MARGIN * float(moving[-1] + SMOOTHED) / SEGMENT_S
+    return band_hz if band_hz < WIDEST * rate_hz else None
+
+
+def lowpass(x: Array, rate_hz: float, band_hz: float) -> Array:
+    """x (n, k), one sample a row, limited to `band_hz`: flat to 0.1 % up to it, 66 dB down from 1.5 times it on.
+
+    No phase. Rows within `lowpass_lost` of an end, or of a NaN, are NaN.
+    """
+    half = lowpass_lost(rate_hz, band_hz)
+    n = np.arange(-half, half + 1)
+    cut = 1.25 * band_hz / rate_hz
+    taps = 2.0 * cut * np.sinc(2.0 * cut * n) * np.kaiser(2 * half + 1, 0.1102 * (STOP_BAND_DB - 8.7))
+    taps /= taps.sum()
+    if len(x) <= 2 * half:
+        return np.full_like(x, np.nan)
+    out = np.full_like(x, np.nan)
+    size = len(x) + 2 * half
+    held = np.nan_to_num(x)
+    filtered = np.fft.irfft(np.fft.rfft(held, size, axis=0) * np.fft.rfft(taps, size)[:, None], size, axis=0)
+    out[half:-half] = filtered[2 * half : len(x)]
+    missing = np.isnan(x).any(axis=1)
+    if missing.any():
+        near = np.convolve(missing, np.ones(2 * half + 1), "same") > 0.5
+        out[near] = np.nan
+    return out
+
+
+def lowpass_lost(rate_hz: float, band_hz: float) -> int:
+    """Samples at each end for which the filter has no full support (Kaiser's length for a transition of band / 2)."""
+    return int(np.ceil((STOP_BAND_DB - 8.0) / (2.285 * np.pi * band_hz / rate_hz) / 2.0))
+
+
+def _spectrum(stretches: Sequence[Array], size: int) -> tuple[Array, int]:
+    """Mean power (size // 2 + 1,) over channels, Hann-windowed segments of `size`, and their number."""
+    window = np.hanning(size)[:, None]
+    total, count = np.zeros(size // 2 + 1), 0
+    for x in stretches:
+        for start in range(0, len(x) - size + 1, size):
+            part = x[start : start + size]
+            total += np.sum(np.abs(np.fft.rfft((part - part.mean(axis=0)) * window, axis=0)) ** 2, axis=1)
+            count += 1
+    return total / max(count, 1), count
