@@ -81,6 +81,53 @@ def test_truth_lies_within_the_expanded_uncertainty(session):
     assert np.sqrt(squares) == pytest.approx(told["standard_uncertainty"]["sensitivity"][0][0], rel=1e-6)
 
 
+def test_a_turned_static_sign_is_refused_with_status_3(session):
+    result = _run(session, "--nominal", "1", "--u-nominal-pct", "20", "--static-sign", "-1", "--json", "-")
+    told = _told(result)
+    assert result.return_value == 3
+    assert told["status"] == "refused"
+    assert "static sign" in told["reasons"][0]
+    assert told["sensitivity"] == [[None] * 3] * 3
+
+
+def test_a_contradicted_nominal_is_refused_with_numbers(session):
+    result = _run(session, "--nominal", "2", "--u-nominal-pct", "5", "--json", "-")
+    assert result.return_value == 3
+    assert "2 with u 0.1 was expected" in _told(result)["reasons"][0]
+
+
+def test_an_earlier_result_serves_as_prior_and_may_be_contradicted(session, tmp_path):
+    first = _told(_run(session, *STATED, "--json", "-"))
+    covariance = np.array(first["covariance"]) + np.diag([4e-4] * 9 + [0.1] * 3)  # known to 2 % beforehand
+    prior = tmp_path / "prior.json"
+    prior.write_text(json.dumps({**first, "covariance": covariance.tolist()}))
+    again = _run(session, *STATED, "--prior", str(prior), "--json", "-")
+    assert again.return_value == 0
+    np.testing.assert_allclose(_told(again)["sensitivity"], first["sensitivity"], rtol=0, atol=2e-3)
+    far = np.array(first["sensitivity"]) + 0.2 * np.eye(3)
+    prior.write_text(json.dumps({**first, "sensitivity": far.tolist(), "covariance": covariance.tolist()}))
+    assert _run(session, *STATED, "--prior", str(prior)).return_value == 3
+
+
+def test_the_same_data_again_add_too_little_to_be_a_result(session, tmp_path):
+    first = _told(_run(session, *STATED, "--json", "-"))
+    prior = tmp_path / "prior.json"
+    prior.write_text(json.dumps(first))
+    result = _run(session, *STATED, "--prior", str(prior), "--json", "-")
+    assert result.return_value == 3
+    assert _told(result)["sensitivity"] == [[None] * 3] * 3
+
+
+@pytest.mark.parametrize("text", ["", "{}", '{"sensitivity": 1, "offset": 2, "covariance": 3}', "no JSON"])
+def test_a_prior_that_is_none_is_bad_input(session, tmp_path, text):
+    prior = tmp_path / "prior.json"
+    prior.write_text(text)
+    result = _run(session, "--prior", str(prior))
+    assert result.return_value == 2
+    assert result.stderr.count("\n") == 1
+    assert "prior.json" in result.stderr
+
+
 def test_a_reference_that_is_ac_coupled_gives_its_corner(tmp_path):
     """Stated at 0.16 Hz within 0.03, truly 0.13: found to 2 mHz, and S is right to 0.1 % though 0.5 Hz is in it."""
     stands = tuple(clamped(35.0, alpha, 8.0) for alpha in (0.0, 30.0, 120.0, 210.0))

@@ -59,7 +59,7 @@ def test_rests_in_one_plane_are_refused_with_the_rank():
 
 
 def test_a_direction_hardly_tilted_into_is_not_stated():
-    """Twelve rests within 0.6 deg of one plane: nobody can say what the third axis is worth; the other two are right."""
+    """Twelve rests within 0.6 deg of a plane: nobody can say what the third axis is worth; the other two are right."""
     random = np.random.default_rng(75)
     angles = np.arange(12) * np.pi / 6.0
     ways = np.column_stack([np.cos(angles), np.sin(angles), 0.01 * np.cos(3.0 * angles)])
