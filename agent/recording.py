@@ -83,7 +83,7 @@ class RecordingFile:
             for topic in topics:
                 self._channel(topic)
         except OSError:
-            self.abandon()
+            self.discard()
             raise
 
     @property
@@ -116,6 +116,11 @@ class RecordingFile:
     def abandon(self) -> None:
         """Let go of the file as it is: after an error, writing on would tear a record in the middle of the file."""
         self._stream.close()
+
+    def discard(self) -> None:
+        """Remove a file that has not got as far as its RunStart: on a full disk one would be left at every attempt."""
+        self._stream.close()
+        self.path.unlink(missing_ok=True)
 
     def _channel(self, topic: str) -> int:
         if topic not in self._channels:
@@ -202,8 +207,14 @@ class Recorder:
                 self._file.append(topic, data, log_time, publish_time, event_sequence)
             if results or isinstance(event, RunStart):
                 self._file.sync()
+            if isinstance(event, RunStart):
+                self._previous = (self._file.final_path.name, "")  # until it is finished
         except OSError as error:
-            self._fail(f"{error.strerror or error} ({error.filename or self.path})")
+            where = error.filename or self.path or self._directory
+            if isinstance(event, RunStart) and self._file is not None:
+                self._file.discard()
+                self._file = None
+            self._fail(f"{error.strerror or error} ({where})")
         except (ValueError, TypeError) as error:
             # This event has no form in a recording: the file ends before it, the next begins with a snapshot after it.
             self.close()
@@ -236,7 +247,6 @@ class Recorder:
         self._since_ns = self._now_ns
         self._file = RecordingFile(self._directory, start, self._topics, previous)
         sync_directory(self._directory)
-        self._previous = (self._file.final_path.name, "")  # until it is finished
         self.fault = ""
 
     def _fail(self, fault: str) -> None:

@@ -218,6 +218,21 @@ def test_a_full_disk_ends_the_file_and_a_later_run_start_begins_another(
     assert (metadata["previous_file"], metadata["previous_sha256"]) == ("fieldcal-000001.mcap", "")
 
 
+@pytest.mark.parametrize("room", [0, 100, 1000])
+def test_a_disk_that_stays_full_leaves_no_file_at_each_attempt(tmp_path: Path, room: int) -> None:
+    recorder = begun(tmp_path)
+    with largest_file(room):
+        for _ in range(3):
+            assert not recorder.record(1, run_start(StandIn(CONFIG), 1, recorder.next_file_sequence), [])
+            assert str(tmp_path) in recorder.fault
+    assert [path.name for _, path in recordings(tmp_path)] == ["fieldcal-000001.mcap.active"]
+    assert recorder.record(1, run_start(StandIn(CONFIG), 1, recorder.next_file_sequence), [])
+    recorder.close()
+    with open(tmp_path / "fieldcal-000002.mcap", "rb") as file:
+        metadata = next(make_reader(file).iter_metadata()).metadata
+    assert (metadata["previous_file"], metadata["previous_sha256"]) == ("fieldcal-000001.mcap", "")
+
+
 def test_after_a_failed_file_the_next_does_not_name_the_one_before_it(tmp_path: Path) -> None:
     recorder = begun(tmp_path)
     recorder.record(1, run_start(StandIn(CONFIG), 1, 2), [])
