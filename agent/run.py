@@ -54,7 +54,7 @@ def serve(config: Config, data_dir: Path, watch: Any, duration_s: float | None) 
     from agent.service import Service
 
     service = Service(config, data_dir, watch)
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, lambda *_: service.stop())
     try:
         ended = service.run(duration_s)

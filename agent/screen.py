@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import TextIO
 
 from rich.console import Console, ConsoleOptions
@@ -39,19 +40,22 @@ class Screen:
         )
         self._drawn_s = time.monotonic()
         self._open = True
-        self._live.start(refresh=True)
+        with suppress(OSError):
+            self._live.start(refresh=True)
 
     def refresh(self, *, now: bool = False) -> None:
         """Draw, unless it was drawn less than REFRESH_S ago."""
         if now or time.monotonic() - self._drawn_s >= REFRESH_S:
             self._drawn_s = time.monotonic()
-            self._live.refresh()
+            with suppress(OSError):  # whoever watched went away with the terminal; the agent goes on
+                self._live.refresh()
 
     def close(self) -> None:
         """Draw a last time and let go of the terminal."""
         if self._open:
             self._open = False
-            self._live.stop()
+            with suppress(OSError):
+                self._live.stop()
 
 
 class Picture:
