@@ -12,7 +12,10 @@ from calib.geometry import beside
 from hw.sensor import DeviceError, load_driver
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,62}$", description="a chunk of a Zenoh key")]
+Endpoint = Annotated[str, Field(pattern=r"^[^/]+/.+$", description="of a Zenoh router: tcp/192.0.2.1:7447")]
 Vector = tuple[float, float, float]
+# What is left of a pose after its guards. Shorter ones hold nothing to calibrate by; a typo would flood the store.
+SHORTEST_POSE_S = 0.1
 
 
 class Section(BaseModel):
@@ -78,9 +81,10 @@ class Channel(Section):
     static_sign: Literal[1, -1] = 1
     # Turning a clamp by hand ends in a second of ringing and of fingers leaving; half a second each side is unused.
     guard_s: Annotated[float, Field(ge=0, le=60)] = 0.5
-    late_horizon_s: Annotated[float, Field(gt=0, le=600)] = 5.0
+    # Samples wait as long, in memory and in every snapshot: a minute of 10 kHz on six axes is 29 MB.
+    late_horizon_s: Annotated[float, Field(gt=0, le=60)] = 5.0
     silence_s: Annotated[float, Field(gt=0, le=3600, description="without a block the status is INVALID")] = 5.0
-    windows: Annotated[int, Field(ge=1, le=1000, description="how many of the newest windows the solution uses")] = 24
+    windows: Annotated[int, Field(ge=1, le=200, description="how many of the newest windows the solution uses")] = 24
     # A tri-axial reference beside the sensor needs no poses: a = R a_ref, R row by row. What the sensor reads at rest
     # belongs here only where the reference is AC-coupled.
     rotation: tuple[float, float, float, float, float, float, float, float, float] | None = None
@@ -99,8 +103,10 @@ class Channel(Section):
             if pose.start_s < end:
                 raise ValueError(f"poses.{i}.start_s {pose.start_s} lies before the end of the pose before, {end}")
             end = pose.stop_s
-            if pose.stop_s - pose.start_s <= 2 * self.guard_s:
-                raise ValueError(f"poses.{i}: nothing is left of it after guard_s {self.guard_s} on both sides")
+            if pose.stop_s - pose.start_s - 2 * self.guard_s < SHORTEST_POSE_S:
+                raise ValueError(
+                    f"poses.{i}: less than {SHORTEST_POSE_S} s is left of it after guard_s {self.guard_s} on both sides"
+                )
             if self.reference is None and (pose.theta_deg is not None or pose.direction is not None):
                 raise ValueError(f"poses.{i} needs a reference (only gravity_mps2 alone does without)")
             if self.reference is not None and pose.theta_deg is None and pose.direction is None:
@@ -113,8 +119,8 @@ class Channel(Section):
 class Recording(Section):
     """Where and how raw data are kept."""
 
-    rotate_s: Annotated[float, Field(ge=1)] = 3600.0
-    rotate_bytes: ByteSize = ByteSize(256 * 1024 * 1024)
+    rotate_s: Annotated[float, Field(ge=1, le=86400)] = 3600.0
+    rotate_bytes: Annotated[ByteSize, Field(ge=1 << 20)] = ByteSize(256 * 1024 * 1024)
     # At most this much is lost to a power cut; facts: 2 s costs 11 % more disk than no flush.
     flush_s: Annotated[float, Field(gt=0, le=5)] = 2.0
 
@@ -123,7 +129,7 @@ class Zenoh(Section):
     """How results leave."""
 
     enabled: bool = True
-    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    connect: tuple[Endpoint, ...] = ("tcp/127.0.0.1:7447",)
 
 
 class Config(Section):
@@ -206,8 +212,14 @@ def _driver_faults(device: dict[str, Any]) -> list[str]:
 
 
 def _fault_lines(error: ValidationError) -> list[str]:
-    lines = []
-    for fault in error.errors():
+    lines, faults = [], error.errors()
+    places = [fault["loc"] for fault in faults]
+    for fault in faults:
+        # A list that is too short only because what is in it was refused is no fault of its own.
+        if fault["type"] == "too_short" and any(
+            len(p) > len(fault["loc"]) and p[: len(fault["loc"])] == fault["loc"] for p in places
+        ):
+            continue
         path = ".".join(str(part) for part in fault["loc"])
         value = fault.get("input")
         # A whole section as "the offending value" would bury the message.
