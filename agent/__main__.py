@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 
@@ -11,9 +12,15 @@ def main() -> None:
     # scipy carries its own OpenBLAS beside numpy's; both read this when they load, and sums over another number of
     # threads differ in the last bit.
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
-    from agent.cli import run_cli
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # an output without a plus-minus sign is better than none
+    try:
+        from agent.cli import run_cli
 
-    sys.exit(run_cli())
+        status = run_cli()
+    except KeyboardInterrupt:  # while modules load
+        status = 1
+    sys.exit(status)
 
 
 if __name__ == "__main__":

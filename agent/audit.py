@@ -12,6 +12,7 @@ import msgspec
 from agent.comparison import OTHER_CPU
 from agent.integrity import Integrity, check_integrity
 from agent.mcap_records import Fault
+from agent.reading import open_recording
 from agent.recording import FILE_METADATA
 from agent.replaying import Replay, ReplayedFile, Restore
 
@@ -82,7 +83,7 @@ def audit_files(
     replayed = Replay(restore, fingerprint(), elsewhere=OTHER_CPU)
     audited: list[AuditedFile] = []
     for path in files:
-        with open(path, "rb") as file:
+        with open_recording(path) as file:
             sha256 = hashlib.file_digest(file, "sha256").hexdigest()
             size = file.tell()
             file.seek(0)

@@ -47,6 +47,11 @@ def fieldcal() -> None:
     """Recalibrate tri-axial accelerometers where they stand (Method 3 of D'Emilia et al. 2018)."""
 
 
+def _discard_output() -> None:
+    """Let what is still in the buffer of our output go nowhere when Python flushes it at exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
 def run_cli(arguments: list[str] | None = None) -> int:
     """Run and return the exit status: 0 done, 1 our or the machine's fault, 2 usage or bad input, 3 refused.
 
@@ -63,8 +68,12 @@ def run_cli(arguments: list[str] | None = None) -> int:
         click.echo("interrupted", err=True)
         return 1
     except BrokenPipeError:
-        # The reader of our output went away; Python would complain again when it flushes at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        # The reader of our output went away.
+        _discard_output()
+        return 1
+    except OSError as error:
+        _discard_output()
+        click.echo(f"fieldcal: {error}", err=True)
         return 1
     except Exception as error:
         if os.environ.get("FIELDCAL_TRACEBACK"):

@@ -16,6 +16,7 @@ Endpoint = Annotated[str, Field(pattern=r"^[^/]+/.+$", description="of a Zenoh r
 Vector = tuple[float, float, float]
 # What is left of a pose after its guards. Shorter ones hold nothing to calibrate by; a typo would flood the store.
 SHORTEST_POSE_S = 0.1
+LARGEST_FILE = 4 << 20  # bytes; a day of a pose each second has as many
 
 
 class Section(BaseModel):
@@ -171,9 +172,12 @@ class ConfigError(Exception):
 def load_config(path: Path) -> Config:
     """Read and check a TOML file. Raises ConfigError with all faults."""
     try:
-        text = path.read_text(encoding="utf-8")
+        with open(path, "rb") as file:
+            text = file.read(LARGEST_FILE + 1).decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError([f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}"]) from None
+    if len(text) > LARGEST_FILE:
+        raise ConfigError([f"{path}: more than {LARGEST_FILE} bytes, no configuration"])
     try:
         raw = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

@@ -5,9 +5,11 @@ Linear and without trust: the summary is not used, a torn tail ends the reading 
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from io import BufferedReader
 from pathlib import Path
 from typing import BinaryIO
 
@@ -48,7 +50,7 @@ class RecordingReader:
         """Events in recorded order, the first a RunStart, numbers without a gap. Raises OSError."""
         step: Step | None = None
         try:
-            with open(self.path, "rb") as file:
+            with open_recording(self.path) as file:
                 for record, number, item in self._items(file):
                     if isinstance(item, RESULTS):
                         if step is None or number != step.event_sequence:
@@ -101,6 +103,13 @@ class RecordingReader:
         if topic_of(item) != channel.topic or number & 0xFFFFFFFF != message.sequence:
             raise refusal(record, f"{channel.topic}: the message says {topic_of(item)}, event {number}")
         return number, item
+
+
+def open_recording(path: Path) -> BufferedReader:
+    """Open for reading. Raises OSError, also for what is no file: a pipe or a device may never begin, or never end."""
+    if path.exists() and not path.is_file() and not path.is_dir():
+        raise OSError(errno.EINVAL, "Not a file", str(path))
+    return open(path, "rb")
 
 
 def first_event(path: Path) -> RunStart | None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from agent.config import ConfigError, load_config, parse_config
+from agent.config import LARGEST_FILE, ConfigError, load_config, parse_config
 
 DEVICES = """
 [[devices]]
@@ -62,7 +62,7 @@ def test_all_faults_come_at_once() -> None:
     ]
 
 
-@pytest.mark.parametrize("content", [None, b"\xff\xfe", b"devices = [", b""])
+@pytest.mark.parametrize("content", [None, b"\xff\xfe", b"devices = [", b"", b"#" * (LARGEST_FILE + 1)])
 def test_a_file_that_is_none_is_a_fault(tmp_path: Path, content: bytes | None) -> None:
     path = tmp_path / "f.toml"
     if content is not None:
