@@ -17,6 +17,7 @@ from agent.config import Config, ConfigError, load_config, parse_config
 from agent.history import StoreError
 
 LOOPBACK = "tcp/127.0.0.1:7447"
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @click.command()
@@ -32,6 +33,9 @@ def run(config: Path | None, data_dir: Path, duration: float | None, preset: str
     """Read, calibrate, record and publish until Ctrl-C. Without CONFIG on the virtual bench."""
     from agent.watch import Watch
 
+    # Until the service takes them over: as Ctrl-C, so that a router or a bench started here does not stay behind.
+    for number in STOP_SIGNALS:
+        signal.signal(number, signal.default_int_handler)
     with ExitStack() as stack:
         try:
             if config is None:
@@ -54,7 +58,7 @@ def serve(config: Config, data_dir: Path, watch: Any, duration_s: float | None) 
     from agent.service import Service
 
     service = Service(config, data_dir, watch)
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+    for number in STOP_SIGNALS:
         signal.signal(number, lambda *_: service.stop())
     try:
         ended = service.run(duration_s)
