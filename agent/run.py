@@ -85,10 +85,11 @@ def virtual_bench(preset: str, seed: int) -> Iterator[tuple[Config, Any]]:
             {"start_s": p.start_s, "stop_s": p.stop_s, "theta_deg": p.theta_deg, "alpha_deg": p.alpha_deg}
             for p in live.bench.poses
         ]
+        number = f"{preset}-{seed}"  # each is a sensor of its own: one's calibration is not another's
         raw = {
             "gateway": {"site": "virtual", "name": "bench"},
             "devices": [
-                {"name": "mems", "driver": "adxl355", "options": live.sensor_options},
+                {"name": "mems", "driver": "adxl355", "options": live.sensor_options | {"serial_number": number}},
                 {"name": "reference", "driver": "serial-csv", "options": live.reference_options},
             ],
             "channels": [

@@ -27,6 +27,7 @@ class FifoOptions(Options):
     bus: int = Field(1, ge=0, description="N of /dev/i2c-N")
     rate_hz: float
     poll_interval_s: float | None = Field(None, gt=0, description="time between reads; by default that of 16 samples")
+    serial_number: str = Field("", description="as on the plate: these chips have none, and a calibration is one's own")
     bus_khz: float = Field(400.0, gt=0, le=3400, description="clock of the bus, as the machine sets it")
 
     @field_validator("rate_hz")

@@ -218,7 +218,7 @@ class FifoSensor(ABC):
         return DeviceInfo(
             driver=driver,
             kind=self._kind(),
-            serial_number="",
+            serial_number=self._options.serial_number,
             unit="count",
             axes=3,
             nominal_rate_hz=rate_hz,
