@@ -88,3 +88,16 @@ class Cutter:
         self._flags = BlockFlags.NONE
         self._index += stop - start
         return [block]
+
+
+def follow(steps: NDArray[np.int64] | NDArray[np.float64], longest_gap: float) -> list[Break]:
+    """Breaks of a count by its steps (n,) from sample to sample: a longer step than one is a GAP of known length, none,
+    one backwards or one beyond `longest_gap` a RESTART."""
+    breaks = []
+    for at in np.flatnonzero(steps != 1).tolist():
+        missing = int(steps[at]) - 1
+        if 0 < missing <= longest_gap:
+            breaks.append(Break(at, BlockFlags.GAP, missing))
+        else:
+            breaks.append(Break(at, BlockFlags.RESTART))
+    return breaks

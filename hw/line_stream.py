@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hw.block import BlockFlags, Drop, SampleBlock
-from hw.cutting import Break, Cutter, Stretch
+from hw.cutting import Break, Cutter, Stretch, follow
 from hw.lines import MAX_LINE_BYTES, decode
 
 UNREADABLE = "not the expected decimals"
@@ -96,12 +96,4 @@ class LineStream:
             return []
         before = sequence[0] - 1 if self._last_sequence is None else self._last_sequence
         self._last_sequence = float(sequence[-1])
-        steps = np.diff(sequence, prepend=before)
-        breaks = []
-        for at in np.flatnonzero(steps != 1).tolist():
-            missing = int(steps[at]) - 1
-            if 0 < missing <= self._longest_gap:
-                breaks.append(Break(at, BlockFlags.GAP, missing))
-            else:
-                breaks.append(Break(at, BlockFlags.RESTART))
-        return breaks
+        return follow(np.diff(sequence, prepend=before), self._longest_gap)

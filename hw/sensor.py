@@ -86,7 +86,9 @@ BUILT_IN: Mapping[str, str] = {
     "adxl359": "hw.adxl355:Adxl359",
     "lsm6dso": "hw.lsm6dso:Lsm6dso",
     "mpu6050": "hw.mpu6050:Mpu6050",
+    "serial-binary": "hw.serial_binary:SerialBinary",
     "serial-csv": "hw.serial_stream:SerialCsv",
+    "witmotion": "hw.witmotion:WitMotion",
 }
 
 

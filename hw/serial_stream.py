@@ -2,38 +2,21 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
-import termios
-import time
-from collections import deque
-from collections.abc import Callable
-from typing import ClassVar, Literal
+from typing import Literal
 
 import serial
 from pydantic import Field
 
-from hw.block import DeviceInfo, Drop, SampleBlock
+from hw.block import DeviceInfo
 from hw.cutting import Cutter
 from hw.line_stream import LineStream
-from hw.sensor import Clock, ConfigurationError, DeviceLost, Options, system_clock
-
-BLOCK_S = 0.5
-GATHER_S = 0.010  # a wake-up for ten samples at 1 kHz, not for each; 115 B of the kernel's 4 kB at 115200 baud
-SLOW_RATE_HZ = 100.0  # below, a line is read as it comes: the port wakes the reader, and GATHER_SLOW_S lets it end
-GATHER_SLOW_S = 0.002
-GOLDEN = (5**0.5 - 1) / 2
-READ_BYTES = 65536  # bounds a single read
-BLOCK_BYTES = 262144  # bounds a block's memory: 0.5 s at 4 Mbaud is 200 kB
-LONGEST_GAP_S = 10.0  # a longer jump in the sequence is a counter that began anew, or a damaged number
-LOST = (serial.SerialException, OSError, termios.error)  # termios.error is no OSError; all three come at an unplug
+from hw.serial_sensor import LONGEST_GAP_S, SerialOptions, SerialSensor
 
 
-class SerialCsvOptions(Options):
+class SerialCsvOptions(SerialOptions):
     """Options of `serial-csv`."""
 
-    port: str = Field(min_length=1, description="path of the port, best one of /dev/serial/by-id")
-    baud_rate: int = Field(115200, gt=0, le=4_000_000)
     axes: Literal[1, 3] = Field(3, description="1: a uniaxial device, 3: x,y,z")
     rate_hz: float = Field(gt=0, le=100_000, allow_inf_nan=False, description="nominal rate of the samples")
     sequence: bool = Field(False, description="each line begins with a sample count; without it lost lines go unseen")
@@ -42,100 +25,28 @@ class SerialCsvOptions(Options):
     serial_number: str = Field("", description="of the device, as on its plate")
 
 
-class SerialCsv:
-    """Lets bursts gather, stamps each with the time at which its read returned, decodes them block by block."""
+class SerialCsv(SerialSensor):
+    """A bad line is counted and skipped; a jump in the sequence is a gap."""
 
-    options_model: ClassVar[type[Options]] = SerialCsvOptions
+    options_model = SerialCsvOptions
 
-    def __init__(
-        self,
-        name: str,
-        options: SerialCsvOptions,
-        *,
-        clock: Clock = system_clock,
-        sleep: Callable[[float], None] = time.sleep,
-    ) -> None:
-        self._options = options
-        self._clock = clock
-        self._sleep = sleep
+    def _build_stream(self, name: str) -> LineStream:
+        options = self._options
         limit = options.full_scale or math.inf
-        self._stream = LineStream(
+        return LineStream(
             Cutter(name, options.rate_hz, -limit, limit),
             options.axes,
             sequence=options.sequence,
             longest_gap=LONGEST_GAP_S * options.rate_hz,
         )
-        self._port: serial.Serial | None = None
-        self._loss: DeviceLost | None = None
-        self._ready: deque[SampleBlock] = deque()
-        self._phase = 0.0
 
-    def open(self) -> DeviceInfo:
-        """Open the port. Raises DeviceLost (absent, in use, no right), ConfigurationError (settings it cannot do)."""
-        self.close()
+    def _set_up(self, port: serial.Serial) -> DeviceInfo:  # noqa: ARG002 - nothing is set in such a device
         options = self._options
-        try:
-            self._port = serial.Serial(options.port, options.baud_rate, timeout=BLOCK_S, exclusive=True)
-        except LOST as error:
-            raise DeviceLost(f"port {options.port}: {error}") from error
-        except ValueError as error:
-            raise ConfigurationError(f"port {options.port}, baud_rate {options.baud_rate}: {error}") from error
-        self._loss = None
-        self._stream.begin()
-        return DeviceInfo(
-            driver="serial-csv",
+        return self._info(
+            "serial-csv",
+            {"sequence": str(options.sequence)},
             kind="serial-csv",
             serial_number=options.serial_number,
             unit=options.unit,
             axes=options.axes,
-            nominal_rate_hz=options.rate_hz,
-            settings={"port": options.port, "baud_rate": str(options.baud_rate), "sequence": str(options.sequence)},
         )
-
-    def close(self) -> None:
-        """Release the port."""
-        port, self._port = self._port, None
-        if port is not None:
-            with contextlib.suppress(*LOST):
-                port.close()
-
-    def take_drops(self) -> list[Drop]:
-        """Bad lines and overlong ones since the last call."""
-        return self._stream.take_drops()
-
-    def read_block(self) -> SampleBlock | None:
-        """The next block, or None. Raises DeviceLost."""
-        if not self._ready and self._loss is None:
-            if self._port is None:
-                raise DeviceLost(f"port {self._options.port} is not open")
-            self._gather(self._port)
-        if self._ready:
-            return self._ready.popleft()
-        if self._loss is not None:
-            raise self._loss
-        return None
-
-    def _gather(self, port: serial.Serial) -> None:
-        """Read bursts for BLOCK_S and decode them; silence or a loss ends it earlier."""
-        now_ns, _ = self._clock()
-        end_ns = now_ns + round(BLOCK_S * 1e9)
-        while now_ns < end_ns and self._stream.size < BLOCK_BYTES:
-            self._sleep(self._pause_s())
-            try:
-                data = port.read(min(max(1, port.in_waiting), READ_BYTES))
-            except LOST as error:
-                self._loss = DeviceLost(f"port {self._options.port}: {error}")  # raised once all before it is returned
-                break
-            now_ns, utc_ns = self._clock()
-            if not data:
-                break
-            self._stream.feed(data, now_ns, utc_ns)
-        self._ready.extend(self._stream.blocks())
-
-    def _pause_s(self) -> float:
-        """Time to let a burst gather; spread over a sample period by the golden ratio, so that poll and sample clock
-        do not beat and each second's arrivals sample all of the period."""
-        if self._options.rate_hz < SLOW_RATE_HZ:
-            return GATHER_SLOW_S
-        self._phase = (self._phase + GOLDEN) % 1.0
-        return GATHER_S + self._phase / self._options.rate_hz

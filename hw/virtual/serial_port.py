@@ -22,16 +22,21 @@ class PtyDevice:
     """Writes the text that is due to whoever has the port open, and never waits for a reader.
 
     `text_due(t_s)` returns the text that became due since its last call, as bytes; `clock()` is the device's time in
-    seconds. `path` is a symbolic link that stays the same over `unplug` and `replug`. Either `start` a thread that
-    serves in bursts, or call `serve` yourself. As on a wire, what nobody reads is lost: without a reader all of it,
-    with a slow one what the kernel's buffer does not hold (`lost_bytes`).
+    seconds; `received(data)` takes what is sent to it. `path` is a symbolic link that stays the same over `unplug` and
+    `replug`. Either `start` a thread that serves in bursts, or call `serve` yourself. As on a wire, what nobody reads
+    is lost: without a reader all of it, with a slow one what the kernel's buffer does not hold (`lost_bytes`).
     """
 
     def __init__(
-        self, text_due: Callable[[float], bytes], clock: Callable[[], float] = time.monotonic, link: Path | None = None
+        self,
+        text_due: Callable[[float], bytes],
+        clock: Callable[[], float] = time.monotonic,
+        link: Path | None = None,
+        received: Callable[[bytes], None] | None = None,
     ) -> None:
         self._text_due = text_due
         self._clock = clock
+        self._received = received
         self._directory = tempfile.TemporaryDirectory(prefix="fieldcal-") if link is None else None
         self.path = Path(self._directory.name) / "port" if self._directory else Path(link or "")
         self.lost_bytes = 0
@@ -77,7 +82,8 @@ class PtyDevice:
         self._garbage += garbage
 
     def serve(self) -> None:
-        """Write what is due now."""
+        """Take what was sent to the device, write what is due now."""
+        self._listen()
         text = self._garbage + self._text_due(self._clock())
         self._garbage = b""
         with self._lock:
@@ -86,6 +92,16 @@ class PtyDevice:
                 with contextlib.suppress(BlockingIOError):
                     written = os.write(self._master, text)
             self.lost_bytes += len(text) - written
+
+    def _listen(self) -> None:
+        with self._lock:
+            if self._received is None or self._master is None or not self._open_for_reading():
+                return
+            try:
+                commands = os.read(self._master, 4096)
+            except BlockingIOError:
+                return
+        self._received(commands)
 
     def start(self) -> None:
         """Serve from a thread until `stop`."""

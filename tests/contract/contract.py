@@ -99,6 +99,8 @@ def check_shape(block: SampleBlock, axes: int) -> None:
 
 
 class SensorContract(ABC):
+    million = 1_000_000
+
     @pytest.fixture
     @abstractmethod
     def rig(self) -> Iterator[Rig]: ...
@@ -237,7 +239,7 @@ class SensorContract(ABC):
 
     def test_a_million_samples_none_lost_doubled_or_shifted(self, rig: Rig) -> None:
         rig.open()
-        blocks = rig.blocks(1e6 / rig.rate_hz)
+        blocks = rig.blocks(self.million / rig.rate_hz)
         block = next(blocks)
         assert block.first_index == 0
         next_number = int(rig.number(block.indications)[0])
@@ -247,7 +249,7 @@ class SensorContract(ABC):
             assert np.array_equal(rig.number(block.indications), np.arange(next_number, next_number + block.n))
             index += block.n
             next_number += block.n
-            if index >= 1_000_000:
+            if index >= self.million:
                 break
             block = next(blocks)
             assert block.flags == BlockFlags.NONE

@@ -1,0 +1,93 @@
+"""From bursts of bytes to sample blocks by frames of fixed length, without a port."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hw.block import BlockFlags, Drop, SampleBlock
+from hw.cutting import Break, Cutter, Stretch
+from hw.frames import Found, Layout, find
+
+NO_FRAME = "no frame"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Decoded:
+    """Samples of a run of frames: `indications` (n, axes), `frame` (n,) which of the frames ended each sample."""
+
+    indications: NDArray[np.int32] | NDArray[np.float64]
+    frame: NDArray[np.int64]
+    breaks: list[Break]
+    temperature_raw: int | None = None
+    temperature_degc: float | None = None
+
+
+class FrameStream(ABC):
+    """Gathers bursts with `feed`, decodes all of them at once in `blocks`. Holds at most a frame begun besides."""
+
+    def __init__(self, cutter: Cutter, layout: Layout) -> None:
+        self._cutter = cutter
+        self._layout = layout
+        self._dropped = 0
+        self.begin()
+
+    @abstractmethod
+    def _decode(self, found: Found) -> Decoded:
+        """Samples of these frames."""
+
+    def begin(self) -> None:
+        """A port was opened: up to the first frame there is only the rest of one."""
+        self._listening = False
+        self._slipped = False
+        self._rest = b""
+        self._bursts: list[bytes] = []
+        self._arrivals_ns: list[int] = []
+        self._utc_ns = 0
+        self.size = 0
+        self._cutter.flag(BlockFlags.RESTART)
+
+    def feed(self, data: bytes, arrival_ns: int, utc_ns: int) -> None:
+        """One burst and its arrival."""
+        self._bursts.append(data)
+        self._arrivals_ns.append(arrival_ns)
+        self._utc_ns = utc_ns
+        self.size += len(data)
+
+    def blocks(self) -> list[SampleBlock]:
+        """Blocks of all that was fed since the last call."""
+        if not self._bursts:
+            return []
+        read = len(self._rest) + np.cumsum([len(burst) for burst in self._bursts])
+        arrivals_ns = np.array(self._arrivals_ns, np.int64)
+        found = find(self._rest + b"".join(self._bursts), self._layout)
+        self._bursts, self._arrivals_ns, self.size = [], [], 0
+        self._rest = found.rest
+        self._dropped += found.dropped
+        if not self._listening:
+            self._dropped -= int(found.end[0]) - self._layout.length if len(found.end) else found.dropped
+            self._listening = bool(len(found.end))
+        slipped = found.slipped
+        slipped[0] |= self._slipped
+        self._slipped = bool(slipped[-1])
+        decoded = self._decode(found)
+        ends = found.end[decoded.frame]
+        return self._cutter.cut(
+            Stretch(
+                decoded.indications,
+                arrivals_ns,
+                np.searchsorted(ends, read, side="right"),
+                self._utc_ns,
+                decoded.temperature_raw,
+                decoded.temperature_degc,
+            ),
+            decoded.breaks,
+        )
+
+    def take_drops(self) -> list[Drop]:
+        """Bytes that belong to no frame since the last call."""
+        dropped, self._dropped = self._dropped, 0
+        return [Drop(dropped, "bytes", NO_FRAME)] if dropped else []

@@ -1,0 +1,163 @@
+"""Driver `serial-binary`: a device that sends one sample a frame of fixed length, described in the configuration."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, Self
+
+import numpy as np
+import serial
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from hw.block import BlockFlags, DeviceInfo
+from hw.cutting import Break, Cutter, follow
+from hw.frame_stream import Decoded, FrameStream
+from hw.frames import CHECKSUMS, WIDTH, ByteOrder, ChecksumName, Found, Layout, NumberType, numbers
+from hw.serial_sensor import LONGEST_GAP_S, SerialOptions, SerialSensor
+
+BITS_A_BYTE = 10  # with start and stop bit
+
+
+class Number(BaseModel):
+    """A number in a frame."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    at: int = Field(ge=0, description="its first byte, counted from 0")
+    type: NumberType
+
+    @property
+    def end(self) -> int:
+        """The byte behind it."""
+        return self.at + WIDTH[self.type]
+
+
+class Thermometer(Number):
+    """The device's temperature: degC = zero_degc + number / counts_per_degc."""
+
+    counts_per_degc: float = Field(1.0, description="counts a degree; below 0 where they fall")
+    zero_degc: float = Field(0.0, description="degC at 0 counts")
+
+
+class SerialBinaryOptions(SerialOptions):
+    """Options of `serial-binary`."""
+
+    rate_hz: float = Field(gt=0, le=100_000, allow_inf_nan=False, description="nominal rate of the samples")
+    start: str = Field(pattern="^([0-9a-fA-F]{2}){1,8}$", description='bytes every frame begins with, e.g. "aa55"')
+    length: int = Field(ge=3, le=256, description="bytes of a frame, with start and checksum")
+    byte_order: ByteOrder = Field("little", description="of all numbers")
+    indications: tuple[Number, ...] = Field(description="x, y, z or one alone: [{at = 4, type = 'i16'}, ...]")
+    sequence: Number | None = Field(None, description="a sample count; without it lost frames go unseen")
+    temperature: Thermometer | None = None
+    checksum: ChecksumName = Field("none", description="the frame's last bytes")
+    checksum_from: int = Field(0, ge=0, description="first byte that it covers")
+    checksum_order: ByteOrder = "little"
+    unit: Literal["count", "m/s2", "m/s", "mV"] = Field("count", description="of the indications")
+    full_scale: float | None = Field(None, gt=0, description="indications of this size or more are saturated")
+    serial_number: str = Field("", description="of the device, as on its plate")
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        if self.temperature is not None and self.temperature.counts_per_degc == 0:
+            raise ValueError("temperature.counts_per_degc: 0 counts a degree is no thermometer")
+        if len(self.indications) not in (1, 3):
+            raise ValueError(f"indications: 1 or 3 numbers, not {len(self.indications)}")
+        covered = self.length - CHECKSUMS[self.checksum][0]
+        for number in (*self.indications, self.sequence, self.temperature):
+            if number is not None and number.end > covered:
+                raise ValueError(
+                    f"the {number.type} at {number.at} ends at byte {number.end}; "
+                    f"a frame of {self.length} bytes has room up to {covered}"
+                )
+        if self.sequence is not None and self.sequence.type not in ("u8", "u16", "u32"):
+            raise ValueError(f"sequence: u8, u16 or u32, not {self.sequence.type}")
+        bits_hz = BITS_A_BYTE * self.length * self.rate_hz
+        if bits_hz > self.baud_rate:
+            raise ValueError(
+                f"port too slow: {self.rate_hz:g} frames/s of {self.length} bytes, {BITS_A_BYTE} bits each, are "
+                f"{bits_hz:g} bit/s; baud_rate is {self.baud_rate}"
+            )
+        return self
+
+    @property
+    def layout(self) -> Layout:
+        """How frames are found."""
+        start = bytes.fromhex(self.start)
+        return Layout(start, self.length, self.checksum, self.checksum_from, self.checksum_order)
+
+
+class BinaryStream(FrameStream):
+    """One sample a frame. With a sequence a missing frame is a GAP; without one, bytes that are no frame may stand for
+    any number of them: RESTART. Frames with a number that is not finite are no samples."""
+
+    def __init__(self, cutter: Cutter, options: SerialBinaryOptions) -> None:
+        self._options = options
+        super().__init__(cutter, options.layout)
+
+    def begin(self) -> None:
+        """A port was opened."""
+        super().begin()
+        self._last: int | None = None
+
+    def _decode(self, found: Found) -> Decoded:
+        options = self._options
+        columns = [numbers(found.frames, n.at, n.type, options.byte_order) for n in options.indications]
+        counted = all(n.type not in ("f32", "u32") for n in options.indications)
+        values = np.column_stack(columns).astype(np.int32 if counted else np.float64)
+        sound = np.isfinite(values).all(axis=1)
+        return Decoded(
+            np.ascontiguousarray(values[sound]),
+            np.flatnonzero(sound),
+            self._unseen(found, sound) if options.sequence is None else self._follow(found.frames[sound]),
+            *self._temperature(found.frames[sound]),
+        )
+
+    def _unseen(self, found: Found, sound: NDArray[np.bool_]) -> list[Break]:
+        """Where bytes or frames that are no samples lie between two."""
+        broken = found.slipped[:-1].copy()
+        broken[1:] |= ~sound[:-1]
+        return [Break(at, BlockFlags.RESTART) for at in np.flatnonzero(broken[sound]).tolist()]
+
+    def _follow(self, frames: NDArray[np.uint8]) -> list[Break]:
+        """Where the sequence, which wraps, does not go on by one."""
+        kind = self._options.sequence
+        if kind is None or not len(frames):
+            return []
+        sequence = numbers(frames, kind.at, kind.type, self._options.byte_order).astype(np.int64)
+        before = sequence[0] - 1 if self._last is None else self._last
+        self._last = int(sequence[-1])
+        steps = np.diff(sequence, prepend=before) % 256 ** WIDTH[kind.type]
+        return follow(steps, LONGEST_GAP_S * self._options.rate_hz)
+
+    def _temperature(self, frames: NDArray[np.uint8]) -> tuple[int | None, float | None]:
+        """Of the last frame."""
+        kind = self._options.temperature
+        if kind is None or not len(frames):
+            return None, None
+        value = float(numbers(frames[-1:], kind.at, kind.type, self._options.byte_order)[0])
+        degc = kind.zero_degc + value / kind.counts_per_degc
+        if not math.isfinite(degc):
+            return None, None
+        return None if kind.type == "f32" else int(value), degc
+
+
+class SerialBinary(SerialSensor):
+    """Frames are found by their first bytes and their checksum; what is none is counted and skipped."""
+
+    options_model = SerialBinaryOptions
+
+    def _build_stream(self, name: str) -> BinaryStream:
+        limit = self._options.full_scale or math.inf
+        return BinaryStream(Cutter(name, self._options.rate_hz, -limit, limit), self._options)
+
+    def _set_up(self, port: serial.Serial) -> DeviceInfo:  # noqa: ARG002 - nothing is set in such a device
+        options = self._options
+        return self._info(
+            "serial-binary",
+            {"start": options.start, "length": str(options.length), "checksum": options.checksum},
+            kind="serial-binary",
+            serial_number=options.serial_number,
+            unit=options.unit,
+            axes=len(options.indications),
+        )

@@ -1,0 +1,128 @@
+"""What every driver on a serial port must do: the contract on a pseudo-terminal under the real pyserial."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import struct
+import termios
+import time
+from abc import abstractmethod
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pytest
+
+from hw.block import DeviceInfo
+from hw.sensor import DeviceLost
+from hw.serial_sensor import SerialSensor
+from hw.virtual.serial_port import PtyDevice
+from tests.contract.contract import Rig, SensorContract
+
+KERNEL_BUFFER = 4095  # bytes a terminal holds for its reader
+
+
+class SerialRig(Rig):
+    """A subclass names the driver, its options, and what the device writes."""
+
+    driver: ClassVar[type[SerialSensor]]
+    known: ClassVar[dict[str, Any]]
+
+    def __init__(self, link: Path) -> None:
+        self.saturated = range(0)
+        self.next = 0
+        self.text = b""
+        self.noise = b""  # what the device says instead
+        self.noise_bytes = 0
+        self.port = PtyDevice(self.text_due, lambda: self.t_s, link, self.received)
+        self.listener: int | None = None
+        self.sensor = self.build()
+
+    @abstractmethod
+    def write(self, first: int, n: int) -> bytes:
+        """What the device writes of these samples."""
+
+    def received(self, data: bytes) -> None:
+        """What the driver sent."""
+
+    def build(self, **changes: Any) -> SerialSensor:
+        options = {"port": str(self.port.path), "rate_hz": self.rate_hz} | self.known | changes
+        model = self.driver.options_model
+        return self.driver("sensor", model.model_validate(options), clock=self.clock, sleep=lambda s: self.sleep(s))
+
+    def build_elsewhere(self) -> SerialSensor:
+        return self.build(port="/dev/no-such-port")
+
+    def text_due(self, t_s: float) -> bytes:
+        due = self.due(t_s)
+        if self.noise:
+            self.noise_bytes += len(self.noise)
+            self.text = self.noise
+        else:
+            self.text = self.write(self.next, due - self.next)
+        self.next = due
+        return self.text
+
+    def sleep(self, seconds: float) -> None:
+        """Time passes; the device writes what it made, as far as the terminal holds it, and it reaches the reader."""
+        super().sleep(seconds)
+        lost = self.port.lost_bytes
+        waiting = self.waiting()
+        self.port.serve()
+        if self.listener is None or not self.port.has_reader():
+            return
+        wanted = min(waiting + len(self.text) - (self.port.lost_bytes - lost), KERNEL_BUFFER)
+        deadline = time.monotonic() + 5.0
+        while self.waiting() < wanted and time.monotonic() < deadline:
+            pass  # the kernel hands the bytes on from a worker of its own, within microseconds
+
+    def waiting(self) -> int:
+        """Bytes that wait for the reader, asked by a second file that never reads."""
+        if self.listener is None:
+            return 0
+        try:
+            return int(struct.unpack("I", fcntl.ioctl(self.listener, termios.FIONREAD, b"\0\0\0\0"))[0])
+        except OSError:  # hung up
+            return 0
+
+    def open(self) -> DeviceInfo:
+        """As a driver does it, and the device then goes on where it is."""
+        if self.listener is not None:
+            os.close(self.listener)
+            self.listener = None
+        info = super().open()
+        self.listener = os.open(self.port.path, os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK)
+        self.next = self.due(self.t_s)
+        return info
+
+    def saturate(self, first: int, last: int) -> None:
+        self.saturated = range(first, last + 1)
+
+    def lose(self) -> None:
+        self.next += 3
+
+    def unplug(self) -> None:
+        self.port.unplug()
+
+    def replug(self) -> None:
+        self.port.replug()
+
+    def close(self) -> None:
+        self.sensor.close()
+        if self.listener is not None:
+            os.close(self.listener)
+        self.port.stop()
+
+
+class SerialContract(SensorContract):
+    def test_port_in_use(self, rig: SerialRig) -> None:
+        rig.open()
+        second = rig.build()
+        with pytest.raises(DeviceLost, match=f"port {rig.port.path}: .*exclusively lock"):
+            second.open()
+
+    def test_a_file_is_no_port(self, rig: SerialRig, tmp_path: Path) -> None:
+        file = tmp_path / "recording.csv"
+        file.write_text("1,2,3\n")
+        with pytest.raises(DeviceLost, match=f"port {file}: "):
+            rig.build(port=str(file)).open()

@@ -1,0 +1,140 @@
+"""The contract on the WitMotion's twin, and what only this device can do wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from hw.block import BlockFlags, DeviceInfo, Drop
+from hw.sensor import ConfigurationError, DeviceLost, IdentityError
+from hw.virtual.witmotion_twin import WitMotionTwin
+from hw.witmotion import WitMotion
+from tests.contract.serial_contract import SerialContract, SerialRig
+
+LAP = 30_000
+
+
+class WitMotionRig(SerialRig):
+    driver = WitMotion
+    known = {}  # noqa: RUF012
+    rate_hz = 200.0
+
+    def __init__(self, link: Path) -> None:
+        self.twin = WitMotionTwin(self.counts, self.due, self.rate_hz)
+        super().__init__(link)
+
+    def counts(self, first: int, n: int) -> NDArray[np.int32]:
+        k = np.arange(first, first + n)
+        return np.column_stack([k % LAP, -(k // LAP), np.where(np.isin(k, self.saturated), 32767, 0x5155)])
+
+    def write(self, first: int, n: int) -> bytes:
+        raise AssertionError(f"the twin writes samples {first} to {first + n}")
+
+    def received(self, data: bytes) -> None:
+        self.twin.received(data)
+
+    def text_due(self, t_s: float) -> bytes:
+        self.text = self.noise or self.twin.text_due(t_s)
+        return self.text
+
+    def number(self, indications: NDArray[np.generic]) -> NDArray[np.int64]:
+        x, y, z = indications.astype(np.int64).T
+        numbers = x - LAP * y
+        assert ((z == 0x5155) | ((z == 32767) & np.isin(numbers, self.saturated))).all()
+        return numbers
+
+    def open(self) -> DeviceInfo:
+        info = super().open()
+        self.twin.next = self.due(self.t_s)
+        return info
+
+    def lose(self) -> None:
+        self.twin.next += 3
+
+
+class TestWitMotion(SerialContract):
+    million = 100_000  # it sends two frames a sample and shares the way of serial-binary, which reads a million
+
+    @pytest.fixture
+    def rig(self, tmp_path: Path) -> Iterator[WitMotionRig]:
+        rig = WitMotionRig(tmp_path / "port")
+        yield rig
+        rig.close()
+
+    def test_says_who_it_is_and_how_it_is_set(self, rig: WitMotionRig) -> None:
+        info = rig.open()
+        assert info.serial_number == "WT4200001234"
+        # Protocol: 16 g are 32768.
+        assert info.nominal_sensitivity == pytest.approx(2048 / 9.80665, rel=1e-12)
+        assert {name: info.settings[name] for name in ("RSW", "RRATE", "AXOFFSET", "BANDWIDTH")} == {
+            "RSW": "0x0003",
+            "RRATE": "0x000B",
+            "AXOFFSET": "0x0000",
+            "BANDWIDTH": "0x0002",
+        }
+        assert rig.twin.registers[0x05] == 0
+
+    def test_setting_that_does_not_take(self, rig: WitMotionRig) -> None:
+        class Stubborn(WitMotionTwin):
+            def received(self, data: bytes) -> None:
+                super().received(data)
+                self.registers[0x05] = 12
+
+        rig.twin = Stubborn(rig.counts, rig.due, rig.rate_hz)
+        with pytest.raises(ConfigurationError, match="AXOFFSET is 0x000C, not 0x0000"):
+            rig.sensor.open()
+
+    @pytest.mark.parametrize(("noise", "said"), [(b"", "nothing"), (b"hello, world\n", "bytes without an answer")])
+    def test_wrong_identity(self, rig: WitMotionRig, noise: bytes, said: str) -> None:
+        rig.noise = noise
+        rig.twin = WitMotionTwin(rig.counts, lambda _: 0, rig.rate_hz)
+        rig.twin.received = lambda data: None  # type: ignore[method-assign]  # noqa: ARG005
+        with pytest.raises(IdentityError, match=f"no WitMotion at 115200 baud: it sent .*{said}"):
+            rig.sensor.open()
+
+    def test_missing_samples_are_counted_by_the_clock(self, rig: WitMotionRig) -> None:
+        rig.open()
+        *_, before = rig.blocks(0.6)
+        rig.twin.next += 7
+        rig.sleep(0.04)
+        after = next(rig.blocks(0.1))
+        assert after.flags == BlockFlags.GAP
+        assert after.first_index == before.first_index + before.n + 7
+
+    def test_an_acceleration_without_its_time_is_no_sample(self, rig: WitMotionRig) -> None:
+        rig.open()
+        list(rig.blocks(0.6))
+        rig.port.inject(b"\x55\x51" + bytes(8) + b"\xa6")
+        (block,) = rig.blocks(0.3)
+        assert block.flags == BlockFlags.NONE
+        assert (np.diff(rig.number(block.indications)) == 1).all()
+
+    def test_power_lost_underway(self, rig: WitMotionRig) -> None:
+        # Its offsets are back then: nothing of what it sends may be taken.
+        rig.open()
+        list(rig.blocks(11.0))
+        rig.twin.power_cycle()
+        rig.twin.registers[0x02] = 0x03
+        with pytest.raises(DeviceLost, match=r"did it lose power\?"):
+            rig.sensor.read_block()
+        rig.open()
+        assert next(rig.blocks(0.1)).flags == BlockFlags.RESTART
+        assert rig.twin.registers[0x05] == 0
+
+    def test_garbage_between_frames_costs_no_sample(self, rig: WitMotionRig) -> None:
+        rig.open()
+        *_, before = rig.blocks(0.6)
+        rig.port.inject(b"\x55\x51\x55")
+        block = next(rig.blocks(0.1))
+        assert block.flags == BlockFlags.NONE
+        assert rig.number(block.indications)[0] == rig.number(before.indications)[-1] + 1
+        assert rig.sensor.take_drops() == [Drop(3, "bytes", "no frame")]
+
+    def test_temperature(self, rig: WitMotionRig) -> None:
+        rig.open()
+        (block,) = rig.blocks(0.4)
+        assert (block.temperature_raw, block.temperature_degc) == (2503, 25.03)
