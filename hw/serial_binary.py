@@ -14,6 +14,7 @@ from hw.block import BlockFlags, DeviceInfo
 from hw.cutting import Break, Cutter, follow
 from hw.frame_stream import Decoded, FrameStream
 from hw.frames import CHECKSUMS, WIDTH, ByteOrder, ChecksumName, Found, Layout, NumberType, numbers
+from hw.lines import LARGEST
 from hw.serial_sensor import LONGEST_GAP_S, SerialOptions, SerialSensor
 
 BITS_A_BYTE = 10  # with start and stop bit
@@ -89,7 +90,7 @@ class SerialBinaryOptions(SerialOptions):
 
 class BinaryStream(FrameStream):
     """One sample a frame. With a sequence a missing frame is a GAP; without one, bytes that are no frame may stand for
-    any number of them: RESTART. Frames with a number that is not finite are no samples."""
+    any number of them: RESTART. Frames with a number that is none, or beyond LARGEST, are no samples."""
 
     def __init__(self, cutter: Cutter, options: SerialBinaryOptions) -> None:
         self._options = options
@@ -104,8 +105,9 @@ class BinaryStream(FrameStream):
         options = self._options
         columns = [numbers(found.frames, n.at, n.type, options.byte_order) for n in options.indications]
         counted = all(n.type not in ("f32", "u32") for n in options.indications)
-        values = np.column_stack(columns).astype(np.int32 if counted else np.float64)
-        sound = np.isfinite(values).all(axis=1)
+        with np.errstate(invalid="ignore"):  # a float may hold any bits
+            values = np.column_stack(columns).astype(np.int32 if counted else np.float64)
+        sound = (np.abs(values) <= LARGEST).all(axis=1)
         return Decoded(
             np.ascontiguousarray(values[sound]),
             np.flatnonzero(sound),

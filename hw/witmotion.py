@@ -74,9 +74,11 @@ class WitStream(FrameStream):
         self._time_frame = frames[-1:] if len(frames) and kind[-1] == wit.TIME else None
         times_ms = wit.milliseconds(frames[frame - 1])
         breaks = self._breaks(times_ms)
-        if (breaks and breaks[-1].flags & BlockFlags.RESTART) or self.restarted:
+        if self.restarted:
+            frame, breaks = frame[:0], []
+        elif breaks and breaks[-1].flags & BlockFlags.RESTART:
             self.restarted = True
-            frame, breaks = frame[: breaks[-1].at if breaks else 0], breaks[:-1]
+            frame, breaks = frame[: breaks[-1].at], breaks[:-1]
         samples = frames[frame]
         raw_degc = wit.temperature(samples[-1]) if len(samples) else (None, None)
         return Decoded(wit.counts(samples), frame - waiting, breaks, *raw_degc)
