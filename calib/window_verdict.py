@@ -42,33 +42,50 @@ def judge(sums: WindowSums, struck: NDArray[np.bool_], numbers: Mapping[str, flo
     """Verdict on a window of these sums, of which the points `struck` were left out.
 
     `numbers`: for motion reference_rms_mps2, reference_noise_mps2, coherence, drift_mps2 and clipped_points; for a rest
-    sd_over_floor where other rests are known.
+    sd_over_floor where other rests are known. The verdict carries each with its threshold (`<name>_threshold`).
     """
     points = float(sums.count.sum())
     left_out = 100.0 * float(struck.mean()) if len(struck) else 0.0
     numbers = {"points": points, "left_out_pct": left_out, **numbers}
-    return Verdict(not (reason := _reason(numbers, limits)), reason, numbers)
+    numbers |= {f"{name}_threshold": limit for name, limit in _thresholds(numbers, limits).items()}
+    return Verdict(not (reason := _reason(numbers)), reason, numbers)
 
 
-def _reason(n: Mapping[str, float], limits: Limits) -> str:
-    """The first thing that is wrong with a window of these numbers, "" where nothing is."""
-    if n["points"] < limits.least_points:
-        return f"too few points: {n['points']:.0f}, {limits.least_points} needed"
+def _thresholds(n: Mapping[str, float], limits: Limits) -> dict[str, float]:
+    """What each number is held against; recorded with it, so that who checks can tell a close decision."""
+    limit = {"points": float(limits.least_points), "left_out_pct": limits.most_left_out_pct}
     if "reference_rms_mps2" in n:
-        if n["reference_rms_mps2"] <= limits.least_level * n["reference_noise_mps2"]:
+        limit["reference_rms_mps2"] = limits.least_level * n["reference_noise_mps2"]
+        limit["clipped_points"] = 0.0
+        limit["coherence"] = limits.least_coherence
+        limit["drift_mps2"] = max(limits.most_drift_mps2, limits.most_drift_pct / 100.0 * n["reference_rms_mps2"])
+    if "sd_over_floor" in n:
+        limit["sd_over_floor"] = limits.most_restless
+    return limit
+
+
+def _reason(n: Mapping[str, float]) -> str:
+    """The first thing that is wrong with a window of these numbers, "" where nothing is."""
+    limit = {name: n[f"{name}_threshold"] for name in n if f"{name}_threshold" in n}
+    if n["points"] < limit["points"]:
+        return f"too few points: {n['points']:.0f}, {limit['points']:.0f} needed"
+    if "reference_rms_mps2" in n:
+        if n["reference_rms_mps2"] <= limit["reference_rms_mps2"]:
             return (
                 f"the reference is silent: {n['reference_rms_mps2']:.3g} m/s2 in band, "
                 f"its noise is {n['reference_noise_mps2']:.3g} m/s2"
             )
-        if n["clipped_points"]:
+        if n["clipped_points"] > limit["clipped_points"]:
             return f"clipped: {n['clipped_points']:.0f} points at the end of the sensor's range"
-        if n["coherence"] < limits.least_coherence:
+        if n["coherence"] < limit["coherence"]:
             return f"the sensor does not follow the reference: coherence {n['coherence']:.3f}"
-        most = max(limits.most_drift_mps2, limits.most_drift_pct / 100.0 * n["reference_rms_mps2"])
-        if n["drift_mps2"] > most:
-            return f"the sensor's mean moves by {n['drift_mps2']:.3g} m/s2 within the window, {most:.3g} at most"
-    if n.get("sd_over_floor", 0.0) > limits.most_restless:
+        if n["drift_mps2"] > limit["drift_mps2"]:
+            return (
+                f"the sensor's mean moves by {n['drift_mps2']:.3g} m/s2 within the window, "
+                f"{limit['drift_mps2']:.3g} at most"
+            )
+    if "sd_over_floor" in n and n["sd_over_floor"] > limit["sd_over_floor"]:
         return f"the sensor is not at rest: {n['sd_over_floor']:.1f} times the noise it has in other positions"
-    if n["left_out_pct"] > limits.most_left_out_pct:
-        return f"{n['left_out_pct']:.1f} % of the points are knocked out, {limits.most_left_out_pct:g} % at most"
+    if n["left_out_pct"] > limit["left_out_pct"]:
+        return f"{n['left_out_pct']:.1f} % of the points are knocked out, {limit['left_out_pct']:g} % at most"
     return ""

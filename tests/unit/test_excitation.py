@@ -10,7 +10,8 @@ import pytest
 from calib import detection
 from calib.excitation import Points, motion_parts, motion_windows, rest_sd, rest_window
 from calib.geometry import along, at_rest, beside, clamp
-from calib.model import Window
+from calib.model import Window, WindowSums
+from calib.window_verdict import Limits, judge
 
 RATE_HZ = 500.0
 S = np.array([[1.02, 0.01, -0.02], [0.015, 0.98, 0.005], [-0.01, 0.02, 1.01]])
@@ -297,3 +298,24 @@ def test_knocks_in_a_rest_are_left_out() -> None:
     V[1500] += 0.2  # 10 SD, too little for its block to be no rest
     assert rest_window(REST, t, V).left_out == 1
     assert rest_window(REST, t, V, leave_out=False).left_out == 0
+
+
+def test_what_a_verdict_rests_on_stands_beside_it() -> None:
+    sums = WindowSums(0, np.array([10.0]), np.zeros((1, 3)), np.zeros((1, 3, 3)))
+    numbers = {
+        "reference_rms_mps2": 2.0,
+        "reference_noise_mps2": 0.1,
+        "coherence": 0.9,
+        "drift_mps2": 0.1,
+        "clipped_points": 0.0,
+    }
+    limits = Limits(least_points=5, least_level=4.0, most_drift_pct=20.0)
+    verdict = judge(sums, np.zeros(10, dtype=bool), numbers, limits)
+    assert verdict.used
+    held = {name.removesuffix("_threshold") for name in verdict.numbers if name.endswith("_threshold")}
+    assert held == {"points", "left_out_pct", "reference_rms_mps2", "coherence", "drift_mps2", "clipped_points"}
+    assert verdict.numbers["reference_rms_mps2_threshold"] == pytest.approx(0.4)
+    assert verdict.numbers["drift_mps2_threshold"] == pytest.approx(0.4)
+    silent = judge(sums, np.zeros(10, dtype=bool), numbers | {"reference_rms_mps2": 0.39}, limits)
+    assert not silent.used
+    assert "silent" in silent.reason
