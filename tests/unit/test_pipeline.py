@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ import pytest
 from agent.config import parse_config
 from agent.events import CalibrationUpdate, DeviceChange, Result, StatusChange, Tick, WindowReport
 from agent.pipeline import Pipeline
-from hw.block import DeviceInfo, SampleBlock
+from hw.block import BlockFlags, DeviceInfo, SampleBlock
 
 SECOND = 1_000_000_000
 EPOCH_NS = 1_790_000_000 * SECOND
@@ -167,3 +167,29 @@ def test_another_device_at_the_port_is_said_before_it_speaks() -> None:
     found.step(opened("s", 0.0, serial_number="A"))
     found.step(lost("s", 1.0))
     assert statuses(found.step(opened("s", 2.0, serial_number="B"))) == ["UNCALIBRATED"]
+
+
+def test_silence_turns_the_status_invalid_by_tick_and_a_block_ends_it() -> None:
+    found = pipeline(reference=False, rate_hz=100.0)
+    found.step(opened("s", 0.0))
+    found.step(block("s", 0, np.zeros((50, 3)), nominal_hz=100.0, true_hz=100.0))  # up to 0.491 s; silence_s is 5
+    assert statuses(found.step(tick(5.4))) == []
+    assert statuses(found.step(tick(5.6))) == ["INVALID"]
+    assert statuses(found.step(tick(6.6))) == []
+    spoken = block("s", 700, np.zeros((50, 3)), nominal_hz=100.0, true_hz=100.0)
+    assert statuses(found.step(spoken)) == ["UNCALIBRATED"]
+
+
+def test_a_window_in_which_the_sensor_was_at_the_end_of_its_range_is_not_used() -> None:
+    def verdicts(flags: BlockFlags) -> list[tuple[bool, str]]:
+        found = pipeline(reference=False, rate_hz=100.0)
+        results = found.step(opened("s", 0.0))
+        noise = np.random.default_rng(1)
+        for k in range(10):
+            values = noise.normal((0.0, 0.0, 9.8), 0.01, (50, 3))
+            whole = block("s", 50 * k, values, nominal_hz=100.0, true_hz=100.0)
+            results += found.step(replace(whole, flags=flags if k == 4 else BlockFlags.NONE))
+        return [(r.used, r.reason) for r in results if isinstance(r, WindowReport)]
+
+    assert verdicts(BlockFlags.NONE) == [(True, "")]
+    assert verdicts(BlockFlags.SATURATED) == [(False, "the sensor was at the end of its range")]
