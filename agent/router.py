@@ -10,7 +10,7 @@ from pathlib import Path
 import click
 import zenoh
 
-from agent.session import EndpointError, session_config
+from agent.session import EndpointError, EndpointRefused, session_config
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 ANSWER_S = 0.5  # a router on the same machine answers within milliseconds
@@ -52,7 +52,7 @@ def open_router(listen: str | None, config_file: Path | None = None) -> tuple[ze
     except zenoh.ZError as error:
         where = endpoint or str(config_file)
         taken = "Address already in use" in str(error)
-        raise EndpointError(f"{where}: {'the port is taken' if taken else _first_line(error)}") from None
+        raise EndpointRefused(f"{where}: {'the port is taken' if taken else _first_line(error)}") from None
     for reply in session.get(f"@/{session.zid()}/router"):
         if reply.ok:
             return session, list(json.loads(reply.ok.payload.to_string())["locators"])
@@ -76,7 +76,7 @@ def _first_line(error: zenoh.ZError) -> str:
     help="A Zenoh configuration (JSON5), for TLS and access control.",
 )
 def router(listen: str | None, config_file: Path | None) -> int:
-    """Serve until SIGINT or SIGTERM."""
+    """Serve until SIGINT or SIGTERM. Exit status 2 for what is no endpoint or configuration, 1 for a taken port."""
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
@@ -84,7 +84,7 @@ def router(listen: str | None, config_file: Path | None) -> int:
         session, endpoints = open_router(listen, config_file)
     except EndpointError as error:
         click.echo(f"fieldcal router: {error}", err=True)
-        return 1
+        return 1 if isinstance(error, EndpointRefused) else 2
     click.echo(f"router at {', '.join(endpoints)}")
     stop.wait()
     session.close()

@@ -13,6 +13,10 @@ class EndpointError(Exception):
     """An endpoint that Zenoh cannot use. The message names it."""
 
 
+class EndpointRefused(EndpointError):  # noqa: N818 - said of a sound endpoint
+    """The machine does not serve an endpoint that is one: its port is taken, its address is another's."""
+
+
 def session_config(
     mode: Literal["peer", "client", "router"], *, connect: Sequence[str] = (), listen: Sequence[str] = ()
 ) -> zenoh.Config:

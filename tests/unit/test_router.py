@@ -64,3 +64,10 @@ def test_a_configuration_file_is_used_and_its_faults_are_one_line(tmp_path: Path
 def test_a_bad_endpoint_is_named(endpoint: str) -> None:
     with pytest.raises(EndpointError, match=endpoint):
         open_router(endpoint)
+
+
+@pytest.mark.parametrize("arguments", [("--listen", "7447"), ("--config", "/dev/null")])
+def test_what_is_no_endpoint_or_configuration_is_status_2(arguments: tuple[str, str]) -> None:
+    router = router_process(*arguments)
+    said, faults = router.communicate(timeout=5)
+    assert (router.returncode, said, faults.count("\n")) == (2, "", 1)
