@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Literal
 
 from pydantic import Field
@@ -12,6 +13,7 @@ from hw.fifo import Burst, FifoSamples, plain_samples
 from hw.fifo_options import FifoOptions
 from hw.fifo_sensor import FifoSensor, Registers
 from hw.i2c import READS_MAX
+from hw.self_test import SelfTest
 from hw.sensor import IdentityError
 
 SAMPLES_A_TRANSFER = READS_MAX - 1  # INT_SOURCE goes before them
@@ -50,15 +52,24 @@ class Adxl345(FifoSensor):
     def _settings(self) -> Registers:
         return chip.settings(self._options.rate_hz, self._options.range_g)
 
-    def _set_up(self) -> DeviceInfo:
+    def _counts_per_g(self) -> float:
+        return chip.COUNTS_PER_G
+
+    def _self_test(self) -> SelfTest:
+        return chip.self_test(self._options.range_g)
+
+    def _identify(self) -> dict[str, int]:
         (found,) = self._device.read(chip.DEVID, 1)
         if found != chip.IDENTITY:
             raise IdentityError(f"{self._device.name}: expected 0x{chip.IDENTITY:02X}, found 0x{found:02X}")
+        return {"DEVID": found}
+
+    def _set_up(self, identity: Mapping[str, int]) -> DeviceInfo:
         self._device.write(chip.POWER_CTL, chip.STANDBY)
         self._device.write(chip.FIFO_CTL, chip.BYPASS)  # empties the FIFO
         self._device.read(chip.DATA, 6)  # clears what INT_SOURCE says of an earlier run
         self._write_settings(last=chip.POWER_CTL)
-        return self._info("adxl345", chip.COUNTS_PER_G, self._options.rate_hz, {"DEVID": found})
+        return self._info("adxl345", self._options.rate_hz, identity)
 
     def _poll(self) -> Burst:
         retries = self._device.retries

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar, Literal
 
 from pydantic import Field
@@ -11,6 +12,7 @@ from hw.block import DeviceInfo
 from hw.fifo import Burst, FifoSamples
 from hw.fifo_options import FifoOptions
 from hw.fifo_sensor import FifoSensor, Registers
+from hw.self_test import SelfTest
 from hw.sensor import DeviceLost, IdentityError, Options
 
 NEARLY_FULL = chip.FIFO_ENTRIES_MAX - 12  # with less room it may run over before it is read
@@ -58,15 +60,23 @@ class Adxl355(FifoSensor):
         values = chip.settings(self.part, self._options.rate_hz, self._options.range_g)
         return dict(enumerate(zip(chip.SETTING_NAMES, values, strict=True), chip.FIRST_SETTING))
 
-    def _set_up(self) -> DeviceInfo:
+    def _counts_per_g(self) -> float:
+        return self.part.counts_per_g[self._options.range_g]
+
+    def _self_test(self) -> SelfTest:
+        return chip.self_test(self.part, self._options.rate_hz)
+
+    def _identify(self) -> dict[str, int]:
         found = self._device.read(chip.DEVID, 4)
         if found[:3] != self.part.identity:
             wanted = self.part.identity.hex(" ")
             raise IdentityError(f"{self._device.name}: expected {wanted}, found {found[:3].hex(' ')}")
+        return {"REVID": found[chip.REVISION]}
+
+    def _set_up(self, identity: Mapping[str, int]) -> DeviceInfo:
         self._reset()
         self._write_settings(last=chip.POWER_CTL)  # settings take in standby only
-        counts_per_g = self.part.counts_per_g[self._options.range_g]
-        return self._info(self.part.kind.lower(), counts_per_g, self._options.rate_hz, {"REVID": found[chip.REVISION]})
+        return self._info(self.part.kind.lower(), self._options.rate_hz, identity)
 
     def _reset(self) -> None:
         """Reset until the part's trim is back as it was before."""

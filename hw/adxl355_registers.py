@@ -13,12 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from hw.fifo import FifoSamples
+from hw.self_test import SelfTest
 
 DEVID, REVISION, STATUS, TEMPERATURE, FIFO_DATA = 0x00, 0x03, 0x04, 0x06, 0x11
 FIRST_SETTING, FILTER, RANGE, POWER_CTL, SELF_TEST, RESET, SHADOW = 0x1E, 0x28, 0x2C, 0x2D, 0x2E, 0x2F, 0x50
 SHADOW_BYTES = 5
 RESET_CODE = 0x52
-MEASURE = 0x00
+MEASURE, _STANDBY = 0x00, 0x01
 OVERRUN = 0x04  # in STATUS
 FIFO_ENTRIES_MAX = 96
 SETTING_NAMES = (
@@ -40,11 +41,12 @@ class Part:
     identity: bytes  # Analog Devices, MEMS, part
     counts_per_g: Mapping[int, int]
     temperature_intercept: int  # LSB at 25 degC; the slope is -9.05 LSB a degree in all of them
+    noise_g: float  # per root Hz, at the lowest range
 
 
-ADXL355 = Part("ADXL355", bytes([0xAD, 0x1D, 0xED]), {2: 256000, 4: 128000, 8: 64000}, 1885)
-ADXL357 = Part("ADXL357", bytes([0xAD, 0x1D, 0xED]), {10: 51200, 20: 25600, 40: 12800}, 1852)
-ADXL359 = Part("ADXL359", bytes([0xAD, 0x1D, 0xE9]), {10: 51200, 20: 25600, 40: 12800}, 1852)
+ADXL355 = Part("ADXL355", bytes([0xAD, 0x1D, 0xED]), {2: 256000, 4: 128000, 8: 64000}, 1885, 22.5e-6)
+ADXL357 = Part("ADXL357", bytes([0xAD, 0x1D, 0xED]), {10: 51200, 20: 25600, 40: 12800}, 1852, 75e-6)
+ADXL359 = Part("ADXL359", bytes([0xAD, 0x1D, 0xE9]), {10: 51200, 20: 25600, 40: 12800}, 1852, 75e-6)
 
 
 def settings(part: Part, rate_hz: float, range_g: int) -> bytes:
@@ -59,6 +61,20 @@ def settings(part: Part, rate_hz: float, range_g: int) -> bytes:
     values["POWER_CTL"] = MEASURE
     values["ACT_COUNT"] = 1  # its reset value; activity detection is off
     return bytes(values.values())
+
+
+def self_test(part: Part, rate_hz: float) -> SelfTest:
+    """ST1 and ST2, set in standby. The data sheets state a typical change (0.3, 0.3, 1.5 g) and no limits: half and
+    twice of it are taken for them. Noise over a bandwidth of a quarter of the rate."""
+    noise_g = part.noise_g * (rate_hz / 4) ** 0.5
+    return SelfTest(
+        writes=((POWER_CTL, _STANDBY), (SELF_TEST, 0x03), (POWER_CTL, MEASURE)),
+        settle_s=0.1,
+        low_g=(0.15, 0.15, 0.75),
+        high_g=(0.6, 0.6, 3.0),
+        noise_g=(noise_g, noise_g, noise_g),
+        source=f"{part.kind} data sheet, typical change, half to twice",
+    )
 
 
 def temperature(part: Part, data: bytes) -> tuple[int, float]:

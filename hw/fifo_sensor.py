@@ -9,11 +9,13 @@ from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hw.block import BlockFlags, DeviceInfo, Drop, SampleBlock
 from hw.cutting import Break, Cutter, Stretch
 from hw.fifo import Burst, FifoSamples
 from hw.i2c import I2CDevice
+from hw.self_test import SelfTest, SelfTestReport
 from hw.sensor import Clock, ConfigurationError, DeviceError, DeviceLost, Options, system_clock
 
 STANDARD_GRAVITY_MPS2 = 9.80665
@@ -64,8 +66,20 @@ class FifoSensor(ABC):
         """Lowest and highest count of the range."""
 
     @abstractmethod
-    def _set_up(self) -> DeviceInfo:
-        """Identify, reset, configure, read back, start the FIFO."""
+    def _identify(self) -> Mapping[str, int]:
+        """What says who it is, by register; reads only. Raises IdentityError."""
+
+    @abstractmethod
+    def _set_up(self, identity: Mapping[str, int]) -> DeviceInfo:
+        """Reset, configure, read back, start the FIFO."""
+
+    @abstractmethod
+    def _counts_per_g(self) -> float:
+        """Nominal, at the range that is set."""
+
+    @abstractmethod
+    def _self_test(self) -> SelfTest:
+        """How the device tests itself as it is set."""
 
     @abstractmethod
     def _settings(self) -> Registers:
@@ -96,7 +110,7 @@ class FifoSensor(ABC):
         """
         self._device.open()
         try:
-            info = self._set_up()
+            info = self._set_up(self._identify())
         except BaseException:
             self.close()
             raise
@@ -107,6 +121,40 @@ class FifoSensor(ABC):
         self._cutter.flag(BlockFlags.RESTART)
         self._next_poll_ns = self._clock()[0]
         return info
+
+    def identify(self) -> str:
+        """Who answers at the address. Reads identity alone, so that a device in use is not disturbed.
+
+        Raises as `open`.
+        """
+        self._device.open()
+        try:
+            self._device.check_free()
+            identity = self._identify()
+        finally:
+            self.close()
+        return f"{self._kind()} ({', '.join(f'{name} 0x{value:02X}' for name, value in identity.items())})"
+
+    def self_test(self) -> SelfTestReport:
+        """Let the open device test itself, about 3 s. It has to be opened anew afterwards. Raises as `read_block`."""
+        test = self._self_test()
+        g = self._counts_per_g()
+        still = self._settled(0.0)
+        for register, value in test.writes:
+            self._device.write(register, value)
+        change = (self._settled(test.settle_s).mean(axis=0) - still.mean(axis=0)) / g
+        noise = still.std(axis=0) / g
+        self.close()
+        return SelfTestReport(test, tuple(change.tolist()), tuple(noise.tolist()))
+
+    def _settled(self, settle_s: float) -> NDArray[np.generic]:
+        """Indications of a block, with what came before and within `settle_s` thrown away."""
+        self._sleep(settle_s)
+        self.read_block()
+        block = self.read_block()
+        if block is None:
+            raise DeviceLost(f"{self._device.name}: it fell silent")
+        return block.indications
 
     def close(self) -> None:
         """Release the bus; the device goes on measuring until the next reset."""
@@ -212,8 +260,9 @@ class FifoSensor(ABC):
         self._device.write(last, settings[last][1])
         self._check_settings()
 
-    def _info(self, driver: str, counts_per_g: float, rate_hz: float, found: Mapping[str, int]) -> DeviceInfo:
+    def _info(self, driver: str, rate_hz: float, found: Mapping[str, int]) -> DeviceInfo:
         """What `open` returns; `found` are read registers that were not set."""
+        counts_per_g = self._counts_per_g()
         registers = dict(found) | dict(self._settings().values())
         return DeviceInfo(
             driver=driver,

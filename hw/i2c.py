@@ -75,6 +75,10 @@ class I2CDevice:
 
         return self._retry(stamped)
 
+    def check_free(self) -> None:
+        """Raises ConfigurationError if a kernel driver holds the address, DeviceLost if nobody answers at it."""
+        self._retry(lambda bus: bus.read_byte_data(self._address, 0))
+
     def write(self, register: int, value: int) -> None:
         """One byte to a register, as an SMBus call: the kernel refuses these, and only these, while a driver of its own
         holds the address."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Literal
 
 from pydantic import Field
@@ -11,6 +12,7 @@ from hw.block import DeviceInfo
 from hw.fifo import Burst, FifoSamples
 from hw.fifo_options import FifoOptions
 from hw.fifo_sensor import FifoSensor, Registers
+from hw.self_test import SelfTest
 from hw.sensor import DeviceLost, IdentityError
 
 RESET_WAIT_S = 0.01
@@ -53,10 +55,19 @@ class Lsm6dso(FifoSensor):
     def _settings(self) -> Registers:
         return chip.settings(self._options.rate_hz, self._options.range_g)
 
-    def _set_up(self) -> DeviceInfo:
+    def _counts_per_g(self) -> float:
+        return 1000.0 / chip.MG_PER_COUNT[self._options.range_g]
+
+    def _self_test(self) -> SelfTest:
+        return chip.self_test(self._options.rate_hz)
+
+    def _identify(self) -> dict[str, int]:
         (found,) = self._device.read(chip.WHO_AM_I, 1)
         if found != chip.IDENTITY:
             raise IdentityError(f"{self._device.name}: expected 0x{chip.IDENTITY:02X}, found 0x{found:02X}")
+        return {"WHO_AM_I": found}
+
+    def _set_up(self, identity: Mapping[str, int]) -> DeviceInfo:
         self._reset()
         (freq_fine,) = self._device.read(chip.FREQ_FINE, 1)
         rate_hz = chip.actual_rate_hz(self._options.rate_hz, freq_fine)
@@ -64,8 +75,7 @@ class Lsm6dso(FifoSensor):
         self._device.write(chip.FIFO_CTRL4, chip.BYPASS)
         self._sleep(SETTLE_SAMPLES / rate_hz)
         self._device.write(chip.FIFO_CTRL4, chip.CONTINUOUS)
-        counts_per_g = 1000.0 / chip.MG_PER_COUNT[self._options.range_g]
-        return self._info("lsm6dso", counts_per_g, rate_hz, {"WHO_AM_I": found, "INTERNAL_FREQ_FINE": freq_fine})
+        return self._info("lsm6dso", rate_hz, {**identity, "INTERNAL_FREQ_FINE": freq_fine})
 
     def _reset(self) -> None:
         self._device.write(chip.CTRL3_C, chip.SOFTWARE_RESET)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Literal
 
 from pydantic import Field
@@ -11,6 +12,7 @@ from hw.block import DeviceInfo
 from hw.fifo import Burst, FifoSamples, plain_samples
 from hw.fifo_options import FifoOptions
 from hw.fifo_sensor import FifoSensor, Registers
+from hw.self_test import SelfTest
 from hw.sensor import IdentityError
 
 RESET_WAIT_S = 0.1  # register map: 100 ms; Linux waits as long
@@ -54,7 +56,14 @@ class Mpu6050(FifoSensor):
     def _settings(self) -> Registers:
         return chip.settings(self._part, self._options.rate_hz, self._options.range_g)
 
-    def _set_up(self) -> DeviceInfo:
+    def _counts_per_g(self) -> float:
+        return chip.COUNTS_PER_G[self._options.range_g]
+
+    def _self_test(self) -> SelfTest:
+        options = self._options
+        return chip.self_test(self._part, self._device.read(chip.SELF_TEST, 4), options.rate_hz, options.range_g)
+
+    def _identify(self) -> dict[str, int]:
         (found,) = self._device.read(chip.WHO_AM_I, 1)
         if found not in chip.PARTS and not self._options.clone:
             known = ", ".join(f"0x{identity:02X}" for identity in chip.PARTS)
@@ -62,16 +71,19 @@ class Mpu6050(FifoSensor):
                 f"{self._device.name}: WHO_AM_I is 0x{found:02X}, expected one of {known} (option clone accepts others)"
             )
         self._part = chip.PARTS.get(found) or chip.clone(found)
+        return {"WHO_AM_I": found}
+
+    def _set_up(self, identity: Mapping[str, int]) -> DeviceInfo:
         self._device.write(chip.POWER_1, chip.DEVICE_RESET)
         self._sleep(RESET_WAIT_S)
         self._device.write(chip.POWER_1, chip.CLOCK_FROM_GYRO)  # it is asleep after a reset
         self._sleep(START_WAIT_S)
         self._write_settings(last=chip.USER_CTRL)
         self._reset_fifo()
-        trim = self._device.read(self._part.accel_offset, 8)
+        offset = self._part.accel_offset
+        trim = self._device.read(offset[0], len(offset))
         untouched = {f"ACCEL_OFFSET_{i}": value for i, value in enumerate(trim)}
-        counts_per_g = chip.COUNTS_PER_G[self._options.range_g]
-        return self._info("mpu6050", counts_per_g, self._options.rate_hz, {"WHO_AM_I": found} | untouched)
+        return self._info("mpu6050", self._options.rate_hz, {**identity, **untouched})
 
     def _reset_fifo(self) -> None:
         self._device.write(chip.USER_CTRL, chip.FIFO_RESET)

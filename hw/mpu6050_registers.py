@@ -9,9 +9,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from hw.self_test import SelfTest
+
 SAMPLE_RATE_DIV, CONFIG, GYRO_CONFIG, ACCEL_CONFIG, ACCEL_CONFIG_2, FIFO_EN = 0x19, 0x1A, 0x1B, 0x1C, 0x1D, 0x23
 INT_ENABLE, INT_STATUS, TEMPERATURE, USER_CTRL, POWER_1, POWER_2 = 0x38, 0x3A, 0x41, 0x6A, 0x6B, 0x6C
-FIFO_COUNT, FIFO_DATA, WHO_AM_I = 0x72, 0x74, 0x75
+SELF_TEST, FIFO_COUNT, FIFO_DATA, WHO_AM_I = 0x0D, 0x72, 0x74, 0x75
 DEVICE_RESET, CLOCK_FROM_GYRO = 0x80, 0x01
 FIFO_RESET, FIFO_ON = 0x04, 0x40
 OVERFLOW = 0x10  # in INT_STATUS and INT_ENABLE
@@ -30,7 +32,7 @@ class Part:
 
     kind: str
     fifo_bytes: int
-    accel_offset: int  # first of the accelerometer's offset registers, which hold the maker's trim
+    accel_offset: range  # the accelerometer's offset registers, which hold the maker's trim
     accel_config_2: bool
     counts_per_degc: float
     zero_count_degc: float
@@ -41,21 +43,21 @@ class Part:
         return raw, raw / self.counts_per_degc + self.zero_count_degc
 
 
-_MPU6050 = Part("MPU-6050", 1024, 0x06, False, 340.0, 36.53)
-_MPU6500 = Part("MPU-6500", 512, 0x77, True, 333.87, 21.0)
+_MPU6050 = Part("MPU-6050", 1024, range(0x06, 0x0C), False, 340.0, 36.53)
+_MPU6500 = Part("MPU-6500", 512, range(0x77, 0x7F), True, 333.87, 21.0)
 PARTS: Mapping[int, Part] = {
     0x68: _MPU6050,
     0x70: _MPU6500,
-    0x71: Part("MPU-9250", 512, 0x77, True, 333.87, 21.0),
-    0x73: Part("MPU-9255", 512, 0x77, True, 333.87, 21.0),
-    0x74: Part("MPU-6515", 512, 0x77, True, 333.87, 21.0),
+    0x71: Part("MPU-9250", 512, range(0x77, 0x7F), True, 333.87, 21.0),
+    0x73: Part("MPU-9255", 512, range(0x77, 0x7F), True, 333.87, 21.0),
+    0x74: Part("MPU-6515", 512, range(0x77, 0x7F), True, 333.87, 21.0),
 }
 """By WHO_AM_I."""
 
 
 def clone(who_am_i: int) -> Part:
     """What is taken for granted of a part with another WHO_AM_I: the smaller FIFO of the later parts."""
-    return Part(f"MPU clone 0x{who_am_i:02X}", 512, 0x77, True, 333.87, 21.0)
+    return Part(f"MPU clone 0x{who_am_i:02X}", 512, range(0x77, 0x7F), True, 333.87, 21.0)
 
 
 def low_pass_code(rate_hz: float) -> int:
@@ -84,3 +86,31 @@ def settings(part: Part, rate_hz: float, range_g: int) -> dict[int, tuple[str, i
     if part.accel_config_2:
         values[ACCEL_CONFIG_2] = ("ACCEL_CONFIG_2", low_pass)
     return dict(sorted(values.items()))
+
+
+def factory_trim_g(part: Part, codes: bytes) -> list[float]:
+    """Change by self-test that the maker measured, in g by axis, from the registers SELF_TEST on (4 bytes).
+
+    MPU-6050 (RM-MPU-6000A, 4.1): 0.34 (0.92 / 0.34)^((code - 1) / 30). MPU-6500 and later (AN-MPU-9250A-03):
+    2620 * 1.01^(code - 1) counts at 2 g. 0 where the code is 0.
+    """
+    if part.accel_config_2:
+        return [2620 * 1.01 ** (code - 1) / COUNTS_PER_G[2] if code else 0.0 for code in codes[:3]]
+    five_bits = [codes[i] >> 3 & 0x1C | codes[3] >> (4 - 2 * i) & 0x03 for i in range(3)]
+    return [0.34 * (0.92 / 0.34) ** ((code - 1) / 30) if code else 0.0 for code in five_bits]
+
+
+def self_test(part: Part, codes: bytes, rate_hz: float, range_g: int) -> SelfTest:
+    """All three axes. MPU-6050: within 14 % of the maker's (PS-MPU-6000A); later parts: half to one and a half of it
+    (AN-MPU-9250A-03). Noise 400 and 300 ug per root Hz over the filter's bandwidth."""
+    spread = 0.5 if part.accel_config_2 else 0.14
+    x, y, z = factory_trim_g(part, codes)
+    noise_g = (300e-6 if part.accel_config_2 else 400e-6) * _BANDWIDTH_HZ[low_pass_code(rate_hz)] ** 0.5
+    return SelfTest(
+        writes=((ACCEL_CONFIG, 0xE0 | list(COUNTS_PER_G).index(range_g) << 3),),
+        settle_s=0.1,
+        low_g=(x * (1 - spread), y * (1 - spread), z * (1 - spread)),
+        high_g=(x * (1 + spread), y * (1 + spread), z * (1 + spread)),
+        noise_g=(noise_g, noise_g, noise_g),
+        source=f"the maker's own figures in the {part.kind}, within {spread:.0%}",
+    )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from hw.virtual.fifo_twin import Counts, FifoTwin
 
 DEVID, FIRST_SETTING, BW_RATE, POWER_CTL, INT_SOURCE, DATA_FORMAT, DATA, FIFO_CTL, FIFO_STATUS = (
@@ -36,6 +38,9 @@ class Adxl345Twin(FifoTwin):
         self._pointer += min(count, self.word_bytes)
         self._overrun = False
         return self._take(self.word_bytes)[:count]
+
+    def _deflection(self) -> Counts:
+        return np.array([200, -200, 300] if self.registers[DATA_FORMAT] & 0x80 else [0, 0, 0], np.int32)
 
     def _get(self, register: int) -> int:
         entries = len(self._fifo) // self.word_bytes

@@ -69,6 +69,9 @@ class Adxl355Twin(FifoTwin):
     def _nothing(self, count: int) -> bytes:
         return (EMPTY_ENTRY * (count // 3 + 1))[:count]
 
+    def _deflection(self) -> Counts:
+        return np.array([76800, 76800, 384000] if self.registers[LAST_SETTING] & 3 == 3 else [0, 0, 0], np.int32)
+
     def _get(self, register: int) -> int:
         if register == STATUS:
             entries = len(self._fifo) // 3

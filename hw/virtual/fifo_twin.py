@@ -64,6 +64,10 @@ class FifoTwin(ABC):
     def _set(self, register: int, value: int) -> None:
         """One register written."""
 
+    def _deflection(self) -> Counts:
+        """What self-test adds (3,)."""
+        return np.zeros(3, np.int32)
+
     def power_cycle(self) -> None:
         """Power fails and comes back, or a reset: registers as after it, FIFO empty."""
         self.registers = self._reset_registers()
@@ -136,7 +140,7 @@ class FifoTwin(ABC):
             return
         room = self.fifo_bytes // self.sample_bytes + 1  # one more than it holds, so that an overflow shows
         first = max(self._next, due - room)
-        self._fifo += self._encode(first, self._source(first, due - first))
+        self._fifo += self._encode(first, self._source(first, due - first) + self._deflection())
         self._next = due
         if len(self._fifo) > self.fifo_bytes:
             self._overrun = True

@@ -45,6 +45,9 @@ class Lsm6dsoTwin(FifoTwin):
     def _encode(self, first: int, counts: Counts) -> bytes:
         return words(2, first, counts)
 
+    def _deflection(self) -> Counts:
+        return np.array([6000, 7000, 8000] if self.registers[0x14] & 3 == 1 else [0, 0, 0], np.int32)
+
     def _get(self, register: int) -> int:
         if register == FIFO_STATUS:
             return len(self._fifo) // 7 & 0xFF

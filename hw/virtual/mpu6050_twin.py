@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from hw.virtual.fifo_twin import Counts, FifoTwin
 
 SMPLRT_DIV, FIFO_EN, INT_ENABLE, INT_STATUS, TEMPERATURE = 0x19, 0x23, 0x38, 0x3A, 0x41
 USER_CTRL, POWER_1, POWER_2, FIFO_COUNT, FIFO_DATA, WHO_AM_I = 0x6A, 0x6B, 0x6C, 0x72, 0x74, 0x75
-TRIM = bytes([0x12, 0x34, 0x56, 0x78, 0x9A, 0xBC, 0xDE, 0xF0])  # the maker's, any constant does
+TRIM = bytes([0x12, 0x34, 0x56, 0x78, 0x9A, 0xBC])  # the maker's, any constant does
 
 
 class Mpu6050Twin(FifoTwin):
@@ -18,11 +20,14 @@ class Mpu6050Twin(FifoTwin):
     data_register = FIFO_DATA
     identity = 0x68
     trim_register = 0x06
+    # 0.488 g as the maker measured it: code 12 of the MPU-6050's five bits, 113 of the later parts
+    self_test_codes = bytes([3 << 5, 3 << 5, 3 << 5, 0])
     temperature_at_25_degc = round((25 - 36.53) * 340)
 
     def _reset_registers(self) -> bytearray:
         registers = bytearray(256)
         registers[WHO_AM_I] = self.identity
+        registers[0x0D:0x11] = self.self_test_codes
         registers[POWER_1] = 0x40  # asleep
         registers[self.trim_register : self.trim_register + len(TRIM)] = TRIM
         return registers
@@ -34,6 +39,9 @@ class Mpu6050Twin(FifoTwin):
 
     def _encode(self, first: int, counts: Counts) -> bytes:  # noqa: ARG002 - these samples bear no number
         return counts.astype(">i2").tobytes()
+
+    def _deflection(self) -> Counts:
+        return np.array([8000, 8000, 8000] if self.registers[0x1C] & 0xE0 == 0xE0 else [0, 0, 0], np.int32)
 
     def _get(self, register: int) -> int:
         if register == INT_STATUS:
@@ -69,4 +77,5 @@ class Mpu6500Twin(Mpu6050Twin):
     fifo_bytes = 512
     identity = 0x70
     trim_register = 0x77
+    self_test_codes = bytes([113, 113, 113, 0])
     temperature_at_25_degc = round((25 - 21) * 333.87)

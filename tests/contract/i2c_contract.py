@@ -214,3 +214,38 @@ class I2cContract(SensorContract):
         assert block is not None
         assert block.temperature_raw == raw
         assert block.temperature_degc == (None if degc is None else pytest.approx(degc, abs=1e-3))
+
+    def test_identity_is_read_without_disturbing(self, rig: I2cRig) -> None:
+        rig.sensor.open()
+        before = bytes(rig.twin.registers)
+        assert rig.build().identify().startswith(rig.sensor._kind())
+        assert bytes(rig.twin.registers) == before
+        rig.bus.claimed.add(rig.address)
+        with pytest.raises(ConfigurationError, match="a kernel driver holds the address"):
+            rig.build().identify()
+
+    def test_self_test_passes_on_a_sound_part_and_tells_a_stuck_one(self, rig: I2cRig) -> None:
+        rig.put(
+            rig.twin_class(lambda first, n: np.arange(first, first + n)[:, None] % [2, 4, 8], rig.due, lambda: rig.t_s)
+        )
+        rig.sensor.open()
+        report = rig.sensor.self_test()
+        assert report.faults == []
+        counts_per_g = rig.sensor._counts_per_g()
+        # of 0 and 1 in turn, of 0 to 3, of 0 to 7
+        assert [g * counts_per_g for g in report.noise_g] == pytest.approx([0.5, 1.118, 2.291], rel=0.01)
+        rig.sensor.open()  # and it is off again
+        block = rig.sensor.read_block()
+        assert block is not None
+        assert block.indications.max() == 7
+
+        class Stuck(rig.twin_class):  # type: ignore[name-defined,misc]
+            def _deflection(self) -> NDArray[np.int32]:
+                return np.zeros(3, np.int32)
+
+        rig.put(Stuck(lambda first, n: np.zeros((n, 3), np.int32) + 0 * first, rig.due, lambda: rig.t_s))
+        rig.sensor.open()
+        faults = rig.sensor.self_test().faults
+        assert len(faults) == 6
+        assert "x changes by 0.000 g, not by" in faults[0]
+        assert "is it dead?" in faults[1]

@@ -82,6 +82,23 @@ def test_lsm6dso_states_its_own_rate(rate_hz: float, freq_fine: int, actual_hz: 
     assert lsm6dso_registers.actual_rate_hz(rate_hz, freq_fine) == pytest.approx(actual_hz, abs=1e-3)
 
 
+def test_mpu6050_self_test_figures_of_the_maker() -> None:
+    # RM-MPU-6000A 4.1: bits 4:2 of the codes in the axes' registers, bits 1:0 in the fourth; 0.34 g at 1, 0.92 g at 31.
+    part = mpu6050_registers.PARTS[0x68]
+    assert mpu6050_registers.factory_trim_g(part, bytes([0, 0xE0, 0, 0x1C])) == [
+        pytest.approx(0.34),
+        pytest.approx(0.92),
+        0.0,
+    ]
+    # AN-MPU-9250A-03: 2620 counts at 2 g, and 1 % more a code
+    later = mpu6050_registers.PARTS[0x71]
+    assert mpu6050_registers.factory_trim_g(later, bytes([1, 2, 0, 9])) == [
+        pytest.approx(2620 / 16384),
+        pytest.approx(2620 * 1.01 / 16384),
+        0.0,
+    ]
+
+
 def test_lsm6dso_settings() -> None:
     found = by_name(lsm6dso_registers.settings(833.0, 16))
     # Data sheet: 833 Hz is 7, 16 g is 1; BDU and IF_INC; continuous mode.
