@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from agent.events import CalibrationUpdate, Result, StatusChange, WindowReport
@@ -19,6 +19,8 @@ seeds = st.integers(0, 2**32 - 1)
 
 @settings(max_examples=12)
 @given(seed=seeds, reference=st.booleans())
+@example(seed=9, reference=True)  # five calibrations each, which few seeds have
+@example(seed=35, reference=True)
 def test_restored_at_any_event_it_goes_on_alike(seed: int, reference: bool) -> None:
     settings_ = config(reference)
     config_json = settings_.model_dump_json()
@@ -34,6 +36,8 @@ def test_restored_at_any_event_it_goes_on_alike(seed: int, reference: bool) -> N
 
 @settings(max_examples=12)
 @given(seed=seeds, reference=st.booleans())
+@example(seed=9, reference=True)  # five calibrations each, which few seeds have
+@example(seed=35, reference=True)
 def test_results_are_numbered_and_follow_from_each_other(seed: int, reference: bool) -> None:
     pipeline = Pipeline.begin(config(reference), "run", ORIGIN_NS, 7, {})
     results: list[Result] = [r for event in happenings(seed, EVENTS, moving=reference) for r in pipeline.step(event)]
