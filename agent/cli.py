@@ -17,6 +17,8 @@ COMMANDS = {
     "audit": ("agent.audit", "Check a recording: every byte, and that its results follow from its data."),
     "show": ("agent.show", "Calibration in force, status and history of a data directory."),
     "report": ("agent.report", "Figures and one page of a calibration."),
+    "sensors": ("agent.sensors", "Drivers with their options."),
+    "probe": ("agent.probe", "What answers on this machine's buses and ports, with self-test."),
     "router": ("agent.router", "A Zenoh router, for tests and small sites."),
     "simulate": ("agent.simulate", "Serve virtual devices on pseudo-terminals, or write a recording with known truth."),
     "check": ("agent.check", "All faults of a configuration at once."),

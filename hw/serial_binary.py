@@ -50,10 +50,10 @@ class SerialBinaryOptions(SerialOptions):
     byte_order: ByteOrder = Field("little", description="of all numbers")
     indications: tuple[Number, ...] = Field(description="x, y, z or one alone: [{at = 4, type = 'i16'}, ...]")
     sequence: Number | None = Field(None, description="a sample count; without it lost frames go unseen")
-    temperature: Thermometer | None = None
+    temperature: Thermometer | None = Field(None, description="of the device")
     checksum: ChecksumName = Field("none", description="the frame's last bytes")
     checksum_from: int = Field(0, ge=0, description="first byte that it covers")
-    checksum_order: ByteOrder = "little"
+    checksum_order: ByteOrder = Field("little", description="of a checksum of two bytes")
     unit: Literal["count", "m/s2", "m/s", "mV"] = Field("count", description="of the indications")
     full_scale: float | None = Field(None, gt=0, description="indications of this size or more are saturated")
     serial_number: str = Field("", description="of the device, as on its plate")

@@ -31,7 +31,7 @@ class SerialOptions(Options):
     """Options of every driver on a serial port."""
 
     port: str = Field(min_length=1, description="path of the port, best one of /dev/serial/by-id")
-    baud_rate: int = Field(115200, gt=0, le=4_000_000)
+    baud_rate: int = Field(115200, gt=0, le=4_000_000, description="as the device was set")
 
 
 class Stream(Protocol):

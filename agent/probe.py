@@ -1,0 +1,192 @@
+"""`fieldcal probe`: what answers on this machine's I2C buses and serial ports, who it is, and whether it is sound."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, get_args
+
+import click
+
+from hw.fifo_sensor import FifoSensor
+from hw.i2c import I2CDevice
+from hw.self_test import SelfTestReport
+from hw.sensor import ConfigurationError, DeviceError, DeviceLost, IdentityError, driver_names, load_driver
+
+MICRO = 1e6
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """Something at an address. `drivers` are those that know it (several where the part does not say which one it is);
+    `note` what the others, or the kernel, say of it."""
+
+    address: int
+    drivers: list[str] = field(default_factory=list)
+    identity: str = ""
+    note: str = ""
+    self_test: dict[str, Any] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Bus:
+    """/dev/i2c-N; `fault` says why nothing can be asked there."""
+
+    number: int
+    fault: str
+    answers: list[Answer]
+
+
+@click.command()
+@click.option("--bus", "buses", type=click.IntRange(0), multiple=True, metavar="N", help="Only /dev/i2c-N.")
+@click.option("--self-test", is_flag=True, help="Let each device test itself: it is reset, so no agent may use it.")
+@click.option("--json", "json_to", type=click.Choice(["-"]), help="One JSON object on standard output.")
+def probe(buses: tuple[int, ...], self_test: bool, json_to: str | None) -> int:
+    """I2C buses and serial ports of this machine. Reads identities alone, unless asked for a self-test.
+
+    Exit status 3 if a self-test failed, 1 if a bus that was named cannot be asked.
+    """
+    drivers = i2c_drivers()
+    found = [on_bus(number, drivers, self_test) for number in buses or i2c_buses()]
+    ports = [] if buses else serial_ports()
+    if json_to:
+        click.echo(json.dumps({"i2c": [asdict(bus) for bus in found], "serial": ports}))
+    else:
+        _print(found, ports)
+    if buses and any(bus.fault for bus in found):
+        return 1
+    results = [answer.self_test for bus in found for answer in bus.answers]
+    return 3 if any(result and result["faults"] for result in results) else 0
+
+
+def i2c_buses() -> list[int]:
+    """Numbers of the I2C adapters of this machine."""
+    nodes = (path.name.removeprefix("i2c-") for path in Path("/dev").glob("i2c-*"))
+    return sorted(int(number) for number in nodes if number.isdigit())
+
+
+def serial_ports() -> list[dict[str, str]]:
+    """Serial ports with what the system knows of them. None is opened: that would reset some boards."""
+    from serial.tools.list_ports import comports
+
+    by_id = {str(path.resolve()): str(path) for path in Path("/dev/serial/by-id").glob("*")}
+    return [
+        {
+            "port": by_id.get(port.device, port.device),
+            "device": port.device,
+            "description": port.description or "",
+            "serial_number": port.serial_number or "",
+        }
+        for port in sorted(comports(), key=lambda port: port.device)
+    ]
+
+
+def i2c_drivers() -> dict[str, type[FifoSensor]]:
+    """Drivers that can say who answers at an address, by name."""
+    found = {}
+    for name in driver_names():
+        try:
+            driver = load_driver(name)
+        except ConfigurationError:
+            continue  # `fieldcal sensors` tells why
+        if isinstance(driver, type) and issubclass(driver, FifoSensor):
+            found[name] = driver
+    return found
+
+
+def on_bus(number: int, drivers: dict[str, type[FifoSensor]], self_test: bool) -> Bus:
+    """What answers at the addresses that the drivers know, in their order."""
+    adapter = I2CDevice("adapter", number, 0, time.sleep)
+    try:
+        adapter.open()
+    except DeviceError as error:
+        return Bus(number, str(error), [])
+    finally:
+        adapter.close()
+    by_address: dict[int, dict[str, type[FifoSensor]]] = {}
+    for name, driver in drivers.items():
+        for address in get_args(driver.options_model.model_fields["address"].annotation):
+            by_address.setdefault(address, {})[name] = driver
+    answers = [_at(number, address, by_address[address], self_test) for address in sorted(by_address)]
+    return Bus(number, "", [answer for answer in answers if answer is not None])
+
+
+def _at(bus: int, address: int, drivers: dict[str, type[FifoSensor]], self_test: bool) -> Answer | None:
+    known: dict[str, FifoSensor] = {}
+    identities: list[str] = []
+    notes: list[str] = []
+    for name, driver in drivers.items():
+        sensor = driver(name, driver.options_model.model_validate({"bus": bus, "address": address}))
+        try:
+            identities.append(sensor.identify())
+            known[name] = sensor
+        except IdentityError as error:
+            notes.append(str(error))
+        except ConfigurationError as error:
+            return Answer(address, note=str(error))
+        except DeviceLost:
+            return None
+    if not known:
+        return Answer(address, note="; ".join(notes))
+    result = tested(next(iter(known.values()))) if self_test else None
+    return Answer(address, list(known), " or ".join(identities), self_test=result)
+
+
+def tested(sensor: FifoSensor) -> dict[str, Any]:
+    """The self-test's result, for JSON and for the lines."""
+    try:
+        sensor.open()
+        return as_object(sensor.self_test())
+    except DeviceError as error:
+        return {"faults": [str(error)]}
+    finally:
+        sensor.close()
+
+
+def as_object(report: SelfTestReport) -> dict[str, Any]:
+    """Figures in g by axis."""
+    return {
+        "change_g": report.change_g,
+        "low_g": report.test.low_g,
+        "high_g": report.test.high_g,
+        "noise_g": report.noise_g,
+        "data_sheet_noise_g": report.test.noise_g,
+        "source": report.test.source,
+        "faults": report.faults,
+    }
+
+
+def _print(buses: list[Bus], ports: list[dict[str, str]]) -> None:
+    if not buses:
+        click.echo("no I2C bus (no /dev/i2c-N): is the adapter enabled, and i2c-dev loaded?")
+    for bus in buses:
+        if bus.fault:
+            click.echo(bus.fault)
+            continue
+        click.echo(f"/dev/i2c-{bus.number}: " + ("" if bus.answers else "no device that a driver knows"))
+        for answer in bus.answers:
+            click.echo(f"  0x{answer.address:02X}  {answer.identity or answer.note}")
+            if answer.drivers:
+                click.echo(f"        driver {' or '.join(answer.drivers)}")
+            for line in _self_test_lines(answer.self_test):
+                click.echo(f"        {line}")
+    for port in ports:
+        details = ", ".join(text for text in (port["description"], port["serial_number"]) if text)
+        click.echo(f"{port['port']}: {details or 'no details'}")
+
+
+def _self_test_lines(result: dict[str, Any] | None) -> Iterator[str]:
+    if result is None:
+        return
+    if "change_g" in result:
+        figures = (result[key] for key in ("change_g", "low_g", "high_g", "noise_g", "data_sheet_noise_g"))
+        for axis, change, low, high, noise, stated in zip("xyz", *figures, strict=True):
+            yield (
+                f"{axis}: changes by {change:.3f} g ({low:.3g} to {high:.3g}), "
+                f"noise {MICRO * noise:.0f} ug rms (data sheet {MICRO * stated:.0f})"
+            )
+        yield f"limits: {result['source']}"
+    yield "self-test failed: " + "; ".join(result["faults"]) if result["faults"] else "self-test passed"

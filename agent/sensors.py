@@ -1,0 +1,118 @@
+"""`fieldcal sensors`: the drivers and their options, with units and defaults."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import dataclass
+from typing import Any
+
+import click
+
+from hw.sensor import BUILT_IN, ConfigurationError, DriverFactory, driver_names, load_driver
+
+# by the end of a name
+UNITS = {"_hz": "Hz", "_khz": "kHz", "_s": "s", "_g": "g", "_mps2": "m/s2", "_degc": "degC", "baud_rate": "bit/s"}
+
+
+@dataclass(frozen=True, slots=True)
+class Driver:
+    """One driver. `options` is the JSON schema of its options; `fault` says why it cannot be loaded."""
+
+    name: str
+    built_in: bool
+    description: str
+    options: dict[str, Any]
+    fault: str = ""
+
+
+@click.command()
+@click.argument("names", nargs=-1, metavar="[DRIVER]...")
+@click.option("--json", "json_to", type=click.Choice(["-"]), help="One JSON object on standard output.")
+def sensors(names: tuple[str, ...], json_to: str | None) -> int:
+    """Drivers with their options; without DRIVER all of them. Exit status 2 for a driver that nobody has."""
+    known = driver_names()
+    strangers = [name for name in names if name not in known]
+    for name in strangers:
+        click.echo(f"fieldcal sensors: no driver {name!r}: there are {', '.join(known)}", err=True)
+    if strangers:
+        return 2
+    drivers = [describe(name) for name in names or known]
+    if json_to:
+        click.echo(json.dumps({"drivers": [as_object(driver) for driver in drivers]}))
+        return 0
+    for i, driver in enumerate(drivers):
+        if i:
+            click.echo()
+        for line in as_lines(driver):
+            click.echo(line)
+    return 0
+
+
+def describe(name: str) -> Driver:
+    """What is known of a driver; one that cannot be loaded says why."""
+    try:
+        factory = load_driver(name)
+    except ConfigurationError as error:
+        return Driver(name, name in BUILT_IN, "", {}, str(error))
+    return Driver(name, name in BUILT_IN, _first_line(factory), factory.options_model.model_json_schema())
+
+
+def _first_line(factory: DriverFactory) -> str:
+    """Of the module's docstring, without the driver's name: `Driver `x`: what it is`."""
+    module = sys.modules[getattr(factory, "__module__", "")]
+    line = (module.__doc__ or "").strip().partition("\n")[0]
+    return line.partition(": ")[2] or line
+
+
+def as_object(driver: Driver) -> dict[str, Any]:
+    """For JSON; `units` by option."""
+    units = {option: unit_of(option) for option in driver.options.get("properties", {}) if unit_of(option)}
+    found: dict[str, Any] = {"name": driver.name, "built_in": driver.built_in, "description": driver.description}
+    if driver.fault:
+        return found | {"fault": driver.fault}
+    return found | {"options": driver.options, "units": units}
+
+
+def unit_of(option: str) -> str:
+    """An option's unit, by its name."""
+    return next((unit for end, unit in UNITS.items() if option.endswith(end)), "")
+
+
+def as_lines(driver: Driver) -> list[str]:
+    """Name and description, then a row for each option: name, unit, default or `required`, values, description."""
+    head = f"{driver.name}: {driver.fault or driver.description}" + ("" if driver.built_in else " (plug-in)")
+    required = driver.options.get("required", [])
+    rows = [
+        (
+            option,
+            unit_of(option),
+            "required" if option in required else _shown(schema.get("default")),
+            _values(schema, driver.options.get("$defs", {})),
+            schema.get("description", ""),
+        )
+        for option, schema in driver.options.get("properties", {}).items()
+    ]
+    widths = [max((len(row[i]) for row in rows), default=0) for i in range(4)]
+    return [head, *("  " + "  ".join(_padded(row, widths)).rstrip() for row in rows)]
+
+
+def _padded(row: tuple[str, ...], widths: list[int]) -> list[str]:
+    return [*(cell.ljust(width) for cell, width in zip(row[:4], widths, strict=True)), row[4]]
+
+
+def _shown(value: Any) -> str:
+    return "-" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _values(schema: dict[str, Any], definitions: dict[str, Any]) -> str:
+    """Which values an option takes: a list of them, or its type; of a table its keys."""
+    if "$ref" in schema:
+        return "{" + ", ".join(definitions[schema["$ref"].rpartition("/")[2]]["properties"]) + "}"
+    if "enum" in schema:
+        return " ".join(str(value) for value in schema["enum"])
+    if "anyOf" in schema:
+        return " or ".join(_values(kind, definitions) for kind in schema["anyOf"] if kind.get("type") != "null")
+    if schema.get("type") == "array":
+        return f"list of {_values(schema.get('items', {}), definitions)}"
+    return str(schema.get("type", "any"))

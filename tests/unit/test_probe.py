@@ -1,0 +1,82 @@
+"""`fieldcal probe` on adapters under the real smbus2: what answers, who it is, whether it is sound."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from agent.cli import run_cli
+from hw.virtual.adxl345_twin import Adxl345Twin
+from hw.virtual.adxl355_twin import Adxl355Twin
+from hw.virtual.kernel import FUNCTIONS, I2CBus, installed
+from hw.virtual.mpu6050_twin import Mpu6500Twin
+
+
+def noise(first: int, n: int) -> NDArray[np.int32]:
+    return np.random.default_rng(first).integers(-3, 4, (n, 3), np.int32)
+
+
+def twin(kind: Any, rate_hz: float, **known: Any) -> Any:
+    return kind(noise, lambda t_s: int(t_s * rate_hz), time.monotonic, **known)
+
+
+@pytest.fixture
+def bus() -> Iterator[I2CBus]:
+    bus = I2CBus({0x1D: twin(Adxl355Twin, 1000), 0x53: twin(Adxl345Twin, 800), 0x68: twin(Mpu6500Twin, 1000)})
+    with installed({"/dev/i2c-4": bus}):
+        yield bus
+
+
+def probed(capsys: pytest.CaptureFixture[str], *arguments: str, status: int = 0) -> dict[int, dict[str, Any]]:
+    assert run_cli(["probe", "--bus", "4", *arguments, "--json", "-"]) == status
+    (found,) = json.loads(capsys.readouterr().out)["i2c"]
+    return {answer["address"]: answer for answer in found["answers"]}
+
+
+def test_who_answers(bus: I2CBus, capsys: pytest.CaptureFixture[str]) -> None:
+    registers = {address: bytes(target.registers) for address, target in bus.targets.items()}  # type: ignore[attr-defined]
+    found = probed(capsys)
+    assert {address: answer["drivers"] for address, answer in found.items()} == {
+        0x1D: ["adxl355", "adxl357"],  # they have the same part ID
+        0x53: ["adxl345"],
+        0x68: ["mpu6050"],
+    }
+    assert found[0x68]["identity"] == "MPU-6500 (WHO_AM_I 0x70)"
+    assert registers == {address: bytes(target.registers) for address, target in bus.targets.items()}  # type: ignore[attr-defined]
+
+
+def test_a_stranger_and_an_address_of_the_kernel(bus: I2CBus, capsys: pytest.CaptureFixture[str]) -> None:
+    bus.targets[0x68] = twin(Adxl345Twin, 800)
+    bus.claimed.add(0x1D)
+    found = probed(capsys)
+    assert found[0x1D]["drivers"] == found[0x68]["drivers"] == []
+    assert "a kernel driver holds the address" in found[0x1D]["note"]
+    assert "WHO_AM_I is 0x00" in found[0x68]["note"]
+
+
+def test_self_test_of_sound_and_stuck_parts(bus: I2CBus, capsys: pytest.CaptureFixture[str]) -> None:
+    del bus.targets[0x53]
+    found = probed(capsys, "--self-test")
+    assert [answer["self_test"]["faults"] for answer in found.values()] == [[], []]
+    bus.targets[0x1D]._deflection = lambda: np.zeros(3, np.int32)  # type: ignore[attr-defined]
+    del bus.targets[0x68]
+    (fault, *_) = probed(capsys, "--self-test", status=3)[0x1D]["self_test"]["faults"]
+    assert fault.startswith("x changes by ")
+    assert run_cli(["probe", "--bus", "4"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines == ["/dev/i2c-4: ", "  0x1D  ADXL355 (REVID 0x01) or ADXL357 (REVID 0x01)", lines[2]]
+    assert lines[2].split() == ["driver", "adxl355", "or", "adxl357"]
+
+
+def test_buses_that_cannot_be_asked(bus: I2CBus, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_cli(["probe", "--bus", "9"]) == 1
+    assert capsys.readouterr().out == "/dev/i2c-9: No such file or directory\n"
+    bus.functions = FUNCTIONS & ~1
+    assert run_cli(["probe", "--bus", "4"]) == 1
+    assert "plain I2C" in capsys.readouterr().out
