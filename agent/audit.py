@@ -9,12 +9,12 @@ from pathlib import Path
 import click
 import msgspec
 
-from agent.comparison import OTHER_CPU
-from agent.integrity import Integrity, check_integrity
-from agent.mcap_records import Fault
-from agent.reading import open_recording
-from agent.recording import FILE_METADATA
-from agent.replaying import Replay, ReplayedFile, Restore
+from agent.recording.comparison import OTHER_CPU
+from agent.recording.integrity import Integrity, check_integrity
+from agent.recording.reading import open_recording
+from agent.recording.records import Fault
+from agent.recording.replaying import Replay, ReplayedFile, Restore
+from agent.recording.writer import FILE_METADATA
 
 
 class AuditedFile(msgspec.Struct, kw_only=True):
@@ -45,9 +45,9 @@ def audit(files: tuple[Path, ...], public_key: Path | None, strict: bool, json_t
 
     Exit status 0 when all is as it should be, 3 when not, 2 when a file cannot be read.
     """
-    from agent.fingerprint import compute_as
     from agent.pipeline import Pipeline
-    from agent.reading import first_event
+    from agent.recording.fingerprint import compute_as
+    from agent.recording.reading import first_event
 
     start = first_event(files[0])
     if start is not None:
@@ -78,7 +78,7 @@ def audit_files(
     files: Sequence[Path], restore: Restore, *, strict: bool = False, signed: bool = False
 ) -> list[AuditedFile]:
     """The verdict on each file; files of one run, in order, are also held against each other. Raises OSError."""
-    from agent.fingerprint import fingerprint
+    from agent.recording.fingerprint import fingerprint
 
     replayed = Replay(restore, fingerprint(), elsewhere=OTHER_CPU)
     audited: list[AuditedFile] = []

@@ -12,14 +12,14 @@ from agent import __version__
 
 COMMANDS = {
     "run": ("agent.run", "The agent: read, calibrate, record and publish; without CONFIG on the virtual bench."),
-    "calibrate": ("agent.calibrate", "Calibrate from files."),
+    "calibrate": ("agent.calibrate.command", "Calibrate from files."),
     "replay": ("agent.replay", "Run recordings through the same pipeline and print the calibrations."),
     "audit": ("agent.audit", "Check a recording: every byte, and that its results follow from its data."),
     "show": ("agent.show", "Calibration in force, status and history of a data directory."),
     "report": ("agent.report", "Figures and one page of a calibration."),
     "sensors": ("agent.sensors", "Drivers with their options."),
     "probe": ("agent.probe", "What answers on this machine's buses and ports, with self-test."),
-    "router": ("agent.router", "A Zenoh router, for tests and small sites."),
+    "router": ("agent.delivery.router", "A Zenoh router, for tests and small sites."),
     "simulate": ("agent.simulate", "Serve virtual devices on pseudo-terminals, or write a recording with known truth."),
     "check": ("agent.check", "All faults of a configuration at once."),
 }

@@ -11,7 +11,7 @@ import click
 import msgspec
 
 from agent.events import CalibrationUpdate
-from agent.replaying import Replay, ReplayedFile, Restore
+from agent.recording.replaying import Replay, ReplayedFile, Restore
 
 SHOWN = 12  # lines of a table; `--json` has them all
 
@@ -24,9 +24,9 @@ def replay(files: tuple[Path, ...], json_to: str | None) -> int:
 
     Exit status 0 when the recorded results came out again bit for bit; 3 when not; 2 when a file cannot be read.
     """
-    from agent.fingerprint import compute_as
     from agent.pipeline import Pipeline
-    from agent.reading import first_event
+    from agent.recording.fingerprint import compute_as
+    from agent.recording.reading import first_event
 
     start = first_event(files[0])
     if start is not None:
@@ -36,7 +36,7 @@ def replay(files: tuple[Path, ...], json_to: str | None) -> int:
 
 def run_replay(files: Sequence[Path], restore: Restore, *, as_json: bool) -> int:
     """Replay, print, and return the exit status."""
-    from agent.fingerprint import fingerprint
+    from agent.recording.fingerprint import fingerprint
 
     replayed = Replay(restore, fingerprint(), elsewhere=0.0)
     unreadable = []

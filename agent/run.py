@@ -14,7 +14,7 @@ from typing import Any
 import click
 
 from agent.config import Config, ConfigError, load_config, parse_config
-from agent.history import StoreError
+from agent.delivery.history import StoreError
 
 LOOPBACK = "tcp/127.0.0.1:7447"
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -31,7 +31,7 @@ STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 @click.option("--with-router", is_flag=True, help=f"Start a Zenoh router at {LOOPBACK} unless one is there.")
 def run(config: Path | None, data_dir: Path, duration: float | None, preset: str, seed: int, with_router: bool) -> int:
     """Read, calibrate, record and publish until Ctrl-C. Without CONFIG on the virtual bench."""
-    from agent.watch import Watch
+    from agent.terminal.watch import Watch
 
     # Until the service takes them over: as Ctrl-C, so that a router or a bench started here does not stay behind.
     for number in STOP_SIGNALS:
@@ -108,7 +108,7 @@ def virtual_bench(preset: str, seed: int) -> Iterator[tuple[Config, Any]]:
 @contextmanager
 def router(endpoint: str) -> Iterator[str]:
     """A router process beside the agent, or the one that is there; yields what to tell the user."""
-    from agent.router import router_running
+    from agent.delivery.router import router_running
 
     if router_running(endpoint):
         yield f"using the Zenoh router that is already at {endpoint}"

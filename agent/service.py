@@ -10,16 +10,16 @@ from pathlib import Path
 
 from agent import __version__
 from agent.config import Config
+from agent.delivery.history import History, Record, StoreError
+from agent.delivery.publication import Publisher
+from agent.delivery.store import Store
 from agent.events import CalibrationUpdate, Event, Result, RunStart, Tick
-from agent.fingerprint import fingerprint, versions
-from agent.history import History, Record, StoreError
 from agent.pipeline import Pipeline
-from agent.publication import Publisher
 from agent.reader import EventQueue, Reader
-from agent.recording import Recorder
-from agent.recording_thread import RecordingThread
-from agent.store import Store
-from agent.watch import Watch
+from agent.recording.fingerprint import fingerprint, versions
+from agent.recording.thread import RecordingThread
+from agent.recording.writer import Recorder
+from agent.terminal.watch import Watch
 from hw.sensor import Sensor, boot_id, load_driver
 
 TICK_S = 1.0

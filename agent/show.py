@@ -12,9 +12,9 @@ import click
 import msgspec
 
 from agent import __version__
+from agent.delivery.history import FILE_NAME, History, Record, StoreError
 from agent.events import CalibrationUpdate, StatusChange, WindowReport
-from agent.history import FILE_NAME, History, Record, StoreError
-from agent.quantity import size
+from agent.terminal.quantity import size
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -67,7 +67,7 @@ class Overview:
 
 def read_overview(data_dir: Path, limit: int) -> Overview:
     """Read it, the newest `limit` results of each kind. Raises StoreError."""
-    from agent.recording import recordings
+    from agent.recording.writer import recordings
 
     with History(data_dir / FILE_NAME) as history:
         in_force = {record.sensor: record for record in history.latest() if record.what == "calibration"}
@@ -127,7 +127,7 @@ def _print(overview: Overview) -> None:
 def _print_sensor(console: Console, sensor: str, held: SensorHistory) -> None:
     from rich.text import Text
 
-    from agent.wording import STATUS_STYLES, calibration_cells, verdict, window_span
+    from agent.terminal.wording import STATUS_STYLES, calibration_cells, verdict, window_span
 
     name, said = "UNCALIBRATED", "no status yet"
     if held.status and isinstance(status := held.status.result, StatusChange):
@@ -156,7 +156,7 @@ def _print_calibration(console: Console, calibration: CalibrationUpdate) -> None
     from rich import box
     from rich.table import Table
 
-    from agent.wording import calibration_cells, uncertainty_words
+    from agent.terminal.wording import calibration_cells, uncertainty_words
 
     unit = calibration.output_unit.replace("m/s2", "m/s²")
     table = Table(box=box.SIMPLE_HEAD)

@@ -13,7 +13,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from agent.reading import RecordingReader
+from agent.recording.reading import RecordingReader
 from benchmarks.page import machine, write_part
 from hw.block import SampleBlock
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from agent.config import load_config
 from agent.events import RunStart
 from agent.reader import EventQueue, Reader
-from agent.recording import Recorder
+from agent.recording.writer import Recorder
 from hw.sensor import boot_id, load_driver
 
 

@@ -13,11 +13,11 @@ import zstandard
 
 from agent.config import Config
 from agent.events import Event, RunStart
-from agent.integrity import check_integrity
-from agent.mcap_records import walk
 from agent.pipeline import Pipeline
-from agent.reading import RecordingReader
-from agent.recording import Recorder
+from agent.recording.integrity import check_integrity
+from agent.recording.reading import RecordingReader
+from agent.recording.records import walk
+from agent.recording.writer import Recorder
 from benchmarks.page import machine, write_part
 from hw.block import SampleBlock
 

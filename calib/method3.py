@@ -14,6 +14,7 @@ from calib.sums import factor
 # Below this part of the largest singular value (columns scaled to one) a direction was not excited: positions 0/1/2 deg
 # stand at 3e-6, what rounding alone leaves of an unseen direction at 1e-15.
 RANK_TOLERANCE = 1e-10
+PLAIN = "3 (plain)"  # what a calibration says of its method
 # Without a prior a parameter counts as determined up to this u, as a part of the largest main sensitivity (contract).
 DETERMINED_U = 0.1
 
@@ -118,4 +119,4 @@ def _calibration(solution: Array, residual: Array, spread: Array, seen: NDArray[
     values = np.where(determined, solution[column, output], np.nan)
     covariance = np.where(np.outer(determined, determined), covariance, np.nan)
     assert len(order) == len(PARAMETERS)
-    return Calibration(values[:9].reshape(3, 3), values[9:], covariance, determined, dof, "3 (plain)")
+    return Calibration(values[:9].reshape(3, 3), values[9:], covariance, determined, dof, PLAIN)

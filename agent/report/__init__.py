@@ -98,7 +98,7 @@ def left_over(material: Material) -> list[Residuals]:
 def as_object(material: Material, seen: list[Residuals], figures: list[str]) -> dict[str, Any]:
     """What report.json holds: results as in `fieldcal calibrate --json -`, with their unit."""
     from agent import __version__
-    from agent.history import Record
+    from agent.delivery.history import Record
     from agent.report.result import plain
 
     return {

@@ -9,10 +9,10 @@ from typing import Any
 
 import msgspec
 
+from agent.calibrate.origin import SourceFile, source_file
+from agent.delivery.history import FILE_NAME, History, StoreError
 from agent.events import CalibrationUpdate, StatusChange, WindowReport
-from agent.history import FILE_NAME, History, StoreError
-from agent.origin import SourceFile, source_file
-from agent.recording import recordings
+from agent.recording.writer import recordings
 from agent.report.recorded import Recorded, RecordingError, read_recordings, sensors_of
 from agent.report.result import (
     CalibrationResult,

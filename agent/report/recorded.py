@@ -11,8 +11,8 @@ import numpy as np
 
 from agent.config import Channel, Config
 from agent.events import CalibrationUpdate, DeviceChange, Event, Result, RunStart, StatusChange, WindowReport
-from agent.mcap_records import Fault
-from agent.reading import RecordingReader
+from agent.recording.reading import RecordingReader
+from agent.recording.records import Fault
 from agent.report.trace import Trace
 from agent.schedule import WINDOW_S, pieces
 from agent.snapshot import unpack

@@ -11,8 +11,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.calibrate.origin import SourceFile
 from agent.events import CalibrationUpdate
-from agent.origin import SourceFile
 from calib.model import PARAMETERS, Array
 
 Item = TypeVar("Item")

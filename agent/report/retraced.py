@@ -7,12 +7,12 @@ from typing import Any
 
 import click
 
-from agent.calibrate import read_files
-from agent.frontend import FrontEnd
-from agent.origin import SourceFile, source_file
+from agent.calibrate.command import read_files
+from agent.calibrate.frontend import FrontEnd
+from agent.calibrate.origin import SourceFile, source_file
+from agent.calibrate.tables import TableError
 from agent.report.result import CalibrationResult, WindowVerdict
 from agent.report.trace import Trace
-from agent.tables import TableError
 
 MOST_TRACES = 24  # windows shown in numbers: the newest of as many positions
 

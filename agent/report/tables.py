@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from agent.quantity import plus_minus
 from agent.report.result import CalibrationResult
 from agent.report.trace import Residuals
 from agent.report.units import ACCELERATION, output_unit, position_name, said, sensitivity_unit
+from agent.terminal.quantity import plus_minus
 from calib.model import PARAMETERS
 
 AXES = "xyz"

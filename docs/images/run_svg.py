@@ -15,9 +15,9 @@ os.environ["OPENBLAS_NUM_THREADS"] = "1"
 from rich.console import Console
 
 from agent.run import LOOPBACK, router, virtual_bench
-from agent.screen import Picture
 from agent.service import Service
-from agent.watch import Watch
+from agent.terminal.screen import Picture
+from agent.terminal.watch import Watch
 
 HERE = Path(__file__).parent
 

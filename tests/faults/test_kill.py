@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 
 from agent.channel import identity_of
+from agent.delivery.history import Record
+from agent.delivery.store import Store
 from agent.events import CalibrationUpdate, StatusChange
-from agent.history import Record
-from agent.reading import RecordingReader
-from agent.store import Store
+from agent.recording.reading import RecordingReader
 from hw.serial_stream import SerialCsv, SerialCsvOptions
 from hw.virtual.serial_port import PtyDevice
 from tests.scenarios.processes import fieldcal, recordings, results, started, wait_until

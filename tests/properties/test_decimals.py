@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from agent.decimals import decimals
+from agent.calibrate.decimals import decimals
 
 
 def text_of(rows: list[list[str]]) -> bytes:

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from mcap.writer import CompressionType, Writer
 
-from agent.mcap_records import MAGIC, Record, walk
-from agent.messages import schema_data, schema_of
+from agent.recording.messages import schema_data, schema_of
+from agent.recording.records import MAGIC, Record, walk
 
 
 def records(data: bytes) -> list[Record]:

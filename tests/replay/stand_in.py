@@ -20,8 +20,8 @@ from agent.events import (
     Tick,
     WindowReport,
 )
-from agent.fingerprint import fingerprint
-from agent.recording import Recorder
+from agent.recording.fingerprint import fingerprint
+from agent.recording.writer import Recorder
 from hw.block import BlockFlags, SampleBlock
 
 SECOND = 1_000_000_000

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from agent.audit import audit_files, run_audit
-from agent.comparison import OTHER_CPU
 from agent.events import RunStart
-from agent.fingerprint import environment_for, fingerprint
-from agent.recording import recordings
+from agent.recording.comparison import OTHER_CPU
+from agent.recording.fingerprint import environment_for, fingerprint
+from agent.recording.writer import recordings
 from tests.replay.forgery import with_sums
 from tests.replay.stand_in import Recorded, StandIn, record_run
 from tests.replay.test_replay import alter_data, record_again
@@ -161,8 +161,8 @@ AUDIT = """
 import sys
 from pathlib import Path
 from agent.audit import run_audit
-from agent.fingerprint import compute_as
-from agent.reading import first_event
+from agent.recording.fingerprint import compute_as
+from agent.recording.reading import first_event
 from tests.replay.stand_in import StandIn
 path = Path(sys.argv[1])
 compute_as(first_event(path).fingerprint)

@@ -11,14 +11,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from agent.comparison import OTHER_CPU
 from agent.events import CalibrationUpdate, Event, Result, RunStart, StatusChange, WindowReport
-from agent.fingerprint import fingerprint
-from agent.mcap_records import walk
-from agent.messages import encode
-from agent.recording import Recorder, recordings
+from agent.recording.comparison import OTHER_CPU
+from agent.recording.fingerprint import fingerprint
+from agent.recording.messages import encode
+from agent.recording.records import walk
+from agent.recording.replaying import Replay, ReplayedFile
+from agent.recording.writer import Recorder, recordings
 from agent.replay import run_replay
-from agent.replaying import Replay, ReplayedFile
 from tests.replay.stand_in import CONFIG, SECOND, Recorded, StandIn, happenings, record_run, run_start
 
 BLOCKS = 14

@@ -14,9 +14,9 @@ import pytest
 
 from agent.config import parse_config
 from agent.events import DeviceChange, Gap
-from agent.reading import RecordingReader
+from agent.recording.reading import RecordingReader
 from agent.service import Service
-from agent.watch import Watch
+from agent.terminal.watch import Watch
 from hw.block import SampleBlock
 from hw.virtual.adxl355_twin import Adxl355Twin
 from hw.virtual.kernel import I2CBus, installed

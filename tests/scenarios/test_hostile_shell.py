@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from agent.history import Record
-from agent.store import Store
+from agent.delivery.history import Record
+from agent.delivery.store import Store
 from tests.scenarios.processes import ROOT, fieldcal
 from tests.unit.results import calibration, status
 

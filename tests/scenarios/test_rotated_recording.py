@@ -12,7 +12,7 @@ import pytest
 
 from agent.events import RunStart
 from agent.pipeline import Pipeline
-from agent.reading import RecordingReader
+from agent.recording.reading import RecordingReader
 from tests.scenarios.processes import ROOT, fieldcal, interrupt, recordings, results, started, wait_until
 
 CONFIG = """

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import zenoh
 
-from agent.router import open_router, router_running
+from agent.delivery.router import open_router, router_running
 from hw.virtual.bench import Bench, Truth
 from hw.virtual.presets import COUNTS_PER_MPS2, PRESETS
 from tests.scenarios.processes import fieldcal, interrupt, recordings, results, started, wait_until
@@ -55,7 +55,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 @pytest.fixture(scope="module", autouse=True)
 def router() -> Iterator[None]:
-    if router_running(ENDPOINT):  # the machine's own; the agent is told to use no other
+    if router_running(ENDPOINT):  # the machine's own serves as well
         yield
         return
     session, _ = open_router(ENDPOINT)

@@ -10,12 +10,12 @@ import msgspec
 import numpy as np
 
 from agent.config import Config, parse_config
+from agent.delivery.history import Record
+from agent.delivery.store import Store
 from agent.events import DeviceChange, Event, Result, RunStart, Tick
-from agent.fingerprint import fingerprint, versions
-from agent.history import Record
 from agent.pipeline import Pipeline
-from agent.recording import Recorder
-from agent.store import Store
+from agent.recording.fingerprint import fingerprint, versions
+from agent.recording.writer import Recorder
 from hw.block import DeviceInfo, SampleBlock
 from hw.virtual.bench import Bench, Truth
 from hw.virtual.presets import plain

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agent.frontend import FrontEnd, Options
-from agent.poses import PoseInterval
-from agent.tables import ReferenceTable, SensorTable
+from agent.calibrate.frontend import FrontEnd, Options
+from agent.calibrate.poses import PoseInterval
+from agent.calibrate.tables import ReferenceTable, SensorTable
 from calib.alignment import drift, segment_lags
 from calib.excitation import Points, motion_windows
 from calib.geometry import beside, clamp

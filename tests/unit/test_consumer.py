@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from agent.answers import NOTHING
-from agent.consumer import Consumer, Received
-from agent.keys import PREFIX, narrow, parse_key
-from agent.publication import Publisher
-from agent.store import Store
+from agent.delivery.answers import NOTHING
+from agent.delivery.consumer import Consumer, Received
+from agent.delivery.keys import PREFIX, narrow, parse_key
+from agent.delivery.publication import Publisher
+from agent.delivery.store import Store
 from tests.unit.zenoh_site import Site, record, wait_for
 
 
@@ -233,7 +233,7 @@ def test_what_is_no_result_is_passed_over(site: Site, gateway: Gateway) -> None:
 
 
 def test_no_router_is_one_clear_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("agent.consumer.CONNECT_S", 0.2)
+    monkeypatch.setattr("agent.delivery.consumer.CONNECT_S", 0.2)
     with pytest.raises(ConnectionError, match=r"no Zenoh router answers at tcp/127\.0\.0\.1:9$"):
         Consumer(["tcp/127.0.0.1:9"])
 

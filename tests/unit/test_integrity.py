@@ -16,11 +16,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.writer import IndexType, Writer
 
-from agent.crc_location import changed_byte
-from agent.integrity import Integrity, check_integrity
-from agent.mcap_records import MAGIC, RECORD_LIMIT, RecordError
-from agent.messages import encode, schema_data, topic_of
-from agent.reading import RecordingReader
+from agent.recording.crc_location import changed_byte
+from agent.recording.integrity import Integrity, check_integrity
+from agent.recording.messages import encode, schema_data, topic_of
+from agent.recording.reading import RecordingReader
+from agent.recording.records import MAGIC, RECORD_LIMIT, RecordError
 from tests.replay.forgery import records, with_sums, write_messages
 from tests.replay.stand_in import CONFIG, StandIn, happenings, record_run, run_start
 

@@ -26,8 +26,8 @@ from agent.events import (
     Tick,
     WindowReport,
 )
-from agent.messages import MessageError, decode, encode, schema_data, schema_of, topic_of
 from agent.proto import fieldcal_pb2 as pb
+from agent.recording.messages import MessageError, decode, encode, schema_data, schema_of, topic_of
 from hw.block import BlockFlags, SampleBlock
 from tests.replay.stand_in import block
 

@@ -15,10 +15,10 @@ import pytest
 import zenoh
 from zenoh.ext import AdvancedSubscriber, HistoryConfig, declare_advanced_subscriber
 
-from agent.history import StoreError
-from agent.publication import Publisher
-from agent.session import EndpointError, session_config
-from agent.store import Store
+from agent.delivery.history import StoreError
+from agent.delivery.publication import Publisher
+from agent.delivery.session import EndpointError, session_config
+from agent.delivery.store import Store
 from tests.unit.zenoh_site import KEY, Site, record, router_process, sequence_of, wait_for
 
 ALL = zenoh.ConsolidationMode.NONE
@@ -282,9 +282,9 @@ def test_an_endpoint_of_an_unknown_protocol_is_a_fault_that_is_told(store: Store
 _AGENT = """
 import os, sys, time
 from pathlib import Path
-from agent.history import StoreError
-from agent.publication import Publisher
-from agent.store import Store
+from agent.delivery.history import StoreError
+from agent.delivery.publication import Publisher
+from agent.delivery.store import Store
 from tests.unit.zenoh_site import record, wait_for
 store = Store(Path(sys.argv[1]), 0)
 publisher = Publisher("site", "gw", [sys.argv[2]], store)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from agent.messages import encode, topic_of
-from agent.reading import RecordingReader, first_event
+from agent.recording.messages import encode, topic_of
+from agent.recording.reading import RecordingReader, first_event
 from tests.replay.forgery import write_messages
 from tests.replay.stand_in import CONFIG, StandIn, happenings, run_start
 

@@ -19,10 +19,10 @@ from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
 from agent.events import Gap, Tick
-from agent.integrity import check_integrity
-from agent.messages import encode
-from agent.reading import RecordingReader, Step
-from agent.recording import FILE_METADATA, Recorder, recordings
+from agent.recording.integrity import check_integrity
+from agent.recording.messages import encode
+from agent.recording.reading import RecordingReader, Step
+from agent.recording.writer import FILE_METADATA, Recorder, recordings
 from tests.replay.stand_in import CONFIG, EPOCH_NS, SECOND, StandIn, block, happenings, record_run, run_start
 
 REPOSITORY = Path(__file__).parents[2]

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from agent.events import Result
-from agent.reading import RecordingReader
-from agent.recording import Recorder
-from agent.recording_thread import RecordingThread
+from agent.recording.reading import RecordingReader
+from agent.recording.thread import RecordingThread
+from agent.recording.writer import Recorder
 from tests.replay.stand_in import CONFIG, SECOND, StandIn, block, happenings, run_start
 
 PATIENCE_S = 10.0  # how long a test waits for another thread on a busy machine

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from agent.router import open_router, router_running
-from agent.session import EndpointError
+from agent.delivery.router import open_router, router_running
+from agent.delivery.session import EndpointError
 from tests.unit.zenoh_site import Site, router_process
 
 

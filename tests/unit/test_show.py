@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner, Result
 
+from agent.delivery.history import FILE_NAME, Record
+from agent.delivery.store import Store
 from agent.events import Result as PipelineResult
-from agent.history import FILE_NAME, Record
 from agent.show import show
-from agent.store import Store
 from tests.unit.results import calibration, status, window
 
 

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
+from agent.delivery.history import FILE_NAME, History, Record, StoreError
+from agent.delivery.store import UNKEPT_MAX, WAITING_MAX, Store
 from agent.events import CalibrationUpdate, StatusChange
-from agent.history import FILE_NAME, History, Record, StoreError
-from agent.store import UNKEPT_MAX, WAITING_MAX, Store
 
 
 def record(sequence: int, what: str = "window", sensor: str = "mems", **fields: object) -> Record:
@@ -171,7 +171,7 @@ def test_one_process_has_the_store_and_the_next_gets_one_clear_line(tmp_path: Pa
 _WRITER = """
 import sys, json
 from pathlib import Path
-from agent.store import Store
+from agent.delivery.store import Store
 from tests.unit.test_store import record
 store = Store(Path(sys.argv[1]), 0)
 n = store.last_sequence()

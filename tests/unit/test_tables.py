@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agent import tables
-from agent.poses import Setting, read_poses
-from agent.tables import TableError, read_reference, read_sensor
+from agent.calibrate import tables
+from agent.calibrate.poses import Setting, read_poses
+from agent.calibrate.tables import TableError, read_reference, read_sensor
 
 HEADER = "time_s,vx,vy,vz\n"
 

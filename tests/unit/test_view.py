@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from agent.publication import PublicationState
-from agent.quantity import duration, plus_minus, size
-from agent.screen import Picture, Screen
-from agent.view import DeviceState, Lines, RecordingState, ViewState, open_view
-from agent.wording import truth_line
+from agent.delivery.publication import PublicationState
+from agent.terminal.quantity import duration, plus_minus, size
+from agent.terminal.screen import Picture, Screen
+from agent.terminal.view import DeviceState, Lines, RecordingState, ViewState, open_view
+from agent.terminal.wording import truth_line
 from tests.unit.results import calibration, status, window
 
 

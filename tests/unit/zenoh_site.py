@@ -11,16 +11,18 @@ from typing import Any
 import msgspec
 import zenoh
 
-from agent.history import Record
-from agent.router import open_router
-from agent.session import session_config
+from agent.delivery.history import Record
+from agent.delivery.router import open_router
+from agent.delivery.session import session_config
 
 KEY = "fieldcal/v1/site/gw"
 
 
 def router_process(*options: str) -> subprocess.Popen[str]:
     """`fieldcal router` in a process of its own."""
-    command = "import sys; from agent.router import router; sys.exit(router(sys.argv[1:], standalone_mode=False))"
+    command = (
+        "import sys; from agent.delivery.router import router; sys.exit(router(sys.argv[1:], standalone_mode=False))"
+    )
     return subprocess.Popen(
         [sys.executable, "-c", command, *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
 
-from agent.history import FILE_NAME, SCHEMA_VERSION, Record, StoreError, connect_read_only
+from agent.delivery.history import FILE_NAME, SCHEMA_VERSION, Record, StoreError, connect_read_only
 
 LOCK_NAME = "state.lock"
 # After a run that did not close well, numbers may be out in the world that no commit has kept; the next run counts on

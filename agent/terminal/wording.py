@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from agent.events import CalibrationUpdate, Result, StatusChange, WindowReport
-from agent.quantity import plus_minus, size
+from agent.terminal.quantity import plus_minus, size
+from calib.method3 import PLAIN
 from calib.model import Array
 
 if TYPE_CHECKING:
-    from agent.publication import PublicationState
-    from agent.view import RecordingState, Truth
+    from agent.delivery.publication import PublicationState
+    from agent.terminal.view import RecordingState, Truth
 
 STATUS_STYLES = {"VALID": "bold green", "HELD": "yellow", "RECALIBRATING": "yellow", "INVALID": "bold red"}
 
@@ -74,8 +75,9 @@ def truth_line(calibration: CalibrationUpdate, truth: Truth) -> str:
     error[~found[:9].reshape(3, 3)] = np.nan
     q = np.where(found[9:], (np.array(calibration.offset) - truth.offset) / main, np.nan)
     main_error, transverse = np.diag(error), error[~np.eye(3, dtype=bool)]
+    whose = "plain Method 3 is " if calibration.method == PLAIN else ""
     return (
-        f"off the truth by at most: S main {_largest(main_error, 3)} %, transverse {_largest(transverse, 3)} %,"
+        f"{whose}off the truth by at most: S main {_largest(main_error, 3)} %, transverse {_largest(transverse, 3)} %,"
         f" Q {_largest(q, 4)} m/s²"
     )
 

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import zenoh
 from zenoh.ext import AdvancedPublisher, CacheConfig, MissDetectionConfig, declare_advanced_publisher
 
-from agent.answers import answer_queries
-from agent.history import History, Record, StoreError
-from agent.keys import gateway_key, result_key
-from agent.session import session_config
-from agent.store import Store
+from agent.delivery.answers import answer_queries
+from agent.delivery.history import History, Record, StoreError
+from agent.delivery.keys import gateway_key, result_key
+from agent.delivery.session import session_config
+from agent.delivery.store import Store
 
 BATCH = 100  # results read from the store at a time
 POLL_S = 0.2  # how soon a router that came back is seen; asking costs a microsecond
@@ -46,9 +46,9 @@ class Publisher:
 
     The store is the outbox: Zenoh acknowledges nothing, so a result counts as published when it was put while a router
     was connected, and what is lost with a dying link is still in the publisher's cache and behind the queryable
-    (`?after=<sequence>`, see agent.answers). Each sample's attachment is the number of the result put before it, "0"
-    where that says nothing (put again at the start, or not kept by the store): a consumer whose last number is another
-    has missed something, or must ask.
+    (`?after=<sequence>`, see agent.delivery.answers). Each sample's attachment is the number of the result put before
+    it, "0" where that says nothing (put again at the start, or not kept by the store): a consumer whose last number is
+    another has missed something, or must ask.
     The session is a peer that does not listen; it connects when a router appears.
     Raises ValueError on a bad name, EndpointError on a bad endpoint; after that no method raises.
     """

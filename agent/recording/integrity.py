@@ -12,9 +12,9 @@ from typing import Any, BinaryIO, cast
 from mcap.opcode import Opcode
 from mcap.records import Attachment, DataEnd, Footer, MessageIndex, Metadata
 
-from agent.crc_location import changed_byte
-from agent.mcap_records import MAGIC, Fault, Record, RecordError, parse, record_name, refusal, walk
-from agent.summary import KINDS, DerivedSummary
+from agent.recording.crc_location import changed_byte
+from agent.recording.records import MAGIC, Fault, Record, RecordError, parse, record_name, refusal, walk
+from agent.recording.summary import KINDS, DerivedSummary
 
 FAULTS_KEPT = 20  # of one file; the first tells where, the count how bad
 

@@ -8,11 +8,11 @@ from typing import Protocol, cast
 
 import msgspec
 
-from agent.comparison import Difference, compare
 from agent.events import CalibrationUpdate, Event, Result, RunStart, WindowReport
-from agent.mcap_records import Fault
-from agent.messages import decode, encode, schema_of, topic_of
-from agent.reading import RecordingReader, Step
+from agent.recording.comparison import Difference, compare
+from agent.recording.messages import decode, encode, schema_of, topic_of
+from agent.recording.reading import RecordingReader, Step
+from agent.recording.records import Fault
 
 
 class PipelineLike(Protocol):

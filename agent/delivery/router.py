@@ -10,7 +10,7 @@ from pathlib import Path
 import click
 import zenoh
 
-from agent.session import EndpointError, EndpointRefused, session_config
+from agent.delivery.session import EndpointError, EndpointRefused, session_config
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 ANSWER_S = 0.5  # a router on the same machine answers within milliseconds

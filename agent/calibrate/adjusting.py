@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from agent.frontend import FrontEnd
-from agent.outcome import NuisanceValue, Outcome
-from agent.priors import u_gravity_mps2
-from agent.tables import SensorTable
+from agent.calibrate.frontend import FrontEnd
+from agent.calibrate.outcome import NuisanceValue, Outcome
+from agent.calibrate.priors import u_gravity_mps2
+from agent.calibrate.tables import SensorTable
 from calib.adjustment import Adjustment, adjust
 from calib.excitation import rests_anywhere
 from calib.geometry import STANDARD_GRAVITY_MPS2

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from agent import __version__
-from agent.quantity import plus_minus
+from agent.terminal.quantity import plus_minus
 from calib.model import Array, Calibration, Window
 
 AXES = "xyz"

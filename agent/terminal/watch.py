@@ -9,10 +9,10 @@ import time
 from collections import deque
 
 from agent.config import Config
+from agent.delivery.publication import PublicationState
 from agent.events import DeviceChange, Event, Gap, Result
-from agent.publication import PublicationState
-from agent.recording import Recorder
-from agent.view import DeviceState, RecordingState, Truth, ViewState, open_view
+from agent.recording.writer import Recorder
+from agent.terminal.view import DeviceState, RecordingState, Truth, ViewState, open_view
 from hw.block import BlockFlags, SampleBlock
 
 RATE_OVER_BLOCKS = 20  # the rate shown is over this many blocks, ten seconds

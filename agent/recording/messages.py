@@ -26,7 +26,7 @@ from agent.events import (
     WindowReport,
 )
 from agent.proto import fieldcal_pb2 as pb
-from agent.raw_block import decode_block, encode_block
+from agent.recording.raw_block import decode_block, encode_block
 from calib.model import PARAMETERS
 from hw.block import SampleBlock
 

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from agent.poses import PoseInterval
-from agent.tables import ReferenceTable, SensorTable, TableError
+from agent.calibrate.poses import PoseInterval
+from agent.calibrate.tables import ReferenceTable, SensorTable, TableError
 from calib.alignment import Drift, drift
 from calib.band import lowpass, lowpass_lost, moving_band_hz
 from calib.excitation import Points, judged, motion_parts, rest_sd, rest_window

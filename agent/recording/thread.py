@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 
 from agent.events import Event, Result, RunStart
-from agent.recording import Recorder
+from agent.recording.writer import Recorder
 
 FLUSH_S = 2.0  # s; a power cut costs at most this much of the recording, for 11 % more disk than one long chunk
 CAPACITY = 256  # events; half a minute of two devices and ticks, while a slow card takes its time

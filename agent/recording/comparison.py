@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 
 from agent.events import Result, WindowReport
-from agent.messages import topic_of
+from agent.recording.messages import topic_of
 
 OTHER_CPU = (
     1e-9  # relative; kernels of two CPUs differ by 7e-16 a solve, a condition number of 1.2e4 and recursion on top

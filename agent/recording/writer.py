@@ -17,7 +17,7 @@ from typing import IO, cast
 from mcap.writer import CompressionType, Writer
 
 from agent.events import Event, Result, RunStart
-from agent.messages import EVENTS_TOPIC, RESULT_TOPICS, encode, schema_data, schema_of, topic_of
+from agent.recording.messages import EVENTS_TOPIC, RESULT_TOPICS, encode, schema_data, schema_of, topic_of
 
 log = logging.getLogger(__name__)
 

@@ -18,7 +18,7 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from agent.mcap_records import ChunkMessage, Record, content, refusal, unpack
+from agent.recording.records import ChunkMessage, Record, content, refusal, unpack
 
 KINDS = (
     Opcode.SCHEMA,

@@ -15,9 +15,9 @@ import msgspec
 import zenoh
 from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
-from agent.answers import NOTHING
-from agent.keys import PREFIX, Address, narrow, parse_key
-from agent.session import session_config
+from agent.delivery.answers import NOTHING
+from agent.delivery.keys import PREFIX, Address, narrow, parse_key
+from agent.delivery.session import session_config
 
 INBOX = 1000  # samples that may wait, or be held; what is dropped is fetched from the gateway's store
 ANSWER_S = 5.0  # for one query

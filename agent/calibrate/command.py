@@ -11,17 +11,17 @@ from typing import Any
 import click
 import numpy as np
 
-from agent.adjusting import adjusted, norm_fitted
-from agent.amplitude_methods import by_amplitudes
-from agent.corners import has_corner, uncoupled
-from agent.frontend import FrontEnd, Options
-from agent.origin import origin
-from agent.outcome import Outcome, as_json, print_outcome
-from agent.poses import PoseInterval, Setting, beside_reference, read_poses
-from agent.priors import priors_of
-from agent.tables import ReferenceTable, TableError, read_reference, read_sensor
+from agent.calibrate.adjusting import adjusted, norm_fitted
+from agent.calibrate.amplitude_methods import by_amplitudes
+from agent.calibrate.corners import has_corner, uncoupled
+from agent.calibrate.frontend import FrontEnd, Options
+from agent.calibrate.origin import origin
+from agent.calibrate.outcome import Outcome, as_json, print_outcome
+from agent.calibrate.poses import PoseInterval, Setting, beside_reference, read_poses
+from agent.calibrate.priors import priors_of
+from agent.calibrate.tables import ReferenceTable, TableError, read_reference, read_sensor
 from calib.geometry import STANDARD_GRAVITY_MPS2
-from calib.method3 import fit, refusal
+from calib.method3 import PLAIN, fit, refusal
 from calib.nuisances import Priors
 
 BAR_FROM_BYTES = 30_000_000  # shorter files are read before a bar could be of use
@@ -167,7 +167,7 @@ def _rotation(text: str | None) -> np.ndarray[Any, np.dtype[np.float64]] | None:
 
 def _plain(front: FrontEnd) -> Outcome:
     windows = front.windows()
-    nothing = Outcome(None, ("no window can be used",), windows, front.sensor_clock.rate_hz, "3 (plain)")
+    nothing = Outcome(None, ("no window can be used",), windows, front.sensor_clock.rate_hz, PLAIN)
     if not any(w.used for w in windows):
         return nothing
     found = fit(windows)

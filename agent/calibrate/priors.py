@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from agent.tables import TableError
+from agent.calibrate.tables import TableError
 from calib.model import Array
 from calib.nuisances import Priors
 

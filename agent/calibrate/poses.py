@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from agent.tables import TableError, fields_of, header_of, number_of, open_table, require
+from agent.calibrate.tables import TableError, fields_of, header_of, number_of, open_table, require
 from calib.geometry import STANDARD_GRAVITY_MPS2, along, at_rest, beside, clamp, on_axis
 from calib.model import Array, Pose
 

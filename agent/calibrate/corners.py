@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from agent.poses import PoseInterval
-from agent.tables import ReferenceTable, SensorTable, TableError
+from agent.calibrate.poses import PoseInterval
+from agent.calibrate.tables import ReferenceTable, SensorTable, TableError
 from calib.corner import integral, with_integral, without_corner
 from calib.model import Array
 from calib.nuisances import Priors

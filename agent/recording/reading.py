@@ -17,8 +17,8 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
 from agent.events import CalibrationUpdate, Event, Result, RunStart, StatusChange, WindowReport
-from agent.mcap_records import ChunkMessage, Fault, Record, RecordError, content, refusal, unpack, walk
-from agent.messages import MessageError, decode, topic_of
+from agent.recording.messages import MessageError, decode, topic_of
+from agent.recording.records import ChunkMessage, Fault, Record, RecordError, content, refusal, unpack, walk
 
 RESULTS = (WindowReport, CalibrationUpdate, StatusChange)
 

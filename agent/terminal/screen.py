@@ -12,9 +12,9 @@ from rich.live import Live
 from rich.text import Text
 
 from agent.events import CalibrationUpdate
-from agent.quantity import duration
-from agent.view import ViewState
-from agent.wording import (
+from agent.terminal.quantity import duration
+from agent.terminal.view import ViewState
+from agent.terminal.wording import (
     STATUS_STYLES,
     calibration_cells,
     publication_line,

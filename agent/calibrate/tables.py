@@ -13,7 +13,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.decimals import decimals
+from agent.calibrate.decimals import decimals
 from calib.stamps import kind_of
 
 Array = NDArray[np.float64]

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import zenoh
 
-from agent.history import History, Record, StoreError
-from agent.keys import result_key
+from agent.delivery.history import History, Record, StoreError
+from agent.delivery.keys import result_key
 
 REPLIES_MAX = 500  # per query, about 1 MB; who asks goes on from the last number until nothing comes
 NOTHING = b"nothing to tell"

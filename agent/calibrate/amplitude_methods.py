@@ -7,9 +7,9 @@ from typing import Any
 import click
 import numpy as np
 
-from agent.frontend import FrontEnd
-from agent.outcome import Outcome
-from agent.priors import priors_of
+from agent.calibrate.frontend import FrontEnd
+from agent.calibrate.outcome import Outcome
+from agent.calibrate.priors import priors_of
 from calib import method1, method2
 from calib.amplitudes import AmplitudeCalibration, Run
 from calib.model import PARAMETERS

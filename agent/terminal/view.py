@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, Protocol, TextIO
 
 from agent.events import CalibrationUpdate, Result, StatusChange, WindowReport
-from agent.wording import publication_line, result_lines
+from agent.terminal.wording import publication_line, result_lines
 from calib.model import Array
 
 if TYPE_CHECKING:
-    from agent.publication import PublicationState
+    from agent.delivery.publication import PublicationState
 
 
 class Truth(Protocol):
@@ -95,7 +95,7 @@ class View(Protocol):
 def open_view(state: ViewState, stream: TextIO) -> View:
     """A live screen where `stream` is a terminal, plain lines elsewhere."""
     if stream.isatty():
-        from agent.screen import Screen
+        from agent.terminal.screen import Screen
 
         return Screen(state, stream)
     return Lines(state, stream)
