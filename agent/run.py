@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import subprocess
@@ -33,6 +34,8 @@ def run(config: Path | None, data_dir: Path, duration: float | None, preset: str
     """Read, calibrate, record and publish until Ctrl-C. Without CONFIG on the virtual bench."""
     from agent.terminal.watch import Watch
 
+    if duration is not None and not math.isfinite(duration):
+        raise click.BadParameter(f"{duration} is not a time", param_hint="--duration")
     # Until the service takes them over: as Ctrl-C, so that a router or a bench started here does not stay behind.
     for number in STOP_SIGNALS:
         signal.signal(number, signal.default_int_handler)

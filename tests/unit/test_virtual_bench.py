@@ -5,7 +5,10 @@ from __future__ import annotations
 import json
 from dataclasses import asdict
 
+import pytest
+
 from agent.channel import identity_of
+from agent.cli import run_cli
 from agent.run import virtual_bench
 from hw.sensor import load_driver
 
@@ -25,3 +28,9 @@ def test_a_calibration_is_kept_for_the_same_bench_and_no_other() -> None:
     first = identity("plain", 1)
     assert identity("plain", 1) == first
     assert len({first, identity("plain", 2), identity("faulty", 1)}) == 3
+
+
+@pytest.mark.parametrize("duration", ["nan", "inf", "0", "-1", "soon"])
+def test_a_duration_that_is_no_time_is_refused(duration: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_cli(["run", "--duration", duration]) == 2
+    assert "--duration" in capsys.readouterr().err
