@@ -9,8 +9,8 @@ import pytest
 
 from hw.adxl345 import Adxl345
 from hw.block import BlockFlags, Drop
+from hw.conformance.i2c import I2cContract, I2cRig
 from hw.virtual.adxl345_twin import Adxl345Twin
-from tests.contract.i2c_contract import I2cContract, I2cRig
 
 
 class Adxl345Rig(I2cRig):

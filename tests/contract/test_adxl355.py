@@ -10,9 +10,9 @@ import pytest
 
 from hw.adxl355 import Adxl355, Adxl357, Adxl359
 from hw.block import BlockFlags, Drop
+from hw.conformance.i2c import I2cContract, I2cRig
 from hw.sensor import DeviceLost, IdentityError
 from hw.virtual.adxl355_twin import Adxl355Twin
-from tests.contract.i2c_contract import I2cContract, I2cRig
 
 
 class Adxl355Rig(I2cRig):

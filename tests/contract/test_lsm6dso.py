@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from hw.block import BlockFlags, Drop
+from hw.conformance.i2c import I2cContract, I2cRig
 from hw.lsm6dso import Lsm6dso
 from hw.virtual.lsm6dso_twin import Lsm6dsoTwin, words
-from tests.contract.i2c_contract import I2cContract, I2cRig
 
 FREQ_FINE = -7
 

@@ -7,10 +7,10 @@ from collections.abc import Iterator
 import pytest
 
 from hw.block import BlockFlags
+from hw.conformance.i2c import I2cContract, I2cRig
 from hw.mpu6050 import Mpu6050
 from hw.sensor import IdentityError
 from hw.virtual.mpu6050_twin import TRIM, Mpu6050Twin, Mpu6500Twin
-from tests.contract.i2c_contract import I2cContract, I2cRig
 
 
 class Mpu6050Rig(I2cRig):

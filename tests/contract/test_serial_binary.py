@@ -12,8 +12,8 @@ import pytest
 from numpy.typing import NDArray
 
 from hw.block import BlockFlags, Drop
+from hw.conformance.serial import SerialContract, SerialRig
 from hw.serial_binary import SerialBinary
-from tests.contract.serial_contract import SerialContract, SerialRig
 
 LAP = 30_000
 FRAME = np.dtype([("start", "S2"), ("sequence", ">u2"), ("x", ">i2"), ("y", ">i2"), ("z", ">i2"), ("t", ">i2")])

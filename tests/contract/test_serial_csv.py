@@ -10,9 +10,9 @@ import pytest
 from numpy.typing import NDArray
 
 from hw.block import BlockFlags, DeviceInfo, Drop
+from hw.conformance.serial import SerialContract, SerialRig
 from hw.serial_stream import SerialCsv
 from hw.virtual.serial_port import format_lines
-from tests.contract.serial_contract import SerialContract, SerialRig
 
 
 class CsvRig(SerialRig):

@@ -10,10 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 from hw.block import BlockFlags, DeviceInfo, Drop
+from hw.conformance.serial import SerialContract, SerialRig
 from hw.sensor import ConfigurationError, DeviceLost, IdentityError
 from hw.virtual.witmotion_twin import WitMotionTwin
 from hw.witmotion import WitMotion
-from tests.contract.serial_contract import SerialContract, SerialRig
 
 LAP = 30_000
 

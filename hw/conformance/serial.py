@@ -14,10 +14,10 @@ from typing import Any, ClassVar
 import pytest
 
 from hw.block import DeviceInfo
+from hw.conformance.sensor import Rig, SensorContract
 from hw.sensor import DeviceLost
 from hw.serial_sensor import SerialSensor
 from hw.virtual.serial_port import PtyDevice
-from tests.contract.contract import Rig, SensorContract
 
 KERNEL_BUFFER = 4095  # bytes a terminal holds for its reader
 
