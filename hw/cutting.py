@@ -37,14 +37,15 @@ class Cutter:
     """Numbers a device's samples through its life and cuts stretches into blocks.
 
     `lowest` and `highest` are the ends of the range, in the indications' unit: an indication there is SATURATED.
-    Flags that no sample could carry yet wait for the next one. `nominal_rate_hz` may change when a device is opened.
+    Flags that no sample could carry yet wait for the next one. Rate and ends may
+    change when a device is opened.
     """
 
     def __init__(self, device: str, nominal_rate_hz: float, lowest: float = -np.inf, highest: float = np.inf) -> None:
         self._device = device
         self.nominal_rate_hz = nominal_rate_hz
-        self._lowest = lowest
-        self._highest = highest
+        self.lowest = lowest
+        self.highest = highest
         self._index = 0
         self._flags = BlockFlags.NONE
 
@@ -70,7 +71,7 @@ class Cutter:
         bringing = np.diff(count, prepend=0) > 0  # the others say nothing of this block's times
         arrivals = stretch.burst_t_monotonic_ns[bringing]
         indications = stretch.indications[start:stop]
-        if indications.max() >= self._highest or indications.min() <= self._lowest:
+        if indications.max() >= self.highest or indications.min() <= self.lowest:
             self._flags |= BlockFlags.SATURATED
         block = SampleBlock(
             device=self._device,

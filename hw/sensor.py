@@ -84,6 +84,7 @@ BUILT_IN: Mapping[str, str] = {
     "adxl355": "hw.adxl355:Adxl355",
     "adxl357": "hw.adxl355:Adxl357",
     "adxl359": "hw.adxl355:Adxl359",
+    "iio": "hw.iio:Iio",
     "lsm6dso": "hw.lsm6dso:Lsm6dso",
     "mpu6050": "hw.mpu6050:Mpu6050",
     "serial-binary": "hw.serial_binary:SerialBinary",

@@ -1,0 +1,223 @@
+"""Driver `iio`: an accelerometer that a kernel driver reads (Linux industrial I/O), through its buffer."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from hw import iio_scan
+from hw.block import BlockFlags, DeviceInfo, Drop, SampleBlock
+from hw.cutting import Break, Cutter, Stretch
+from hw.sensor import Clock, ConfigurationError, DeviceLost, Options, system_clock
+
+SYSFS, DEV = Path("/sys/bus/iio/devices"), Path("/dev")
+BLOCK_S, POLL_S, BUFFER_S = 0.5, 0.05, 4.0
+READ_BYTES = 1 << 20
+LONGEST_GAP = 100  # samples: with a rate 1 % off, how many a longer one held is not known
+AXES = ("accel_x", "accel_y", "accel_z")
+OFF = ("in_accel_x_calibbias", "in_accel_y_calibbias", "in_accel_z_calibbias")
+HIGH_PASS = "in_accel_filter_high_pass_3db_frequency"
+
+
+class IioOptions(Options):
+    """Options of `iio`."""
+
+    device: str = Field(min_length=1, description="its name, e.g. adxl355, or its node, e.g. iio:device0")
+    rate_hz: float = Field(gt=0, le=100_000, description="sampling frequency, one that the kernel driver has")
+    trigger: str | None = Field(None, description="name of the trigger, where the driver sets none itself")
+
+
+class Iio:
+    """Files of sysfs and the device's node alone: no library is needed.
+
+    The kernel stamps every sample at its interrupt (CLOCK_MONOTONIC): each sample is a burst with that arrival. A step
+    between stamps tells how many samples the buffer dropped.
+    """
+
+    options_model: ClassVar[type[Options]] = IioOptions
+
+    def __init__(
+        self,
+        name: str,
+        options: IioOptions,
+        *,
+        clock: Clock = system_clock,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._options = options
+        self._clock = clock
+        self._sleep = sleep
+        self._cutter = Cutter(name, options.rate_hz)
+        self._file: int | None = None
+        self._directory = SYSFS
+        self._ready: deque[SampleBlock] = deque()
+        self._loss: DeviceLost | None = None
+        self._rest = b""
+        self._last_ns: int | None = None
+
+    def open(self) -> DeviceInfo:
+        """Find it, set it, read it back, start its buffer. Raises DeviceLost or ConfigurationError."""
+        self.close()
+        self._directory = self._find()
+        try:
+            settings = self._configure()
+            self._file = os.open(DEV / self._directory.name, os.O_RDONLY | os.O_NONBLOCK)
+        except OSError as error:
+            self.close()
+            message = f"IIO device {self._options.device}: {error.filename or ''}: {error.strerror}"
+            held = error.errno == errno.EBUSY
+            raise (ConfigurationError if held else DeviceLost)(message) from error
+        except BaseException:
+            self.close()
+            raise
+        self._loss = None
+        self._rest = b""
+        self._last_ns = None
+        self._cutter.flag(BlockFlags.RESTART)
+        scale = float(settings.get("in_accel_scale", "nan"))
+        return DeviceInfo(
+            driver="iio",
+            kind=settings["name"],
+            serial_number="",
+            unit="count",
+            axes=3,
+            nominal_rate_hz=self._options.rate_hz,
+            range_mps2=-self._cutter.lowest * scale if scale > 0 else None,
+            nominal_sensitivity=1 / scale if scale > 0 else None,
+            settings=settings,
+        )
+
+    def close(self) -> None:
+        """Release the node and stop the buffer."""
+        file, self._file = self._file, None
+        if file is not None:
+            with contextlib.suppress(OSError):
+                os.close(file)
+            with contextlib.suppress(OSError):
+                (self._directory / "buffer" / "enable").write_text("0")
+
+    def take_drops(self) -> list[Drop]:
+        """Nothing is read in vain: what the kernel dropped shows as gaps."""
+        return []
+
+    def read_block(self) -> SampleBlock | None:
+        """The next block, or None. Raises DeviceLost."""
+        if not self._ready and self._loss is None:
+            if self._file is None:
+                raise DeviceLost(f"IIO device {self._options.device} (/dev/{self._directory.name}) is not open")
+            self._gather(self._file)
+        if self._ready:
+            return self._ready.popleft()
+        if self._loss is not None:
+            raise self._loss
+        return None
+
+    def _gather(self, file: int) -> None:
+        data = self._rest
+        end_ns = self._clock()[0] + round(BLOCK_S * 1e9)
+        while self._loss is None and self._clock()[0] < end_ns:
+            self._sleep(POLL_S)
+            data += self._read(file)
+        now_ns, utc_ns = self._clock()
+        whole = len(data) // self._scan.itemsize * self._scan.itemsize
+        self._rest = data[whole:]
+        scans = np.frombuffer(data[:whole], self._scan)
+        if not len(scans):
+            return
+        stamps_ns = self._elements["timestamp"].value(scans["timestamp"])
+        counts = np.column_stack([self._elements[axis].value(scans[axis]) for axis in AXES]).astype(np.int32)
+        lost = iio_scan.missing(stamps_ns, self._last_ns, self._options.rate_hz)
+        self._last_ns = int(stamps_ns[-1])
+        breaks = [
+            Break(at, BlockFlags.GAP, int(lost[at])) if lost[at] <= LONGEST_GAP else Break(at, BlockFlags.RESTART)
+            for at in np.flatnonzero(lost).tolist()
+        ]
+        newer = np.diff(np.maximum.accumulate(stamps_ns), prepend=-1) > 0
+        stretch = Stretch(
+            counts, stamps_ns[newer], np.flatnonzero(newer) + 1, utc_ns - now_ns + int(stamps_ns[newer][-1])
+        )
+        self._ready.extend(self._cutter.cut(stretch, breaks))
+
+    def _read(self, file: int) -> bytes:
+        try:
+            data = os.read(file, READ_BYTES)
+        except BlockingIOError:
+            return b""
+        except OSError as error:
+            self._loss = DeviceLost(f"/dev/{self._directory.name}: {error.strerror}")
+            return b""
+        if not data:
+            self._loss = DeviceLost(f"/dev/{self._directory.name}: it ended")
+        return data
+
+    def _find(self) -> Path:
+        """The device's directory."""
+        names = {path: _text(path / "name") for path in sorted(SYSFS.glob("iio:device*"))}
+        for path, name in names.items():
+            if self._options.device in (path.name, name):
+                return path
+        known = ", ".join(f"{name} ({path.name})" for path, name in names.items()) or "none"
+        raise DeviceLost(f"{SYSFS}: no IIO device {self._options.device!r}; there are {known}")
+
+    def _configure(self) -> dict[str, str]:
+        """Set all, start the buffer; what stands in the files then."""
+        here = self._directory
+        (here / "buffer" / "enable").write_text("0")
+        rate = next(
+            (path for path in (here / "in_accel_sampling_frequency", here / "sampling_frequency") if path.exists()),
+            None,
+        )
+        wanted = {} if rate is None else {rate: f"{self._options.rate_hz:g}"}
+        wanted |= {here / name: "0" for name in (*OFF, HIGH_PASS) if (here / name).exists()}
+        if self._options.trigger is not None:
+            wanted[here / "trigger" / "current_trigger"] = self._options.trigger
+        wanted[here / "current_timestamp_clock"] = "monotonic"
+        for path, value in wanted.items():
+            path.write_text(value)
+            found = _text(path)
+            if found != value and not _same_number(found, value):
+                raise ConfigurationError(f"{path}: wrote {value}, it says {found}")
+        self._elements = self._choose(here / "scan_elements")
+        self._scan = iio_scan.layout(self._elements)
+        bits = self._elements["accel_x"].bits
+        self._cutter.lowest, self._cutter.highest = -(2.0 ** (bits - 1)), 2.0 ** (bits - 1) - 1
+        (here / "buffer" / "length").write_text(str(round(BUFFER_S * self._options.rate_hz)))
+        (here / "buffer" / "enable").write_text("1")
+        kept = [here / "name", here / "in_accel_scale", here / "in_accel_offset", *wanted]
+        return {path.name: _text(path) for path in kept if path.exists()}
+
+    def _choose(self, directory: Path) -> dict[str, iio_scan.Element]:
+        """Acceleration and time stamp are stored, nothing else."""
+        elements = {}
+        for path in sorted(directory.glob("in_*_en")):
+            name = path.name.removeprefix("in_").removesuffix("_en")
+            chosen = name in (*AXES, "timestamp")
+            path.write_text("1" if chosen else "0")
+            if chosen:
+                index = int(_text(directory / f"in_{name}_index"))
+                elements[name] = iio_scan.Element.parse(index, _text(directory / f"in_{name}_type"))
+        absent = [name for name in (*AXES, "timestamp") if name not in elements]
+        if absent:
+            raise ConfigurationError(f"{directory}: no element {', '.join(absent)}")
+        return elements
+
+
+def _text(path: Path) -> str:
+    return path.read_text("ascii", errors="replace").strip()
+
+
+def _same_number(found: str, wanted: str) -> bool:
+    """1000.000000 is 1000; what a driver made of a rate that it does not have is not."""
+    try:
+        return abs(float(found) - float(wanted)) <= 1e-3 * abs(float(wanted))
+    except ValueError:
+        return False

@@ -1,0 +1,70 @@
+"""Scans of Linux's industrial I/O buffers: how one is laid out, what its bytes mean. Pure functions, no files.
+
+Source: Linux, Documentation/ABI/testing/sysfs-bus-iio (scan_elements: `[be|le]:[s|u]bits/storagebitsXrepeat>>shift`);
+elements stand in the order of their index, each aligned to its own size, the whole to its largest.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+_TYPE = re.compile(r"(be|le):([su])(\d+)/(8|16|32|64)>>(\d+)")
+
+
+@dataclass(frozen=True, slots=True)
+class Element:
+    """One number of a scan; `text` is its type as the kernel states it. ValueError for a type that is none."""
+
+    index: int
+    order: str
+    signed: bool
+    bits: int
+    storage_bits: int
+    shift: int
+
+    @classmethod
+    def parse(cls, index: int, text: str) -> Element:
+        """Of the files `*_index` and `*_type`."""
+        found = _TYPE.fullmatch(text)
+        if found is None:
+            raise ValueError(f"{text!r} is no type of a scan element")
+        order, sign, bits, storage_bits, shift = found.groups()
+        return cls(index, order, sign == "s", int(bits), int(storage_bits), int(shift))
+
+    @property
+    def dtype(self) -> str:
+        """As it is stored."""
+        return f"{'<' if self.order == 'le' else '>'}{'i' if self.signed else 'u'}{self.storage_bits // 8}"
+
+    def value(self, stored: NDArray[np.generic]) -> NDArray[np.int64]:
+        """Numbers out of what is stored: shifted, cut to their bits, with their sign."""
+        numbers = stored.astype(np.int64) >> self.shift
+        if self.bits >= 64:
+            return numbers
+        numbers &= (1 << self.bits) - 1
+        return numbers - ((numbers >> (self.bits - 1)) << self.bits) if self.signed else numbers
+
+
+def layout(elements: Mapping[str, Element]) -> np.dtype[np.void]:
+    """How a scan of these elements lies in memory."""
+    names = sorted(elements, key=lambda name: elements[name].index)
+    offsets, end = [], 0
+    for name in names:
+        size = elements[name].storage_bits // 8
+        offsets.append(-(-end // size) * size)
+        end = offsets[-1] + size
+    widest = max(elements[name].storage_bits // 8 for name in names)
+    formats = [elements[name].dtype for name in names]
+    return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": -(-end // widest) * widest})
+
+
+def missing(stamps_ns: NDArray[np.int64], before_ns: int | None, rate_hz: float) -> NDArray[np.int64]:
+    """How many samples lie between each stamp (n,) and the one before it; a step up to 1.7 periods is one sample."""
+    first = stamps_ns[:1] - round(1e9 / rate_hz) if before_ns is None else np.array([before_ns])
+    steps = np.diff(np.concatenate([first, stamps_ns])) * 1e-9 * rate_hz
+    return np.where(steps > 1.7, np.round(steps) - 1, 0).astype(np.int64)

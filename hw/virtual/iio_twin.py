@@ -1,0 +1,97 @@
+"""An accelerometer as the kernel's industrial I/O shows it: files in a directory, and a pipe for the node."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+NODE = "iio:device0"
+SCAN = np.dtype([("x", ">i2"), ("y", ">i2"), ("z", ">i2"), ("_", "V2"), ("timestamp", "<i8")])
+FILES = {
+    "name": "twin345",
+    "in_accel_scale": "0.038300",
+    "in_accel_sampling_frequency": "100.000000",
+    "in_accel_x_calibbias": "12",
+    "in_accel_y_calibbias": "0",
+    "in_accel_z_calibbias": "-3",
+    "current_timestamp_clock": "realtime",
+    "buffer/enable": "0",
+    "buffer/length": "2",
+    "scan_elements/in_timestamp_en": "0",
+    "scan_elements/in_timestamp_index": "4",
+    "scan_elements/in_timestamp_type": "le:s64/64>>0",
+    "scan_elements/in_temp_en": "1",
+    "scan_elements/in_temp_index": "3",
+    "scan_elements/in_temp_type": "be:s16/16>>0",
+}
+for _i, _axis in enumerate("xyz"):
+    FILES[f"scan_elements/in_accel_{_axis}_en"] = "0"
+    FILES[f"scan_elements/in_accel_{_axis}_index"] = str(_i)
+    FILES[f"scan_elements/in_accel_{_axis}_type"] = "be:s14/16>>2"
+
+
+class IioTwin:
+    """`source(first, n)` returns (n, 3) counts, `stamps_ns(first, n)` their stamps, `samples_due(t_s)` how many exist.
+
+    Lives in `root`/sys and `root`/dev. As the kernel's, its buffer drops the newest samples once it is full.
+    """
+
+    def __init__(
+        self,
+        root: Path,
+        source: Callable[[int, int], NDArray[np.int32]],
+        stamps_ns: Callable[[int, int], NDArray[np.int64]],
+        samples_due: Callable[[float], int],
+    ) -> None:
+        self.sysfs, self.dev = root / "sys", root / "dev"
+        self._source = source
+        self._stamps_ns = stamps_ns
+        self._samples_due = samples_due
+        self.next = 0
+        self._pending = b""
+        self._pipe: int | None = None
+        self.plug()
+
+    def plug(self) -> None:
+        """Bind the driver: files and node are there."""
+        for name, text in FILES.items():
+            path = self.sysfs / NODE / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text)
+        self.dev.mkdir(exist_ok=True)
+        os.mkfifo(self.dev / NODE)
+        self._pipe = os.open(self.dev / NODE, os.O_RDWR | os.O_NONBLOCK)
+
+    def unplug(self) -> None:
+        """Take all of it away."""
+        if self._pipe is not None:
+            os.close(self._pipe)
+            self._pipe = None
+            (self.dev / NODE).unlink()
+            shutil.rmtree(self.sysfs / NODE)
+
+    def serve(self, t_s: float) -> None:
+        """Store what was made up to `t_s`, hand on what the reader has room for."""
+        due = self._samples_due(t_s)
+        first, self.next = self.next, max(self.next, due)
+        if self._pipe is None:
+            return
+        if (self.sysfs / NODE / "buffer" / "enable").read_text() != "1":
+            self._pending = b""
+            return
+        room = int((self.sysfs / NODE / "buffer" / "length").read_text()) - len(self._pending) // SCAN.itemsize
+        n = min(self.next - first, room)
+        scans = np.zeros(n, SCAN)
+        counts = self._source(first, n)
+        for i, axis in enumerate("xyz"):
+            scans[axis] = counts[:, i] << 2
+        scans["timestamp"] = self._stamps_ns(first, n)
+        self._pending += scans.tobytes()
+        with contextlib.suppress(BlockingIOError):
+            self._pending = self._pending[os.write(self._pipe, self._pending) :]

@@ -1,0 +1,128 @@
+"""The contract on `iio`, over files and a pipe as the kernel lays them out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from hw import iio
+from hw.block import BlockFlags
+from hw.conformance.sensor import Rig, SensorContract
+from hw.iio import Iio, IioOptions
+from hw.iio_scan import Element, layout
+from hw.sensor import ConfigurationError, DeviceLost
+from hw.virtual.iio_twin import IioTwin
+
+LAP = 8000
+
+
+class IioRig(Rig):
+    def __init__(self, root: Path) -> None:
+        self.saturated = range(0)
+        self.twin = IioTwin(root, self.counts, self.stamps_ns, self.due)
+        self.sensor = self.build()
+
+    def build(self, **changes: object) -> Iio:
+        options = IioOptions.model_validate({"device": "twin345", "rate_hz": self.rate_hz} | changes)
+        return Iio("sensor", options, clock=self.clock, sleep=lambda s: self.sleep(s))
+
+    def build_elsewhere(self) -> Iio:
+        return self.build(device="other")
+
+    def counts(self, first: int, n: int) -> NDArray[np.int32]:
+        k = np.arange(first, first + n, dtype=np.int32)
+        return np.column_stack([k % LAP, -(k // LAP), np.where(np.isin(k, self.saturated), 8191, -5)])
+
+    def stamps_ns(self, first: int, n: int) -> NDArray[np.int64]:
+        return np.round(np.arange(first, first + n) * 1e9 / self.rate_hz).astype(np.int64)
+
+    def sleep(self, seconds: float) -> None:
+        super().sleep(seconds)
+        self.twin.serve(self.t_s)
+
+    def number(self, indications: NDArray[np.generic]) -> NDArray[np.int64]:
+        x, y, z = indications.astype(np.int64).T
+        numbers = x - LAP * y
+        assert ((z == -5) | ((z == 8191) & np.isin(numbers, self.saturated))).all()
+        return np.asarray(numbers)
+
+    def saturate(self, first: int, last: int) -> None:
+        self.saturated = range(first, last + 1)
+
+    def lose(self) -> None:
+        self.twin.next += 3
+
+    def unplug(self) -> None:
+        self.twin.unplug()
+
+    def replug(self) -> None:
+        self.twin.plug()
+
+    def close(self) -> None:
+        self.sensor.close()
+        self.twin.unplug()
+
+
+class TestIio(SensorContract):
+    @pytest.fixture
+    def rig(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[IioRig]:
+        rig = IioRig(tmp_path)
+        monkeypatch.setattr(iio, "SYSFS", rig.twin.sysfs)
+        monkeypatch.setattr(iio, "DEV", rig.twin.dev)
+        yield rig
+        rig.close()
+
+    def test_polls_do_not_beat_with_the_sample_clock(self, rig: IioRig) -> None:
+        """Here the kernel stamps every sample: nothing is left to beat."""
+        rig.open()
+        for block in rig.blocks(1.0):
+            assert block.burst_count.tolist() == list(range(1, block.n + 1))
+            assert block.burst_t_monotonic_ns.tolist() == self.stamps(rig, block.indications)
+
+    def stamps(self, rig: IioRig, indications: NDArray[np.generic]) -> list[int]:
+        return [round(number * 1e9 / rig.rate_hz) for number in rig.number(indications).tolist()]
+
+    def test_says_who_it_is_and_how_it_is_set(self, rig: IioRig) -> None:
+        info = rig.sensor.open()
+        assert (info.kind, info.unit) == ("twin345", "count")
+        assert info.nominal_sensitivity == pytest.approx(1 / 0.0383)
+        assert info.range_mps2 == pytest.approx(8192 * 0.0383)
+        assert info.settings["in_accel_x_calibbias"] == info.settings["in_accel_z_calibbias"] == "0"
+        assert info.settings["current_timestamp_clock"] == "monotonic"
+        assert (rig.twin.sysfs / "iio:device0/scan_elements/in_temp_en").read_text() == "0"
+
+    def test_a_rate_that_the_kernel_driver_rounds_is_refused(
+        self, rig: IioRig, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(iio, "_text", lambda path: "800.000000" if "frequency" in path.name else path.read_text())
+        with pytest.raises(ConfigurationError, match=r"in_accel_sampling_frequency: wrote 1000, it says 800"):
+            rig.sensor.open()
+
+    def test_absent_says_what_there_is(self, rig: IioRig) -> None:
+        with pytest.raises(DeviceLost, match=r"no IIO device 'other'; there are twin345 \(iio:device0\)"):
+            rig.build_elsewhere().open()
+
+    def test_what_the_full_buffer_dropped_is_a_gap_of_known_length_or_a_restart(self, rig: IioRig) -> None:
+        rig.open()
+        *_, before = rig.blocks(0.6)
+        rig.twin.next += 50
+        rig.sleep(0.06)
+        blocks = list(rig.blocks(1.0))
+        assert [b.flags for b in (before, *blocks)].count(BlockFlags.GAP) == 1
+        assert blocks[-1].first_index + blocks[-1].n - rig.number(blocks[-1].indications)[
+            -1
+        ] == 1 + before.first_index + (before.n - 1 - rig.number(before.indications)[-1])
+
+
+def test_elements_as_the_kernel_states_them() -> None:
+    assert Element.parse(0, "le:s12/16>>4").value(np.array([-16, 0x7FF0], np.int16)).tolist() == [-1, 2047]
+    assert Element.parse(0, "be:u10/16>>6").value(np.array([0xFFC0], np.uint16)).tolist() == [1023]
+    assert Element.parse(0, "le:s20/32>>12").value(np.array([-(2**31)], np.int32)).tolist() == [-(2**19)]
+    with pytest.raises(ValueError, match="is no type of a scan element"):
+        Element.parse(0, "le:s12/16X2>>4")
+    scan = layout({"b": Element.parse(1, "le:s64/64>>0"), "a": Element.parse(0, "be:s16/16>>0")})
+    assert (scan.names, scan.itemsize, scan.fields["b"][1]) == (("a", "b"), 16, 8)  # type: ignore[index]
