@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from agent.calibrate.frontend import FrontEnd
-from agent.calibrate.outcome import NuisanceValue, Outcome
-from agent.calibrate.priors import u_gravity_mps2
+from agent.calibrate.outcome import NuisanceValue, Outcome, nothing_used
+from agent.calibrate.priors import priors_of, row_contradictions, u_gravity_mps2
 from agent.calibrate.tables import SensorTable
 from calib.adjustment import Adjustment, adjust
 from calib.excitation import rests_anywhere
@@ -35,8 +35,7 @@ def adjusted(front: FrontEnd, priors: Priors) -> Outcome:
         windows = front.windows(applied.lag_s)
         used = [w for w in windows if w.used]
         if not used:
-            nothing = ("no window can be used",)
-            return Outcome(None, nothing, windows, front.sensor_clock.rate_hz, "3 (adjustment)")
+            return nothing_used(windows, front.sensor_clock.rate_hz, "3 (adjustment)")
         calm = _telling([w for w in windows if w.kind == "quiet"], used)
         if calm and front.band_hz is None and front.limit_band(used, calm):
             windows = front.windows(applied.lag_s)
@@ -52,7 +51,11 @@ def adjusted(front: FrontEnd, priors: Priors) -> Outcome:
 
 
 def norm_fitted(sensor: SensorTable, options: dict[str, Any]) -> Outcome:
-    """Rests found in the sensor's file, gravity's magnitude all that is known: S upper triangular, the frame free."""
+    """Rests found in the sensor's file, gravity's magnitude all that is known: S upper triangular, the frame free.
+
+    Raises TableError where --prior cannot be read.
+    """
+    priors = priors_of(options)
     clock = clock_from_stamps(sensor.time_s)
     gravity = options["gravity_mps2"] or STANDARD_GRAVITY_MPS2
     windows = rests_anywhere(clock.time_of(np.arange(len(sensor.time_s))), np.asarray(sensor.v), gravity)
@@ -60,8 +63,9 @@ def norm_fitted(sensor: SensorTable, options: dict[str, Any]) -> Outcome:
         found = norm_fit(windows, gravity, u_gravity_mps2(options))
     except ValueError as error:
         return Outcome(None, (str(error),), windows, clock.rate_hz, "norm fit", more={"frame": "free"})
+    reasons = (*found.reasons, *row_contradictions(found.calibration, priors))
     return Outcome(
-        None if found.reasons else found.calibration, found.reasons, windows, clock.rate_hz, "norm fit",
+        None if reasons else found.calibration, reasons, windows, clock.rate_hz, "norm fit",
         coverage_factor=found.coverage_factor,
         uncertainty_kind="scatter of the rests and u of gravity",
         more={"frame": "free", "residual_mps2": found.residual_mps2},

@@ -8,24 +8,21 @@ import click
 import numpy as np
 
 from agent.calibrate.frontend import FrontEnd
-from agent.calibrate.outcome import Outcome
-from agent.calibrate.priors import priors_of
+from agent.calibrate.outcome import Outcome, nothing_used
+from agent.calibrate.priors import contradictions, priors_of
 from calib import method1, method2
 from calib.amplitudes import AmplitudeCalibration, Run
 from calib.model import PARAMETERS
-from calib.nuisances import Priors
 from calib.statistics import rel_s_pct, transverse_excess
 
 SOLVE = {"1": method1.solve, "2": method2.solve}
-# A sensitivity this many standard uncertainties from what was known is another sensor, axis or reference; noise and
-# priors alone do it once in 370 times.
-CONTRADICTION = 3.0
 
 
 def by_amplitudes(front: FrontEnd, options: dict[str, Any]) -> Outcome:
     """Method 1 or 2 on every used window in motion, windows of one position being repetitions.
 
-    Raises click.UsageError for --plain, which is Method 3's, TableError where --prior cannot be read.
+    Raises click.UsageError for --plain, which is Method 3's, and for a tri-axial reference, TableError where --prior
+    cannot be read.
     """
     if options["plain"]:
         raise click.UsageError("--plain belongs to Method 3")
@@ -33,15 +30,17 @@ def by_amplitudes(front: FrontEnd, options: dict[str, Any]) -> Outcome:
     pairs = list(front.runs())
     windows = [window for _, window in pairs]
     # what the front end has made of a velocity is an acceleration already
-    runs = [Run(p.time_s, p.u[:, 0], p.V, w.pose) for p, w in pairs if w.used and p.u.shape[1] == 1]
     method = options["method"]
+    if any(p.u.shape[1] != 1 for p, _ in pairs):
+        raise click.UsageError(f"--method {method} needs a uniaxial --reference")
+    runs = [Run(p.time_s, p.u[:, 0], p.V, w.pose) for p, w in pairs if w.used]
     if not runs:
-        return Outcome(None, ("no window can be used",), windows, front.sensor_clock.rate_hz, method)
+        return nothing_used(windows, front.sensor_clock.rate_hz, method)
     try:
         found = SOLVE[method](runs, priors)
     except ValueError as error:
         return Outcome(None, (str(error),), windows, front.sensor_clock.rate_hz, method)
-    reasons = (*found.reasons, *_contradictions(found, priors))
+    reasons = (*found.reasons, *contradictions(found.calibration, priors))
     omega = 2 * np.pi * found.frequency_hz
     return Outcome(
         calibration=None if reasons else found.calibration,
@@ -55,24 +54,6 @@ def by_amplitudes(front: FrontEnd, options: dict[str, Any]) -> Outcome:
         statistics=_appendix_a(found),
         more={"frequency_hz": found.frequency_hz, "budget": found.statement.by_source},
     )
-
-
-def _contradictions(found: AmplitudeCalibration, priors: Priors) -> list[str]:
-    """Sensitivities that what was known of them (--nominal, --prior) contradicts."""
-    if priors.parameters is None or priors.covariance is None:
-        return []
-    values, u = found.calibration.sensitivity.ravel(), found.calibration.standard_uncertainty
-    u_known = np.sqrt(np.diag(priors.covariance))
-    reasons = []
-    for k in np.flatnonzero(found.calibration.determined & np.isfinite(u_known)):
-        known = priors.parameters[k]
-        away = abs(values[k] - known) / np.hypot(u[k], u_known[k])
-        if away > CONTRADICTION:
-            reasons.append(
-                f"{PARAMETERS[k]} is {values[k]:.4g}, {away:.1f} standard uncertainties from {known:.4g} "
-                f"(u {u_known[k]:.3g}) as known before; {CONTRADICTION:g} at most"
-            )
-    return reasons
 
 
 def _appendix_a(found: AmplitudeCalibration) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
@@ -16,19 +17,32 @@ from agent.calibrate.amplitude_methods import by_amplitudes
 from agent.calibrate.corners import has_corner, uncoupled
 from agent.calibrate.frontend import FrontEnd, Options
 from agent.calibrate.origin import origin
-from agent.calibrate.outcome import Outcome, as_json, print_outcome
+from agent.calibrate.outcome import Outcome, as_json, nothing_used, print_outcome
 from agent.calibrate.poses import PoseInterval, Setting, beside_reference, read_poses
-from agent.calibrate.priors import priors_of
+from agent.calibrate.priors import contradictions, priors_of
 from agent.calibrate.tables import ReferenceTable, TableError, read_reference, read_sensor
 from calib.geometry import STANDARD_GRAVITY_MPS2
 from calib.method3 import PLAIN, fit, refusal
 from calib.nuisances import Priors
 
 BAR_FROM_BYTES = 30_000_000  # shorter files are read before a bar could be of use
+PLAIN = "3 (plain)"
 COVERAGE_FACTOR = 2.0  # of plain Method 3: thousands of points, as the paper has it
 
 _FILE = click.Path(path_type=Path, dir_okay=False)
-_U = click.FloatRange(0)
+
+
+class _Finite(click.FloatRange):
+    """A range of numbers; nan and inf, which click lets through, are none."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        number = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{value!r} is not a finite number.", param, ctx)
+        return number
+
+
+_U = _Finite(0)
 
 
 @click.command()
@@ -60,15 +74,13 @@ _U = click.FloatRange(0)
 @click.option("--u-tilt-deg", type=_U, default=0.0, show_default=True, help="u of the mount's tilt.")
 @click.option("--rotation", metavar="R11,...,R33", help="Of a tri-axial reference: a = R a_ref.")
 @click.option("--u-rotation-deg", type=_U, default=0.2, show_default=True, help="u of the rotation, about each axis.")
-@click.option("--gravity", "gravity_mps2", type=click.FloatRange(9.7, 9.9), help="Local gravity in m/s2.")
+@click.option("--gravity", "gravity_mps2", type=_Finite(9.7, 9.9), help="Local gravity in m/s2.")
 @click.option("--u-gravity-mps2", type=_U, help="u of gravity: 0.03, or 0 with --gravity.")
 @click.option(
     "--static-sign", type=click.Choice(["+1", "-1"]), default="+1", show_default=True, help="+1: Eqs. (9)-(11)."
 )
-@click.option(
-    "--nominal", type=click.FloatRange(min=0, min_open=True), help="Nominal sensitivity, output unit per m/s2."
-)
-@click.option("--u-nominal-pct", type=click.FloatRange(0, min_open=True), help="Its standard uncertainty.")
+@click.option("--nominal", type=_Finite(min=0, min_open=True), help="Nominal sensitivity, output unit per m/s2.")
+@click.option("--u-nominal-pct", type=_Finite(0, min_open=True), help="Its standard uncertainty.")
 @click.option("--prior", type=_FILE, help="A result of this command (JSON): what was known before.")
 @click.option("--plain", is_flag=True, help="Method 3 exactly as printed, no nuisances.")
 @click.option("--json", "json_to", type=click.Choice(["-"]), help="One JSON object on standard output.")
@@ -99,7 +111,7 @@ def calibrated(options: dict[str, Any]) -> Outcome:
     if options["method"] != "3":
         return by_amplitudes(read_files(options), options)
     if options["plain"]:
-        return _plain(read_files(options))
+        return _plain(read_files(options), priors_of(options))
     priors = priors_of(options)
     return adjusted(read_files(options, priors), priors)
 
@@ -135,6 +147,8 @@ def setting_of(options: dict[str, Any], reference: ReferenceTable | None) -> Set
 
 
 def _poses(options: dict[str, Any], setting: Setting, reference: ReferenceTable | None) -> list[PoseInterval]:
+    if options["rotation"] and setting.reference_channels != 3:
+        raise click.UsageError("--rotation turns a tri-axial --reference, this one has one axis")
     if options["poses"]:
         return read_poses(options["poses"], setting)
     if reference is None or setting.reference_channels != 3:
@@ -154,6 +168,8 @@ def _check(options: dict[str, Any]) -> None:
         raise click.UsageError("give one of --nominal and --prior")
     if options["rotation"] and not options["reference"]:
         raise click.UsageError("--rotation turns a tri-axial --reference")
+    if options["method"] != "3" and not (options["reference"] and options["poses"]):
+        raise click.UsageError(f"--method {options['method']} needs --reference and --poses")
 
 
 def _rotation(text: str | None) -> np.ndarray[Any, np.dtype[np.float64]] | None:
@@ -165,17 +181,18 @@ def _rotation(text: str | None) -> np.ndarray[Any, np.dtype[np.float64]] | None:
         raise click.BadParameter(f"{text!r} is not nine numbers r11,r12,...,r33", param_hint="--rotation") from None
 
 
-def _plain(front: FrontEnd) -> Outcome:
+def _plain(front: FrontEnd, priors: Priors) -> Outcome:
     windows = front.windows()
-    nothing = Outcome(None, ("no window can be used",), windows, front.sensor_clock.rate_hz, PLAIN)
     if not any(w.used for w in windows):
-        return nothing
+        return nothing_used(windows, front.sensor_clock.rate_hz, PLAIN)
     found = fit(windows)
-    reasons = tuple(refusal(found, windows))
-    return replace(
-        nothing,
-        calibration=None if reasons else found.calibration,
-        reasons=reasons,
+    reasons = (*refusal(found, windows), *contradictions(found.calibration, priors))
+    return Outcome(
+        None if reasons else found.calibration,
+        reasons,
+        windows,
+        front.sensor_clock.rate_hz,
+        PLAIN,
         coverage_factor=COVERAGE_FACTOR,
         uncertainty_kind="type A, white",
         rank=found.rank,

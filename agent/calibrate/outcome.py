@@ -48,6 +48,13 @@ class Outcome:
     more: Mapping[str, Any] = field(default_factory=dict)  # further members of the JSON object
 
 
+def nothing_used(windows: Sequence[Window], rate_hz: float, method: str) -> Outcome:
+    """The outcome where no window can be used: how many there were, and what is wrong with the first that should."""
+    wanted = [w for w in windows if w.kind != "quiet"] or windows
+    first = f", the first ({wanted[0].pose.position}): {wanted[0].reason}" if wanted else ""
+    return Outcome(None, (f"no window can be used, of {len(wanted)}{first}",), windows, rate_hz, method)
+
+
 def as_json(outcome: Outcome) -> str:
     """One JSON object; what is not known is null."""
     return msgspec.json.encode(_plain(as_object(outcome))).decode()

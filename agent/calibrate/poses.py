@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,6 +20,7 @@ from calib.model import Array, Pose
 CLAMP, DIRECTION, AXIS, GRAVITY = ("theta_deg", "alpha_deg"), ("dx", "dy", "dz"), ("axis",), ("gx", "gy", "gz")
 FORMS = (CLAMP, DIRECTION, AXIS, GRAVITY)
 TOGETHER = ([DIRECTION, GRAVITY], [AXIS, GRAVITY])
+LEAST_GRAVITY_MPS2, MOST_GRAVITY_MPS2 = 9.65, 9.95  # on Earth 9.76 to 9.84; components may be rounded to 0.05
 NOT_FELT = (0.0, 0.0, 0.0)
 
 
@@ -105,7 +107,13 @@ def beside_reference(setting: Setting, gravity: Sequence[float] | None = None) -
 
 
 def _felt(stated: Sequence[float] | None, setting: Setting) -> Sequence[float] | None:
-    return NOT_FELT if setting.coupling == "ac" else stated
+    """Raises ValueError for a gravity that is none: in g, say, or in cm/s2."""
+    if setting.coupling == "ac":
+        return NOT_FELT
+    if stated is not None and not LEAST_GRAVITY_MPS2 < math.hypot(*stated) < MOST_GRAVITY_MPS2:
+        told = ", ".join(f"{g:.6g}" for g in stated)
+        raise ValueError(f"gx,gy,gz ({told}) has length {math.hypot(*stated):.6g} m/s2, gravity has 9.7 to 9.9 m/s2")
+    return stated
 
 
 def _at_rest(gravity: Sequence[float] | None, setting: Setting) -> Pose:

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from agent.calibrate.tables import TableError
-from calib.model import Array
+from calib.model import PARAMETERS, Array, Calibration
 from calib.nuisances import Priors
 
 # Without a local value gravity is the standard one, which is up to 0.3 % off (poles and equator differ by 0.05 m/s2).
 U_STANDARD_GRAVITY_MPS2 = 0.03
+# A sensitivity this many standard uncertainties from what was known is another sensor, axis or reference; noise and
+# priors alone do it once in 370 times.
+CONTRADICTION = 3.0
 NOMINAL_TRANSVERSE = 0.03  # of the nominal sensitivity: data sheets of MEMS say 1 to 3 %
 
 
@@ -79,3 +83,35 @@ def _read_prior(path: Path) -> tuple[Array, Array]:
     if not np.all(np.isfinite(known)) or (known.size and np.linalg.eigvalsh(known).min() <= 0.0):
         raise TableError(f"{path}, covariance: not one: it has a direction of no or negative variance")
     return np.nan_to_num(values), covariance
+
+
+def contradictions(found: Calibration, priors: Priors) -> list[str]:
+    """Sensitivities that what was known of them (--nominal, --prior) contradicts, for methods that take no prior in."""
+    if priors.parameters is None or priors.covariance is None:
+        return []
+    u_known = np.sqrt(np.diag(priors.covariance))[:9]
+    return _contradicted(PARAMETERS[:9], found.sensitivity.ravel(), found.standard_uncertainty[:9],
+                         priors.parameters[:9], u_known)  # fmt: skip
+
+
+def row_contradictions(found: Calibration, priors: Priors) -> list[str]:
+    """The same where the frame is free: of S only the lengths of its rows are then comparable."""
+    if priors.parameters is None or priors.covariance is None:
+        return []
+    main = [0, 4, 8]
+    length, known = (np.linalg.norm(S, axis=1) for S in (found.sensitivity, priors.parameters[:9].reshape(3, 3)))
+    u_known = np.sqrt(np.diag(priors.covariance))[main]
+    names = [f"the length of S's row {axis}" for axis in "xyz"]
+    return _contradicted(names, length, found.standard_uncertainty[main], known, u_known)
+
+
+def _contradicted(names: Sequence[str], values: Array, u: Array, known: Array, u_known: Array) -> list[str]:
+    reasons = []
+    for k in np.flatnonzero(np.isfinite(values) & np.isfinite(u_known)).tolist():
+        away = abs(values[k] - known[k]) / np.hypot(u[k], u_known[k])
+        if away > CONTRADICTION:
+            reasons.append(
+                f"{names[k]} is {values[k]:.4g}, {away:.1f} standard uncertainties from {known[k]:.4g} "
+                f"(u {u_known[k]:.3g}) as known before; {CONTRADICTION:g} at most"
+            )
+    return reasons

@@ -101,7 +101,7 @@ def require(path: Path, header: Sequence[str], names: Sequence[str]) -> None:
     """All columns are there, and none of them under another unit besides (time_ms, ax_g). Raises TableError."""
     for name in names:
         base = name.rsplit("_", 1)[0]
-        others = [n for n in header if n != name and n.rsplit("_", 1)[0] == base and n not in names]
+        others = [n for n in header if n.isidentifier() and n.rsplit("_", 1)[0] == base and n not in names]
         if name not in header:
             hint = f"; {others[0]} is another unit" if others else ""
             raise TableError(f"{path}, line 1: no column {name} in the header {','.join(header)!r}{hint}")

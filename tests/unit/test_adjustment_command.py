@@ -169,6 +169,11 @@ def test_rests_alone_give_a_free_frame(tmp_path):
     # 400 samples of 0.01 a rest: 0.5 mm/s2 a rest, 0.02 % of S after the geometry; four of that
     np.testing.assert_allclose(told["sensitivity"], S, rtol=0, atol=8e-4)
     np.testing.assert_allclose(told["offset"], Q_TRUE, rtol=0, atol=3e-3)
+    for nominal, status in ("1", 0), ("2", 3):
+        known = [*options, "--nominal", nominal, "--u-nominal-pct", "10"]
+        result = CliRunner().invoke(calibrate, known, standalone_mode=False)
+        assert result.return_value == status
+    assert "the length of S's row x is 1.02" in _told(result)["reasons"][0]
 
 
 def test_too_few_rests_are_refused(tmp_path):

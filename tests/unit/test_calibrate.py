@@ -168,7 +168,10 @@ def test_a_dead_reference_is_refused(
     (tmp_path / "reference.csv").write_text("time_s,a\n" + "".join(f"{k / 100:.2f},0.013\n" for k in range(6000)))
     status, found, _ = run(capsys, *arguments(tmp_path))
     assert status == 3
-    assert found["reasons"] == ["no window can be used"]
+    (reason,) = found["reasons"]
+    assert reason.startswith(
+        "no window can be used, of 4, the first (theta 35 deg, alpha 0 deg): the reference is silent"
+    )
     assert all("silent" in w["reason"] for w in found["windows"])
 
 
@@ -191,6 +194,10 @@ def no_number(path: Path) -> None:
         (no_number, [], "reference.csv, line 4322, column a: '?' is not a finite number"),
         (None, ["--reference-quantity", "velocity"], "reference.csv, line 1: column a is no velocity"),
         (None, ["--rotation", "1,2,3"], "'1,2,3' is not nine numbers"),
+        (None, ["--rotation", "1,0,0,0,1,0,0,0,1"], "--rotation turns a tri-axial --reference"),
+        (None, ["--u-angle-deg", "nan"], "'--u-angle-deg': 'nan' is not a finite number"),
+        (None, ["--u-offset-mps2", "inf"], "'--u-offset-mps2': 'inf' is not a finite number"),
+        (None, ["--nominal", "nan", "--u-nominal-pct", "5"], "'--nominal': 'nan' is not a finite number"),
         (None, ["--nominal", "1"], "--nominal and --u-nominal-pct go together"),
         (None, ["--u-angle-deg", "-1"], "--u-angle-deg"),
         (None, ["--prior", "x.json", "--nominal", "1", "--u-nominal-pct", "2"], "give one of --nominal and --prior"),
@@ -232,3 +239,26 @@ def test_poses_that_nobody_recorded_are_told(
     status, _, said = run(capsys, *arguments(tmp_path))
     assert status == 2
     assert "no overlap in time" in said
+
+
+def test_plain_too_is_refused_where_what_was_known_contradicts_it(
+    recorded: tuple[Path, Bench], capsys: pytest.CaptureFixture[str]
+) -> None:
+    nominal = recorded[1].parameters.sensor.nominal_sensitivity
+    twice = ["--nominal", str(2 * nominal), "--u-nominal-pct", "10"]
+    status, found, _ = run(capsys, *arguments(recorded[0], *twice))
+    assert (status, found["sensitivity"]) == (3, [[None] * 3] * 3)
+    assert found["reasons"][0].startswith("Sxx is ")
+    status, _, _ = run(capsys, *arguments(recorded[0], "--nominal", str(nominal), "--u-nominal-pct", "10"))
+    assert status == 0
+
+
+@pytest.mark.parametrize("g", [1.0, 981.0])
+def test_gravity_in_another_unit_is_bad_input(
+    g: float, recorded: tuple[Path, Bench], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "sensor.csv").symlink_to(recorded[0] / "sensor.csv")
+    (tmp_path / "poses.csv").write_text(f"start_s,stop_s,gx,gy,gz\n0,5,0,0,{-g}\n")
+    status, _, said = run(capsys, *arguments(tmp_path, reference=False))
+    assert status == 2
+    assert f"poses.csv, line 2: gx,gy,gz (0, 0, {-g:g}) has length {g:g} m/s2" in said

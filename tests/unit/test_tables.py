@@ -185,11 +185,15 @@ def test_who_feels_gravity(tmp_path: Path) -> None:
         ("start_s,stop_s,theta_deg,alpha_rad\n0,1,35,0\n", UNIAXIAL, r"line 1: no column alpha_deg .*alpha_rad is ano"),
         ("start_s,stop_s,theta_deg,alpha_deg,axis\n0,1,35,0,x\n", UNIAXIAL, r"line 1: expected one of"),
         ("start_s,stop_s\n0,1\n", UNIAXIAL, r"line 1: expected one of"),
-        ("start_s,stop_s,gx,gy,gz\n0,1,0,0,9\n", UNIAXIAL, r"line 2: gx,gy,gz alone is a static position"),
-        ("start_s,stop_s,gx,gy,gz\n0,1,0,0,9\n", Setting(reference_channels=0, coupling="ac"), "line 2: an AC-coupled"),
+        ("start_s,stop_s,gx,gy,gz\n0,1,0,0,9.8\n", UNIAXIAL, r"line 2: gx,gy,gz alone is a static position"),
+        (
+            "start_s,stop_s,gx,gy,gz\n0,1,0,0,9.8\n",
+            Setting(reference_channels=0, coupling="ac"),
+            "line 2: an AC-coupled",
+        ),
         ("start_s,stop_s,axis\n0,1,x\n", Setting(reference_channels=0), r"line 2: .*--reference is needed"),
         ("start_s,stop_s,axis\n0,1,x\n", Setting(reference_channels=3), r"line 2: a tri-axial reference needs no"),
-        ("start_s,stop_s,gx,gy,gz\n0,1,0,0,9\n", Setting(reference_channels=3), r"line 2: .* needs --rotation"),
+        ("start_s,stop_s,gx,gy,gz\n0,1,0,0,9.8\n", Setting(reference_channels=3), r"line 2: .* needs --rotation"),
     ],
 )
 def test_a_fault_of_poses_is_named_with_its_place(tmp_path: Path, text: str, setting: Setting, message: str) -> None:
