@@ -135,6 +135,9 @@ def _neighbours(scores: list[Array]) -> tuple[float, float]:
 
 
 def _paired(scores: Array) -> Array:
+    """Neighbours summed; an odd last one goes with the pair before it, a single one stays."""
+    if len(scores) < 2:
+        return scores
     even = scores[: len(scores) // 2 * 2]
     pairs = np.asarray(even.reshape(-1, 2, even.shape[1]).sum(1))
     if len(even) < len(scores):

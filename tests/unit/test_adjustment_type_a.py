@@ -54,3 +54,12 @@ def test_windows_of_one_segment_are_taken_for_white():
     told = condense(windows).type_a
     np.testing.assert_array_equal(told.means, np.eye(3))
     np.testing.assert_allclose(told.noise, 1.0, rtol=0.2)  # 600 samples: 3 % each, six of those
+
+
+def test_a_window_of_one_segment_beside_coloured_ones_stays_as_it_is():
+    """A part of a hold can be as short as that; its neighbours' segments are joined in pairs."""
+    windows, _ = _rests(np.random.default_rng(53), 40, 0.97)
+    nothing = np.empty((PER_SEGMENT, 0))
+    single = np.random.default_rng(54).normal(size=(PER_SEGMENT, 3)) * 0.02
+    told = condense([*windows, window_of(REST, nothing, nothing, np.array([0.1, -0.2, 9.81]) + single, 1)]).type_a
+    np.testing.assert_allclose(np.diag(told.means), np.diag(condense(windows).type_a.means), rtol=0.1)
