@@ -26,7 +26,6 @@ from calib.method3 import PLAIN, fit, refusal
 from calib.nuisances import Priors
 
 BAR_FROM_BYTES = 30_000_000  # shorter files are read before a bar could be of use
-PLAIN = "3 (plain)"
 COVERAGE_FACTOR = 2.0  # of plain Method 3: thousands of points, as the paper has it
 
 _FILE = click.Path(path_type=Path, dir_okay=False)
