@@ -23,15 +23,17 @@ import numpy as np
 from benchmarks.page import machine, write_part
 from benchmarks.torture_rows import FIXED, Q_TRUE, S_TRUE
 from calib.adjustment import adjust
+from calib.band import lowpass, moving_band_hz
 from calib.excitation import Points, judged
 from calib.geometry import beside
 from calib.method3 import fit
+from calib.model import Window
 from calib.resampling import resample
 from calib.stamps import clock_from_stamps
-from hw.virtual.bench import Bench
+from hw.virtual.bench import Bench, Recording
 from hw.virtual.motion import ambient
 from hw.virtual.parameters import BenchParameters, ReferenceParameters, SensorParameters
-from hw.virtual.schedule import Schedule, directed
+from hw.virtual.schedule import PoseInterval, Schedule, directed
 from hw.virtual.timebase import Clock
 
 SECONDS, STRETCH_S, CALM = 600.0, 10.0, 0.15
@@ -59,17 +61,39 @@ def one(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     recording = bench.recording(SECONDS)
     times = np.asarray(clock_from_stamps(recording.sensor_stamp_s).time_of(np.arange(len(recording.v))))
     reference = resample(recording.reference, clock_from_stamps(recording.reference_stamp_s), times)
-    loud, calm = [], []
-    for interval in recording.poses:
-        inside = (times >= interval.start_s) & (times < interval.stop_s) & reference.usable
-        points = Points(times[inside], recording.v[inside], reference.u[inside], reference.du[inside])
-        kind, out = ("motion", loud) if interval.level == 1.0 else ("quiet", calm)
-        out += judged(kind, beside(np.eye(3), np.zeros(3)), points)
-    loud = [replace(w, used=True, reason="") for w in loud]
-    found = adjust(loud, replace(FIXED, offset_mps2=0.05), quiet=calm)
+    columns = np.where(reference.usable[:, None], np.hstack([recording.v, reference.u, reference.du]), np.nan)
+    loud, calm = stretches(recording, times, columns)
     naive = fit(loud).calibration.sensitivity
+    # As fieldcal calibrate does: sensor and reference limited alike to the band in which the reference moves.
+    parts = [stretch_u(recording, times, columns, level) for level in (1.0, CALM)]
+    band_hz = moving_band_hz(*parts, rate_hz=100.0)
+    assert band_hz is not None
+    loud, calm = stretches(recording, times, lowpass(columns, 100.0, band_hz))
+    found = adjust(loud, replace(FIXED, offset_mps2=0.05), quiet=calm)
     u = np.sqrt(np.diag(found.covariance)[:9])
     return naive.ravel() - S_TRUE.ravel(), found.mean[:9] - S_TRUE.ravel(), u, found.coverage_factor
+
+
+def stretches(recording: Recording, times: np.ndarray, columns: np.ndarray) -> tuple[list[Window], list[Window]]:
+    """Loud windows, all to be used, and calm ones; columns (n, 9): V, u, du."""
+    loud: list[Window] = []
+    calm: list[Window] = []
+    for interval in recording.poses:
+        x = columns[inside := within(times, columns, interval)]
+        points = Points(times[inside], x[:, :3], x[:, 3:6], x[:, 6:])
+        kind, out = ("motion", loud) if interval.level == 1.0 else ("quiet", calm)
+        out += judged(kind, beside(np.eye(3), np.zeros(3)), points)
+    return [replace(w, used=True, reason="") for w in loud], calm
+
+
+def stretch_u(recording: Recording, times: np.ndarray, columns: np.ndarray, level: float) -> list[np.ndarray]:
+    """The reference (n, 3) in each stretch of this level."""
+    return [columns[within(times, columns, i), 3:6] for i in recording.poses if i.level == level]
+
+
+def within(times: np.ndarray, columns: np.ndarray, interval: PoseInterval) -> np.ndarray:
+    """Which samples of a stretch are whole."""
+    return (times >= interval.start_s) & (times < interval.stop_s) & np.isfinite(columns).all(axis=1)
 
 
 def main(arguments: Sequence[str] = ("--write",)) -> int:
@@ -93,6 +117,7 @@ def main(arguments: Sequence[str] = ("--write",)) -> int:
         f"| {100 * np.sqrt(np.mean(u**2)):.2f} |\n"
         f"| worst of nine, median of {len(errors)} recordings, % | {100 * np.median(np.abs(naive).max(axis=1)):.1f} "
         f"| {100 * np.median(np.abs(errors).max(axis=1)):.2f} | |\n"
+        f"| worst of nine, largest of all, % | {100 * np.abs(naive).max():.1f} | {100 * np.abs(errors).max():.2f} | |\n"
         f"| coverage, % | | {100 * inside:.1f} | |"
     )
     print(table)
