@@ -89,6 +89,7 @@ BUILT_IN: Mapping[str, str] = {
     "mpu6050": "hw.mpu6050:Mpu6050",
     "serial-binary": "hw.serial_binary:SerialBinary",
     "serial-csv": "hw.serial_stream:SerialCsv",
+    "sound-card": "hw.sound_card:SoundCard",
     "witmotion": "hw.witmotion:WitMotion",
 }
 
