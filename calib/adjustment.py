@@ -20,7 +20,7 @@ from calib.gauss_newton import Flags, Solution, slope_residuals, solve
 from calib.jitter import LagScatter, estimated
 from calib.model import Array, Calibration, Pose, Window
 from calib.nuisances import Applied, Nuisances, Priors
-from calib.verdict import misfit, reasons, turned_windows
+from calib.verdict import misfit, nuisance_pull, reasons, turned_windows
 
 DETERMINED_SHARE = 0.5  # of the prior u, which the data must halve (contract)
 JITTER_TURNS = 3  # the first solution is bent by what it takes for exact; the estimate settles in two
@@ -46,8 +46,9 @@ class Adjustment:
     `calibration` has NaN where the data do not determine a parameter. `contributions` {source: (12,) standard
     uncertainties} is the budget. `reasons`: why it is refused, empty if it is not. `rank` of the input vectors, 4 at
     most. `offset_scatter_mps2`, `slope_scatter` (relative) and `lag_scatter_s`: between windows, as estimated.
-    `misfit`: what S a + Q leaves of the signal. `mean` (N,) and `covariance` (N, N): joint state of [S, Q, nuisances],
-    nothing blanked.
+    `misfit`: what S a + Q leaves of the signal. `nuisance_pull`: how far the nuisances moved from what was stated, in
+    standard deviations, worst direction. `mean` (N,) and `covariance` (N, N): joint state of [S, Q, nuisances], nothing
+    blanked.
     """
 
     calibration: Calibration
@@ -62,6 +63,7 @@ class Adjustment:
     slope_scatter: float
     lag_scatter_s: float
     misfit: float
+    nuisance_pull: float
     mean: Array
     covariance: Array
 
@@ -118,6 +120,7 @@ def adjust(
         slope_scatter=shares.slope_scatter,
         lag_scatter_s=jitter.scatter_s,
         misfit=misfit(solution),
+        nuisance_pull=nuisance_pull(solution, shares.covariance)[0],
         mean=solution.x,
         covariance=shares.covariance,
     )

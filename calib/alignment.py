@@ -13,6 +13,7 @@ import numpy as np
 
 from calib.model import Array, Window, WindowSums
 from calib.sums import factor
+from calib.type_a import NOISE_FLOOR
 
 LEAST_SEGMENTS = 6  # two unknowns, and a scatter of some weight
 SIGNIFICANT = 5.0  # standard uncertainties: else nothing is gained by taking the drift out
@@ -78,4 +79,5 @@ def _of_window(sums: WindowSums) -> tuple[Array, Array]:
     part = factor(sums, derivative=True)
     slopes, *_ = np.linalg.lstsq(part.r[1:, 1:], part.rhs[1:], rcond=UNSEEN)
     variance = np.diag(part.residual) / max(part.count - 2 * m - 1, 1.0)
-    return np.asarray(slopes[:m]), np.asarray(np.maximum(variance, np.finfo(float).tiny))
+    power = np.diag(part.rhs.T @ part.rhs) / part.count
+    return np.asarray(slopes[:m]), np.maximum(variance, NOISE_FLOOR**2 * power.max())

@@ -60,17 +60,27 @@ def solve(equations: Equations, priors: Priors) -> Solution:
     x = mean.copy()
     residual, jacobian = _stacked(equations, x, mean, scale, root)
     for _ in range(MAX_STEPS):
-        # The factor of [J, r] holds that of J and Q'r: Q itself is never needed.
-        factor = np.asarray(np.linalg.qr(np.column_stack([jacobian, residual]), mode="r"), dtype=np.float64)
-        half = np.asarray(np.linalg.inv(factor[: len(x), : len(x)]), dtype=np.float64)
-        step = half @ factor[: len(x), len(x)]
+        half, step = _step(jacobian, residual)
         if np.all(np.abs(step) < np.maximum(CONVERGED * np.linalg.norm(half, axis=1), ROUNDING)):
             break
         x, residual, jacobian = _shortened(equations, x, step, mean, scale, root, float(residual @ residual))
     x = x + step * scale
-    residual, jacobian = equations.at(x).stacked()
-    half = half * scale[:, None]
-    return Solution(equations, x, half, residual, jacobian @ half, mean, precision, bounded)
+    # Where the noise is small the equations bend by more than that within the last step: half is taken at its end.
+    residual, jacobian = _stacked(equations, x, mean, scale, root)
+    half, _ = _step(jacobian, residual)
+    rows = len(residual) - len(x)  # the others are the priors'
+    return Solution(
+        equations, x, half * scale[:, None], residual[:rows], jacobian[:rows] @ half, mean, precision, bounded
+    )
+
+
+def _step(jacobian: Array, residual: Array) -> tuple[Array, Array]:
+    """half with half half' = (J'J)^-1, and the step (N,), of scaled unknowns."""
+    # The factor of [J, r] holds that of J and Q'r: Q itself is never needed.
+    n = jacobian.shape[1]
+    factor = np.asarray(np.linalg.qr(np.column_stack([jacobian, residual]), mode="r"), dtype=np.float64)
+    half = np.asarray(np.linalg.inv(factor[:n, :n]), dtype=np.float64)
+    return half, half @ factor[:n, n]
 
 
 def slope_residuals(solution: Solution) -> tuple[Array, Array]:

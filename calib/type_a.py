@@ -15,7 +15,8 @@ from calib.model import Array
 
 # Correlation of neighbours above which segments are joined in pairs: they are shorter than 3 correlation times.
 RHO_COARSEN = 0.35
-NOISE_FLOOR = 1e-12  # of the signal: exact data would have no noise to weigh by (float64 sums round at 1e-13)
+# Of the signal: exact data would have no noise to weigh by. Sums of squares round at 1e-15, their roots at 3e-8.
+NOISE_FLOOR = 1e-7
 
 
 @dataclass(frozen=True, slots=True, eq=False)

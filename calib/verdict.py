@@ -6,11 +6,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.budget import Budget
 from calib.distributions import chi2_quantile
 from calib.gauss_newton import Flags, Solution
-from calib.model import PARAMETERS, Window
+from calib.model import PARAMETERS, Array, Window
 
 CONTRADICTED = 0.999  # probability: one sound calibration in a thousand is refused as contradicting what was known
 PRIOR_SHARE = 0.01  # of a direction's prior variance that the data must have removed for it to be a test of the prior
@@ -19,6 +20,10 @@ PRIOR_SHARE = 0.01  # of a direction's prior variance that the data must have re
 DECISIVE_CHI2 = 25.0
 DECISIVE_RATIO = 0.25
 MISFIT_LIMIT = 0.1  # of the signal; the worst geometry met with right signs leaves 0.01
+# What was stated of the nuisances is contradicted where it is so even with every stated uncertainty doubled: a clamp
+# twice as bad as its default says is still used.
+STATED_TIMES = 2.0
+LEAST_FELT = 0.1  # of the largest sensitivity, that an output which works has in some direction
 CONFOUNDED_LAG = 0.01  # of the largest sensitivity, that an undetermined lag puts into one of the others
 
 
@@ -38,7 +43,9 @@ def reasons(
         or _sign_reasons(solution, turned)
         or _lag_reasons(solution, shares)
         or [*_prior_reasons(solution), *_misfit_reasons(solution)]
+        or _nuisance_reasons(solution, shares.covariance)
         or _nothing_determined(solution, determined)
+        or dead_reasons(np.where(determined, solution.x[:12], np.nan)[:9].reshape(3, 3))
     )
 
 
@@ -88,9 +95,12 @@ def _sign_reasons(solution: Solution, turned: Callable[[int, int], Solution]) ->
         "the polarity of the reference": turned(1, -1),
         "the static sign and the polarity of the reference": turned(-1, -1),
     }
+    tried = {name: other for name, other in tried.items() if np.isfinite(other.chi2)}
+    if not tried:
+        return []
     best = min(other.chi2 for other in tried.values())
     # Where nothing was known of S, turning gravity and turning the reference fit alike; one of them leaves S positive.
-    alike = [name for name, other in tried.items() if other.chi2 < best + DECISIVE_CHI2]
+    alike = [name for name, other in tried.items() if other.chi2 <= best + DECISIVE_CHI2]
     name = max(alike, key=lambda n: float(tried[n].x[[0, 4, 8]].sum()))
     if best > solution.chi2 - DECISIVE_CHI2 or best > DECISIVE_RATIO * solution.chi2:
         return []
@@ -118,6 +128,53 @@ def _prior_reasons(solution: Solution) -> list[str]:
     return [
         f"the data contradict what was known: chi-squared {statistic:.4g}, limit {limit:.4g} (of {int(tested.sum())}); "
         f"{PARAMETERS[p]} is {solution.x[p]:.5g}, {solution.prior_mean[p]:.5g} with u {u[worst]:.3g} was expected"
+    ]
+
+
+def nuisance_pull(solution: Solution, covariance: Array) -> tuple[float, float, str]:
+    """How far the nuisances moved from what was stated, in the worst direction: in the standard deviations that they
+    have beforehand, the limit, and the one that moved most. The lag is left out: the data alone tell it.
+
+    With H the information and C the `covariance` (N, N), an estimate strays from its prior's mean by P^-1 - 2 H^-1 + C.
+    """
+    terms = solution.equations.nuisances.terms
+    stated = [j for j, t in enumerate(terms) if t.source != "lag"]
+    if not stated:
+        return 0.0, np.inf, ""
+    u, k = np.array([terms[j].uncertainty for j in stated]), 12 + np.array(stated)
+    pull = (solution.x[k] - solution.prior_mean[k]) / u
+    twice = 2.0 * solution.half[k] @ solution.half[k].T - covariance[np.ix_(k, k)]
+    strays, ways = np.linalg.eigh(np.eye(len(k)) - twice / np.outer(u, u))
+    tested = strays > PRIOR_SHARE
+    found = np.abs(ways.T @ pull)[tested] / np.sqrt(strays[tested])
+    single = 1.0 - (1.0 - CONTRADICTED) / max(len(found), 1)
+    worst = int(np.argmax(np.abs(pull)))
+    term, moved = terms[stated[worst]], pull[worst] * u[worst]
+    told = f"{term.name} would be off by {moved:.3g} {term.unit}, its standard uncertainty was stated as {u[worst]:.3g}"
+    limit = STATED_TIMES * float(np.sqrt(chi2_quantile(single, 1.0)))
+    return float(found.max(initial=0.0)), limit, told
+
+
+def _nuisance_reasons(solution: Solution, covariance: Array) -> list[str]:
+    found, limit, told = nuisance_pull(solution, covariance)
+    if found <= limit:
+        return []
+    return [f"the data contradict what was stated: {told} ({found:.3g} standard deviations, limit {limit:.3g})"]
+
+
+def dead_reasons(sensitivity: Array) -> list[str]:
+    """Outputs (rows of S) that hardly feel anything. NaN where not determined.
+
+    Axes that are exchanged are no fault by themselves: S says so, and only what was known beforehand contradicts it.
+    """
+    size = np.abs(sensitivity)
+    largest = float(np.nanmax(size, initial=0.0))
+    felt = np.nanmax(size, axis=1, initial=0.0)
+    told: NDArray[np.bool_] = np.isfinite(size).all(axis=1)
+    return [
+        f"output {axis} is dead: its largest sensitivity is {felt[i]:.4g}, that of the others {largest:.4g}"
+        for i, axis in enumerate("xyz")
+        if told[i] and felt[i] < LEAST_FELT * largest
     ]
 
 

@@ -92,6 +92,7 @@ def _outcome(found: Adjustment, windows: Sequence[Window], rate_hz: float) -> Ou
             "slope_scatter": found.slope_scatter,
             "lag_scatter_s": found.lag_scatter_s,
             "misfit": found.misfit,
+            "nuisance_pull": found.nuisance_pull,
             "invariant": found.invariant,
         },
     )  # fmt: skip

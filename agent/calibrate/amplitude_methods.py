@@ -14,6 +14,7 @@ from calib import method1, method2
 from calib.amplitudes import AmplitudeCalibration, Run
 from calib.model import PARAMETERS
 from calib.statistics import rel_s_pct, transverse_excess
+from calib.verdict import dead_reasons
 
 SOLVE = {"1": method1.solve, "2": method2.solve}
 
@@ -40,7 +41,11 @@ def by_amplitudes(front: FrontEnd, options: dict[str, Any]) -> Outcome:
         found = SOLVE[method](runs, priors)
     except ValueError as error:
         return Outcome(None, (str(error),), windows, front.sensor_clock.rate_hz, method)
-    reasons = (*found.reasons, *contradictions(found.calibration, priors))
+    reasons = (
+        *found.reasons,
+        *dead_reasons(found.calibration.sensitivity),
+        *contradictions(found.calibration, priors),
+    )
     omega = 2 * np.pi * found.frequency_hz
     return Outcome(
         calibration=None if reasons else found.calibration,

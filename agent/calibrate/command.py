@@ -24,6 +24,7 @@ from agent.calibrate.tables import ReferenceTable, TableError, read_reference, r
 from calib.geometry import STANDARD_GRAVITY_MPS2
 from calib.method3 import PLAIN, fit, refusal
 from calib.nuisances import Priors
+from calib.verdict import dead_reasons
 
 BAR_FROM_BYTES = 30_000_000  # shorter files are read before a bar could be of use
 COVERAGE_FACTOR = 2.0  # of plain Method 3: thousands of points, as the paper has it
@@ -185,7 +186,11 @@ def _plain(front: FrontEnd, priors: Priors) -> Outcome:
     if not any(w.used for w in windows):
         return nothing_used(windows, front.sensor_clock.rate_hz, PLAIN)
     found = fit(windows)
-    reasons = (*refusal(found, windows), *contradictions(found.calibration, priors))
+    reasons = (
+        *refusal(found, windows),
+        *dead_reasons(found.calibration.sensitivity),
+        *contradictions(found.calibration, priors),
+    )
     return Outcome(
         None if reasons else found.calibration,
         reasons,

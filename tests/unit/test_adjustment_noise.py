@@ -10,7 +10,7 @@ import pytest
 from calib.adjustment import adjust
 from calib.model import Pose, Window
 from calib.nuisances import Priors
-from tests.clamp_windows import S_TRUE, window_of
+from tests.clamp_windows import S_TRUE, Faults, clamp_points, window_of
 
 RATE_HZ, SECONDS, STRETCH_S = 100.0, 300.0, 10.0
 BESIDE = Pose("beside", np.eye(3), np.full(3, np.nan))
@@ -72,3 +72,16 @@ def test_a_direction_with_no_more_than_the_reference_s_noise_is_not_excited(seed
     assert found.rank == 1
     assert found.calibration.determined.tolist() == [True, False, False] * 3 + [False] * 3
     np.testing.assert_allclose(found.calibration.sensitivity[:, 0], S_TRUE[:, 0], rtol=0, atol=0.03)
+
+
+@pytest.mark.parametrize("noise_mps2", [1e-5, 1e-7, 0.0])
+def test_data_of_hardly_any_noise_leave_what_the_priors_leave(noise_mps2: float) -> None:
+    """Offsets and angles make u; type A at 0.001 m/s2 is a hundredth of it. Simulated data come without noise."""
+    ordinary = adjust(clamp_points(np.random.default_rng(60), Faults(noise_mps2=1e-3)).windows)
+    found = adjust(clamp_points(np.random.default_rng(60), Faults(noise_mps2=noise_mps2)).windows)
+    assert found.reasons == ()
+    # no fault but the noise: what little it says of angles and transverse motion is a tenth of what the priors leave
+    np.testing.assert_allclose(found.calibration.sensitivity, S_TRUE, atol=1e-3)
+    np.testing.assert_allclose(
+        found.calibration.standard_uncertainty, ordinary.calibration.standard_uncertainty, rtol=0.01
+    )

@@ -132,3 +132,58 @@ def test_a_misfit_of_the_size_of_the_signal_is_refused():
     faults = Faults(alpha_rad={300.0: 40.0 * DEGREE}, offset_mps2=0.05)
     windows = clamp_points(np.random.default_rng(11), faults, alphas_deg=(0.0, 30.0, 120.0, 210.0, 300.0)).windows
     assert any("unexplained" in reason or "contradict" in reason for reason in adjust(windows, _nominal()).reasons)
+
+
+def _through(windows: list[Window], matrix: np.ndarray) -> list[Window]:
+    """The same windows with the outputs V times `matrix` (3, 3), the reference as it is."""
+    m = windows[0].sums.reference_channels
+    full = np.eye(2 * m + 3)
+    full[2 * m :, 2 * m :] = matrix
+    return [
+        replace(w, sums=replace(w.sums, mean=w.sums.mean @ full.T, scatter=full @ w.sums.scatter @ full.T))
+        for w in windows
+    ]
+
+
+def _reference_times(windows: list[Window], factor: float) -> list[Window]:
+    scale = np.array([factor, factor, 1.0, 1.0, 1.0])
+    return [
+        replace(w, sums=replace(w.sums, mean=w.sums.mean * scale, scatter=w.sums.scatter * np.outer(scale, scale)))
+        for w in windows
+    ]
+
+
+@pytest.mark.parametrize("factor", [2.0, 0.8, 1.2])
+def test_a_reference_that_gravity_contradicts_is_refused_without_a_nominal(factor):
+    windows = _reference_times(clamp_points(np.random.default_rng(20), ORDINARY).windows, factor)
+    reason = _only_reason(adjust(windows))
+    assert "the data contradict what was stated: " in reason
+    assert "its standard uncertainty was stated as" in reason
+    assert not adjust(windows, replace(Priors(), reference=0.5)).reasons
+
+
+def test_nuisances_drawn_from_their_priors_pull_as_such():
+    """Pull over its limit in 60 sound recordings: a twice too small spread would bring one above 1."""
+    pulls = []
+    for seed in range(60):
+        random = np.random.default_rng([21, seed])
+        alpha = {a: float(random.normal(0.0, 0.2 * DEGREE)) for a in (0.0, 30.0, 120.0, 210.0)}
+        faults = Faults(float(random.normal(0.0, 0.2 * DEGREE)), float(random.normal(0.0, 0.1 * DEGREE)), alpha, 0.05)
+        pulls.append(adjust(clamp_points(random, faults).windows).nuisance_pull)
+    assert 0.5 < np.median(pulls) < 2.5
+    assert max(pulls) < 4.5  # of some seven directions: one sound recording in 2e4 is beyond
+
+
+@pytest.mark.parametrize(
+    ("factors", "output"), [((0.0, 1.0, 1.0), "output x is dead"), ((1.0, 1.0, 1e-3), "output z is dead")]
+)
+def test_a_dead_output_is_refused_without_a_nominal(factors, output):
+    windows = _through(clamp_points(np.random.default_rng(22), Faults()).windows, np.diag(factors))
+    assert adjust(windows, Priors.none()).reasons[0].startswith(output)
+
+
+def test_exchanged_outputs_are_a_sensitivity_like_any_other():
+    windows = _through(clamp_points(np.random.default_rng(22), Faults()).windows, np.eye(3)[[1, 0, 2]])
+    found = adjust(windows, Priors.none())
+    assert found.reasons == ()
+    assert found.calibration.sensitivity[0, 1] > 0.9
