@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.budget import Budget
 from calib.distributions import chi2_quantile
@@ -170,7 +169,7 @@ def dead_reasons(sensitivity: Array) -> list[str]:
     size = np.abs(sensitivity)
     largest = float(np.nanmax(size, initial=0.0))
     felt = np.nanmax(size, axis=1, initial=0.0)
-    told: NDArray[np.bool_] = np.isfinite(size).all(axis=1)
+    told = [bool(np.isfinite(row).all()) for row in size]
     return [
         f"output {axis} is dead: its largest sensitivity is {felt[i]:.4g}, that of the others {largest:.4g}"
         for i, axis in enumerate("xyz")
