@@ -61,6 +61,15 @@ class TestLsm6dso(I2cContract):
         assert after[0] == before[-1] + 1 + lost
         assert rig.sensor.take_drops() == []
 
+    def test_lost_words_show_between_blocks_too(self, rig: Lsm6dsoRig) -> None:
+        rig.sensor.open()
+        _, before = rig.read()
+        rig.sleep(0.02)
+        rig.twin.steal(0, 2)
+        flags, after = rig.read()
+        assert flags == BlockFlags.RESTART
+        assert after[0] == before[-1] + 3
+
     @pytest.mark.parametrize("tag", [1, 3, 4, 5])
     def test_words_of_other_sensors_are_left_out(self, rig: Lsm6dsoRig, tag: int) -> None:
         rig.sensor.open()
