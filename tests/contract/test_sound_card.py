@@ -89,6 +89,23 @@ class TestSoundCard(SensorContract):
         assert rig.number(after.indications)[0] == rig.number(before.indications)[-1] + 1 + 3 + drop.count
         assert isinstance(drop, Drop)
 
+    def test_what_was_read_before_an_overflow_is_kept(self, rig: SoundCardRig) -> None:
+        rig.open()
+        *_, before = rig.blocks(0.6)
+        sleep, start_s = rig.sleep, rig.t_s
+
+        def overflowing_underway(seconds: float) -> None:
+            sleep(seconds)
+            if rig.t_s > start_s + 0.2:
+                rig.sleep = sleep  # type: ignore[method-assign]
+                rig.lose()
+
+        rig.sleep = overflowing_underway  # type: ignore[method-assign]
+        block = next(rig.blocks(0.1))
+        assert block.flags == BlockFlags.NONE
+        assert 0.15 * rig.rate_hz < block.n < 0.25 * rig.rate_hz
+        assert rig.number(block.indications)[0] == rig.number(before.indications)[-1] + 1
+
     def test_a_rate_that_it_does_not_have(self, rig: SoundCardRig) -> None:
         with pytest.raises(DeviceLost, match="at 96000 Hz: Invalid sample rate"):
             rig.build(rate_hz=96000.0).open()
