@@ -64,6 +64,8 @@ def _rank_reasons(windows: Sequence[Window], solution: Solution) -> list[str]:
 def _nothing_determined(solution: Solution, determined: Flags) -> list[str]:
     if determined.any():
         return []
+    if solution.bounded.any() and solution.equations.rank == 4:
+        return ["the data add too little to what was known: no parameter's uncertainty is halved"]
     return [f"rank {solution.equations.rank} of 4: the data determine none of the 12 parameters"]
 
 
