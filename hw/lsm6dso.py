@@ -39,7 +39,7 @@ class Lsm6dso(FifoSensor):
 
     Each word says of which sensor it is and counts from 0 to 3, so that a lost one shows. The nominal rate is the one
     that the part states of itself (INTERNAL_FREQ_FINE). Its own time stamps are not stored: they would double the
-    traffic on the bus, and a sample's time follows from the arrivals to better than their 25 us within a minute.
+    traffic on the bus, and a sample's time follows from the arrivals to some 40 us within a minute, near their 25 us.
     """
 
     options_model = Lsm6dsoOptions
