@@ -83,7 +83,7 @@ def _lag_reasons(solution: Solution, shares: Budget) -> list[str]:
     return [
         f"rank {solution.equations.rank} of 4 with the lag fixed, one less with it: the motion cannot tell the lag "
         f"(u {after * 1e3:.3g} ms of {before * 1e3:.3g} ms before) from a rotation; it puts {moved:.1%} into S. "
-        "Motion in a plane at one frequency does that: excite another frequency or direction, or state the lag"
+        "Motion in a plane at one frequency does that: excite another frequency or direction"
     ]
 
 

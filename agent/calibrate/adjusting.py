@@ -93,7 +93,7 @@ def _outcome(found: Adjustment, windows: Sequence[Window], rate_hz: float) -> Ou
             "lag_scatter_s": found.lag_scatter_s,
             "misfit": found.misfit,
             "nuisance_pull": found.nuisance_pull,
-            "invariant": found.invariant,
+            "invariant": None if found.reasons else found.invariant,
         },
     )  # fmt: skip
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from agent import __version__
 from agent.terminal.quantity import plus_minus
-from calib.model import Array, Calibration, Window
+from calib.model import PARAMETERS, Array, Calibration, Window
 
 AXES = "xyz"
 FILE_WIDTH = 120  # columns where the output is no terminal and tells none
@@ -153,7 +153,27 @@ def _print_calibration(console: Any, outcome: Outcome) -> None:
     console.print(table)
     kind = f", {outcome.uncertainty_kind}" if outcome.uncertainty_kind else ""
     console.print(f"  S in output unit per m/s², Q in output unit, U with k = {outcome.coverage_factor:.3g}{kind}")
+    _print_sources(console, outcome)
     console.print(f"  method {outcome.method}, {sum(w.used for w in outcome.windows)} windows", soft_wrap=True)
+
+
+def _print_sources(console: Any, outcome: Outcome) -> None:
+    """Where the uncertainty of the least known main sensitivity and offset comes from, sources above a tenth of it."""
+    assert outcome.calibration is not None
+    u = outcome.calibration.standard_uncertainty
+    for group in ([0, 4, 8], [9, 10, 11]):
+        told = [k for k in group if np.isfinite(u[k])]
+        if not told or "budget" not in outcome.more:
+            continue
+        worst = max(told, key=lambda k: float(u[k]))
+        parts = {name: _of(source, worst) for name, source in outcome.more["budget"].items()}
+        large = sorted((name for name in parts if parts[name] > 0.1 * u[worst]), key=lambda name: -parts[name])
+        sources = ", ".join(f"{name} {parts[name]:.2g}" for name in large)
+        console.print(f"  u({PARAMETERS[worst]}) = {u[worst]:.2g}: {sources}", soft_wrap=True)
+
+
+def _of(source: Mapping[str, float] | Array, k: int) -> float:
+    return float(source[PARAMETERS[k]] if isinstance(source, Mapping) else source[k])
 
 
 def _cell(value: float, expanded: float, determined: bool) -> str:

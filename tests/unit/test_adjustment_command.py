@@ -182,3 +182,19 @@ def test_too_few_rests_are_refused(tmp_path):
     result = CliRunner().invoke(calibrate, ["--sensor", str(tmp_path / "sensor.csv")], standalone_mode=False)
     assert result.return_value == 3
     assert "10 rests" in result.stderr
+
+
+def test_the_table_says_where_the_uncertainty_comes_from(session):
+    files = [part for name in ("sensor", "reference", "poses") for part in (f"--{name}", str(session / f"{name}.csv"))]
+    result = CliRunner().invoke(calibrate, files, standalone_mode=False)
+    lines = [line.strip() for line in result.stdout.splitlines()]
+    assert any(line.startswith("u(Szz) = ") and ": transverse motion " in line for line in lines), result.stdout
+    assert any(line.startswith("u(Qz) = ") and "transverse motion" in line for line in lines), result.stdout
+
+
+def test_a_refused_result_tells_nothing_of_s(session):
+    files = [part for name in ("sensor", "reference", "poses") for part in (f"--{name}", str(session / f"{name}.csv"))]
+    known = ["--nominal", "2", "--u-nominal-pct", "5", "--json", "-"]
+    result = CliRunner().invoke(calibrate, [*files, *known], standalone_mode=False)
+    told = _told(result)
+    assert (result.return_value, told["sensitivity"], told["invariant"]) == (3, [[None] * 3] * 3, None)
