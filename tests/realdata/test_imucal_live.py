@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pytest
+import zenoh
 
+from agent.delivery.router import open_router
 from tests.realdata.datasets import dataset
 from tests.realdata.test_calibrate_imucal import as_files
 from tests.scenarios.processes import fieldcal, interrupt, recordings, results, started, wait_until
@@ -27,11 +32,29 @@ poses = [
 {poses}
 ]
 [zenoh]
-enabled = false
+connect = ["{endpoint}"]
 """
+KEY = "fieldcal/v1/test/recorded/imu/calibration"
 
 
-def test_played_over_a_port_the_agent_finds_what_imucal_found(tmp_path: Path) -> None:
+@pytest.fixture
+def router() -> Iterator[str]:
+    """The endpoint of a router that is there for the test alone."""
+    session, endpoints = open_router("tcp/127.0.0.1:0")
+    yield endpoints[0]
+    session.close()
+
+
+def published(endpoint: str) -> list[dict[str, Any]]:
+    """What a plain client gets now."""
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("connect/endpoints", json.dumps([endpoint]))
+    with zenoh.open(config) as session:
+        return [json.loads(reply.ok.payload.to_string()) for reply in session.get(KEY) if reply.ok is not None]
+
+
+def test_played_over_a_port_the_agent_finds_what_imucal_found(tmp_path: Path, router: str) -> None:
     as_files(tmp_path)
     rests = np.loadtxt(tmp_path / "poses.csv", delimiter=",", skiprows=1)
     rests = rests[np.argsort(rests[:, 0])]
@@ -42,7 +65,7 @@ def test_played_over_a_port_the_agent_finds_what_imucal_found(tmp_path: Path) ->
         f"  {{ start_s = {start:.6f}, stop_s = {stop:.6f}, gravity_mps2 = {gravity} }},"
         for start, stop, *gravity in rests.tolist()
     )
-    config.write_text(CONFIG.format(port=port, poses=poses))
+    config.write_text(CONFIG.format(port=port, poses=poses, endpoint=router))
     playing = ("simulate", "--play", tmp_path / "sensor.csv", "--sequence", "--link", port)
     with started(*playing, output=tmp_path / "playing"):
         wait_until(port.is_symlink, 20, "the port")
@@ -50,8 +73,9 @@ def test_played_over_a_port_the_agent_finds_what_imucal_found(tmp_path: Path) ->
             # The last rest ends after 27.3 s; what follows is turning.
             wait_until(lambda: len(results(data_dir, "window")) >= len(rests), 60, "six windows")
             wait_until(lambda: results(data_dir, "calibration")[-1]["windows"] == len(rests), 5, "from all of them")
+            in_force = results(data_dir, "calibration")[-1]
+            wait_until(lambda: published(router) == [in_force], 5, "a plain client gets it")
             interrupt(agent)
-    in_force = results(data_dir, "calibration")[-1]
     difference = np.abs(np.array(in_force["sensitivity"]) - expected) / np.diag(expected)[:, None]
     assert difference.max() < WITHIN, difference
     assert "Traceback" not in (tmp_path / "output").read_text()
