@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from agent.config import LARGEST_FILE, ConfigError, load_config, parse_config
+from agent.config import ConfigError, load_config, parse_config
+from agent.config.reading import LARGEST_FILE
 
 DEVICES = """
 [[devices]]
