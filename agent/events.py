@@ -59,7 +59,27 @@ class Tick(msgspec.Struct, frozen=True, kw_only=True):
     t_utc_ns: int
 
 
-Event = RunStart | SampleBlock | DeviceChange | Gap | Tick
+class Command(msgspec.Struct, frozen=True, kw_only=True):
+    """What an operator asked for; refused ones are events as well, for the record, and change nothing.
+
+    `arguments_json` by verb: pose {"theta_deg", "alpha_deg"} or {"direction", "gravity_mps2"} or {"gravity_mps2"} with
+    an optional "position"; hold {} or {"release": true}; accept {"sequence"} of an Estimate; rollback {"sequence"} of
+    a calibration, which the event then carries whole in `calibration_json`. `key_id` is empty where it was given on
+    the gateway itself.
+    """
+
+    sensor: str
+    verb: Literal["pose", "hold", "accept", "rollback"]
+    t_monotonic_ns: int
+    t_utc_ns: int
+    arguments_json: str = "{}"
+    calibration_json: str = ""
+    key_id: str = ""
+    counter: int = 0
+    refused: str = ""  # why; "" where it was taken
+
+
+Event = RunStart | SampleBlock | DeviceChange | Gap | Command | Tick
 
 
 class WindowReport(msgspec.Struct, frozen=True, kw_only=True):
@@ -80,7 +100,12 @@ class WindowReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class CalibrationUpdate(msgspec.Struct, frozen=True, kw_only=True):
-    """S and Q in force from now on."""
+    """S and Q in force from now on.
+
+    Where a parameter is not determined its value and uncertainty are the prior's. At a temperature T the offset is
+    Q + sum of offset_temperature[k - 1] (T - T0)^k over k = 1.., T0 = reference_temperature_degc, and row i of S is
+    multiplied by 1 + sensitivity_temperature[i] (T - T0); both were seen between the two ends of the range only.
+    """
 
     run_id: str
     sequence: int
@@ -98,6 +123,47 @@ class CalibrationUpdate(msgspec.Struct, frozen=True, kw_only=True):
     residual_sd: list[float]  # per output axis, output unit
     output_unit: str
     identity: str  # device kind, serial number and settings this calibration belongs to
+    reference_temperature_degc: float = float("nan")  # NaN where the device tells no temperature
+    temperature_low_degc: float = float("nan")
+    temperature_high_degc: float = float("nan")
+    offset_temperature: list[list[float]] = []  # (order, 3), output unit per K^k
+    u_offset_temperature: list[list[float]] = []
+    sensitivity_temperature: list[float] = []  # (3,) per K; empty where it is not modelled
+    u_sensitivity_temperature: list[float] = []
+    offset_rate: list[float] = []  # (3,) output unit per day
+    u_offset_rate: list[float] = []
+
+
+class Estimate(msgspec.Struct, frozen=True, kw_only=True):
+    """S and Q as the data have them, not in force: they wait for an operator's `accept` of this `sequence`."""
+
+    run_id: str
+    sequence: int
+    sensor: str
+    t_utc_ns: int
+    reason: str
+    calibration: CalibrationUpdate
+
+
+class DriftReport(msgspec.Struct, frozen=True, kw_only=True):
+    """The sequential test's verdict on one parameter, whenever it changes. It is the sensor or the reference: data
+    cannot tell."""
+
+    run_id: str
+    sequence: int
+    sensor: str
+    t_utc_ns: int
+    parameter: str  # of calib.model.PARAMETERS
+    verdict: Literal["stable", "drifting", "stepped"]
+    change: float  # stepped: by how much, output unit (per m/s2)
+    u_change: float
+    rate: float  # drifting: a day
+    u_rate: float
+    onset_utc_ns: int  # stepped: since when
+    statistic: float
+    threshold: float
+    false_alarms_a_year: float
+    reason: str
 
 
 class StatusChange(msgspec.Struct, frozen=True, kw_only=True):
@@ -112,4 +178,4 @@ class StatusChange(msgspec.Struct, frozen=True, kw_only=True):
     reason: str
 
 
-Result = WindowReport | CalibrationUpdate | StatusChange
+Result = WindowReport | CalibrationUpdate | Estimate | DriftReport | StatusChange

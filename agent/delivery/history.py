@@ -14,11 +14,17 @@ from urllib.parse import quote
 
 import msgspec
 
-from agent.events import CalibrationUpdate, Result, StatusChange, WindowReport
+from agent.events import CalibrationUpdate, DriftReport, Estimate, Result, StatusChange, WindowReport
 
 FILE_NAME = "state.sqlite"
 SCHEMA_VERSION = 1
-_TYPES: dict[str, type[Result]] = {"calibration": CalibrationUpdate, "window": WindowReport, "status": StatusChange}
+_TYPES: dict[str, type[Result]] = {
+    "calibration": CalibrationUpdate,
+    "window": WindowReport,
+    "estimate": Estimate,
+    "drift": DriftReport,
+    "status": StatusChange,
+}
 _KINDS = {kind: what for what, kind in _TYPES.items()}
 _COLUMNS = "sequence, run_id, sensor, what, payload, t_utc_ns, recorded, recording, identity"
 

@@ -7,7 +7,7 @@ from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
 DESCRIPTOR: _descriptor.FileDescriptor
 
 class Event(_message.Message):
-    __slots__ = ("event_sequence", "run_start", "device_change", "gap", "tick")
+    __slots__ = ("event_sequence", "run_start", "device_change", "gap", "tick", "command")
     class RunStart(_message.Message):
         __slots__ = ("run_id", "site", "gateway", "boot_id", "t_monotonic_ns", "t_utc_ns", "config_json", "versions", "fingerprint", "snapshot", "file_sequence", "continuation")
         class VersionsEntry(_message.Message):
@@ -86,17 +86,40 @@ class Event(_message.Message):
         t_monotonic_ns: int
         t_utc_ns: int
         def __init__(self, t_monotonic_ns: _Optional[int] = ..., t_utc_ns: _Optional[int] = ...) -> None: ...
+    class Command(_message.Message):
+        __slots__ = ("sensor", "verb", "t_monotonic_ns", "t_utc_ns", "arguments_json", "calibration_json", "key_id", "counter", "refused")
+        SENSOR_FIELD_NUMBER: _ClassVar[int]
+        VERB_FIELD_NUMBER: _ClassVar[int]
+        T_MONOTONIC_NS_FIELD_NUMBER: _ClassVar[int]
+        T_UTC_NS_FIELD_NUMBER: _ClassVar[int]
+        ARGUMENTS_JSON_FIELD_NUMBER: _ClassVar[int]
+        CALIBRATION_JSON_FIELD_NUMBER: _ClassVar[int]
+        KEY_ID_FIELD_NUMBER: _ClassVar[int]
+        COUNTER_FIELD_NUMBER: _ClassVar[int]
+        REFUSED_FIELD_NUMBER: _ClassVar[int]
+        sensor: str
+        verb: str
+        t_monotonic_ns: int
+        t_utc_ns: int
+        arguments_json: str
+        calibration_json: str
+        key_id: str
+        counter: int
+        refused: str
+        def __init__(self, sensor: _Optional[str] = ..., verb: _Optional[str] = ..., t_monotonic_ns: _Optional[int] = ..., t_utc_ns: _Optional[int] = ..., arguments_json: _Optional[str] = ..., calibration_json: _Optional[str] = ..., key_id: _Optional[str] = ..., counter: _Optional[int] = ..., refused: _Optional[str] = ...) -> None: ...
     EVENT_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     RUN_START_FIELD_NUMBER: _ClassVar[int]
     DEVICE_CHANGE_FIELD_NUMBER: _ClassVar[int]
     GAP_FIELD_NUMBER: _ClassVar[int]
     TICK_FIELD_NUMBER: _ClassVar[int]
+    COMMAND_FIELD_NUMBER: _ClassVar[int]
     event_sequence: int
     run_start: Event.RunStart
     device_change: Event.DeviceChange
     gap: Event.Gap
     tick: Event.Tick
-    def __init__(self, event_sequence: _Optional[int] = ..., run_start: _Optional[_Union[Event.RunStart, _Mapping]] = ..., device_change: _Optional[_Union[Event.DeviceChange, _Mapping]] = ..., gap: _Optional[_Union[Event.Gap, _Mapping]] = ..., tick: _Optional[_Union[Event.Tick, _Mapping]] = ...) -> None: ...
+    command: Event.Command
+    def __init__(self, event_sequence: _Optional[int] = ..., run_start: _Optional[_Union[Event.RunStart, _Mapping]] = ..., device_change: _Optional[_Union[Event.DeviceChange, _Mapping]] = ..., gap: _Optional[_Union[Event.Gap, _Mapping]] = ..., tick: _Optional[_Union[Event.Tick, _Mapping]] = ..., command: _Optional[_Union[Event.Command, _Mapping]] = ...) -> None: ...
 
 class RawBlock(_message.Message):
     __slots__ = ("event_sequence", "device", "boot_id", "t_utc_ns", "first_index", "nominal_rate_hz", "flags", "temperature_raw", "temperature_degc", "axes", "decimal", "burst_t_monotonic_ns", "burst_count", "x_counts", "y_counts", "z_counts", "x", "y", "z")
@@ -220,7 +243,7 @@ class Window(_message.Message):
     def __init__(self, event_sequence: _Optional[int] = ..., run_id: _Optional[str] = ..., sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., start_s: _Optional[float] = ..., stop_s: _Optional[float] = ..., position: _Optional[str] = ..., used: _Optional[bool] = ..., reason: _Optional[str] = ..., points: _Optional[int] = ..., left_out: _Optional[int] = ..., numbers: _Optional[_Mapping[str, float]] = ...) -> None: ...
 
 class Calibration(_message.Message):
-    __slots__ = ("event_sequence", "run_id", "sequence", "sensor", "t_utc_ns", "sxx", "sxy", "sxz", "syx", "syy", "syz", "szx", "szy", "szz", "qx", "qy", "qz", "u_sxx", "u_sxy", "u_sxz", "u_syx", "u_syy", "u_syz", "u_szx", "u_szy", "u_szz", "u_qx", "u_qy", "u_qz", "coverage_factor", "residual_sd_x", "residual_sd_y", "residual_sd_z", "windows", "method", "uncertainty_kind", "output_unit", "identity", "determined", "covariance")
+    __slots__ = ("event_sequence", "run_id", "sequence", "sensor", "t_utc_ns", "sxx", "sxy", "sxz", "syx", "syy", "syz", "szx", "szy", "szz", "qx", "qy", "qz", "u_sxx", "u_sxy", "u_sxz", "u_syx", "u_syy", "u_syz", "u_szx", "u_szy", "u_szz", "u_qx", "u_qy", "u_qz", "coverage_factor", "residual_sd_x", "residual_sd_y", "residual_sd_z", "windows", "method", "uncertainty_kind", "output_unit", "identity", "determined", "covariance", "reference_temperature_degc", "temperature_low_degc", "temperature_high_degc", "offset_temperature", "u_offset_temperature", "sensitivity_temperature", "u_sensitivity_temperature", "offset_rate", "u_offset_rate")
     EVENT_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     RUN_ID_FIELD_NUMBER: _ClassVar[int]
     SEQUENCE_FIELD_NUMBER: _ClassVar[int]
@@ -261,6 +284,15 @@ class Calibration(_message.Message):
     IDENTITY_FIELD_NUMBER: _ClassVar[int]
     DETERMINED_FIELD_NUMBER: _ClassVar[int]
     COVARIANCE_FIELD_NUMBER: _ClassVar[int]
+    REFERENCE_TEMPERATURE_DEGC_FIELD_NUMBER: _ClassVar[int]
+    TEMPERATURE_LOW_DEGC_FIELD_NUMBER: _ClassVar[int]
+    TEMPERATURE_HIGH_DEGC_FIELD_NUMBER: _ClassVar[int]
+    OFFSET_TEMPERATURE_FIELD_NUMBER: _ClassVar[int]
+    U_OFFSET_TEMPERATURE_FIELD_NUMBER: _ClassVar[int]
+    SENSITIVITY_TEMPERATURE_FIELD_NUMBER: _ClassVar[int]
+    U_SENSITIVITY_TEMPERATURE_FIELD_NUMBER: _ClassVar[int]
+    OFFSET_RATE_FIELD_NUMBER: _ClassVar[int]
+    U_OFFSET_RATE_FIELD_NUMBER: _ClassVar[int]
     event_sequence: int
     run_id: str
     sequence: int
@@ -301,7 +333,16 @@ class Calibration(_message.Message):
     identity: str
     determined: _containers.RepeatedScalarFieldContainer[bool]
     covariance: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, event_sequence: _Optional[int] = ..., run_id: _Optional[str] = ..., sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., sxx: _Optional[float] = ..., sxy: _Optional[float] = ..., sxz: _Optional[float] = ..., syx: _Optional[float] = ..., syy: _Optional[float] = ..., syz: _Optional[float] = ..., szx: _Optional[float] = ..., szy: _Optional[float] = ..., szz: _Optional[float] = ..., qx: _Optional[float] = ..., qy: _Optional[float] = ..., qz: _Optional[float] = ..., u_sxx: _Optional[float] = ..., u_sxy: _Optional[float] = ..., u_sxz: _Optional[float] = ..., u_syx: _Optional[float] = ..., u_syy: _Optional[float] = ..., u_syz: _Optional[float] = ..., u_szx: _Optional[float] = ..., u_szy: _Optional[float] = ..., u_szz: _Optional[float] = ..., u_qx: _Optional[float] = ..., u_qy: _Optional[float] = ..., u_qz: _Optional[float] = ..., coverage_factor: _Optional[float] = ..., residual_sd_x: _Optional[float] = ..., residual_sd_y: _Optional[float] = ..., residual_sd_z: _Optional[float] = ..., windows: _Optional[int] = ..., method: _Optional[str] = ..., uncertainty_kind: _Optional[str] = ..., output_unit: _Optional[str] = ..., identity: _Optional[str] = ..., determined: _Optional[_Iterable[bool]] = ..., covariance: _Optional[_Iterable[float]] = ...) -> None: ...
+    reference_temperature_degc: float
+    temperature_low_degc: float
+    temperature_high_degc: float
+    offset_temperature: _containers.RepeatedScalarFieldContainer[float]
+    u_offset_temperature: _containers.RepeatedScalarFieldContainer[float]
+    sensitivity_temperature: _containers.RepeatedScalarFieldContainer[float]
+    u_sensitivity_temperature: _containers.RepeatedScalarFieldContainer[float]
+    offset_rate: _containers.RepeatedScalarFieldContainer[float]
+    u_offset_rate: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, event_sequence: _Optional[int] = ..., run_id: _Optional[str] = ..., sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., sxx: _Optional[float] = ..., sxy: _Optional[float] = ..., sxz: _Optional[float] = ..., syx: _Optional[float] = ..., syy: _Optional[float] = ..., syz: _Optional[float] = ..., szx: _Optional[float] = ..., szy: _Optional[float] = ..., szz: _Optional[float] = ..., qx: _Optional[float] = ..., qy: _Optional[float] = ..., qz: _Optional[float] = ..., u_sxx: _Optional[float] = ..., u_sxy: _Optional[float] = ..., u_sxz: _Optional[float] = ..., u_syx: _Optional[float] = ..., u_syy: _Optional[float] = ..., u_syz: _Optional[float] = ..., u_szx: _Optional[float] = ..., u_szy: _Optional[float] = ..., u_szz: _Optional[float] = ..., u_qx: _Optional[float] = ..., u_qy: _Optional[float] = ..., u_qz: _Optional[float] = ..., coverage_factor: _Optional[float] = ..., residual_sd_x: _Optional[float] = ..., residual_sd_y: _Optional[float] = ..., residual_sd_z: _Optional[float] = ..., windows: _Optional[int] = ..., method: _Optional[str] = ..., uncertainty_kind: _Optional[str] = ..., output_unit: _Optional[str] = ..., identity: _Optional[str] = ..., determined: _Optional[_Iterable[bool]] = ..., covariance: _Optional[_Iterable[float]] = ..., reference_temperature_degc: _Optional[float] = ..., temperature_low_degc: _Optional[float] = ..., temperature_high_degc: _Optional[float] = ..., offset_temperature: _Optional[_Iterable[float]] = ..., u_offset_temperature: _Optional[_Iterable[float]] = ..., sensitivity_temperature: _Optional[_Iterable[float]] = ..., u_sensitivity_temperature: _Optional[_Iterable[float]] = ..., offset_rate: _Optional[_Iterable[float]] = ..., u_offset_rate: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Status(_message.Message):
     __slots__ = ("event_sequence", "run_id", "sequence", "sensor", "t_utc_ns", "status", "before", "reason")
@@ -322,3 +363,57 @@ class Status(_message.Message):
     before: str
     reason: str
     def __init__(self, event_sequence: _Optional[int] = ..., run_id: _Optional[str] = ..., sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., status: _Optional[str] = ..., before: _Optional[str] = ..., reason: _Optional[str] = ...) -> None: ...
+
+class Estimate(_message.Message):
+    __slots__ = ("event_sequence", "run_id", "sequence", "sensor", "t_utc_ns", "reason", "calibration")
+    EVENT_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    RUN_ID_FIELD_NUMBER: _ClassVar[int]
+    SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    SENSOR_FIELD_NUMBER: _ClassVar[int]
+    T_UTC_NS_FIELD_NUMBER: _ClassVar[int]
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    CALIBRATION_FIELD_NUMBER: _ClassVar[int]
+    event_sequence: int
+    run_id: str
+    sequence: int
+    sensor: str
+    t_utc_ns: int
+    reason: str
+    calibration: bytes
+    def __init__(self, event_sequence: _Optional[int] = ..., run_id: _Optional[str] = ..., sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., reason: _Optional[str] = ..., calibration: _Optional[bytes] = ...) -> None: ...
+
+class Drift(_message.Message):
+    __slots__ = ("event_sequence", "run_id", "sequence", "sensor", "t_utc_ns", "parameter", "verdict", "change", "u_change", "rate", "u_rate", "onset_utc_ns", "statistic", "threshold", "false_alarms_a_year", "reason")
+    EVENT_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    RUN_ID_FIELD_NUMBER: _ClassVar[int]
+    SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    SENSOR_FIELD_NUMBER: _ClassVar[int]
+    T_UTC_NS_FIELD_NUMBER: _ClassVar[int]
+    PARAMETER_FIELD_NUMBER: _ClassVar[int]
+    VERDICT_FIELD_NUMBER: _ClassVar[int]
+    CHANGE_FIELD_NUMBER: _ClassVar[int]
+    U_CHANGE_FIELD_NUMBER: _ClassVar[int]
+    RATE_FIELD_NUMBER: _ClassVar[int]
+    U_RATE_FIELD_NUMBER: _ClassVar[int]
+    ONSET_UTC_NS_FIELD_NUMBER: _ClassVar[int]
+    STATISTIC_FIELD_NUMBER: _ClassVar[int]
+    THRESHOLD_FIELD_NUMBER: _ClassVar[int]
+    FALSE_ALARMS_A_YEAR_FIELD_NUMBER: _ClassVar[int]
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    event_sequence: int
+    run_id: str
+    sequence: int
+    sensor: str
+    t_utc_ns: int
+    parameter: str
+    verdict: str
+    change: float
+    u_change: float
+    rate: float
+    u_rate: float
+    onset_utc_ns: int
+    statistic: float
+    threshold: float
+    false_alarms_a_year: float
+    reason: str
+    def __init__(self, event_sequence: _Optional[int] = ..., run_id: _Optional[str] = ..., sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., parameter: _Optional[str] = ..., verdict: _Optional[str] = ..., change: _Optional[float] = ..., u_change: _Optional[float] = ..., rate: _Optional[float] = ..., u_rate: _Optional[float] = ..., onset_utc_ns: _Optional[int] = ..., statistic: _Optional[float] = ..., threshold: _Optional[float] = ..., false_alarms_a_year: _Optional[float] = ..., reason: _Optional[str] = ...) -> None: ...

@@ -64,7 +64,7 @@ def compare(
     for before, now in zip(recorded, computed, strict=False):
         if type(before) is not type(now) or topic_of(before) != topic_of(now):
             return difference(topic_of(before), "kind", topic_of(before), topic_of(now), decision=True)
-        pair = (msgspec.structs.asdict(before), msgspec.structs.asdict(now))
+        pair = (msgspec.to_builtins(before), msgspec.to_builtins(now))
         for field, a, b in differences(*pair, tolerance):
             return difference(topic_of(before), field, a, b, decision=not isinstance(a, float))
     if len(recorded) > len(computed) or (complete and len(recorded) < len(computed)):

@@ -16,7 +16,10 @@ from google.protobuf.message import DecodeError, Message
 
 from agent.events import (
     CalibrationUpdate,
+    Command,
     DeviceChange,
+    DriftReport,
+    Estimate,
     Event,
     Gap,
     Result,
@@ -32,17 +35,26 @@ from hw.block import SampleBlock
 
 PACKAGE = "fieldcal.v1"
 EVENTS_TOPIC = "/events"
-RESULT_TOPICS = {WindowReport: "window", CalibrationUpdate: "calibration", StatusChange: "status"}
+RESULT_TOPICS: dict[type[Any], str] = {
+    WindowReport: "window",
+    CalibrationUpdate: "calibration",
+    Estimate: "estimate",
+    DriftReport: "drift",
+    StatusChange: "status",
+}
 
 _EVENT_FIELDS: dict[type[Any], str] = {
     RunStart: "run_start",
     DeviceChange: "device_change",
     Gap: "gap",
+    Command: "command",
     Tick: "tick",
 }
 _EVENT_KINDS = {field: kind for kind, field in _EVENT_FIELDS.items()}
 _S_AND_Q = [name.lower() for name in PARAMETERS]
 _U = [f"u_{name}" for name in _S_AND_Q]
+_BY_POWER = ["offset_temperature", "u_offset_temperature"]
+_BY_AXIS = ["sensitivity_temperature", "u_sensitivity_temperature", "offset_rate", "u_offset_rate"]
 _RESIDUALS = ["residual_sd_x", "residual_sd_y", "residual_sd_z"]
 
 
@@ -54,7 +66,7 @@ def topic_of(item: Event | Result) -> str:
     """Topic on which an event or result is recorded."""
     if isinstance(item, SampleBlock):
         return f"/{item.device}/raw"
-    if isinstance(item, WindowReport | CalibrationUpdate | StatusChange):
+    if isinstance(item, Result):
         return f"/{item.sensor}/{RESULT_TOPICS[type(item)]}"
     return EVENTS_TOPIC
 
@@ -84,6 +96,10 @@ def encode(event_sequence: int, item: Event | Result) -> bytes:
         return encode_block(event_sequence, item)
     if isinstance(item, CalibrationUpdate):
         message: Message = _calibration_message(event_sequence, item)
+    elif isinstance(item, Estimate):
+        message = _estimate_message(event_sequence, item)
+    elif isinstance(item, DriftReport):
+        message = pb.Drift(event_sequence=event_sequence, **msgspec.structs.asdict(item))
     elif isinstance(item, WindowReport):
         message = pb.Window(event_sequence=event_sequence, **msgspec.structs.asdict(item))
     elif isinstance(item, StatusChange):
@@ -137,7 +153,7 @@ def _values(message: Message) -> dict[str, Any]:
 
 
 def _result_decoder(
-    message_type: Callable[[], Message], kind: type[WindowReport] | type[StatusChange]
+    message_type: Callable[[], Message], kind: type[WindowReport] | type[DriftReport] | type[StatusChange]
 ) -> Callable[[bytes], tuple[int, Event | Result]]:
     def decode_result(data: bytes) -> tuple[int, Event | Result]:
         message = message_type()
@@ -155,6 +171,7 @@ def _calibration_message(event_sequence: int, update: CalibrationUpdate) -> pb.C
     values |= zip(_S_AND_Q, s_and_q, strict=True)
     values |= zip(_U, values.pop("standard_uncertainty"), strict=True)
     values |= zip(_RESIDUALS, values.pop("residual_sd"), strict=True)
+    values |= {name: np.ravel(values[name]) for name in _BY_POWER}
     return pb.Calibration(event_sequence=event_sequence, covariance=covariance.ravel(), **values)
 
 
@@ -166,8 +183,23 @@ def _decode_calibration(data: bytes) -> tuple[int, Result]:
     values["standard_uncertainty"] = [values.pop(name) for name in _U]
     values["residual_sd"] = [values.pop(name) for name in _RESIDUALS]
     values["covariance"] = np.array(values["covariance"]).reshape(12, 12).tolist()
-    values["determined"] = list(values["determined"])
+    values |= {name: np.reshape(values[name], (-1, 3)).tolist() for name in _BY_POWER}
+    values |= {name: list(values[name]) for name in ("determined", *_BY_AXIS)}
     return values.pop("event_sequence"), msgspec.convert(values, CalibrationUpdate)
+
+
+def _estimate_message(event_sequence: int, estimate: Estimate) -> pb.Estimate:
+    values = msgspec.structs.asdict(estimate)
+    inside = _calibration_message(event_sequence, values.pop("calibration"))
+    return pb.Estimate(
+        event_sequence=event_sequence, calibration=inside.SerializeToString(deterministic=True), **values
+    )
+
+
+def _decode_estimate(data: bytes) -> tuple[int, Result]:
+    values = _values(pb.Estimate.FromString(data))
+    _, values["calibration"] = _decode_calibration(values["calibration"])
+    return values.pop("event_sequence"), msgspec.convert(values, Estimate)
 
 
 _DECODERS: dict[str, Callable[[bytes], tuple[int, Event | Result]]] = {
@@ -175,5 +207,7 @@ _DECODERS: dict[str, Callable[[bytes], tuple[int, Event | Result]]] = {
     f"{PACKAGE}.RawBlock": decode_block,
     f"{PACKAGE}.Window": _result_decoder(pb.Window, WindowReport),
     f"{PACKAGE}.Calibration": _decode_calibration,
+    f"{PACKAGE}.Estimate": _decode_estimate,
+    f"{PACKAGE}.Drift": _result_decoder(pb.Drift, DriftReport),
     f"{PACKAGE}.Status": _result_decoder(pb.Status, StatusChange),
 }

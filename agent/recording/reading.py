@@ -16,11 +16,9 @@ from typing import BinaryIO
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
-from agent.events import CalibrationUpdate, Event, Result, RunStart, StatusChange, WindowReport
+from agent.events import Event, Result, RunStart
 from agent.recording.messages import MessageError, decode, topic_of
 from agent.recording.records import ChunkMessage, Fault, Record, RecordError, content, refusal, unpack, walk
-
-RESULTS = (WindowReport, CalibrationUpdate, StatusChange)
 
 
 @dataclass(slots=True)
@@ -52,7 +50,7 @@ class RecordingReader:
         try:
             with open_recording(self.path) as file:
                 for record, number, item in self._items(file):
-                    if isinstance(item, RESULTS):
+                    if isinstance(item, Result):
                         if step is None or number != step.event_sequence:
                             raise refusal(record, f"a result of event {number} does not follow it")
                         step.results.append(item)

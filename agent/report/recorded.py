@@ -80,7 +80,7 @@ def _take(out: Recorded, event: Event, results: list[Result], windows: _Windows)
             out.calibrations.append(result)
         elif isinstance(result, StatusChange):
             out.status = result
-        else:
+        elif isinstance(result, WindowReport):
             out.windows.append(result)
             trace = windows.trace(result) if result.used else None
             if trace is not None:

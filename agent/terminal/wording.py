@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from agent.events import CalibrationUpdate, Result, StatusChange, WindowReport
+from agent.events import CalibrationUpdate, DriftReport, Estimate, Result, StatusChange, WindowReport
 from agent.terminal.quantity import plus_minus, size
 from calib.method3 import PLAIN
 from calib.model import Array
@@ -25,6 +25,11 @@ def result_lines(result: Result, truth: Truth | None) -> list[str]:
             return [f"{result.sensor}: window {window_span(result)} at {result.position}: {verdict(result)}"]
         case StatusChange():
             return [f"{result.sensor}: {result.status}{f', {result.reason}' if result.reason else ''}"]
+        case DriftReport():
+            return [f"{result.sensor}: {result.parameter} {result.verdict}: {result.reason}"]
+        case Estimate():
+            lines = [f"{result.sensor}: estimate {result.sequence}, not in force: {result.reason}"]
+            return lines + [f"  {row}" for row in calibration_rows(result.calibration)]
         case CalibrationUpdate():
             lines = [f"{result.sensor}: calibration from {result.windows} windows, {uncertainty_words(result)}"]
             lines += [f"  {row}" for row in calibration_rows(result)]

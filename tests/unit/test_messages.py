@@ -19,7 +19,10 @@ from hypothesis import strategies as st
 
 from agent.events import (
     CalibrationUpdate,
+    Command,
     DeviceChange,
+    DriftReport,
+    Estimate,
     Gap,
     RunStart,
     StatusChange,
@@ -36,8 +39,10 @@ STRUCTS = [
     RunStart,
     DeviceChange,
     Gap,
+    Command,
     Tick,
     WindowReport,
+    DriftReport,
     StatusChange,
 ]
 INTEGER = st.integers(-(2**63), 2**63 - 1)
@@ -100,8 +105,19 @@ def test_calibration_comes_back_as_it_was(numbers: list[float], cells: st.DataOb
         residual_sd=numbers[25:28],
         output_unit="count",
         identity="i",
+        reference_temperature_degc=numbers[0],
+        temperature_low_degc=numbers[1],
+        temperature_high_degc=numbers[2],
+        offset_temperature=[numbers[3:6], numbers[6:9]],
+        u_offset_temperature=[numbers[4:7], numbers[7:10]],
+        sensitivity_temperature=numbers[5:8],
+        u_sensitivity_temperature=numbers[6:9],
+        offset_rate=numbers[7:10],
+        u_offset_rate=numbers[8:11],
     )
-    assert bits(msgspec.structs.asdict(through_the_wire(9, update))) == bits(msgspec.structs.asdict(update))
+    assert bits(msgspec.to_builtins(through_the_wire(9, update))) == bits(msgspec.to_builtins(update))
+    estimate = Estimate(run_id="r", sequence=4, sensor="s", t_utc_ns=5, reason="beyond", calibration=update)
+    assert bits(msgspec.to_builtins(through_the_wire(9, estimate))) == bits(msgspec.to_builtins(estimate))
 
 
 def test_calibration_scalars_have_the_papers_names() -> None:

@@ -76,6 +76,8 @@ def test_other_readers_see_topics_times_and_numbers(tmp_path: Path) -> None:
             "/ref/raw",
             "/bridge-1/window",
             "/bridge-1/calibration",
+            "/bridge-1/estimate",
+            "/bridge-1/drift",
             "/bridge-1/status",
         }
         messages = list(make_reader(file, validate_crcs=True).iter_messages(topics="/acc/raw"))
