@@ -51,15 +51,22 @@ class Equations:
     """Condensed windows, the pose of each, and the weights: the functions that Gauss-Newton needs."""
 
     def __init__(
-        self, data: Condensed, nuisances: Nuisances, pose_of: list[int], offset_scatter_mps2: float, jitter: LagScatter
+        self,
+        data: Condensed,
+        nuisances: Nuisances,
+        pose_of: list[int],
+        offset_scatter_mps2: float,
+        jitter: LagScatter,
+        output_per_mps2: float | None = None,
     ) -> None:
-        """`pose_of` (W,) the nuisances' pose of a window; `offset_scatter_mps2` and `jitter` between windows."""
+        """`pose_of` (W,) the nuisances' pose of a window; `offset_scatter_mps2` and `jitter` between windows;
+        `output_per_mps2` the sensor's scale, None: as the data show."""
         self.data, self.nuisances, self.jitter = data, nuisances, jitter
         self.pose_of_window = np.array(pose_of)
         self.pose_of_block = self.pose_of_window[data.block_window]
         known = np.isfinite(nuisances.gravity).all(axis=1)[self.pose_of_window]
         self.known = known
-        self.output_per_mps2 = self._output_per_mps2()
+        self.output_per_mps2 = self._output_per_mps2() if output_per_mps2 is None else output_per_mps2
         self.unseen = self._unseen_inputs()
         self.rank = 4 - len(self.unseen)
         self.seen = self._seen()

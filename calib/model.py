@@ -69,6 +69,7 @@ class Window:
     left_out: int
     kind: Literal["motion", "rest", "quiet"] = "motion"
     numbers: Mapping[str, float] = field(default_factory=dict)
+    reference_noise: Array | None = None  # (2, m) rms of the reference's own noise in u, m/s2, and in du/dt, m/s3
 
 
 @dataclass(frozen=True, slots=True, eq=False)

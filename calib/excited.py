@@ -1,0 +1,72 @@
+"""Which channels of a reference were excited in a window, and what its own noise did to the sums.
+
+A channel that holds noise alone would be taken for a motion that the sensor does not feel, and pull its column of S to
+zero; one that moves along with another adds to what the sensor feels. So silent channels leave the basis, and the
+directions of the others take up what of them moved along.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.model import Array, Window, WindowSums
+from calib.nuisances import own_channels
+
+# Power over that of the channel's own noise: with less, what is left of the noise's attenuation after its correction
+# (a tenth of it) is above 1 %.
+OVER_NOISE = 10.0
+OF_STRONGEST = 1e-4  # of the strongest channel's power: 1 % of its amplitude
+MOST_NOISE = 0.5  # of a segment's power, that may be taken for noise
+CORRECTION_SHARE = 0.1  # to which the noise's power is known: a spectrum of some hundred lines
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Excitation:
+    """`window` with silent channels taken out and the noise's power out of the others; `directions` (3, k) orthonormal,
+    of what was excited, in the sensor's frame; `attenuation` relative uncertainty that the correction leaves."""
+
+    window: Window
+    directions: Array
+    attenuation: float
+
+
+def excited(window: Window) -> Excitation:
+    """See the module. A window at rest, or of a uniaxial reference without known noise, is as it was."""
+    m = own_channels(window.sums.reference_channels)
+    if m == 0:
+        return Excitation(window, np.zeros((3, 0)), 0.0)
+    power = np.diagonal(window.sums.scatter.sum(axis=0))[:m] / window.sums.count.sum()
+    noise = np.zeros((2, m)) if window.reference_noise is None else window.reference_noise**2
+    live = (power > OF_STRONGEST * power.max(initial=0.0)) & (power > OVER_NOISE * noise[0])
+    share = float(np.max(noise[0][live] / power[live], initial=0.0))
+    basis, _ = np.linalg.qr(window.pose.direction[:, np.flatnonzero(live)])
+    return Excitation(_reduced(window, live, noise), basis, CORRECTION_SHARE * share)
+
+
+def _reduced(window: Window, live: NDArray[np.bool_], noise: Array) -> Window:
+    sums, pose, m = window.sums, window.pose, len(live)
+    both = np.concatenate([live, live, [True] * 3])
+    scatter = np.where(np.outer(both, both), sums.scatter, 0.0)
+    for power, at in zip(noise, (0, m), strict=True):
+        for k in np.flatnonzero(live):
+            own = scatter[:, at + k, at + k]
+            scatter[:, at + k, at + k] = own - np.minimum(sums.count * power[k], MOST_NOISE * own)
+    if live.all():
+        return replace(window, sums=replace(sums, scatter=scatter))
+    total = sums.scatter.sum(axis=0)
+    along = np.zeros((m, m))
+    if live.any():
+        own = total[:m, :m]
+        along[np.ix_(~live, live)] = np.linalg.solve(own[np.ix_(live, live)], own[np.ix_(live, ~live)]).T
+    mean = sums.count @ sums.mean[:, :m] / sums.count.sum()
+    direction = np.where(live, pose.direction + pose.direction @ along, 0.0)
+    # The means of silent channels (gravity, where the reference feels it) are still felt.
+    gravity = pose.gravity_mps2 + pose.direction @ np.where(live, 0.0, mean - along @ mean)
+    return replace(
+        window,
+        pose=replace(pose, direction=direction, gravity_mps2=gravity),
+        sums=WindowSums(sums.reference_channels, sums.count, sums.mean, scatter),
+    )

@@ -1,0 +1,100 @@
+"""Mean and covariance of everything that is estimated together, by name; the covariance is kept as a factor.
+
+P = L L', L (N, N): a product of a factor with itself cannot lose its sign, whatever the conditioning (square-root form
+of the Kalman filter; Bierman 1977, ch. V).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from calib.model import Array
+
+
+class JointState:
+    """Named quantities with their joint covariance. Methods change it in place."""
+
+    def __init__(self, names: Sequence[str], mean: Array, standard_uncertainty: Array) -> None:
+        self.names = list(names)
+        self.mean = np.array(mean, dtype=np.float64)
+        self.factor = np.diag(np.asarray(standard_uncertainty, dtype=np.float64))
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def covariance(self) -> Array:
+        """(N, N)."""
+        return np.asarray(self.factor @ self.factor.T)
+
+    @property
+    def variance(self) -> Array:
+        """(N,) the diagonal of the covariance."""
+        return np.asarray(np.einsum("ij,ij->i", self.factor, self.factor))
+
+    def index(self, name: str) -> int:
+        """Where a quantity stands. Raises ValueError where there is none of this name."""
+        return self.names.index(name)
+
+    def append(self, name: str, mean: float, standard_uncertainty: float) -> None:
+        """A quantity more, independent of all others."""
+        n = len(self.names)
+        grown = np.zeros((n + 1, n + 1))
+        grown[:n, :n], grown[n, n] = self.factor, standard_uncertainty
+        self.names.append(name)
+        self.mean, self.factor = np.append(self.mean, mean), grown
+
+    def drop(self, names: Iterable[str]) -> None:
+        """Forget quantities; what they did to the others' covariance stays (they are marginalised)."""
+        gone = set(names)
+        keep = [k for k, name in enumerate(self.names) if name not in gone]
+        self.names = [self.names[k] for k in keep]
+        self.mean, self.factor = self.mean[keep], _square(self.factor[keep])
+
+    def transform(self, matrix: Array) -> None:
+        """x -> M x."""
+        self.mean, self.factor = matrix @ self.mean, matrix @ self.factor
+
+    def spread(self, variance: Array) -> None:
+        """Add independent variance (N,) to the quantities."""
+        live = np.flatnonzero(variance > 0.0)
+        if live.size:
+            noise = np.zeros((len(self), live.size))
+            noise[live, range(live.size)] = np.sqrt(variance[live])
+            self.factor = _square(np.hstack([self.factor, noise]))
+
+    def replace(self, where: slice, mean: Array, covariance: Array) -> None:
+        """Give some quantities this mean and covariance, independent of all others from now on."""
+        values, ways = np.linalg.eigh(covariance)
+        own = np.zeros((len(self), len(mean)))
+        own[where] = ways * np.sqrt(np.maximum(values, 0.0))
+        self.mean[where], self.factor[where] = mean, 0.0
+        self.factor = _square(np.hstack([self.factor, own]))
+
+    def correct(self, step: Array, gain: Array, jacobian: Array, noise: Array) -> None:
+        """x -> x + step, P -> (1 - K H) P (1 - K H)' + K R K', R = noise noise': true for any gain K (Joseph)."""
+        self.mean = self.mean + step
+        self.factor = _square(np.hstack([self.factor - gain @ (jacobian @ self.factor), gain @ noise]))
+
+    def copy(self) -> JointState:
+        """An independent copy."""
+        return JointState.load(self.snapshot())
+
+    def snapshot(self) -> dict[str, Any]:
+        """All of it, exactly."""
+        return {"names": list(self.names), "mean": self.mean.copy(), "factor": self.factor.copy()}
+
+    @classmethod
+    def load(cls, state: Mapping[str, Any]) -> JointState:
+        """The state whose snapshot this is."""
+        loaded = cls(state["names"], np.array(state["mean"]), np.zeros(len(state["names"])))
+        loaded.factor = np.array(state["factor"])
+        return loaded
+
+
+def _square(wide: Array) -> Array:
+    """A square factor of the same product with itself."""
+    return np.asarray(np.linalg.qr(wide.T, mode="r"), dtype=np.float64).T

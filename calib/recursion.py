@@ -1,0 +1,385 @@
+"""Method 3 by adjustment, window by window: S, Q and every persistent nuisance as one state with its joint covariance.
+
+The priors enter once, when the state begins and when a window brings a nuisance of its own (a position never seen);
+what belongs to a window alone (its offset, its lag's scatter) is in the weight of its rows. Each window is one
+least-squares correction of the state, so that the cost does not depend on how long it has run.
+
+All windows are linearised at one point. At points of their own the same unseen direction (an inclination against the
+main sensitivities, say) would be another in each, and a little of it would seem seen: after twelve windows on a clamp u
+came out a third too small. So the newest windows are kept in summary, and are taken anew where the estimate has moved
+away from the point; a window that leaves them is part of the base for good. With no wandering the result is that of
+calib.adjustment for all windows at once.
+
+At a fixed mount the mean of V is Q plus S times a gravity that never changes: it corrects Q alone, and S, gravity and
+tilt stay consider parameters there, of which Q's covariance is told (Schmidt 1966). Else a mean that drifts would move
+the column of S along gravity.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from calib.distributions import coverage_factor
+from calib.gauss_newton import Flags
+from calib.joint_state import JointState
+from calib.model import PARAMETERS, Array, Calibration
+from calib.nuisances import Priors
+from calib.wander import RATES, TemperatureModel, Wander
+from calib.window_rows import Noise, Rows, Summary, WindowRows
+
+DETERMINED_SHARE = 0.5  # of the prior's u, which the data must halve (contract)
+MOST_RECENT = 48  # windows: four times round twelve positions
+ITERATIONS = 6
+# Relative change of S, or rad of an angle, up to which the point need not move: its product with an angle's 0.3 deg is
+# 5e-6 of S.
+STRAIGHT = 1e-3
+STRAIGHT_LAG_S = 5e-5  # (omega lag)^2 / 2 of it at 10 Hz is as much
+MOST_NOISE_FREEDOM = 400.0  # degrees of freedom: beyond, the oldest windows' scatter is forgotten
+MOST_POSITIONS = 48  # whose own nuisances are kept; of the oldest ones nothing but their effect on S and Q remains
+TELLS = 1e-6  # of the prior's own information on a parameter, that a window must bring to say anything of it
+METHOD = "3 (recursive adjustment)"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Innovation:
+    """What a window says against the state, before it is taken.
+
+    `statistic` is chi-squared with `degrees_of_freedom` if the state and its uncertainty are true. `score` (12,) is the
+    innovation projected on each parameter, standard normal likewise, NaN where the window says nothing of it; a change
+    d of the parameter moves it by d sqrt(`information`).
+    """
+
+    statistic: float
+    degrees_of_freedom: int
+    score: Array
+    information: Array
+
+
+class Recursion:
+    """The state of one sensor. `predict`, `update` and `loosen` change it; `innovation` and `result` read.
+
+    `mean` and `standard_uncertainty` (12,) are what was known of S, Q beforehand, in output units; `fixed` mounts do
+    not turn. Days count from any origin.
+    """
+
+    def __init__(
+        self,
+        mean: Array,
+        standard_uncertainty: Array,
+        priors: Priors,
+        wander: Wander,
+        temperature: TemperatureModel,
+        *,
+        fixed: bool,
+    ) -> None:
+        self._priors, self._wander, self._temperature, self._fixed = priors, wander, temperature, fixed
+        self.scale = float(np.sqrt(np.mean(mean[[0, 4, 8]] ** 2)))
+        self._state = JointState(PARAMETERS, mean, standard_uncertainty)
+        for name in RATES:
+            self._state.append(name, 0.0, wander.offset_rate_mps2 * self.scale)
+        for name, u in temperature.terms(self.scale):
+            self._state.append(name, 0.0, u)
+        self._prior_u = np.array(standard_uncertainty, dtype=np.float64)
+        self._bound = self._state.variance.copy()  # what wandering may not exceed
+        self._base = self._state.copy()  # before the recent windows
+        self._base_day: float | None = None
+        self._recent: list[Summary] = []
+        self._point = self._state.mean.copy()
+        self._positions: list[str] = []
+        self._noise = Noise()
+        self._day: float | None = None
+        self._temperature_range = (np.inf, -np.inf)
+        self.windows = 0
+
+    # --- reading
+
+    def innovation(self, summary: Summary) -> Innovation:
+        """What the window says against the state at its time."""
+        trial = self.copy()
+        rows = trial._rows(summary)
+        trial._know(rows)
+        state = trial._wandered(trial._state, trial._day, summary.day)
+        return _innovation(rows.at(state, state.mean, trial._noise), state, trial._fixed)
+
+    @property
+    def lag_s(self) -> float:
+        """By which the sensor's indications come late; 0 before any window told."""
+        return float(self._state.mean[self._state.index("lag")]) if "lag" in self._state.names else 0.0
+
+    @property
+    def determined(self) -> Flags:
+        """(12,) whose standard uncertainty is below half of that before any data."""
+        return np.asarray(np.sqrt(self._state.variance[:12]) < DETERMINED_SHARE * self._prior_u)
+
+    def result(self) -> Calibration:
+        """S and Q as they are; where a parameter is not determined, still what was known beforehand of it."""
+        return Calibration(
+            self._state.mean[:9].reshape(3, 3).copy(),
+            self._state.mean[9:12].copy(),
+            self._state.covariance[:12, :12],
+            self.determined,
+            self._noise.degrees_of_freedom or np.inf,
+            METHOD,
+        )
+
+    @property
+    def coverage_factor(self) -> float:
+        """For about 95 % coverage."""
+        return coverage_factor(self._noise.degrees_of_freedom or np.inf)
+
+    def quantity(self, name: str) -> tuple[float, float]:
+        """(value, standard uncertainty) of anything in the state. Raises ValueError where it is not in it."""
+        k = self._state.index(name)
+        return float(self._state.mean[k]), float(np.sqrt(self._state.variance[k]))
+
+    @property
+    def names(self) -> list[str]:
+        """Of all quantities in the state."""
+        return list(self._state.names)
+
+    @property
+    def temperature_range_degc(self) -> tuple[float, float]:
+        """Lowest and highest temperature of a window taken; NaN before any."""
+        low, high = self._temperature_range
+        return (low, high) if low <= high else (np.nan, np.nan)
+
+    # --- changing
+
+    def update(self, summary: Summary) -> None:
+        """Take a window: one correction of everything."""
+        rows = self._rows(summary)
+        self._know(rows)
+        self._state = self._taken(self._state, self._day, rows)
+        self._day = _later(self._day, summary.day)
+        self._recent.append(summary)
+        self._settle()
+        if len(self._recent) > MOST_RECENT:
+            self._absorb(1)
+        self._noise = _pooled(self._noise, rows.noise)
+        if np.isfinite(summary.temperature_degc):
+            low, high = self._temperature_range
+            self._temperature_range = (min(low, summary.temperature_degc), max(high, summary.temperature_degc))
+        self._keep_positions(summary.pose.position)
+        self.windows += 1
+
+    def loosen(self, standard_uncertainty: Array, tilt_rad: float = 0.0) -> None:
+        """Something changed: S and Q (12,) may be off by as much more from now on, and a fixed mount be tilted."""
+        self._absorb(len(self._recent))
+        variance = np.zeros(len(self._state))
+        variance[:12] = standard_uncertainty**2
+        for k, name in enumerate(self._state.names):
+            if name.startswith("gravity_") and self._fixed:
+                variance[k] = tilt_rad**2
+        self._state.spread(variance)
+        self._base = self._state.copy()
+
+    def forget_reference(self) -> None:
+        """Another reference: what is known of the old one's own sensitivity and lag holds no more."""
+        self._absorb(len(self._recent))
+        self._drop([n for n in self._state.names if n.startswith(("reference", "lag", "rotation_"))])
+
+    def put(self, calibration: Calibration) -> None:
+        """S and Q as an operator wants them, with their covariance; independent of the nuisances from then on."""
+        self._absorb(len(self._recent))
+        values = np.append(calibration.sensitivity.ravel(), calibration.offset)
+        self._state.replace(slice(0, 12), values, calibration.covariance)
+        self._base = self._state.copy()
+        self._point = self._state.mean.copy()
+
+    def copy(self) -> Recursion:
+        """An independent copy, to try windows on."""
+        other = object.__new__(Recursion)
+        other.__dict__.update(self.__dict__)
+        other._state, other._base = self._state.copy(), self._base.copy()
+        other._recent, other._positions = list(self._recent), list(self._positions)
+        return other
+
+    # --- inside
+
+    def _rows(self, summary: Summary) -> WindowRows:
+        reference_degc = self._temperature.reference_degc
+        return WindowRows(summary, self._priors, self.scale, reference_degc, fixed=self._fixed)
+
+    def _wandered(self, state: JointState, since: float | None, day: float) -> JointState:
+        """A copy of the state, wandered on to `day`; earlier days are as now."""
+        state = state.copy()
+        elapsed = 0.0 if since is None else max(day - since, 0.0)
+        if elapsed > 0.0:
+            drift = np.eye(len(state))
+            for i, name in enumerate(RATES):
+                drift[9 + i, state.index(name)] = elapsed
+            state.transform(drift)
+            wanted = self._wander.variance_a_day(state.names, self.scale) * elapsed
+            room = np.maximum(self._bound - state.variance, 0.0)
+            state.spread(np.minimum(wanted, room))
+        return state
+
+    def _know(self, rows: WindowRows) -> None:
+        """Nuisances that no window had before come in with their priors."""
+        for name, mean, u in rows.unknowns:
+            if name not in self._state.names:
+                self._state.append(name, mean, u)
+                self._base.append(name, mean, u)
+                self._point = np.append(self._point, mean)
+                # A mount may come to lean by more than anybody stated of the day it was made.
+                self._bound = np.append(self._bound, (2.0 * u) ** 2)
+
+    def _taken(self, before: JointState, since: float | None, rows: WindowRows) -> JointState:
+        """The state after one window, linearised at the point."""
+        state = self._wandered(before, since, rows.summary.day)
+        own = rows.at(state, self._point, self._noise)
+        step, gain = _gained(own, state, self._point, self._means_free(state) if self._fixed else None)
+        state.correct(step, gain, own.jacobian, own.noise)
+        return state
+
+    @staticmethod
+    def _means_free(state: JointState) -> Flags:
+        """What the mean of V corrects at a fixed mount: Q, its drift and its temperature."""
+        return np.array([n in PARAMETERS[9:] or n.startswith(("Qx_", "Qy_", "Qz_")) for n in state.names])
+
+    def _settle(self) -> None:
+        """Take the recent windows anew, from the base on, until the point is where the estimate is."""
+        for _ in range(ITERATIONS):
+            if not self._moved():
+                return
+            self._point = self._state.mean.copy()
+            state, since = self._base, self._base_day
+            for summary in self._recent:
+                state = self._taken(state, since, self._rows(summary))
+                since = _later(since, summary.day)
+            self._state = state
+
+    def _moved(self) -> bool:
+        """Whether the products of S and the nuisances, which are all that bends, have left the point."""
+        moved = np.abs(self._state.mean - self._point)
+        limit = np.full(len(moved), STRAIGHT)
+        limit[:9] *= self.scale
+        for k, name in enumerate(self._state.names):
+            if name in PARAMETERS[9:] or name.startswith(("Q", "offset")):
+                limit[k] = np.inf  # these are linear
+            elif name.startswith("lag"):
+                limit[k] = STRAIGHT_LAG_S
+            elif name == "gravity":
+                limit[k] = 10.0 * STRAIGHT
+        return bool(np.any(moved > limit))
+
+    def _absorb(self, count: int) -> None:
+        """The oldest recent windows become part of the base, linearised as they are now."""
+        for summary in self._recent[:count]:
+            self._base = self._taken(self._base, self._base_day, self._rows(summary))
+            self._base_day = _later(self._base_day, summary.day)
+        del self._recent[:count]
+
+    def _keep_positions(self, position: str) -> None:
+        if position in self._positions:
+            self._positions.remove(position)
+        self._positions.append(position)
+        while len(self._positions) > MOST_POSITIONS:
+            end = f"[{self._positions.pop(0)}]"
+            self._absorb(len(self._recent))
+            self._drop([name for name in self._state.names if name.endswith(end)])
+
+    def _drop(self, names: list[str]) -> None:
+        kept = [name not in names for name in self._state.names]
+        self._bound, self._point = self._bound[kept], self._point[kept]
+        self._state.drop(names)
+        self._base = self._state.copy()
+
+    # --- state
+
+    def snapshot(self) -> dict[str, Any]:
+        """All that changes, exactly."""
+        return {
+            "state": self._state.snapshot(),
+            "base": self._base.snapshot(),
+            "base_day": self._base_day,
+            "recent": [summary.snapshot() for summary in self._recent],
+            "point": self._point.copy(),
+            "prior_u": self._prior_u.copy(),
+            "bound": self._bound.copy(),
+            "positions": list(self._positions),
+            "noise": asdict(self._noise),
+            "day": self._day,
+            "temperature_range": list(self._temperature_range),
+            "windows": self.windows,
+            "scale": self.scale,
+        }
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        """Go on from a snapshot of a recursion that was made with the same settings."""
+        self._state, self._base = JointState.load(state["state"]), JointState.load(state["base"])
+        self._base_day, self._point = state["base_day"], np.array(state["point"])
+        self._recent = [Summary.load(s) for s in state["recent"]]
+        self._prior_u, self._bound = np.array(state["prior_u"]), np.array(state["bound"])
+        self._positions = list(state["positions"])
+        self._noise = Noise(**state["noise"])
+        self._day = state["day"]
+        low, high = state["temperature_range"]
+        self._temperature_range = (low, high)
+        self.windows, self.scale = state["windows"], state["scale"]
+
+
+def _gained(rows: Rows, prior: JointState, at: Array, means_free: Flags | None) -> tuple[Array, Array]:
+    """Step (N,) from the prior's mean and gain (N, R). With `means_free` (N,) the rows of means correct only those.
+
+    The gain is L A' (A A' + 1)^-1 with A = H L: nothing larger than the rows is inverted, and the 1 bounds it.
+    """
+    expected = rows.residual + rows.jacobian @ (at - prior.mean)
+    gain = np.zeros((len(prior), len(expected)))
+    if means_free is None:
+        gain = _optimal(rows.jacobian, prior.factor)
+        return gain @ expected, gain
+    s = slice(0, rows.slopes)
+    gain[:, s] = _optimal(rows.jacobian[s], prior.factor)
+    # The means come after the slopes: their gain is that of the state which the slopes have left.
+    left = prior.factor - gain[:, s] @ (rows.jacobian[s] @ prior.factor)
+    wide = np.hstack([left, gain[:, s]])
+    m = slice(rows.slopes, len(expected))
+    late = np.where(means_free[:, None], _optimal(rows.jacobian[m], wide), 0.0)
+    gain[:, s] -= late @ (rows.jacobian[m] @ gain[:, s])
+    gain[:, m] = late
+    return gain @ expected, gain
+
+
+def _optimal(jacobian: Array, factor: Array) -> Array:
+    """L A' (A A' + 1)^-1, A = H L."""
+    if not len(jacobian):
+        return np.zeros((len(factor), 0))
+    a = jacobian @ factor
+    return np.asarray(np.linalg.solve(a @ a.T + np.eye(len(a)), a @ factor.T).T)
+
+
+def _innovation(rows: Rows, state: JointState, fixed: bool) -> Innovation:
+    a = rows.jacobian @ state.factor
+    covariance = a @ a.T + rows.noise @ rows.noise.T
+    weighed = np.linalg.solve(covariance, np.column_stack([rows.residual, rows.jacobian[:, :12]]))
+    own = rows.jacobian[:, :12].copy()
+    if fixed:
+        own[rows.slopes :, :9] = 0.0  # a change of the mean is none of S there
+        weighed = np.linalg.solve(covariance, np.column_stack([rows.residual, own]))
+    information = np.einsum("rp,rp->p", own, weighed[:, 1:])
+    tells = information * state.variance[:12] > TELLS
+    root = np.sqrt(np.where(tells, information, 1.0))
+    score = np.where(tells, own.T @ weighed[:, 0] / root, np.nan)
+    statistic = float(rows.residual @ weighed[:, 0])
+    return Innovation(statistic, len(a), score, np.where(tells, information, 0.0))
+
+
+def _pooled(noise: Noise, own: Noise) -> Noise:
+    """Both by their degrees of freedom, the older ones forgotten beyond MOST_NOISE_FREEDOM."""
+    kept = min(noise.degrees_of_freedom, MOST_NOISE_FREEDOM - min(own.degrees_of_freedom, MOST_NOISE_FREEDOM))
+    total = kept + own.degrees_of_freedom
+    if total <= 0.0:
+        return replace(noise, slopes=own.slopes, means=own.means) if noise.degrees_of_freedom <= 0.0 else noise
+    share = kept / total
+    return Noise(
+        share * noise.slopes + (1.0 - share) * own.slopes, share * noise.means + (1.0 - share) * own.means, total
+    )
+
+
+def _later(day: float | None, other: float) -> float:
+    return other if day is None else max(day, other)
