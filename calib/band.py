@@ -18,6 +18,8 @@ LEAST_SEGMENTS = 8  # of each kind, else the spectra are known too poorly to cho
 SIGNIFICANT = 6.0  # standard deviations of a smoothed line, of a hundred of them
 SMOOTHED = 5  # lines
 MARGIN = 1.25  # the filter passes all of the band and a quarter more
+FEWEST_LINES = 64
+TINY = 1e-300
 WIDEST = 0.35  # of the sampling rate: beyond, a filter has nothing left to take away
 STOP_BAND_DB = 66.0
 
@@ -42,6 +44,44 @@ def moving_band_hz(loud: Sequence[Array], quiet: Sequence[Array], rate_hz: float
         return None
     band_hz = MARGIN * float(moving[-1] + SMOOTHED) / SEGMENT_S
     return band_hz if band_hz < WIDEST * rate_hz else None
+
+
+def band_above_noise(x: Array, rate_hz: float) -> tuple[float | None, Array]:
+    """Upper end in Hz of where x (n, m) has more power than the white noise in it, and that noise (m,) per root Hz.
+
+    Motion must leave more than half of the spectrum free. None where it does not, where nothing stands out, or where
+    too little is known; the noise is zero then.
+    """
+    m = x.shape[1]
+    size = min(int(SEGMENT_S * rate_hz), len(x) // LEAST_SEGMENTS)
+    if size < FEWEST_LINES:
+        return None, np.zeros(m)
+    powers = np.stack([_spectrum([x[:, k : k + 1]], size)[0] for k in range(m)])
+    segments = len(x) // size
+    window = np.hanning(size)
+    # A line's power is a mean of `segments` exponentials: its median is the mean but for one part in 3 segments.
+    floor = np.median(powers[:, 1:-1], axis=1) / (1.0 - 1.0 / (3.0 * segments))
+    ratio = np.convolve(
+        np.mean(powers / np.maximum(floor, TINY)[:, None], axis=0), np.ones(SMOOTHED) / SMOOTHED, "same"
+    )
+    moving = np.flatnonzero(ratio[SMOOTHED:-SMOOTHED] > 1.0 + SIGNIFICANT / np.sqrt(m * SMOOTHED * segments))
+    if not len(moving):
+        return None, np.zeros(m)
+    band_hz = MARGIN * float(moving[-1] + SMOOTHED) * rate_hz / size
+    if band_hz >= WIDEST * rate_hz:
+        return None, np.zeros(m)
+    return band_hz, np.sqrt(floor / (0.5 * rate_hz * np.sum(window**2)))
+
+
+def noise_in_band(density: Array, band_hz: float, *, differentiated: bool) -> Array:
+    """(2, m) rms of white noise of `density` (m,) per root Hz in a signal limited to `band_hz`, and in its derivative.
+
+    `differentiated`: the signal itself is the derivative of what is so noisy (acceleration of a velocity).
+    """
+    first = 1 if differentiated else 0
+    turn = 2.0 * np.pi
+    powers = [turn ** (2 * k) * band_hz ** (2 * k + 1) / (2 * k + 1) for k in (first, first + 1)]
+    return np.sqrt(np.array(powers))[:, None] * density
 
 
 def lowpass(x: Array, rate_hz: float, band_hz: float) -> Array:

@@ -10,26 +10,29 @@ came out a third too small. So the newest windows are kept in summary, and are t
 away from the point; a window that leaves them is part of the base for good. With no wandering the result is that of
 calib.adjustment for all windows at once.
 
-At a fixed mount the mean of V is Q plus S times a gravity that never changes: it corrects Q alone, and S, gravity and
-tilt stay consider parameters there, of which Q's covariance is told (Schmidt 1966). Else a mean that drifts would move
-the column of S along gravity.
+At a fixed mount the mean of V is m = Q + S (G + tilt x G) under a gravity that never changes, so that the data tell m
+and no part of it. The state then has m in the place of Q; Q = m - S (G + tilt x G) is made of it when it is read, with
+the uncertainties of S, G and tilt. Were Q in the state, a mean that drifts would move the column of S along gravity
+(by 1.9 % where it drifted by 0.24 m/s2).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 
 from calib.distributions import coverage_factor
+from calib.fixed_mount import Held, held_at
 from calib.gauss_newton import Flags
+from calib.innovation import Innovation, innovation
 from calib.joint_state import JointState
 from calib.model import PARAMETERS, Array, Calibration
 from calib.nuisances import Priors
 from calib.wander import RATES, TemperatureModel, Wander
-from calib.window_rows import Noise, Rows, Summary, WindowRows
+from calib.window_rows import Noise, Summary, WindowRows
 
 DETERMINED_SHARE = 0.5  # of the prior's u, which the data must halve (contract)
 MOST_RECENT = 48  # windows: four times round twelve positions
@@ -40,23 +43,7 @@ STRAIGHT = 1e-3
 STRAIGHT_LAG_S = 5e-5  # (omega lag)^2 / 2 of it at 10 Hz is as much
 MOST_NOISE_FREEDOM = 400.0  # degrees of freedom: beyond, the oldest windows' scatter is forgotten
 MOST_POSITIONS = 48  # whose own nuisances are kept; of the oldest ones nothing but their effect on S and Q remains
-TELLS = 1e-6  # of the prior's own information on a parameter, that a window must bring to say anything of it
 METHOD = "3 (recursive adjustment)"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Innovation:
-    """What a window says against the state, before it is taken.
-
-    `statistic` is chi-squared with `degrees_of_freedom` if the state and its uncertainty are true. `score` (12,) is the
-    innovation projected on each parameter, standard normal likewise, NaN where the window says nothing of it; a change
-    d of the parameter moves it by d sqrt(`information`).
-    """
-
-    statistic: float
-    degrees_of_freedom: int
-    score: Array
-    information: Array
 
 
 class Recursion:
@@ -93,6 +80,7 @@ class Recursion:
         self._noise = Noise()
         self._day: float | None = None
         self._temperature_range = (np.inf, -np.inf)
+        self._held: Held | None = None  # at a fixed mount, from the first window on
         self.windows = 0
 
     # --- reading
@@ -100,10 +88,9 @@ class Recursion:
     def innovation(self, summary: Summary) -> Innovation:
         """What the window says against the state at its time."""
         trial = self.copy()
-        rows = trial._rows(summary)
-        trial._know(rows)
+        rows = trial._know(summary)
         state = trial._wandered(trial._state, trial._day, summary.day)
-        return _innovation(rows.at(state, state.mean, trial._noise), state, trial._fixed)
+        return innovation(rows.at(state, state.mean, trial._noise), state)
 
     @property
     def lag_s(self) -> float:
@@ -113,14 +100,15 @@ class Recursion:
     @property
     def determined(self) -> Flags:
         """(12,) whose standard uncertainty is below half of that before any data."""
-        return np.asarray(np.sqrt(self._state.variance[:12]) < DETERMINED_SHARE * self._prior_u)
+        return np.asarray(np.sqrt(np.diag(self._parameters()[1])) < DETERMINED_SHARE * self._prior_u)
 
     def result(self) -> Calibration:
         """S and Q as they are; where a parameter is not determined, still what was known beforehand of it."""
+        mean, covariance = self._parameters()
         return Calibration(
-            self._state.mean[:9].reshape(3, 3).copy(),
-            self._state.mean[9:12].copy(),
-            self._state.covariance[:12, :12],
+            mean[:9].reshape(3, 3),
+            mean[9:],
+            covariance,
             self.determined,
             self._noise.degrees_of_freedom or np.inf,
             METHOD,
@@ -130,6 +118,12 @@ class Recursion:
     def coverage_factor(self) -> float:
         """For about 95 % coverage."""
         return coverage_factor(self._noise.degrees_of_freedom or np.inf)
+
+    def _parameters(self) -> tuple[Array, Array]:
+        """S and Q (12,) and their covariance."""
+        if self._held is not None:
+            return self._held.parameters(self._state)
+        return self._state.mean[:12].copy(), self._state.covariance[:12, :12]
 
     def quantity(self, name: str) -> tuple[float, float]:
         """(value, standard uncertainty) of anything in the state. Raises ValueError where it is not in it."""
@@ -151,8 +145,7 @@ class Recursion:
 
     def update(self, summary: Summary) -> None:
         """Take a window: one correction of everything."""
-        rows = self._rows(summary)
-        self._know(rows)
+        rows = self._know(summary)
         self._state = self._taken(self._state, self._day, rows)
         self._day = _later(self._day, summary.day)
         self._recent.append(summary)
@@ -179,7 +172,7 @@ class Recursion:
 
     def forget_reference(self) -> None:
         """Another reference: what is known of the old one's own sensitivity and lag holds no more."""
-        self._absorb(len(self._recent))
+        self.put(self.result())
         self._drop([n for n in self._state.names if n.startswith(("reference", "lag", "rotation_"))])
 
     def put(self, calibration: Calibration) -> None:
@@ -187,6 +180,7 @@ class Recursion:
         self._absorb(len(self._recent))
         values = np.append(calibration.sensitivity.ravel(), calibration.offset)
         self._state.replace(slice(0, 12), values, calibration.covariance)
+        self._held = None  # Q itself is known again; the next window of a fixed mount makes the mean output of it
         self._base = self._state.copy()
         self._point = self._state.mean.copy()
 
@@ -202,7 +196,8 @@ class Recursion:
 
     def _rows(self, summary: Summary) -> WindowRows:
         reference_degc = self._temperature.reference_degc
-        return WindowRows(summary, self._priors, self.scale, reference_degc, fixed=self._fixed)
+        held = self._held.mps2 if self._held is not None else np.zeros(3) if self._fixed else None
+        return WindowRows(summary, self._priors, self.scale, reference_degc, held)
 
     def _wandered(self, state: JointState, since: float | None, day: float) -> JointState:
         """A copy of the state, wandered on to `day`; earlier days are as now."""
@@ -213,33 +208,56 @@ class Recursion:
             for i, name in enumerate(RATES):
                 drift[9 + i, state.index(name)] = elapsed
             state.transform(drift)
-            wanted = self._wander.variance_a_day(state.names, self.scale) * elapsed
+            tilted = 0.0 if self._held is None else float(np.linalg.norm(self._held.mps2))
+            wanted = self._wander.variance_a_day(state.names, self.scale, tilted) * elapsed
             room = np.maximum(self._bound - state.variance, 0.0)
             state.spread(np.minimum(wanted, room))
         return state
 
-    def _know(self, rows: WindowRows) -> None:
-        """Nuisances that no window had before come in with their priors."""
+    def _mount(self, summary: Summary) -> None:
+        """At the first window of a fixed mount: Q gives its place to the mean output there."""
+        if not self._fixed or self._held is not None or not np.isfinite(summary.held_mps2).all():
+            return
+        held, terms = held_at(summary, self._priors)
+        u = self._mean_output_u(summary.held_mps2)
+        for state in (self._state, self._base):
+            S = state.mean[:9].reshape(3, 3)
+            state.replace(slice(9, 12), state.mean[9:12] + S @ summary.held_mps2, np.diag(u**2))
+        self._point[9:12] = self._state.mean[9:12]
+        self._bound[9:12] = u**2
+        for term in terms:
+            self._append(term.name, term.expected, term.uncertainty)
+        self._held = held
+
+    def _mean_output_u(self, held_mps2: Array) -> Array:
+        """(3,) standard uncertainty of the mean output before any data: of Q and S, and never the less for them."""
+        variance = self._state.variance
+        return np.sqrt(variance[9:12] + variance[:9].reshape(3, 3) @ held_mps2**2)
+
+    def _append(self, name: str, mean: float, u: float) -> None:
+        if name not in self._state.names:
+            self._state.append(name, mean, u)
+            self._base.append(name, mean, u)
+            self._point = np.append(self._point, mean)
+            # A mount may come to lean by more than anybody stated of the day it was made.
+            self._bound = np.append(self._bound, (2.0 * u) ** 2)
+
+    def _know(self, summary: Summary) -> WindowRows:
+        """Nuisances that no window had before come in with their priors; the window's rows."""
+        self._mount(summary)
+        rows = self._rows(summary)
         for name, mean, u in rows.unknowns:
-            if name not in self._state.names:
-                self._state.append(name, mean, u)
-                self._base.append(name, mean, u)
-                self._point = np.append(self._point, mean)
-                # A mount may come to lean by more than anybody stated of the day it was made.
-                self._bound = np.append(self._bound, (2.0 * u) ** 2)
+            self._append(name, mean, u)
+        return rows
 
     def _taken(self, before: JointState, since: float | None, rows: WindowRows) -> JointState:
         """The state after one window, linearised at the point."""
         state = self._wandered(before, since, rows.summary.day)
         own = rows.at(state, self._point, self._noise)
-        step, gain = _gained(own, state, self._point, self._means_free(state) if self._fixed else None)
+        gain = _gain(own.jacobian, state.factor)
+        step = gain @ (own.residual + own.jacobian @ (self._point - state.mean))
         state.correct(step, gain, own.jacobian, own.noise)
         return state
-
-    @staticmethod
-    def _means_free(state: JointState) -> Flags:
-        """What the mean of V corrects at a fixed mount: Q, its drift and its temperature."""
-        return np.array([n in PARAMETERS[9:] or n.startswith(("Qx_", "Qy_", "Qz_")) for n in state.names])
 
     def _settle(self) -> None:
         """Take the recent windows anew, from the base on, until the point is where the estimate is."""
@@ -305,6 +323,7 @@ class Recursion:
             "noise": asdict(self._noise),
             "day": self._day,
             "temperature_range": list(self._temperature_range),
+            "held": None if self._held is None else {"mps2": self._held.mps2, "by": dict(self._held.by)},
             "windows": self.windows,
             "scale": self.scale,
         }
@@ -320,53 +339,14 @@ class Recursion:
         self._day = state["day"]
         low, high = state["temperature_range"]
         self._temperature_range = (low, high)
+        self._held = None if state["held"] is None else Held(**state["held"])
         self.windows, self.scale = state["windows"], state["scale"]
 
 
-def _gained(rows: Rows, prior: JointState, at: Array, means_free: Flags | None) -> tuple[Array, Array]:
-    """Step (N,) from the prior's mean and gain (N, R). With `means_free` (N,) the rows of means correct only those.
-
-    The gain is L A' (A A' + 1)^-1 with A = H L: nothing larger than the rows is inverted, and the 1 bounds it.
-    """
-    expected = rows.residual + rows.jacobian @ (at - prior.mean)
-    gain = np.zeros((len(prior), len(expected)))
-    if means_free is None:
-        gain = _optimal(rows.jacobian, prior.factor)
-        return gain @ expected, gain
-    s = slice(0, rows.slopes)
-    gain[:, s] = _optimal(rows.jacobian[s], prior.factor)
-    # The means come after the slopes: their gain is that of the state which the slopes have left.
-    left = prior.factor - gain[:, s] @ (rows.jacobian[s] @ prior.factor)
-    wide = np.hstack([left, gain[:, s]])
-    m = slice(rows.slopes, len(expected))
-    late = np.where(means_free[:, None], _optimal(rows.jacobian[m], wide), 0.0)
-    gain[:, s] -= late @ (rows.jacobian[m] @ gain[:, s])
-    gain[:, m] = late
-    return gain @ expected, gain
-
-
-def _optimal(jacobian: Array, factor: Array) -> Array:
-    """L A' (A A' + 1)^-1, A = H L."""
-    if not len(jacobian):
-        return np.zeros((len(factor), 0))
+def _gain(jacobian: Array, factor: Array) -> Array:
+    """(N, R) L A' (A A' + 1)^-1, A = H L: nothing larger than the rows is inverted, and the 1 bounds it."""
     a = jacobian @ factor
     return np.asarray(np.linalg.solve(a @ a.T + np.eye(len(a)), a @ factor.T).T)
-
-
-def _innovation(rows: Rows, state: JointState, fixed: bool) -> Innovation:
-    a = rows.jacobian @ state.factor
-    covariance = a @ a.T + rows.noise @ rows.noise.T
-    weighed = np.linalg.solve(covariance, np.column_stack([rows.residual, rows.jacobian[:, :12]]))
-    own = rows.jacobian[:, :12].copy()
-    if fixed:
-        own[rows.slopes :, :9] = 0.0  # a change of the mean is none of S there
-        weighed = np.linalg.solve(covariance, np.column_stack([rows.residual, own]))
-    information = np.einsum("rp,rp->p", own, weighed[:, 1:])
-    tells = information * state.variance[:12] > TELLS
-    root = np.sqrt(np.where(tells, information, 1.0))
-    score = np.where(tells, own.T @ weighed[:, 0] / root, np.nan)
-    statistic = float(rows.residual @ weighed[:, 0])
-    return Innovation(statistic, len(a), score, np.where(tells, information, 0.0))
 
 
 def _pooled(noise: Noise, own: Noise) -> Noise:

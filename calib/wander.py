@@ -33,14 +33,15 @@ class Wander:
     tilt_rad: float = 3.5e-5
     reference: float = 0.0
 
-    def variance_a_day(self, names: list[str], scale: float) -> Array:
-        """(N,) of named quantities; `scale` is the sensor's output unit per m/s2."""
+    def variance_a_day(self, names: list[str], scale: float, tilted_mps2: float) -> Array:
+        """(N,) of named quantities; `scale` is the sensor's output unit per m/s2, `tilted_mps2` the gravity of which a
+        tilt of the mount moves the mean output: 0 where Q itself is meant."""
         found = np.zeros(len(names))
         for k, name in enumerate(names):
             if name in PARAMETERS[:9]:
                 found[k] = (self.sensitivity * scale) ** 2
             elif name in PARAMETERS[9:]:
-                found[k] = (self.offset_mps2 * scale) ** 2
+                found[k] = (self.offset_mps2**2 + (tilted_mps2 * self.tilt_rad) ** 2) * scale**2
             elif name in RATES:
                 found[k] = (self.offset_rate_walk_mps2 * scale) ** 2
             elif name.startswith(("gravity_x", "gravity_y", "gravity_z", "tilt_")):

@@ -38,9 +38,15 @@ LEAST_INFLATION = 0.25  # variance ratios below it are the luck of few segments
 @dataclass(frozen=True, slots=True, eq=False)
 class Summary:
     """All that is kept of a window: its slopes and means, the directions (3, k) that were excited and what the
-    correction for noise leaves, its time in days, the lag that the front end took out, and its temperature."""
+    correction for noise leaves, its time in days, the lag that the front end took out, and its temperature.
+
+    `pose` as stated, `moved` as `calib.excited` leaves it. `held_mps2` (3,) is the mean input acceleration by the pose
+    as stated, NaN where nobody stated gravity.
+    """
 
     pose: Pose
+    moved: Pose
+    held_mps2: Array
     data: Condensed
     directions: Array
     attenuation: float
@@ -51,22 +57,29 @@ class Summary:
     @classmethod
     def of(cls, window: Window, day: float, lag_s: float = 0.0, temperature_degc: float = np.nan) -> Summary:
         """The summary of a window that is used."""
-        found = excited(window)
+        found, sums, m = excited(window), window.sums, window.pose.direction.shape[1]
+        mean = sums.count @ sums.mean[:, :m] / sums.count.sum()
+        held = window.pose.gravity_mps2 + window.pose.direction @ mean
         data = condense([found.window])
-        return cls(found.window.pose, data, found.directions, found.attenuation, day, lag_s, temperature_degc)
+        moved = found.window.pose
+        return cls(window.pose, moved, held, data, found.directions, found.attenuation, day, lag_s, temperature_degc)
 
     def snapshot(self) -> dict[str, Any]:
         """Plain values and arrays."""
         held = {f.name: getattr(self, f.name) for f in fields(self)}
         data = {f.name: getattr(self.data, f.name) for f in fields(self.data)}
         data["type_a"] = {f.name: getattr(self.data.type_a, f.name) for f in fields(self.data.type_a)}
-        return held | {"pose": {f.name: getattr(self.pose, f.name) for f in fields(self.pose)}, "data": data}
+        poses = {
+            name: {f.name: getattr(pose, f.name) for f in fields(pose)}
+            for name, pose in (("pose", self.pose), ("moved", self.moved))
+        }
+        return held | poses | {"data": data}
 
     @classmethod
     def load(cls, state: Mapping[str, Any]) -> Summary:
         """The summary whose snapshot this is."""
         data = Condensed(**{**state["data"], "type_a": TypeA(**state["data"]["type_a"])})
-        return cls(**{**state, "pose": Pose(**state["pose"]), "data": data})
+        return cls(**{**state, "pose": Pose(**state["pose"]), "moved": Pose(**state["moved"]), "data": data})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,18 +99,19 @@ class Rows:
 class WindowRows:
     """One window's equations on the names of a joint state.
 
-    `scale` is the sensor's output unit per m/s2. `fixed`: the mount does not turn, and columns of S in directions that
-    were not excited get no part in the slopes.
+    `scale` is the sensor's output unit per m/s2. `held_mps2` (3,) makes it the window of a fixed mount: the quantities
+    Q are then the mean output under that constant input acceleration (see calib.recursion), and columns of S in
+    directions that were not excited get no part in the slopes. None: the mount turns.
     """
 
     def __init__(
-        self, summary: Summary, priors: Priors, scale: float, reference_degc: float, *, fixed: bool = False
+        self, summary: Summary, priors: Priors, scale: float, reference_degc: float, held_mps2: Array | None
     ) -> None:
         self.summary, self.data = summary, summary.data
-        self.nuisances = Nuisances([summary.pose], self.data.channels, priors, Applied(summary.lag_s))
+        self.nuisances = Nuisances([summary.moved], self.data.channels, priors, Applied(summary.lag_s))
         self._jitter = LagScatter.of(self.data, 0.0)
         self.equations = Equations(self.data, self.nuisances, [0], priors.offset_mps2, self._jitter, scale)
-        self._priors, self._fixed = priors, fixed
+        self._priors, self._held_mps2 = priors, held_mps2
         above = summary.temperature_degc - reference_degc
         self._temperature_k = above if np.isfinite(above) else 0.0
         self._live = np.repeat(np.diag(self.data.root[0]) > 0.0, 3)
@@ -124,7 +138,8 @@ class WindowRows:
         mean, d_mean = rows.mean.reshape(-1), rows.d_mean.reshape(-1, len(x))
         slope, d_slope = slope[self._live], d_slope[self._live]
         weights, covariance = self._slope_covariances(noise)
-        if self._fixed:
+        if self._held_mps2 is not None:
+            mean, d_mean = self._fixed_means(x, self._held_mps2)
             d_slope, missed = self._without_silent(d_slope, state)
             weights, covariance = weights + np.diag(missed), covariance + np.diag(missed)
         parts = []
@@ -194,6 +209,14 @@ class WindowRows:
             return white, white
         pull = SHRINKAGE * len(own)
         return (freedom * own + pull * white) / (freedom + pull), white
+
+    def _fixed_means(self, x: Array, held_mps2: Array) -> tuple[Array, Array]:
+        """Weighted residuals (3,) and Jacobian (3, n) of the means at a fixed mount: the mean output alone."""
+        weight = self.equations.mean_weight[0]
+        away = x[:9].reshape(3, 3) @ np.nan_to_num(self.summary.held_mps2 - held_mps2)
+        jacobian = np.zeros((3, len(x)))
+        jacobian[range(3), range(9, 12)] = weight
+        return (self.data.mean_v[0] - x[9:12] - away) * weight, jacobian
 
     def _without_silent(self, d_slope: Array, state: JointState) -> tuple[Array, Array]:
         """The slopes' Jacobian without the columns of S along directions that were not excited, and the variance that
