@@ -1,0 +1,131 @@
+"""How far S and Q may go from what an operator last accepted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.config.gate import GateSettings
+from calib.model import PARAMETERS, Array, Calibration
+
+COVERAGE_FACTOR = 2.0  # an anchor known to u alone holds nothing tighter than U = 2 u
+MAIN = np.isin(np.arange(12), (0, 4, 8))
+OFFSET = np.arange(12) >= 9
+TRANSVERSE = ~MAIN & ~OFFSET
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """How far a calibration is from the anchor: `reason` names every limit it is beyond, "" where it is within all."""
+
+    reason: str
+    numbers: dict[str, float]
+
+
+class Anchor:
+    """The calibration that changes are counted from, cumulatively, and the limits around it.
+
+    It is what an operator accepted: a certificate or data sheet in the configuration, later an `accept` or `rollback`.
+    A parameter of it with U beyond max_change (a data sheet's) limits at U, until the data first know that parameter to
+    within max_change: that value is then its anchor, once and for all.
+    """
+
+    def __init__(self, settings: GateSettings, calibration: Calibration) -> None:
+        """Raises ValueError where S has no inverse, a main sensitivity is 0, or values are not finite."""
+        self._settings = settings
+        self._value = _values(calibration)
+        self._u = calibration.standard_uncertainty
+        usable = np.isfinite(self._value).all() and self._value[MAIN].all()
+        if not usable or np.linalg.matrix_rank(calibration.sensitivity) < 3:
+            raise ValueError("a calibration to start from needs finite S and Q, and S an inverse and no main one of 0")
+        self._fixed = self._expanded() <= self._max_change()
+
+    @property
+    def calibration(self) -> Calibration:
+        """It as a calibration: an Anchor made of that is equal to this one."""
+        sensitivity, offset = self._value[:9].reshape(3, 3).copy(), self._value[9:].copy()
+        return Calibration(sensitivity, offset, np.diag(self._u**2), self._fixed.copy(), np.inf, "accepted")
+
+    def change(self, calibration: Calibration) -> Change:
+        """From the anchor to this calibration, held against the limits."""
+        value = _values(calibration)
+        if not np.isfinite(value).all():
+            return Change("S or Q is not finite", {})
+        moved, limits = np.abs(value - self._value), self.limits()
+        scale, numbers, reasons = self._full_scale(), dict[str, float](), list[str]()
+        relative = np.where(MAIN, 100.0 / np.abs(self._value), np.where(TRANSVERSE, 100.0 / scale, 1.0))
+        for name, kind in (("main_pct", MAIN), ("transverse_pct", TRANSVERSE), ("offset", OFFSET)):
+            worst = int(np.argmax(np.where(kind, moved / limits, -1.0)))
+            if np.isfinite(limits[worst]):
+                numbers[f"change_{name}"] = float(moved[worst] * relative[worst])
+                numbers[f"change_{name}_threshold"] = float(limits[worst] * relative[worst])
+            reasons += [PARAMETERS[p] for p in np.flatnonzero(kind & ~(moved <= limits))]
+        self._turned(calibration, numbers, reasons)
+        self._off_sheet(value, numbers, reasons)
+        return Change(f"beyond max_change: {', '.join(reasons)}" if reasons else "", numbers)
+
+    def limits(self) -> Array:
+        """(12,) how far each parameter may go; inf where nothing limits an offset."""
+        return np.where(self._fixed, self._max_change(), np.maximum(self._max_change(), self._expanded()))
+
+    def learn(self, calibration: Calibration) -> None:
+        """What came in force: a parameter that only a data sheet anchored is anchored here once it is known well."""
+        known = calibration.determined & (COVERAGE_FACTOR * calibration.standard_uncertainty <= self._max_change())
+        fresh = known & ~self._fixed
+        self._value = np.where(fresh, _values(calibration), self._value)
+        self._u = np.where(fresh, calibration.standard_uncertainty, self._u)
+        self._fixed = self._fixed | fresh
+
+    def _full_scale(self) -> float:
+        return float(np.abs(self._value[MAIN]).mean())
+
+    def _expanded(self) -> Array:
+        return COVERAGE_FACTOR * self._u
+
+    def _max_change(self) -> Array:
+        of = self._settings
+        main = of.max_change_main_pct / 100.0 * np.abs(self._value)
+        transverse = of.max_change_transverse_pct / 100.0 * self._full_scale()
+        offset = np.inf if of.max_change_offset is None else of.max_change_offset
+        return np.where(MAIN, main, np.where(TRANSVERSE, transverse, offset))
+
+    def _turned(self, calibration: Calibration, numbers: dict[str, float], reasons: list[str]) -> None:
+        if not self._fixed[:9].all():
+            return  # a data sheet does not say how the sensor stands to the reference
+        angle_deg = float(np.degrees(rotation_rad(calibration.sensitivity, self._value[:9].reshape(3, 3))))
+        numbers["rotation_deg"] = angle_deg
+        numbers["rotation_deg_threshold"] = self._settings.max_change_rotation_deg
+        if not angle_deg <= self._settings.max_change_rotation_deg:
+            reasons.append("common rotation")
+
+    def _off_sheet(self, value: Array, numbers: dict[str, float], reasons: list[str]) -> None:
+        largest = self._settings.largest_offset
+        if largest is None:
+            return
+        numbers["offset"], numbers["offset_threshold"] = float(np.abs(value[OFFSET]).max()), largest
+        reasons += [f"{PARAMETERS[p]} off the data sheet" for p in np.flatnonzero(OFFSET & (np.abs(value) > largest))]
+
+    def snapshot(self) -> dict[str, Any]:
+        """State for `load`, bit-exact."""
+        return {"value": self._value.copy(), "u": self._u.copy(), "fixed": self._fixed.copy()}
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Take the state that `snapshot` gave."""
+        self._value, self._u, self._fixed = state["value"].copy(), state["u"].copy(), state["fixed"].copy()
+
+
+def rotation_rad(sensitivity: Array, before: Array) -> float:
+    """Angle of the rotation in S S0^-1 (its polar decomposition); pi where the one is a reflection of the other."""
+    left, _, right = np.linalg.svd(sensitivity @ np.linalg.inv(before))
+    turn = left @ right
+    if np.linalg.det(turn) < 0.0:
+        return float(np.pi)
+    skew = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+    return float(np.arctan2(np.linalg.norm(skew), np.trace(turn) - 1.0))
+
+
+def _values(calibration: Calibration) -> NDArray[np.float64]:
+    return np.concatenate([calibration.sensitivity.ravel(), calibration.offset])
