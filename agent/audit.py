@@ -10,11 +10,11 @@ import click
 import msgspec
 
 from agent.recording.comparison import OTHER_CPU
+from agent.recording.files import FILE_METADATA
 from agent.recording.integrity import Integrity, check_integrity
 from agent.recording.reading import open_recording
 from agent.recording.records import Fault
 from agent.recording.replaying import Replay, ReplayedFile, Restore
-from agent.recording.writer import FILE_METADATA
 
 
 class AuditedFile(msgspec.Struct, kw_only=True):

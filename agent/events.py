@@ -79,7 +79,18 @@ class Command(msgspec.Struct, frozen=True, kw_only=True):
     refused: str = ""  # why; "" where it was taken
 
 
-Event = RunStart | SampleBlock | DeviceChange | Gap | Command | Tick
+class Pruned(msgspec.Struct, frozen=True, kw_only=True):
+    """Recordings that were deleted to keep to their limits: all of these numbers, so that no one need suspect theft."""
+
+    t_monotonic_ns: int
+    t_utc_ns: int
+    first_file: int
+    last_file: int
+    last_sha256: str  # of the last of them, hexadecimal: the file after it names the same
+    bytes: int
+
+
+Event = RunStart | SampleBlock | DeviceChange | Gap | Command | Pruned | Tick
 
 
 class WindowReport(msgspec.Struct, frozen=True, kw_only=True):

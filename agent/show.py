@@ -67,9 +67,10 @@ class Overview:
 
 def read_overview(data_dir: Path, limit: int) -> Overview:
     """Read it, the newest `limit` results of each kind. Raises StoreError."""
-    from agent.recording.writer import recordings
+    from agent.recording.files import recordings
 
     with History(data_dir / FILE_NAME) as history:
+        history.check()
         in_force = {record.sensor: record for record in history.latest() if record.what == "calibration"}
         sensors = {
             sensor: SensorHistory(

@@ -14,10 +14,22 @@ from urllib.parse import quote
 
 import msgspec
 
+from agent.delivery.schema import (
+    RESULT_COLUMNS,
+    SCHEMA_VERSION,
+    DamagedRow,
+    StoreError,
+    checked,
+    damage,
+    known_version,
+    row_crc,
+    version_of,
+)
 from agent.events import CalibrationUpdate, DriftReport, Estimate, Result, StatusChange, WindowReport
 
+__all__ = ["FILE_NAME", "History", "Record", "Removed", "StoreError", "connect_read_only"]
+
 FILE_NAME = "state.sqlite"
-SCHEMA_VERSION = 1
 _TYPES: dict[str, type[Result]] = {
     "calibration": CalibrationUpdate,
     "window": WindowReport,
@@ -26,11 +38,6 @@ _TYPES: dict[str, type[Result]] = {
     "status": StatusChange,
 }
 _KINDS = {kind: what for what, kind in _TYPES.items()}
-_COLUMNS = "sequence, run_id, sensor, what, payload, t_utc_ns, recorded, recording, identity"
-
-
-class StoreError(Exception):
-    """The store cannot be read or written. The message names the file and the reason."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +76,24 @@ class Record:
             identity,
         )
 
+    @staticmethod
+    def of_row(row: tuple[Any, ...]) -> Record:
+        """The record of a row of RESULT_COLUMNS and its CRC. Raises DamagedRow."""
+        sequence, run_id, sensor, what, payload, t_utc_ns, recorded, recording, identity = checked(row)
+        return Record(sequence, run_id, sensor, what, payload, t_utc_ns, bool(recorded), recording, identity)
+
+    @property
+    def row(self) -> tuple[Any, ...]:
+        """The columns of RESULT_COLUMNS and their CRC."""
+        columns: tuple[Any, ...] = (self.sequence, self.run_id, self.sensor, self.what, self.payload, self.t_utc_ns)
+        columns += (int(self.recorded), self.recording, self.identity)
+        return (*columns, row_crc(*columns))
+
+    @property
+    def is_withdrawal(self) -> bool:
+        """Whether a calibration is in force no more after this: it says that the sensor is UNCALIBRATED."""
+        return self.what == "status" and self.fields.get("status") == "UNCALIBRATED"
+
     @property
     def fields(self) -> dict[str, Any]:
         """The payload decoded. Raises StoreError where it is not JSON."""
@@ -86,10 +111,20 @@ class Record:
             raise StoreError(f"result {self.sequence}, a {self.what}, cannot be read: {error}") from None
 
 
+@dataclass(frozen=True, slots=True)
+class Removed:
+    """What retention deleted of a channel: `count` results, the last of them number `up_to`."""
+
+    sensor: str
+    what: str
+    count: int
+    up_to: int
+
+
 class History:
     """Reads the store through a connection of its own, also while the agent writes. Belongs to the thread that made it.
 
-    Raises StoreError where there is no store, or it cannot be read.
+    Raises StoreError where there is no store, or what is read of it is not what was written.
     """
 
     def __init__(self, path: Path) -> None:
@@ -97,10 +132,24 @@ class History:
         if not path.is_file():
             raise StoreError(f"{path}: there is no such file")
         self._connection = connect_read_only(path)
-        version = self._rows("PRAGMA user_version")[0][0]
+        try:
+            version = version_of(self._connection)
+        except sqlite3.Error as error:
+            self.close()
+            raise StoreError(f"{path}: {error}") from None
         if version != SCHEMA_VERSION:
             self.close()
-            raise StoreError(f"{path}: written in version {version}, this program reads version {SCHEMA_VERSION}")
+            hint = "; `fieldcal run` brings it up to date" if known_version(version) else ""
+            raise StoreError(f"{path}: written in version {version}, this program reads version {SCHEMA_VERSION}{hint}")
+
+    def check(self) -> None:
+        """Look at every page and row, as the agent does when it starts; 6 s a GB. Raises StoreError on damage."""
+        try:
+            found = damage(self._connection)
+        except (sqlite3.Error, UnicodeDecodeError) as error:
+            found = str(error)
+        if found:
+            raise StoreError(f"{self._path}: damaged: {found}")
 
     def after(self, sequence: int, channels: Collection[tuple[str, str]] | None = None, *, limit: int) -> list[Record]:
         """The first `limit` results after `sequence`, in order; of the `channels` (sensor, what) if given."""
@@ -113,25 +162,35 @@ class History:
 
     def channels(self) -> list[tuple[str, str]]:
         """All (sensor, what) that ever gave a result."""
-        return [(sensor, what) for sensor, what in self._rows("SELECT sensor, what FROM latest ORDER BY sensor, what")]
+        return sorted((sensor, what) for sensor, what, _, _ in self._latest())
 
     def latest(self) -> list[Record]:
         """The newest result of every channel, in order; a calibration only where it is in force."""
-        records = self._records("WHERE sequence IN (SELECT sequence FROM latest) ORDER BY sequence")
-        return [r for r in records if r.what != "calibration" or not self._is_withdrawn(r)]
+        return sorted(
+            (self._record(sequence) for _, _, sequence, withdrawn in self._latest() if not withdrawn),
+            key=lambda record: record.sequence,
+        )
 
     def in_force(self, sensor: str) -> Record | None:
         """The newest calibration of a sensor; None if it has none, or its status was UNCALIBRATED since."""
         return next((r for r in self.latest() if r.sensor == sensor and r.what == "calibration"), None)
 
-    def calibration_of(self, sensor: str, identity: str) -> Record | None:
-        """The newest calibration that belongs to this very device and its settings: the one a start may restore."""
-        where = "WHERE sensor = ? AND what = 'calibration' AND identity = ? ORDER BY sequence DESC LIMIT 1"
-        return next(iter(self._records(where, sensor, identity)), None)
+    def calibrations(self, sensor: str) -> dict[str, Record]:
+        """The newest calibration of a sensor by each identity it ever had: device, serial number, settings."""
+        rows = self._rows(
+            "SELECT max(sequence) FROM results WHERE sensor = ? AND what = 'calibration' GROUP BY identity", sensor
+        )
+        records = [self._record(sequence) for (sequence,) in rows]
+        return {record.identity: record for record in records}
 
     def newest(self, sensor: str, what: str, *, limit: int) -> list[Record]:
         """The newest `limit` results of one channel, newest first."""
         return self._records("WHERE sensor = ? AND what = ? ORDER BY sequence DESC LIMIT ?", sensor, what, limit)
+
+    def removed(self) -> list[Removed]:
+        """What retention deleted, by channel."""
+        rows = self._checked("SELECT sensor, what, count, up_to, crc FROM removed ORDER BY sensor, what")
+        return [Removed(*row) for row in rows]
 
     def close(self) -> None:
         """Close the connection."""
@@ -143,25 +202,34 @@ class History:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _is_withdrawn(self, calibration: Record) -> bool:
-        """Whether the status was UNCALIBRATED since: what came after it may be COLLECTING, but not with this one."""
-        where = "WHERE sensor = ? AND what = 'status' AND sequence > ?"
-        since = self._records(where, calibration.sensor, calibration.sequence)
-        return any(record.fields.get("status") == "UNCALIBRATED" for record in since)
+    def _latest(self) -> list[tuple[Any, ...]]:
+        return self._checked("SELECT sensor, what, sequence, withdrawn, crc FROM latest")
+
+    def _record(self, sequence: int) -> Record:
+        found = self._records("WHERE sequence = ?", sequence)
+        if not found:
+            raise StoreError(f"{self._path}: result {sequence} is not there")
+        return found[0]
 
     def _records(self, clause: str, *values: object) -> list[Record]:
-        rows = self._rows(f"SELECT {_COLUMNS} FROM results {clause}", *values)
-        return [
-            Record(sequence, run_id, sensor, what, payload, t_utc_ns, bool(recorded), recording, identity)
-            for sequence, run_id, sensor, what, payload, t_utc_ns, recorded, recording, identity in rows
-        ]
+        rows = self._rows(f"SELECT {RESULT_COLUMNS}, crc FROM results {clause}", *values)
+        try:
+            return [Record.of_row(row) for row in rows]
+        except DamagedRow as error:
+            raise StoreError(f"{self._path}: {error}") from None
+
+    def _checked(self, sql: str) -> list[tuple[Any, ...]]:
+        try:
+            return [checked(row) for row in self._rows(sql)]
+        except DamagedRow as error:
+            raise StoreError(f"{self._path}: {error}") from None
 
     def _rows(self, sql: str, *values: object) -> list[tuple[Any, ...]]:
         # A whole answer at once: a reader that stays in a transaction keeps the log from being folded in.
         try:
             with closing(self._connection.execute(sql, values)) as cursor:
                 return cursor.fetchall()
-        except sqlite3.Error as error:
+        except (sqlite3.Error, UnicodeDecodeError) as error:
             raise StoreError(f"{self._path}: {error}") from None
 
 

@@ -2,60 +2,60 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import sqlite3
 import threading
 import time
 from collections.abc import Iterable
-from contextlib import closing
 from pathlib import Path
 
-from agent.delivery.history import FILE_NAME, SCHEMA_VERSION, Record, StoreError, connect_read_only
+from agent.delivery.history import FILE_NAME, Record
+from agent.delivery.opening import lock, open_or_set_aside
+from agent.delivery.recovery import Recovered, recover
+from agent.delivery.retention import FOR_EVER, KeepResults, Sweep
+from agent.delivery.schema import (
+    DamagedRow,
+    StoreError,
+    create_tables,
+    insert_results,
+    read_marks,
+    version_of,
+    withdraw,
+    write_latest,
+    write_mark,
+)
 
-LOCK_NAME = "state.lock"
 # After a run that did not close well, numbers may be out in the world that no commit has kept; the next run counts on
 # from beyond them. More than a week of one unkept result a second.
 UNKEPT_MAX = 1_000_000
 # Results that a failing disk refused wait in memory for the next commit; beyond this the oldest are given up.
 WAITING_MAX = 1000
-_CORRUPT = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
-_SCHEMA = """
-BEGIN;
-CREATE TABLE results (
-    sequence INTEGER PRIMARY KEY, run_id TEXT NOT NULL, sensor TEXT NOT NULL, what TEXT NOT NULL,
-    payload BLOB NOT NULL, t_utc_ns INTEGER NOT NULL, recorded INTEGER NOT NULL, recording TEXT NOT NULL,
-    identity TEXT NOT NULL) STRICT;
-CREATE INDEX results_of_channel ON results (sensor, what, sequence);
-CREATE TABLE latest (
-    sensor TEXT NOT NULL, what TEXT NOT NULL, sequence INTEGER NOT NULL, PRIMARY KEY (sensor, what)) STRICT;
-CREATE TABLE marks (name TEXT PRIMARY KEY, value INTEGER NOT NULL) STRICT;
-INSERT INTO marks VALUES ('floor', {first}), ('published', {first}), ('clean', 1);
-PRAGMA user_version = {version};
-COMMIT;
-"""
 
 
 class Store:
     """Commits results durably (WAL, synchronous FULL) and remembers up to where they are published.
 
     May be called from any thread; reading is done by a `History` of one's own on `path`.
-    `set_aside` names the corrupt file that was found and renamed, None where there was none.
-    A new store cannot know which numbers were used before it, by a store that is corrupt or was deleted; it counts on
-    from `count_from`, by default the UTC milliseconds, which lie beyond them and still fit a number of JavaScript.
+    Every page and row is checked at the start. `set_aside` names the damaged file that was found and renamed, None
+    where there was none; `recovered` says what was found again in the recordings of `data_dir`: everything that they
+    hold where the store is new, what the last moments before a crash left out where it is not.
+    A new store cannot know which numbers were used before it; it counts on from `count_from`, by default the UTC
+    milliseconds, and from beyond what the recordings hold. They still fit a number of JavaScript.
     Raises StoreError where the directory cannot be written or another process has the store.
     """
 
-    def __init__(self, data_dir: Path, count_from: int | None = None) -> None:
+    def __init__(self, data_dir: Path, count_from: int | None = None, keep: KeepResults = FOR_EVER) -> None:
         first = time.time_ns() // 1_000_000 if count_from is None else count_from
         self.path = data_dir / FILE_NAME
         self._mutex = threading.Lock()
         self._waiting: list[Record] = []
-        self._lock = _lock(data_dir)
+        self._last = self._published = self._file_sequence = 0
+        self._sweep = Sweep(keep)
+        self._lock = lock(data_dir)
         try:
-            self.set_aside, self._connection = _open_or_set_aside(self.path, first)
-            self._last, self._published = self._begin_run()
-        except sqlite3.Error as error:
+            self.set_aside, self._connection = open_or_set_aside(self.path)
+            self.recovered = self._begin_run(first)
+        except (sqlite3.Error, DamagedRow, OSError) as error:
             os.close(self._lock)
             raise StoreError(f"{self.path}: {error}") from None
         except StoreError:
@@ -77,7 +77,8 @@ class Store:
                 with self._connection:
                     self._connection.execute("BEGIN IMMEDIATE")
                     self._write(self._waiting)
-            except sqlite3.Error as error:
+                    self._sweep.run(self._connection, self._waiting, self._published)
+            except (sqlite3.Error, DamagedRow) as error:
                 del self._waiting[:-WAITING_MAX]
                 raise StoreError(f"{self.path}: {error}") from None
             self._waiting.clear()
@@ -90,6 +91,25 @@ class Store:
         """Results up to `sequence` are out. Kept with the next commit: after a crash a few go out twice."""
         self._published = max(self._published, sequence)
 
+    def file_sequence(self) -> int:
+        """The highest number that a recording here ever had, also one that is deleted."""
+        return self._file_sequence
+
+    def mark_file(self, file_sequence: int) -> None:
+        """A recording of this number is there. Raises StoreError where that cannot be kept; the next commit tries."""
+        self._file_sequence = max(self._file_sequence, file_sequence)
+        self.commit([])
+
+    def first_waiting_recording(self) -> str:
+        """Name of the recording with the first result that is not published; "" where there is none."""
+        with self._mutex:
+            sql = "SELECT recording FROM results WHERE sequence > ? AND recorded = 1 ORDER BY sequence LIMIT 1"
+            try:
+                row = self._connection.execute(sql, (self._published,)).fetchone()
+            except sqlite3.Error as error:
+                raise StoreError(f"{self.path}: {error}") from None
+            return str(row[0]) if row else ""
+
     def close(self) -> None:
         """Keep what is left and let go of the file. May be called twice."""
         with self._mutex:
@@ -99,7 +119,7 @@ class Store:
                 with self._connection:
                     self._connection.execute("BEGIN IMMEDIATE")
                     self._write(self._waiting)
-                    self._mark("clean", 1)
+                    write_mark(self._connection, "clean", 1)
             except sqlite3.Error as error:
                 raise StoreError(f"{self.path}: {error}") from None
             finally:
@@ -115,85 +135,34 @@ class Store:
             self._last = record.sequence
 
     def _write(self, records: list[Record]) -> None:
-        self._connection.executemany(
-            "INSERT INTO results (sequence, run_id, sensor, what, payload, t_utc_ns, recorded, recording, identity)"
-            " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
-            [
-                (r.sequence, r.run_id, r.sensor, r.what, r.payload, r.t_utc_ns, r.recorded, r.recording, r.identity)
-                for r in records
-            ],
-        )
-        self._connection.executemany(
-            "INSERT OR REPLACE INTO latest (sensor, what, sequence) VALUES (?, ?, ?)",
-            [(r.sensor, r.what, r.sequence) for r in records],
-        )
-        self._mark("published", self._published)
+        insert_results(self._connection, [record.row for record in records])
+        for record in records:
+            write_latest(self._connection, record.sensor, record.what, record.sequence, withdrawn=False)
+            if record.is_withdrawal:
+                withdraw(self._connection, record.sensor)
+        write_mark(self._connection, "published", self._published)
+        write_mark(self._connection, "file", self._file_sequence)
 
-    def _mark(self, name: str, value: int) -> None:
-        self._connection.execute("UPDATE marks SET value = ? WHERE name = ?", (value, name))
-
-    def _begin_run(self) -> tuple[int, int]:
-        marks = dict(self._connection.execute("SELECT name, value FROM marks").fetchall())
-        (kept,) = self._connection.execute("SELECT coalesce(max(sequence), 0) FROM results").fetchone()
-        last = max(kept, marks["floor"])
-        if not marks["clean"]:
-            last += UNKEPT_MAX
+    def _begin_run(self, first: int) -> Recovered:
+        """Read the marks; make the tables where the file is new; fetch from the recordings what is not here."""
         with self._connection:
-            self._mark("floor", last)
-            self._mark("clean", 0)
-        return last, marks["published"]
-
-
-def _lock(data_dir: Path) -> int:
-    try:
-        data_dir.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(data_dir / LOCK_NAME, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-    except OSError as error:
-        raise StoreError(f"{data_dir}: cannot be written: {error.strerror}") from None
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        os.close(descriptor)
-        raise StoreError(f"{data_dir}: another process is using it") from None
-    return descriptor
-
-
-def _open_or_set_aside(path: Path, first: int) -> tuple[Path | None, sqlite3.Connection]:
-    if not path.exists() or not _is_corrupt(path):
-        return None, _open(path, first)
-    number = 1
-    while (aside := path.with_name(f"{path.name}.corrupt-{number}")).exists():
-        number += 1
-    for end in ("-wal", "-shm", ""):
-        source = path.with_name(path.name + end)
-        if source.exists():
-            source.rename(path.with_name(f"{source.name}.corrupt-{number}"))
-    return aside, _open(path, first)
-
-
-def _is_corrupt(path: Path) -> bool:
-    # Read-only: a connection that may write would fold the log into the broken file and delete it when it closes.
-    with closing(connect_read_only(path)) as connection:
-        try:
-            return bool(connection.execute("PRAGMA quick_check(1)").fetchone() != ("ok",))
-        except sqlite3.DatabaseError as error:
-            if error.sqlite_errorcode in _CORRUPT:
-                return True
-            raise
-
-
-def _open(path: Path, first: int) -> sqlite3.Connection:
-    # Any thread: a mutex guards the connection, and the thread that opens is not the one that commits.
-    connection = sqlite3.connect(path, timeout=5.0, isolation_level=None, check_same_thread=False)
-    try:
-        connection.execute("PRAGMA journal_mode = WAL")
-        connection.execute("PRAGMA synchronous = FULL")
-        (version,) = connection.execute("PRAGMA user_version").fetchone()
-        if version == 0:
-            connection.executescript(_SCHEMA.format(version=SCHEMA_VERSION, first=first))
-        elif version != SCHEMA_VERSION:
-            raise StoreError(f"{path}: written in version {version}, this program writes version {SCHEMA_VERSION}")
-    except BaseException:
-        connection.close()
-        raise
-    return connection
+            self._connection.execute("BEGIN IMMEDIATE")
+            new = version_of(self._connection) == 0
+            if new:
+                create_tables(self._connection, {"floor": first, "published": first, "clean": 0, "file": 0})
+            marks = read_marks(self._connection)
+            recovered = Recovered() if marks["clean"] else recover(self._connection, self.path.parent, everything=new)
+            (kept,) = self._connection.execute("SELECT coalesce(max(sequence), 0) FROM results").fetchone()
+            self._last = max(kept, marks["floor"])
+            if not marks["clean"] and not new:
+                self._last += UNKEPT_MAX
+            self._published = marks["published"]
+            if new and recovered.results:
+                self._last = max(first, kept + UNKEPT_MAX)
+                self._published = recovered.published
+            self._file_sequence = max(marks["file"], recovered.file_sequence)
+            write_mark(self._connection, "floor", self._last)
+            write_mark(self._connection, "published", self._published)
+            write_mark(self._connection, "file", self._file_sequence)
+            write_mark(self._connection, "clean", 0)
+        return recovered

@@ -7,7 +7,7 @@ from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
 DESCRIPTOR: _descriptor.FileDescriptor
 
 class Event(_message.Message):
-    __slots__ = ("event_sequence", "run_start", "device_change", "gap", "tick", "command")
+    __slots__ = ("event_sequence", "run_start", "device_change", "gap", "tick", "command", "pruned")
     class RunStart(_message.Message):
         __slots__ = ("run_id", "site", "gateway", "boot_id", "t_monotonic_ns", "t_utc_ns", "config_json", "versions", "fingerprint", "snapshot", "file_sequence", "continuation")
         class VersionsEntry(_message.Message):
@@ -107,19 +107,36 @@ class Event(_message.Message):
         counter: int
         refused: str
         def __init__(self, sensor: _Optional[str] = ..., verb: _Optional[str] = ..., t_monotonic_ns: _Optional[int] = ..., t_utc_ns: _Optional[int] = ..., arguments_json: _Optional[str] = ..., calibration_json: _Optional[str] = ..., key_id: _Optional[str] = ..., counter: _Optional[int] = ..., refused: _Optional[str] = ...) -> None: ...
+    class Pruned(_message.Message):
+        __slots__ = ("t_monotonic_ns", "t_utc_ns", "first_file", "last_file", "last_sha256", "bytes")
+        T_MONOTONIC_NS_FIELD_NUMBER: _ClassVar[int]
+        T_UTC_NS_FIELD_NUMBER: _ClassVar[int]
+        FIRST_FILE_FIELD_NUMBER: _ClassVar[int]
+        LAST_FILE_FIELD_NUMBER: _ClassVar[int]
+        LAST_SHA256_FIELD_NUMBER: _ClassVar[int]
+        BYTES_FIELD_NUMBER: _ClassVar[int]
+        t_monotonic_ns: int
+        t_utc_ns: int
+        first_file: int
+        last_file: int
+        last_sha256: str
+        bytes: int
+        def __init__(self, t_monotonic_ns: _Optional[int] = ..., t_utc_ns: _Optional[int] = ..., first_file: _Optional[int] = ..., last_file: _Optional[int] = ..., last_sha256: _Optional[str] = ..., bytes: _Optional[int] = ...) -> None: ...
     EVENT_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     RUN_START_FIELD_NUMBER: _ClassVar[int]
     DEVICE_CHANGE_FIELD_NUMBER: _ClassVar[int]
     GAP_FIELD_NUMBER: _ClassVar[int]
     TICK_FIELD_NUMBER: _ClassVar[int]
     COMMAND_FIELD_NUMBER: _ClassVar[int]
+    PRUNED_FIELD_NUMBER: _ClassVar[int]
     event_sequence: int
     run_start: Event.RunStart
     device_change: Event.DeviceChange
     gap: Event.Gap
     tick: Event.Tick
     command: Event.Command
-    def __init__(self, event_sequence: _Optional[int] = ..., run_start: _Optional[_Union[Event.RunStart, _Mapping]] = ..., device_change: _Optional[_Union[Event.DeviceChange, _Mapping]] = ..., gap: _Optional[_Union[Event.Gap, _Mapping]] = ..., tick: _Optional[_Union[Event.Tick, _Mapping]] = ..., command: _Optional[_Union[Event.Command, _Mapping]] = ...) -> None: ...
+    pruned: Event.Pruned
+    def __init__(self, event_sequence: _Optional[int] = ..., run_start: _Optional[_Union[Event.RunStart, _Mapping]] = ..., device_change: _Optional[_Union[Event.DeviceChange, _Mapping]] = ..., gap: _Optional[_Union[Event.Gap, _Mapping]] = ..., tick: _Optional[_Union[Event.Tick, _Mapping]] = ..., command: _Optional[_Union[Event.Command, _Mapping]] = ..., pruned: _Optional[_Union[Event.Pruned, _Mapping]] = ...) -> None: ...
 
 class RawBlock(_message.Message):
     __slots__ = ("event_sequence", "device", "boot_id", "t_utc_ns", "first_index", "nominal_rate_hz", "flags", "temperature_raw", "temperature_degc", "axes", "decimal", "burst_t_monotonic_ns", "burst_count", "x_counts", "y_counts", "z_counts", "x", "y", "z")

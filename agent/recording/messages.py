@@ -22,6 +22,7 @@ from agent.events import (
     Estimate,
     Event,
     Gap,
+    Pruned,
     Result,
     RunStart,
     StatusChange,
@@ -48,6 +49,7 @@ _EVENT_FIELDS: dict[type[Any], str] = {
     DeviceChange: "device_change",
     Gap: "gap",
     Command: "command",
+    Pruned: "pruned",
     Tick: "tick",
 }
 _EVENT_KINDS = {field: kind for kind, field in _EVENT_FIELDS.items()}
@@ -69,6 +71,11 @@ def topic_of(item: Event | Result) -> str:
     if isinstance(item, Result):
         return f"/{item.sensor}/{RESULT_TOPICS[type(item)]}"
     return EVENTS_TOPIC
+
+
+def is_result_topic(topic: str) -> bool:
+    """Whether results are recorded on a topic."""
+    return topic.rsplit("/", 1)[-1] in RESULT_TOPICS.values()
 
 
 def schema_of(topic: str) -> str:

@@ -161,8 +161,10 @@ def walk(file: BinaryIO, size: int) -> Iterator[Record]:
             raise RecordError("corrupt", offset, record_name(opcode), f"{length} bytes, more than {RECORD_LIMIT}")
         yield Record(offset, opcode, file.read(length))
         offset += _HEAD.size + length
-    if file.read(len(MAGIC)) != MAGIC:
-        raise RecordError("corrupt", offset, "magic", "the file does not end as MCAP does")
+    end = file.read(len(MAGIC))
+    if end != MAGIC:
+        early = len(end) < len(MAGIC) and MAGIC.startswith(end)
+        raise RecordError("torn" if early else "corrupt", offset, "magic", "the file does not end as MCAP does")
     if offset + len(MAGIC) != size:
         raise RecordError("corrupt", offset + len(MAGIC), "end of file", f"{size - offset - 8} bytes follow the end")
 

@@ -107,6 +107,10 @@ class DerivedSummary:
         if missing:
             raise refusal(record, f"comes before the message index of channels {missing}")
 
+    def awaited_indexes(self) -> list[MessageIndex]:
+        """The message indexes that are still missing behind the last chunk."""
+        return [MessageIndex(channel_id, records) for channel_id, records in (self._awaited or {}).items()]
+
     def add_metadata(self, record: Record, metadata: Metadata) -> None:
         """A Metadata record."""
         self._metadata.append(MetadataIndex(record.offset, record.end - record.offset, metadata.name))

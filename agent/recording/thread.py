@@ -7,10 +7,11 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 
-from agent.events import Event, Result, RunStart
+from agent.events import Event, Pruned, Result, RunStart
 from agent.recording.writer import Recorder
 
 FLUSH_S = 2.0  # s; a power cut costs at most this much of the recording, for 11 % more disk than one long chunk
+LOOK_S = 10.0  # s; how often it is asked whether recordings are due to be deleted
 CAPACITY = 256  # events; half a minute of two devices and ticks, while a slow card takes its time
 
 Deliver = Callable[[int, Sequence[Result], bool], None]
@@ -29,6 +30,7 @@ class RecordingThread:
         self._flush_s = flush_s
         self._queue: queue.Queue[tuple[int, Event, Sequence[Result]] | None] = queue.Queue(CAPACITY)
         self._starts_sent = self._starts_done = 0
+        self._pruning_sent = False
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._run, name="recording", daemon=True)
         self._thread.start()
@@ -38,10 +40,16 @@ class RecordingThread:
         """Whether the next event should be a RunStart; false while one is on its way."""
         return self._starts_sent == self._starts_done and self._recorder.wants_rotation
 
+    def take_pruning(self) -> Pruned | None:
+        """The next event, where recordings are due to be deleted; None while one is on its way."""
+        return None if self._pruning_sent else self._recorder.pruning
+
     def put(self, event_sequence: int, event: Event, results: Sequence[Result]) -> None:
         """Hand over an event and what came of it; waits while the disk is far behind."""
         if isinstance(event, RunStart):
             self._starts_sent += 1
+        elif isinstance(event, Pruned):
+            self._pruning_sent = True
         self._hand_over((event_sequence, event, results))
 
     def close(self) -> None:
@@ -72,7 +80,11 @@ class RecordingThread:
 
     def _loop(self) -> None:
         flush_at = time.monotonic() + self._flush_s
+        look_at = time.monotonic()
         while True:
+            if time.monotonic() >= look_at:
+                self._recorder.look_for_pruning()
+                look_at = time.monotonic() + LOOK_S
             if time.monotonic() >= flush_at:
                 self._recorder.sync()
                 flush_at = time.monotonic() + self._flush_s
@@ -85,5 +97,7 @@ class RecordingThread:
             event_sequence, event, results = entry
             recorded = self._recorder.record(event_sequence, event, results)
             self._starts_done += isinstance(event, RunStart)
+            if isinstance(event, Pruned):
+                self._pruning_sent = False
             if results:
                 self._deliver(event_sequence, results, recorded)

@@ -16,8 +16,8 @@ import pytest
 from agent.audit import audit_files, run_audit
 from agent.events import RunStart
 from agent.recording.comparison import OTHER_CPU
+from agent.recording.files import recordings
 from agent.recording.fingerprint import environment_for, fingerprint
-from agent.recording.writer import recordings
 from tests.replay.forgery import with_sums
 from tests.replay.stand_in import Recorded, StandIn, record_run
 from tests.replay.test_replay import alter_data, record_again

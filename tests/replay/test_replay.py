@@ -13,11 +13,12 @@ import pytest
 
 from agent.events import CalibrationUpdate, Event, Result, RunStart, StatusChange, WindowReport
 from agent.recording.comparison import OTHER_CPU
+from agent.recording.files import recordings
 from agent.recording.fingerprint import fingerprint
 from agent.recording.messages import encode
 from agent.recording.records import walk
 from agent.recording.replaying import Replay, ReplayedFile
-from agent.recording.writer import Recorder, recordings
+from agent.recording.writer import Recorder
 from agent.replay import run_replay
 from tests.replay.stand_in import CONFIG, SECOND, Recorded, StandIn, happenings, record_run, run_start
 

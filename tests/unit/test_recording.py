@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import os
 import resource
 import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import msgspec
@@ -19,10 +20,12 @@ from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
 from agent.events import Gap, Tick
+from agent.recording.files import FILE_METADATA, recordings
 from agent.recording.integrity import check_integrity
 from agent.recording.messages import encode
 from agent.recording.reading import RecordingReader, Step
-from agent.recording.writer import FILE_METADATA, Recorder, recordings
+from agent.recording.records import Record, RecordError, walk
+from agent.recording.writer import Recorder
 from tests.replay.stand_in import CONFIG, EPOCH_NS, SECOND, StandIn, block, happenings, record_run, run_start
 
 REPOSITORY = Path(__file__).parents[2]
@@ -40,6 +43,25 @@ def begun(directory: Path, **options: float) -> Recorder:
     recorder = Recorder(directory, ["acc"], ["bridge-1"], **options)  # type: ignore[arg-type]
     assert recorder.record(0, run_start(StandIn(CONFIG), 0, recorder.next_file_sequence), [])
     return recorder
+
+
+def sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def origin(path: Path) -> tuple[str, str]:
+    """The file before, and its SHA-256, as a file names them."""
+    with open(path, "rb") as file:
+        metadata = next(make_reader(file).iter_metadata()).metadata
+    return metadata["previous_file"], metadata["previous_sha256"]
+
+
+def records(data: bytes) -> list[Record]:
+    """The records of a file that may end early."""
+    found: list[Record] = []
+    with suppress(RecordError):
+        found.extend(walk(io.BytesIO(data), len(data)))
+    return found
 
 
 @contextmanager
@@ -203,6 +225,8 @@ def test_a_full_disk_ends_the_file_and_a_later_run_start_begins_another(
     assert "File too large" in recorder.fault
     assert len(caplog.records) == 1
     left = path.read_bytes()
+    *_, last = records(left)
+    kept = last.end
     assert not recorder.record(2, tick(7), [])
     recorder.sync()
     recorder.close()
@@ -215,9 +239,9 @@ def test_a_full_disk_ends_the_file_and_a_later_run_start_begins_another(
     assert recorder.fault == ""
     recorder.close()
     assert read(tmp_path / "fieldcal-000002.mcap")[0].event_sequence == 4
-    with open(tmp_path / "fieldcal-000002.mcap", "rb") as file:
-        metadata = next(make_reader(file).iter_metadata()).metadata
-    assert (metadata["previous_file"], metadata["previous_sha256"]) == ("fieldcal-000001.mcap", "")
+    closed = tmp_path / "fieldcal-000001.mcap"  # what was given up is closed before the next begins
+    assert closed.read_bytes()[:kept] == left[:kept]
+    assert origin(tmp_path / "fieldcal-000002.mcap") == (closed.name, sha256(closed))
 
 
 @pytest.mark.parametrize("room", [0, 100, 1000])
@@ -230,12 +254,13 @@ def test_a_disk_that_stays_full_leaves_no_file_at_each_attempt(tmp_path: Path, r
     assert [path.name for _, path in recordings(tmp_path)] == ["fieldcal-000001.mcap.active"]
     assert recorder.record(1, run_start(StandIn(CONFIG), 1, recorder.next_file_sequence), [])
     recorder.close()
-    with open(tmp_path / "fieldcal-000002.mcap", "rb") as file:
-        metadata = next(make_reader(file).iter_metadata()).metadata
-    assert (metadata["previous_file"], metadata["previous_sha256"]) == ("fieldcal-000001.mcap", "")
+    assert origin(tmp_path / "fieldcal-000002.mcap") == (
+        "fieldcal-000001.mcap",
+        sha256(tmp_path / "fieldcal-000001.mcap"),
+    )
 
 
-def test_after_a_failed_file_the_next_does_not_name_the_one_before_it(tmp_path: Path) -> None:
+def test_after_a_failed_file_the_next_names_it_closed(tmp_path: Path) -> None:
     recorder = begun(tmp_path)
     recorder.record(1, run_start(StandIn(CONFIG), 1, 2), [])
     assert recorder.path is not None
@@ -245,9 +270,9 @@ def test_after_a_failed_file_the_next_does_not_name_the_one_before_it(tmp_path: 
     assert not recorder.recording
     recorder.record(3, run_start(StandIn(CONFIG), 3, 3), [])
     recorder.close()
-    with open(tmp_path / "fieldcal-000003.mcap", "rb") as file:
-        metadata = next(make_reader(file).iter_metadata()).metadata
-    assert (metadata["previous_file"], metadata["previous_sha256"]) == ("fieldcal-000002.mcap", "")
+    failed = tmp_path / "fieldcal-000002.mcap"
+    assert origin(tmp_path / "fieldcal-000003.mcap") == (failed.name, sha256(failed))
+    assert [step.event_sequence for step in read(failed)] == [1]
 
 
 def test_no_file_is_ever_overwritten(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -1,0 +1,112 @@
+"""Opens the store's file: locked against a second agent, checked wholly, set aside where it is damaged, migrated."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+from agent.delivery.history import connect_read_only
+from agent.delivery.schema import (
+    SCHEMA_VERSION,
+    DamagedRow,
+    StoreError,
+    bring_up_to_date,
+    damage,
+    known_version,
+    version_of,
+)
+
+LOCK_NAME = "state.lock"
+# What SQLite says of a sound file on a machine that is not: anything else means that the file is damaged.
+_OF_THE_MACHINE = frozenset(
+    {
+        sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_FULL,
+        sqlite3.SQLITE_NOMEM, sqlite3.SQLITE_PERM, sqlite3.SQLITE_READONLY, sqlite3.SQLITE_PROTOCOL,
+    }
+)  # fmt: skip
+
+
+def lock(data_dir: Path) -> int:
+    """The descriptor that holds a data directory for this process. Raises StoreError."""
+    try:
+        data_dir.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(data_dir / LOCK_NAME, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    except OSError as error:
+        raise StoreError(f"{data_dir}: cannot be written: {error.strerror}") from None
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(descriptor)
+        raise StoreError(f"{data_dir}: another process is using it") from None
+    return descriptor
+
+
+def open_or_set_aside(path: Path) -> tuple[Path | None, sqlite3.Connection]:
+    """(where a damaged file was put, a connection to a store of this version or to an empty file).
+
+    Raises StoreError for a store of a later version, sqlite3.Error where the machine does not let it be opened.
+    """
+    if not path.exists():
+        return None, _open(path)
+    if not _is_damaged(path):
+        try:
+            return None, _open(path)
+        except (sqlite3.Error, DamagedRow) as error:
+            if not _means_damage(error, path):
+                raise
+    number = 1
+    while (aside := path.with_name(f"{path.name}.corrupt-{number}")).exists():
+        number += 1
+    for end in ("-wal", "-shm", ""):
+        source = path.with_name(path.name + end)
+        if source.exists():
+            source.rename(path.with_name(f"{source.name}.corrupt-{number}"))
+    return aside, _open(path)
+
+
+def _is_damaged(path: Path) -> bool:
+    # Read-only: a connection that may write would fold the log into the broken file and delete it when it closes.
+    with closing(connect_read_only(path)) as connection:
+        try:
+            version = version_of(connection)
+            if version in (0, SCHEMA_VERSION):
+                return bool(version and damage(connection))
+            if not known_version(version):
+                return False  # `_open` refuses it
+            return bool(connection.execute("PRAGMA integrity_check(1)").fetchone() != ("ok",))
+        except (sqlite3.Error, UnicodeDecodeError) as error:
+            if _means_damage(error, path):
+                return True
+            raise
+
+
+def _means_damage(error: Exception, path: Path) -> bool:
+    code = getattr(error, "sqlite_errorcode", None)
+    if code is None:
+        return True  # of Python's own: text that cannot be decoded
+    if code & 0xFF == sqlite3.SQLITE_READONLY:  # also said of a version of the file format that is none
+        return os.access(path, os.W_OK)
+    return code & 0xFF not in _OF_THE_MACHINE
+
+
+def _open(path: Path) -> sqlite3.Connection:
+    # Any thread: a mutex guards the connection, and the thread that opens is not the one that commits.
+    connection = sqlite3.connect(path, timeout=5.0, isolation_level=None, check_same_thread=False)
+    try:
+        connection.execute("PRAGMA journal_mode = WAL")
+        connection.execute("PRAGMA synchronous = FULL")
+        version = version_of(connection)
+        if not known_version(version) and version != 0:
+            raise StoreError(f"{path}: written in version {version}, this program writes version {SCHEMA_VERSION}")
+        if version == SCHEMA_VERSION:
+            # Whether it can be written at all shows here; and where a bit of the number itself had changed, it is right.
+            connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+        elif version != 0:
+            bring_up_to_date(connection, version)
+    except BaseException:
+        connection.close()
+        raise
+    return connection

@@ -1,0 +1,92 @@
+"""What the store lets go of, so that years do not fill the disk: the oldest results, two at most for each new one."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from agent.delivery.history import Record
+from agent.delivery.schema import checked, row_crc
+
+DAY_NS = 86_400_000_000_000
+# A store that is too large shrinks as fast as it grows, and a clock that jumped ahead by years has deleted little when
+# somebody sets it right.
+FOR_EACH_NEW = 2
+
+
+@dataclass(frozen=True, slots=True)
+class KeepResults:
+    """How long results stay; None is for ever.
+
+    `days`, `bytes`: of what is published, by the UTC in the results and by the pages of the store in use.
+    `waiting_days`: of what no router ever took. The newest result of each channel stays, and the newest calibration of
+    each device that a sensor ever was, however old.
+    """
+
+    days: float | None = None
+    bytes: int | None = None
+    waiting_days: float | None = None
+
+
+FOR_EVER = KeepResults()
+
+
+class Sweep:
+    """Deletes with every commit, in its transaction; counts what it deleted in the table `removed`."""
+
+    def __init__(self, keep: KeepResults) -> None:
+        self._keep = keep
+        self._looked_at = 0  # up to this number nothing is left but what stays
+
+    def run(self, connection: sqlite3.Connection, new: Sequence[Record], published: int) -> None:
+        """Delete the oldest for the sake of `new` ones. Raises sqlite3.Error, DamagedRow."""
+        if self._keep == FOR_EVER or not new:
+            return
+        now_ns, too_large = new[-1].t_utc_ns, self._too_large(connection)
+        rows = connection.execute(
+            "SELECT sequence, sensor, what, identity, t_utc_ns FROM results"
+            " WHERE sequence > ? ORDER BY sequence LIMIT ?",
+            (self._looked_at, FOR_EACH_NEW * len(new)),
+        ).fetchall()
+        for sequence, sensor, what, identity, t_utc_ns in rows:
+            age_days = (now_ns - t_utc_ns) / DAY_NS
+            done = sequence <= published and (too_large or _beyond(age_days, self._keep.days))
+            if not done and not _beyond(age_days, self._keep.waiting_days):
+                return
+            if not _stays(connection, sequence, sensor, what, identity):
+                connection.execute("DELETE FROM results WHERE sequence = ?", (sequence,))
+                _count(connection, sensor, what, sequence)
+            self._looked_at = sequence  # where the transaction fails, these are looked at again after a restart
+
+    def _too_large(self, connection: sqlite3.Connection) -> bool:
+        if self._keep.bytes is None:
+            return False
+        size, count, free = (
+            connection.execute(f"PRAGMA {name}").fetchone()[0] for name in ("page_size", "page_count", "freelist_count")
+        )
+        return bool(size * (count - free) > self._keep.bytes)
+
+
+def _beyond(age_days: float, limit_days: float | None) -> bool:
+    return limit_days is not None and age_days > limit_days
+
+
+def _stays(connection: sqlite3.Connection, sequence: int, sensor: str, what: str, identity: str) -> bool:
+    newer = "SELECT 1 FROM results WHERE sensor = ? AND what = ? AND sequence > ? LIMIT 1"
+    values: tuple[object, ...] = (sensor, what, sequence)
+    if what == "calibration":
+        newer = (
+            "SELECT 1 FROM results WHERE sensor = ? AND what = 'calibration' AND sequence > ? AND identity = ? LIMIT 1"
+        )
+        values = (sensor, sequence, identity)
+    return connection.execute(newer, values).fetchone() is None
+
+
+def _count(connection: sqlite3.Connection, sensor: str, what: str, sequence: int) -> None:
+    where = "SELECT sensor, what, count, up_to, crc FROM removed WHERE sensor = ? AND what = ?"
+    row = connection.execute(where, (sensor, what)).fetchone()
+    new = (sensor, what, (checked(row)[2] if row else 0) + 1, sequence)
+    connection.execute(
+        "INSERT OR REPLACE INTO removed (sensor, what, count, up_to, crc) VALUES (?, ?, ?, ?, ?)", (*new, row_crc(*new))
+    )

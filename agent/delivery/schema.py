@@ -1,0 +1,194 @@
+"""The tables of the store, how an older store is brought up to date, and what tells that one is damaged.
+
+SQLite finds a page that is broken, not a digit that changed within a value. So each row carries the CRC-32 of its other
+columns; whoever reads a row checks it.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+import zlib
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import msgspec
+
+SCHEMA_VERSION = 2
+MARKS = frozenset({"floor", "published", "clean", "file"})
+RESULT_COLUMNS = "sequence, run_id, sensor, what, payload, t_utc_ns, recorded, recording, identity"
+_RESULTS = """CREATE TABLE results (
+    sequence INTEGER PRIMARY KEY, run_id TEXT NOT NULL, sensor TEXT NOT NULL, what TEXT NOT NULL,
+    payload BLOB NOT NULL, t_utc_ns INTEGER NOT NULL, recorded INTEGER NOT NULL, recording TEXT NOT NULL,
+    identity TEXT NOT NULL, crc INTEGER NOT NULL) STRICT"""
+# `withdrawn`: a calibration is in force no more, since the status was UNCALIBRATED after it.
+_LATEST = """CREATE TABLE latest (
+    sensor TEXT NOT NULL, what TEXT NOT NULL, sequence INTEGER NOT NULL, withdrawn INTEGER NOT NULL,
+    crc INTEGER NOT NULL, PRIMARY KEY (sensor, what)) STRICT"""
+_MARKS = "CREATE TABLE marks (name TEXT PRIMARY KEY, value INTEGER NOT NULL, crc INTEGER NOT NULL) STRICT"
+# What retention deleted, by channel: how many results, and the number of the last of them.
+_REMOVED = """CREATE TABLE removed (
+    sensor TEXT NOT NULL, what TEXT NOT NULL, count INTEGER NOT NULL, up_to INTEGER NOT NULL, crc INTEGER NOT NULL,
+    PRIMARY KEY (sensor, what)) STRICT"""
+_INDEXES = (
+    "CREATE INDEX results_of_channel ON results (sensor, what, sequence)",
+    "CREATE INDEX calibrations_of_device ON results (sensor, identity, sequence) WHERE what = 'calibration'",
+)
+_STATEMENTS = (_RESULTS, _LATEST, _MARKS, _REMOVED, *_INDEXES)
+
+
+class StoreError(Exception):
+    """The store cannot be read or written. The message names the file and the reason."""
+
+
+class DamagedRow(StoreError):  # noqa: N818 - said of what was read
+    """A row is not what was written."""
+
+
+def row_crc(*columns: object) -> int:
+    """CRC-32 of the columns of a row, in their order."""
+    return zlib.crc32(msgspec.msgpack.encode(columns))
+
+
+def checked(row: tuple[Any, ...]) -> tuple[Any, ...]:
+    """The columns of a row without its last, the CRC of the others. Raises DamagedRow where it does not fit."""
+    *columns, crc = row
+    try:
+        fits = row_crc(*columns) == crc
+    except (OverflowError, UnicodeEncodeError):
+        fits = False
+    if not fits:
+        raise DamagedRow(f"a row that begins with {columns[0]!r:.40} is damaged: its CRC does not fit it")
+    return tuple(columns)
+
+
+def write_mark(connection: sqlite3.Connection, name: str, value: int) -> None:
+    """Set one of the MARKS."""
+    row = (name, value, row_crc(name, value))
+    connection.execute("INSERT OR REPLACE INTO marks (name, value, crc) VALUES (?, ?, ?)", row)
+
+
+def read_marks(connection: sqlite3.Connection) -> dict[str, int]:
+    """All of the MARKS. Raises DamagedRow or sqlite3.Error."""
+    rows = connection.execute("SELECT name, value, crc FROM marks").fetchall()
+    marks = {str(name): value for name, value in map(checked, rows) if isinstance(value, int)}
+    if marks.keys() != MARKS:
+        raise DamagedRow(f"the marks are {', '.join(sorted(marks))}, not {', '.join(sorted(MARKS))}")
+    return marks
+
+
+def write_latest(connection: sqlite3.Connection, sensor: str, what: str, sequence: int, *, withdrawn: bool) -> None:
+    """Name the newest result of a channel."""
+    row = (sensor, what, sequence, int(withdrawn))
+    connection.execute(
+        "INSERT OR REPLACE INTO latest (sensor, what, sequence, withdrawn, crc) VALUES (?, ?, ?, ?, ?)",
+        (*row, row_crc(*row)),
+    )
+
+
+def withdraw(connection: sqlite3.Connection, sensor: str) -> None:
+    """The newest calibration of a sensor, if there is one, is in force no more."""
+    where = "SELECT sequence FROM latest WHERE sensor = ? AND what = 'calibration'"
+    for (sequence,) in connection.execute(where, (sensor,)).fetchall():
+        write_latest(connection, sensor, "calibration", sequence, withdrawn=True)
+
+
+def insert_results(connection: sqlite3.Connection, rows: Iterable[tuple[object, ...]]) -> None:
+    """Add rows of RESULT_COLUMNS with their CRC. Raises sqlite3.IntegrityError where a number is there already."""
+    places = ", ".join("?" * 10)
+    connection.executemany(f"INSERT INTO results ({RESULT_COLUMNS}, crc) VALUES ({places})", rows)
+
+
+def create_tables(connection: sqlite3.Connection, marks: dict[str, int]) -> None:
+    """Make an empty store; within the caller's transaction."""
+    for statement in _STATEMENTS:
+        connection.execute(statement)
+    for name, value in marks.items():
+        write_mark(connection, name, value)
+    connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+
+
+def bring_up_to_date(connection: sqlite3.Connection, version: int) -> None:
+    """Migrate a store of an older version, in one transaction: it is wholly of the old version or of this one."""
+    connection.execute("BEGIN IMMEDIATE")
+    with connection:
+        for older in range(version, SCHEMA_VERSION):
+            _MIGRATIONS[older](connection)
+        connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+
+
+def known_version(version: int) -> bool:
+    """Whether this program can use a store of a version, itself or after a migration."""
+    return version == SCHEMA_VERSION or version in _MIGRATIONS
+
+
+def _add_crcs(connection: sqlite3.Connection) -> None:
+    """1 to 2: CRCs, withdrawal kept beside the newest calibration, the marks of retention and of file numbers."""
+    withdrawn = {sensor for (sensor,) in connection.execute(_WITHDRAWN_IN_1)}
+    newest = connection.execute("SELECT sensor, what, sequence FROM latest").fetchall()
+    marks = dict(connection.execute("SELECT name, value FROM marks").fetchall())
+    connection.create_function("row_crc", 9, row_crc, deterministic=True)
+    connection.execute("ALTER TABLE results RENAME TO results_1")
+    connection.execute("DROP TABLE latest")
+    connection.execute("DROP TABLE marks")
+    for statement in (_RESULTS, _LATEST, _MARKS, _REMOVED):
+        connection.execute(statement)
+    connection.execute(
+        f"INSERT INTO results ({RESULT_COLUMNS}, crc) SELECT {RESULT_COLUMNS}, row_crc({RESULT_COLUMNS}) FROM results_1"
+    )
+    connection.execute("DROP TABLE results_1")
+    for statement in _INDEXES:
+        connection.execute(statement)
+    for sensor, what, sequence in newest:
+        write_latest(connection, sensor, what, sequence, withdrawn=what == "calibration" and sensor in withdrawn)
+    for name, value in (marks | {"file": 0}).items():
+        write_mark(connection, name, value)
+
+
+_WITHDRAWN_IN_1 = """
+SELECT DISTINCT status.sensor FROM results AS status JOIN latest ON latest.sensor = status.sensor
+WHERE latest.what = 'calibration' AND status.what = 'status' AND status.sequence > latest.sequence
+AND json_extract(CAST(status.payload AS TEXT), '$.status') = 'UNCALIBRATED'"""
+_MIGRATIONS: dict[int, Callable[[sqlite3.Connection], None]] = {1: _add_crcs}
+
+
+def damage(connection: sqlite3.Connection) -> str:
+    """What is wrong with a store of this version, every page and row looked at; "" where nothing is.
+
+    Raises sqlite3.Error: the caller knows which of them mean damage too.
+    """
+    (said,) = connection.execute("PRAGMA integrity_check(1)").fetchone()
+    if said != "ok":
+        return str(said)
+    if not _is_ours(connection):
+        return "its tables are not those of this version"
+    newest = "SELECT sensor, what, max(sequence) FROM results GROUP BY sensor, what"
+    try:
+        read_marks(connection)
+        _check_all(connection.execute(f"SELECT {RESULT_COLUMNS}, crc FROM results"))
+        _check_all(connection.execute("SELECT sensor, what, count, up_to, crc FROM removed"))
+        named = {checked(row)[:3] for row in connection.execute("SELECT * FROM latest")}
+    except DamagedRow as error:
+        return str(error)
+    if named != set(connection.execute(newest)):
+        return "it does not name the newest results"
+    return ""
+
+
+def version_of(connection: sqlite3.Connection) -> int:
+    """The version of a store; 0 where it is empty.
+
+    A number of ours on tables that are none of that version, or the other way round, is told by `damage`.
+    """
+    (version,) = connection.execute("PRAGMA user_version").fetchone()
+    # A later version has other tables: with ours, it is the number that is damaged.
+    return SCHEMA_VERSION if version != SCHEMA_VERSION and _is_ours(connection) else int(version)
+
+
+def _is_ours(connection: sqlite3.Connection) -> bool:
+    rows = connection.execute("SELECT sql FROM sqlite_master WHERE sql IS NOT NULL").fetchall()
+    return sorted(sql for (sql,) in rows) == sorted(_STATEMENTS)
+
+
+def _check_all(rows: Iterable[tuple[object, ...]]) -> None:
+    for row in rows:
+        checked(row)

@@ -1,0 +1,216 @@
+"""Closes the files that a crash left open: what is sound stays byte for byte, a proper end is put behind it.
+
+In place, since the disk may be full: from the end of the last sound record on, what was torn is overwritten by an
+attachment that holds it, then come a note of the repair, the signature where there is a key, and the summary.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import Attachment, DataEnd, Footer, Metadata, SummaryOffset
+
+from agent.recording.files import ACTIVE_SUFFIX, recordings, sync_directory
+from agent.recording.integrity import check_integrity
+from agent.recording.records import MAGIC, Record, RecordError, parse, unpack, walk
+from agent.recording.signing import SIGNATURE_METADATA, Signer
+from agent.recording.summary import KINDS, DerivedSummary
+
+REPAIR_METADATA = "fieldcal.repair"
+TAIL_ATTACHMENT = "torn"
+# A crash tears what was written after the last flush: a chunk or two. More behind a broken record is damage of another
+# kind, and hides what can still be read.
+TAIL_MAX = 8 << 20
+
+_log = logging.getLogger(__name__)
+
+
+def close_torn(directory: Path, signer: Signer | None = None) -> None:
+    """Close every file in `directory` that was left `.active`; nothing may be writing one. Raises OSError for the
+    directory alone: a file that cannot be closed is told and stays as it is."""
+    for _, path in recordings(directory):
+        if path.name.endswith(ACTIVE_SUFFIX):
+            try:
+                _log.warning("%s", close_file(path, signer))
+            except (OSError, RecordError) as error:
+                _log.warning("%s was left unfinished and cannot be closed: %s", path, error)
+
+
+def close_file(path: Path, signer: Signer | None = None) -> str:
+    """Close one file; returns what was done. Raises OSError, or RecordError where it is damaged inside."""
+    final = path.with_name(path.name.removesuffix(ACTIVE_SUFFIX))
+    if final.exists():
+        raise FileExistsError(f"{final.name} is there as well")
+    with open(path, "r+b") as file:
+        size = os.fstat(file.fileno()).st_size
+        sound = _sound_part(file, size)
+        torn = size - sound.length
+        if sound.chunks == 0:
+            path.unlink()
+            sync_directory(path.parent)
+            return f"{path} was left without its first event, and removed"
+        file.seek(0)
+        if check_integrity(file, size).finished:
+            torn = 0  # it only lacks its name
+        else:
+            _append(file, sound, size, signer)
+    path.rename(final)
+    sync_directory(path.parent)
+    return f"{final} was left unfinished and is closed now; {torn} bytes at its end were torn"
+
+
+@dataclass(slots=True)
+class _Sound:
+    """The data section up to the first record that is not whole."""
+
+    length: int
+    crc: int
+    sha256: Any
+    derived: DerivedSummary
+    chunks: int
+
+
+def _sound_part(file: BinaryIO, size: int) -> _Sound:
+    sound = _Sound(0, 0, hashlib.sha256(), DerivedSummary(), 0)
+
+    def keep(data: bytes) -> None:
+        sound.length += len(data)
+        sound.crc = zlib.crc32(data, sound.crc)
+        sound.sha256.update(data)
+
+    broken: RecordError | None = None
+    goes_on = False  # something sound follows what is broken: no crash did that
+    try:
+        for record in walk(file, size):
+            if broken is not None:
+                goes_on |= record.opcode == Opcode.CHUNK and _is_sound(record)
+                continue
+            if record.opcode == Opcode.DATA_END:
+                break
+            try:
+                _take(sound.derived, record)
+            except RecordError as error:
+                broken = error
+                continue
+            keep(record.head + record.body if sound.length else MAGIC + record.head + record.body)
+            sound.chunks = len(sound.derived.chunks)
+    except RecordError as error:
+        broken = broken or error
+    if broken is not None:
+        unlike_a_crash = goes_on or (broken.fault.kind == "corrupt" and not sound.chunks)
+        if unlike_a_crash or (size - sound.length > TAIL_MAX and not _ends_in_zeros(file, sound.length)):
+            raise broken
+    return sound
+
+
+def _is_sound(chunk: Record) -> bool:
+    try:
+        unpack(chunk)
+    except RecordError:
+        return False
+    return True
+
+
+def _ends_in_zeros(file: BinaryIO, offset: int) -> bool:
+    """Whether nothing but zeros follows: some file systems fill with them what they lost."""
+    file.seek(offset)
+    while piece := file.read(1 << 20):
+        if any(piece):
+            return False
+    return True
+
+
+def _take(derived: DerivedSummary, record: Record) -> None:
+    if record.opcode == Opcode.CHUNK:
+        derived.end_of_indexes(record)
+        derived.add_chunk(record)
+        return
+    parsed: Any = parse(record)
+    if record.opcode == Opcode.MESSAGE_INDEX:
+        derived.add_message_index(record, parsed)
+    elif record.opcode == Opcode.METADATA:
+        derived.end_of_indexes(record)
+        derived.add_metadata(record, parsed)
+    elif record.opcode == Opcode.ATTACHMENT:
+        derived.end_of_indexes(record)
+        derived.add_attachment(record, parsed)
+
+
+def _append(file: BinaryIO, sound: _Sound, size: int, signer: Signer | None) -> None:
+    """Write the end; where there is no room for it, leave the file as it was."""
+    length = sound.length
+    file.seek(length)
+    tail = file.read(TAIL_MAX) if size - length <= TAIL_MAX else b""
+    end = _end(sound, tail, size, signer)
+    try:
+        file.seek(length)
+        file.write(end)
+        file.truncate(length + len(end))
+        file.flush()
+        os.fsync(file.fileno())
+    except OSError:
+        file.seek(length)
+        file.write(tail)
+        file.truncate(size)
+        raise
+
+
+def _end(sound: _Sound, tail: bytes, size: int, signer: Signer | None) -> bytes:
+    """The bytes that close the file behind its sound part."""
+    parts: list[bytes] = []
+
+    def add(record: Any) -> None:
+        builder = RecordBuilder()
+        record.write(builder)
+        data = builder.end()
+        _take(sound.derived, Record(sound.length, data[0], data[9:]))
+        sound.length += len(data)
+        sound.crc = zlib.crc32(data, sound.crc)
+        sound.sha256.update(data)
+        parts.append(data)
+
+    kept = sound.length
+    for index in sound.derived.awaited_indexes():
+        add(index)
+    if tail:
+        add(
+            Attachment(
+                create_time=0, log_time=0, name=TAIL_ATTACHMENT, media_type="application/octet-stream", data=tail
+            )
+        )
+    note = {"found_bytes": str(size), "kept_bytes": str(kept), "torn_bytes": str(size - kept)}
+    add(Metadata(name=REPAIR_METADATA, metadata=note))
+    if signer is not None:
+        add(Metadata(name=SIGNATURE_METADATA, metadata=signer.metadata(sound.sha256.digest(), sound.length)))
+    return b"".join(parts) + _summary(sound)
+
+
+def _summary(sound: _Sound) -> bytes:
+    builder = RecordBuilder()
+    DataEnd(sound.crc).write(builder)
+    data_end = builder.end()
+    start = sound.length + len(data_end)
+    offsets = []
+    for kind in KINDS[:-1]:
+        group_start = builder.count
+        for record in sound.derived.expected(kind, {}):
+            record.write(builder)
+        if builder.count > group_start:
+            offsets.append(SummaryOffset(kind, start + group_start, builder.count - group_start))
+    offset_start = start + builder.count
+    for offset in offsets:
+        offset.write(builder)
+    summary: bytes = builder.end()
+    Footer(start, offset_start, 0).write(builder)
+    covered: bytes = builder.end()[:-4]
+    crc = zlib.crc32(covered, zlib.crc32(summary))
+    end: bytes = data_end + summary + covered + crc.to_bytes(4, "little") + MAGIC
+    return end

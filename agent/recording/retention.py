@@ -1,0 +1,99 @@
+"""Which recordings are deleted, and when: the oldest by number, never one that somebody reads or still waits for."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import hashlib
+import logging
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from agent.events import Pruned
+from agent.recording.files import file_number, recordings, sync_directory
+
+PIN_SUFFIX = ".lock"  # `fieldcal-000007.mcap.lock` beside a recording, whatever is in it, keeps it
+DAY_NS = 86_400_000_000_000
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class KeepFiles:
+    """How much of the recordings stays; None is no limit. `least_free_bytes` is of the whole file system."""
+
+    days: float | None = None
+    bytes: int | None = None
+    least_free_bytes: int = 0
+
+
+FOR_EVER = KeepFiles()
+
+
+def due(directory: Path, keep: KeepFiles, active: Path | None, waiting: str) -> Pruned | None:
+    """The next files to delete, consecutive by number; None where none is due.
+
+    `active` is the file being written; `waiting` names the recording with the first result that is not published: it
+    and those after it stay. By age one file goes at a time: a clock that jumped ahead by years costs as many recordings
+    as begin before it is set right. Raises OSError.
+    """
+    if keep == FOR_EVER:
+        return None
+    files = [(number, path, path.stat()) for number, path in recordings(directory)]
+    excess = _excess(directory, keep, sum(status.st_size for _, _, status in files))
+    oldest_ns = time.time_ns() - int(keep.days * DAY_NS) if keep.days is not None else None
+    limit = file_number(waiting)
+    chosen: list[tuple[int, Path]] = []
+    freed = 0
+    for number, path, status in files:
+        old = oldest_ns is not None and status.st_mtime_ns < oldest_ns and not chosen
+        if path == active or (limit is not None and number >= limit) or not (freed < excess or old):
+            break
+        if _is_kept(path) or (chosen and chosen[-1][0] + 1 != number):
+            if chosen:
+                break
+            continue
+        chosen.append((number, path))
+        freed += status.st_size
+    if not chosen:
+        return None
+    with open(chosen[-1][1], "rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    return Pruned(
+        t_monotonic_ns=time.monotonic_ns(),
+        t_utc_ns=time.time_ns(),
+        first_file=chosen[0][0],
+        last_file=chosen[-1][0],
+        last_sha256=digest,
+        bytes=freed,
+    )
+
+
+def delete(directory: Path, pruned: Pruned) -> None:
+    """Delete the files of a range, but those that somebody began to read since. Raises OSError."""
+    for number, path in recordings(directory):
+        if pruned.first_file <= number <= pruned.last_file and not _is_kept(path):
+            path.unlink(missing_ok=True)
+    sync_directory(directory)
+    _log.info("recordings %d to %d deleted", pruned.first_file, pruned.last_file)
+
+
+def _excess(directory: Path, keep: KeepFiles, total: int) -> int:
+    """Bytes that must go."""
+    space = os.statvfs(directory)
+    excess = keep.least_free_bytes - space.f_bavail * space.f_frsize
+    return max(excess, total - keep.bytes) if keep.bytes is not None else excess
+
+
+def _is_kept(path: Path) -> bool:
+    if path.with_name(path.name + PIN_SUFFIX).exists():
+        return True
+    with contextlib.suppress(FileNotFoundError), open(path, "rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            return error.errno in (errno.EWOULDBLOCK, errno.EACCES)  # else: this file system knows no locks
+    return False

@@ -1,0 +1,98 @@
+"""Signatures of recordings: Ed25519 over the SHA-256 of all that a file holds before the signature.
+
+The signature is the last record of a file's data section, as MCAP metadata: it travels with the file. What follows it,
+the summary, says nothing that the audit does not derive from what is signed.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import hashlib
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+
+SIGNATURE_METADATA = "fieldcal.signature"
+_CONTEXT = b"fieldcal recording, version 1\n"  # so that the key's signature of something else is none of a recording
+LARGEST_KEY_FILE = 1 << 16  # bytes; a key has 120
+
+
+class KeyFileError(Exception):
+    """A file that holds no usable key. The message names it."""
+
+
+class Signer:
+    """Signs recordings with a gateway's private key."""
+
+    def __init__(self, key: Ed25519PrivateKey) -> None:
+        self._key = key
+        self.key_id = key_id(key.public_key())
+
+    @staticmethod
+    def load(path: Path) -> Signer:
+        """From a PEM file (PKCS #8, not encrypted). Raises KeyFileError."""
+        from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+        from cryptography.hazmat.primitives.serialization import load_pem_private_key
+
+        try:
+            key = load_pem_private_key(_read(path), password=None)
+        except (ValueError, TypeError):  # what cryptography says may quote the file
+            raise KeyFileError(f"{path}: not a private key in PEM without a password") from None
+        if not isinstance(key, Ed25519PrivateKey):
+            raise KeyFileError(f"{path}: a private key, but not of Ed25519")
+        return Signer(key)
+
+    def metadata(self, sha256: bytes, length: int) -> dict[str, str]:
+        """The metadata record that closes a data section of `length` bytes with this digest."""
+        return {
+            "algorithm": "Ed25519",
+            "key_id": self.key_id,
+            "bytes": str(length),
+            "sha256": sha256.hex(),
+            "signature": base64.b64encode(self._key.sign(_CONTEXT + sha256)).decode(),
+        }
+
+
+def load_public_key(path: Path) -> Ed25519PublicKey:
+    """From a PEM file. Raises KeyFileError."""
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+    from cryptography.hazmat.primitives.serialization import load_pem_public_key
+
+    try:
+        key = load_pem_public_key(_read(path))
+    except ValueError:
+        raise KeyFileError(f"{path}: not a public key in PEM") from None
+    if not isinstance(key, Ed25519PublicKey):
+        raise KeyFileError(f"{path}: a public key, but not of Ed25519")
+    return key
+
+
+def key_id(key: Ed25519PublicKey) -> str:
+    """The first 16 hexadecimal digits of the SHA-256 of the 32 bytes of a public key."""
+    return hashlib.sha256(key.public_bytes_raw()).hexdigest()[:16]
+
+
+def signature_fault(metadata: dict[str, str], sha256: bytes, length: int, key: Ed25519PublicKey) -> str:
+    """Why a signature is not the key's over a data section with this digest and length; "" where it is."""
+    from cryptography.exceptions import InvalidSignature
+
+    if metadata.get("key_id") != key_id(key):
+        return f"signed with the key {metadata.get('key_id', '')!r:.40}, not {key_id(key)}"
+    if metadata.get("sha256") != sha256.hex() or metadata.get("bytes") != str(length):
+        return "its signature is of other bytes"
+    try:
+        key.verify(base64.b64decode(metadata.get("signature", ""), validate=True), _CONTEXT + sha256)
+    except (InvalidSignature, binascii.Error):
+        return "its signature is not the key's"
+    return ""
+
+
+def _read(path: Path) -> bytes:
+    try:
+        with open(path, "rb") as file:
+            return file.read(LARGEST_KEY_FILE)
+    except OSError as error:
+        raise KeyFileError(f"{path}: cannot be read: {error.strerror}") from None
