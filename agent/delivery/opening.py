@@ -102,7 +102,7 @@ def _open(path: Path) -> sqlite3.Connection:
         if not known_version(version) and version != 0:
             raise StoreError(f"{path}: written in version {version}, this program writes version {SCHEMA_VERSION}")
         if version == SCHEMA_VERSION:
-            # Whether it can be written at all shows here; and where a bit of the number itself had changed, it is right.
+            # Whether it can be written at all shows here; and where a bit of the number had changed, it is right.
             connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
         elif version != 0:
             bring_up_to_date(connection, version)
