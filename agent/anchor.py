@@ -56,7 +56,9 @@ class Anchor:
             return Change("S or Q is not finite", {})
         moved, limits = np.abs(value - self._value), self.limits()
         scale, numbers, reasons = self._full_scale(), dict[str, float](), list[str]()
-        relative = np.where(MAIN, 100.0 / np.abs(self._value), np.where(TRANSVERSE, 100.0 / scale, 1.0))
+        relative = np.where(
+            MAIN, 100.0 / np.where(MAIN, np.abs(self._value), 1.0), np.where(TRANSVERSE, 100.0 / scale, 1.0)
+        )
         for name, kind in (("main_pct", MAIN), ("transverse_pct", TRANSVERSE), ("offset", OFFSET)):
             worst = int(np.argmax(np.where(kind, moved / limits, -1.0)))
             if np.isfinite(limits[worst]):

@@ -1,59 +1,77 @@
-"""One sensor with its reference: streams -> windows -> Method 3 -> calibration in force and status."""
+"""One sensor with its reference: streams -> windows -> estimation -> results."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import msgspec
 
 from agent.config import Channel
-from agent.events import CalibrationUpdate, DeviceChange, Result, StatusChange, Tick, WindowReport
-from agent.schedule import Piece, pieces
+from agent.estimation import DAY_S, Estimation, Judged
+from agent.events import CalibrationUpdate, Command, DeviceChange, Estimate, Result, Tick
+from agent.operators import CommandError, answer, commanded_pose
+from agent.outcome import (
+    Source,
+    calibration_update,
+    drift_report,
+    estimate,
+    status_change,
+    window_report,
+)
+from agent.schedule import Piece, Stance, pieces
+from agent.snapshot import pack, unpack
 from agent.stream import DeviceStream
-from agent.windows import MARGIN_S, window_of, window_state, windows_in
-from calib.method3 import Fit, fit
-from calib.model import PARAMETERS, Window
+from agent.windows import MARGIN_S, Found, windows_in
+from calib.model import Pose, Window
+from calib.timing import HORIZON_S
 from hw.block import SampleBlock
 
-COVERAGE_FACTOR = 2.0
 # Ports and speeds name the way to a device, not the device: they may change without the calibration losing its sense.
 WAYS = frozenset({"port", "baud_rate", "bus"})
+LAG_TURNS = 4  # a lag is found, taken out, looked for again: each turn leaves a thousandth
+# A run that begins long after the one before ended: more is a clock that was wrong, and everything has wandered anyway.
+LONGEST_PAUSE_DAYS = 3650.0
 
 
 class ChannelState:
     """All that is known of one channel; changes with events only.
 
-    The first status comes with the first news of the sensor: UNCALIBRATED (nothing known), COLLECTING (windows used,
-    not all parameters determined), VALID (a calibration in force) or INVALID (the sensor is silent or lost).
+    The first status comes with the first news of the sensor. `kept` states are by the identity of a device: one that
+    was there before goes on where it was.
     """
 
     def __init__(self, channel: Channel) -> None:
         self._channel = channel
         self.sensor = channel.sensor
+        self.identity = ""
         self._origin_ns = 0
         self._streams: dict[str, DeviceStream] = {}
-        self._units: dict[str, str] = {}
-        self._identity = ""
-        self._windows: list[Window] = []
+        self._unit = ""
+        self._nominal: float | None = None  # sensitivity by the device's own data sheet
+        self._reference = ""  # identity
+        self._estimation: Estimation | None = None
         self._in_force: CalibrationUpdate | None = None
-        self._kept: CalibrationUpdate | None = None
+        self._kept: dict[str, bytes] = {}
+        self._first_day = 0.0  # in the estimation's own count, at the run's origin
         self._status = ""  # nothing said yet
         self._after_s = 0.0  # the schedule is done up to here, seconds since the sensor's first sample
+        self._stances: list[Stance] = []  # by command; the configuration's before any
         self._now_ns = 0  # monotonic and UTC of the newest event that carried both
         self._utc_minus_monotonic_ns = 0
-        self._upcoming = pieces(channel, 0.0)
-        self._piece = next(self._upcoming, None)
+        self._plan()
 
-    def begin(self, origin_ns: int, kept: CalibrationUpdate | None) -> None:
-        """A new run: seconds count from `origin_ns`; `kept` waits for a sensor of its identity."""
+    def begin(self, origin_ns: int, kept: Mapping[str, bytes]) -> None:
+        """A new run: seconds count from `origin_ns`; `kept` (`memory`) waits for sensors of those identities."""
         self._origin_ns = origin_ns
         self._now_ns = origin_ns
-        self._kept = kept
+        self._kept = dict(kept)
         for name in self._devices():
-            self._streams[name] = DeviceStream(origin_ns)
+            self._streams[name] = DeviceStream(origin_ns, self._horizon_s)
+
+    # --- events
 
     def on_block(self, block: SampleBlock) -> list[Result]:
         """A block of the sensor or its reference; others are not this channel's."""
@@ -62,8 +80,9 @@ class ChannelState:
         self._clock(block.t_monotonic_ns, block.t_utc_ns)
         self._streams[block.device].update(block)
         results: list[Result] = []
-        if block.device == self.sensor and self._status == "INVALID":
-            results += self._set_status(self._resting_status(), f"{self.sensor} speaks again")
+        if block.device == self.sensor and self._status == "INVALID" and self._estimation is not None:
+            self._estimation.gate.regain("")
+            results += self._say_status(f"{self.sensor} speaks again")
         return results + list(self._close_windows())
 
     def on_tick(self, tick: Tick) -> list[Result]:
@@ -79,12 +98,37 @@ class ChannelState:
         if change.state == "lost":
             if change.device != self.sensor:
                 return []
-            return self._set_status("INVALID", f"{self.sensor} is lost: {change.message}")
-        self._units[change.device] = json.loads(change.info_json)["unit"]
-        return self._identify(change) if change.device == self.sensor else []
+            return self._lose(f"{self.sensor} is lost: {change.message}")
+        if change.device == self.sensor:
+            return self._identify(change.info_json)
+        return self._identify_reference(change.info_json)
+
+    def on_command(self, command: Command) -> list[Result]:
+        """An operator's word; what was refused before it came here changes nothing."""
+        if command.sensor != self.sensor or command.refused:
+            return []
+        self._clock(command.t_monotonic_ns, command.t_utc_ns)
+        if self._estimation is None:
+            return [self._told(f"{command.verb} refused: {self.sensor} was never there")]
+        try:
+            if command.verb == "pose":
+                return self._turn(commanded_pose(command, self._channel))
+            said = answer(command, self._estimation)
+        except CommandError as error:
+            return [self._told(f"{command.verb} refused: {error}")]
+        if said.refused:
+            return [self._told(f"{command.verb} refused: {said.refused}")]
+        results: list[Result] = [self._put_in_force()] if said.calibration is not None else []
+        return [*results, *(self._say_status(said.reason) or [self._told(said.reason)])]
+
+    # --- time and identity
 
     def _devices(self) -> list[str]:
         return [self.sensor] + ([self._channel.reference] if self._channel.reference else [])
+
+    @property
+    def _horizon_s(self) -> float:
+        return max(HORIZON_S, self._channel.window_s + 2.0 * MARGIN_S)
 
     def _clock(self, t_monotonic_ns: int, t_utc_ns: int) -> None:
         # Blocks of two devices may arrive out of order by a read; time here never goes back.
@@ -98,71 +142,93 @@ class ChannelState:
     def _now_s(self) -> float:
         return (self._now_ns - self._origin_ns) * 1e-9
 
-    # --- identity and status
+    def _source(self) -> Source:
+        return Source(self.sensor, self.identity, self._unit, self._utc_ns())
 
-    def _identify(self, change: DeviceChange) -> list[Result]:
-        identity = identity_of(change.info_json)
+    def _identify(self, info_json: str) -> list[Result]:
+        info, identity = json.loads(info_json), identity_of(info_json)
+        reason = f"{self.sensor} opened"
         results: list[Result] = []
-        if self._identity and identity != self._identity:
-            self._windows.clear()
-            self._in_force = None
-            results += self._set_status("UNCALIBRATED", f"{self.sensor} is now {identity}, was {self._identity}")
-        self._identity = identity
-        if self._kept is not None:
-            kept, self._kept = self._kept, None
-            if kept.identity == identity:
-                self._in_force = msgspec.structs.replace(kept, t_utc_ns=self._utc_ns())
-                results += [self._in_force, *self._opened("restored from the run before")]
-            else:
-                reason = f"the calibration kept belongs to {kept.identity}, this is {identity}"
-                results += self._set_status("UNCALIBRATED", reason)
-        return results or self._opened(f"{self.sensor} opened")
+        if self._estimation is None or identity != self.identity:
+            if self._estimation is not None:
+                self._kept[self.identity] = self.memory()
+                reason = f"{self.sensor} is now {identity}, was {self.identity}"
+            elif self._kept and identity not in self._kept:
+                reason = f"the calibration kept belongs to {', '.join(sorted(self._kept))}, this is {identity}"
+            self.identity, self._unit, self._in_force = identity, info["unit"], None
+            self._status = "" if self._status == "INVALID" else self._status  # the one that was silent is another
+            try:
+                self._nominal = _nominal_of(info)
+                self._estimation = Estimation(self._channel, self._nominal)
+            except ValueError as error:
+                self._estimation = None
+                return self._change("INVALID", str(error))
+            if identity in self._kept:
+                results += self._remember(self._kept.pop(identity))
+                reason = "restored from the run before"
+        if self._status == "INVALID":
+            # A port that opens is no sensor that speaks: one that was INVALID stays so until a block comes.
+            self._estimation.gate.lose("")
+        return results + self._say_status(reason)
 
-    def _opened(self, reason: str) -> list[Result]:
-        # A port that opens is no sensor that speaks: one that was INVALID stays so until a block comes.
-        return [] if self._status == "INVALID" else self._set_status(self._resting_status(), reason)
+    def _identify_reference(self, info_json: str) -> list[Result]:
+        identity = identity_of(info_json)
+        if self._reference and identity != self._reference and self._estimation is not None:
+            self._estimation.recursion.forget_reference()
+        self._reference = identity
+        return []
 
-    def _resting_status(self) -> str:
-        """The status of a sensor that speaks."""
-        if self._in_force is not None:
-            return "VALID"
-        return "COLLECTING" if self._windows else "UNCALIBRATED"
-
-    def _set_status(self, status: Any, reason: str) -> list[Result]:
-        if status == self._status:
-            return []
-        before, self._status = self._status, status
-        return [
-            StatusChange(
-                run_id="", sequence=0, sensor=self.sensor, t_utc_ns=self._utc_ns(),
-                status=status, before=before, reason=reason,
-            )
-        ]  # fmt: skip
+    def _lose(self, reason: str) -> list[Result]:
+        if self._estimation is not None:
+            self._estimation.gate.lose(reason)
+        return self._change("INVALID", reason)
 
     def _watch_silence(self) -> list[Result]:
         newest_s = self._streams[self.sensor].newest_arrival_s
         silent_s = self._now_s() - (newest_s if newest_s is not None else 0.0)
         if silent_s <= self._channel.silence_s:
             return []
-        return self._set_status("INVALID", f"no block of {self.sensor} for more than {self._channel.silence_s:g} s")
+        return self._lose(f"no block of {self.sensor} for more than {self._channel.silence_s:g} s")
 
-    # --- windows and solution
+    def _say_status(self, reason: str) -> list[Result]:
+        return [] if self._estimation is None else self._change(self._estimation.gate.status, reason)
+
+    def _change(self, status: str, reason: str) -> list[Result]:
+        if status == self._status:
+            return []
+        before, self._status = self._status, status
+        return [status_change(self._source(), status, before, reason)]
+
+    def _told(self, reason: str) -> Result:
+        return status_change(self._source(), self._status or "UNCALIBRATED", self._status, reason)
+
+    # --- windows
+
+    def _plan(self) -> None:
+        self._upcoming = pieces(self._channel, self._after_s, self._stances)
+        self._piece = next(self._upcoming, None)
+
+    def _turn(self, pose: Pose) -> list[Result]:
+        first_s = self._streams[self.sensor].first_sample_s
+        now_s = 0.0 if first_s is None else self._now_s() - first_s
+        stood = []
+        if self._piece is not None and self._piece.start_s < now_s:
+            # The pose before holds until now: its window is closed here, a guard taken off as at every change.
+            stood = [Stance(self._piece.start_s - self._channel.guard_s, now_s, self._piece.pose)]
+        self._stances = [*stood, Stance(now_s, float("inf"), pose)]
+        self._plan()
+        return [self._told(f"stands at {pose.position} from now on")]
 
     def _close_windows(self) -> Iterator[Result]:
         first_s = self._streams[self.sensor].first_sample_s
         while self._piece is not None and first_s is not None and self._due(self._piece, first_s):
             piece = self._piece
-            windows = windows_in(piece, first_s, self._channel, self._streams)
             self._after_s = piece.stop_s
             self._piece = next(self._upcoming, None)
-            yield from (self._report(window) for window in windows)
-            used = [window for window in windows if window.used]
-            if used:
-                self._windows = [*self._windows, *used][-self._channel.windows :]
-                yield from self._solve()
-        keep_from_s = self._now_s() - MARGIN_S
+            yield from self._estimate(piece, first_s)
+        keep_from_s = self._now_s() - 2.0 * MARGIN_S
         if self._piece is not None and first_s is not None:
-            keep_from_s = min(keep_from_s, first_s + self._piece.start_s - MARGIN_S)
+            keep_from_s = min(keep_from_s, first_s + self._piece.start_s - 2.0 * MARGIN_S)
         for stream in self._streams.values():
             stream.forget_before(keep_from_s)
 
@@ -173,69 +239,126 @@ class ChannelState:
             return True
         return all(stream.reaches(end_s) for stream in self._streams.values())
 
-    def _report(self, window: Window) -> WindowReport:
-        return WindowReport(
-            run_id="", sequence=0, sensor=self.sensor, t_utc_ns=self._utc_ns(),
-            start_s=window.start_s, stop_s=window.stop_s, position=window.pose.position, used=window.used,
-            reason=window.reason, points=window.points, left_out=window.left_out, numbers=dict(window.numbers),
-        )  # fmt: skip
+    def _estimate(self, piece: Piece, first_s: float) -> Iterator[Result]:
+        day = self._first_day + (first_s + piece.stop_s) / DAY_S
+        found, lag_s = self._found(piece, first_s, day)
+        for window in found.windows:
+            if not window.used or self._estimation is None:
+                reason = window.reason or f"{self.sensor} was never opened"
+                yield window_report(self._source(), window, used=False, reason=reason, numbers={})
+                continue
+            judged = self._estimation.judge(window, day, lag_s, found.temperature_degc)
+            yield from self._results(window, judged, lag_s)
 
-    def _solve(self) -> list[Result]:
-        solution = fit(self._windows)
-        if not solution.calibration.determined.all():
-            missing = [p for p, d in zip(PARAMETERS, solution.calibration.determined, strict=True) if not d]
-            if self._in_force is not None:
-                return []
-            reason = f"{len(self._windows)} windows, rank {solution.rank} of 4; not determined: {', '.join(missing)}"
-            return self._set_status("COLLECTING", reason)
-        self._in_force = self._update(solution)
-        return [self._in_force, *self._set_status("VALID", f"{len(self._windows)} windows determine S and Q")]
+    def _found(self, piece: Piece, first_s: float, day: float) -> tuple[Found, float]:
+        """The windows, made again until no lag is left in them that matters."""
+        lag_s = 0.0 if self._estimation is None else self._estimation.lag_s
+        for _ in range(LAG_TURNS):
+            found = windows_in(piece, first_s, self._channel, self._streams, lag_s)
+            used = [w for w in found.windows if w.used]
+            if self._estimation is None or not used or self._channel.reference is None:
+                break
+            better_s = self._estimation.lag_after(used, day, lag_s)
+            if better_s == lag_s:
+                break
+            lag_s = better_s
+        return found, lag_s
 
-    def _update(self, solution: Fit) -> CalibrationUpdate:
-        calibration = solution.calibration
-        return CalibrationUpdate(
-            run_id="", sequence=0, sensor=self.sensor, t_utc_ns=self._utc_ns(),
-            sensitivity=calibration.sensitivity.tolist(), offset=calibration.offset.tolist(),
-            standard_uncertainty=calibration.standard_uncertainty.tolist(),
-            covariance=calibration.covariance.tolist(), coverage_factor=COVERAGE_FACTOR,
-            determined=calibration.determined.tolist(), method=calibration.method, uncertainty_kind="type A, white",
-            windows=len(self._windows), residual_sd=solution.residual_sd.tolist(),
-            output_unit=self._units.get(self.sensor, ""), identity=self._identity,
-        )  # fmt: skip
+    def _results(self, window: Window, judged: Judged, lag_s: float) -> Iterator[Result]:
+        assert self._estimation is not None
+        decision, source = judged.decision, self._source()
+        used = decision.action in ("take", "adopt")
+        numbers = {**decision.numbers, "lag_applied_s": lag_s}
+        yield window_report(source, window, used=used, reason="" if used else decision.reason, numbers=numbers)
+        origin_utc_ns = self._utc_ns() - round((self._first_day * DAY_S + self._now_s()) * 1e9)
+        for verdict in judged.drift:
+            yield drift_report(source, verdict, self._channel.drift.false_alarms_a_year, origin_utc_ns)
+        if judged.proposal is not None:
+            update = calibration_update(source, judged.proposal, self._estimation.recursion)
+            yield estimate(source, decision.reason, update)
+        if decision.in_force:
+            yield self._put_in_force()
+        yield from self._say_status(decision.reason)
+
+    def _put_in_force(self) -> CalibrationUpdate:
+        assert self._estimation is not None
+        self._in_force = calibration_update(self._source(), self._estimation.in_force, self._estimation.recursion)
+        return self._in_force
+
+    def number(self, results: Sequence[Result]) -> None:
+        """The results as they leave, with their numbers: what is in force and what waits is known by them."""
+        for result in results:
+            if isinstance(result, CalibrationUpdate):
+                self._in_force = result
+            elif isinstance(result, Estimate) and self._estimation is not None:
+                self._estimation.gate.published(result.sequence)
 
     # --- state
+
+    def memory(self) -> bytes:
+        """What outlives a run, of the device that is there now."""
+        assert self._estimation is not None
+        return pack(
+            {
+                "estimation": self._estimation.snapshot(),
+                "in_force": _plain(self._in_force),
+                "day": self._first_day + self._now_s() / DAY_S,
+                "t_utc_ns": self._utc_ns(),
+            }
+        )
+
+    def _remember(self, memory: bytes) -> list[Result]:
+        assert self._estimation is not None
+        state = unpack(memory)
+        self._estimation.load(state["estimation"])
+        self._estimation.gate.regain("")
+        pause_days = (self._utc_ns() - state["t_utc_ns"]) * 1e-9 / DAY_S
+        pause_days = pause_days if 0.0 <= pause_days <= LONGEST_PAUSE_DAYS else 0.0
+        self._first_day = state["day"] + pause_days - self._now_s() / DAY_S
+        kept = _calibration(state["in_force"])
+        if kept is None:
+            return []
+        self._in_force = msgspec.structs.replace(kept, t_utc_ns=self._utc_ns())
+        return [self._in_force]
 
     def snapshot(self) -> dict[str, Any]:
         """State for `load`, bit-exact."""
         return {
             "origin_ns": self._origin_ns,
             "streams": {name: stream.snapshot() for name, stream in self._streams.items()},
-            "units": dict(self._units),
-            "identity": self._identity,
-            "windows": [window_state(window) for window in self._windows],
+            "unit": self._unit,
+            "identity": self.identity,
+            "reference": self._reference,
+            "nominal": self._nominal,
+            "estimation": None if self._estimation is None else self._estimation.snapshot(),
             "in_force": _plain(self._in_force),
-            "kept": _plain(self._kept),
+            "kept": dict(self._kept),
+            "first_day": self._first_day,
             "status": self._status,
             "after_s": self._after_s,
+            "stances": [_stance_state(stance) for stance in self._stances],
             "now_ns": self._now_ns,
             "utc_minus_monotonic_ns": self._utc_minus_monotonic_ns,
         }
 
-    def load(self, state: dict[str, Any]) -> None:
+    def load(self, state: Mapping[str, Any]) -> None:
         """Take the state that `snapshot` gave."""
         self._origin_ns = state["origin_ns"]
-        self._streams = {n: DeviceStream.restore(self._origin_ns, s) for n, s in state["streams"].items()}
-        self._units = dict(state["units"])
-        self._identity = state["identity"]
-        self._windows = [window_of(w) for w in state["windows"]]
+        self._streams = {
+            n: DeviceStream.restore(self._origin_ns, s, self._horizon_s) for n, s in state["streams"].items()
+        }
+        self._unit, self.identity, self._reference = state["unit"], state["identity"], state["reference"]
+        self._nominal, self._estimation = state["nominal"], None
+        if state["estimation"] is not None:
+            self._estimation = Estimation(self._channel, self._nominal)
+            self._estimation.load(state["estimation"])
         self._in_force = _calibration(state["in_force"])
-        self._kept = _calibration(state["kept"])
-        self._status = state["status"]
-        self._after_s = state["after_s"]
+        self._kept = dict(state["kept"])
+        self._first_day, self._status, self._after_s = state["first_day"], state["status"], state["after_s"]
+        self._stances = [_stance_of(s) for s in state["stances"]]
         self._now_ns = state["now_ns"]
         self._utc_minus_monotonic_ns = state["utc_minus_monotonic_ns"]
-        self._upcoming = pieces(self._channel, self._after_s)
-        self._piece = next(self._upcoming, None)
+        self._plan()
 
 
 def identity_of(info_json: str) -> str:
@@ -247,9 +370,24 @@ def identity_of(info_json: str) -> str:
     return " ".join(part for part in (info["kind"], info["serial_number"], digest) if part)
 
 
+def _nominal_of(info: Mapping[str, Any]) -> float | None:
+    """What the device's data sheet says of its sensitivity; one that tells m/s2 has 1."""
+    nominal = info["nominal_sensitivity"]
+    return 1.0 if nominal is None and info["unit"] == "m/s2" else nominal
+
+
 def _plain(update: CalibrationUpdate | None) -> dict[str, Any] | None:
     return None if update is None else msgspec.structs.asdict(update)
 
 
 def _calibration(state: dict[str, Any] | None) -> CalibrationUpdate | None:
     return None if state is None else CalibrationUpdate(**state)
+
+
+def _stance_state(stance: Stance) -> dict[str, Any]:
+    pose = {name: getattr(stance.pose, name) for name in Pose.__slots__}
+    return {"start_s": stance.start_s, "stop_s": stance.stop_s, "pose": pose}
+
+
+def _stance_of(state: Mapping[str, Any]) -> Stance:
+    return Stance(state["start_s"], state["stop_s"], Pose(**state["pose"]))

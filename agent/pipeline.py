@@ -5,11 +5,14 @@ Live, devices feed it; in an audit, a recording does. `restore(snapshot())` equa
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import msgspec
 
 from agent.channel import ChannelState
 from agent.config import Config
-from agent.events import CalibrationUpdate, DeviceChange, Event, Result, RunStart, Tick
+from agent.delivery.history import Memory
+from agent.events import CalibrationUpdate, Command, DeviceChange, Event, Result, RunStart, Tick, WindowReport
 from agent.snapshot import pack, unpack
 from hw.block import SampleBlock
 
@@ -25,18 +28,23 @@ class Pipeline:
 
     @classmethod
     def begin(
-        cls, config: Config, run_id: str, origin_ns: int, last_sequence: int, kept: dict[str, CalibrationUpdate]
+        cls,
+        config: Config,
+        run_id: str,
+        origin_ns: int,
+        last_sequence: int,
+        kept: Mapping[str, Mapping[str, bytes]],
     ) -> Pipeline:
         """The pipeline of a new run: results count on from `last_sequence`, seconds from `origin_ns` (monotonic).
 
-        `kept` are the calibrations of the run before, by sensor; each comes into force again when its sensor opens with
-        the same identity.
+        `kept` are the memories of runs before, by sensor and identity of the device: each is taken up again when its
+        very device opens.
         """
         pipeline = cls(config)
         pipeline._run_id = run_id
         pipeline._next_sequence = last_sequence + 1
         for channel in pipeline._channels:
-            channel.begin(origin_ns, kept.get(channel.sensor))
+            channel.begin(origin_ns, kept.get(channel.sensor, {}))
         return pipeline
 
     @classmethod
@@ -72,7 +80,18 @@ class Pipeline:
             for i, result in enumerate(results)
         ]
         self._next_sequence += len(numbered)
+        for channel in self._channels:
+            channel.number([result for result in numbered if result.sensor == channel.sensor])
         return numbered
+
+    def memories(self, results: Sequence[Result]) -> list[Memory]:
+        """What must outlive the run, of every sensor whose state these results (of the step just made) have changed."""
+        found = []
+        for channel in self._channels:
+            own = [r for r in results if r.sensor == channel.sensor and changes_state(r)]
+            if own:
+                found.append(Memory(channel.sensor, channel.identity, own[-1].sequence, channel.memory()))
+        return found
 
     @staticmethod
     def _dispatch(channel: ChannelState, event: Event) -> list[Result]:
@@ -82,4 +101,11 @@ class Pipeline:
             return channel.on_tick(event)
         if isinstance(event, DeviceChange):
             return channel.on_device(event)
+        if isinstance(event, Command):
+            return channel.on_command(event)
         return []  # a Gap is visible in the blocks' own flags and indices; it is recorded for people
+
+
+def changes_state(result: Result) -> bool:
+    """Whether a result tells of a window taken, or of a calibration put in force."""
+    return isinstance(result, CalibrationUpdate) or (isinstance(result, WindowReport) and result.used)

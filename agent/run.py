@@ -99,7 +99,8 @@ def virtual_bench(preset: str, seed: int) -> Iterator[tuple[Config, Any]]:
                 {
                     "sensor": "mems",
                     "reference": "reference",
-                    "reference_quantity": parameters.reference.quantity,
+                    "prior": {},
+                    "certificate": {"quantity": parameters.reference.quantity},
                     "poses": poses,
                     "poses_repeat_s": parameters.schedule.period_s,
                 }

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from agent.config import Channel, PoseInterval
 from calib.geometry import along, at_rest, beside, clamp
 from calib.model import Pose
 
-# A pose that holds for long is cut into windows of this length, so that memory stays bounded and news comes.
-WINDOW_S = 60.0
+ROUNDING_S = 1e-6  # of ends that were added up
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,14 +23,30 @@ class Piece:
     pose: Pose
 
 
-def pieces(channel: Channel, after_s: float) -> Iterator[Piece]:
-    """The pieces that lie after `after_s`, in order of time; without end where the schedule repeats."""
-    for start_s, stop_s, pose in _stretches(channel, after_s):
-        first_s = max(start_s + channel.guard_s, after_s)
-        while first_s < stop_s - channel.guard_s:
-            last_s = min(first_s + WINDOW_S, stop_s - channel.guard_s)
-            yield Piece(first_s, last_s, pose)
-            first_s = last_s
+@dataclass(frozen=True, slots=True)
+class Stance:
+    """How the sensor stands between two times, guards not yet taken off; the last one has no end."""
+
+    start_s: float
+    stop_s: float
+    pose: Pose
+
+
+def pieces(channel: Channel, after_s: float, stances: Sequence[Stance] = ()) -> Iterator[Piece]:
+    """The pieces that lie after `after_s`, in order of time; without end where the schedule repeats.
+
+    `stances`, where there are any, take the place of the configuration's poses.
+    """
+    stretches = ((s.start_s, s.stop_s, s.pose) for s in stances) if stances else _stretches(channel, after_s)
+    for start_s, stop_s, pose in stretches:
+        last_s, k = start_s + channel.guard_s, 0
+        if not math.isfinite(stop_s):
+            k = max(0, int((after_s - last_s) // (channel.every_s or channel.window_s)))
+        while last_s < stop_s - channel.guard_s:
+            first_s = start_s + channel.guard_s + k * (channel.every_s or channel.window_s)
+            last_s, k = min(first_s + channel.window_s, stop_s - channel.guard_s), k + 1
+            if first_s > after_s - ROUNDING_S and first_s < last_s:
+                yield Piece(first_s, last_s, pose)
 
 
 def _stretches(channel: Channel, after_s: float) -> Iterator[tuple[float, float, Pose]]:
@@ -43,10 +58,11 @@ def _stretches(channel: Channel, after_s: float) -> Iterator[tuple[float, float,
     for cycle in itertools.count(int(after_s // period_s)) if period_s and channel.poses else (0,):
         base_s = cycle * period_s if period_s else 0.0
         for interval in channel.poses:
-            yield base_s + interval.start_s, base_s + interval.stop_s, _pose(interval, channel)
+            yield base_s + interval.start_s, base_s + interval.stop_s, pose_of(interval, channel)
 
 
-def _pose(interval: PoseInterval, channel: Channel) -> Pose:
+def pose_of(interval: PoseInterval, channel: Channel) -> Pose:
+    """The pose that a section of the configuration, or a command, states."""
     feels_gravity = channel.coupling == "dc"
     if interval.theta_deg is not None and interval.alpha_deg is not None:
         theta_rad, alpha_rad = math.radians(interval.theta_deg), math.radians(interval.alpha_deg)

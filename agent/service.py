@@ -10,10 +10,10 @@ from pathlib import Path
 
 from agent import __version__
 from agent.config import Config
-from agent.delivery.history import History, Record, StoreError
+from agent.delivery.history import History, Memory, Record, StoreError
 from agent.delivery.publication import Publisher
 from agent.delivery.store import Store
-from agent.events import CalibrationUpdate, Event, Result, RunStart, Tick
+from agent.events import Event, Result, RunStart, Tick
 from agent.pipeline import Pipeline
 from agent.reader import EventQueue, Reader
 from agent.recording.fingerprint import fingerprint, versions
@@ -96,15 +96,14 @@ class Service:
             self._config, self._run_id, self._origin_ns, self._store.last_sequence(), self._kept()
         )
 
-    def _kept(self) -> dict[str, CalibrationUpdate]:
-        """Calibrations in force at the end of the run before. What cannot be read is said and left."""
-        kept: dict[str, CalibrationUpdate] = {}
+    def _kept(self) -> dict[str, dict[str, bytes]]:
+        """What runs before left of every device, by sensor. What cannot be read is said and left."""
+        kept: dict[str, dict[str, bytes]] = {}
         try:
             with History(self._store.path) as history:
                 for channel in self._config.channels:
-                    record = history.in_force(channel.sensor)
-                    if record is not None and isinstance(calibration := record.result, CalibrationUpdate):
-                        kept[channel.sensor] = calibration
+                    memories = history.memories(channel.sensor)
+                    kept[channel.sensor] = {identity: memory.state for identity, memory in memories.items()}
         except StoreError as error:
             self._watch.say(f"the calibration in force cannot be restored: {error}")
         return kept
@@ -147,15 +146,17 @@ class Service:
     def _step(self, event: Event, writer: RecordingThread) -> None:
         self._sequence += 1
         results = self._pipeline.step(event)
-        writer.put(self._sequence, event, results)
+        writer.put(self._sequence, event, results, self._pipeline.memories(results))
         self._watch.update(event, results)
 
-    def _deliver(self, event_sequence: int, results: Sequence[Result], recorded: bool) -> None:
+    def _deliver(
+        self, event_sequence: int, results: Sequence[Result], recorded: bool, memories: Sequence[Memory]
+    ) -> None:
         """In the recording's thread, when the disk has the results: store, then network."""
         path = self._recorder.path
         records = [Record.of(r, recorded=recorded, recording=path.name if path else "") for r in results]
         try:
-            self._store.commit(records)
+            self._store.commit(records, memories)
         except StoreError as error:
             self._watch.say(f"the store cannot keep results up to event {event_sequence}: {error}")
         if self._publisher is not None:

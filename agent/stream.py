@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.timing import ClockFit, ClockModel
+from calib.timing import HORIZON_S, ClockFit, ClockModel
 from hw.block import BlockFlags, SampleBlock
 
 # Times its nominal rate, more than any clock is off: a count in microseconds, say, is none of samples, and the holes
@@ -30,6 +30,7 @@ class Cut:
     clock: ClockFit
     saturated: bool
     in_time: bool
+    temperature_degc: float = float("nan")  # mean over the blocks; NaN where the device tells none
 
     @property
     def axes(self) -> int:
@@ -49,8 +50,10 @@ class DeviceStream:
     time) empties the buffer and starts the clock model anew.
     """
 
-    def __init__(self, origin_ns: int) -> None:
+    def __init__(self, origin_ns: int, horizon_s: float = HORIZON_S) -> None:
+        """`horizon_s`: how far back the clock model must know the times."""
         self._origin_ns = origin_ns
+        self._horizon_s = horizon_s
         self._blocks: deque[SampleBlock] = deque()
         self._clock: ClockModel | None = None
         self._fitted: ClockFit | None = None  # the clock model's result, until the next block
@@ -62,10 +65,10 @@ class DeviceStream:
         arrivals_s = (block.burst_t_monotonic_ns - self._origin_ns) * 1e-9
         first_arrival_s = float(arrivals_s[0])
         if self._clock is None:
-            self._clock = ClockModel(block.nominal_rate_hz)
+            self._clock = ClockModel(block.nominal_rate_hz, self._horizon_s)
             self.first_sample_s = first_arrival_s - int(block.burst_count[0]) / block.nominal_rate_hz
         elif block.flags & BlockFlags.RESTART:
-            self._clock = ClockModel(block.nominal_rate_hz)
+            self._clock = ClockModel(block.nominal_rate_hz, self._horizon_s)
             self._blocks.clear()
         self._clock.update(block.first_index + block.burst_count.astype(np.int64) - 1, arrivals_s)
         self._fitted = None
@@ -102,13 +105,16 @@ class DeviceStream:
         within = start_s - 1 / rate_hz <= times_s[0] and times_s[-1] <= stop_s + 1 / rate_hz
         in_time = bool(within and (np.diff(times_s) > 0).all())
         held = np.full((stop - first, axes), np.nan)
-        saturated = False
+        saturated, temperatures = False, []
         for block in self._blocks:
             a, b = max(first, block.first_index), min(stop, block.first_index + block.n)
             if a < b:
+                if block.temperature_degc is not None:
+                    temperatures.append(block.temperature_degc)
                 held[a - first : b - first] = block.indications[a - block.first_index : b - block.first_index]
                 saturated |= bool(block.flags & BlockFlags.SATURATED)
-        return Cut(first, held, clock, saturated, in_time)
+        degc = float(np.mean(temperatures)) if temperatures else float("nan")
+        return Cut(first, held, clock, saturated, in_time, degc)
 
     def forget_before(self, time_s: float) -> None:
         """Drop whole blocks that ended before `time_s` (by arrival, which is never early)."""
@@ -125,9 +131,9 @@ class DeviceStream:
         }
 
     @classmethod
-    def restore(cls, origin_ns: int, state: dict[str, Any]) -> DeviceStream:
+    def restore(cls, origin_ns: int, state: dict[str, Any], horizon_s: float = HORIZON_S) -> DeviceStream:
         """The stream whose `snapshot` this is."""
-        stream = cls(origin_ns)
+        stream = cls(origin_ns, horizon_s)
         if state["clock"] is not None:
             stream._clock = ClockModel.restore(state["clock"])
         stream._blocks.extend(_block_of(s) for s in state["blocks"])

@@ -1,48 +1,65 @@
-"""Windows out of streams, and their state for a snapshot."""
+"""Windows out of streams: the reference at the sensor's sample times, both in the band of the motion, verdicts."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from agent.config import Channel
 from agent.schedule import Piece
 from agent.stream import Cut, DeviceStream
+from calib.band import band_above_noise, lowpass, noise_in_band
 from calib.excitation import Points, motion_windows, rest_window
-from calib.model import Pose, Window, WindowSums
-from calib.resampling import differentiate, resample
+from calib.model import Array, Pose, Window, WindowSums
+from calib.resampling import VELOCITY_BAND_HZ, differentiate, resample
+from calib.window_verdict import Limits
 
-# Reference samples beyond a window's ends: half the taps of resampling, and of differentiating at 100 Hz and above.
-MARGIN_S = 0.5
+# Samples beyond a window's ends, the reference's (the sensor's half of it): half the taps of resampling, of
+# differentiating and of the low-pass filter at 100 Hz and above.
+MARGIN_S = 1.0
+NOISE_MATTERS = 1e-5  # of the motion's power: a filter against less of it would cost its ends for nothing
+FILTER_BAND = 1.25  # times its band, where calib.band.lowpass is 6 dB down
+RESAMPLED_BAND = 0.35  # of the reference's rate, to which interpolation itself passes noise
 
 
-def windows_in(piece: Piece, first_s: float, channel: Channel, streams: dict[str, DeviceStream]) -> list[Window]:
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """The windows of a stretch, in seconds since the sensor's first sample; its temperature, NaN where none is told."""
+
+    windows: list[Window]
+    temperature_degc: float = float("nan")
+
+
+def windows_in(piece: Piece, first_s: float, channel: Channel, streams: dict[str, DeviceStream], lag_s: float) -> Found:
     """The windows of a stretch in one pose, each with its verdict; one unused window where there is nothing to judge.
 
-    `first_s` is the time of the sensor's first sample; the windows' times count from it.
+    `first_s` is the time of the sensor's first sample; the windows' times count from it. The sensor's indications are
+    taken to come late by `lag_s`.
     """
     start_s, stop_s = first_s + piece.start_s, first_s + piece.stop_s
-    cut = streams[channel.sensor].cut(start_s, stop_s)
+    cut = streams[channel.sensor].cut(start_s - 0.5 * MARGIN_S, stop_s + 0.5 * MARGIN_S)
     if cut is None:
-        return [_refused(piece, f"no samples of {channel.sensor}")]
+        return Found([_refused(piece, f"no samples of {channel.sensor}")])
     if fault := _fault(channel.sensor, cut, axes=3):
-        return [_refused(piece, fault)]
+        return Found([_refused(piece, fault)])
     if channel.reference is None:
-        found = _rest(piece, cut)
+        found = _rest(piece, cut, (start_s, stop_s), channel)
     else:
         reference = streams[channel.reference].cut(start_s - MARGIN_S, stop_s + MARGIN_S)
         if reference is None:
-            return [_refused(piece, f"no samples of the reference {channel.reference}")]
+            return Found([_refused(piece, f"no samples of the reference {channel.reference}")])
         if fault := _fault(f"the reference {channel.reference}", reference, axes=piece.pose.direction.shape[1]):
-            return [_refused(piece, fault)]
-        found = _motion(piece, cut, reference, channel)
+            return Found([_refused(piece, fault)])
+        if reference.saturated:
+            return Found([_refused(piece, f"the reference {channel.reference} was at the end of its range")])
+        found = _motion(piece.pose, cut, reference, channel, (start_s, stop_s), lag_s)
     if not found:
-        return [_refused(piece, "the samples of sensor and reference do not meet")]
+        return Found([_refused(piece, "the samples of sensor and reference do not meet")])
     if cut.saturated:
         found = [replace(w, used=False, reason=w.reason or "the sensor was at the end of its range") for w in found]
-    return [replace(w, start_s=w.start_s - first_s, stop_s=w.stop_s - first_s) for w in found]
+    found = [replace(w, start_s=w.start_s - first_s, stop_s=w.stop_s - first_s) for w in found]
+    return Found(found, cut.temperature_degc)
 
 
 def _fault(device: str, cut: Cut, axes: int) -> str:
@@ -52,55 +69,77 @@ def _fault(device: str, cut: Cut, axes: int) -> str:
     return "" if cut.in_time else f"{device}: its sample numbers and arrivals do not make a clock"
 
 
-def _rest(piece: Piece, cut: Cut) -> list[Window]:
-    whole = np.isfinite(cut.indications).all(axis=1)
+def _rest(piece: Piece, cut: Cut, span_s: tuple[float, float], channel: Channel) -> list[Window]:
+    time_s = cut.time_s
+    whole = np.isfinite(cut.indications).all(axis=1) & _within(time_s, span_s)
     if whole.sum() < 2:
         return []
-    return [rest_window(piece.pose, cut.time_s[whole], cut.indications[whole], leave_out=False)]
+    return [rest_window(piece.pose, time_s[whole], cut.indications[whole], _limits(channel))]
 
 
-def motion_points(cut: Cut, reference: Cut, channel: Channel) -> Points | None:
-    """Samples of the sensor that have a reference, with it in m/s2 at their times; None where there are not two."""
-    u, margin = reference.indications / channel.reference_sensitivity, 0
-    if channel.reference_quantity == "velocity":
-        u, margin = differentiate(u, reference.clock.rate_hz)
+@dataclass(frozen=True, slots=True, eq=False)
+class Signals:
+    """The sensor's samples with the reference at their times, in the band of the motion, and the reference's noise."""
+
+    points: Points
+    reference_noise: Array
+
+
+def signals(cut: Cut, reference: Cut, channel: Channel, span_s: tuple[float, float], lag_s: float) -> Signals | None:
+    """Samples within `span_s` that have a reference, in m/s2; None where there are not two."""
+    certificate, rate_hz = channel.certificate, reference.clock.rate_hz
+    raw = reference.indications / certificate.sensitivity
+    u, margin = differentiate(raw, rate_hz) if certificate.quantity == "velocity" else (raw, 0)
     time_s = cut.time_s
-    at = resample(u, reference.clock, time_s, reference.first_index, margin)
-    usable = at.usable & np.isfinite(at.u).all(axis=1) & np.isfinite(cut.indications).all(axis=1)
+    at = resample(u, reference.clock, time_s - lag_s, reference.first_index, margin)
+    columns = np.hstack([cut.indications, at.u, at.du])
+    columns[~at.usable] = np.nan
+    band_hz, noise = _band(raw, at.u[at.usable], channel, rate_hz)
+    sensor_rate_hz = float((len(time_s) - 1) / (time_s[-1] - time_s[0])) if len(time_s) > 1 else 0.0
+    if band_hz is not None:
+        columns = lowpass(columns, sensor_rate_hz, band_hz)
+    usable = np.isfinite(columns).all(axis=1) & _within(time_s, span_s)
     if usable.sum() < 2:
         return None
-    return Points(time_s[usable], cut.indications[usable], at.u[usable], at.du[usable])
+    m = u.shape[1]
+    kept = columns[usable]
+    return Signals(Points(time_s[usable], kept[:, :3], kept[:, 3 : 3 + m], kept[:, 3 + m :]), noise)
 
 
-def _motion(piece: Piece, cut: Cut, reference: Cut, channel: Channel) -> list[Window]:
-    points = motion_points(cut, reference, channel)
-    # Method 3 as printed takes all points of a window.
-    return [] if points is None else motion_windows(piece.pose, points, leave_out=False)
+def _band(raw: Array, u: Array, channel: Channel, rate_hz: float) -> tuple[float | None, Array]:
+    """Where to limit both signals, None where that gains nothing, and the reference's noise (2, m) in what is left."""
+    certificate, m = channel.certificate, raw.shape[1]
+    velocity = certificate.quantity == "velocity"
+    whole = raw[np.isfinite(raw).all(axis=1)]
+    found_hz, density = band_above_noise(whole, rate_hz)
+    density = np.maximum(density, certificate.noise_mps2 / np.sqrt(0.5 * rate_hz))
+    widest_hz = min(VELOCITY_BAND_HZ, RESAMPLED_BAND * rate_hz) if velocity else RESAMPLED_BAND * rate_hz
+    unlimited = noise_in_band(density, widest_hz, differentiated=velocity)
+    power = np.var(u, axis=0).max(initial=0.0) if len(u) else 0.0
+    if found_hz is None or np.max(unlimited[0] ** 2, initial=0.0) <= NOISE_MATTERS * power:
+        return None, unlimited.reshape(2, m)
+    return found_hz, noise_in_band(density, min(FILTER_BAND * found_hz, widest_hz), differentiated=velocity)
+
+
+def _motion(
+    pose: Pose, cut: Cut, reference: Cut, channel: Channel, span_s: tuple[float, float], lag_s: float
+) -> list[Window]:
+    found = signals(cut, reference, channel, span_s, lag_s)
+    if found is None:
+        return []
+    windows = motion_windows(pose, found.points, _limits(channel))
+    return [replace(window, reference_noise=found.reference_noise) for window in windows]
+
+
+def _limits(channel: Channel) -> Limits:
+    return Limits(longest_s=channel.window_s)
+
+
+def _within(time_s: Array, span_s: tuple[float, float]) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    return np.asarray((time_s >= span_s[0]) & (time_s < span_s[1]))
 
 
 def _refused(piece: Piece, reason: str) -> Window:
     m = piece.pose.direction.shape[1]
     nothing = WindowSums(m, np.zeros(0), np.zeros((0, 2 * m + 3)), np.zeros((0, 2 * m + 3, 2 * m + 3)))
     return Window(piece.start_s, piece.stop_s, piece.pose, nothing, False, reason, 0, 0)
-
-
-def window_state(window: Window) -> dict[str, Any]:
-    """A window as plain values."""
-    pose, sums = window.pose, window.sums
-    return {
-        "start_s": window.start_s,
-        "stop_s": window.stop_s,
-        "used": window.used,
-        "reason": window.reason,
-        "points": window.points,
-        "left_out": window.left_out,
-        "kind": window.kind,
-        "numbers": dict(window.numbers),
-        "pose": {name: getattr(pose, name) for name in Pose.__slots__},
-        "sums": {name: getattr(sums, name) for name in WindowSums.__slots__},
-    }
-
-
-def window_of(state: dict[str, Any]) -> Window:
-    """The window that `window_state` took apart."""
-    return Window(**(state | {"pose": Pose(**state["pose"]), "sums": WindowSums(**state["sums"])}))

@@ -7,6 +7,7 @@ import time
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import zstandard
@@ -50,7 +51,8 @@ def configuration() -> Config:
         {"start_s": start_s, "stop_s": start_s + 10, "theta_deg": 35, "alpha_deg": alpha_deg}
         for start_s, alpha_deg in ((3, 0), (16, 30), (29, 120))
     ]
-    channel = {"sensor": "mems", "reference": "reference", "poses": poses, "poses_repeat_s": 39}
+    channel: dict[str, Any] = {"sensor": "mems", "reference": "reference", "poses": poses, "poses_repeat_s": 39}
+    channel |= {"prior": {"sensitivity": 26000.0}}
     devices = [{"name": name, "driver": "adxl355"} for name in ("mems", "reference")]
     return Config.model_validate({"devices": devices, "channels": [channel]})
 

@@ -81,7 +81,7 @@ def noise_in_band(density: Array, band_hz: float, *, differentiated: bool) -> Ar
     first = 1 if differentiated else 0
     turn = 2.0 * np.pi
     powers = [turn ** (2 * k) * band_hz ** (2 * k + 1) / (2 * k + 1) for k in (first, first + 1)]
-    return np.sqrt(np.array(powers))[:, None] * density
+    return np.asarray(np.sqrt(np.array(powers))[:, None] * density)
 
 
 def lowpass(x: Array, rate_hz: float, band_hz: float) -> Array:

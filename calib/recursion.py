@@ -80,6 +80,7 @@ class Recursion:
         self._noise = Noise()
         self._day: float | None = None
         self._temperature_range = (np.inf, -np.inf)
+        self._residual_sd = np.full(3, np.nan)
         self._held: Held | None = None  # at a fixed mount, from the first window on
         self.windows = 0
 
@@ -131,6 +132,16 @@ class Recursion:
         return float(self._state.mean[k]), float(np.sqrt(self._state.variance[k]))
 
     @property
+    def residual_sd(self) -> Array:
+        """(3,) of single points in the newest window, output unit; NaN before any."""
+        return self._residual_sd.copy()
+
+    @property
+    def reference_temperature_degc(self) -> float:
+        """To which S and Q refer."""
+        return self._temperature.reference_degc
+
+    @property
     def names(self) -> list[str]:
         """Of all quantities in the state."""
         return list(self._state.names)
@@ -153,6 +164,7 @@ class Recursion:
         if len(self._recent) > MOST_RECENT:
             self._absorb(1)
         self._noise = _pooled(self._noise, rows.noise)
+        self._residual_sd = summary.data.type_a.noise.copy()
         if np.isfinite(summary.temperature_degc):
             low, high = self._temperature_range
             self._temperature_range = (min(low, summary.temperature_degc), max(high, summary.temperature_degc))
@@ -323,6 +335,7 @@ class Recursion:
             "noise": asdict(self._noise),
             "day": self._day,
             "temperature_range": list(self._temperature_range),
+            "residual_sd": self._residual_sd.copy(),
             "held": None if self._held is None else {"mps2": self._held.mps2, "by": dict(self._held.by)},
             "windows": self.windows,
             "scale": self.scale,
@@ -339,6 +352,7 @@ class Recursion:
         self._day = state["day"]
         low, high = state["temperature_range"]
         self._temperature_range = (low, high)
+        self._residual_sd = np.array(state["residual_sd"])
         self._held = None if state["held"] is None else Held(**state["held"])
         self.windows, self.scale = state["windows"], state["scale"]
 

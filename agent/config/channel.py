@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from agent.config.knowledge import Knowledge, Nine
 from agent.config.section import Name, Section, Vector
 from calib.geometry import beside
 
@@ -43,13 +44,11 @@ class PoseInterval(Section):
         return self
 
 
-class Channel(Section):
+class Channel(Knowledge):
     """One sensor with its reference and its geometry."""
 
     sensor: Name
     reference: Name | None = None
-    reference_quantity: Literal["acceleration", "velocity"] = "acceleration"
-    reference_sensitivity: Annotated[float, Field(gt=0, description="indication per m/s2, or per m/s")] = 1.0
     coupling: Literal["dc", "ac"] = "dc"
     gravity_mps2: Annotated[float, Field(gt=9.7, lt=9.9)] = 9.80665
     static_sign: Literal[1, -1] = 1
@@ -58,13 +57,20 @@ class Channel(Section):
     # Samples wait as long, in memory and in every snapshot: a minute of 10 kHz on six axes is 29 MB.
     late_horizon_s: Annotated[float, Field(gt=0, le=60)] = 5.0
     silence_s: Annotated[float, Field(gt=0, le=3600, description="without a block the status is INVALID")] = 5.0
-    windows: Annotated[int, Field(ge=1, le=200, description="how many of the newest windows the solution uses")] = 24
+    # A long stretch is cut into windows of this length, so that memory stays bounded and news comes.
+    window_s: Annotated[float, Field(ge=1, le=600)] = 60.0
+    every_s: Annotated[float, Field(ge=0, le=86400, description="one window each; 0: one after the other")] = 0.0
     # A tri-axial reference beside the sensor needs no poses: a = R a_ref, R row by row. What the sensor reads at rest
     # belongs here only where the reference is AC-coupled.
-    rotation: tuple[float, float, float, float, float, float, float, float, float] | None = None
+    rotation: Nine | None = None
     rotation_gravity_mps2: Vector | None = (0.0, 0.0, 0.0)
     poses: tuple[PoseInterval, ...] = ()
     poses_repeat_s: Annotated[float | None, Field(gt=0)] = None
+
+    @property
+    def fixed_mount(self) -> bool:
+        """Whether the sensor never turns against gravity: its mean output then tells nothing of S."""
+        return self.rotation is not None or len(self.poses) == 1
 
     @model_validator(mode="after")
     def _schedule(self) -> Channel:
@@ -72,6 +78,8 @@ class Channel(Section):
             if self.poses or self.reference is None:
                 raise ValueError("rotation is for a tri-axial reference and takes the place of poses")
             beside([self.rotation[i : i + 3] for i in (0, 3, 6)])
+        if self.every_s and self.every_s < self.window_s:
+            raise ValueError(f"every_s {self.every_s} is shorter than window_s {self.window_s}")
         end = 0.0
         for i, pose in enumerate(self.poses):
             if pose.start_s < end:

@@ -27,7 +27,7 @@ from agent.delivery.schema import (
 )
 from agent.events import CalibrationUpdate, DriftReport, Estimate, Result, StatusChange, WindowReport
 
-__all__ = ["FILE_NAME", "History", "Record", "Removed", "StoreError", "connect_read_only"]
+__all__ = ["FILE_NAME", "History", "Memory", "Record", "Removed", "StoreError", "connect_read_only"]
 
 FILE_NAME = "state.sqlite"
 _TYPES: dict[str, type[Result]] = {
@@ -38,6 +38,16 @@ _TYPES: dict[str, type[Result]] = {
     "status": StatusChange,
 }
 _KINDS = {kind: what for what, kind in _TYPES.items()}
+
+
+@dataclass(frozen=True, slots=True)
+class Memory:
+    """What outlives a run of the estimation on one device: its state after the result with this number."""
+
+    sensor: str
+    identity: str
+    sequence: int
+    state: bytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,6 +192,14 @@ class History:
         )
         records = [self._record(sequence) for (sequence,) in rows]
         return {record.identity: record for record in records}
+
+    def memories(self, sensor: str) -> dict[str, Memory]:
+        """The newest state of every device that this sensor ever was, by identity."""
+        rows = self._rows("SELECT sensor, identity, sequence, state, crc FROM memory WHERE sensor = ?", sensor)
+        try:
+            return {row[1]: Memory(*checked(row)) for row in rows}
+        except DamagedRow as error:
+            raise StoreError(f"{self._path}: {error}") from None
 
     def newest(self, sensor: str, what: str, *, limit: int) -> list[Record]:
         """The newest `limit` results of one channel, newest first."""

@@ -29,11 +29,15 @@ _MARKS = "CREATE TABLE marks (name TEXT PRIMARY KEY, value INTEGER NOT NULL, crc
 _REMOVED = """CREATE TABLE removed (
     sensor TEXT NOT NULL, what TEXT NOT NULL, count INTEGER NOT NULL, up_to INTEGER NOT NULL, crc INTEGER NOT NULL,
     PRIMARY KEY (sensor, what)) STRICT"""
+# What outlives a run of a device's estimation: the newest state of each identity, opaque here.
+_MEMORY = """CREATE TABLE memory (
+    sensor TEXT NOT NULL, identity TEXT NOT NULL, sequence INTEGER NOT NULL, state BLOB NOT NULL, crc INTEGER NOT NULL,
+    PRIMARY KEY (sensor, identity)) STRICT"""
 _INDEXES = (
     "CREATE INDEX results_of_channel ON results (sensor, what, sequence)",
     "CREATE INDEX calibrations_of_device ON results (sensor, identity, sequence) WHERE what = 'calibration'",
 )
-_STATEMENTS = (_RESULTS, _LATEST, _MARKS, _REMOVED, *_INDEXES)
+_STATEMENTS = (_RESULTS, _LATEST, _MARKS, _REMOVED, _MEMORY, *_INDEXES)
 
 
 class StoreError(Exception):
@@ -98,6 +102,14 @@ def insert_results(connection: sqlite3.Connection, rows: Iterable[tuple[object, 
     connection.executemany(f"INSERT INTO results ({RESULT_COLUMNS}, crc) VALUES ({places})", rows)
 
 
+def write_memory(connection: sqlite3.Connection, row: tuple[str, str, int, bytes]) -> None:
+    """Keep the state of a device's estimation in place of the one before: sensor, identity, sequence, state."""
+    connection.execute(
+        "INSERT OR REPLACE INTO memory (sensor, identity, sequence, state, crc) VALUES (?, ?, ?, ?, ?)",
+        (*row, row_crc(*row)),
+    )
+
+
 def create_tables(connection: sqlite3.Connection, marks: dict[str, int]) -> None:
     """Make an empty store; within the caller's transaction."""
     for statement in _STATEMENTS:
@@ -130,7 +142,7 @@ def _add_crcs(connection: sqlite3.Connection) -> None:
     connection.execute("ALTER TABLE results RENAME TO results_1")
     connection.execute("DROP TABLE latest")
     connection.execute("DROP TABLE marks")
-    for statement in (_RESULTS, _LATEST, _MARKS, _REMOVED):
+    for statement in (_RESULTS, _LATEST, _MARKS, _REMOVED, _MEMORY):
         connection.execute(statement)
     connection.execute(
         f"INSERT INTO results ({RESULT_COLUMNS}, crc) SELECT {RESULT_COLUMNS}, row_crc({RESULT_COLUMNS}) FROM results_1"
@@ -166,6 +178,7 @@ def damage(connection: sqlite3.Connection) -> str:
         read_marks(connection)
         _check_all(connection.execute(f"SELECT {RESULT_COLUMNS}, crc FROM results"))
         _check_all(connection.execute("SELECT sensor, what, count, up_to, crc FROM removed"))
+        _check_all(connection.execute("SELECT sensor, identity, sequence, state, crc FROM memory"))
         named = {checked(row)[:3] for row in connection.execute("SELECT * FROM latest")}
     except DamagedRow as error:
         return str(error)

@@ -9,7 +9,7 @@ import time
 from collections.abc import Iterable
 from pathlib import Path
 
-from agent.delivery.history import FILE_NAME, Record
+from agent.delivery.history import FILE_NAME, Memory, Record
 from agent.delivery.opening import lock, open_or_set_aside
 from agent.delivery.recovery import Recovered, recover
 from agent.delivery.retention import FOR_EVER, KeepResults, Sweep
@@ -23,6 +23,7 @@ from agent.delivery.schema import (
     withdraw,
     write_latest,
     write_mark,
+    write_memory,
 )
 
 # After a run that did not close well, numbers may be out in the world that no commit has kept; the next run counts on
@@ -49,6 +50,7 @@ class Store:
         self.path = data_dir / FILE_NAME
         self._mutex = threading.Lock()
         self._waiting: list[Record] = []
+        self._memories: dict[tuple[str, str], Memory] = {}
         self._last = self._published = self._file_sequence = 0
         self._sweep = Sweep(keep)
         self._lock = lock(data_dir)
@@ -66,13 +68,14 @@ class Store:
         """The number after which this run may count."""
         return self._last
 
-    def commit(self, records: Iterable[Record]) -> None:
-        """Keep the results in one transaction; when this returns they survive a power cut.
+    def commit(self, records: Iterable[Record], memories: Iterable[Memory] = ()) -> None:
+        """Keep the results and states in one transaction; when this returns they survive a power cut.
 
         Raises StoreError where they cannot be kept (they are tried again with the next commit) or are out of order.
         """
         with self._mutex:
             self._enqueue(records)
+            self._memories |= {(memory.sensor, memory.identity): memory for memory in memories}
             try:
                 with self._connection:
                     self._connection.execute("BEGIN IMMEDIATE")
@@ -82,6 +85,7 @@ class Store:
                 del self._waiting[:-WAITING_MAX]
                 raise StoreError(f"{self.path}: {error}") from None
             self._waiting.clear()
+            self._memories.clear()
 
     def published(self) -> int:
         """Results up to this number have been put on the network; those after it are the outbox."""
@@ -140,6 +144,8 @@ class Store:
             write_latest(self._connection, record.sensor, record.what, record.sequence, withdrawn=False)
             if record.is_withdrawal:
                 withdraw(self._connection, record.sensor)
+        for memory in self._memories.values():
+            write_memory(self._connection, (memory.sensor, memory.identity, memory.sequence, memory.state))
         write_mark(self._connection, "published", self._published)
         write_mark(self._connection, "file", self._file_sequence)
 

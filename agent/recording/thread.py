@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 
+from agent.delivery.history import Memory
 from agent.events import Event, Pruned, Result, RunStart
 from agent.recording.writer import Recorder
 
@@ -14,21 +15,24 @@ FLUSH_S = 2.0  # s; a power cut costs at most this much of the recording, for 11
 LOOK_S = 10.0  # s; how often it is asked whether recordings are due to be deleted
 CAPACITY = 256  # events; half a minute of two devices and ticks, while a slow card takes its time
 
-Deliver = Callable[[int, Sequence[Result], bool], None]
+Deliver = Callable[[int, Sequence[Result], bool, Sequence[Memory]], None]
+
+
+Entry = tuple[int, Event, Sequence[Result], Sequence[Memory]]
 
 
 class RecordingThread:
     """Takes events with their results from the main loop, in order, and records them.
 
-    `deliver(event_sequence, results, recorded)` is called in this thread after the results are on disk (or, with
-    `recorded` false, could not be); it must not raise. What is raised nevertheless comes out of the next `put`.
+    `deliver(event_sequence, results, recorded, memories)` is called in this thread after the results are on disk (or,
+    with `recorded` false, could not be); it must not raise. What is raised nevertheless comes out of the next `put`.
     """
 
     def __init__(self, recorder: Recorder, deliver: Deliver, *, flush_s: float = FLUSH_S) -> None:
         self._recorder = recorder
         self._deliver = deliver
         self._flush_s = flush_s
-        self._queue: queue.Queue[tuple[int, Event, Sequence[Result]] | None] = queue.Queue(CAPACITY)
+        self._queue: queue.Queue[Entry | None] = queue.Queue(CAPACITY)
         self._starts_sent = self._starts_done = 0
         self._pruning_sent = False
         self._error: BaseException | None = None
@@ -44,13 +48,15 @@ class RecordingThread:
         """The next event, where recordings are due to be deleted; None while one is on its way."""
         return None if self._pruning_sent else self._recorder.pruning
 
-    def put(self, event_sequence: int, event: Event, results: Sequence[Result]) -> None:
+    def put(
+        self, event_sequence: int, event: Event, results: Sequence[Result], memories: Sequence[Memory] = ()
+    ) -> None:
         """Hand over an event and what came of it; waits while the disk is far behind."""
         if isinstance(event, RunStart):
             self._starts_sent += 1
         elif isinstance(event, Pruned):
             self._pruning_sent = True
-        self._hand_over((event_sequence, event, results))
+        self._hand_over((event_sequence, event, results, memories))
 
     def close(self) -> None:
         """Record what is waiting and finish the file."""
@@ -58,7 +64,7 @@ class RecordingThread:
         self._thread.join()
         self._raise()
 
-    def _hand_over(self, entry: tuple[int, Event, Sequence[Result]] | None) -> None:
+    def _hand_over(self, entry: Entry | None) -> None:
         while True:
             self._raise()
             try:
@@ -94,10 +100,10 @@ class RecordingThread:
                 continue
             if entry is None:
                 return
-            event_sequence, event, results = entry
+            event_sequence, event, results, memories = entry
             recorded = self._recorder.record(event_sequence, event, results)
             self._starts_done += isinstance(event, RunStart)
             if isinstance(event, Pruned):
                 self._pruning_sent = False
             if results:
-                self._deliver(event_sequence, results, recorded)
+                self._deliver(event_sequence, results, recorded, memories)

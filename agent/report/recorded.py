@@ -14,10 +14,10 @@ from agent.events import CalibrationUpdate, DeviceChange, Event, Result, RunStar
 from agent.recording.reading import RecordingReader
 from agent.recording.records import Fault
 from agent.report.trace import Trace
-from agent.schedule import WINDOW_S, pieces
+from agent.schedule import pieces
 from agent.snapshot import unpack
 from agent.stream import DeviceStream
-from agent.windows import MARGIN_S, motion_points
+from agent.windows import MARGIN_S, signals
 from calib.model import Pose
 from hw.block import SampleBlock
 
@@ -114,7 +114,7 @@ class _Windows:
         self._channel = channel
         held = unpack(start.snapshot)["channels"][channel.sensor]
         self._streams = {n: DeviceStream.restore(held["origin_ns"], s) for n, s in held["streams"].items()}
-        self._keep_s = WINDOW_S + channel.late_horizon_s + 2 * MARGIN_S
+        self._keep_s = channel.window_s + channel.late_horizon_s + 2 * MARGIN_S
 
     def update(self, event: Event) -> None:
         if isinstance(event, SampleBlock) and event.device in self._streams:
@@ -137,9 +137,11 @@ class _Windows:
             nothing = np.empty((int(whole.sum()), 0))
             return Trace(cut.time_s[whole] - first_s, cut.indications[whole], nothing, nothing, pose)
         reference = self._streams[self._channel.reference].cut(start_s - MARGIN_S, stop_s + MARGIN_S)
-        points = motion_points(cut, reference, self._channel) if reference is not None else None
-        if points is None:
+        lag_s = window.numbers.get("lag_applied_s", 0.0)
+        found = None if reference is None else signals(cut, reference, self._channel, (start_s, stop_s), lag_s)
+        if found is None:
             return None
+        points = found.points
         return Trace(points.time_s - first_s, points.V, points.u, points.du, pose)
 
     def _pose(self, window: WindowReport) -> Pose | None:

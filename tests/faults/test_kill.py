@@ -10,12 +10,16 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 
+import msgspec
+import numpy as np
 import pytest
 
 from agent.channel import identity_of
+from agent.config import load_config
 from agent.delivery.history import Record
 from agent.delivery.store import Store
-from agent.events import CalibrationUpdate, StatusChange
+from agent.events import CalibrationUpdate, Command, DeviceChange
+from agent.pipeline import Pipeline
 from agent.recording.reading import RecordingReader
 from hw.serial_stream import SerialCsv, SerialCsvOptions
 from hw.virtual.serial_port import PtyDevice
@@ -31,6 +35,7 @@ driver = "serial-csv"
 options = {{ port = "{port}", rate_hz = 100, axes = 3, sequence = true, unit = "m/s2", serial_number = "A1" }}
 [[channels]]
 sensor = "imu"
+prior = {{}}
 guard_s = 0.1
 poses = [{{ start_s = 0, stop_s = 1, gravity_mps2 = [0, 0, 9.81] }}]
 poses_repeat_s = 1
@@ -59,36 +64,38 @@ def port(tmp_path: Path) -> Iterator[PtyDevice]:
     device.stop()
 
 
-def keep_calibration(data_dir: Path, port: Path) -> CalibrationUpdate:
-    """What a run before left in the store: a calibration of this very device, VALID."""
+def keep_calibration(data_dir: Path, port: Path, config: Path) -> CalibrationUpdate:
+    """What a run before left in the store: a calibration of this very device, put in force by an operator."""
     data_dir.mkdir()
     options = SerialCsvOptions(port=str(port), rate_hz=100, axes=3, sequence=True, unit="m/s2", serial_number="A1")
     sensor = SerialCsv("imu", options)
-    info = sensor.open()
+    info_json = json.dumps(asdict(sensor.open()))
     sensor.close()
-    store = Store(data_dir)
-    sequence = store.last_sequence() + 1
     calibration = CalibrationUpdate(
-        run_id="before", sequence=sequence, sensor="imu", t_utc_ns=1,
+        run_id="before", sequence=1, sensor="imu", t_utc_ns=1,
         sensitivity=[[1.01, 0.002, 0.1], [0, 1, 0], [0, 0, 1]],
-        offset=[0.1, 0.2, 0.3], standard_uncertainty=[1e-3] * 12, covariance=[[1e-6] * 12] * 12, coverage_factor=2.0,
-        determined=[True] * 12, method="3 (plain)", uncertainty_kind="type A, white", windows=4,
-        residual_sd=[0.1, 0.1, 0.1], output_unit="m/s2", identity=identity_of(json.dumps(asdict(info))),
+        offset=[0.1, 0.2, 0.3], standard_uncertainty=[1e-3] * 12, covariance=(1e-6 * np.eye(12)).tolist(),
+        coverage_factor=2.0, determined=[True] * 12, method="3", uncertainty_kind="combined", windows=4,
+        residual_sd=[0.1, 0.1, 0.1], output_unit="m/s2", identity=identity_of(info_json),
     )  # fmt: skip
-    status = StatusChange(
-        run_id="before", sequence=sequence + 1, sensor="imu", t_utc_ns=1,
-        status="VALID", before="COLLECTING", reason="",
-    )  # fmt: skip
-    store.commit([Record.of(r, recorded=True, recording="") for r in (calibration, status)])
+    store = Store(data_dir)
+    pipeline = Pipeline.begin(load_config(config), "before", 0, store.last_sequence(), {})
+    times = {"t_monotonic_ns": 1, "t_utc_ns": 1}
+    for event in (
+        DeviceChange(device="imu", state="open", info_json=info_json, **times),
+        Command(sensor="imu", verb="rollback", calibration_json=msgspec.json.encode(calibration).decode(), **times),
+    ):
+        found = pipeline.step(event)
+        store.commit([Record.of(r, recorded=True, recording="") for r in found], pipeline.memories(found))
     store.close()
     return calibration
 
 
 def test_killed_at_random_moments_it_goes_on(tmp_path: Path, port: PtyDevice) -> None:
     data_dir, output = tmp_path / "data", tmp_path / "output"
-    kept = keep_calibration(data_dir, port.path)
     config = tmp_path / "config.toml"
     config.write_text(CONFIG.format(port=port.path))
+    kept = keep_calibration(data_dir, port.path, config)
     moments = random.Random(SEED)
     for kill in range(KILLS):
         before = len(recordings(data_dir))
@@ -124,8 +131,9 @@ def test_killed_at_random_moments_it_goes_on(tmp_path: Path, port: PtyDevice) ->
 
 def test_a_calibration_of_another_device_is_not_taken(tmp_path: Path, port: PtyDevice) -> None:
     data_dir = tmp_path / "data"
-    keep_calibration(data_dir, port.path)
     config = tmp_path / "config.toml"
+    config.write_text(CONFIG.format(port=port.path))
+    keep_calibration(data_dir, port.path, config)
     config.write_text(CONFIG.format(port=port.path).replace('"A1"', '"B2"'))
     with started("run", config, "--data-dir", data_dir, output=tmp_path / "output") as agent:
         wait_until(lambda: "belongs to" in (tmp_path / "output").read_text(), 20, "it says whose it is")

@@ -25,7 +25,7 @@ def config(reference: bool) -> Config:
     if reference:
         forms = [{"theta_deg": 35, "alpha_deg": alpha} for alpha in (0, 30, 120, 210)]
     poses = [{"start_s": 2 * k, "stop_s": 2 * k + 1.6, **form} for k, form in enumerate(forms)]
-    channel = {"sensor": "s", "guard_s": 0.1, "late_horizon_s": 2, "silence_s": 2, "windows": 8, "poses": poses}
+    channel = {"sensor": "s", "prior": {}, "guard_s": 0.1, "late_horizon_s": 2, "silence_s": 2, "poses": poses}
     channel |= {"poses_repeat_s": 8.0} | ({"reference": "r"} if reference else {})
     devices = [{"name": n, "driver": "serial-csv", "options": {"port": n, "rate_hz": RATE_HZ}} for n in "sr"]
     return parse_config({"devices": devices, "channels": [channel]}, "test")

@@ -27,6 +27,7 @@ driver = "serial-csv"
 options = {{ port = "{port}", rate_hz = 204.8, axes = 3, sequence = true, unit = "count" }}
 [[channels]]
 sensor = "imu"
+prior = {{ sensitivity = {nominal}, u_main_pct = 20 }}
 guard_s = 0.2
 poses = [
 {poses}

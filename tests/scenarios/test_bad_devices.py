@@ -33,6 +33,7 @@ driver = "serial-csv"
 options = {{ port = "{port}", rate_hz = 100, axes = 3, sequence = true, unit = "m/s2" }}
 [[channels]]
 sensor = "imu"
+prior = {{}}
 silence_s = 2
 poses = [{{ start_s = 0, stop_s = 3600, gravity_mps2 = [0, 0, 9.81] }}]
 [zenoh]
@@ -147,7 +148,7 @@ def test_a_silent_device_turns_the_status_invalid_by_tick(tmp_path: Path) -> Non
 def test_a_wrong_chip_is_named_and_does_not_stop_the_agent(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     raw = {
         "devices": [{"name": "mems", "driver": "adxl355", "options": {"bus": 1}}],
-        "channels": [{"sensor": "mems", "silence_s": 2}],
+        "channels": [{"sensor": "mems", "silence_s": 2, "prior": {}}],
         "zenoh": {"enabled": False},
     }
     config = parse_config(raw, "test")

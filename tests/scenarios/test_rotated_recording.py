@@ -29,6 +29,7 @@ driver = "serial-csv"
 options = {{ port = "{link}-reference", rate_hz = 1000, axes = 1, sequence = true, unit = "m/s2" }}
 [[channels]]
 sensor = "mems"
+prior = {{}}
 reference = "reference"
 poses = [
   {{ start_s = 3, stop_s = 13, theta_deg = 35, alpha_deg = 0 }},

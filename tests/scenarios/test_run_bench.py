@@ -90,7 +90,7 @@ def test_s_and_q_are_right_within_a_minute(run: Run) -> None:
     full = np.abs(np.diag(true.sensitivity))[:, None]
     assert np.abs((np.array(last["sensitivity"]) - true.sensitivity) / full).max() < 0.005
     assert np.abs(np.array(last["offset"]) - true.offset).max() / COUNTS_PER_MPS2 < 0.03
-    assert last["uncertainty_kind"] == "type A, white"
+    assert last["uncertainty_kind"] == "combined"
     first_ns, last_ns = results(run.data_dir, "status")[0]["t_utc_ns"], last["t_utc_ns"]
     assert (last_ns - first_ns) * 1e-9 < THROUGH_S
 

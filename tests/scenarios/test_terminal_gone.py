@@ -19,6 +19,7 @@ driver = "serial-csv"
 options = { port = "/nonexistent/port", rate_hz = 100 }
 [[channels]]
 sensor = "imu"
+prior = {}
 [recording]
 rotate_s = 1
 [zenoh]

@@ -18,10 +18,11 @@ from agent.recording.fingerprint import fingerprint, versions
 from agent.recording.writer import Recorder
 from hw.block import DeviceInfo, SampleBlock
 from hw.virtual.bench import Bench, Truth
-from hw.virtual.presets import plain
+from hw.virtual.presets import COUNTS_PER_MPS2, plain
 
 EPOCH_NS = 1_790_000_000_000_000_000
 BLOCK, BURST = 500, 25
+PRIOR = {"sensitivity": COUNTS_PER_MPS2}
 
 
 def record(data_dir: Path, duration_s: float, seed: int = 7) -> Truth:
@@ -60,7 +61,7 @@ def _config(bench: Bench) -> Config:
             {"name": "mems", "driver": "serial-csv", "options": port | {"axes": 3}},
             {"name": "reference", "driver": "serial-csv", "options": port | {"axes": 1, "unit": "m/s2"}},
         ],
-        "channels": [{"sensor": "mems", "reference": "reference", "poses": poses}],
+        "channels": [{"sensor": "mems", "reference": "reference", "prior": PRIOR, "poses": poses}],
         "zenoh": {"enabled": False},
     }
     return parse_config(raw, "bench")

@@ -16,7 +16,7 @@ name = "imu"
 driver = "serial-csv"
 options = { port = "/dev/ttyUSB0", rate_hz = 100 }
 """
-CHANNEL = DEVICES + '[[channels]]\nsensor = "imu"\n'
+CHANNEL = DEVICES + '[[channels]]\nsensor = "imu"\nprior = {}\n'
 REST = "gravity_mps2 = [0, 0, 9.8]"
 
 
@@ -41,7 +41,7 @@ def faults(text: str) -> list[str]:
         (CHANNEL + '[zenoh]\nconnect = ["localhost:7447"]', ["zenoh.connect.0", "not 'localhost:7447'"]),
         (CHANNEL.replace("serial-csv", "serial-cvs"), ["devices.0.driver", "did you mean 'serial-csv'"]),
         (CHANNEL.replace("rate_hz = 100", "rate_hz = -1"), ["devices.0.options.rate_hz", "not -1"]),
-        (DEVICES + '[[channels]]\nsensor = "other"', ["channels.0.sensor", "'other'"]),
+        (DEVICES + '[[channels]]\nsensor = "other"\nprior = {}', ["channels.0.sensor", "'other'"]),
         (DEVICES, ["channels"]),
         ("channels = []\n" + DEVICES, ["channels", "at least 1"]),
     ],

@@ -30,7 +30,7 @@ def test_results_are_delivered_in_order_when_the_file_has_them(tmp_path: Path) -
     recorder = Recorder(tmp_path, ["acc", "ref"], ["bridge-1"])
     delivered: list[tuple[int, list[Result]]] = []
 
-    def deliver(number: int, results: Sequence[Result], recorded: bool) -> None:
+    def deliver(number: int, results: Sequence[Result], recorded: bool, _: object) -> None:
         assert recorded
         assert recorder.path is not None
         *_, last = RecordingReader(recorder.path).steps()
@@ -102,7 +102,7 @@ def test_what_delivery_raises_comes_out_of_the_next_put(tmp_path: Path) -> None:
 def test_results_that_could_not_be_recorded_are_delivered_as_such(tmp_path: Path) -> None:
     delivered: list[bool] = []
     recorder = Recorder(tmp_path / "gone", [], ["bridge-1"])
-    thread = RecordingThread(recorder, lambda _, __, recorded: delivered.append(recorded))
+    thread = RecordingThread(recorder, lambda _, __, recorded, ___: delivered.append(recorded))
     pipeline = StandIn(CONFIG)
     start = run_start(pipeline, 0, 1)
     thread.put(0, start, pipeline.step(start))

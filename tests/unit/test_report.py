@@ -114,13 +114,14 @@ def test_a_data_directory(recorded: tuple[Path, Truth], tmp_path: Path, capsys: 
     seen = Page(tmp_path / "out" / "report.html")
     check_alone(seen)
     for words in (
-        "Calibration of mems", "VALID", "Method 3 (plain)", "count/(m/s²)", "fieldcal-000001.mcap", "θ 35°",
-        "type A, white", "SHA-256", "mems-1", "Covariance",
+        "Calibration of mems", "VALID", "Method 3 (recursive adjustment)",
+        "count/(m/s²)", "fieldcal-000001.mcap", "θ 35°",
+        "combined", "SHA-256", "mems-1", "Covariance",
     ):  # fmt: skip
         assert words in seen.text, words
     held = json.loads((tmp_path / "out" / "report.json").read_text())
     S = np.array(held["results"][0]["sensitivity"])
-    np.testing.assert_allclose(S, truth.sensitivity, atol=1e-4 * truth.sensitivity.max())
+    np.testing.assert_allclose(S, truth.sensitivity, atol=5e-3 * truth.sensitivity.max())  # the clamp's angles
     assert f"{S[0, 0]:.7g}" in seen.text
     assert len(held["residuals"]) == 3
     # A sensor that has no lag and a fit of these very windows: what is left is its noise, and that is white.
@@ -155,10 +156,10 @@ def test_a_recording_without_a_calibration_says_why_and_is_status_3(
     torn.write_bytes(source[: len(source) // 2])
     status, said = run(capsys, torn, "-o", tmp_path / "out")
     assert status == 3
-    assert "refused: 1 windows, rank 2 of 4; not determined: Sxx" in said
+    assert "refused: not determined yet: Sxx" in said
     seen = Page(tmp_path / "out" / "report.html")
     assert "REFUSED" in seen.text
-    assert "rank 2 of 4" in seen.text
+    assert "not determined yet" in seen.text
     check_figures(tmp_path / "out", "windows")
 
 

@@ -1,0 +1,174 @@
+"""What is known before any data: of the sensor, of its reference, and of all that moves the data besides S and Q."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from agent.config.gate import DriftOptions, GateSettings
+from agent.config.section import Section, Vector
+from calib.model import Array
+from calib.nuisances import Priors
+from calib.wander import TemperatureModel, Wander
+
+Percent = Annotated[float, Field(gt=0, le=100)]
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+Nine = tuple[float, float, float, float, float, float, float, float, float]
+
+
+class Prior(Section):
+    """S and Q of the sensor before any data, from its certificate or data sheet; the agent does not start without.
+
+    `sensitivity` is the main one in output unit per m/s2, or all nine, row by row (row = output axis); left out, it is
+    the data sheet's, which the drivers of the chips know. `offset` is in m/s2, as are its uncertainties.
+    """
+
+    sensitivity: Positive | Nine | None = None
+    u_main_pct: Percent = 5.0
+    u_transverse_pct: Percent = 3.0  # of the main one: data sheets of MEMS say 1 to 3 %
+    offset_mps2: Vector = (0.0, 0.0, 0.0)
+    u_offset_mps2: Positive = 20.0  # two g: nothing is known
+
+    def mean(self, nominal: float | None) -> Array:
+        """(12,) S row by row and Q. Raises ValueError where neither configuration nor device tells a sensitivity."""
+        if self.sensitivity is None:
+            if nominal is None:
+                raise ValueError("neither prior.sensitivity nor the device tells a sensitivity to begin with")
+            S = nominal * np.eye(3)
+        elif isinstance(self.sensitivity, tuple):
+            S = np.reshape(self.sensitivity, (3, 3))
+        else:
+            S = self.sensitivity * np.eye(3)
+        return np.append(S.ravel(), scale_of(S) * np.array(self.offset_mps2))
+
+    def standard_uncertainty(self, mean: Array) -> Array:
+        """(12,) of what `mean` gave, in its units."""
+        scale = scale_of(mean[:9].reshape(3, 3))
+        share = np.where(np.eye(3).ravel() > 0, self.u_main_pct, self.u_transverse_pct) / 100.0
+        return scale * np.append(share, np.full(3, self.u_offset_mps2))
+
+
+def scale_of(S: Array) -> float:
+    """Output unit per m/s2: root mean square of the main sensitivities."""
+    return float(np.sqrt(np.mean(np.diag(S) ** 2)))
+
+
+class Certificate(Section):
+    """The reference's certificate. `serial_number` and `calibrated` are for the record; a device with another serial
+    number is refused."""
+
+    quantity: Literal["acceleration", "velocity"] = "acceleration"
+    sensitivity: Annotated[float, Field(gt=0, description="indication per m/s2, or per m/s")] = 1.0
+    u_sensitivity_pct: Annotated[float, Field(gt=0, le=50)] = 0.1
+    lag_s: Annotated[float, Field(ge=-0.1, le=0.1, description="by which its indications come late")] = 0.0
+    u_lag_s: Annotated[float, Field(ge=0, le=0.1, description="0: the lag is found from the data alone")] = 0.0
+    noise_mps2: Annotated[float, Field(ge=0, description="rms over its whole band; 0: as the data show")] = 0.0
+    serial_number: str = ""
+    calibrated: str = ""
+
+
+class Uncertainty(Section):
+    """Standard uncertainties of what moves the data besides S and Q (method: nuisances); 0 fixes one as stated."""
+
+    angle_deg: NotNegative = 0.2
+    theta_deg: NotNegative = 0.2
+    theta_position_deg: NotNegative = 0.0
+    alpha_common_deg: NotNegative = 0.1
+    rotation_deg: NotNegative = 0.2
+    tilt_deg: NotNegative = 0.2  # of gravity at a fixed mount
+    transverse_motion_pct: NotNegative = 1.0
+    offset_mps2: Positive = 0.05  # between windows
+    offset_position_mps2: NotNegative = 0.0
+    gravity_mps2: NotNegative = 0.03  # standard gravity is up to 0.3 % off
+    lag_s: NotNegative = 0.02
+    lag_window_s: NotNegative = 2e-5  # between windows: what two clock models leave
+
+
+class Process(Section):
+    """How fast things may wander: standard deviation of a random walk after a day, growing with the square root of
+    time, and the first uncertainty of a steady drift. Defaults: MEMS data sheets' stability over life, divided down."""
+
+    sensitivity_pct: NotNegative = 0.005  # 0.1 % a year; ADXL355: 0.11 % over ten years' accelerated life
+    offset_mps2: NotNegative = 0.002  # 40 mm/s2 a year; ADXL355: 35 mm/s2 over the same
+    offset_rate_mps2: NotNegative = 0.001  # a day: first uncertainty of the steady part
+    offset_rate_walk_mps2: NotNegative = 2e-5  # a day, per square-root day
+    tilt_deg: NotNegative = 0.002  # of a mount; 0.04 deg a year
+    reference_pct: NotNegative = 0.0
+
+
+class Temperature(Section):
+    """Dependence on temperature as a polynomial about `reference_degc`; order 0 is a constant.
+
+    First uncertainties of the coefficients: data sheets say 0.15 mg/K and 0.01 %/K of a good MEMS.
+    """
+
+    offset_order: Annotated[int, Field(ge=0, le=2)] = 1
+    sensitivity_order: Annotated[int, Field(ge=0, le=1)] = 0
+    reference_degc: Annotated[float, Field(ge=-60, le=150)] = 20.0
+    u_offset_mps2_per_k: Positive = 0.01
+    u_offset_mps2_per_k2: Positive = 2e-4
+    u_sensitivity_pct_per_k: Positive = 0.02
+
+
+class Knowledge(Section):
+    """Base of a channel: all its sections of what is known beforehand."""
+
+    prior: Prior
+    certificate: Certificate = Certificate()
+    uncertainty: Uncertainty = Uncertainty()
+    process: Process = Process()
+    temperature: Temperature = Temperature()
+    gate: GateSettings = GateSettings()
+    drift: DriftOptions = DriftOptions()
+
+    @model_validator(mode="after")
+    def _certificate_lag(self) -> Knowledge:
+        if self.certificate.lag_s and not self.certificate.u_lag_s:
+            raise ValueError("certificate.lag_s needs certificate.u_lag_s")
+        return self
+
+    def priors(self, *, fixed_mount: bool) -> Priors:
+        """The nuisances' priors."""
+        u = self.uncertainty
+        return Priors(
+            angle_rad=float(np.deg2rad(u.tilt_deg if fixed_mount else u.angle_deg)),
+            theta_rad=float(np.deg2rad(u.theta_deg)),
+            theta_position_rad=float(np.deg2rad(u.theta_position_deg)),
+            alpha_common_rad=float(np.deg2rad(u.alpha_common_deg)),
+            offset_mps2=u.offset_mps2,
+            offset_position_mps2=u.offset_position_mps2,
+            reference=self.certificate.u_sensitivity_pct / 100.0,
+            transverse=u.transverse_motion_pct / 100.0,
+            tilt_rad=0.0,
+            rotation_rad=float(np.deg2rad(u.rotation_deg)),
+            gravity_mps2=u.gravity_mps2,
+            # The sensor's own lag and the reference's are one unknown: what their stamps differ by.
+            lag_s=float(np.hypot(u.lag_s, self.certificate.u_lag_s)),
+            lag_window_s=u.lag_window_s,
+        )
+
+    def wander(self) -> Wander:
+        """How fast things may change."""
+        p = self.process
+        return Wander(
+            sensitivity=p.sensitivity_pct / 100.0,
+            offset_mps2=p.offset_mps2,
+            offset_rate_mps2=p.offset_rate_mps2,
+            offset_rate_walk_mps2=p.offset_rate_walk_mps2,
+            tilt_rad=float(np.deg2rad(p.tilt_deg)),
+            reference=p.reference_pct / 100.0,
+        )
+
+    def temperature_model(self) -> TemperatureModel:
+        """Dependence on temperature."""
+        t = self.temperature
+        return TemperatureModel(
+            t.offset_order,
+            t.sensitivity_order,
+            t.reference_degc,
+            (t.u_offset_mps2_per_k, t.u_offset_mps2_per_k2),
+            t.u_sensitivity_pct_per_k / 100.0,
+        )
