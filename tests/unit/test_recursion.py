@@ -1,0 +1,264 @@
+"""The recursion against other ways to the same numbers, and what it must never do however long it runs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib.adjustment import adjust
+from calib.model import Calibration
+from calib.nuisances import Priors
+from calib.recursion import Recursion
+from calib.wander import TemperatureModel, Wander
+from calib.window_rows import Summary
+from tests.building_windows import BESIDE, GRAVITY, building_window
+from tests.clamp_windows import ALPHAS_DEG, G_MPS2, Q_TRUE, S_TRUE, TRUTH, Faults, clamp_points, sums_of
+
+MEAN = np.append(np.eye(3).ravel(), np.zeros(3))
+U = np.append(np.where(np.eye(3).ravel() > 0, 0.05, 0.03), np.full(3, 20.0))
+STILL = Wander(0.0, 0.0, 1e-9, 0.0, 0.0, 0.0)
+DEGREE = np.deg2rad(1.0)
+COLUMN_Y, OTHERS = [1, 4, 7], [0, 2, 3, 5, 6, 8]
+FIXED = Priors(gravity_mps2=0.03, offset_mps2=1e-3, lag_window_s=0.0)
+
+
+def turned(priors: Priors, wander: Wander = STILL) -> Recursion:
+    return Recursion(MEAN, U, priors, wander, TemperatureModel(), fixed=False)
+
+
+def mounted(priors: Priors = FIXED, wander: Wander = STILL, model: TemperatureModel | None = None) -> Recursion:
+    return Recursion(MEAN, U, priors, wander, model or TemperatureModel(), fixed=True)
+
+
+def values(calibration: Calibration) -> np.ndarray:
+    return np.append(calibration.sensitivity.ravel(), calibration.offset)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_on_a_clamp_it_gives_what_all_windows_at_once_give(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    faults = Faults(
+        theta_rad=0.2 * DEGREE * random.normal(),
+        alpha_rad={alpha: 0.2 * DEGREE * random.normal() for alpha in ALPHAS_DEG},
+        offset_mps2=0.05,
+        lag_s=2e-4,
+    )
+    windows = clamp_points(random, faults).windows
+    found = turned(Priors())
+    for k, window in enumerate(windows):
+        found.update(Summary.of(window, k * 1e-3))
+    at_once = adjust(windows, Priors(parameters=MEAN, covariance=np.diag(U**2)))
+    u = np.sqrt(np.diag(at_once.covariance)[:12])
+    # Both weigh each window by its own noise; what differs is which windows that noise was learned from.
+    np.testing.assert_array_less(np.abs(values(found.result()) - at_once.mean[:12]) / u, 0.2)
+    ratio = found.result().standard_uncertainty / u
+    np.testing.assert_allclose(np.delete(ratio, [6, 7]), 1.0, atol=0.01)
+    # S_zx and S_zy are all type A, which twelve windows of six segments tell to 13 %.
+    np.testing.assert_allclose(ratio[[6, 7]], 1.0, atol=0.2)
+
+
+def test_with_exact_angles_it_is_the_least_squares_of_all_points() -> None:
+    points = clamp_points(np.random.default_rng(5), Faults(noise_mps2=0.02), repetitions=2)
+    found = turned(replace(Priors.none(), offset_mps2=1e-9))
+    for k, window in enumerate(points.windows):
+        found.update(Summary.of(window, k * 1e-3))
+    basis = np.column_stack([points.a, np.ones(len(points.a))])
+    plain, *_ = np.linalg.lstsq(basis, points.V, rcond=None)
+    # Type A is 8e-5; windows are weighed by their own noise, known to 5 %, here and not there.
+    np.testing.assert_allclose(found.result().sensitivity, plain[:3].T, rtol=0, atol=5e-5)
+    np.testing.assert_allclose(found.result().offset, plain[3], rtol=0, atol=2e-4)
+
+
+def test_the_stated_uncertainty_covers() -> None:
+    covered, runs = np.zeros(12), 80
+    for seed in range(runs):
+        random = np.random.default_rng(1000 + seed)
+        faults = Faults(
+            theta_rad=0.2 * DEGREE * random.normal(),
+            alpha_common_rad=0.1 * DEGREE * random.normal(),
+            alpha_rad={alpha: 0.2 * DEGREE * random.normal() for alpha in ALPHAS_DEG},
+            offset_mps2=0.05,
+        )
+        S = np.eye(3) * (1 + 0.05 * random.normal(size=3)) + 0.03 * random.normal(size=(3, 3)) * (1 - np.eye(3))
+        windows = clamp_points(random, faults, S=S, rate_hz=60.0).windows
+        found = turned(replace(Priors(), gravity_mps2=0.0, reference=0.0, transverse=0.0))
+        for k, window in enumerate(windows):
+            found.update(Summary.of(window, k * 1e-3))
+        calibration = found.result()
+        away = np.abs(values(calibration) - np.append(S.ravel(), Q_TRUE))
+        covered += away <= found.coverage_factor * calibration.standard_uncertainty
+    # 99.9 % binomial band of 95.45 % over 80 runs, Bonferroni over 12: at least 66. All 12 together: 93 % or more.
+    assert covered.min() >= 66, covered
+    assert 0.93 * 12 * runs <= covered.sum() <= 0.99 * 12 * runs, covered.sum() / 12 / runs
+
+
+def test_what_was_not_excited_stays_to_the_last_digit() -> None:
+    random, found = np.random.default_rng(1), mounted()
+    for k in range(40):
+        found.update(Summary.of(building_window(random), k / 24))
+    S = found.result().sensitivity.ravel()
+    np.testing.assert_allclose(S[OTHERS], MEAN[OTHERS], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(S[COLUMN_Y], S_TRUE.ravel()[COLUMN_Y], rtol=0, atol=3e-3)
+    np.testing.assert_array_equal(np.flatnonzero(found.determined[:9]), COLUMN_Y)
+    np.testing.assert_allclose(found.result().standard_uncertainty[OTHERS], U[OTHERS], rtol=1e-9)
+
+
+def test_motion_that_goes_along_is_none_of_the_excited_column() -> None:
+    # x moves along with y at 0.9 % of it, too little to tell S_x by, enough to put 1 % into S_xy if it were left out.
+    random, found = np.random.default_rng(2), mounted()
+    for k in range(20):
+        window = building_window(random)
+        sums = window.sums
+        turn = np.eye(9)
+        turn[0, 1] = turn[3, 4] = 0.009  # u_x = 0.009 u_y, and so its derivative
+        felt = np.eye(9)
+        felt[6:, 1] = 0.009 * S_TRUE[:, 0]  # and the sensor feels it
+        both = felt @ turn
+        moved = replace(sums, mean=sums.mean @ both.T, scatter=np.einsum("ab,kbc,dc->kad", both, sums.scatter, both))
+        found.update(Summary.of(replace(window, sums=moved), k / 24))
+    assert abs(found.result().sensitivity[0, 1] - S_TRUE[0, 1]) < 1.5e-3
+    np.testing.assert_allclose(found.result().sensitivity[:, 0], MEAN[[0, 3, 6]], rtol=0, atol=1e-12)
+
+
+def test_a_mean_that_drifts_at_a_fixed_mount_moves_the_offset_alone() -> None:
+    random, found = np.random.default_rng(3), mounted(wander=Wander(0.0, 0.01, 1e-3, 1e-5, 0.0, 0.0))
+    for k in range(200):
+        Q = Q_TRUE + 0.24 * k / 199
+        found.update(Summary.of(building_window(random, Q=Q), k / 24))
+    now = found.result()
+    np.testing.assert_allclose(now.sensitivity.ravel()[OTHERS], MEAN[OTHERS], rtol=0, atol=1e-12)
+    output = S_TRUE @ GRAVITY + Q_TRUE + 0.24
+    np.testing.assert_allclose(now.sensitivity @ GRAVITY + now.offset, output, rtol=0, atol=2e-3)
+    # What of the mean is Q and what S_iz g nobody told: U(Q) must say so.
+    assert np.all(np.abs(now.offset - Q_TRUE - 0.24) < 2.0 * now.standard_uncertainty[9:])
+    assert now.standard_uncertainty[9] > 0.9 * U[2] * G_MPS2
+
+
+def test_a_reference_known_to_a_tenth_of_a_per_cent_is_never_known_better() -> None:
+    random, found = np.random.default_rng(4), mounted(replace(FIXED, reference=1e-3))
+    smallest = np.inf
+    for k in range(400):
+        found.update(Summary.of(building_window(random, reference_error=1.5e-3), k / 24))
+        smallest = min(smallest, float(found.result().standard_uncertainty[4]))
+    # S_yy is known relative to a prior of 5 %, which takes 0.02 % off the reference's own 0.1 %.
+    assert smallest > 0.97e-3
+    assert abs(found.result().sensitivity[1, 1] - S_TRUE[1, 1]) < 2 * 1.1e-3
+
+
+def test_wandering_never_makes_less_known_than_before_any_data() -> None:
+    random, found = np.random.default_rng(5), mounted(wander=Wander(0.01, 0.1, 1e-3, 1e-3, 0.01, 0.0))
+    found.update(Summary.of(building_window(random), 0.0))
+    found.update(Summary.of(building_window(random), 1e6))
+    u = found.result().standard_uncertainty
+    assert np.all(u[OTHERS] <= U[OTHERS] * (1 + 1e-9))
+    assert u[4] < U[4]
+
+
+def test_temperature_is_told_from_drift() -> None:
+    random = np.random.default_rng(6)
+    model = TemperatureModel(offset_order=1, sensitivity_order=1, u_offset_mps2=(0.05, 1e-3), u_sensitivity=1e-3)
+    found = mounted(model=model, wander=Wander(0.0, 1e-3, 1e-3, 0.0, 0.0, 0.0))
+    per_k, of_main = np.array([0.01, -0.02, 0.005]), np.array([0.0, 5e-4, 0.0])
+    for k in range(150):
+        day = k / 24
+        above = 8.0 * np.sin(2 * np.pi * day)
+        S = S_TRUE * (1.0 + of_main * above)[:, None]
+        Q = Q_TRUE + per_k * above + 0.003 * day
+        # Under gravity a row of S that depends on temperature moves the mean as well; the model's Q takes that up.
+        found.update(Summary.of(building_window(random, S=S, Q=Q, level_mps2=(0.1, 0.3, 0.1)), day, 0.0, 20.0 + above))
+    moved = per_k + of_main * (S_TRUE @ GRAVITY)
+    for i, axis in enumerate("xyz"):
+        value, u = found.quantity(f"Q{axis}_T1")
+        assert abs(value - moved[i]) < 4 * u
+        assert u < 1e-3
+    value, u = found.quantity("Sy_T1")
+    assert abs(value - 5e-4) < 4 * u
+    assert u < 1e-4
+    low, high = found.temperature_range_degc
+    assert (low, high) == pytest.approx((12.0, 28.0), abs=0.2)
+
+
+def test_the_innovation_is_chi_squared_and_each_score_normal() -> None:
+    scores, statistics, freedom = [], [], 0
+    for seed in range(60):
+        random = np.random.default_rng(seed)
+        found = mounted(replace(FIXED, offset_mps2=1e-3))
+        Q = Q_TRUE + 1e-3 * random.normal(size=(12, 3))
+        for k in range(12):
+            summary = Summary.of(building_window(random, level_mps2=(0.1, 0.1, 0.1), Q=Q[k]), k / 24)
+            if k >= 3:
+                told = found.innovation(summary)
+                statistics.append(told.statistic)
+                scores.append(told.score)
+                freedom = told.degrees_of_freedom
+            found.update(summary)
+    n = len(statistics)
+    assert freedom == 21
+    # 540 of them: the mean's SD is 0.28; segments of one window know their own scatter to a few per cent.
+    assert 0.9 * freedom < np.mean(statistics) < 1.12 * freedom
+    assert np.all(np.abs(np.mean(scores, axis=0)) < 4 / np.sqrt(n))
+    np.testing.assert_allclose(np.std(scores, axis=0), 1.0, atol=0.13)
+
+
+def test_a_change_moves_a_score_by_what_the_information_says() -> None:
+    random, found = np.random.default_rng(8), mounted()
+    for k in range(10):
+        found.update(Summary.of(building_window(random), k / 24))
+    S = S_TRUE.copy()
+    S[1, 1] += 0.01
+    told = [found.innovation(Summary.of(building_window(random, S=S), 10 / 24)) for _ in range(30)]
+    expected = 0.01 * np.sqrt(told[0].information[4])
+    assert expected > 5
+    assert np.mean([t.score[4] for t in told]) == pytest.approx(expected, abs=4 * 1.2 / np.sqrt(30) + 0.05 * expected)
+    assert np.isnan(told[0].score[[0, 2]]).all()  # these columns were not excited
+
+
+def test_a_snapshot_goes_on_bit_for_bit() -> None:
+    random = np.random.default_rng(9)
+    summaries = [Summary.of(building_window(random), k / 24, 1e-4, 20.0 + k) for k in range(8)]
+    summaries += [Summary.of(w, 1.0 + k) for k, w in enumerate(clamp_points(random).windows)]
+    going_on, other = turned(Priors()), turned(Priors())
+    for summary in summaries:
+        fresh = turned(Priors())
+        fresh.load(other.snapshot())
+        other = fresh
+        again = Summary.load(summary.snapshot())
+        assert other.innovation(again).statistic == going_on.innovation(summary).statistic
+        going_on.update(summary)
+        other.update(again)
+    np.testing.assert_array_equal(values(other.result()), values(going_on.result()))
+    np.testing.assert_array_equal(other.result().covariance, going_on.result().covariance)
+
+
+def test_an_operators_calibration_is_where_it_goes_on_from() -> None:
+    random, found = np.random.default_rng(10), mounted()
+    for k in range(5):
+        found.update(Summary.of(building_window(random), k / 24))
+    earlier = found.result()
+    S = S_TRUE * 1.02
+    for k in range(5, 10):
+        found.update(Summary.of(building_window(random, S=S), k / 24))
+    found.put(earlier)
+    np.testing.assert_allclose(values(found.result()), values(earlier), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(found.result().covariance, earlier.covariance, rtol=1e-9, atol=1e-15)
+    found.update(Summary.of(building_window(random), 1.0))
+    assert abs(found.result().sensitivity[1, 1] - S_TRUE[1, 1]) < 3e-3
+
+
+def test_a_window_of_another_pose_than_stated_is_far_from_expected() -> None:
+    random, found = np.random.default_rng(11), mounted()
+    for k in range(5):
+        found.update(Summary.of(building_window(random), k / 24))
+    tilted = GRAVITY + np.array([0.5, 0.0, 0.0])
+    calm = found.innovation(Summary.of(building_window(random), 0.3))
+    turned_ = found.innovation(Summary.of(building_window(random, gravity_mps2=tilted), 0.3))
+    assert calm.statistic < 45  # 12 degrees of freedom: one in 10^5
+    assert turned_.statistic > 1000
+
+
+def test_truth_is_what_the_tests_take_it_for() -> None:
+    assert np.array_equal(TRUTH, np.append(S_TRUE.ravel(), Q_TRUE))
+    assert BESIDE.direction.shape == (3, 3)
+    assert sums_of(np.zeros((4, 3)), np.zeros((4, 3)), np.ones((4, 3)), 2).count.tolist() == [2.0, 2.0]
