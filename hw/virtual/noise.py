@@ -23,6 +23,8 @@ class Stream(IntEnum):
     KNOCK = 7
     WINDOW_OFFSET = 8
     PRESET = 9
+    BUILDING_MOTION = 10
+    BUILDING_HARM = 11
 
 
 def generator(seed: int, stream: Stream, block: int = 0) -> np.random.Generator:

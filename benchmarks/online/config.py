@@ -1,0 +1,31 @@
+"""Configurations of the scenarios: what an operator would have written down, with what he knows and does not know."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from agent.config import Config, parse_config
+from hw.virtual.building import Building
+
+LONGEST_SILENCE_S = 3600.0
+
+
+def building_config(building: Building, **keys: Any) -> Config:
+    """Sensor and reference of a building, the mount's rotation and gravity as nominal (identity, z up).
+
+    `keys` are further ones of the channel.
+    """
+    devices = [
+        {"name": name, "driver": "serial-csv", "options": {"port": name, "rate_hz": info.nominal_rate_hz, "axes": 3}}
+        for name, info in building.infos().items()
+    ]
+    channel: dict[str, Any] = {
+        "sensor": "sensor",
+        "reference": "reference",
+        "rotation": np.eye(3).ravel().tolist(),
+        "rotation_gravity_mps2": [0.0, 0.0, 9.80665],
+        "silence_s": LONGEST_SILENCE_S,
+    }
+    return parse_config({"devices": devices, "channels": [channel | keys], "zenoh": {"enabled": False}}, "building")

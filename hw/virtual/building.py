@@ -1,0 +1,232 @@
+"""A sensor fixed in a building beside a tri-axial reference: blocks as a gateway gets them, for years, with the truth.
+
+Time goes by visits: in each the building moves for one window, at a level and in a direction drawn for it. Between two
+visits nothing is generated, while the devices' clocks, their sample numbers, temperature, tilt and drift go on.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hw.block import BlockFlags, DeviceInfo, SampleBlock
+from hw.virtual.building_motion import Band, BuildingMotion
+from hw.virtual.harm import HARMLESS, Harm, Role, Visit
+from hw.virtual.noise import Stream, generator
+from hw.virtual.schedule import STANDARD_GRAVITY_MPS2, rotation
+from hw.virtual.timebase import Bursts, Clock
+
+Array = NDArray[np.float64]
+DAY_S = 86_400.0
+YEAR_S = 365.0 * DAY_S
+EPOCH_NS = 1_790_000_000_000_000_000  # UTC at the building's zero
+TEMPERATURE_STEP_K = 1 / 16  # resolution of a usual chip's thermometer
+STREAMS: dict[Role, tuple[Stream, Stream]] = {
+    "sensor": (Stream.SENSOR, Stream.SENSOR_ARRIVAL),
+    "reference": (Stream.REFERENCE, Stream.REFERENCE_ARRIVAL),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Instrument:
+    """One of the two devices: when it samples, when it is read, and its white noise."""
+
+    noise_mps2: float
+    clock: Clock
+    bursts: Bursts = field(default_factory=lambda: Bursts(poll_s=0.16))
+
+
+@dataclass(frozen=True, slots=True)
+class Weather:
+    """Temperature of the sensor, degC: mean + season + day."""
+
+    mean_degc: float = 15.0
+    season_k: float = 10.0
+    day_k: float = 4.0
+
+    def at(self, time_s: float) -> float:
+        """Temperature at a time."""
+        turn = 2 * np.pi * time_s
+        return float(self.mean_degc + self.season_k * np.sin(turn / YEAR_S) + self.day_k * np.sin(turn / DAY_S))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BuildingParameters:
+    """What is true in the building. Faults are off by default; the output is in m/s2, so S is near 1.
+
+    `rotation` is R in a = R a_ref, `gravity_mps2` (3,) what an ideal sensor reads at rest at the beginning;
+    `tilt_rad_a_day` (3,) turns it. `steps`: (time in s, (3, 3) added to S from then on). The building moves along the
+    reference's y; in a part `elsewhere` of the visits along a direction drawn at random; with `all_axes` in all three.
+    """
+
+    window_s: float = 120.0
+    every_s: float = 3600.0  # from the beginning of one visit to the next; 0: one after the other
+    level_mps2: tuple[float, float] = (0.02, 0.3)  # rms, drawn log-uniformly for each visit
+    band: Band = field(default_factory=Band)
+    elsewhere: float = 0.0
+    all_axes: bool = False
+    sensitivity: Array = field(default_factory=lambda: np.eye(3))
+    steps: tuple[tuple[float, Array], ...] = ()
+    offset: Array = field(default_factory=lambda: np.zeros(3))  # at `weather.mean_degc`
+    offset_a_day: Array = field(default_factory=lambda: np.zeros(3))
+    offset_per_k: Array = field(default_factory=lambda: np.zeros(3))
+    lag_s: float = 0.0
+    rotation: Array = field(default_factory=lambda: np.eye(3))
+    gravity_mps2: Array = field(default_factory=lambda: np.array([0.0, 0.0, STANDARD_GRAVITY_MPS2]))
+    tilt_rad_a_day: Array = field(default_factory=lambda: np.zeros(3))
+    weather: Weather = field(default_factory=Weather)
+    reference_sensitivity: Array = field(default_factory=lambda: np.eye(3))  # (3, 3) what it shows of a_ref
+    sensor: Instrument = field(
+        default_factory=lambda: Instrument(0.005, Clock(200.0, rate_error=1e-4, offset_s=0.0013, wander=20e-6))
+    )
+    reference: Instrument = field(
+        default_factory=lambda: Instrument(
+            0.001, Clock(200.0, rate_error=-0.6e-4, offset_s=0.0004, wander=10e-6, wander_period_s=2700.0)
+        )
+    )
+    lead_s: float = 3.0  # data before and after each window, for guards and filters
+    block_s: float = 10.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BuildingTruth:
+    """What is true at one time. `offset` (3,) is Q at the present temperature, `offset_at_mean` at the mean one.
+
+    `mean_output` (3,) = S g + Q: what the sensor shows, on average.
+    """
+
+    sensitivity: Array
+    offset: Array
+    offset_at_mean: Array
+    gravity_mps2: Array
+    temperature_degc: float
+    mean_output: Array
+
+
+class Building:
+    """Deterministic by `parameters` and `seed`: any visit gives the same bits in whatever order they are asked for.
+
+    `harm` befalls the devices from visit `harmed_from` on.
+    """
+
+    def __init__(self, parameters: BuildingParameters, seed: int, harm: Harm = HARMLESS, harmed_from: int = 0) -> None:
+        self.parameters = parameters
+        self.seed = seed
+        self._harm = harm
+        self._harmed_from = harmed_from
+
+    def infos(self) -> dict[str, DeviceInfo]:
+        """The two devices by name, in the order in which they are opened."""
+        p = self.parameters
+        return {
+            role: DeviceInfo("serial-csv", "virtual", f"building-{role}", "m/s2", 3, instrument.clock.nominal_rate_hz)
+            for role, instrument in (("sensor", p.sensor), ("reference", p.reference))
+        }
+
+    def span(self, visit: int) -> tuple[float, float]:
+        """First and last moment, in s, of which there are data in a visit."""
+        p = self.parameters
+        if not p.every_s:
+            return visit * p.window_s, (visit + 1) * p.window_s
+        start_s = visit * p.every_s
+        return start_s, start_s + p.lead_s + p.window_s + p.lead_s
+
+    def truth(self, time_s: float) -> BuildingTruth:
+        """What is true at a time."""
+        p = self.parameters
+        days = time_s / DAY_S
+        sensitivity = p.sensitivity + sum(
+            (change for since_s, change in p.steps if time_s >= since_s), np.zeros((3, 3))
+        )
+        at_mean = p.offset + days * p.offset_a_day
+        degc = p.weather.at(time_s)
+        offset = at_mean + (degc - p.weather.mean_degc) * p.offset_per_k
+        gravity = _turned(p.tilt_rad_a_day * days) @ p.gravity_mps2
+        return BuildingTruth(sensitivity, offset, at_mean, gravity, degc, sensitivity @ gravity + offset)
+
+    def level_mps2(self, visit: int) -> float:
+        """Rms of the motion in a visit."""
+        low, high = np.log(self.parameters.level_mps2)
+        return float(np.exp(generator(self.seed, Stream.BUILDING_MOTION, visit).uniform(low, high)))
+
+    def visit(self, visit: int) -> list[SampleBlock]:
+        """All blocks of a visit, both devices, in order of their arrival."""
+        harm = self._harm if visit >= self._harmed_from else HARMLESS
+        motion = self._motion(visit, Stream.BUILDING_MOTION)
+        elsewhere = self._motion(visit, Stream.BUILDING_HARM)
+        blocks = [block for role in STREAMS for block in self._device(role, visit, harm, motion, elsewhere)]
+        return sorted(blocks, key=lambda block: block.t_monotonic_ns)
+
+    def _motion(self, visit: int, stream: Stream) -> BuildingMotion:
+        p = self.parameters
+        random = generator(self.seed, stream, visit)
+        level = float(np.exp(random.uniform(*np.log(p.level_mps2))))
+        shape = np.eye(3) if p.all_axes else np.array([[0.0, 1.0, 0.0]])
+        if random.random() < p.elsewhere:
+            direction = random.standard_normal(3)
+            shape = direction[None] / np.linalg.norm(direction)
+        return BuildingMotion(random, p.band, *self.span(visit), level, shape)
+
+    def _device(
+        self, role: Role, visit: int, harm: Harm, motion: BuildingMotion, elsewhere: BuildingMotion
+    ) -> list[SampleBlock]:
+        p = self.parameters
+        instrument = p.sensor if role == "sensor" else p.reference
+        start_s, stop_s = self.span(visit)
+        first = int(instrument.clock.due(start_s))
+        reads_s, due = self._reads(role, visit, instrument)
+        time_s = instrument.clock.times(first, int(due[-1]) - first) - (p.lag_s if role == "sensor" else 0.0)
+        random = generator(self.seed, STREAMS[role][0], visit)
+        noise = instrument.noise_mps2 * random.standard_normal((len(time_s), 3))
+        seen = Visit(role, time_s, self.level_mps2(visit), elsewhere, random, first=visit == self._harmed_from)
+        moved = harm.moved(seen, motion.at(time_s))
+        values = harm.shown(seen, self._shown(role, (start_s + stop_s) / 2, moved) + noise)
+        blocks, begin, oldest = [], 0, first
+        for end in (np.flatnonzero(np.diff(reads_s // p.block_s, append=np.inf)) + 1).tolist():
+            newest = int(due[end - 1])
+            part = values[oldest - first : newest - first]
+            blocks.append(self._block(role, oldest, part, reads_s[begin:end], due[begin:end]))
+            begin, oldest = end, newest
+        if visit and p.every_s:
+            blocks[0] = replace(blocks[0], flags=BlockFlags.GAP)
+        return harm.arrived(seen, blocks)
+
+    def _reads(self, role: Role, visit: int, instrument: Instrument) -> tuple[Array, NDArray[np.int64]]:
+        """When the device is read in a visit (B,), and how many samples it has taken by then; the last read is late."""
+        start_s, stop_s = self.span(visit)
+        bursts = instrument.bursts
+        random = generator(self.seed, STREAMS[role][1], visit)
+        n = round((stop_s - start_s) / bursts.poll_s)
+        late = bursts.least_late_s + random.exponential(bursts.mean_late_s, n)
+        late += (random.random(n) < bursts.stall_probability) * random.uniform(0.3, 1.0, n) * bursts.longest_stall_s
+        reads_s = np.maximum.accumulate(np.linspace(start_s, stop_s, n + 1)[1:] + late)
+        due = instrument.clock.due(np.minimum(reads_s, stop_s))
+        some = np.diff(due, prepend=int(instrument.clock.due(start_s))) > 0
+        return reads_s[some], due[some]
+
+    def _shown(self, role: Role, time_s: float, moved: Array) -> Array:
+        """Indications (n, 3) without noise: V = S (R a_ref + g) + Q, or what the reference makes of a_ref."""
+        p = self.parameters
+        if role == "reference":
+            return moved @ p.reference_sensitivity.T
+        truth = self.truth(time_s)
+        return moved @ (truth.sensitivity @ p.rotation).T + truth.mean_output
+
+    def _block(self, role: Role, first: int, values: Array, reads_s: Array, due: NDArray[np.int64]) -> SampleBlock:
+        p = self.parameters
+        arrivals_ns = np.round(reads_s * 1e9).astype(np.int64)
+        degc = round(p.weather.at(float(reads_s[-1])) / TEMPERATURE_STEP_K) * TEMPERATURE_STEP_K
+        clock = p.sensor.clock if role == "sensor" else p.reference.clock
+        return SampleBlock(
+            role, "boot", EPOCH_NS + int(arrivals_ns[-1]), first, clock.nominal_rate_hz, arrivals_ns,
+            (due - first).astype(np.int32), np.ascontiguousarray(values),
+            temperature_degc=degc if role == "sensor" else None,
+        )  # fmt: skip
+
+
+def _turned(vector_rad: Array) -> Array:
+    """Rotation matrix (3, 3) of a rotation vector."""
+    angle = float(np.linalg.norm(vector_rad))
+    return rotation(vector_rad / angle, angle) if angle else np.eye(3)

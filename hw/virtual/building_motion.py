@@ -1,0 +1,91 @@
+"""Random motion of a building for some minutes: modes over a broad band, at one level, in one direction or in all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+# Points of the grid a period of the band's upper end: cubic pieces between them are right to 3e-6 of the motion there.
+POINTS_A_PERIOD = 32
+
+
+@dataclass(frozen=True, slots=True)
+class Band:
+    """Where a building moves: modes (natural frequency and damping ratio) above a flat part of the spectrum."""
+
+    low_hz: float = 0.5
+    high_hz: float = 15.0
+    modes: tuple[tuple[float, float], ...] = ((1.3, 0.02), (3.9, 0.02), (8.4, 0.03))
+    flat: float = 0.3  # part of the power that is spread over the band
+
+    def density(self, frequency_hz: Array) -> Array:
+        """Power of the acceleration over frequency, up to a factor; the modes have equal power."""
+        inside = (frequency_hz >= self.low_hz) & (frequency_hz <= self.high_hz)
+        width = self.high_hz - self.low_hz
+        density = np.full_like(frequency_hz, self.flat / width)
+        for natural_hz, damping in self.modes:
+            half = damping * natural_hz
+            line = half / np.pi / ((frequency_hz - natural_hz) ** 2 + half**2)
+            density += (1 - self.flat) / len(self.modes) * line
+        return np.asarray(density * inside)
+
+
+class BuildingMotion:
+    """Acceleration (m/s2) from `start_s` to `stop_s`, fading in and out within `ramp_s`, zero beyond.
+
+    `shape` (C, 3): each of the C rows is a direction with its own random motion of `level_mps2` rms.
+    """
+
+    def __init__(
+        self,
+        random: np.random.Generator,
+        band: Band,
+        start_s: float,
+        stop_s: float,
+        level_mps2: float,
+        shape: Array,
+        ramp_s: float = 0.4,
+    ) -> None:
+        self._start_s, self._stop_s, self._ramp_s = start_s, stop_s, ramp_s
+        self._shape = shape
+        self._rate_hz = POINTS_A_PERIOD * band.high_hz
+        points = _fast_length(int(np.ceil((stop_s - start_s) * self._rate_hz)) + 2)
+        frequency_hz: Array = np.arange(points // 2 + 1) * np.float64(self._rate_hz / points)
+        lines = np.sqrt(band.density(frequency_hz))[:, None] * (
+            random.standard_normal((len(frequency_hz), len(shape)))
+            + 1j * random.standard_normal((len(frequency_hz), len(shape)))
+        )
+        lines *= level_mps2 * points / np.sqrt(2 * np.sum(np.abs(lines) ** 2, axis=0))
+        self._value = np.fft.irfft(lines, points, axis=0)
+        self._slope = np.fft.irfft(lines * (2j * np.pi * frequency_hz[:, None] / self._rate_hz), points, axis=0)
+
+    def at(self, time_s: Array) -> Array:
+        """(n, 3) at times (n,)."""
+        place = np.clip((time_s - self._start_s) * self._rate_hz, 0.0, len(self._value) - 2.0)
+        cell = place.astype(np.int64)
+        x = place - cell
+        # Cubic Hermite pieces: value and slope are exact on the grid.
+        fade = _step((time_s - self._start_s) / self._ramp_s) * _step((self._stop_s - time_s) / self._ramp_s)
+        a, b = (1 + 2 * x) * (1 - x) ** 2 * fade, x * (1 - x) ** 2 * fade
+        c, d = x**2 * (3 - 2 * x) * fade, x**2 * (x - 1) * fade
+        moved = np.zeros((len(time_s), 3))
+        for k, direction in enumerate(self._shape):
+            value, slope = self._value[:, k], self._slope[:, k]
+            one = a * value[cell] + b * slope[cell] + c * value[cell + 1] + d * slope[cell + 1]
+            for axis in np.flatnonzero(direction):
+                moved[:, axis] += direction[axis] * one
+        return moved
+
+
+def _step(progress: Array) -> Array:
+    p = np.clip(progress, 0.0, 1.0)
+    return np.asarray(p * p * (3 - 2 * p))
+
+
+def _fast_length(least: int) -> int:
+    """The smallest 2^a 3^b 5^c that is not below `least`."""
+    candidates = ((1 << a) * (1, 3, 9)[b] * (1, 5, 25)[c] for a in range(1, 30) for b in range(3) for c in range(3))
+    return min(n for n in candidates if n >= least)

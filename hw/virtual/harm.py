@@ -1,0 +1,313 @@
+"""What can befall the two devices in a building so that what they show says nothing, or something wrong, of S and Q."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hw.block import BlockFlags, SampleBlock
+from hw.virtual.schedule import rotation
+
+Array = NDArray[np.float64]
+Role = Literal["sensor", "reference"]
+
+
+class Motion(Protocol):
+    """Acceleration over time."""
+
+    def at(self, time_s: Array) -> Array: ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Visit:
+    """One device in one visit: when it samples (n,), how the building moves (rms), and the `first` since the harm.
+
+    `elsewhere` is motion that has nothing to do with the device.
+    """
+
+    role: Role
+    time_s: Array
+    level_mps2: float
+    elsewhere: Motion
+    random: np.random.Generator
+    first: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Harm:
+    """Nothing wrong; each kind overrides what it changes. `name` is for tables."""
+
+    name: str = "none"
+
+    @property
+    def output(self) -> Array:
+        """(3, 3) M: the sensor's S is M S and its Q is M Q as long as this lasts."""
+        return np.eye(3)
+
+    def moved(self, visit: Visit, felt: Array) -> Array:
+        """Acceleration (n, 3) that a device feels."""
+        del visit
+        return felt
+
+    def shown(self, visit: Visit, values: Array) -> Array:
+        """Indications (n, 3)."""
+        del visit
+        return values
+
+    def arrived(self, visit: Visit, blocks: list[SampleBlock]) -> list[SampleBlock]:
+        """Blocks, as the gateway gets them."""
+        del visit
+        return blocks
+
+
+HARMLESS = Harm()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Unplugged(Harm):
+    """The reference's cable is off: no blocks, a constant, or noise and hum at 50 Hz."""
+
+    how: Literal["lost", "constant", "hum"] = "lost"
+
+    def shown(self, visit: Visit, values: Array) -> Array:
+        if visit.role != "reference":
+            return values
+        still = np.full_like(values, 0.0123)
+        if self.how == "hum":
+            n = len(values)
+            still += 0.02 * np.sin(2 * np.pi * 0.2503 * np.arange(n))[:, None]
+            still += 0.01 * visit.random.standard_normal((n, 3))
+        return still
+
+    def arrived(self, visit: Visit, blocks: list[SampleBlock]) -> list[SampleBlock]:
+        return [] if visit.role == "reference" and self.how == "lost" else blocks
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DeadChannel(Harm):
+    """One channel of a device holds one value, or shows noise alone."""
+
+    role: Role = "sensor"
+    axis: int = 1
+    noise_mps2: float = 0.0
+
+    @property
+    def output(self) -> Array:
+        alive = np.eye(3)
+        if self.role == "sensor":
+            alive[self.axis, self.axis] = 0.0
+        return alive
+
+    def shown(self, visit: Visit, values: Array) -> Array:
+        if visit.role == self.role:
+            values[:, self.axis] = 0.01 + self.noise_mps2 * visit.random.standard_normal(len(values))
+        return values
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Transformed(Harm):
+    """All that a device shows is multiplied by a matrix (3, 3): wrong sensitivity, sign, or axes."""
+
+    role: Role = "reference"
+    matrix: Array = field(default_factory=lambda: np.eye(3))
+
+    @property
+    def output(self) -> Array:
+        return self.matrix if self.role == "sensor" else np.eye(3)
+
+    def shown(self, visit: Visit, values: Array) -> Array:
+        return values @ self.matrix.T if visit.role == self.role else values
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KnockedOff(Harm):
+    """The sensor fell off its mount and lies there turned; it still moves with the building, or hangs by its cable."""
+
+    turn: Array = field(default_factory=lambda: np.eye(3))
+    follows: bool = True
+
+    def moved(self, visit: Visit, felt: Array) -> Array:
+        return felt if visit.role == "reference" or self.follows else visit.elsewhere.at(visit.time_s)
+
+    def shown(self, visit: Visit, values: Array) -> Array:
+        # S is near 1: turning what it shows is turning it, gravity and all.
+        return values @ self.turn.T if visit.role == "sensor" else values
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FarAway(Harm):
+    """The reference stands 100 m away: `common` of the amplitude there is the sensor's motion, the rest is not."""
+
+    common: float = 0.3
+
+    def moved(self, visit: Visit, felt: Array) -> Array:
+        if visit.role == "sensor":
+            return felt
+        return np.asarray(self.common * felt + np.sqrt(1 - self.common**2) * visit.elsewhere.at(visit.time_s))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Clipped(Harm):
+    """The sensor holds its indications within `peak` times the rms of the motion, about their mean."""
+
+    peak: float = 1.0
+
+    def shown(self, visit: Visit, values: Array) -> Array:
+        if visit.role == "reference":
+            return values
+        mean = values.mean(axis=0)
+        return np.asarray(np.clip(values, mean - self.peak * visit.level_mps2, mean + self.peak * visit.level_mps2))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lossy(Harm):
+    """A part of the samples is lost, `run` in a row; the sample numbers say so (`told`), or count what came."""
+
+    role: Role = "sensor"
+    share: float = 0.1
+    run: int = 16
+    told: bool = True
+
+    def arrived(self, visit: Visit, blocks: list[SampleBlock]) -> list[SampleBlock]:
+        if visit.role != self.role:
+            return blocks
+        left: list[SampleBlock] = []
+        number = round(blocks[0].first_index * (1 - self.share))
+        for block in blocks:
+            kept = np.repeat(visit.random.random(-(-block.n // self.run)) >= self.share, self.run)[: block.n]
+            if self.told:
+                left += _pieces(block, kept)
+            elif kept.any():
+                left.append(_shortened(block, kept, number))
+                number += int(kept.sum())
+        return left
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ClockStep(Harm):
+    """All of a device comes later from one moment on, or its sample numbers jump, or the gateway's UTC does."""
+
+    role: Role = "sensor"
+    what: Literal["arrival", "number", "utc"] = "arrival"
+    step: float = 0.1  # s, of whichever clock
+
+    def arrived(self, visit: Visit, blocks: list[SampleBlock]) -> list[SampleBlock]:
+        since = len(blocks) // 2 if visit.first else 0
+        if self.what != "utc" and visit.role != self.role:
+            return blocks
+        return blocks[:since] + [self._stepped(block) for block in blocks[since:]]
+
+    def _stepped(self, block: SampleBlock) -> SampleBlock:
+        step_ns = round(self.step * 1e9)
+        if self.what == "number":
+            return replace(block, first_index=block.first_index + round(self.step * block.nominal_rate_hz))
+        if self.what == "utc":
+            return replace(block, t_utc_ns=block.t_utc_ns + step_ns)
+        late = block.burst_t_monotonic_ns + step_ns
+        return replace(block, burst_t_monotonic_ns=late, t_utc_ns=block.t_utc_ns + step_ns)
+
+
+def _pieces(block: SampleBlock, kept: NDArray[np.bool_]) -> list[SampleBlock]:
+    """What is left of a block, cut where samples are missing; each piece arrives with the burst that brought it."""
+    edges = np.flatnonzero(np.diff(kept.astype(np.int8), prepend=0, append=0)).tolist()
+    pieces = []
+    for first, stop in zip(edges[::2], edges[1::2], strict=True):
+        begun, done = np.searchsorted(block.burst_count, [first + 1, stop])
+        burst = np.arange(begun, done + 1)
+        piece = replace(
+            block,
+            first_index=block.first_index + first,
+            burst_t_monotonic_ns=block.burst_t_monotonic_ns[burst],
+            burst_count=(np.minimum(block.burst_count[burst], stop) - first).astype(np.int32),
+            indications=np.ascontiguousarray(block.indications[first:stop]),
+            flags=block.flags | BlockFlags.GAP,
+            t_utc_ns=block.t_utc_ns - block.t_monotonic_ns + int(block.burst_t_monotonic_ns[burst[-1]]),
+        )
+        pieces.append(piece)
+    return pieces
+
+
+def _shortened(block: SampleBlock, kept: NDArray[np.bool_], number: int) -> SampleBlock:
+    """A block with the samples `kept` alone, the first of them `number`; bursts that brought none are left out."""
+    count = np.cumsum(kept)[block.burst_count - 1]
+    some = np.diff(count, prepend=0) > 0
+    return replace(
+        block,
+        first_index=number,
+        burst_t_monotonic_ns=block.burst_t_monotonic_ns[some],
+        burst_count=count[some].astype(np.int32),
+        indications=np.asarray(block.indications[kept], dtype=np.float64),
+        t_utc_ns=block.t_utc_ns - block.t_monotonic_ns + int(block.burst_t_monotonic_ns[some][-1]),
+    )
+
+
+Drawing = Callable[[np.random.Generator], Harm]
+
+
+def _role(random: np.random.Generator) -> Role:
+    return "sensor" if random.random() < 0.5 else "reference"
+
+
+def _wrong_sensitivity(random: np.random.Generator) -> Harm:
+    role: Role = _role(random)
+    factor = (1.6, 1 / 1.6, -1.0)[int(random.integers(3))]
+    axes = np.eye(3)
+    if random.random() < 0.5:
+        return Transformed(f"wrong sensitivity, {role}", role, factor * axes)
+    axis = int(random.integers(3))
+    axes[axis, axis] = factor
+    return Transformed(f"wrong sensitivity, one axis, {role}", role, axes)
+
+
+def _swapped(random: np.random.Generator) -> Harm:
+    role: Role = _role(random)
+    order: Sequence[int] = ((1, 0, 2), (0, 2, 1), (2, 1, 0), (1, 2, 0), (2, 0, 1))[int(random.integers(5))]
+    return Transformed(f"swapped axes, {role}", role, np.eye(3)[list(order)])
+
+
+def _knocked_off(random: np.random.Generator) -> Harm:
+    axis = random.standard_normal(3)
+    turn = rotation(axis / np.linalg.norm(axis), np.deg2rad(random.uniform(8.0, 180.0)))
+    follows = bool(random.random() < 0.7)
+    return KnockedOff(f"knocked off, {'follows' if follows else 'hangs'}", turn, follows)
+
+
+def _lossy(random: np.random.Generator) -> Harm:
+    role, told = _role(random), bool(random.random() < 0.5)
+    return Lossy(f"10 % lost, {'told' if told else 'untold'}", role, 0.1, (1, 16)[int(random.integers(2))], told)
+
+
+def _clock_step(random: np.random.Generator) -> Harm:
+    what: Literal["arrival", "number", "utc"] = ("arrival", "number", "utc")[int(random.integers(3))]
+    step = float(np.exp(random.uniform(np.log(0.03), np.log(3.0))))
+    if what == "utc":
+        step *= 3600.0 * random.choice([-1.0, 1.0])
+    return ClockStep(f"clock step, {what}", _role(random), what, step)
+
+
+def _dead(random: np.random.Generator, role: Role) -> Harm:
+    noise = 0.005 * float(random.integers(2))
+    return DeadChannel(f"dead channel, {role}", role, int(random.integers(3)), noise)
+
+
+def _unplugged(random: np.random.Generator) -> Harm:
+    how: Literal["lost", "constant", "hum"] = ("lost", "constant", "hum")[int(random.integers(3))]
+    return Unplugged(f"unplugged, {how}", how)
+
+
+KINDS: dict[str, Drawing] = {
+    "reference unplugged": _unplugged,
+    "dead channel of the sensor": lambda random: _dead(random, "sensor"),
+    "dead channel of the reference": lambda random: _dead(random, "reference"),
+    "wrong sensitivity": _wrong_sensitivity,
+    "swapped axes": _swapped,
+    "knocked off its mount": _knocked_off,
+    "100 m away": lambda random: FarAway("100 m away", float(random.uniform(0.0, 0.65))),
+    "clipping": lambda random: Clipped("clipping", float(random.uniform(0.4, 1.6))),
+    "10 % lost": _lossy,
+    "clock step": _clock_step,
+}
