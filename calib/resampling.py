@@ -55,16 +55,17 @@ def resample(x: Array, clock: ClockFit, time_s: Array, first_index: int = 0, mar
         usable &= np.abs(base - gap) > HALF + margin + NODES
     middle = clock.index_of(np.median(time_s))
     rate = 1.0 / float(clock.time_of(middle + 0.5) - clock.time_of(middle - 0.5))
-    u, du = np.zeros((len(position), x.shape[1])), np.zeros((len(position), x.shape[1]))
+    # A channel a row: what is done to a channel afterwards finds its samples side by side.
+    u, du = np.zeros((x.shape[1], len(position))), np.zeros((x.shape[1], len(position)))
     inside = np.nonzero(usable)[0]
     for k in range(0, len(inside), CHUNK):
         part = inside[k : k + CHUNK]
         low, high = int(start[part].min()), int(start[part].max()) + TAPS
         for channel in range(x.shape[1]):
-            sums = sliding_window_view(x[low:high, channel], TAPS) @ _weights().T
-            value, slope = _horner(sums[start[part] - low], fraction[part])
-            u[part, channel], du[part, channel] = value, slope * rate
-    return Resampled(u, du, usable)
+            taps = np.ascontiguousarray(sliding_window_view(x[low:high, channel], TAPS).T)
+            value, slope = _horner((_weights() @ taps).take(start[part] - low, axis=1), fraction[part])
+            u[channel, part], du[channel, part] = value, slope * rate
+    return Resampled(u.T, du.T, usable)
 
 
 def differentiate(velocity: Array, rate_hz: float, band_hz: float = VELOCITY_BAND_HZ) -> tuple[Array, int]:
@@ -89,13 +90,13 @@ def differentiate(velocity: Array, rate_hz: float, band_hz: float = VELOCITY_BAN
 
 
 def _horner(sums: Array, fraction: Array) -> tuple[Array, Array]:
-    """Polynomials `sums` (n, DEGREE + 1), rising powers, at `fraction` (n,): values and derivatives."""
-    value, slope = sums[:, DEGREE].copy(), np.zeros(len(fraction))
+    """Polynomials `sums` (DEGREE + 1, n), rising powers, at `fraction` (n,): values and derivatives."""
+    value, slope = sums[DEGREE].copy(), np.zeros(len(fraction))
     for k in range(DEGREE - 1, -1, -1):
         slope *= fraction
         slope += value
         value *= fraction
-        value += sums[:, k]
+        value += sums[k]
     return value, slope
 
 

@@ -223,7 +223,7 @@ def _pieces(block: SampleBlock, kept: NDArray[np.bool_]) -> list[SampleBlock]:
             first_index=block.first_index + first,
             burst_t_monotonic_ns=block.burst_t_monotonic_ns[burst],
             burst_count=(np.minimum(block.burst_count[burst], stop) - first).astype(np.int32),
-            indications=np.ascontiguousarray(block.indications[first:stop]),
+            indications=block.indications[first:stop].copy(),
             flags=block.flags | BlockFlags.GAP,
             t_utc_ns=block.t_utc_ns - block.t_monotonic_ns + int(block.burst_t_monotonic_ns[burst[-1]]),
         )
@@ -240,7 +240,7 @@ def _shortened(block: SampleBlock, kept: NDArray[np.bool_], number: int) -> Samp
         first_index=number,
         burst_t_monotonic_ns=block.burst_t_monotonic_ns[some],
         burst_count=count[some].astype(np.int32),
-        indications=np.asarray(block.indications[kept], dtype=np.float64),
+        indications=np.array(block.indications, dtype=np.float64)[kept],
         t_utc_ns=block.t_utc_ns - block.t_monotonic_ns + int(block.burst_t_monotonic_ns[some][-1]),
     )
 

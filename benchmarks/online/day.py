@@ -1,0 +1,94 @@
+"""A day of 1 kHz from the paper's bench: what of it is the pipeline's own time.
+
+The bench's schedule of four positions is generated once for `GENERATED_S` and then played again and again, sample
+numbers and arrivals going on; the pipeline sees a day of data like any other.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from agent.config import Config, parse_config
+from agent.events import CalibrationUpdate, Event, WindowReport
+from benchmarks.online.runner import Run, opened, tick
+from hw.block import DeviceInfo, SampleBlock
+from hw.virtual.bench import Bench
+from hw.virtual.presets import plain
+from hw.virtual.timebase import Clock
+
+RATE_HZ = 1000.0
+BLOCK_S = 5.2  # ten blocks a cycle of the schedule
+BURST = 25
+CYCLES = 10  # of the schedule of 52 s, generated
+DAY_S = 86_400.0
+
+
+def config(bench: Bench) -> Config:
+    """The bench's four positions, again and again."""
+    poses = [
+        {"start_s": p.start_s, "stop_s": p.stop_s, "theta_deg": p.theta_deg, "alpha_deg": p.alpha_deg}
+        for p in bench.poses
+    ]
+    options = {"port": "p", "rate_hz": RATE_HZ}
+    raw = {
+        "devices": [
+            {"name": name, "driver": "serial-csv", "options": options | {"axes": axes, "unit": unit}}
+            for name, axes, unit in (("sensor", 3, "count"), ("reference", 1, "m/s2"))
+        ],
+        "channels": [
+            {
+                "sensor": "sensor",
+                "reference": "reference",
+                "poses": poses,
+                "poses_repeat_s": bench.parameters.schedule.period_s,
+            }
+        ],
+        "zenoh": {"enabled": False},
+    }
+    return parse_config(raw, "day")
+
+
+def bench() -> Bench:
+    """The plain preset, its clocks exact so that what was generated can be played again."""
+    p = plain(1)
+    exact = Clock(RATE_HZ)
+    return Bench(replace(p, sensor=replace(p.sensor, clock=exact), reference=replace(p.reference, clock=exact)), 1)
+
+
+def events(bench: Bench, duration_s: float) -> Iterator[Event]:
+    """Openings, then blocks and a tick a block for `duration_s`."""
+    yield from opened(
+        {
+            "sensor": DeviceInfo("serial-csv", "virtual", "1", "count", 3, RATE_HZ),
+            "reference": DeviceInfo("serial-csv", "virtual", "2", "m/s2", 1, RATE_HZ),
+        }
+    )
+    n = round(BLOCK_S * RATE_HZ)
+    blocks = round(CYCLES * bench.parameters.schedule.period_s / BLOCK_S)
+    held = [(bench.sensor_counts(k * n, n), bench.reference_values(k * n, n)) for k in range(blocks)]
+    count = np.arange(BURST, n + 1, BURST, dtype=np.int32)
+    late_ns = np.random.default_rng(1).exponential(2e5, len(count)).astype(np.int64)
+    for k in range(int(duration_s / BLOCK_S)):
+        arrivals_ns = ((k * n + count) * (1e9 / RATE_HZ)).astype(np.int64) + late_ns
+        for device, values in zip(("sensor", "reference"), held[k % blocks], strict=True):
+            yield SampleBlock(device, "boot", int(arrivals_ns[-1]), k * n, RATE_HZ, arrivals_ns, count, values)
+        yield tick((k + 1) * BLOCK_S)
+
+
+def measure(duration_s: float) -> tuple[float, int, int]:
+    """CPU seconds, windows used and calibrations of a run."""
+    world = bench()
+    run = Run(config(world))
+    feed = events(world, duration_s)
+    next(feed)  # the generating is done by the first event
+    begin = time.process_time()
+    windows = updates = 0
+    for event in feed:
+        for result in run.feed(event):
+            windows += isinstance(result, WindowReport) and result.used
+            updates += isinstance(result, CalibrationUpdate)
+    return time.process_time() - begin, windows, updates
