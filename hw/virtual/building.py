@@ -114,8 +114,8 @@ class Building:
     def __init__(self, parameters: BuildingParameters, seed: int, harm: Harm = HARMLESS, harmed_from: int = 0) -> None:
         self.parameters = parameters
         self.seed = seed
-        self._harm = harm
-        self._harmed_from = harmed_from
+        self.harm = harm
+        self.harmed_from = harmed_from
 
     def infos(self) -> dict[str, DeviceInfo]:
         """The two devices by name, in the order in which they are opened."""
@@ -153,7 +153,7 @@ class Building:
 
     def visit(self, visit: int) -> list[SampleBlock]:
         """All blocks of a visit, both devices, in order of their arrival."""
-        harm = self._harm if visit >= self._harmed_from else HARMLESS
+        harm = self.harm if visit >= self.harmed_from else HARMLESS
         motion = self._motion(visit, Stream.BUILDING_MOTION)
         elsewhere = self._motion(visit, Stream.BUILDING_HARM)
         blocks = [block for role in STREAMS for block in self._device(role, visit, harm, motion, elsewhere)]
@@ -180,7 +180,7 @@ class Building:
         time_s = instrument.clock.times(first, int(due[-1]) - first) - (p.lag_s if role == "sensor" else 0.0)
         random = generator(self.seed, STREAMS[role][0], visit)
         noise = instrument.noise_mps2 * random.standard_normal((len(time_s), 3))
-        seen = Visit(role, time_s, self.level_mps2(visit), elsewhere, random, first=visit == self._harmed_from)
+        seen = Visit(role, time_s, self.level_mps2(visit), elsewhere, random, first=visit == self.harmed_from)
         moved = harm.moved(seen, motion.at(time_s))
         values = harm.shown(seen, self._shown(role, (start_s + stop_s) / 2, moved) + noise)
         blocks, begin, oldest = [], 0, first

@@ -1,0 +1,114 @@
+"""Harm: what befalls sensor or reference must not get into the calibration in force; harmless windows must."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from agent.events import CalibrationUpdate, DriftReport, Estimate, Result, StatusChange, WindowReport
+from benchmarks.online.node import Node, Timing, node
+from benchmarks.online.runner import EPOCH_NS, Run, visits
+from calib.model import PARAMETERS
+from hw.virtual.harm import HARMLESS, KINDS
+
+SEED = 20_000
+TIMING = Timing(20.0, 60.0, 12)
+KNOWN_WINDOWS = 4  # before the harm, in every other run
+FACTOR_U = 4.0  # off the truth by more standard uncertainties is wrong
+MAIN = np.eye(3, dtype=bool)
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What became of a run. `wrong`: the first wrong acceptance, "" where there was none; counts are since the harm."""
+
+    kind: str
+    name: str
+    seed: int
+    wrong: str
+    status: str
+    windows: int
+    used: int
+    updates: int
+    estimates: int
+    drifts: int
+    reasons: tuple[tuple[str, int], ...]
+
+
+def harmed(kind: str, seed: int) -> Outcome:
+    """One run with a harm of this kind ("" for none), everything drawn by the seed."""
+    random = np.random.default_rng([seed, 7])
+    harm = KINDS[kind](random) if kind else HARMLESS
+    since = KNOWN_WINDOWS * int(random.integers(2)) if kind else 0
+    drawn = node(seed, all_axes=bool(random.integers(2)), harm=harm, harmed_from=since, timing=TIMING)
+    run = Run(drawn.config)
+    results = [r for event in visits(drawn.building, range(TIMING.windows)) for r in run.feed(event)]
+    return _outcome(kind, harm.name, seed, drawn, since, results)
+
+
+def _outcome(kind: str, name: str, seed: int, drawn: Node, since: int, results: list[Result]) -> Outcome:
+    from_s = drawn.building.span(since)[0]
+    later = [r for r in results if (r.t_utc_ns - EPOCH_NS) * 1e-9 >= from_s and not isinstance(r, DriftReport)]
+    windows = [r for r in later if isinstance(r, WindowReport) and r.start_s >= from_s - 1.0]
+    updates = [r for r in later if isinstance(r, CalibrationUpdate)]
+    statuses = [r for r in results if isinstance(r, StatusChange)]
+    reasons = Counter(plain(w.reason) for w in windows)
+    return Outcome(
+        kind or "none", name, seed,
+        wrong=next((why for update in updates if (why := wrong(update, drawn, name != "none"))), ""),
+        status=statuses[-1].status if statuses else "",
+        windows=len(windows), used=sum(w.used for w in windows), updates=len(updates),
+        estimates=sum(isinstance(r, Estimate) for r in later),
+        drifts=sum(isinstance(r, DriftReport) for r in results),
+        reasons=tuple(sorted(reasons.items(), key=lambda item: -item[1])),
+    )  # fmt: skip
+
+
+def wrong(update: CalibrationUpdate, drawn: Node, harmed: bool) -> str:
+    """Why a calibration in force is wrong: a determined parameter off the truth, or further than max_change."""
+    building = drawn.building
+    output = building.harm.output if harmed else np.eye(3)
+    true = building.truth((update.t_utc_ns - EPOCH_NS) * 1e-9)
+    truth = np.concatenate([(output @ true.sensitivity).ravel(), output @ true.offset_at_mean])
+    value = np.concatenate([np.ravel(update.sensitivity), update.offset])
+    determined, u = np.array(update.determined), np.array(update.standard_uncertainty)
+    gate = drawn.config.channels[0].gate
+    limit = np.where(MAIN, gate.max_change_main_pct, gate.max_change_transverse_pct) / 100
+    off = np.where(determined, np.abs(value - truth) / u, 0.0)
+    far = np.where(determined[:9], np.abs(value[:9] - np.eye(3).ravel()) / limit.ravel(), 0.0)
+    if off.max() > FACTOR_U:
+        return f"{PARAMETERS[int(off.argmax())]} is off the truth by {off.max():.1f} u"
+    if far.max() > 1.0:
+        return f"{PARAMETERS[int(far.argmax())]} is further than max_change: {far.max():.2f} of it"
+    return ""
+
+
+def plain(reason: str) -> str:
+    """A reason without its numbers, for counting."""
+    return re.sub(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?", "#", reason)
+
+
+def table(outcomes: Iterable[Outcome]) -> str:
+    """A row a kind: runs, wrong acceptances, statuses at the end, the commonest reasons."""
+    by_kind: dict[str, list[Outcome]] = {}
+    for outcome in outcomes:
+        by_kind.setdefault(outcome.kind, []).append(outcome)
+    lines = [
+        "| harm | runs | wrong acceptances | windows refused or held | status at the end | commonest reasons |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
+    for kind, runs in by_kind.items():
+        windows, used = sum(o.windows for o in runs), sum(o.used for o in runs)
+        statuses = Counter(o.status for o in runs)
+        reasons: Counter[str] = Counter()
+        for outcome in runs:
+            reasons.update(dict(outcome.reasons))
+        said = "; ".join(f"{r or 'taken'} ({100 * n / windows:.0f} %)" for r, n in reasons.most_common(3))
+        states = ", ".join(f"{status} {n}" for status, n in statuses.most_common())
+        refused = f"{100 * (1 - used / windows):.1f} %" if windows else "no window"
+        lines.append(f"| {kind} | {len(runs)} | {sum(bool(o.wrong) for o in runs)} | {refused} | {states} | {said} |")
+    return "\n".join(lines)

@@ -1,0 +1,96 @@
+"""A node with its faults drawn once: what an operator states of it, and a building in which that is just so true."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from agent.config import Config
+from benchmarks.online.config import building_config
+from hw.virtual.building import Building, BuildingParameters, Instrument, Weather
+from hw.virtual.building_motion import Band
+from hw.virtual.harm import HARMLESS, Harm
+from hw.virtual.schedule import STANDARD_GRAVITY_MPS2, rotation
+from hw.virtual.timebase import Clock
+
+RATE_HZ = 100.0
+
+
+@dataclass(frozen=True, slots=True)
+class Stated:
+    """Standard uncertainties that the operator writes down; the faults are drawn from them."""
+
+    main_pct: float = 2.0
+    transverse_pct: float = 1.0
+    offset_mps2: float = 0.2
+    rotation_deg: float = 0.2
+    reference_pct: float = 0.1
+    lag_s: float = 0.002
+    gravity_deg: float = 0.1  # of the mount against plumb
+    gravity_mps2: float = 0.03
+    offset_window_mps2: float = 0.002
+
+    def keys(self) -> dict[str, Any]:
+        """The channel's sections."""
+        del self
+        return {}
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """Windows of a run."""
+
+    window_s: float = 20.0
+    every_s: float = 60.0
+    windows: int = 12
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Node:
+    """A building with the configuration that belongs to it."""
+
+    building: Building
+    config: Config
+    stated: Stated = field(default_factory=Stated)
+
+
+def node(
+    seed: int,
+    *,
+    all_axes: bool,
+    harm: Harm = HARMLESS,
+    harmed_from: int = 0,
+    stated: Stated | None = None,
+    timing: Timing | None = None,
+) -> Node:
+    """One draw of everything, at 100 Hz."""
+    stated, timing = stated or Stated(), timing or Timing()
+    random = np.random.default_rng([seed, 5])
+    main, across = stated.main_pct / 100, stated.transverse_pct / 100
+    gravity = _turned(random, stated.gravity_deg) @ np.array([0.0, 0.0, STANDARD_GRAVITY_MPS2])
+    parameters = BuildingParameters(
+        window_s=timing.window_s,
+        every_s=timing.every_s,
+        band=Band(0.5, 12.0),
+        all_axes=all_axes,
+        sensitivity=np.eye(3) + np.where(np.eye(3), main, across) * random.standard_normal((3, 3)),
+        offset=stated.offset_mps2 * random.standard_normal(3),
+        lag_s=stated.lag_s * float(random.standard_normal()),
+        rotation=_turned(random, stated.rotation_deg),
+        gravity_mps2=gravity * (1 + stated.gravity_mps2 / STANDARD_GRAVITY_MPS2 * random.standard_normal()),
+        reference_sensitivity=np.diag(1 + stated.reference_pct / 100 * random.standard_normal(3)),
+        weather=Weather(15.0, 0.0, 0.0),
+        sensor=Instrument(0.005, Clock(RATE_HZ, 1e-4 * random.standard_normal(), 0.0013, 20e-6)),
+        reference=Instrument(0.001, Clock(RATE_HZ, 1e-4 * random.standard_normal(), 0.0004)),
+    )
+    building = Building(parameters, seed, harm, harmed_from)
+    return Node(building, building_config(building, **stated.keys()), stated)
+
+
+def _turned(random: np.random.Generator, u_deg: float) -> np.ndarray:
+    """A small rotation, `u_deg` about each axis."""
+    vector = np.deg2rad(u_deg) * random.standard_normal(3)
+    angle = float(np.linalg.norm(vector))
+    return rotation(vector / angle, angle) if angle else np.eye(3)

@@ -1,0 +1,138 @@
+"""A year in a building: what is in force is held against the truth at every window."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.config import Config
+from agent.events import CalibrationUpdate, DriftReport, StatusChange, WindowReport
+from benchmarks.online.config import building_config
+from benchmarks.online.runner import EPOCH_NS, Run, visits
+from hw.virtual.building import DAY_S, Building, BuildingParameters
+
+Array = NDArray[np.float64]
+MONTH_DAYS = 30.4
+STEP_DAY = 150.0  # in month 5
+STEP = 0.01  # of S_yy
+LOUD_MPS2 = 0.1
+SYY, QZ = 4, 11
+GRAVITY = np.array([0.0, 0.0, 9.80665])  # as stated
+
+
+def parameters(seed: int, elsewhere: float = 0.0) -> BuildingParameters:
+    """The issue's building; what is not exactly known is drawn."""
+    random = np.random.default_rng([seed, 3])
+    sensitivity = np.eye(3) + np.where(np.eye(3), 0.01, 0.005) * random.standard_normal((3, 3))
+    step = np.zeros((3, 3))
+    step[1, 1] = STEP * sensitivity[1, 1]
+    axis = random.standard_normal(3) * [1.0, 1.0, 0.0]
+    return BuildingParameters(
+        elsewhere=elsewhere,
+        sensitivity=sensitivity,
+        steps=((STEP_DAY * DAY_S, step),),
+        offset=0.1 * random.standard_normal(3),
+        offset_a_day=np.array([0.02, -0.02, 0.02]) / MONTH_DAYS,
+        offset_per_k=np.array([0.0098, -0.0049, 0.0098]),
+        lag_s=0.0015,
+        tilt_rad_a_day=np.deg2rad(0.05) / 365.0 * axis / np.linalg.norm(axis),
+        reference_sensitivity=np.diag(1 + 1e-3 * random.standard_normal(3)),
+    )
+
+
+def config(building: Building, **keys: Any) -> Config:
+    """What an operator states of it."""
+    return building_config(building, **keys)
+
+
+@dataclass(slots=True)
+class Year:
+    """What was seen, window by window. Errors are in force less true; `u` standard uncertainties."""
+
+    time_s: list[float] = field(default_factory=list)
+    syy_error: list[float] = field(default_factory=list)
+    u_syy: list[float] = field(default_factory=list)
+    mean_error_mps2: list[Array] = field(default_factory=list)
+    offset_error: list[Array] = field(default_factory=list)
+    u_offset: list[Array] = field(default_factory=list)
+    columns: list[Array] = field(default_factory=list)
+    drifts: list[DriftReport] = field(default_factory=list)
+    statuses: list[StatusChange] = field(default_factory=list)
+    windows: int = 0
+    used: int = 0
+
+    def step_found_after(self, building: Building) -> int | None:
+        """Windows of level 0.1 or more from the step of S_yy to its report; None where it was never found."""
+        p = building.parameters
+        at_s = STEP_DAY * DAY_S
+        found = [d for d in self.drifts if d.parameter == "Syy" and d.verdict == "stepped"]
+        found_s = [seconds(d.t_utc_ns) for d in found if seconds(d.t_utc_ns) >= at_s]
+        if not found_s:
+            return None
+        visits_since = range(int(np.ceil(at_s / p.every_s)), int(found_s[0] // p.every_s) + 1)
+        return sum(building.level_mps2(visit) >= LOUD_MPS2 for visit in visits_since)
+
+    def alarms_before(self) -> list[DriftReport]:
+        """Verdicts "stepped", or "drifting" of S, before anything of the kind was true."""
+        return [
+            d
+            for d in self.drifts
+            if d.verdict != "stable"
+            and seconds(d.t_utc_ns) < STEP_DAY * DAY_S
+            and (d.parameter.startswith("S") or d.verdict == "stepped")
+        ]
+
+
+def seconds(t_utc_ns: int) -> float:
+    """Of the building's clock."""
+    return (t_utc_ns - EPOCH_NS) * 1e-9
+
+
+def at_temperature(update: CalibrationUpdate, degc: float) -> Array:
+    """Q (3,) at a temperature."""
+    offset = np.array(update.offset)
+    for power, coefficients in enumerate(update.offset_temperature, start=1):
+        offset = offset + np.array(coefficients) * (degc - update.reference_temperature_degc) ** power
+    return offset
+
+
+def followed(building: Building, run: Run, numbers: range) -> Iterator[Year]:
+    """The year so far, after each visit; the last one is the whole."""
+    year = Year()
+    for event in visits(building, numbers):
+        fresh = False
+        for result in run.feed(event):
+            if isinstance(result, CalibrationUpdate):
+                _note(year, building, result)
+                fresh = True
+            elif isinstance(result, DriftReport):
+                year.drifts.append(result)
+            elif isinstance(result, StatusChange):
+                year.statuses.append(result)
+            elif isinstance(result, WindowReport):
+                year.windows += 1
+                year.used += result.used
+        if fresh:
+            yield year
+
+
+def _note(year: Year, building: Building, update: CalibrationUpdate) -> None:
+    now_s = seconds(update.t_utc_ns)
+    truth = building.truth(now_s)
+    S, u = np.array(update.sensitivity), np.array(update.standard_uncertainty)
+    year.time_s.append(now_s)
+    year.syy_error.append(S[1, 1] / truth.sensitivity[1, 1] - 1)
+    year.u_syy.append(u[SYY])
+    year.mean_error_mps2.append(S @ GRAVITY + at_temperature(update, truth.temperature_degc) - truth.mean_output)
+    year.offset_error.append(np.array(update.offset) - truth.offset_at_mean)
+    year.u_offset.append(u[9:])
+    year.columns.append(S[:, [0, 2]])
+
+
+def quicker(parameters: BuildingParameters, every_s: float, window_s: float) -> BuildingParameters:
+    """The same building with fewer and shorter windows, for tests."""
+    return replace(parameters, every_s=every_s, window_s=window_s)
