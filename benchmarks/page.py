@@ -1,4 +1,4 @@
-"""Keeps docs/performance.md: each benchmark owns the part between its two markers."""
+"""Keeps docs/performance.md and docs/online.md: each benchmark owns the part between its two markers."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ def machine() -> str:
     return f"{model}, {os.cpu_count()} cores, Python {platform.python_version()}"
 
 
-def write_part(name: str, text: str) -> None:
+def write_part(name: str, text: str, at: Path = PAGE) -> None:
     """Put `text` between the markers of `name`, and print it. Raises ValueError where the page has no such markers."""
     begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
-    page = PAGE.read_text()
+    page = at.read_text()
     if begin not in page or end not in page:
-        raise ValueError(f"{PAGE} has no markers for {name}")
+        raise ValueError(f"{at} has no markers for {name}")
     head, rest = page.split(begin, 1)
     tail = rest.split(end, 1)[1]
-    PAGE.write_text(f"{head}{begin}\n{text.strip()}\n{end}{tail}")
+    at.write_text(f"{head}{begin}\n{text.strip()}\n{end}{tail}")
     print(text)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -20,6 +19,7 @@ MONTH_DAYS = 30.4
 STEP_DAY = 150.0  # in month 5
 STEP = 0.01  # of S_yy
 LOUD_MPS2 = 0.1
+SETTLED_DAYS = 2.0  # after the step
 SYY, QZ = 4, 11
 GRAVITY = np.array([0.0, 0.0, 9.80665])  # as stated
 
@@ -100,15 +100,13 @@ def at_temperature(update: CalibrationUpdate, degc: float) -> Array:
     return offset
 
 
-def followed(building: Building, run: Run, numbers: range) -> Iterator[Year]:
-    """The year so far, after each visit; the last one is the whole."""
-    year = Year()
+def whole(building: Building, numbers: range) -> Year:
+    """The agent over these visits."""
+    run, year = Run(config(building)), Year()
     for event in visits(building, numbers):
-        fresh = False
         for result in run.feed(event):
             if isinstance(result, CalibrationUpdate):
                 _note(year, building, result)
-                fresh = True
             elif isinstance(result, DriftReport):
                 year.drifts.append(result)
             elif isinstance(result, StatusChange):
@@ -116,8 +114,43 @@ def followed(building: Building, run: Run, numbers: range) -> Iterator[Year]:
             elif isinstance(result, WindowReport):
                 year.windows += 1
                 year.used += result.used
-        if fresh:
-            yield year
+    return year
+
+
+def facts(building: Building, year: Year) -> dict[str, str]:
+    """What the issue asks, in words and numbers."""
+    time_s = np.array(year.time_s)
+    syy, u_syy = np.abs(year.syy_error), np.array(year.u_syy)
+    mean = np.abs(year.mean_error_mps2).max(axis=1)
+    offset = np.abs(np.array(year.offset_error)) / (2 * np.array(year.u_offset))
+    after = time_s > (STEP_DAY + SETTLED_DAYS) * DAY_S
+    found = year.step_found_after(building)
+    return {
+        "windows, of them used": f"{year.windows}, {year.used}",
+        f"step of {100 * STEP:g} % in S_yy on day {STEP_DAY:g} found after": (
+            "never" if found is None else f"{found} windows of level {LOUD_MPS2:g} or more"
+        ),
+        "verdicts before it": "; ".join(d.reason for d in year.alarms_before()) or "none",
+        f"S_yy off the truth from {SETTLED_DAYS:g} days after it on, at most": (
+            f"{100 * syy[after].max():.3f} %" if after.any() else ""
+        ),
+        "u(S_yy) at the end": f"{100 * u_syy[-1]:.3f} %",
+        "mean output off the truth, at most (99 % of the windows)": (
+            f"{1e3 * mean.max():.2f} ({1e3 * np.quantile(mean, 0.99):.2f}) mm/s2"
+        ),
+        "Q off the truth in parts of its U, at most": f"{offset.max():.2f}",
+        "U(Q) at the end": ", ".join(f"{2e3 * u:.0f}" for u in year.u_offset[-1]) + " mm/s2",
+        "columns x and z of S moved by": f"{np.abs(np.array(year.columns) - year.columns[0]).max():.1e}",
+        "status": ", ".join(f"{s.status} ({seconds(s.t_utc_ns) / DAY_S:.1f} d)" for s in year.statuses[-6:]),
+    }
+
+
+def table(found: dict[str, dict[str, str]]) -> str:
+    """A column a run."""
+    lines = ["| | " + " | ".join(found) + " |", "| --- |" + " --- |" * len(found)]
+    first = next(iter(found.values()))
+    lines += [f"| {name} | " + " | ".join(column[name] for column in found.values()) + " |" for name in first]
+    return "\n".join(lines)
 
 
 def _note(year: Year, building: Building, update: CalibrationUpdate) -> None:

@@ -1,0 +1,13 @@
+"""The scenarios on-line: `python -m benchmarks.online [NAME ...] [--write] [--workers N] [--runs N]`."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+os.environ["OPENBLAS_NUM_THREADS"] = "1"  # as every entry point of the product, before numpy loads
+
+from benchmarks.online.pages import main
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,93 @@
+"""Runs the scenarios and writes what they show into docs/online.md (the cost into docs/performance.md)."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from benchmarks.online import cost, coverage, day, harm, year
+from benchmarks.page import PAGE, machine, write_part
+from hw.virtual.building import Building
+from hw.virtual.harm import KINDS
+
+ONLINE = PAGE.with_name("online.md")
+
+
+def main() -> int:
+    """The command line."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.online", description=__doc__)
+    parser.add_argument("names", nargs="*", choices=[*PARTS, []], help="all without any")
+    parser.add_argument("--write", action="store_true", help="put the tables into the pages")
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--runs", type=int, help="of harm (and as many harmless) or coverage; windows of year or cost")
+    options = parser.parse_args()
+    for name in options.names or PARTS:
+        begin = time.monotonic()
+        page, text = PARTS[name](options.workers, options.runs)
+        text = f"`python -m benchmarks.online {name}`, {machine()}.\n\n{text}"
+        if options.write:
+            write_part(name, text, page)
+        else:
+            print(text)
+        print(f"[{name}: {time.monotonic() - begin:.0f} s]\n", flush=True)
+    return 0
+
+
+def spread(work: Callable[[Any], Any], items: Sequence[Any], workers: int) -> list[Any]:
+    """All results in order, by so many processes."""
+    if workers == 1:
+        return [work(item) for item in items]
+    with ProcessPoolExecutor(workers) as pool:
+        return list(pool.map(work, items, chunksize=8))
+
+
+def _harm(workers: int, runs: int | None) -> tuple[Path, str]:
+    count = runs or 1000
+    kinds = list(KINDS)
+    jobs = [(kinds[k % len(kinds)], harm.SEED + k) for k in range(count)]
+    jobs += [("", harm.SEED + 100_000 + k) for k in range(count)]
+    outcomes = spread(_one_harm, jobs, workers)
+    wrong = [f"- {o.kind} ({o.name}), seed {o.seed}: {o.wrong}" for o in outcomes if o.wrong]
+    return ONLINE, "\n".join([harm.table(outcomes), "", *wrong])
+
+
+def _one_harm(job: tuple[str, int]) -> harm.Outcome:
+    return harm.harmed(*job)
+
+
+def _coverage(workers: int, runs: int | None) -> tuple[Path, str]:
+    seeds = range(coverage.SEED, coverage.SEED + (runs or coverage.RUNS))
+    return ONLINE, coverage.table(spread(coverage.one, seeds, workers))
+
+
+def _year(workers: int, runs: int | None) -> tuple[Path, str]:
+    windows = runs or 8760
+    found = spread(_one_year, [(windows, 0.0), (windows, 0.05)], min(workers, 2))
+    return ONLINE, year.table(dict(zip(["y alone", "5 % in other directions"], found, strict=True)))
+
+
+def _one_year(job: tuple[int, float]) -> dict[str, str]:
+    windows, elsewhere = job
+    building = Building(year.parameters(1, elsewhere), 1)
+    return year.facts(building, year.whole(building, range(windows)))
+
+
+def _day(_workers: int, _runs: int | None) -> tuple[Path, str]:
+    return ONLINE, day.table()
+
+
+def _cost(_workers: int, runs: int | None) -> tuple[Path, str]:
+    return PAGE, cost.table(cost.measure(runs or cost.TIMING.windows))
+
+
+PARTS: dict[str, Callable[[int, int | None], tuple[Path, str]]] = {
+    "year": _year,
+    "harm": _harm,
+    "coverage": _coverage,
+    "day": _day,
+    "cost": _cost,
+}
