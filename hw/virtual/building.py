@@ -31,11 +31,19 @@ STREAMS: dict[Role, tuple[Stream, Stream]] = {
 
 @dataclass(frozen=True, slots=True)
 class Instrument:
-    """One of the two devices: when it samples, when it is read, and its white noise."""
+    """One of the two devices: when it samples, and its white noise.
+
+    It sends `burst` samples each time so many are there; `late` says how much later than the newest of them they come.
+    """
 
     noise_mps2: float
     clock: Clock
-    bursts: Bursts = field(default_factory=lambda: Bursts(poll_s=0.16))
+    burst: int = 32
+    late: Bursts = field(default_factory=Bursts)
+
+    def bursts(self, time_s: float) -> int:
+        """How many bursts are complete at a time."""
+        return int(self.clock.due(time_s)) // self.burst
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,9 +183,12 @@ class Building:
         p = self.parameters
         instrument = p.sensor if role == "sensor" else p.reference
         start_s, stop_s = self.span(visit)
-        first = int(instrument.clock.due(start_s))
-        reads_s, due = self._reads(role, visit, instrument)
-        time_s = instrument.clock.times(first, int(due[-1]) - first) - (p.lag_s if role == "sensor" else 0.0)
+        begun, done = instrument.bursts(start_s), instrument.bursts(stop_s)
+        first = begun * instrument.burst
+        taken_s = instrument.clock.times(first, (done - begun) * instrument.burst)
+        due = first + instrument.burst * np.arange(1, done - begun + 1)
+        reads_s = self._arrivals(role, visit, taken_s[instrument.burst - 1 :: instrument.burst])
+        time_s = taken_s - (p.lag_s if role == "sensor" else 0.0)
         random = generator(self.seed, STREAMS[role][0], visit)
         noise = instrument.noise_mps2 * random.standard_normal((len(time_s), 3))
         seen = Visit(role, time_s, self.level_mps2(visit), elsewhere, random, first=visit == self.harmed_from)
@@ -193,18 +204,13 @@ class Building:
             blocks[0] = replace(blocks[0], flags=BlockFlags.GAP)
         return harm.arrived(seen, blocks)
 
-    def _reads(self, role: Role, visit: int, instrument: Instrument) -> tuple[Array, NDArray[np.int64]]:
-        """When the device is read in a visit (B,), and how many samples it has taken by then; the last read is late."""
-        start_s, stop_s = self.span(visit)
-        bursts = instrument.bursts
-        random = generator(self.seed, STREAMS[role][1], visit)
-        n = round((stop_s - start_s) / bursts.poll_s)
-        late = bursts.least_late_s + random.exponential(bursts.mean_late_s, n)
-        late += (random.random(n) < bursts.stall_probability) * random.uniform(0.3, 1.0, n) * bursts.longest_stall_s
-        reads_s = np.maximum.accumulate(np.linspace(start_s, stop_s, n + 1)[1:] + late)
-        due = instrument.clock.due(np.minimum(reads_s, stop_s))
-        some = np.diff(due, prepend=int(instrument.clock.due(start_s))) > 0
-        return reads_s[some], due[some]
+    def _arrivals(self, role: Role, visit: int, newest_s: Array) -> Array:
+        """When the bursts with these newest samples (B,) arrive, never running backwards."""
+        late = (self.parameters.sensor if role == "sensor" else self.parameters.reference).late
+        random, n = generator(self.seed, STREAMS[role][1], visit), len(newest_s)
+        by = late.least_late_s + random.exponential(late.mean_late_s, n)
+        by += (random.random(n) < late.stall_probability) * random.uniform(0.3, 1.0, n) * late.longest_stall_s
+        return np.maximum.accumulate(newest_s + by)
 
     def _shown(self, role: Role, time_s: float, moved: Array) -> Array:
         """Indications (n, 3) without noise: V = S (R a_ref + g) + Q, or what the reference makes of a_ref."""

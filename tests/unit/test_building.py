@@ -53,19 +53,19 @@ def test_blocks_go_on_in_number_and_time_and_arrive_after_they_were_taken() -> N
     for visit in (0, 3):
         blocks = building.visit(visit)
         assert np.all(np.diff([block.t_monotonic_ns for block in blocks]) >= 0)
-        for device, clock in (("sensor", small().sensor.clock), ("reference", small().reference.clock)):
-            own = of(blocks, device)
+        for device, instrument in (("sensor", small().sensor), ("reference", small().reference)):
+            own, clock = of(blocks, device), instrument.clock
             assert own[0].flags == (BlockFlags.GAP if visit else BlockFlags.NONE)
             start_s, stop_s = building.span(visit)
-            assert own[0].first_index == clock.due(start_s)
-            assert own[-1].first_index + own[-1].n == clock.due(stop_s)
+            assert own[0].first_index == clock.due(start_s) // 32 * 32
+            assert own[-1].first_index + own[-1].n == clock.due(stop_s) // 32 * 32
             for before, block in itertools.pairwise(own):
                 assert block.first_index == before.first_index + before.n
             for block in own:
                 newest_s = clock.times(block.first_index, block.n)[block.burst_count - 1]
                 late_s = block.burst_t_monotonic_ns * 1e-9 - newest_s
-                assert late_s.min() > 0
-                assert np.median(late_s) < 0.012  # a period, and the reads' lateness
+                assert late_s.min() >= 79e-6
+                assert 0.1e-3 < np.median(late_s) < 0.5e-3
 
 
 def test_any_visit_gives_the_same_bits_whatever_was_asked_before() -> None:
