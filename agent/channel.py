@@ -10,8 +10,9 @@ from typing import Any
 import msgspec
 
 from agent.config import Channel
+from agent.corrected import acceleration_block
 from agent.estimation import DAY_S, Estimation, Judged
-from agent.events import CalibrationUpdate, Command, DeviceChange, Estimate, Result, Tick
+from agent.events import Acceleration, CalibrationUpdate, Command, DeviceChange, Estimate, Output, Result, Tick
 from agent.operators import CommandError, answer, commanded_pose
 from agent.outcome import (
     Source,
@@ -73,16 +74,18 @@ class ChannelState:
 
     # --- events
 
-    def on_block(self, block: SampleBlock) -> list[Result]:
+    def on_block(self, block: SampleBlock) -> list[Output]:
         """A block of the sensor or its reference; others are not this channel's."""
         if block.device not in self._streams:
             return []
         self._clock(block.t_monotonic_ns, block.t_utc_ns)
         self._streams[block.device].update(block)
-        results: list[Result] = []
-        if block.device == self.sensor and self._status == "INVALID" and self._estimation is not None:
-            self._estimation.gate.regain("")
-            results += self._say_status(f"{self.sensor} speaks again")
+        results: list[Output] = []
+        if block.device == self.sensor and self._estimation is not None:
+            if self._status == "INVALID":
+                self._estimation.gate.regain("")
+                results += self._say_status(f"{self.sensor} speaks again")
+            results += self._corrected(block, self._estimation)
         return results + list(self._close_windows())
 
     def on_tick(self, tick: Tick) -> list[Result]:
@@ -201,6 +204,16 @@ class ChannelState:
 
     def _told(self, reason: str) -> Result:
         return status_change(self._source(), self._status or "UNCALIBRATED", self._status, reason)
+
+    def _corrected(self, block: SampleBlock, estimation: Estimation) -> list[Acceleration]:
+        if self._channel.acceleration == "off":
+            return []
+        found = acceleration_block(
+            block, self._streams[self.sensor], self._origin_ns + self._utc_minus_monotonic_ns,
+            estimation.law, estimation.residual_sd, self._in_force,
+            dynamic_only=self._channel.coupling == "ac", recorded=self._channel.acceleration == "record",
+        )  # fmt: skip
+        return [] if found is None else [found]
 
     # --- windows
 

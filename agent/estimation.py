@@ -11,6 +11,7 @@ import numpy as np
 from agent.config import Channel
 from agent.config.gate import GateSettings
 from agent.gate import Decision, Evidence, Gate
+from calib.correction import Law, constant
 from calib.distributions import chi2_quantile
 from calib.drift import DriftTest, DriftVerdict
 from calib.innovation import Innovation
@@ -55,7 +56,8 @@ class Estimation:
         self.recursion = Recursion(
             mean, u, channel.priors(fixed_mount=fixed), channel.wander(), channel.temperature_model(), fixed=fixed
         )
-        self.in_force = self.recursion.result()
+        self.in_force, self.law = self.recursion.result(), self.recursion.law()
+        self.residual_sd = self.recursion.residual_sd
         self.gate = Gate(_limits(channel, self.recursion.scale), self.in_force)
         self.drift = DriftTest(channel.drift.settings())
         self._held: list[Summary] = []
@@ -96,13 +98,14 @@ class Estimation:
         if decision.propose:
             proposal = candidate if adopted is None else adopted.result()
         if decision.in_force:
-            self.in_force = self.recursion.result()
+            self.in_force, self.law = self.recursion.result(), self.recursion.law()
+            self.residual_sd = self.recursion.residual_sd
         self._follow(drift)
         return Judged(decision, innovation, drift, proposal)
 
     def put(self, calibration: Calibration) -> None:
         """An operator put this in force: the state goes on from it, unless it is there anyway."""
-        self.in_force = calibration
+        self.in_force, self.law = calibration, constant(calibration)
         now = self.recursion.result()
         if not (
             np.array_equal(now.sensitivity, calibration.sensitivity) and np.array_equal(now.offset, calibration.offset)
@@ -166,6 +169,8 @@ class Estimation:
             "drift": self.drift.snapshot(),
             "held": [summary.snapshot() for summary in self._held],
             "in_force": {name: getattr(self.in_force, name) for name in Calibration.__slots__},
+            "law": {name: getattr(self.law, name) for name in Law.__slots__},
+            "residual_sd": self.residual_sd,
         }
 
     def load(self, state: dict[str, Any]) -> None:
@@ -174,7 +179,8 @@ class Estimation:
         self.gate.load(state["gate"])
         self.drift.load(state["drift"])
         self._held = [Summary.load(summary) for summary in state["held"]]
-        self.in_force = Calibration(**state["in_force"])
+        self.in_force, self.law = Calibration(**state["in_force"]), Law(**state["law"])
+        self.residual_sd = np.array(state["residual_sd"])
 
 
 def _limits(channel: Channel, scale: float) -> GateSettings:

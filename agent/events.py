@@ -5,9 +5,12 @@ All times are the gateway's: `t_monotonic_ns` is CLOCK_MONOTONIC of the boot nam
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from hw.block import SampleBlock
 
@@ -189,4 +192,29 @@ class StatusChange(msgspec.Struct, frozen=True, kw_only=True):
     reason: str
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Acceleration:
+    """A block of the corrected stream, a = S^-1 (V - Q) in m/s2, in the sensor's frame.
+
+    `acceleration` (N, 3); sample i was taken at `t_utc_ns` + i / `rate_hz`. `covariance` (3, 3) in m2/s4 is the
+    calibration's part at the block's mean, `noise` (3,) in m/s2 the residual SD of one sample. `determined` (12,) of
+    the calibration used, which `calibration_run_id` and `calibration_sequence` name (0: the prior). It has no number of
+    its own: `first_index` counts.
+    """
+
+    sensor: str
+    t_utc_ns: int
+    first_index: int
+    rate_hz: float
+    acceleration: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    noise: NDArray[np.float64]
+    determined: NDArray[np.bool_]
+    calibration_run_id: str
+    calibration_sequence: int
+    dynamic_only: bool  # an AC-coupled sensor: its mean means nothing
+    recorded: bool  # whether it goes into the recording as well
+
+
 Result = WindowReport | CalibrationUpdate | Estimate | DriftReport | StatusChange
+Output = Result | Acceleration

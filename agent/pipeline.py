@@ -12,7 +12,18 @@ import msgspec
 from agent.channel import ChannelState
 from agent.config import Config
 from agent.delivery.history import Memory
-from agent.events import CalibrationUpdate, Command, DeviceChange, Event, Result, RunStart, Tick, WindowReport
+from agent.events import (
+    Acceleration,
+    CalibrationUpdate,
+    Command,
+    DeviceChange,
+    Event,
+    Output,
+    Result,
+    RunStart,
+    Tick,
+    WindowReport,
+)
 from agent.snapshot import pack, unpack
 from hw.block import SampleBlock
 
@@ -68,33 +79,35 @@ class Pipeline:
             }
         )
 
-    def step(self, event: Event) -> list[Result]:
-        """Take the next event; what follows from it, in order."""
-        results: list[Result] = []
+    def step(self, event: Event) -> list[Output]:
+        """Take the next event; what follows from it, in order. Results are numbered, blocks of acceleration are not."""
         if isinstance(event, RunStart):
-            return results
+            return []
+        found: list[Output] = []
         for channel in self._channels:
-            results += self._dispatch(channel, event)
-        numbered = [
-            msgspec.structs.replace(result, run_id=self._run_id, sequence=self._next_sequence + i)
-            for i, result in enumerate(results)
-        ]
-        self._next_sequence += len(numbered)
+            found += self._dispatch(channel, event)
+        outputs = [self._numbered(item) for item in found]
         for channel in self._channels:
-            channel.number([result for result in numbered if result.sensor == channel.sensor])
-        return numbered
+            channel.number([r for r in outputs if isinstance(r, Result) and r.sensor == channel.sensor])
+        return outputs
 
-    def memories(self, results: Sequence[Result]) -> list[Memory]:
+    def _numbered(self, item: Output) -> Output:
+        if isinstance(item, Acceleration):
+            return item
+        self._next_sequence += 1
+        return msgspec.structs.replace(item, run_id=self._run_id, sequence=self._next_sequence - 1)
+
+    def memories(self, results: Sequence[Output]) -> list[Memory]:
         """What must outlive the run, of every sensor whose state these results (of the step just made) have changed."""
         found = []
         for channel in self._channels:
-            own = [r for r in results if r.sensor == channel.sensor and changes_state(r)]
+            own = [r for r in results if r.sensor == channel.sensor and isinstance(r, Result) and changes_state(r)]
             if own:
                 found.append(Memory(channel.sensor, channel.identity, own[-1].sequence, channel.memory()))
         return found
 
     @staticmethod
-    def _dispatch(channel: ChannelState, event: Event) -> list[Result]:
+    def _dispatch(channel: ChannelState, event: Event) -> Sequence[Output]:
         if isinstance(event, SampleBlock):
             return channel.on_block(event)
         if isinstance(event, Tick):

@@ -13,9 +13,10 @@ from agent.config import Config
 from agent.delivery.history import History, Memory, Record, StoreError
 from agent.delivery.publication import Publisher
 from agent.delivery.store import Store
-from agent.events import Event, Result, RunStart, Tick
+from agent.events import Acceleration, Event, Result, RunStart, Tick
 from agent.pipeline import Pipeline
 from agent.reader import EventQueue, Reader
+from agent.recording.acceleration import encode_acceleration
 from agent.recording.fingerprint import fingerprint, versions
 from agent.recording.thread import RecordingThread
 from agent.recording.writer import Recorder
@@ -145,9 +146,13 @@ class Service:
 
     def _step(self, event: Event, writer: RecordingThread) -> None:
         self._sequence += 1
-        results = self._pipeline.step(event)
-        writer.put(self._sequence, event, results, self._pipeline.memories(results))
-        self._watch.update(event, results)
+        outputs = self._pipeline.step(event)
+        writer.put(self._sequence, event, outputs, self._pipeline.memories(outputs))
+        self._watch.update(event, [item for item in outputs if isinstance(item, Result)])
+        if self._publisher is not None:
+            for item in outputs:
+                if isinstance(item, Acceleration):
+                    self._publisher.stream(item.sensor, encode_acceleration(self._sequence, item))
 
     def _deliver(
         self, event_sequence: int, results: Sequence[Result], recorded: bool, memories: Sequence[Memory]

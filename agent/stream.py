@@ -83,6 +83,11 @@ class DeviceStream:
         newest = self._blocks[-1]
         return bool(self._fit().time_of(newest.first_index + newest.n - 1) >= time_s)
 
+    def taken_at(self, index: int) -> tuple[float, float]:
+        """(time in s since the origin, rate in Hz) of a sample, by the clock as it is now."""
+        clock = self._fit()
+        return float(clock.time_of(index)), clock.rate_hz
+
     def _fit(self) -> ClockFit:
         if self._fitted is None:
             assert self._clock is not None  # there are blocks

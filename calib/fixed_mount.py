@@ -21,7 +21,7 @@ class Held:
     by: Mapping[str, Array]
 
     def parameters(self, state: JointState) -> tuple[Array, Array]:
-        """S and Q (12,) with their covariance, of a state that holds the mean output in the place of Q."""
+        """S and Q (12,) and a factor (12, N) of their covariance, of a state with the mean output in the place of Q."""
         mean, factor = state.mean[:12].copy(), state.factor[:12].copy()
         S, felt = mean[:9].reshape(3, 3), self.mps2.copy()
         for name, moves in self.by.items():
@@ -30,7 +30,7 @@ class Held:
         factor[9:] -= np.einsum("k,ikn->in", felt, factor[:9].reshape(3, 3, -1))
         for name, moves in self.by.items():
             factor[9:] -= np.outer(S @ moves, state.factor[state.index(name)])
-        return mean, np.asarray(factor @ factor.T)
+        return mean, factor
 
 
 def held_at(summary: Summary, priors: Priors) -> tuple[Held, Sequence[Term]]:

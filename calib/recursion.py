@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 
+from calib.correction import Law
 from calib.distributions import coverage_factor
 from calib.fixed_mount import Held, held_at
 from calib.gauss_newton import Flags
@@ -31,7 +32,7 @@ from calib.innovation import Innovation, innovation
 from calib.joint_state import JointState
 from calib.model import PARAMETERS, Array, Calibration
 from calib.nuisances import Priors
-from calib.wander import RATES, TemperatureModel, Wander
+from calib.wander import MAIN_TEMPERATURE, RATES, TemperatureModel, Wander, offset_temperature
 from calib.window_rows import Noise, Summary, WindowRows
 
 DETERMINED_SHARE = 0.5  # of the prior's u, which the data must halve (contract)
@@ -122,9 +123,26 @@ class Recursion:
 
     def _parameters(self) -> tuple[Array, Array]:
         """S and Q (12,) and their covariance."""
+        mean, factor = self._parameters_factor()
+        return mean, np.asarray(factor @ factor.T)
+
+    def _parameters_factor(self) -> tuple[Array, Array]:
         if self._held is not None:
             return self._held.parameters(self._state)
-        return self._state.mean[:12].copy(), self._state.covariance[:12, :12]
+        return self._state.mean[:12].copy(), self._state.factor[:12].copy()
+
+    def law(self) -> Law:
+        """S and Q over temperature, with all that their covariance knows of each other."""
+        order, rows = self._temperature.offset_order, self._temperature.sensitivity_order > 0
+        names = [n for k in range(1, order + 1) for n in offset_temperature(k)] + list(MAIN_TEMPERATURE if rows else ())
+        more = [self._state.index(name) for name in names]
+        mean, factor = self._parameters_factor()
+        mean, factor = np.append(mean, self._state.mean[more]), np.vstack([factor, self._state.factor[more]])
+        low, high = self.temperature_range_degc
+        u_beyond = self._temperature.u_offset_mps2[1] * self.scale
+        return Law(
+            mean, factor @ factor.T, order, rows, self.reference_temperature_degc, low, high, u_beyond, self.determined
+        )
 
     def quantity(self, name: str) -> tuple[float, float]:
         """(value, standard uncertainty) of anything in the state. Raises ValueError where it is not in it."""

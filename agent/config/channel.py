@@ -60,6 +60,8 @@ class Channel(Knowledge):
     # A long stretch is cut into windows of this length, so that memory stays bounded and news comes.
     window_s: Annotated[float, Field(ge=1, le=600)] = 60.0
     every_s: Annotated[float, Field(ge=0, le=86400, description="one window each; 0: one after the other")] = 0.0
+    # Each block corrected, a = S^-1 (V - Q) with its uncertainty: published, or recorded as well.
+    acceleration: Literal["off", "publish", "record"] = "off"
     # A tri-axial reference beside the sensor needs no poses: a = R a_ref, R row by row. What the sensor reads at rest
     # belongs here only where the reference is AC-coupled.
     rotation: Nine | None = None

@@ -25,6 +25,7 @@ REOPEN_S = 5.0  # between attempts to open a session that the machine refuses
 CACHE_SAMPLES = 100  # per channel, for subscribers that come late; all before is in the store
 HEARTBEAT_S = 10.0  # tells a subscriber that it missed the last sample; 40 bytes each, only where one listens
 RECENT_MAX = 1000  # results handed over last: those that the store refused go out from here
+BLOCKS_MAX = 64  # of the corrected stream, half a minute of one sensor; they are not results, nobody asks for old ones
 CLOSE_S = 1.2  # a frozen router blocks a put for 5 s; leaving must not wait for it
 
 _log = logging.getLogger(__name__)
@@ -59,6 +60,7 @@ class Publisher:
         self._config = session_config("peer", connect=connect)
         self._store = store
         self._recent: deque[Record] = deque(maxlen=RECENT_MAX)
+        self._blocks: deque[tuple[str, bytes]] = deque(maxlen=BLOCKS_MAX)
         self._wake = threading.Event()
         self._stop = threading.Event()
         self._connected = False
@@ -75,6 +77,11 @@ class Publisher:
     def publish(self, record: Record) -> None:
         """A result was committed, or could not be: send it when its turn comes. Returns at once."""
         self._recent.append(record)
+        self._wake.set()
+
+    def stream(self, sensor: str, block: bytes) -> None:
+        """A block of the corrected stream: sent as soon as may be, and not kept. Returns at once."""
+        self._blocks.append((sensor, block))  # without a router the oldest fall out
         self._wake.set()
 
     def state(self) -> PublicationState:
@@ -126,6 +133,7 @@ class Publisher:
                 stopping = self._stop.is_set()  # asked before the last round, so that nothing handed over is left
                 if self._find_router(session):
                     self._send_waiting(session, history)
+                    self._send_blocks(session)
                 self._wake.wait(0 if stopping else POLL_S)
                 self._wake.clear()
 
@@ -153,6 +161,17 @@ class Publisher:
             record = self._recent.popleft()
             if record.sequence > self._previous:
                 self._put(session, record, previous=0)  # what the store may hold before it is not known here
+
+    def _send_blocks(self, session: zenoh.Session) -> None:
+        while self._blocks:
+            sensor, block = self._blocks.popleft()
+            # A slow consumer loses blocks rather than hold up the results.
+            session.put(
+                result_key(self._key, sensor, "acceleration"),
+                block,
+                encoding=zenoh.Encoding.APPLICATION_PROTOBUF,
+                congestion_control=zenoh.CongestionControl.DROP,
+            )
 
     def _put(self, session: zenoh.Session, record: Record, previous: int) -> None:
         key = result_key(self._key, record.sensor, record.what)

@@ -434,3 +434,67 @@ class Drift(_message.Message):
     false_alarms_a_year: float
     reason: str
     def __init__(self, event_sequence: _Optional[int] = ..., run_id: _Optional[str] = ..., sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., parameter: _Optional[str] = ..., verdict: _Optional[str] = ..., change: _Optional[float] = ..., u_change: _Optional[float] = ..., rate: _Optional[float] = ..., u_rate: _Optional[float] = ..., onset_utc_ns: _Optional[int] = ..., statistic: _Optional[float] = ..., threshold: _Optional[float] = ..., false_alarms_a_year: _Optional[float] = ..., reason: _Optional[str] = ...) -> None: ...
+
+class Acceleration(_message.Message):
+    __slots__ = ("event_sequence", "sensor", "t_utc_ns", "first_index", "rate_hz", "x", "y", "z", "covariance", "noise", "determined", "calibration_run_id", "calibration_sequence", "dynamic_only")
+    EVENT_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    SENSOR_FIELD_NUMBER: _ClassVar[int]
+    T_UTC_NS_FIELD_NUMBER: _ClassVar[int]
+    FIRST_INDEX_FIELD_NUMBER: _ClassVar[int]
+    RATE_HZ_FIELD_NUMBER: _ClassVar[int]
+    X_FIELD_NUMBER: _ClassVar[int]
+    Y_FIELD_NUMBER: _ClassVar[int]
+    Z_FIELD_NUMBER: _ClassVar[int]
+    COVARIANCE_FIELD_NUMBER: _ClassVar[int]
+    NOISE_FIELD_NUMBER: _ClassVar[int]
+    DETERMINED_FIELD_NUMBER: _ClassVar[int]
+    CALIBRATION_RUN_ID_FIELD_NUMBER: _ClassVar[int]
+    CALIBRATION_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    DYNAMIC_ONLY_FIELD_NUMBER: _ClassVar[int]
+    event_sequence: int
+    sensor: str
+    t_utc_ns: int
+    first_index: int
+    rate_hz: float
+    x: _containers.RepeatedScalarFieldContainer[float]
+    y: _containers.RepeatedScalarFieldContainer[float]
+    z: _containers.RepeatedScalarFieldContainer[float]
+    covariance: _containers.RepeatedScalarFieldContainer[float]
+    noise: _containers.RepeatedScalarFieldContainer[float]
+    determined: _containers.RepeatedScalarFieldContainer[bool]
+    calibration_run_id: str
+    calibration_sequence: int
+    dynamic_only: bool
+    def __init__(self, event_sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., first_index: _Optional[int] = ..., rate_hz: _Optional[float] = ..., x: _Optional[_Iterable[float]] = ..., y: _Optional[_Iterable[float]] = ..., z: _Optional[_Iterable[float]] = ..., covariance: _Optional[_Iterable[float]] = ..., noise: _Optional[_Iterable[float]] = ..., determined: _Optional[_Iterable[bool]] = ..., calibration_run_id: _Optional[str] = ..., calibration_sequence: _Optional[int] = ..., dynamic_only: _Optional[bool] = ...) -> None: ...
+
+class AccelerationBytes(_message.Message):
+    __slots__ = ("event_sequence", "sensor", "t_utc_ns", "first_index", "rate_hz", "x", "y", "z", "covariance", "noise", "determined", "calibration_run_id", "calibration_sequence", "dynamic_only")
+    EVENT_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    SENSOR_FIELD_NUMBER: _ClassVar[int]
+    T_UTC_NS_FIELD_NUMBER: _ClassVar[int]
+    FIRST_INDEX_FIELD_NUMBER: _ClassVar[int]
+    RATE_HZ_FIELD_NUMBER: _ClassVar[int]
+    X_FIELD_NUMBER: _ClassVar[int]
+    Y_FIELD_NUMBER: _ClassVar[int]
+    Z_FIELD_NUMBER: _ClassVar[int]
+    COVARIANCE_FIELD_NUMBER: _ClassVar[int]
+    NOISE_FIELD_NUMBER: _ClassVar[int]
+    DETERMINED_FIELD_NUMBER: _ClassVar[int]
+    CALIBRATION_RUN_ID_FIELD_NUMBER: _ClassVar[int]
+    CALIBRATION_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    DYNAMIC_ONLY_FIELD_NUMBER: _ClassVar[int]
+    event_sequence: int
+    sensor: str
+    t_utc_ns: int
+    first_index: int
+    rate_hz: float
+    x: bytes
+    y: bytes
+    z: bytes
+    covariance: bytes
+    noise: bytes
+    determined: _containers.RepeatedScalarFieldContainer[bool]
+    calibration_run_id: str
+    calibration_sequence: int
+    dynamic_only: bool
+    def __init__(self, event_sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., first_index: _Optional[int] = ..., rate_hz: _Optional[float] = ..., x: _Optional[bytes] = ..., y: _Optional[bytes] = ..., z: _Optional[bytes] = ..., covariance: _Optional[bytes] = ..., noise: _Optional[bytes] = ..., determined: _Optional[_Iterable[bool]] = ..., calibration_run_id: _Optional[str] = ..., calibration_sequence: _Optional[int] = ..., dynamic_only: _Optional[bool] = ...) -> None: ...

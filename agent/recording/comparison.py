@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import struct
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 import msgspec
+import numpy as np
 
-from agent.events import Result, WindowReport
+from agent.events import Acceleration, Output, WindowReport
 from agent.recording.messages import topic_of
 
 OTHER_CPU = (
@@ -38,8 +40,8 @@ class Difference(msgspec.Struct, frozen=True, kw_only=True):
 def compare(
     file: str,
     event_sequence: int,
-    recorded: Sequence[Result],
-    computed: Sequence[Result],
+    recorded: Sequence[Output],
+    computed: Sequence[Output],
     tolerance: float,
     *,
     complete: bool = True,
@@ -64,7 +66,7 @@ def compare(
     for before, now in zip(recorded, computed, strict=False):
         if type(before) is not type(now) or topic_of(before) != topic_of(now):
             return difference(topic_of(before), "kind", topic_of(before), topic_of(now), decision=True)
-        pair = (msgspec.to_builtins(before), msgspec.to_builtins(now))
+        pair = (_plain(before), _plain(now))
         for field, a, b in differences(*pair, tolerance):
             return difference(topic_of(before), field, a, b, decision=not isinstance(a, float))
     if len(recorded) > len(computed) or (complete and len(recorded) < len(computed)):
@@ -100,7 +102,7 @@ def _same(a: float, b: float, tolerance: float, scale: float) -> bool:
     return abs(a - b) <= max(tolerance * max(abs(a), abs(b), scale), FLOOR)
 
 
-def _on_the_edge(results: Sequence[Result]) -> bool:
+def _on_the_edge(results: Sequence[Output]) -> bool:
     """Whether a statistic of these windows lies within OTHER_CPU of what it was held against."""
     for result in results:
         if isinstance(result, WindowReport):
@@ -111,6 +113,13 @@ def _on_the_edge(results: Sequence[Result]) -> bool:
                 if abs(statistic - threshold) <= OTHER_CPU * abs(threshold):
                     return True
     return False
+
+
+def _plain(item: Output) -> Any:
+    if isinstance(item, Acceleration):
+        fields = {f.name: getattr(item, f.name) for f in dataclasses.fields(item)}
+        return {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in fields.items()}
+    return msgspec.to_builtins(item)
 
 
 def _short(value: Any) -> str:

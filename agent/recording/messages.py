@@ -6,7 +6,7 @@ infinities).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import msgspec
@@ -15,6 +15,7 @@ from google.protobuf import descriptor_pb2
 from google.protobuf.message import DecodeError, Message
 
 from agent.events import (
+    Acceleration,
     CalibrationUpdate,
     Command,
     DeviceChange,
@@ -22,6 +23,7 @@ from agent.events import (
     Estimate,
     Event,
     Gap,
+    Output,
     Pruned,
     Result,
     RunStart,
@@ -30,6 +32,7 @@ from agent.events import (
     WindowReport,
 )
 from agent.proto import fieldcal_pb2 as pb
+from agent.recording.acceleration import decode_acceleration, encode_acceleration
 from agent.recording.raw_block import decode_block, encode_block
 from calib.model import PARAMETERS
 from hw.block import SampleBlock
@@ -64,10 +67,12 @@ class MessageError(ValueError):
     """A message that is no event or result of this format; the text names the field and its value."""
 
 
-def topic_of(item: Event | Result) -> str:
+def topic_of(item: Event | Output) -> str:
     """Topic on which an event or result is recorded."""
     if isinstance(item, SampleBlock):
         return f"/{item.device}/raw"
+    if isinstance(item, Acceleration):
+        return f"/{item.sensor}/acceleration"
     if isinstance(item, Result):
         return f"/{item.sensor}/{RESULT_TOPICS[type(item)]}"
     return EVENTS_TOPIC
@@ -78,9 +83,15 @@ def is_result_topic(topic: str) -> bool:
     return topic.rsplit("/", 1)[-1] in RESULT_TOPICS.values()
 
 
+def recorded_ones(outputs: Sequence[Output]) -> list[Output]:
+    """What of a step goes into the recording: all results, and the corrected stream where the configuration says so."""
+    return [item for item in outputs if not isinstance(item, Acceleration) or item.recorded]
+
+
 def schema_of(topic: str) -> str:
     """Full name of the message that is recorded on a topic of this program."""
-    names = {"events": "Event", "raw": "RawBlock"} | {name: name.capitalize() for name in RESULT_TOPICS.values()}
+    names = {"events": "Event", "raw": "RawBlock", "acceleration": "Acceleration"}
+    names |= {name: name.capitalize() for name in RESULT_TOPICS.values()}
     return f"{PACKAGE}.{names[topic.rsplit('/', 1)[1]]}"
 
 
@@ -94,13 +105,15 @@ def schema_data(schema_name: str) -> bytes:
     return descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString(deterministic=True)
 
 
-def encode(event_sequence: int, item: Event | Result) -> bytes:
+def encode(event_sequence: int, item: Event | Output) -> bytes:
     """Wire bytes of an event, or of a result caused by the event with this sequence number.
 
     Raises ValueError where the item does not fit the format (shapes, text that is no Unicode).
     """
     if isinstance(item, SampleBlock):
         return encode_block(event_sequence, item)
+    if isinstance(item, Acceleration):
+        return encode_acceleration(event_sequence, item)
     if isinstance(item, CalibrationUpdate):
         message: Message = _calibration_message(event_sequence, item)
     elif isinstance(item, Estimate):
@@ -116,7 +129,7 @@ def encode(event_sequence: int, item: Event | Result) -> bytes:
     return message.SerializeToString(deterministic=True)
 
 
-def decode(schema_name: str, data: bytes) -> tuple[int, Event | Result]:
+def decode(schema_name: str, data: bytes) -> tuple[int, Event | Output]:
     """(event_sequence, event or result) of wire bytes. Raises MessageError, nothing else, whatever the bytes are."""
     decoder = _DECODERS.get(schema_name)
     if decoder is None:
@@ -161,8 +174,8 @@ def _values(message: Message) -> dict[str, Any]:
 
 def _result_decoder(
     message_type: Callable[[], Message], kind: type[WindowReport] | type[DriftReport] | type[StatusChange]
-) -> Callable[[bytes], tuple[int, Event | Result]]:
-    def decode_result(data: bytes) -> tuple[int, Event | Result]:
+) -> Callable[[bytes], tuple[int, Event | Output]]:
+    def decode_result(data: bytes) -> tuple[int, Event | Output]:
         message = message_type()
         message.ParseFromString(data)
         values = _values(message)
@@ -209,9 +222,10 @@ def _decode_estimate(data: bytes) -> tuple[int, Result]:
     return values.pop("event_sequence"), msgspec.convert(values, Estimate)
 
 
-_DECODERS: dict[str, Callable[[bytes], tuple[int, Event | Result]]] = {
+_DECODERS: dict[str, Callable[[bytes], tuple[int, Event | Output]]] = {
     f"{PACKAGE}.Event": _decode_event,
     f"{PACKAGE}.RawBlock": decode_block,
+    f"{PACKAGE}.Acceleration": decode_acceleration,
     f"{PACKAGE}.Window": _result_decoder(pb.Window, WindowReport),
     f"{PACKAGE}.Calibration": _decode_calibration,
     f"{PACKAGE}.Estimate": _decode_estimate,

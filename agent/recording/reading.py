@@ -16,7 +16,7 @@ from typing import BinaryIO
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
-from agent.events import Event, Result, RunStart
+from agent.events import Event, Output, RunStart
 from agent.recording.messages import MessageError, decode, topic_of
 from agent.recording.records import ChunkMessage, Fault, Record, RecordError, content, refusal, unpack, walk
 
@@ -27,7 +27,7 @@ class Step:
 
     event_sequence: int
     event: Event
-    results: list[Result] = field(default_factory=list)
+    results: list[Output] = field(default_factory=list)
     complete: bool = False
 
 
@@ -50,7 +50,7 @@ class RecordingReader:
         try:
             with open_recording(self.path) as file:
                 for record, number, item in self._items(file):
-                    if isinstance(item, Result):
+                    if isinstance(item, Output):
                         if step is None or number != step.event_sequence:
                             raise refusal(record, f"a result of event {number} does not follow it")
                         step.results.append(item)
@@ -74,7 +74,7 @@ class RecordingReader:
         if before is not None and number != before.event_sequence + 1:
             raise refusal(record, f"event {number} follows event {before.event_sequence}")
 
-    def _items(self, file: BinaryIO) -> Iterator[tuple[Record, int, Event | Result]]:
+    def _items(self, file: BinaryIO) -> Iterator[tuple[Record, int, Event | Output]]:
         """(chunk, event sequence, event or result) of every message."""
         for record in walk(file, os.fstat(file.fileno()).st_size):
             if record.opcode == Opcode.CHUNK:
@@ -89,7 +89,7 @@ class RecordingReader:
                 raise refusal(record, "a message outside a chunk")
             self.good_bytes = record.end
 
-    def _item(self, record: Record, message: ChunkMessage) -> tuple[int, Event | Result]:
+    def _item(self, record: Record, message: ChunkMessage) -> tuple[int, Event | Output]:
         channel = self._channels.get(message.channel_id)
         schema = self._schemas.get(channel.schema_id) if channel else None
         if channel is None or schema is None:

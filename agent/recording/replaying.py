@@ -8,9 +8,9 @@ from typing import Protocol, cast
 
 import msgspec
 
-from agent.events import CalibrationUpdate, Event, Result, RunStart, WindowReport
+from agent.events import CalibrationUpdate, Event, Output, RunStart, WindowReport
 from agent.recording.comparison import Difference, compare
-from agent.recording.messages import decode, encode, schema_of, topic_of
+from agent.recording.messages import decode, encode, recorded_ones, schema_of, topic_of
 from agent.recording.reading import RecordingReader, Step
 from agent.recording.records import Fault
 
@@ -18,7 +18,7 @@ from agent.recording.records import Fault
 class PipelineLike(Protocol):
     """What is replayed: agent.pipeline.Pipeline."""
 
-    def step(self, event: Event) -> list[Result]: ...
+    def step(self, event: Event) -> list[Output]: ...
     def snapshot(self) -> bytes: ...
 
 
@@ -113,7 +113,8 @@ class Replay:
     def _step(self, file: ReplayedFile, step: Step) -> None:
         assert self._pipeline is not None
         try:
-            computed = [_as_recorded(step.event_sequence, result) for result in self._pipeline.step(step.event)]
+            outputs = recorded_ones(self._pipeline.step(step.event))
+            computed = [_as_recorded(step.event_sequence, output) for output in outputs]
         except Exception as error:  # as above; live, the same event would have ended the agent
             file.refused = f"event {step.event_sequence} fails: {type(error).__name__}: {error}"
             return
@@ -138,10 +139,10 @@ class Replay:
         file.first_difference = file.first_difference or difference
 
 
-def _as_recorded(event_sequence: int, result: Result) -> Result:
+def _as_recorded(event_sequence: int, result: Output) -> Output:
     """A result as it would be read from a recording: numpy's scalars become plain ones."""
     _, read = decode(schema_of(topic_of(result)), encode(event_sequence, result))
-    return cast(Result, read)
+    return cast(Output, read)
 
 
 def _snapshot_difference(file: ReplayedFile, start: RunStart) -> Difference:

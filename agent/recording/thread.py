@@ -8,7 +8,8 @@ import time
 from collections.abc import Callable, Sequence
 
 from agent.delivery.history import Memory
-from agent.events import Event, Pruned, Result, RunStart
+from agent.events import Event, Output, Pruned, Result, RunStart
+from agent.recording.messages import recorded_ones
 from agent.recording.writer import Recorder
 
 FLUSH_S = 2.0  # s; a power cut costs at most this much of the recording, for 11 % more disk than one long chunk
@@ -18,7 +19,7 @@ CAPACITY = 256  # events; half a minute of two devices and ticks, while a slow c
 Deliver = Callable[[int, Sequence[Result], bool, Sequence[Memory]], None]
 
 
-Entry = tuple[int, Event, Sequence[Result], Sequence[Memory]]
+Entry = tuple[int, Event, Sequence[Output], Sequence[Memory]]
 
 
 class RecordingThread:
@@ -49,14 +50,14 @@ class RecordingThread:
         return None if self._pruning_sent else self._recorder.pruning
 
     def put(
-        self, event_sequence: int, event: Event, results: Sequence[Result], memories: Sequence[Memory] = ()
+        self, event_sequence: int, event: Event, outputs: Sequence[Output], memories: Sequence[Memory] = ()
     ) -> None:
         """Hand over an event and what came of it; waits while the disk is far behind."""
         if isinstance(event, RunStart):
             self._starts_sent += 1
         elif isinstance(event, Pruned):
             self._pruning_sent = True
-        self._hand_over((event_sequence, event, results, memories))
+        self._hand_over((event_sequence, event, recorded_ones(outputs), memories))
 
     def close(self) -> None:
         """Record what is waiting and finish the file."""
@@ -100,8 +101,9 @@ class RecordingThread:
                 continue
             if entry is None:
                 return
-            event_sequence, event, results, memories = entry
-            recorded = self._recorder.record(event_sequence, event, results)
+            event_sequence, event, outputs, memories = entry
+            recorded = self._recorder.record(event_sequence, event, outputs)
+            results = [item for item in outputs if isinstance(item, Result)]
             self._starts_done += isinstance(event, RunStart)
             if isinstance(event, Pruned):
                 self._pruning_sent = False

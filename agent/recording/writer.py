@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol
 
-from agent.events import Event, Pruned, Result, RunStart
+from agent.events import Event, Output, Pruned, RunStart
 from agent.recording.files import RecordingFile, newest, recordings, sync_directory
 from agent.recording.messages import EVENTS_TOPIC, RESULT_TOPICS, encode, topic_of
 from agent.recording.repair import close_torn
@@ -127,7 +127,7 @@ class Recorder:
         except Exception as error:  # a disk or a store that fails is told by whoever writes to it
             log.info("whether recordings are to be deleted cannot be seen: %s", error)
 
-    def record(self, event_sequence: int, event: Event, results: Sequence[Result]) -> bool:
+    def record(self, event_sequence: int, event: Event, results: Sequence[Output]) -> bool:
         """Write an event and what came of it; with results, or for a RunStart, wait for the disk.
 
         A RunStart finishes the file before and begins the next; the files of a Pruned are deleted once it is on disk.

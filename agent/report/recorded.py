@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from agent.config import Channel, Config
-from agent.events import CalibrationUpdate, DeviceChange, Event, Result, RunStart, StatusChange, WindowReport
+from agent.events import CalibrationUpdate, DeviceChange, Event, Output, RunStart, StatusChange, WindowReport
 from agent.recording.reading import RecordingReader
 from agent.recording.records import Fault
 from agent.report.trace import Trace
@@ -70,7 +70,7 @@ def read_recordings(paths: list[Path], sensor: str) -> Recorded:
     return out
 
 
-def _take(out: Recorded, event: Event, results: list[Result], windows: _Windows) -> None:
+def _take(out: Recorded, event: Event, results: list[Output], windows: _Windows) -> None:
     if isinstance(event, DeviceChange) and event.info_json:
         out.devices[event.device] = event.info_json
     for result in results:

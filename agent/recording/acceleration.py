@@ -1,0 +1,36 @@
+"""Blocks of the corrected stream as protobuf messages; their arrays pass as bytes, as in agent.recording.raw_block."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from agent.events import Acceleration
+from agent.proto import fieldcal_pb2 as pb
+
+
+def encode_acceleration(event_sequence: int, block: Acceleration) -> bytes:
+    """Wire bytes of a block."""
+    columns = np.ascontiguousarray(block.acceleration.T, "<f8")
+    message = pb.AccelerationBytes(
+        event_sequence=event_sequence, sensor=block.sensor, t_utc_ns=block.t_utc_ns, first_index=block.first_index,
+        rate_hz=block.rate_hz, x=columns[0].tobytes(), y=columns[1].tobytes(), z=columns[2].tobytes(),
+        covariance=np.ascontiguousarray(block.covariance, "<f8").tobytes(), noise=block.noise.astype("<f8").tobytes(),
+        determined=block.determined.tolist(), calibration_run_id=block.calibration_run_id,
+        calibration_sequence=block.calibration_sequence, dynamic_only=block.dynamic_only,
+    )  # fmt: skip
+    return message.SerializeToString(deterministic=True)
+
+
+def decode_acceleration(data: bytes) -> tuple[int, Acceleration]:
+    """(event_sequence, block) of wire bytes. Raises ValueError or protobuf's DecodeError where they are none."""
+    m = pb.AccelerationBytes.FromString(data)
+    columns = [np.frombuffer(part, "<f8") for part in (m.x, m.y, m.z)]
+    covariance, noise = np.frombuffer(m.covariance, "<f8"), np.frombuffer(m.noise, "<f8")
+    if len({len(c) for c in columns}) != 1 or len(covariance) != 9 or len(noise) != 3 or len(m.determined) != 12:
+        raise ValueError(f"{len(columns[0])} samples, but axes or uncertainties of other lengths")
+    return m.event_sequence, Acceleration(
+        sensor=m.sensor, t_utc_ns=m.t_utc_ns, first_index=m.first_index, rate_hz=m.rate_hz,
+        acceleration=np.column_stack(columns), covariance=covariance.reshape(3, 3), noise=noise,
+        determined=np.array(m.determined, dtype=bool), calibration_run_id=m.calibration_run_id,
+        calibration_sequence=m.calibration_sequence, dynamic_only=m.dynamic_only, recorded=True,
+    )  # fmt: skip
