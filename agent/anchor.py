@@ -55,15 +55,13 @@ class Anchor:
         if not np.isfinite(value).all():
             return Change("S or Q is not finite", {})
         moved, limits = np.abs(value - self._value), self.limits()
-        scale, numbers, reasons = self._full_scale(), dict[str, float](), list[str]()
-        relative = np.where(
-            MAIN, 100.0 / np.where(MAIN, np.abs(self._value), 1.0), np.where(TRANSVERSE, 100.0 / scale, 1.0)
-        )
+        numbers, reasons = dict[str, float](), list[str]()
+        unit = np.where(MAIN, np.abs(self._value) / 100, np.where(TRANSVERSE, self._full_scale() / 100, 1.0))
         for name, kind in (("main_pct", MAIN), ("transverse_pct", TRANSVERSE), ("offset", OFFSET)):
             worst = int(np.argmax(np.where(kind, moved / limits, -1.0)))
             if np.isfinite(limits[worst]):
-                numbers[f"change_{name}"] = float(moved[worst] * relative[worst])
-                numbers[f"change_{name}_threshold"] = float(limits[worst] * relative[worst])
+                numbers[f"change_{name}"] = float(moved[worst] / unit[worst])
+                numbers[f"change_{name}_threshold"] = float(limits[worst] / unit[worst])
             reasons += [PARAMETERS[p] for p in np.flatnonzero(kind & ~(moved <= limits))]
         self._turned(calibration, numbers, reasons)
         self._off_sheet(value, numbers, reasons)

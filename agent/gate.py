@@ -95,11 +95,14 @@ class Gate:
             return "VALID" if self._hold == "rollback" else "HELD"
         if self._held:
             return "HELD"
-        if self._settling:
-            return "RECALIBRATING"
         if self._calibrated:
-            return "VALID"
+            return "RECALIBRATING" if self._settling else "VALID"
         return "COLLECTING" if self._taken else "UNCALIBRATED"
+
+    @property
+    def held(self) -> int:
+        """Windows kept aside; a command or a lost sensor may have dismissed them."""
+        return self._held
 
     @property
     def accepted(self) -> Calibration:
@@ -123,14 +126,11 @@ class Gate:
         if consistent and not change.reason:
             return self._consistent(candidate, numbers | change.numbers)
         self._held, self._agreeing = self._held + 1, 0
-        reason = change.reason if consistent else "a jump not yet confirmed: innovation beyond its threshold"
-        if self._settings.policy == "observe":
-            return self._decision("refuse", f"only observed: {reason}", numbers)
         if confirmed is not None and self._held >= self._settings.confirm_windows:
             return self._confirmed(confirmed, numbers)
         if consistent:
             return self._beyond(candidate, change, numbers)
-        return self._decision("hold", reason, numbers)
+        return self._decision("hold", "a jump not yet confirmed: innovation beyond its threshold", numbers)
 
     def _consistent(self, candidate: Calibration, numbers: dict[str, float]) -> Decision:
         self._taken = True
@@ -140,15 +140,13 @@ class Gate:
                 self._held = self._agreeing = 0
         elif self._settling:
             self._settling -= 1
-        if self._settings.policy == "observe":
-            return self._decision("refuse", "only observed: consistent with what is in force", numbers)
         return self._accepted("take", candidate, "consistent with what was known", numbers)
 
     def _confirmed(self, confirmed: Calibration, numbers: dict[str, float]) -> Decision:
         change = self._anchor.change(confirmed)
         if change.reason:
             return self._beyond(confirmed, change, numbers)
-        count = self._held
+        count, self._taken = self._held, True
         self._held, self._settling = 0, self._settings.settle_windows
         return self._accepted("adopt", confirmed, f"confirmed by {count} windows that agree", numbers | change.numbers)
 
@@ -163,10 +161,13 @@ class Gate:
         determined = int(np.count_nonzero(calibration.determined))
         if not self._calibrated and determined < self._settings.least_determined:
             missing = [p for p, known in zip(PARAMETERS, calibration.determined, strict=True) if not known]
+            self._settling = 0  # nothing in force that could settle
             numbers |= {"determined": determined, "determined_threshold": self._settings.least_determined}
             return self._decision(action, f"not determined yet: {', '.join(missing)}", numbers)
         if self._settings.policy == "propose":
             return self._decision(action, f"{reason}; waits for an operator", numbers, proposal=calibration)
+        if self._settings.policy == "observe":
+            return self._decision(action, f"{reason}; only observed", numbers)
         self._calibrated = True
         self._anchor.learn(calibration)
         return self._decision(action, reason, numbers, in_force=True)
@@ -180,6 +181,8 @@ class Gate:
         in_force: bool = False,
         proposal: Calibration | None = None,
     ) -> Decision:
+        if self._settings.policy == "observe":
+            proposal = None
         if proposal is not None:
             self._proposals = [*self._proposals, (0, proposal)][-PROPOSALS_KEPT:]
         return Decision(action, self.status, reason, numbers or {}, in_force, proposal is not None, self._held)

@@ -14,7 +14,8 @@ class GateSettings(Section):
     """Acceptance. `max_change_...` is how far S and Q may go from what an operator last accepted, in all.
 
     A calibration that would go further waits for an operator's `accept`. `auto` puts accepted ones in force by itself;
-    `propose` publishes them as estimates and waits for `accept`; `observe` only says what it sees.
+    `propose` publishes them as estimates and waits for `accept`; `observe` only says what it sees. In both
+    the state goes on unseen.
     """
 
     policy: Literal["auto", "propose", "observe"] = "auto"
