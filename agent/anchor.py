@@ -69,7 +69,7 @@ class Anchor:
 
     def limits(self) -> Array:
         """(12,) how far each parameter may go; inf where nothing limits an offset."""
-        return np.where(self._fixed, self._max_change(), np.maximum(self._max_change(), self._expanded()))
+        return np.where(self._fixed, self._max_change(), self._expanded())
 
     def learn(self, calibration: Calibration) -> None:
         """What came in force: a parameter that only a data sheet anchored is anchored here once it is known well."""

@@ -13,6 +13,7 @@ benchmarks/drift_test.py measures the rate by simulation.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 
@@ -25,6 +26,7 @@ def false_alarm_rate(threshold: float, fewest: int, most: int) -> float:
     return b * math.exp(-threshold) / math.sqrt(2.0 * math.pi) * _overshoots(b, fewest, most)
 
 
+@lru_cache(maxsize=64)
 def false_alarm_threshold(rate: float, fewest: int, most: int) -> float:
     """The threshold whose `false_alarm_rate` (a window, one parameter, below 1e-2) is this."""
     b = 5.0

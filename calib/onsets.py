@@ -124,7 +124,7 @@ class Onsets:
         # Only where the test itself speaks: a wild window before the onset would else draw the onset to it.
         loud = np.flatnonzero(statistic >= statistic.max() / 2)
         gains = self._sums[moved, loud, series] ** 2 / (2.0 * self._sums[information, loud, series])
-        best = int(np.argmax(gains))
+        best = len(loud) - 1 - int(np.argmax(gains[::-1]))  # of equals the youngest: windows between told nothing
         return int(loud[best]), float(gains[best])
 
     def _change(self, series: int, onset: int, gain: float, size: float, variance: float) -> Change:

@@ -18,7 +18,7 @@ from calib.onsets import CLIP, FEWEST, SPAN, Onsets
 HOUR_S = 3600.0
 SYY = PARAMETERS.index("Syy")
 HOURLY = DriftSettings(windows_a_year=8766.0)
-QUIET_WINDOWS = 200
+QUIET_WINDOWS = 201  # odd, so that the onset is one that thins out
 
 
 class Feed:
@@ -93,13 +93,15 @@ def test_a_step_of_30_sigma_is_found_with_the_third_window(seed: int) -> None:
 
 def test_a_step_of_1_sigma_is_found_in_days() -> None:
     """20 seeds: (b^2 / 2 = 14.2 is reached after 28 windows on average where the onset is known)."""
-    delays = []
+    delays, changes = [], 0
     for seed in range(20):
         feed = Feed(seed).windows(QUIET_WINDOWS).windows(120, lambda _: 1.0)
+        changes += len(feed.verdicts)
         delays.append(next(k for k, v in feed.verdicts if v.parameter == "Syy" and v.verdict == "stepped"))
         after = feed.test.result()[SYY]
         assert after.change == pytest.approx(1.0, abs=4.5 * after.u_change)
     assert 15 < np.mean(delays) < 40
+    assert changes < 30  # 20 steps; few are first, or for a while, called drift
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -186,6 +188,33 @@ def test_a_restart_forgets_and_three_quiet_windows_make_it_stable() -> None:
     assert [(k, v.verdict) for k, v in feed.verdicts] == [(2, "stepped")]
 
 
+@pytest.mark.parametrize("seed", range(10))
+def test_onsets_before_a_restart_do_not_count(seed: int) -> None:
+    """A ramp from far before it would fit a step as well as a step does."""
+    feed = Feed(seed).windows(50)
+    feed.test.restart(np.arange(12) == SYY)
+    feed.windows(5, lambda _: 20.0)
+    assert [v.verdict for _, v in feed.verdicts] == ["stepped"]
+    assert feed.test.result()[SYY].onset_s == 50 * HOUR_S
+
+
+def test_the_onset_is_a_window_that_tells_of_the_change() -> None:
+    test = DriftTest(HOURLY)
+    for k in range(80):
+        score = 10.0 * (k >= 50) if k % 10 == 0 else np.nan
+        test.update(k * HOUR_S, np.full(12, score), np.ones(12))
+    assert test.result()[0].onset_s == 50 * HOUR_S
+
+
+def test_scatter_beyond_what_was_stated_is_in_the_uncertainty() -> None:
+    """Scores with a standard deviation of 3: u as 100 windows of such scatter have it."""
+    test, random = DriftTest(HOURLY), np.random.default_rng(6)
+    for k in range(100):
+        test.update(k * HOUR_S, np.full(12, 5.0 + 3.0 * random.normal()), np.ones(12))
+    assert test.result()[0].verdict == "stepped"
+    assert test.result()[0].u_change == pytest.approx(3.0 / np.sqrt(100), rel=0.25)
+
+
 def test_what_the_state_has_followed_is_stable_again() -> None:
     """The state takes the change up: scores return to zero mean without a restart."""
     feed = Feed(4).windows(50).windows(12, lambda _: 4.0).windows(400)
@@ -193,6 +222,9 @@ def test_what_the_state_has_followed_is_stable_again() -> None:
     assert kinds[0] == "stepped"
     assert kinds[-1] == "stable"
     assert kinds.count("stable") == 1  # no flutter on the way
+    (quiet,) = [k for k, v in feed.verdicts if v.parameter == "Syy" and v.verdict == "stable"]
+    again = Feed(4).windows(50).windows(12, lambda _: 4.0).windows(quiet + 2)
+    assert again.test.result()[SYY].statistic == 0.0  # what was is forgotten: no half of a threshold to begin with
 
 
 def test_cost_and_memory_stay_bounded() -> None:

@@ -70,6 +70,12 @@ def test_too_little_determined_is_collecting() -> None:
     assert g.judge(consistent(), calibration(determined=4)).in_force  # what is in force once stays
 
 
+def test_what_settles_is_what_was_in_force() -> None:
+    g = gate(least_determined=12)
+    assert held(calibration(determined=4), g).status == "COLLECTING"
+    assert g.judge(consistent(), calibration()).status == "VALID"
+
+
 def test_the_limit_of_consistency_is_the_stated_quantile() -> None:
     """2 %: Wilson and Hilferty's formula is 1.3 % high so far out, at 9 degrees of freedom."""
     for statistic, action in ((0.99 * LIMIT_AT_1E_4, "take"), (1.03 * LIMIT_AT_1E_4, "hold")):
@@ -230,6 +236,7 @@ def test_a_confirmed_jump_beyond_max_change_waits_for_an_operator() -> None:
     answer = g.accept(71, "key-1")
     assert answer.calibration is FAR
     assert (answer.status, answer.reason, answer.refused) == ("VALID", "estimate 71 accepted by key-1", "")
+    assert "waiting: none" in g.accept(71, "key-1").refused
     # It is the new anchor: 5 % about it.
     assert g.judge(consistent(), scaled(1.06 * 1.049)).action == "take"
     assert g.judge(consistent(), scaled(1.0)).action == "hold"
