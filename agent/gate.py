@@ -34,7 +34,8 @@ class Decision:
 
     `take`: it goes into the state; `hold`: it is kept aside; `adopt`: all that were kept aside go in; `refuse`: it is
     left out. `in_force`: S and Q in force are now the state's. `propose`: publish `proposal` as an Estimate and give
-    its number to `Gate.published`. `held`: windows kept aside from now on; the rest are dismissed.
+    its number to `Gate.published`. `held`: the newest windows to keep aside, at most `confirm_windows`, so that a wild
+    one among them does not stand in the way for ever; the others are dismissed.
     """
 
     action: Literal["take", "hold", "adopt", "refuse"]
@@ -42,8 +43,13 @@ class Decision:
     reason: str
     numbers: dict[str, float] = field(default_factory=dict)
     in_force: bool = False
-    propose: bool = False
+    proposal: Calibration | None = None
     held: int = 0
+
+    @property
+    def propose(self) -> bool:
+        """There is a proposal to publish."""
+        return self.proposal is not None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,7 +131,7 @@ class Gate:
         change = self._anchor.change(candidate)
         if consistent and not change.reason:
             return self._consistent(candidate, numbers | change.numbers)
-        self._held, self._agreeing = self._held + 1, 0
+        self._held, self._agreeing = min(self._held + 1, self._settings.confirm_windows), 0
         if confirmed is not None and self._held >= self._settings.confirm_windows:
             return self._confirmed(confirmed, numbers)
         if consistent:
@@ -185,7 +191,7 @@ class Gate:
             proposal = None
         if proposal is not None:
             self._proposals = [*self._proposals, (0, proposal)][-PROPOSALS_KEPT:]
-        return Decision(action, self.status, reason, numbers or {}, in_force, proposal is not None, self._held)
+        return Decision(action, self.status, reason, numbers or {}, in_force, proposal, self._held)
 
     def published(self, sequence: int) -> None:
         """The newest proposal went out as this Estimate."""

@@ -242,6 +242,25 @@ def test_a_confirmed_jump_beyond_max_change_waits_for_an_operator() -> None:
     assert g.judge(consistent(), scaled(1.0)).action == "hold"
 
 
+def test_no_more_windows_are_kept_aside_than_confirm_a_jump() -> None:
+    """Months of HELD cost no more than a day; and a wild window falls out of those that must agree."""
+    g = valid()
+    kept = [g.judge(jumped(), FAR).held for _ in range(50)]
+    assert kept == [1, 2, 3, 4] + [5] * 46
+    assert g.held == 5
+    assert g.judge(jumped(), FAR, NEAR).action == "adopt"
+    assert g.held == 0
+
+
+def test_what_is_proposed_is_told() -> None:
+    assert valid().judge(consistent(), FAR).proposal is FAR
+    assert held(scaled(1.07), valid()).proposal is not None
+    assert valid().judge(consistent(), NEAR).proposal is None
+    shadow = valid(policy="propose")
+    held(FAR, shadow)
+    assert shadow.judge(consistent(), NEAR, FAR).proposal is NEAR
+
+
 def test_two_confirmed_jumps_do_not_walk_past_max_change() -> None:
     g = valid()
     assert held(scaled(1.04), g).action == "adopt"
