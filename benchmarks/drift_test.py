@@ -1,6 +1,6 @@
 """The drift test: how often it is wrong, and how soon it speaks beside a CUSUM of the same false-alarm rate.
 
-`python -m benchmarks.drift_test [MILLIONS]` prints the tables of docs/online.md; 60 million windows take most of an hour.
+`python -m benchmarks.drift_test [MILLIONS]` prints the tables of docs/online.md; 60 takes most of an hour.
 """
 
 from __future__ import annotations
