@@ -32,6 +32,7 @@ from hw.block import SampleBlock
 
 # Ports and speeds name the way to a device, not the device: they may change without the calibration losing its sense.
 WAYS = frozenset({"port", "baud_rate", "bus"})
+REFUSED_IN_A_ROW = 3
 LAG_TURNS = 4  # a lag is found, taken out, looked for again: each turn leaves a thousandth
 # A run that begins long after the one before ended: more is a clock that was wrong, and everything has wandered anyway.
 LONGEST_PAUSE_DAYS = 3650.0
@@ -59,6 +60,7 @@ class ChannelState:
         self._first_day = 0.0  # in the estimation's own count, at the run's origin
         self._status = ""  # nothing said yet
         self._after_s = 0.0  # the schedule is done up to here, seconds since the sensor's first sample
+        self._refused = 0  # windows in a row
         self._stances: list[Stance] = []  # by command; the configuration's before any
         self._now_ns = 0  # monotonic and UTC of the newest event that carried both
         self._utc_minus_monotonic_ns = 0
@@ -100,7 +102,7 @@ class ChannelState:
         self._clock(change.t_monotonic_ns, change.t_utc_ns)
         if change.state == "lost":
             if change.device != self.sensor:
-                return []
+                return [self._told(f"the reference {change.device} is lost, nothing is updated: {change.message}")]
             return self._lose(f"{self.sensor} is lost: {change.message}")
         if change.device == self.sensor:
             return self._identify(change.info_json)
@@ -259,9 +261,17 @@ class ChannelState:
             if not window.used or self._estimation is None:
                 reason = window.reason or f"{self.sensor} was never opened"
                 yield window_report(self._source(), window, used=False, reason=reason, numbers={})
+                yield from self._complain(reason)
                 continue
+            self._refused = 0
             judged = self._estimation.judge(window, day, lag_s, found.temperature_degc)
             yield from self._results(window, judged, lag_s)
+
+    def _complain(self, reason: str) -> Iterator[Result]:
+        """Windows that are refused one after the other: the status, though it stands, says why nothing is updated."""
+        self._refused += 1
+        if self._refused == REFUSED_IN_A_ROW:
+            yield self._told(f"nothing is updated: {reason}")
 
     def _found(self, piece: Piece, first_s: float, day: float) -> tuple[Found, float]:
         """The windows, made again until no lag is left in them that matters."""
@@ -286,8 +296,8 @@ class ChannelState:
         origin_utc_ns = self._utc_ns() - round((self._first_day * DAY_S + self._now_s()) * 1e9)
         for verdict in judged.drift:
             yield drift_report(source, verdict, self._channel.drift.false_alarms_a_year, origin_utc_ns)
-        if judged.proposal is not None:
-            update = calibration_update(source, judged.proposal, self._estimation.recursion)
+        if decision.proposal is not None:
+            update = calibration_update(source, decision.proposal, self._estimation.recursion)
             yield estimate(source, decision.reason, update)
         if decision.in_force:
             yield self._put_in_force()
@@ -349,6 +359,7 @@ class ChannelState:
             "first_day": self._first_day,
             "status": self._status,
             "after_s": self._after_s,
+            "refused": self._refused,
             "stances": [_stance_state(stance) for stance in self._stances],
             "now_ns": self._now_ns,
             "utc_minus_monotonic_ns": self._utc_minus_monotonic_ns,
@@ -368,6 +379,7 @@ class ChannelState:
         self._in_force = _calibration(state["in_force"])
         self._kept = dict(state["kept"])
         self._first_day, self._status, self._after_s = state["first_day"], state["status"], state["after_s"]
+        self._refused = state["refused"]
         self._stances = [_stance_of(s) for s in state["stances"]]
         self._now_ns = state["now_ns"]
         self._utc_minus_monotonic_ns = state["utc_minus_monotonic_ns"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -38,7 +38,6 @@ class Judged:
     decision: Decision
     innovation: Innovation
     drift: Sequence[DriftVerdict]
-    proposal: Calibration | None
 
 
 class Estimation:
@@ -86,22 +85,24 @@ class Estimation:
         adopted = self._adopted(held) if len(held) >= self._channel.gate.confirm_windows else None
         evidence = Evidence(day * DAY_S, innovation.statistic, innovation.degrees_of_freedom)
         decision = self.gate.judge(evidence, candidate, None if adopted is None else adopted.result())
-        drift = self.drift.update(day * DAY_S, innovation.score, innovation.information)
         if decision.action == "take":
             self.recursion = trial
         elif decision.action == "adopt":
             assert adopted is not None
             self.recursion = adopted
             self.drift.restart(innovation.information > 0.0)
-        self._held = held[-decision.held :] if decision.held and decision.action == "hold" else self._kept(decision)
-        proposal = None
-        if decision.propose:
-            proposal = candidate if adopted is None else adopted.result()
+        kept = held if decision.action == "hold" else self._held
+        self._held = kept[-self.gate.held :] if self.gate.held else []
+        drift: Sequence[DriftVerdict] = ()
+        if decision.action in ("take", "hold"):
+            drift = self.drift.update(day * DAY_S, innovation.score, innovation.information)
         if decision.in_force:
             self.in_force, self.law = self.recursion.result(), self.recursion.law()
             self.residual_sd = self.recursion.residual_sd
+        if decision.action == "hold":
+            decision = replace(decision, reason=f"{decision.reason}; {_most(innovation, self.recursion.scale)}")
         self._follow(drift)
-        return Judged(decision, innovation, drift, proposal)
+        return Judged(decision, innovation, drift)
 
     def put(self, calibration: Calibration) -> None:
         """An operator put this in force: the state goes on from it, unless it is there anyway."""
@@ -113,9 +114,6 @@ class Estimation:
             self.recursion.put(calibration)
             self.drift.restart(np.ones(12, dtype=bool))
         self._held = []
-
-    def _kept(self, decision: Decision) -> list[Summary]:
-        return self._held[-decision.held :] if decision.held else []
 
     def _follow(self, drift: Sequence[DriftVerdict]) -> None:
         """A step so small that each window alone was consistent: the state may follow it."""
@@ -192,6 +190,17 @@ def _limits(channel: Channel, scale: float) -> GateSettings:
     if "least_determined" not in given.model_fields_set:
         filled["least_determined"] = FIXED_MOUNT_LEAST if channel.fixed_mount else len(PARAMETERS)
     return given.model_copy(update=filled)
+
+
+def _most(innovation: Innovation, scale: float) -> str:
+    """The parameter that a window contradicts most, if it alone had changed."""
+    size = np.abs(np.nan_to_num(innovation.score))
+    p = int(np.argmax(size))
+    if size[p] == 0.0:
+        return "no single parameter explains it"
+    change = innovation.score[p] / np.sqrt(innovation.information[p]) / scale
+    told = f"{change:+.3g} m/s2" if p >= 9 else f"{100.0 * change:+.3g} %"
+    return f"most of {PARAMETERS[p]}, as if it were off by {told} ({size[p]:.1f} standard deviations)"
 
 
 def largest_omega(windows: Sequence[Window]) -> float:

@@ -152,6 +152,7 @@ def _motion(kind: Kind, pose: Pose, points: Points, limits: Limits, leave_out: b
         if leave_out:
             sums = clean
     numbers = _motion_numbers(clean, basis[~struck], V[~struck], rate_hz)
+    numbers["stuck_axes"] = float(np.sum(np.ptp(V, axis=0) == 0.0))
     numbers["clipped_points"] = float(detection.clipped(V, residual, finest))
     verdict = judge(sums, struck, numbers, limits)
     if kind == "quiet" and verdict.used:

@@ -41,8 +41,9 @@ class Verdict:
 def judge(sums: WindowSums, struck: NDArray[np.bool_], numbers: Mapping[str, float], limits: Limits) -> Verdict:
     """Verdict on a window of these sums, of which the points `struck` were left out.
 
-    `numbers`: for motion reference_rms_mps2, reference_noise_mps2, coherence, drift_mps2 and clipped_points; for a rest
-    sd_over_floor where other rests are known. The verdict carries each with its threshold (`<name>_threshold`).
+    `numbers`: for motion reference_rms_mps2, reference_noise_mps2, coherence, drift_mps2, stuck_axes and
+    clipped_points; for a rest sd_over_floor where other rests are known. The verdict carries each with its threshold
+    (`<name>_threshold`).
     """
     points = float(sums.count.sum())
     left_out = 100.0 * float(struck.mean()) if len(struck) else 0.0
@@ -57,6 +58,7 @@ def _thresholds(n: Mapping[str, float], limits: Limits) -> dict[str, float]:
     if "reference_rms_mps2" in n:
         limit["reference_rms_mps2"] = limits.least_level * n["reference_noise_mps2"]
         limit["clipped_points"] = 0.0
+        limit["stuck_axes"] = 0.0
         limit["coherence"] = limits.least_coherence
         limit["drift_mps2"] = max(limits.most_drift_mps2, limits.most_drift_pct / 100.0 * n["reference_rms_mps2"])
     if "sd_over_floor" in n:
@@ -75,6 +77,8 @@ def _reason(n: Mapping[str, float]) -> str:
                 f"the reference is silent: {n['reference_rms_mps2']:.3g} m/s2 in band, "
                 f"its noise is {n['reference_noise_mps2']:.3g} m/s2"
             )
+        if n["stuck_axes"] > limit["stuck_axes"]:
+            return f"dead: {n['stuck_axes']:.0f} of the sensor's axes do not change at all"
         if n["clipped_points"] > limit["clipped_points"]:
             return f"clipped: {n['clipped_points']:.0f} points at the end of the sensor's range"
         if n["coherence"] < limit["coherence"]:

@@ -308,14 +308,28 @@ def test_what_a_verdict_rests_on_stands_beside_it() -> None:
         "coherence": 0.9,
         "drift_mps2": 0.1,
         "clipped_points": 0.0,
+        "stuck_axes": 0.0,
     }
     limits = Limits(least_points=5, least_level=4.0, most_drift_pct=20.0)
     verdict = judge(sums, np.zeros(10, dtype=bool), numbers, limits)
     assert verdict.used
     held = {name.removesuffix("_threshold") for name in verdict.numbers if name.endswith("_threshold")}
-    assert held == {"points", "left_out_pct", "reference_rms_mps2", "coherence", "drift_mps2", "clipped_points"}
+    judged = {"reference_rms_mps2", "coherence", "drift_mps2", "clipped_points", "stuck_axes"}
+    assert held == {"points", "left_out_pct"} | judged
     assert verdict.numbers["reference_rms_mps2_threshold"] == pytest.approx(0.4)
     assert verdict.numbers["drift_mps2_threshold"] == pytest.approx(0.4)
     silent = judge(sums, np.zeros(10, dtype=bool), numbers | {"reference_rms_mps2": 0.39}, limits)
     assert not silent.used
     assert "silent" in silent.reason
+
+
+def test_an_axis_that_never_changes_is_dead() -> None:
+    random, t = np.random.default_rng(1), np.arange(2000) / 100.0
+    u = np.sin(2 * np.pi * 2.0 * t)[:, None]
+    V = np.column_stack([u[:, 0], np.full(len(t), 0.3), 0.2 * u[:, 0]]) + np.outer(
+        random.normal(size=len(t)), [0.01, 0, 0.01]
+    )
+    pose = along([1.0, 0.0, 0.0], [0.0, 0.0, 9.8])
+    (window,) = motion_windows(pose, Points(t, V, u, np.gradient(u[:, 0], t)[:, None]))
+    assert not window.used
+    assert window.reason == "dead: 1 of the sensor's axes do not change at all"
