@@ -1,8 +1,8 @@
 """Which channels of a reference were excited in a window, and what its own noise did to the sums.
 
-A channel that holds noise alone would be taken for a motion that the sensor does not feel, and pull its column of S to
-zero; one that moves along with another adds to what the sensor feels. So silent channels leave the basis, and the
-directions of the others take up what of them moved along.
+A channel that holds noise alone, or noise beside what it has in common with a stronger one, would be taken for a motion
+that the sensor does not feel, and pull its column of S to zero; what moves along with another adds to what the sensor
+feels. So silent channels leave the basis, and the directions of the others take up what of them moved along.
 """
 
 from __future__ import annotations
@@ -38,12 +38,31 @@ def excited(window: Window) -> Excitation:
     m = own_channels(window.sums.reference_channels)
     if m == 0:
         return Excitation(window, np.zeros((3, 0)), 0.0)
-    power = np.diagonal(window.sums.scatter.sum(axis=0))[:m] / window.sums.count.sum()
+    power = window.sums.scatter.sum(axis=0)[:m, :m] / window.sums.count.sum()
     noise = np.zeros((2, m)) if window.reference_noise is None else window.reference_noise**2
-    live = (power > OF_STRONGEST * power.max(initial=0.0)) & (power > OVER_NOISE * noise[0])
-    share = float(np.max(noise[0][live] / power[live], initial=0.0))
-    basis, _ = np.linalg.qr(window.pose.direction[:, np.flatnonzero(live)])
-    return Excitation(_reduced(window, live, noise), basis, CORRECTION_SHARE * share)
+    own = _own_power(power, noise[0])
+    live = own > 0.0
+    share = float(np.max(noise[0][live] / own[live], initial=0.0))
+    reduced = _reduced(window, live, noise)
+    basis, _ = np.linalg.qr(reduced.pose.direction[:, np.flatnonzero(live)])
+    return Excitation(reduced, basis, CORRECTION_SHARE * share)
+
+
+def _own_power(power: Array, noise: Array) -> Array:
+    """(m,) of each channel what the stronger ones do not tell, 0 of a silent one; of the (m, m) power of all.
+
+    A motion in one direction askew to the channels is on all of them, yet it is one: the strongest channel stands for
+    it, and what the others show beside it is their noise (m,).
+    """
+    own, rest, strongest = np.zeros(len(power)), power.copy(), power.diagonal().max(initial=0.0)
+    for _ in own:
+        left = np.where(own > 0.0, 0.0, rest.diagonal())
+        k = int(np.argmax(left))
+        if left[k] <= max(OF_STRONGEST * strongest, OVER_NOISE * noise[k]):
+            break
+        own[k] = left[k]
+        rest -= np.outer(rest[:, k], rest[k]) / left[k]
+    return own
 
 
 def _reduced(window: Window, live: NDArray[np.bool_], noise: Array) -> Window:
@@ -65,8 +84,9 @@ def _reduced(window: Window, live: NDArray[np.bool_], noise: Array) -> Window:
     direction = np.where(live, pose.direction + pose.direction @ along, 0.0)
     # The means of silent channels (gravity, where the reference feels it) are still felt.
     gravity = pose.gravity_mps2 + pose.direction @ np.where(live, 0.0, mean - along @ mean)
+    # What silent channels did from segment to segment must not come back as scatter between them.
     return replace(
         window,
         pose=replace(pose, direction=direction, gravity_mps2=gravity),
-        sums=WindowSums(sums.reference_channels, sums.count, sums.mean, scatter),
+        sums=WindowSums(sums.reference_channels, sums.count, np.where(both, sums.mean, 0.0), scatter),
     )
