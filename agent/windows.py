@@ -9,6 +9,7 @@ import numpy as np
 from agent.config import Channel
 from agent.schedule import Piece
 from agent.stream import Cut, DeviceStream
+from calib import detection
 from calib.band import band_above_noise, lowpass, noise_in_band
 from calib.excitation import Points, motion_windows, rest_window
 from calib.model import Array, Pose, Window, WindowSums
@@ -79,10 +80,14 @@ def _rest(piece: Piece, cut: Cut, span_s: tuple[float, float], channel: Channel)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Signals:
-    """The sensor's samples with the reference at their times, in the band of the motion, and the reference's noise."""
+    """The sensor's samples with the reference at their times, in the band of the motion, and the reference's noise.
+
+    `clipped_points` at the end of the range: a filter leaves nothing of them to be seen, so they are counted before.
+    """
 
     points: Points
     reference_noise: Array
+    clipped_points: int
 
 
 def signals(cut: Cut, reference: Cut, channel: Channel, span_s: tuple[float, float], lag_s: float) -> Signals | None:
@@ -96,14 +101,26 @@ def signals(cut: Cut, reference: Cut, channel: Channel, span_s: tuple[float, flo
     columns[~at.usable] = np.nan
     band_hz, noise = _band(raw, at.u[at.usable], channel, rate_hz)
     sensor_rate_hz = float((len(time_s) - 1) / (time_s[-1] - time_s[0])) if len(time_s) > 1 else 0.0
+    clipped = 0
     if band_hz is not None:
+        clipped = _clipped(columns[np.isfinite(columns).all(axis=1) & _within(time_s, span_s)])
         columns = lowpass(columns, sensor_rate_hz, band_hz)
     usable = np.isfinite(columns).all(axis=1) & _within(time_s, span_s)
     if usable.sum() < 2:
         return None
     m = u.shape[1]
     kept = columns[usable]
-    return Signals(Points(time_s[usable], kept[:, :3], kept[:, 3 : 3 + m], kept[:, 3 + m :]), noise)
+    return Signals(Points(time_s[usable], kept[:, :3], kept[:, 3 : 3 + m], kept[:, 3 + m :]), noise, clipped)
+
+
+def _clipped(columns: Array) -> int:
+    """How many of the samples [V, u, du] (n, 3 + 2 m) are at an end of the sensor's range."""
+    if len(columns) <= columns.shape[1]:
+        return 0
+    V, finest = columns[:, :3], detection.least_step(columns[:, :3])
+    basis = np.column_stack([np.ones(len(columns)), columns[:, 3:]])
+    _, residual = detection.knocked(V, basis, finest)
+    return detection.clipped(V, residual, finest)
 
 
 def _band(raw: Array, u: Array, channel: Channel, rate_hz: float) -> tuple[float | None, Array]:
@@ -128,7 +145,17 @@ def _motion(
     if found is None:
         return []
     windows = motion_windows(pose, found.points, _limits(channel))
-    return [replace(window, reference_noise=found.reference_noise) for window in windows]
+    return [_told(window, found) for window in windows]
+
+
+def _told(window: Window, found: Signals) -> Window:
+    """The window with what was known before the filter."""
+    window = replace(window, reference_noise=found.reference_noise)
+    if not found.clipped_points:
+        return window
+    count = {"clipped_points": float(found.clipped_points), "clipped_points_threshold": 0.0}
+    reason = window.reason or f"clipped: {found.clipped_points} points at the end of the sensor's range"
+    return replace(window, used=False, reason=reason, numbers={**window.numbers, **count})
 
 
 def _limits(channel: Channel) -> Limits:

@@ -24,6 +24,8 @@ SLOW_BAND_HZ = 50.0  # first band tried for the motion; widened until it holds m
 MOST_POWER = 0.7
 SPECTRUM_SAMPLES, SPECTRA, FEWEST_FOR_SPECTRUM = 4096, 4, 16
 CLIPPED_POINTS = 3  # as many points at the very same extreme, and beyond it by the motion, are no chance
+DISTINCT = 0.99  # of the points within the range differ: then three at an extreme are no chance either
+ROUNDING = 1e-9  # of the range: what is less is no noise
 
 
 def moving(u: Array, rate_hz: float) -> list[Stretch]:
@@ -70,7 +72,8 @@ def _regression(columns: Array, outputs: Array) -> Array:
 
 
 def clipped(V: Array, residual: Array, finest: Array) -> int:
-    """Points of V (n, 3) held at an end of the range: several at the very same extreme while the motion goes beyond.
+    """Points of V (n, 3) held at an end of the range: several at the very same extreme while the motion goes beyond, or
+    where no two points within the range are alike.
 
     `residual` (n, 3) of V about the motion, `finest` (3,) the resolution of V.
     """
@@ -81,10 +84,16 @@ def clipped(V: Array, residual: Array, finest: Array) -> int:
             held = np.flatnonzero(v == end)
             if len(held) < CLIPPED_POINTS:
                 continue
-            shortfall = -sign * float(r[held].mean())
-            if shortfall > 1.4826 * float(np.median(np.abs(r))) + finest[axis]:
+            noise = 1.4826 * float(np.median(np.abs(r)))
+            if _all_differ(v, noise) or -sign * float(r[held].mean()) > noise + finest[axis]:
                 points += len(held)
     return points
+
+
+def _all_differ(v: Array, noise: float) -> bool:
+    """Whether the resolution of v (n,) is so fine that points within its range hardly ever agree."""
+    inside = v[(v > v.min()) & (v < v.max())]
+    return noise > ROUNDING * float(np.ptp(v)) and len(np.unique(inside)) >= DISTINCT * len(inside) > 0
 
 
 def band_width(u: Array, rate_hz: float) -> int:
