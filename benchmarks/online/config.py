@@ -15,8 +15,9 @@ LONGEST_SILENCE_S = 3600.0
 def building_config(building: Building, **keys: Any) -> Config:
     """Sensor and reference of a building, the mount's rotation and gravity as nominal (identity, z up).
 
-    `keys` are further ones of the channel.
+    `keys` are further ones of the channel, the section `prior` among them.
     """
+    p = building.parameters
     devices = [
         {"name": name, "driver": "serial-csv", "options": {"port": name, "rate_hz": info.nominal_rate_hz, "axes": 3}}
         for name, info in building.infos().items()
@@ -27,5 +28,8 @@ def building_config(building: Building, **keys: Any) -> Config:
         "rotation": np.eye(3).ravel().tolist(),
         "rotation_gravity_mps2": [0.0, 0.0, 9.80665],
         "silence_s": LONGEST_SILENCE_S,
+        "window_s": p.window_s,
+        "every_s": p.every_s,
+        "guard_s": p.lead_s if p.every_s else 0.5,
     }
-    return parse_config({"devices": devices, "channels": [channel | keys], "zenoh": {"enabled": False}}, "building")
+    return parse_config({"devices": devices, "channels": [channel | {"prior": {}} | keys], "zenoh": {"enabled": False}}, "building")

@@ -33,9 +33,23 @@ class Stated:
     offset_window_mps2: float = 0.002
 
     def keys(self) -> dict[str, Any]:
-        """The channel's sections."""
-        del self
-        return {}
+        """The channel's sections: nothing wanders, since nothing does in the building."""
+        return {
+            "prior": {
+                "sensitivity": 1.0, "u_main_pct": self.main_pct, "u_transverse_pct": self.transverse_pct,
+                "u_offset_mps2": self.offset_mps2,
+            },
+            "certificate": {"u_sensitivity_pct": self.reference_pct},
+            "uncertainty": {
+                "rotation_deg": self.rotation_deg, "tilt_deg": self.gravity_deg, "gravity_mps2": self.gravity_mps2,
+                "lag_s": self.lag_s, "offset_mps2": self.offset_window_mps2,
+            },
+            "process": {
+                "sensitivity_pct": 0.0, "offset_mps2": 0.0, "offset_rate_mps2": 0.0, "offset_rate_walk_mps2": 0.0,
+                "tilt_deg": 0.0,
+            },
+            "temperature": {"offset_order": 0},
+        }  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
