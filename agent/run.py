@@ -58,6 +58,7 @@ def run(config: Path | None, data_dir: Path, duration: float | None, preset: str
 
 def serve(config: Config, data_dir: Path, watch: Any, duration_s: float | None) -> int:
     """Run the service until a signal or `duration_s`; the exit status."""
+    from agent.recording.signing import KeyFileError
     from agent.service import Service
 
     service = Service(config, data_dir, watch)
@@ -65,6 +66,9 @@ def serve(config: Config, data_dir: Path, watch: Any, duration_s: float | None) 
         signal.signal(number, lambda *_: service.stop())
     try:
         ended = service.run(duration_s)
+    except KeyFileError as error:
+        click.echo(f"fieldcal run: recording.signing_key: {error}", err=True)
+        return 2
     except (StoreError, OSError) as error:
         click.echo(f"fieldcal run: {error}", err=True)
         return 1

@@ -12,12 +12,16 @@ from agent import __version__
 from agent.config import Config
 from agent.delivery.history import History, Memory, Record, StoreError
 from agent.delivery.publication import Publisher
+from agent.delivery.retention import keep_results
 from agent.delivery.store import Store
 from agent.events import Acceleration, Event, Result, RunStart, Tick
 from agent.pipeline import Pipeline
 from agent.reader import EventQueue, Reader
 from agent.recording.acceleration import encode_acceleration
+from agent.recording.files import final_name
 from agent.recording.fingerprint import fingerprint, versions
+from agent.recording.retention import keep_files
+from agent.recording.signing import Signer
 from agent.recording.thread import RecordingThread
 from agent.recording.writer import Recorder
 from agent.terminal.watch import Watch
@@ -46,20 +50,27 @@ class Service:
         """Read, calibrate, record and publish until stopped or `duration_s` is over.
 
         Returns whether all threads have ended; where a frozen router holds one, the process must end by `os._exit`.
-        Raises StoreError or OSError where the data directory cannot be used at all.
+        Raises StoreError or OSError where the data directory cannot be used at all, KeyFileError for a bad signing key.
         """
         self._data_dir.mkdir(parents=True, exist_ok=True)
-        self._store = Store(self._data_dir)
+        config = self._config
+        signer = Signer.load(config.recording.signing_key) if config.recording.signing_key else None
+        self._store = Store(self._data_dir, keep=keep_results(config.results))
         if self._store.set_aside:
             self._watch.say(f"the state file was corrupt and is kept as {self._store.set_aside}")
-        config = self._config
+        if found := self._store.recovered.results:
+            self._watch.say(f"{found} results that the state file lacked were found in the recordings")
         self._recorder = Recorder(
             self._data_dir,
             [device.name for device in config.devices],
             [channel.sensor for channel in config.channels],
             max_bytes=int(config.recording.rotate_bytes),
             max_age_s=config.recording.rotate_s,
+            keep=keep_files(config.recording),
+            ledger=self._store,
+            signer=signer,
         )
+        self._recorder.close_torn()
         self._publisher = self._publication()
         events = EventQueue(len(config.devices))
         readers = [Reader(d.name, _sensor(d.name, d.driver, d.options), events) for d in config.devices]
@@ -140,6 +151,8 @@ class Service:
                 next_tick += TICK_S
                 self._step(Tick(t_monotonic_ns=time.monotonic_ns(), t_utc_ns=time.time_ns()), writer)
                 self._watch.health(self._recorder, self._publisher.state() if self._publisher else None)
+            if (pruned := writer.take_pruning()) is not None:
+                self._step(pruned, writer)
             if writer.wants_rotation:
                 self._sequence += 1
                 writer.put(self._sequence, self._run_start(continuation=True), [])
@@ -159,14 +172,16 @@ class Service:
     ) -> None:
         """In the recording's thread, when the disk has the results: store, then network."""
         path = self._recorder.path
-        records = [Record.of(r, recorded=recorded, recording=path.name if path else "") for r in results]
+        records = [Record.of(r, recorded=recorded, recording=final_name(path) if path else "") for r in results]
         try:
             self._store.commit(records, memories)
         except StoreError as error:
             self._watch.say(f"the store cannot keep results up to event {event_sequence}: {error}")
-        if self._publisher is not None:
-            for record in records:
-                self._publisher.publish(record)
+        if self._publisher is None:
+            self._store.mark_published(records[-1].sequence)  # nobody waits for them
+            return
+        for record in records:
+            self._publisher.publish(record)
 
 
 def _sensor(name: str, driver: str, options: dict[str, object]) -> Sensor:

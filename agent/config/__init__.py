@@ -3,10 +3,10 @@
 from agent.config.channel import Channel, PoseInterval
 from agent.config.devices import Device, Gateway
 from agent.config.reading import ConfigError, load_config, parse_config
-from agent.config.sinks import Recording, Zenoh
+from agent.config.sinks import Recording, Results, Zenoh
 from agent.config.whole import Config
 
 __all__ = [
-    "Channel", "Config", "ConfigError", "Device", "Gateway", "PoseInterval", "Recording", "Zenoh",
+    "Channel", "Config", "ConfigError", "Device", "Gateway", "PoseInterval", "Recording", "Results", "Zenoh",
     "load_config", "parse_config",
 ]  # fmt: skip

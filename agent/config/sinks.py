@@ -1,7 +1,8 @@
-"""Where data and results go: the recording and the network."""
+"""Where data and results go: the recording, the store and the network."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 from pydantic import ByteSize, Field
@@ -16,6 +17,22 @@ class Recording(Section):
     rotate_bytes: Annotated[ByteSize, Field(ge=1 << 20)] = ByteSize(256 * 1024 * 1024)
     # At most this much is lost to a power cut; facts: 2 s costs 11 % more disk than no flush.
     flush_s: Annotated[float, Field(gt=0, le=5)] = 2.0
+    keep_days: Annotated[float | None, Field(gt=0, description="older recordings are deleted; none: for ever")] = None
+    keep_bytes: Annotated[ByteSize | None, Field(ge=1 << 20, description="of all recordings; none: no limit")] = None
+    # A full disk stops more than the recording. Two files of `rotate_bytes` at a day's notice, on any card in use.
+    least_free_bytes: Annotated[ByteSize, Field(ge=0, description="the oldest recordings make room")] = ByteSize(
+        512 * 1024 * 1024
+    )
+    signing_key: Annotated[Path | None, Field(description="Ed25519, PEM; closed files are signed")] = None
+
+
+class Results(Section):
+    """How long results stay in the store; the newest of each kind, and each device's newest calibration, always do."""
+
+    # Two years: a season to compare the last one with. A result is 0.2 to 2 kB, one a minute is 1 GB in that time.
+    keep_days: Annotated[float | None, Field(gt=0)] = 730.0
+    keep_bytes: Annotated[ByteSize | None, Field(ge=1 << 20)] = ByteSize(2 * 1024 * 1024 * 1024)
+    waiting_days: Annotated[float | None, Field(gt=0, description="of what no router has taken")] = 365.0
 
 
 class Zenoh(Section):

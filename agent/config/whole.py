@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from agent.config.channel import Channel
 from agent.config.devices import Device, Gateway
 from agent.config.section import Section
-from agent.config.sinks import Recording, Zenoh
+from agent.config.sinks import Recording, Results, Zenoh
 
 
 class Config(Section):
@@ -19,6 +19,7 @@ class Config(Section):
     devices: Annotated[tuple[Device, ...], Field(min_length=1)]
     channels: Annotated[tuple[Channel, ...], Field(min_length=1)]
     recording: Recording = Recording()
+    results: Results = Results()
     zenoh: Zenoh = Zenoh()
 
     @model_validator(mode="after")

@@ -5,9 +5,13 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from agent.delivery.history import Record
 from agent.delivery.schema import checked, row_crc
+
+if TYPE_CHECKING:
+    from agent.config.sinks import Results
 
 DAY_NS = 86_400_000_000_000
 # A store that is too large shrinks as fast as it grows, and a clock that jumped ahead by years has deleted little when
@@ -30,6 +34,12 @@ class KeepResults:
 
 
 FOR_EVER = KeepResults()
+
+
+def keep_results(section: Results) -> KeepResults:
+    """What the configuration says."""
+    most = int(section.keep_bytes) if section.keep_bytes is not None else None
+    return KeepResults(section.keep_days, most, section.waiting_days)
 
 
 class Sweep:

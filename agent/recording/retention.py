@@ -11,9 +11,13 @@ import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from agent.events import Pruned
 from agent.recording.files import file_number, recordings, sync_directory
+
+if TYPE_CHECKING:
+    from agent.config.sinks import Recording
 
 PIN_SUFFIX = ".lock"  # `fieldcal-000007.mcap.lock` beside a recording, whatever is in it, keeps it
 DAY_NS = 86_400_000_000_000
@@ -31,6 +35,12 @@ class KeepFiles:
 
 
 FOR_EVER = KeepFiles()
+
+
+def keep_files(section: Recording) -> KeepFiles:
+    """What the configuration says."""
+    most = int(section.keep_bytes) if section.keep_bytes is not None else None
+    return KeepFiles(section.keep_days, most, int(section.least_free_bytes))
 
 
 def due(directory: Path, keep: KeepFiles, active: Path | None, waiting: str) -> Pruned | None:
