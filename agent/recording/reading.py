@@ -5,7 +5,9 @@ Linear and without trust: the summary is not used, a torn tail ends the reading 
 
 from __future__ import annotations
 
+import contextlib
 import errno
+import fcntl
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -104,10 +106,16 @@ class RecordingReader:
 
 
 def open_recording(path: Path) -> BufferedReader:
-    """Open for reading. Raises OSError, also for what is no file: a pipe or a device may never begin, or never end."""
+    """Open for reading; until it is closed, retention leaves the file alone.
+
+    Raises OSError, also for what is no file: a pipe or a device may never begin, or never end.
+    """
     if path.exists() and not path.is_file() and not path.is_dir():
         raise OSError(errno.EINVAL, "Not a file", str(path))
-    return open(path, "rb")
+    file = open(path, "rb")
+    with contextlib.suppress(OSError):  # a file system that knows no locks
+        fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    return file
 
 
 def first_event(path: Path) -> RunStart | None:

@@ -27,7 +27,7 @@ from agent.recording.summary import KINDS, DerivedSummary
 REPAIR_METADATA = "fieldcal.repair"
 TAIL_ATTACHMENT = "torn"
 # A crash tears what was written after the last flush: a chunk or two. More behind a broken record is damage of another
-# kind, and hides what can still be read.
+# kind, and hides what can still be read; zeros are none.
 TAIL_MAX = 8 << 20
 
 _log = logging.getLogger(__name__)
@@ -106,7 +106,7 @@ def _sound_part(file: BinaryIO, size: int) -> _Sound:
         broken = broken or error
     if broken is not None:
         unlike_a_crash = goes_on or (broken.fault.kind == "corrupt" and not sound.chunks)
-        if unlike_a_crash or (size - sound.length > TAIL_MAX and not _ends_in_zeros(file, sound.length)):
+        if unlike_a_crash or not _ends_in_zeros(file, sound.length + TAIL_MAX):
             raise broken
     return sound
 
@@ -148,7 +148,7 @@ def _append(file: BinaryIO, sound: _Sound, size: int, signer: Signer | None) -> 
     """Write the end; where there is no room for it, leave the file as it was."""
     length = sound.length
     file.seek(length)
-    tail = file.read(TAIL_MAX) if size - length <= TAIL_MAX else b""
+    tail = file.read(TAIL_MAX)
     end = _end(sound, tail, size, signer)
     try:
         file.seek(length)
