@@ -201,6 +201,11 @@ class History:
         except DamagedRow as error:
             raise StoreError(f"{self._path}: {error}") from None
 
+    def file_sequence(self) -> int:
+        """The highest number that a recording here ever had."""
+        rows = self._checked("SELECT name, value, crc FROM marks WHERE name = 'file'")
+        return int(rows[0][1]) if rows else 0
+
     def newest(self, sensor: str, what: str, *, limit: int) -> list[Record]:
         """The newest `limit` results of one channel, newest first."""
         return self._records("WHERE sensor = ? AND what = ? ORDER BY sequence DESC LIMIT ?", sensor, what, limit)

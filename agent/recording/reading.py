@@ -112,7 +112,7 @@ def open_recording(path: Path) -> BufferedReader:
     """
     if path.exists() and not path.is_file() and not path.is_dir():
         raise OSError(errno.EINVAL, "Not a file", str(path))
-    file = open(path, "rb")
+    file = open(path, "rb")  # noqa: SIM115 - closed by whoever asked
     with contextlib.suppress(OSError):  # a file system that knows no locks
         fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
     return file

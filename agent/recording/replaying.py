@@ -8,7 +8,7 @@ from typing import Protocol, cast
 
 import msgspec
 
-from agent.events import CalibrationUpdate, Event, Output, RunStart, WindowReport
+from agent.events import CalibrationUpdate, Event, Output, Pruned, RunStart, WindowReport
 from agent.recording.comparison import Difference, compare
 from agent.recording.messages import decode, encode, recorded_ones, schema_of, topic_of
 from agent.recording.reading import RecordingReader, Step
@@ -30,6 +30,7 @@ class ReplayedFile(msgspec.Struct, kw_only=True):
 
     path: str
     run_id: str = ""
+    gateway: str = ""  # <site>/<gateway>
     file_sequence: int = 0
     in_chain: bool = False  # went on from the file before, whose state at its end equals the snapshot here
     events: int = 0
@@ -42,6 +43,7 @@ class ReplayedFile(msgspec.Struct, kw_only=True):
     undecidable: int = 0
     tolerance: float = 0.0
     notes: list[str] = []
+    pruned: list[Pruned] = []  # recordings that were deleted, as this one says
 
     @property
     def equal(self) -> bool:
@@ -81,6 +83,8 @@ class Replay:
         for step in reader.steps():
             if isinstance(step.event, RunStart):
                 self._begin(file, step.event)
+            elif isinstance(step.event, Pruned):
+                file.pruned.append(step.event)
             file.events += 1
             if not file.refused and not file.undecidable:
                 self._step(file, step)
@@ -92,6 +96,7 @@ class Replay:
 
     def _begin(self, file: ReplayedFile, start: RunStart) -> None:
         file.run_id, file.file_sequence = start.run_id, start.file_sequence
+        file.gateway = f"{start.site}/{start.gateway}"
         other = sorted(name for name, value in self._here.items() if start.fingerprint.get(name) != value)
         if other:
             file.tolerance = self._elsewhere

@@ -9,14 +9,18 @@ from __future__ import annotations
 import base64
 import binascii
 import hashlib
+import struct
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
+
+from mcap.opcode import Opcode
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 
 SIGNATURE_METADATA = "fieldcal.signature"
 _CONTEXT = b"fieldcal recording, version 1\n"  # so that the key's signature of something else is none of a recording
+_HEAD = struct.Struct("<BQ")
 LARGEST_KEY_FILE = 1 << 16  # bytes; a key has 120
 
 
@@ -88,6 +92,29 @@ def signature_fault(metadata: dict[str, str], sha256: bytes, length: int, key: E
     except (InvalidSignature, binascii.Error):
         return "its signature is not the key's"
     return ""
+
+
+def verify_file(file: BinaryIO, size: int, metadata: dict[str, str] | None, key: Ed25519PublicKey) -> str:
+    """Why an MCAP file (its signature record given) is not signed with the key as a whole; "" where it is.
+
+    Raises OSError.
+    """
+    if metadata is None:
+        return "no signature in this file"
+    length = metadata.get("bytes", "")
+    if not (length.isascii() and length.isdigit() and len(length) < 19 and int(length) < size):
+        return "its signature is of other bytes"
+    digest, left = hashlib.sha256(), int(length)
+    file.seek(0)
+    while left and (piece := file.read(min(left, 1 << 20))):
+        digest.update(piece)
+        left -= len(piece)
+    # The record of the signature stands here, and behind it the data end.
+    opcode, body = _HEAD.unpack(file.read(_HEAD.size).ljust(_HEAD.size, b"\0"))
+    file.seek(min(body, size), 1)
+    if opcode != Opcode.METADATA or file.read(1) != bytes([Opcode.DATA_END]):
+        return "something follows its signature"
+    return signature_fault(metadata, digest.digest(), int(length), key)
 
 
 def _read(path: Path) -> bytes:
