@@ -17,6 +17,7 @@ from agent.recording.chain import Link, chain_faults, missing_after
 from agent.recording.comparison import OTHER_CPU
 from agent.recording.files import FILE_METADATA, recordings
 from agent.recording.integrity import Integrity, check_integrity
+from agent.recording.pruned_ranges import PRUNED_METADATA, from_metadata, merged
 from agent.recording.reading import open_recording
 from agent.recording.records import Fault
 from agent.recording.repair import REPAIR_METADATA
@@ -131,6 +132,7 @@ def audit_files(
     replayed = Replay(restore, fingerprint(), elsewhere=OTHER_CPU)
     audited: list[AuditedFile] = []
     links: list[Link] = []
+    said: list[tuple[int, int]] = []  # recordings that retention deleted
     with ExitStack() as held:  # until all are done: retention deletes none meanwhile
         files = [held.enter_context(open_recording(path)) for path in given.paths]
         for path, file in zip(given.paths, files, strict=True):
@@ -146,8 +148,10 @@ def audit_files(
                 verdict.reasons += verdict.notes
             audited.append(verdict)
             links.append(_link(verdict, integrity))
+            said += from_metadata(integrity.metadata.get(PRUNED_METADATA))
     pruned = [event for verdict in audited for event in verdict.replay.pruned]
-    for index, fault in chain_faults(links, pruned, from_first=given.up_to is not None):
+    deleted = merged([*said, *((event.first_file, event.last_file) for event in pruned)])
+    for index, fault in chain_faults(links, pruned, deleted, from_first=given.up_to is not None):
         audited[index].reasons.append(fault)
     for verdict in audited:
         verdict.ok = not verdict.reasons

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from agent.events import Pruned
+from agent.recording.pruned_ranges import Ranges, first_outside
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,18 +24,21 @@ class Link:
     previous_sha256: str
 
 
-def chain_faults(links: Sequence[Link], pruned: Sequence[Pruned], *, from_first: bool) -> Iterator[tuple[int, str]]:
+def chain_faults(
+    links: Sequence[Link], pruned: Sequence[Pruned], deleted: Ranges, *, from_first: bool
+) -> Iterator[tuple[int, str]]:
     """(index, what is wrong) for each recording that does not follow the one before.
 
+    `pruned` are the events that say what retention deleted, `deleted` all numbers of which anything says so.
     Compared are neighbours of one gateway with rising numbers. `from_first`: before the first there must be nothing.
     """
     if from_first and links:
-        yield from ((0, fault) for fault in _gap(0, links[0], pruned))
+        yield from ((0, fault) for fault in _gap(0, links[0], pruned, deleted))
     for index, (before, after) in enumerate(pairwise(links), start=1):
         if before.gateway != after.gateway or after.file_sequence <= before.file_sequence:
             continue
         if before.file_sequence + 1 < after.file_sequence:
-            yield from ((index, fault) for fault in _gap(before.file_sequence, after, pruned))
+            yield from ((index, fault) for fault in _gap(before.file_sequence, after, pruned, deleted))
         elif not _follows(before, after):
             yield index, f"{before.path} is not the file that was there before this one: its SHA-256 differs"
 
@@ -50,16 +54,11 @@ def missing_after(last: int, expected: int) -> str:
     return f"{_span(last + 1, expected)} missing at the end" if expected > last else ""
 
 
-def _gap(before: int, after: Link, pruned: Sequence[Pruned]) -> Iterator[str]:
+def _gap(before: int, after: Link, pruned: Sequence[Pruned], deleted: Ranges) -> Iterator[str]:
     """What is wrong with the numbers missing between one and the next recording."""
-    first, last = before + 1, after.file_sequence - 1
-    for event in sorted(pruned, key=lambda event: event.first_file):
-        if event.first_file > first:
-            last = min(last, event.first_file - 1)
-            break
-        first = max(first, event.last_file + 1)
-    if first <= last:
-        yield f"{_span(first, last)} missing before it, and nothing here says that retention deleted it"
+    unsaid = first_outside(deleted, before + 1, after.file_sequence - 1)
+    if unsaid is not None:
+        yield f"{_span(*unsaid)} missing before it, and nothing here says that retention deleted it"
     for event in pruned:
         neighbour = event.last_file + 1 == after.file_sequence
         if neighbour and after.previous_sha256 and event.last_sha256 != after.previous_sha256:

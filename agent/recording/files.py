@@ -98,6 +98,12 @@ class RecordingFile:
         self._writer.add_message(self._channel(topic), log_time, data, publish_time, sequence & 0xFFFFFFFF)
         self._unsynced = True
 
+    def note(self, name: str, metadata: dict[str, str]) -> None:
+        """Add a metadata record behind all that was appended."""
+        self._writer.flush()
+        self._writer.add_metadata(name, metadata)
+        self._unsynced = True
+
     def sync(self) -> None:
         """Write the open chunk and wait until the disk has it."""
         if self._unsynced:

@@ -29,7 +29,7 @@ class Integrity:
     good_bytes: int = 0
     chunks: int = 0
     messages: int = 0
-    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)  # the last of each name
 
     def add(self, fault: Fault) -> None:
         """Count a fault; keep it if it is among the first."""
@@ -119,7 +119,7 @@ class _Check:
             return None
         parsed = parse(record)
         if isinstance(parsed, Metadata):
-            self._found.metadata.setdefault(parsed.name, parsed.metadata)
+            self._found.metadata[parsed.name] = parsed.metadata
             return self._derived.add_metadata(record, parsed)
         if isinstance(parsed, Attachment):
             return self._derived.add_attachment(record, parsed)

@@ -28,7 +28,7 @@ class ScannedFile:
     """What a recording says without being replayed: its results in order, its metadata, and what could not be read."""
 
     results: list[Result] = field(default_factory=list)
-    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)  # the last of each name
     faults: list[str] = field(default_factory=list)
 
 
@@ -40,6 +40,14 @@ def scan(path: Path) -> ScannedFile:
     return found
 
 
+def metadata_of(path: Path) -> dict[str, dict[str, str]]:
+    """The metadata of a recording alone; empty where none can be read. Raises OSError."""
+    found = ScannedFile()
+    with open_recording(path) as file:
+        _Scan(file, found).run(results=False)
+    return found.metadata
+
+
 class _Scan:
     def __init__(self, file: BinaryIO, found: ScannedFile) -> None:
         self._file = file
@@ -48,7 +56,7 @@ class _Scan:
         self._results: dict[int, str] = {}  # schema name by channel, of channels with results
         self._others: set[int] = set()
 
-    def run(self) -> None:
+    def run(self, *, results: bool = True) -> None:
         chunk: tuple[int, int] | None = None  # offset and length of the last chunk, whose indexes are being read
         indexed: set[int] = set()
         for offset, opcode, length in self._heads():
@@ -57,7 +65,7 @@ class _Scan:
                 continue
             self._take_chunk(chunk, indexed)
             chunk, indexed = None, set()
-            if opcode == Opcode.CHUNK:
+            if opcode == Opcode.CHUNK and results:
                 chunk = (offset, length)
             elif opcode == Opcode.METADATA:
                 self._take_metadata(offset, length)
@@ -86,7 +94,7 @@ class _Scan:
             self._found.faults.append(str(error))
             return
         if isinstance(metadata, Metadata):
-            self._found.metadata.setdefault(metadata.name, metadata.metadata)
+            self._found.metadata[metadata.name] = metadata.metadata
 
     def _take_chunk(self, chunk: tuple[int, int] | None, indexed: set[int]) -> None:
         # A chunk that declares channels holds messages on them: all others are known to hold no results.

@@ -16,8 +16,10 @@ from typing import Protocol
 from agent.events import Event, Output, Pruned, RunStart
 from agent.recording.files import RecordingFile, newest, recordings, sync_directory
 from agent.recording.messages import EVENTS_TOPIC, RESULT_TOPICS, encode, topic_of
+from agent.recording.pruned_ranges import PRUNED_METADATA, Ranges, from_metadata, merged, to_metadata
 from agent.recording.repair import close_torn
 from agent.recording.retention import FOR_EVER, KeepFiles, delete, due
+from agent.recording.scan import metadata_of
 from agent.recording.signing import Signer
 
 log = logging.getLogger(__name__)
@@ -74,6 +76,7 @@ class Recorder:
         self._utc_minus_monotonic_ns = 0
         self._now_ns = self._since_ns = 0  # event time now; and when the file began, or failed
         self._numbered = ledger.file_sequence() if ledger is not None else 0
+        self._pruned = _pruned_before(directory)
         self._due: Pruned | None = None  # files that may go
         self._unsaid = False  # they went while nothing was recorded
         self.fault = ""  # why nothing is recorded
@@ -142,6 +145,10 @@ class Recorder:
             if self._file is not None:
                 for topic, data in messages:
                     self._file.append(topic, data, log_time, publish_time, event_sequence)
+                if isinstance(event, Pruned):
+                    self._pruned = merged([*self._pruned, (event.first_file, event.last_file)])
+                if isinstance(event, RunStart | Pruned) and self._pruned:
+                    self._file.note(PRUNED_METADATA, to_metadata(self._pruned))
                 if results or isinstance(event, RunStart | Pruned):
                     self._file.sync()
             if isinstance(event, RunStart):
@@ -241,3 +248,14 @@ class Recorder:
             self._utc_minus_monotonic_ns = utc_ns - monotonic_ns
             self._now_ns = monotonic_ns
         return max(utc_ns, 0), max(monotonic_ns, 0)
+
+
+def _pruned_before(directory: Path) -> Ranges:
+    """What retention deleted before this run, as the newest recording that can be read says."""
+    try:
+        for _, path in reversed(recordings(directory)):
+            if metadata := metadata_of(path):
+                return from_metadata(metadata.get(PRUNED_METADATA))
+    except OSError as error:  # whoever writes to this disk will tell it
+        log.info("what was deleted before cannot be read: %s", error)
+    return ()

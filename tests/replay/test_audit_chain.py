@@ -1,0 +1,245 @@
+"""The audit over several recordings: what was deleted and what was stolen, what a crash left, and who signed it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
+
+from agent.audit import audit, audit_files, recordings_of, run_audit
+from agent.delivery.store import Store
+from agent.recording.files import recordings
+from agent.recording.retention import KeepFiles
+from agent.recording.signing import KeyFileError, Signer, load_public_key
+from agent.recording.writer import Recorder
+from tests.replay.forgery import records, with_sums
+from tests.replay.stand_in import CONFIG, StandIn, happenings, run_start
+
+ROTATE_EACH = 9  # events
+FILES = 5
+
+
+def write_keys(directory: Path) -> tuple[Path, Path]:
+    """(private, public) key files."""
+    key = Ed25519PrivateKey.generate()
+    private, public = directory / "gateway.key", directory / "gateway.pub"
+    private.write_bytes(key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))
+    public.write_bytes(key.public_key().public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo))
+    return private, public
+
+
+def record(directory: Path, *, keep: KeepFiles | None = None, signer: Signer | None = None) -> None:
+    """A run of five files with a store beside it, keeping to `keep`."""
+    store = Store(directory, 0)
+    recorder = Recorder(directory, ["acc", "ref"], ["bridge-1"], keep=keep or KeepFiles(), ledger=store, signer=signer)
+    pipeline = StandIn(CONFIG)
+    number = 0
+    for event in happenings(4 * FILES, seed=1):
+        if number % ROTATE_EACH == 0:
+            start = run_start(pipeline, number, recorder.next_file_sequence, event.t_monotonic_ns)
+            recorder.record(number, start, pipeline.step(start))
+            recorder.look_for_pruning()
+            number += 1
+            if (pruned := recorder.pruning) is not None:
+                recorder.record(number, pruned, pipeline.step(pruned))
+                number += 1
+        recorder.record(number, event, pipeline.step(event))
+        number += 1
+    recorder.close()
+    store.close()
+
+
+def names(directory: Path) -> list[int]:
+    return [number for number, _ in recordings(directory)]
+
+
+def said(directory: Path, **options: object) -> tuple[int, str]:
+    return said_of([directory], **options)
+
+
+def said_of(paths: list[Path], **options: object) -> tuple[int, str]:
+    runner = CliRunner()
+    with runner.isolation() as (out, _, _):
+        status = run_audit(recordings_of(paths), StandIn.restore, as_json=False, **options)  # type: ignore[arg-type]
+        return status, out.getvalue().decode()
+
+
+def size(directory: Path, count: int) -> int:
+    return sum(path.stat().st_size for _, path in recordings(directory)[:count])
+
+
+@pytest.fixture
+def limit(tmp_path_factory: pytest.TempPathFactory) -> KeepFiles:
+    """Room for some two of the files."""
+    directory = tmp_path_factory.mktemp("size")
+    record(directory)
+    return KeepFiles(bytes=int(size(directory, FILES) * 2.5 / FILES))
+
+
+def test_a_whole_directory_passes(tmp_path: Path) -> None:
+    record(tmp_path)
+    status, text = said(tmp_path)
+    assert (status, text.count(": passed")) == (0, len(names(tmp_path))), text
+    assert len(names(tmp_path)) >= FILES
+
+
+def test_what_retention_deleted_is_no_theft(tmp_path: Path, limit: KeepFiles) -> None:
+    record(tmp_path, keep=limit)
+    left = names(tmp_path)
+    assert left[0] > 1, "retention had something to do"
+    status, text = said(tmp_path)
+    assert status == 0, text
+
+
+def test_what_was_taken_is_missed(tmp_path: Path, limit: KeepFiles) -> None:
+    record(tmp_path, keep=limit)
+    left = recordings(tmp_path)
+    taken = left[1][1]
+    content = taken.read_bytes()
+    for index, words in ((0, "missing before it"), (1, "missing before it"), (-1, "missing at the end")):
+        path = left[index][1]
+        content = path.read_bytes()
+        path.unlink()
+        status, text = said(tmp_path)
+        assert status == 3, index
+        assert f"recording {left[index][0]} is {words}" in text, index
+        path.write_bytes(content)
+    assert said(tmp_path)[0] == 0
+
+
+def test_a_file_in_the_place_of_the_last_deleted_is_seen(tmp_path: Path, limit: KeepFiles) -> None:
+    record(tmp_path, keep=limit)
+    files = [path for _, path in recordings(tmp_path)]
+    (file,) = audit_files(recordings_of(files[-1:]), StandIn.restore)
+    pruned = file.replay.pruned[-1]
+    assert pruned.last_file + 1 == names(tmp_path)[0]
+    first = files[0]
+    data = first.read_bytes()
+    at = data.index(b"previous_sha256") + len(b"previous_sha256") + 4
+    other = b"0" if data[at : at + 1] != b"0" else b"1"
+    first.write_bytes(with_sums(data[:at] + other + data[at + 1 :]))
+    status, text = said(tmp_path)
+    assert status == 3
+    assert f"the recording {pruned.last_file} that was deleted is not the one that was there before this one" in text
+
+
+def test_neighbours_of_two_runs_are_held_against_each_other(tmp_path: Path) -> None:
+    record(tmp_path)
+    last = recordings(tmp_path)[-1][1]
+    record(tmp_path)
+    assert said(tmp_path)[0] == 0
+    other = tmp_path / "other"
+    other.mkdir()
+    record(other, signer=Signer(Ed25519PrivateKey.generate()))
+    (other / last.name).rename(last)
+    status, text = said(tmp_path)
+    assert status == 3
+    assert f"{last} is not the file that was there before this one: its SHA-256 differs" in text
+
+
+def test_a_file_closed_after_a_crash_passes_and_is_counted(tmp_path: Path) -> None:
+    record(tmp_path)
+    path = recordings(tmp_path)[-1][1]
+    data = path.read_bytes()
+    *_, last = [r for r in records(data) if r.name == "Chunk"]
+    path.unlink()
+    path.with_name(path.name + ".active").write_bytes(data[: last.offset + 20])
+    assert said(tmp_path)[0] == 3
+    recorder = Recorder(tmp_path, [], [])
+    recorder.close_torn()
+    status, text = said(tmp_path)
+    assert status == 0, text
+    assert "note: unsealed: left open by a crash, closed later, 20 torn bytes set aside" in text
+    assert said(tmp_path, strict=True)[0] == 3
+    runner = CliRunner()
+    with runner.isolation() as (out, _, _):
+        assert run_audit(recordings_of([tmp_path]), StandIn.restore, as_json=True) == 0
+        assert json.loads(out.getvalue())["unsealed"] == 1
+
+
+def test_signatures_are_required_with_a_key(tmp_path: Path) -> None:
+    private, public = write_keys(tmp_path)
+    data = tmp_path / "data"
+    data.mkdir()
+    record(data, signer=Signer.load(private))
+    status, text = said(data, key=load_public_key(public))
+    assert status == 0, text
+    assert said(data)[0] == 0
+    other = load_public_key(write_keys(tmp_path)[1])
+    status, text = said(data, key=other)
+    assert (status, text.count("signed with the key")) == (3, len(names(data)))
+    unsigned = tmp_path / "unsigned"
+    unsigned.mkdir()
+    record(unsigned)
+    status, text = said(unsigned, key=other)
+    assert (status, text.count("no signature in this file")) == (3, len(names(unsigned)))
+
+
+def test_a_file_closed_after_a_crash_is_signed_then(tmp_path: Path) -> None:
+    private, public = write_keys(tmp_path)
+    data = tmp_path / "data"
+    data.mkdir()
+    record(data, signer=Signer.load(private))
+    path = recordings(data)[-1][1]
+    path.with_name(path.name + ".active").write_bytes(path.read_bytes()[:-3000])
+    path.unlink()
+    Recorder(data, [], [], signer=Signer.load(private)).close_torn()
+    status, text = said(data, key=load_public_key(public))
+    assert status == 0, text
+    assert text.count("unsealed") == 1
+
+
+def test_every_signed_byte_counts_though_the_sums_fit(tmp_path: Path) -> None:
+    private, public = write_keys(tmp_path)
+    data = tmp_path / "data"
+    data.mkdir()
+    record(data, signer=Signer.load(private))
+    path = recordings(data)[0][1]
+    whole, key = path.read_bytes(), load_public_key(public)
+    signature = next(r for r in records(whole) if r.name == "Metadata" and b"fieldcal.signature" in r.body)
+    at = whole.index(b"file_sequence")
+    forgeries = {
+        "signed byte": (whole[:at] + b"F" + whole[at + 1 :], "its signature is of other bytes"),
+        "signature": (
+            whole[: signature.end - 9] + bytes([whole[signature.end - 9] ^ 1]) + whole[signature.end - 8 :],
+            "its signature is not the key's",
+        ),
+        "length": (whole.replace(b"bytes\x04", b"bytes\x05"), "signature"),
+    }
+    for name, (forged, words) in forgeries.items():
+        if forged == whole:
+            continue
+        path.write_bytes(with_sums(forged))
+        status, text = said_of([path], key=key)
+        assert status == 3, name
+        assert words in text, (name, text)
+    path.write_bytes(with_sums(whole))
+    assert said_of([path], key=key)[0] == 0
+
+
+@pytest.mark.parametrize("content", ["", "-----BEGIN PRIVATE KEY-----\nrubbish\n-----END PRIVATE KEY-----\n"])
+def test_a_file_that_is_no_key_is_one_clear_line(tmp_path: Path, content: str) -> None:
+    path = tmp_path / "key"
+    path.write_text(content)
+    with pytest.raises(KeyFileError, match=f"^{path}: not a private key in PEM without a password$"):
+        Signer.load(path)
+    with pytest.raises(KeyFileError, match=f"^{path}: not a public key in PEM$"):
+        load_public_key(path)
+    with pytest.raises(KeyFileError, match="cannot be read: No such file"):
+        Signer.load(tmp_path / "gone")
+    other = X25519PrivateKey.generate().private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+    path.write_bytes(other)
+    with pytest.raises(KeyFileError, match="but not of Ed25519"):
+        Signer.load(path)
+
+
+def test_the_command_refuses_what_is_no_key(tmp_path: Path) -> None:
+    (tmp_path / "key").write_text("x")
+    done = CliRunner().invoke(audit, [str(tmp_path), "--public-key", str(tmp_path / "key")], standalone_mode=False)
+    assert done.return_value == 2
+    assert done.stderr == f"{tmp_path / 'key'}: not a public key in PEM\n"
