@@ -12,6 +12,7 @@ from agent.delivery.keys import result_key
 
 REPLIES_MAX = 500  # per query, about 1 MB; who asks goes on from the last number until nothing comes
 NOTHING = b"nothing to tell"
+REMOVED = "no longer kept: some results up to "  # and the number; retention was faster than who asks
 
 _log = logging.getLogger(__name__)
 _Queryable = zenoh.Queryable[zenoh.Handler[zenoh.Query]]
@@ -23,13 +24,16 @@ def answer_queries(queryable: _Queryable, gateway: str, store: Path) -> None:
     `<keys>`: the newest result of each channel that matches; a calibration only where it is in force.
     `<keys>?after=<sequence>`: the first REPLIES_MAX results after that number, in order. Several come on one key, so
     the query must be sent with consolidation NONE, else Zenoh keeps the last of each key.
+    Where retention deleted some of those, an error REMOVED comes before the results.
     Where there is none the answer is the error NOTHING, since silence also comes from a gateway that is not there.
     """
     for query in queryable:
         with query:  # a query that stays alive makes the one who asked wait for its whole time
             try:
-                records = _answers(query, gateway, store)
-                if not records:
+                records, removed = _answers(query, gateway, store)
+                if removed:
+                    query.reply_err(f"{REMOVED}{removed}")
+                elif not records:
                     query.reply_err(NOTHING)
                 for record in records:
                     query.reply(
@@ -43,7 +47,8 @@ def answer_queries(queryable: _Queryable, gateway: str, store: Path) -> None:
                 _log.warning("a query could not be answered: %s", error)
 
 
-def _answers(query: zenoh.Query, gateway: str, store: Path) -> list[Record]:
+def _answers(query: zenoh.Query, gateway: str, store: Path) -> tuple[list[Record], int]:
+    """The records, and the number up to which some that were asked for are gone; 0 where none is."""
     after = query.parameters.get("after")
     with History(store) as history:
         wanted = [
@@ -52,7 +57,8 @@ def _answers(query: zenoh.Query, gateway: str, store: Path) -> list[Record]:
             if query.key_expr.intersects(result_key(gateway, sensor, what))
         ]
         if after is None:
-            return [record for record in history.latest() if (record.sensor, record.what) in wanted]
+            return [record for record in history.latest() if (record.sensor, record.what) in wanted], 0
         if not after.isascii() or not after.isdigit() or int(after) >= 2**63:
             raise ValueError(f"after={after}: not a sequence number")
-        return history.after(int(after), wanted, limit=REPLIES_MAX)
+        gone = [r.up_to for r in history.removed() if (r.sensor, r.what) in wanted and r.up_to > int(after)]
+        return history.after(int(after), wanted, limit=REPLIES_MAX), max(gone, default=0)

@@ -5,17 +5,20 @@ from __future__ import annotations
 import json
 import queue
 import threading
+import time
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Self
 
 import msgspec
 import zenoh
 from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
-from agent.delivery.answers import NOTHING
+from agent.delivery import memory as memory_file
+from agent.delivery.answers import NOTHING, REMOVED
 from agent.delivery.keys import PREFIX, Address, narrow, parse_key
 from agent.delivery.session import session_config
 
@@ -23,6 +26,7 @@ INBOX = 1000  # samples that may wait, or be held; what is dropped is fetched fr
 ANSWER_S = 5.0  # for one query
 RETRY_S = 1.0  # between questions to a gateway whose results are held because something before them is missing
 CONNECT_S = 10.0
+SAVE_S = 1.0  # while results come without a pause; where one has to be waited for, at once
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +38,8 @@ class Received:
     sequence: int
     fields: dict[str, Any]
     previous: int | None  # the result that the gateway put before this one; None in an answer to a query
+    # Some results after the last one known, up to this number, are no longer kept: whoever wants them came too late.
+    removed_up_to: int | None = None
 
 
 class Consumer:
@@ -44,14 +50,25 @@ class Consumer:
     after. A result whose number before it is not the last one known shows that something is missing: then the gateway's
     store is asked with `?after=`, and until it answers what came later is held. After a cut the newest results come
     again by themselves (history and recovery of the advanced subscriber), so that this is noticed at once.
+    With a `memory`, a file that is made if need be, it goes on after its own restart where it was: a result counts as
+    done when the next one is asked for. Within a second of a crash results may come again, with the same number.
     `close` may be called from another thread than the one that iterates.
-    Raises EndpointError or ConnectionError.
+    Raises EndpointError, ConnectionError or MemoryFileError; iterating, OSError where the memory cannot be written.
     """
 
     def __init__(
-        self, endpoints: Sequence[str], key: str = f"{PREFIX}/**", last_sequence: Mapping[str, int] | None = None
+        self,
+        endpoints: Sequence[str],
+        key: str = f"{PREFIX}/**",
+        last_sequence: Mapping[str, int] | None = None,
+        memory: Path | None = None,
     ) -> None:
-        self.last_sequence = dict(last_sequence or {})
+        self._memory = memory
+        self._done = memory_file.load(memory) if memory is not None else {}
+        self._saved_s = time.monotonic()
+        self._saved = dict(self._done)
+        self._told: dict[str, int] = {}  # up to where results of a source are known to be removed
+        self.last_sequence = self._done | dict(last_sequence or {})
         self._key = key
         self._inbox: queue.Queue[zenoh.Sample | None] = queue.Queue(maxsize=INBOX)  # None: closed
         self._held: dict[str, deque[Received]] = {}
@@ -75,7 +92,15 @@ class Consumer:
         threading.Thread(target=self._take_samples, args=(subscriber,), name="consumer", daemon=True).start()
 
     def __iter__(self) -> Iterator[Received]:
+        try:
+            yield from self._results()
+        finally:
+            self._remember()
+
+    def _results(self) -> Iterator[Received]:
         while True:
+            if self._inbox.empty():
+                self._remember()
             try:
                 sample = self._inbox.get(timeout=RETRY_S if self._held else None)
             except queue.Empty:
@@ -119,7 +144,10 @@ class Consumer:
         selector = narrow(self._key, source)
         known = self.last_sequence.get(source)
         while True:
-            results, answered = self._get(selector if known is None else f"{selector}?after={known}")
+            results, answered, removed = self._get(selector if known is None else f"{selector}?after={known}")
+            if results and removed > self._told.get(source, 0):
+                self._told[source] = removed
+                results[0] = replace(results[0], removed_up_to=removed)
             yield from self._deliver(*results)
             if known is None or known == self.last_sequence[source]:
                 break
@@ -133,21 +161,40 @@ class Consumer:
             if result.sequence > self.last_sequence.get(result.address.source, -1):
                 self.last_sequence[result.address.source] = result.sequence
                 yield result
+                self._done[result.address.source] = result.sequence
+                if time.monotonic() - self._saved_s > SAVE_S:
+                    self._remember()
 
-    def _get(self, selector: str) -> tuple[list[Received], bool]:
-        """The results in order, and whether anybody answered at all."""
+    def _remember(self) -> None:
+        if self._memory is not None and self._done != self._saved:
+            memory_file.save(self._memory, self._done)
+            self._saved, self._saved_s = dict(self._done), time.monotonic()
+
+    def _get(self, selector: str) -> tuple[list[Received], bool, int]:
+        """The results in order, whether anybody answered at all, and up to which number some are no longer kept."""
         with self._mutex:
             if self._closed:
-                return [], False
+                return [], False, 0
             # Without consolidation, else only the last result of each key would come.
             replies = self._session.get(selector, consolidation=zenoh.ConsolidationMode.NONE, timeout=ANSWER_S)
-        answered = False
+        answered, removed = False, 0
         results = []
         for reply in replies:
             if reply.ok:
                 results.append(_received(reply.ok))
-            answered |= reply.err is None or reply.err.payload.to_bytes() == NOTHING
-        return sorted((r for r in results if r is not None), key=lambda r: r.sequence), answered
+            gone = _removed(reply.err) if reply.err else 0
+            removed = max(removed, gone)
+            answered |= reply.err is None or gone > 0 or reply.err.payload.to_bytes() == NOTHING
+        return sorted((r for r in results if r is not None), key=lambda r: r.sequence), answered, removed
+
+
+def _removed(error: zenoh.ReplyError) -> int:
+    """The number in an answer REMOVED; 0 in any other."""
+    try:
+        number = error.payload.to_string().removeprefix(REMOVED)
+    except zenoh.ZError:
+        return 0
+    return int(number) if number.isascii() and number.isdigit() and len(number) < 19 else 0
 
 
 def _received(sample: zenoh.Sample) -> Received | None:

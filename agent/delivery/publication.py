@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import logging
 import threading
 from collections import deque
@@ -72,6 +73,8 @@ class Publisher:
 
     def start(self) -> None:
         """Begin, in a thread of its own."""
+        # A thread that comes back from Zenoh while the interpreter shuts down aborts it: who forgets to close, does then.
+        atexit.register(self.close)
         self._thread.start()
 
     def publish(self, record: Record) -> None:
@@ -94,6 +97,7 @@ class Publisher:
         False: the thread is still held by a frozen router. The process must then end by os._exit: a thread that comes
         back from Zenoh while the interpreter shuts down aborts it.
         """
+        atexit.unregister(self.close)
         self._stop.set()
         self._wake.set()
         if self._thread.is_alive():
