@@ -109,7 +109,7 @@ class Record:
         """The payload decoded. Raises StoreError where it is not JSON."""
         try:
             return msgspec.json.decode(self.payload, type=dict[str, Any])
-        except msgspec.DecodeError as error:
+        except (msgspec.DecodeError, UnicodeDecodeError) as error:
             raise StoreError(f"result {self.sequence} cannot be read: {error}") from None
 
     @property

@@ -30,7 +30,7 @@ def load(path: Path) -> dict[str, int]:
         return {}
     except OSError as error:
         raise MemoryFileError(f"{path}: cannot be read: {error.strerror}") from None
-    except msgspec.DecodeError as error:
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise MemoryFileError(f"{path}: not what a consumer remembers: {error}") from None
     if content.crc32 != _crc32(content.last_sequence):
         raise MemoryFileError(f"{path}: damaged: its CRC does not fit; without the file everything comes again")

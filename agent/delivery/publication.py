@@ -73,7 +73,7 @@ class Publisher:
 
     def start(self) -> None:
         """Begin, in a thread of its own."""
-        # A thread that comes back from Zenoh while the interpreter shuts down aborts it: who forgets to close, does then.
+        # For who forgets to close: a thread that comes back from Zenoh while the interpreter shuts down aborts it.
         atexit.register(self.close)
         self._thread.start()
 

@@ -42,32 +42,44 @@ def keep_results(section: Results) -> KeepResults:
     return KeepResults(section.keep_days, most, section.waiting_days)
 
 
+@dataclass(frozen=True, slots=True)
+class _Result:
+    sequence: int
+    sensor: str
+    what: str
+    identity: str
+    t_utc_ns: int
+
+
 class Sweep:
     """Deletes with every commit, in its transaction; counts what it deleted in the table `removed`."""
 
     def __init__(self, keep: KeepResults) -> None:
         self._keep = keep
         self._looked_at = 0  # up to this number nothing is left but what stays
+        self._staying: list[_Result] = []  # old, but the newest of their kind when they were looked at
 
     def run(self, connection: sqlite3.Connection, new: Sequence[Record], published: int) -> None:
         """Delete the oldest for the sake of `new` ones. Raises sqlite3.Error, DamagedRow."""
         if self._keep == FOR_EVER or not new:
             return
+        self._staying = [result for result in self._staying if not _delete(connection, result)]
         now_ns, too_large = new[-1].t_utc_ns, self._too_large(connection)
         rows = connection.execute(
             "SELECT sequence, sensor, what, identity, t_utc_ns FROM results"
             " WHERE sequence > ? ORDER BY sequence LIMIT ?",
             (self._looked_at, FOR_EACH_NEW * len(new)),
         ).fetchall()
-        for sequence, sensor, what, identity, t_utc_ns in rows:
-            age_days = (now_ns - t_utc_ns) / DAY_NS
-            done = sequence <= published and (too_large or _beyond(age_days, self._keep.days))
+        for row in rows:
+            result = _Result(*row)
+            age_days = (now_ns - result.t_utc_ns) / DAY_NS
+            done = result.sequence <= published and (too_large or _beyond(age_days, self._keep.days))
             if not done and not _beyond(age_days, self._keep.waiting_days):
                 return
-            if not _stays(connection, sequence, sensor, what, identity):
-                connection.execute("DELETE FROM results WHERE sequence = ?", (sequence,))
-                _count(connection, sensor, what, sequence)
-            self._looked_at = sequence  # where the transaction fails, these are looked at again after a restart
+            if not _delete(connection, result):
+                self._staying.append(result)
+            # Where the transaction fails, what was deleted is looked at again after a restart.
+            self._looked_at = result.sequence
 
     def _too_large(self, connection: sqlite3.Connection) -> bool:
         if self._keep.bytes is None:
@@ -82,21 +94,27 @@ def _beyond(age_days: float, limit_days: float | None) -> bool:
     return limit_days is not None and age_days > limit_days
 
 
-def _stays(connection: sqlite3.Connection, sequence: int, sensor: str, what: str, identity: str) -> bool:
+def _delete(connection: sqlite3.Connection, result: _Result) -> bool:
+    """Delete it, unless it is the newest of its channel, a calibration the newest of its device."""
     newer = "SELECT 1 FROM results WHERE sensor = ? AND what = ? AND sequence > ? LIMIT 1"
-    values: tuple[object, ...] = (sensor, what, sequence)
-    if what == "calibration":
+    values: tuple[object, ...] = (result.sensor, result.what, result.sequence)
+    if result.what == "calibration":
         newer = (
             "SELECT 1 FROM results WHERE sensor = ? AND what = 'calibration' AND sequence > ? AND identity = ? LIMIT 1"
         )
-        values = (sensor, sequence, identity)
-    return connection.execute(newer, values).fetchone() is None
+        values = (result.sensor, result.sequence, result.identity)
+    if connection.execute(newer, values).fetchone() is None:
+        return False
+    connection.execute("DELETE FROM results WHERE sequence = ?", (result.sequence,))
+    _count(connection, result.sensor, result.what, result.sequence)
+    return True
 
 
 def _count(connection: sqlite3.Connection, sensor: str, what: str, sequence: int) -> None:
     where = "SELECT sensor, what, count, up_to, crc FROM removed WHERE sensor = ? AND what = ?"
     row = connection.execute(where, (sensor, what)).fetchone()
-    new = (sensor, what, (checked(row)[2] if row else 0) + 1, sequence)
+    _, _, count, up_to = checked(row) if row else ("", "", 0, 0)
+    new = (sensor, what, count + 1, max(up_to, sequence))
     connection.execute(
         "INSERT OR REPLACE INTO removed (sensor, what, count, up_to, crc) VALUES (?, ?, ?, ?, ?)", (*new, row_crc(*new))
     )
