@@ -91,10 +91,15 @@ def delete(directory: Path, pruned: Pruned) -> None:
     _log.info("recordings %d to %d deleted", pruned.first_file, pruned.last_file)
 
 
+def free_bytes(directory: Path) -> int:
+    """What is free for us in the file system. Raises OSError."""
+    space = os.statvfs(directory)
+    return space.f_bavail * space.f_frsize
+
+
 def _excess(directory: Path, keep: KeepFiles, total: int) -> int:
     """Bytes that must go."""
-    space = os.statvfs(directory)
-    excess = keep.least_free_bytes - space.f_bavail * space.f_frsize
+    excess = keep.least_free_bytes - free_bytes(directory)
     return max(excess, total - keep.bytes) if keep.bytes is not None else excess
 
 

@@ -18,7 +18,7 @@ from agent.recording.files import RecordingFile, newest, recordings, sync_direct
 from agent.recording.messages import EVENTS_TOPIC, RESULT_TOPICS, encode, topic_of
 from agent.recording.pruned_ranges import PRUNED_METADATA, Ranges, from_metadata, merged, to_metadata
 from agent.recording.repair import close_torn
-from agent.recording.retention import FOR_EVER, KeepFiles, delete, due
+from agent.recording.retention import FOR_EVER, KeepFiles, delete, due, free_bytes
 from agent.recording.scan import metadata_of
 from agent.recording.signing import Signer
 
@@ -29,7 +29,9 @@ MAX_AGE_S = 3600.0  # s of event time; what an audit loses when a file is damage
 # s of event time after a failed file, doubled with each that fails; a full disk is asked again, not hammered.
 RETRY_S = 10.0
 RETRY_MAX_NS = 320_000_000_000
-LEAST_ROOM = 1 << 20  # bytes free below which no file is begun: it would hold its snapshot and nothing else
+# Bytes free that are left to the store: results are worth more than what they came from. A thousand of them, and the
+# store's log. A file is begun only where there is twice as much: otherwise it would hold a snapshot and nothing else.
+LEAST_ROOM = 4 << 20
 
 
 class Ledger(Protocol):
@@ -174,6 +176,9 @@ class Recorder:
                 self._file.sync()
                 if self._now_ns - self._since_ns > RETRY_MAX_NS:
                     self._failures = 0
+                if free_bytes(self._directory) < LEAST_ROOM:
+                    self.close()
+                    self._fail(f"{os.strerror(errno.ENOSPC)} ({self._directory})")
         except OSError as error:
             self._fail(f"{error.strerror or error} ({self.path})")
 
@@ -191,8 +196,7 @@ class Recorder:
 
     def _begin(self, start: RunStart) -> None:
         self.close()
-        space = os.statvfs(self._directory)
-        if space.f_bavail * space.f_frsize < LEAST_ROOM:
+        if free_bytes(self._directory) < 2 * LEAST_ROOM:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self._directory))
         if self._failures:
             close_torn(self._directory, self._signer)  # the file that was given up: the next one names its SHA-256

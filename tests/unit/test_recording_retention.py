@@ -13,7 +13,7 @@ import pytest
 from agent.events import Pruned
 from agent.recording.files import recordings
 from agent.recording.reading import RecordingReader, open_recording
-from agent.recording.retention import KeepFiles, due
+from agent.recording.retention import KeepFiles, due, free_bytes
 from agent.recording.writer import Recorder
 from tests.replay.stand_in import CONFIG, EPOCH_NS, SECOND, StandIn, record_run, run_start
 
@@ -80,9 +80,8 @@ def test_bytes_are_kept_to_by_the_oldest_files(directory: Path) -> None:
 
 
 def test_free_space_is_made(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    space = os.statvfs(directory)
-    free = space.f_bavail * space.f_frsize
-    monkeypatch.setattr(os, "statvfs", lambda _: space)
+    free = free_bytes(directory)
+    monkeypatch.setattr("agent.recording.retention.free_bytes", lambda _: free)
     oldest = recordings(directory)[0][1].stat().st_size
     assert due(directory, KeepFiles(least_free_bytes=free), None, "") is None
     assert span(due(directory, KeepFiles(least_free_bytes=free + oldest), None, "")) == (1, 1)
@@ -153,8 +152,7 @@ def test_a_file_that_somebody_began_to_read_stays_though_its_deletion_was_said(d
 
 
 def test_where_nothing_can_be_recorded_room_is_made_and_said_later(directory: Path) -> None:
-    limits = os.statvfs(directory)
-    with begun(directory, KeepFiles(least_free_bytes=limits.f_bavail * limits.f_frsize + (1 << 30))) as recorder:
+    with begun(directory, KeepFiles(least_free_bytes=free_bytes(directory) + (1 << 30))) as recorder:
         recorder._fail("No space left on device")
         pruned = recorder.pruning
         assert span(pruned) == (1, 7)  # file 7 was given up
