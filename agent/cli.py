@@ -19,6 +19,8 @@ COMMANDS = {
     "report": ("agent.report", "Figures and one page of a calibration."),
     "sensors": ("agent.sensors", "Drivers with their options."),
     "probe": ("agent.probe", "What answers on this machine's buses and ports, with self-test."),
+    "command": ("agent.commanding.command", "A signed command to an agent: pose, hold, accept, rollback."),
+    "keys": ("agent.keys.command", "Certificates for Zenoh over TLS, and keys that sign commands."),
     "router": ("agent.delivery.router", "A Zenoh router, for tests and small sites."),
     "simulate": ("agent.simulate", "Serve virtual devices on pseudo-terminals, or write a recording with known truth."),
     "check": ("agent.check", "All faults of a configuration at once."),

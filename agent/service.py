@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from agent import __version__
+from agent.commanding.reception import Reception
 from agent.config import Config
 from agent.delivery.history import History, Memory, Record, StoreError
 from agent.delivery.publication import Publisher
@@ -71,8 +72,9 @@ class Service:
             signer=signer,
         )
         self._recorder.close_torn()
-        self._publisher = self._publication()
         events = EventQueue(len(config.devices))
+        self._reception = self._command_reception(events)
+        self._publisher = self._publication()
         readers = [Reader(d.name, _sensor(d.name, d.driver, d.options), events) for d in config.devices]
         self._begin()
         writer = RecordingThread(self._recorder, self._deliver, flush_s=config.recording.flush_s)
@@ -82,6 +84,8 @@ class Service:
                 reader.start()
             self._loop(events, writer, duration_s)
         finally:
+            if self._reception is not None:
+                self._reception.close()
             for reader in readers:
                 reader.stop()
             deadline = time.monotonic() + READER_STOP_S
@@ -97,9 +101,24 @@ class Service:
         if not self._config.zenoh.enabled:
             return None
         gateway = self._config.gateway
-        publisher = Publisher(gateway.site, gateway.name, self._config.zenoh.connect, self._store)
+        zenoh = self._config.zenoh
+        publisher = Publisher(
+            gateway.site,
+            gateway.name,
+            zenoh.connect,
+            self._store,
+            tls=zenoh.tls.files if zenoh.tls else None,
+            serve=self._reception.serve if self._reception else None,
+        )
         publisher.start()
         return publisher
+
+    def _command_reception(self, events: EventQueue) -> Reception | None:
+        if not self._config.commands.enabled:
+            return None
+        return Reception(
+            self._config, self._data_dir, self._store.path, lambda command: events.put(command.sensor, command)
+        )
 
     def _begin(self) -> None:
         self._origin_ns = time.monotonic_ns()

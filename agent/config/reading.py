@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
+from agent.config.sinks import Tls
 from agent.config.whole import Config
+from agent.delivery.tls import tls_faults
 from hw.sensor import DeviceError, load_driver
 
 LARGEST_FILE = 4 << 20  # bytes; a day of a pose each second has as many
+# Sections of ours go four deep. The parser takes quadratic time for a long dotted key: hours for 4 MB of it.
+DEEPEST_KEY = 16
+LONGEST_LIST = 86_400  # a pose each second of a day; each fault in a list costs 2 kB and 25 us
+SHOWN_FAULTS = 100
+SHOWN_CHARACTERS = 100  # of a value or a path in a fault
+_PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+"""
+_LONG_KEY = re.compile(rf"(?<![\w.-]){_PART}(?:\.[ \t]*+{_PART}){{{DEEPEST_KEY},}}+")
 
 
 class ConfigError(Exception):
@@ -31,10 +42,17 @@ def load_config(path: Path) -> Config:
         raise ConfigError([f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}"]) from None
     if len(text) > LARGEST_FILE:
         raise ConfigError([f"{path}: more than {LARGEST_FILE} bytes, no configuration"])
+    if (deep := _LONG_KEY.search(text)) is not None:
+        line = text.count("\n", 0, deep.start()) + 1
+        raise ConfigError([f"{path}: line {line}: a key of more than {DEEPEST_KEY} parts: {deep[0][:40]}..."])
     try:
         raw = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except ValueError as error:  # TOMLDecodeError is one, and so is an integer of thousands of digits
         raise ConfigError([f"{path}: not TOML: {error}"]) from None
+    except RecursionError:
+        raise ConfigError([f"{path}: not TOML of ours: nested too deep"]) from None
+    if longest := [f"{path}: {line}" for line in _long_lists(raw, "")]:
+        raise ConfigError(longest)
     return parse_config(raw, str(path))
 
 
@@ -50,9 +68,20 @@ def parse_config(raw: dict[str, Any], origin: str) -> Config:
     for i, device in enumerate(devices if isinstance(devices, list) else []):
         if isinstance(device, dict):
             faults += [f"{origin}: devices.{i}.{line}" for line in _driver_faults(device)]
+    faults += [f"{origin}: zenoh.tls.{line}" for line in _tls_faults(raw.get("zenoh"))]
     if faults or config is None:
-        raise ConfigError(faults)
+        more = len(faults) - SHOWN_FAULTS
+        raise ConfigError(faults[:SHOWN_FAULTS] + ([f"{origin}: and {more} faults more"] if more > 0 else []))
     return config
+
+
+def _long_lists(value: Any, path: str) -> Iterator[str]:
+    if isinstance(value, list) and len(value) > LONGEST_LIST:
+        yield f"{_short(path)}: a list of {len(value)}, more than {LONGEST_LIST}"
+    elif isinstance(value, (dict, list)):
+        for name, item in value.items() if isinstance(value, dict) else enumerate(value):
+            if isinstance(item, (dict, list)):
+                yield from _long_lists(item, f"{path}.{name}" if path else str(name))
 
 
 def _driver_faults(device: dict[str, Any]) -> list[str]:
@@ -68,6 +97,15 @@ def _driver_faults(device: dict[str, Any]) -> list[str]:
     return []
 
 
+def _tls_faults(zenoh: Any) -> list[str]:
+    tls = zenoh.get("tls") if isinstance(zenoh, dict) else None
+    try:
+        files = Tls.model_validate(tls).files
+    except ValidationError:
+        return []  # the section's own check names it, if it is there at all
+    return tls_faults(files)
+
+
 def _fault_lines(error: ValidationError) -> list[str]:
     lines, faults = [], error.errors()
     places = [fault["loc"] for fault in faults]
@@ -81,7 +119,17 @@ def _fault_lines(error: ValidationError) -> list[str]:
         value = fault.get("input")
         # A whole section as "the offending value" would bury the message.
         whole = isinstance(value, (dict, BaseModel, list, tuple)) or fault["type"] == "missing"
-        shown = "" if whole else f", not {value!r}"
+        shown = "" if whole else f", not {_shown(value)}"
         message = fault["msg"].removeprefix("Value error, ")
-        lines.append(f"{path}: {message}{shown}" if path else message)
+        lines.append(f"{_short(path)}: {message}{shown}" if path else message)
     return lines
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, int) and value.bit_length() > 64:
+        return f"a number of {value.bit_length()} bits"  # Python refuses to write one of thousands of digits
+    return _short(repr(value))
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= SHOWN_CHARACTERS else f"{text[:SHOWN_CHARACTERS]}..."

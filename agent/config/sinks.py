@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import ByteSize, Field
+from pydantic import ByteSize, Field, model_validator
 
 from agent.config.section import Endpoint, Section
+from agent.delivery.tls import TlsFiles
 
 
 class Recording(Section):
@@ -35,8 +36,28 @@ class Results(Section):
     waiting_days: Annotated[float | None, Field(gt=0, description="of what no router has taken")] = 365.0
 
 
+class Tls(Section):
+    """Certificates for endpoints tls/..: PEM files, made by `fieldcal keys`. Paths only, no secret."""
+
+    ca: str
+    certificate: str
+    key: str
+
+    @property
+    def files(self) -> TlsFiles:
+        """The same, for a session."""
+        return TlsFiles(self.ca, self.certificate, self.key)
+
+
 class Zenoh(Section):
     """How results leave."""
 
     enabled: bool = True
     connect: tuple[Endpoint, ...] = ("tcp/127.0.0.1:7447",)
+    tls: Tls | None = None
+
+    @model_validator(mode="after")
+    def _tls_for_tls(self) -> Zenoh:
+        if self.tls is None and any(endpoint.startswith("tls/") for endpoint in self.connect):
+            raise ValueError("connect: an endpoint tls/.. needs the section zenoh.tls")
+        return self

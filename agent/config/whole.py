@@ -7,6 +7,7 @@ from typing import Annotated
 from pydantic import Field, model_validator
 
 from agent.config.channel import Channel
+from agent.config.commands import Commands
 from agent.config.devices import Device, Gateway
 from agent.config.section import Section
 from agent.config.sinks import Recording, Results, Zenoh
@@ -16,11 +17,13 @@ class Config(Section):
     """All of it."""
 
     gateway: Gateway = Gateway()
-    devices: Annotated[tuple[Device, ...], Field(min_length=1)]
-    channels: Annotated[tuple[Channel, ...], Field(min_length=1)]
+    # A gateway reads a handful; a thousand threads are a typing error.
+    devices: Annotated[tuple[Device, ...], Field(min_length=1, max_length=100)]
+    channels: Annotated[tuple[Channel, ...], Field(min_length=1, max_length=100)]
     recording: Recording = Recording()
     results: Results = Results()
     zenoh: Zenoh = Zenoh()
+    commands: Commands = Commands()
 
     @model_validator(mode="after")
     def _names(self) -> Config:
@@ -38,4 +41,8 @@ class Config(Section):
                 raise ValueError(f"channels.{i}: a sensor cannot be its own reference")
             if sensors.count(channel.sensor) > 1:
                 raise ValueError(f"channels.{i}.sensor: {channel.sensor!r} has more than one channel")
+        for i, key in enumerate(self.commands.keys):
+            for sensor in key.sensors:
+                if sensor != "*" and sensor not in sensors:
+                    raise ValueError(f"commands.keys.{i}.sensors: {sensor!r} has no channel")
         return self

@@ -9,18 +9,19 @@ import time
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
-import msgspec
 import zenoh
 from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
 from agent.delivery import memory as memory_file
 from agent.delivery.answers import NOTHING, REMOVED
-from agent.delivery.keys import PREFIX, Address, narrow, parse_key
+from agent.delivery.keys import PREFIX, narrow
+from agent.delivery.received import Received, receive
 from agent.delivery.session import session_config
+from agent.delivery.tls import TlsFiles
 
 INBOX = 1000  # samples that may wait, or be held; what is dropped is fetched from the gateway's store
 ANSWER_S = 5.0  # for one query
@@ -29,17 +30,7 @@ CONNECT_S = 10.0
 SAVE_S = 1.0  # while results come without a pause; where one has to be waited for, at once
 
 
-@dataclass(frozen=True, slots=True)
-class Received:
-    """One result. `fields` is its JSON: the fields of agent.events, and `recorded`."""
-
-    key: str
-    address: Address
-    sequence: int
-    fields: dict[str, Any]
-    previous: int | None  # the result that the gateway put before this one; None in an answer to a query
-    # Some results after the last one known, up to this number, are no longer kept: whoever wants them came too late.
-    removed_up_to: int | None = None
+__all__ = ["Consumer", "Received"]
 
 
 class Consumer:
@@ -62,6 +53,8 @@ class Consumer:
         key: str = f"{PREFIX}/**",
         last_sequence: Mapping[str, int] | None = None,
         memory: Path | None = None,
+        *,
+        tls: TlsFiles | None = None,
     ) -> None:
         self._memory = memory
         self._done = memory_file.load(memory) if memory is not None else {}
@@ -74,7 +67,7 @@ class Consumer:
         self._held: dict[str, deque[Received]] = {}
         self._mutex = threading.Lock()  # closing a session that another thread uses raises in that moment
         self._closed = False
-        config = session_config("client", connect=endpoints)
+        config = session_config("client", connect=endpoints, tls=tls)
         config.insert_json5("connect/timeout_ms", json.dumps(int(CONNECT_S * 1000)))
         self._open = ExitStack()
         try:
@@ -198,14 +191,5 @@ def _removed(error: zenoh.ReplyError) -> int:
 
 
 def _received(sample: zenoh.Sample) -> Received | None:
-    """None for what is no result of ours: others may put what they like on the same keys."""
-    address = parse_key(str(sample.key_expr))
-    try:
-        fields = msgspec.json.decode(sample.payload.to_bytes(), type=dict[str, Any])
-        previous = int(sample.attachment.to_string()) if sample.attachment else None
-    except (msgspec.DecodeError, ValueError, zenoh.ZError):
-        return None
-    sequence = fields.get("sequence")
-    if address is None or not isinstance(sequence, int):
-        return None
-    return Received(str(sample.key_expr), address, sequence, fields, previous)
+    attachment = sample.attachment.to_bytes() if sample.attachment is not None else None
+    return receive(str(sample.key_expr), sample.payload.to_bytes(), attachment)

@@ -256,6 +256,11 @@ class History:
             raise StoreError(f"{self._path}: {error}") from None
 
 
+def result_of(what: str, fields: dict[str, Any]) -> Result | None:
+    """The result whose fields these are; None where this version knows no such kind. Raises msgspec.ValidationError."""
+    return msgspec.convert(_null_to_nan(fields), _TYPES[what]) if what in _TYPES else None
+
+
 def _null_to_nan(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _null_to_nan(item) for key, item in value.items()}

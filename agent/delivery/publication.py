@@ -6,7 +6,7 @@ import atexit
 import logging
 import threading
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 
@@ -18,6 +18,7 @@ from agent.delivery.history import History, Record, StoreError
 from agent.delivery.keys import gateway_key, result_key
 from agent.delivery.session import session_config
 from agent.delivery.store import Store
+from agent.delivery.tls import TlsFiles
 
 BATCH = 100  # results read from the store at a time
 POLL_S = 0.2  # how soon a router that came back is seen; asking costs a microsecond
@@ -51,14 +52,24 @@ class Publisher:
     (`?after=<sequence>`, see agent.delivery.answers). Each sample's attachment is the number of the result put before
     it, "0" where that says nothing (put again at the start, or not kept by the store): a consumer whose last number is
     another has missed something, or must ask.
-    The session is a peer that does not listen; it connects when a router appears.
+    The session is a peer that does not listen; it connects when a router appears. `serve` is told of each new session.
     Raises ValueError on a bad name, EndpointError on a bad endpoint; after that no method raises.
     """
 
-    def __init__(self, site: str, gateway: str, connect: Sequence[str], store: Store) -> None:
+    def __init__(
+        self,
+        site: str,
+        gateway: str,
+        connect: Sequence[str],
+        store: Store,
+        *,
+        tls: TlsFiles | None = None,
+        serve: Callable[[zenoh.Session, ExitStack], None] | None = None,
+    ) -> None:
         self._key = gateway_key(site, gateway)
         self._endpoints = tuple(connect)
-        self._config = session_config("peer", connect=connect)
+        self._config = session_config("peer", connect=connect, tls=tls)
+        self._serve_more = serve
         self._store = store
         self._recent: deque[Record] = deque(maxlen=RECENT_MAX)
         self._blocks: deque[tuple[str, bytes]] = deque(maxlen=BLOCKS_MAX)
@@ -125,6 +136,8 @@ class Publisher:
                 name="answers",
                 daemon=True,
             ).start()
+            if self._serve_more is not None:
+                self._serve_more(session, open_things)
             token = session.liveliness().declare_token(f"{self._key}/alive")
             open_things.callback(token.undeclare)
             # Before the session closes: Zenoh is known to leak what belongs to a publisher otherwise.

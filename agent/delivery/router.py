@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import threading
 from pathlib import Path
@@ -13,6 +14,8 @@ import zenoh
 from agent.delivery.session import EndpointError, EndpointRefused, session_config
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+LARGEST_FILE = 1 << 20  # bytes; access rules for a thousand gateways have half of it
+DEEPEST = 32  # Zenoh's reader of JSON5 overflows its stack, and ends the process, some thousand brackets deep
 ANSWER_S = 0.5  # a router on the same machine answers within milliseconds
 
 
@@ -37,10 +40,7 @@ def open_router(listen: str | None, config_file: Path | None = None) -> tuple[ze
     """
     endpoint = listen or (None if config_file else DEFAULT_ENDPOINT)
     if config_file:
-        try:
-            config = zenoh.Config.from_file(config_file)
-        except zenoh.ZError as error:
-            raise EndpointError(f"{config_file}: {_first_line(error)}") from None
+        config = _read_config(config_file)
         config.insert_json5("mode", '"router"')
         if endpoint:
             config.insert_json5("listen/endpoints", json.dumps([endpoint]))
@@ -57,6 +57,27 @@ def open_router(listen: str | None, config_file: Path | None = None) -> tuple[ze
         if reply.ok:
             return session, list(json.loads(reply.ok.payload.to_string())["locators"])
     return session, [endpoint] if endpoint else []
+
+
+def _read_config(path: Path) -> zenoh.Config:
+    """JSON5, whatever the file is called. Raises EndpointError naming the file."""
+    try:
+        with open(path, "rb") as file:
+            text = file.read(LARGEST_FILE + 1).decode()
+    except (OSError, UnicodeDecodeError) as error:
+        raise EndpointError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    if len(text) > LARGEST_FILE:
+        raise EndpointError(f"{path}: more than {LARGEST_FILE} bytes, no configuration")
+    depth = deepest = 0
+    for bracket in re.findall(r"[\[{}\]]", text):
+        depth += 1 if bracket in "[{" else -1
+        deepest = max(deepest, depth)
+    if deepest > DEEPEST:
+        raise EndpointError(f"{path}: brackets {deepest} deep, more than {DEEPEST}")
+    try:
+        return zenoh.Config.from_json5(text)
+    except zenoh.ZError as error:
+        raise EndpointError(f"{path}: {_first_line(error)}") from None
 
 
 def _first_line(error: zenoh.ZError) -> str:
@@ -85,6 +106,8 @@ def router(listen: str | None, config_file: Path | None) -> int:
     except EndpointError as error:
         click.echo(f"fieldcal router: {error}", err=True)
         return 1 if isinstance(error, EndpointRefused) else 2
+    # From now on who is not let in, and why, is in our output; RUST_LOG asks for more (docs/security.md).
+    zenoh.init_log_from_env_or("warn")
     click.echo(f"router at {', '.join(endpoints)}")
     stop.wait()
     session.close()

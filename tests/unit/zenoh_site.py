@@ -14,6 +14,7 @@ import zenoh
 from agent.delivery.history import Record
 from agent.delivery.router import open_router
 from agent.delivery.session import session_config
+from tests.unit.results import calibration, status, window
 
 KEY = "fieldcal/v1/site/gw"
 
@@ -49,7 +50,8 @@ class Site:
 
 def record(sequence: int, what: str = "window", sensor: str = "mems", **fields: Any) -> Record:
     """A result; `fields` are added to its payload."""
-    payload = {"run_id": "run-1", "sequence": sequence, "sensor": sensor, "recorded": True, **fields}
+    whole = {"window": window, "calibration": calibration, "status": status}[what](sequence)
+    payload = {**msgspec.structs.asdict(whole), "sensor": sensor, "recorded": True, **fields}
     return Record(sequence, "run-1", sensor, what, msgspec.json.encode(payload), 1000 + sequence, True, "f.mcap")
 
 

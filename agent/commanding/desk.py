@@ -1,0 +1,187 @@
+"""Where commands arrive: each is checked, its counter kept, and it goes into the events; or it is refused, with why."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+
+from agent.commanding.allowance import Allowance
+from agent.commanding.arguments import VERBS, Accept, Arguments, Rollback, parse_arguments
+from agent.commanding.counters import Counters
+from agent.commanding.envelope import Order, parse_envelope
+from agent.commanding.refusal import Refused
+from agent.config.commands import CommandKey, Commands
+from agent.delivery.history import History, StoreError
+from agent.delivery.keys import CHUNK
+from agent.events import Command
+
+# A gateway that asks for the time is right within a second; one that just woke up gets half a minute.
+CLOCK_TOLERANCE_S = 30.0
+# A command is for now. One that is good for longer could be held back and sent when it does harm.
+LONGEST_VALIDITY_S = 600.0
+# Recorded refusals: 20 at once, then 8640 a day, 3 MB. All are counted.
+RECORDED_REFUSALS = (20, 0.1)
+# An operator needs no more; a script that ran wild, with a good key, fills no disk.
+TAKEN = (20, 1.0)
+LONGEST_REASON = 300  # characters
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What whoever sent a command is told."""
+
+    taken: bool
+    reason: str = ""
+
+    @property
+    def json(self) -> bytes:
+        """As it is sent."""
+        return msgspec.json.encode({"taken": self.taken, "reason": self.reason})
+
+
+class CommandDesk:
+    """Takes commands for the gateway `<site>/<gateway>`; `put` is told of each, also of the refused.
+
+    May be called from any thread.
+    """
+
+    def __init__(
+        self,
+        gateway: str,
+        sensors: list[str],
+        settings: Commands,
+        data_dir: Path,
+        store: Path,
+        put: Callable[[Command], None],
+    ) -> None:
+        self._gateway = gateway
+        self._sensors = frozenset(sensors)
+        self._rights = {key.id: key for key in settings.keys}
+        self._keys = {key.id: Ed25519PublicKey.from_public_bytes(key.public_bytes) for key in settings.keys}
+        self._store = store
+        self._put = put
+        self.counters = Counters(data_dir)
+        self._mutex = threading.Lock()
+        self._taken = Allowance(*TAKEN)
+        self._recorded = Allowance(*RECORDED_REFUSALS)
+        self._unrecorded = 0
+        self._counts: Counter[str] = Counter()
+
+    def counts(self) -> dict[str, int]:
+        """How many were taken, and refused by kind, since the start."""
+        with self._mutex:
+            return dict(sorted(self._counts.items()))
+
+    def receive(self, address: str, data: bytes) -> Answer:
+        """A command that came for `address`, `<sensor>/command/<verb>`; whatever the bytes are, there is an answer."""
+        with self._mutex:
+            try:
+                event = self._check(address, data)
+            except Refused as refused:
+                self._refuse(address, data, refused)
+                return Answer(False, str(refused)[:LONGEST_REASON])
+            self._counts["taken"] += 1
+            self._put(event)
+            return Answer(True)
+
+    def _check(self, address: str, data: bytes) -> Command:
+        envelope = parse_envelope(data)
+        key = self._keys.get(envelope.key_id)
+        if key is None:
+            raise Refused("unknown key", f"there is no key {envelope.key_id}")
+        order = envelope.open(key)
+        now_utc_ns = time.time_ns()
+        self._check_place(order, address)
+        self._check_right(order, self._rights[envelope.key_id])
+        _check_time(order, now_utc_ns)
+        last = self.counters.last(envelope.key_id)
+        if order.counter <= last:
+            raise Refused("replayed", f"its counter {order.counter} is not above {last}, the last of this key")
+        arguments = parse_arguments(order.verb, bytes(order.arguments))
+        kept = self._kept(order.sensor, arguments)
+        if not self._taken.passes(time.monotonic()):
+            raise Refused("too many", "too many commands, wait a few seconds")
+        try:
+            self.counters.take(envelope.key_id, order.counter)
+        except OSError as error:
+            raise Refused("not kept", f"its counter cannot be kept: {error.strerror}") from None
+        return Command(
+            sensor=order.sensor,
+            verb=order.verb,
+            t_monotonic_ns=time.monotonic_ns(),
+            t_utc_ns=now_utc_ns,
+            arguments_json=msgspec.json.encode(arguments).decode(),
+            calibration_json=kept,
+            key_id=envelope.key_id,
+            counter=order.counter,
+        )
+
+    def _check_place(self, order: Order, address: str) -> None:
+        if order.gateway != self._gateway:
+            raise Refused("other gateway", f"it is for {order.gateway!r}, this is {self._gateway}")
+        if f"{order.sensor}/command/{order.verb}" != address:
+            raise Refused("malformed", f"{order.verb} of {order.sensor!r} was sent to {address}")
+        if order.sensor not in self._sensors:
+            known = ", ".join(sorted(self._sensors))
+            raise Refused("no such sensor", f"there is no sensor {order.sensor!r}; there are {known}")
+
+    def _check_right(self, order: Order, rights: CommandKey) -> None:
+        if not rights.may(order.verb, order.sensor):
+            raise Refused("no right", f"key {rights.id} has no right to {order.verb} {order.sensor}")
+
+    def _kept(self, sensor: str, arguments: Arguments) -> str:
+        """The calibration that a rollback names, as JSON. Raises Refused where the store has not what is named."""
+        if not isinstance(arguments, (Accept, Rollback)):
+            return ""
+        what = "calibration" if isinstance(arguments, Rollback) else "estimate"
+        try:
+            with History(self._store) as history:
+                found = history.after(arguments.sequence - 1, [(sensor, what)], limit=1)
+        except StoreError as error:
+            raise Refused("not kept", str(error)) from None
+        if not found or found[0].sequence != arguments.sequence:
+            raise Refused("out of limits", f"{sensor} has no {what} with the number {arguments.sequence}")
+        return found[0].payload.decode() if what == "calibration" else ""
+
+    def _refuse(self, address: str, data: bytes, refused: Refused) -> None:
+        self._counts[refused.kind] += 1
+        sensor, _, verb = address.partition("/command/")
+        if not CHUNK.fullmatch(sensor) or verb not in VERBS or not self._recorded.passes(time.monotonic()):
+            self._unrecorded += 1
+            return
+        others = f" (and {self._unrecorded} more refused before, not recorded)" if self._unrecorded else ""
+        self._unrecorded = 0
+        self._put(
+            Command(
+                sensor=sensor,
+                verb=verb,
+                t_monotonic_ns=time.monotonic_ns(),
+                t_utc_ns=time.time_ns(),
+                key_id=_claimed_key(data),
+                refused=f"{refused.kind}: {refused}"[:LONGEST_REASON] + others,
+            )
+        )
+
+
+def _check_time(order: Order, now_utc_ns: int) -> None:
+    left_s = (order.expires_utc_ns - now_utc_ns) * 1e-9
+    if left_s < -CLOCK_TOLERANCE_S:
+        raise Refused("expired", f"it expired {-left_s:.0f} s ago by this gateway's clock")
+    if left_s > LONGEST_VALIDITY_S + CLOCK_TOLERANCE_S:
+        raise Refused(
+            "expired", f"it is good for {left_s:.0f} s by this gateway's clock, {LONGEST_VALIDITY_S:g} at most"
+        )
+
+
+def _claimed_key(data: bytes) -> str:
+    try:
+        return parse_envelope(data).key_id
+    except Refused:
+        return ""

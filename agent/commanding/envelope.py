@@ -1,0 +1,87 @@
+"""A command as bytes: a line with the key's name and the signature, then what was signed.
+
+    fieldcal-command-1 <key id> <Ed25519 signature, base64>\\n<body>
+
+Signed are `fieldcal-command-1 <key id>\\n<body>`. The body is one JSON object in UTF-8. Nothing of it is read before
+the signature holds, so that only who has a key reaches a parser; and since the bytes themselves are signed, no second
+spelling of the same command is one.
+"""
+
+from __future__ import annotations
+
+import re
+from base64 import b64decode, b64encode
+from dataclasses import dataclass
+from typing import Annotated
+
+import msgspec
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+
+from agent.commanding.arguments import Arguments, Verb
+from agent.commanding.refusal import Refused
+
+LARGEST = 4096  # bytes; the longest pose has 400
+_MARK = b"fieldcal-command-1"
+_HEAD = re.compile(_MARK + rb" ([A-Za-z0-9][A-Za-z0-9_.-]{0,62}) ([A-Za-z0-9+/]{86}==)\n")
+Int64 = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
+
+
+class Order(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What is signed. `gateway` is `<site>/<gateway>`; `counter` the sender's UTC in ns, above all before."""
+
+    gateway: str
+    sensor: str
+    verb: Verb
+    arguments: msgspec.Raw
+    counter: Int64
+    expires_utc_ns: Int64
+
+    @staticmethod
+    def of(gateway: str, sensor: str, verb: Verb, arguments: Arguments, counter: int, expires_utc_ns: int) -> Order:
+        """An order with these arguments."""
+        raw = msgspec.Raw(msgspec.json.encode(arguments))
+        return Order(
+            gateway=gateway, sensor=sensor, verb=verb, arguments=raw, counter=counter, expires_utc_ns=expires_utc_ns
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Envelope:
+    """The bytes taken apart; nothing in it is proven yet."""
+
+    key_id: str
+    signature: bytes
+    body: bytes
+
+    def open(self, key: Ed25519PublicKey) -> Order:
+        """What was signed with `key`. Raises Refused."""
+        try:
+            key.verify(self.signature, _signed(self.key_id, self.body))
+        except InvalidSignature:
+            raise Refused("bad signature", f"the signature is not that of key {self.key_id}") from None
+        try:
+            return msgspec.json.decode(self.body, type=Order)
+        except (msgspec.DecodeError, RecursionError) as error:
+            raise Refused("malformed", f"not a command: {error}") from None
+
+
+def seal(order: Order, key_id: str, key: Ed25519PrivateKey) -> bytes:
+    """The bytes to send."""
+    body = msgspec.json.encode(order)
+    signature = b64encode(key.sign(_signed(key_id, body)))
+    return b" ".join([_MARK, key_id.encode(), signature]) + b"\n" + body
+
+
+def parse_envelope(data: bytes) -> Envelope:
+    """Take the bytes apart without trusting them. Raises Refused."""
+    if len(data) > LARGEST:
+        raise Refused("too large", f"{len(data)} bytes, more than {LARGEST}")
+    head = _HEAD.match(data)
+    if head is None:
+        raise Refused("unsigned", "does not begin with a key's name and a signature")
+    return Envelope(head[1].decode(), b64decode(head[2]), data[head.end() :])
+
+
+def _signed(key_id: str, body: bytes) -> bytes:
+    return b" ".join([_MARK, key_id.encode()]) + b"\n" + body

@@ -1,0 +1,121 @@
+"""Commands on the gateway itself, through a socket in the data directory: the same bytes, the same checks.
+
+Who connects is told the gateway's `<site>/<gateway>` in a line, sends `<sensor>/command/<verb>` in a line and the
+command's bytes, shuts its side, and is answered in JSON.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Self
+
+from agent.commanding.desk import CommandDesk
+from agent.commanding.envelope import LARGEST
+
+SOCKET_NAME = "commands.sock"
+ANSWER_S = 5.0  # the agent answers within one fsync
+SENDER_S = 2.0  # who has not said all by then is not heard
+LINE_MAX = 256  # bytes; two names of 63 and what is between
+
+
+class LocalDoor:
+    """Listens in a data directory, one command after the other, until closed. Raises OSError where it cannot."""
+
+    def __init__(self, data_dir: Path, gateway: str, desk: CommandDesk) -> None:
+        self._gateway = gateway
+        self._desk = desk
+        self._path = data_dir / SOCKET_NAME
+        self._path.unlink(missing_ok=True)  # of a run that was killed; the store's lock keeps a second one out
+        self._socket = socket.socket(socket.AF_UNIX)
+        with _short(data_dir) as directory:
+            self._socket.bind(f"{directory}/{SOCKET_NAME}")
+        self._path.chmod(0o660)
+        self._socket.listen(4)
+        threading.Thread(target=self._serve, name="local commands", daemon=True).start()
+
+    def close(self) -> None:
+        """Listen no more."""
+        with suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)  # closing alone would not wake the thread that waits in accept
+        self._socket.close()
+        self._path.unlink(missing_ok=True)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _serve(self) -> None:
+        while True:
+            try:
+                connection, _ = self._socket.accept()
+            except OSError:
+                return
+            with connection, suppress(OSError):
+                connection.settimeout(SENDER_S)
+                connection.sendall(self._gateway.encode() + b"\n")
+                said = _read(connection, LINE_MAX + LARGEST + 1, SENDER_S)
+                address, _, data = said.partition(b"\n")
+                connection.sendall(self._desk.receive(address.decode(errors="replace"), data).json)
+
+
+class LocalAgent:
+    """The agent that uses a data directory. Raises ConnectionError where there is none that takes commands."""
+
+    def __init__(self, data_dir: Path) -> None:
+        self._socket = socket.socket(socket.AF_UNIX)
+        self._socket.settimeout(ANSWER_S)
+        try:
+            with _short(data_dir) as directory:
+                self._socket.connect(f"{directory}/{SOCKET_NAME}")
+            line = b""
+            while not line.endswith(b"\n") and len(line) < LINE_MAX:
+                if not (byte := self._socket.recv(1)):
+                    break
+                line += byte
+        except OSError as error:
+            self._socket.close()
+            raise ConnectionError(f"{data_dir}: no agent takes commands here: {error.strerror or error}") from None
+        self.gateway = line.decode(errors="replace").strip()
+
+    def send(self, address: str, data: bytes) -> bytes:
+        """Send a command for `address`; the answer. Raises OSError."""
+        self._socket.sendall(address.encode() + b"\n" + data)
+        self._socket.shutdown(socket.SHUT_WR)
+        return _read(self._socket, LARGEST, ANSWER_S)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._socket.close()
+
+
+@contextmanager
+def _short(directory: Path) -> Iterator[str]:
+    # The address of a socket has 107 bytes, a path may have more.
+    descriptor = os.open(directory, os.O_PATH | os.O_DIRECTORY)
+    try:
+        yield f"/proc/self/fd/{descriptor}"
+    finally:
+        os.close(descriptor)
+
+
+def _read(connection: socket.socket, most: int, timeout_s: float) -> bytes:
+    """All up to the end, or `most` bytes, whichever is first. Raises TimeoutError."""
+    end_s = time.monotonic() + timeout_s
+    said = b""
+    while len(said) < most:
+        connection.settimeout(max(1e-3, end_s - time.monotonic()))
+        part = connection.recv(most - len(said))
+        if not part:
+            break
+        said += part
+    return said

@@ -1,0 +1,39 @@
+"""Commands that come as Zenoh queries on `<gateway>/<sensor>/command/<verb>`."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from contextlib import ExitStack
+
+import zenoh
+
+from agent.commanding.desk import CommandDesk
+
+# Those that wait. A flood pushes the oldest out; it must not hold up what else comes through the session.
+WAITING_MAX = 16
+_log = logging.getLogger(__name__)
+_Queryable = zenoh.Queryable[zenoh.Handler[zenoh.Query]]
+
+
+def serve_queries(session: zenoh.Session, gateway: str, desk: CommandDesk, open_things: ExitStack) -> None:
+    """Answer commands below the key `gateway`, in a thread of its own, until `open_things` close."""
+    queryable = session.declare_queryable(
+        f"{gateway}/*/command/*", zenoh.handlers.RingChannel(WAITING_MAX), complete=True
+    )
+    open_things.callback(queryable.undeclare)
+    threading.Thread(target=_answer, args=(queryable, gateway, desk), name="commands", daemon=True).start()
+
+
+def _answer(queryable: _Queryable, gateway: str, desk: CommandDesk) -> None:
+    for query in queryable:
+        with query:  # a query that stays alive makes the one who asked wait for its whole time
+            key = str(query.key_expr)
+            if "*" in key:
+                continue  # who asks for results with a wildcard asks here as well, and commands nothing
+            try:
+                payload = query.payload.to_bytes() if query.payload is not None else b""
+                answer = desk.receive(key.removeprefix(gateway + "/"), payload)
+                query.reply(key, answer.json, encoding=zenoh.Encoding.APPLICATION_JSON)
+            except zenoh.ZError as error:
+                _log.warning("a command could not be answered: %s", error)

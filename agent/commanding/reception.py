@@ -1,0 +1,48 @@
+"""All ways by which commands reach an agent, with the desk behind them."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+
+import zenoh
+
+from agent.commanding.desk import CommandDesk
+from agent.commanding.local import LocalDoor
+from agent.commanding.network import serve_queries
+from agent.config import Config
+from agent.delivery.keys import gateway_key
+from agent.events import Command
+
+_log = logging.getLogger(__name__)
+
+
+class Reception:
+    """Open from the start; `put` is told of every command, taken or refused. What is wrong is logged and left out."""
+
+    def __init__(self, config: Config, data_dir: Path, store: Path, put: Callable[[Command], None]) -> None:
+        gateway = config.gateway
+        name = f"{gateway.site}/{gateway.name}"
+        self._key = gateway_key(gateway.site, gateway.name)
+        sensors = [channel.sensor for channel in config.channels]
+        self.desk = CommandDesk(name, sensors, config.commands, data_dir, store, put)
+        if self.desk.counters.set_aside:
+            _log.warning(
+                "the counters of commands were unreadable and are kept as %s; commands signed before now are refused",
+                self.desk.counters.set_aside,
+            )
+        self._open = ExitStack()
+        try:
+            self._open.enter_context(LocalDoor(data_dir, name, self.desk))
+        except OSError as error:
+            _log.warning("no commands on the gateway itself: %s", error)
+
+    def serve(self, session: zenoh.Session, open_things: ExitStack) -> None:
+        """Take commands from a session as well, until `open_things` close."""
+        serve_queries(session, self._key, self.desk, open_things)
+
+    def close(self) -> None:
+        """Take no more on the gateway itself."""
+        self._open.close()

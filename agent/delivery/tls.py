@@ -1,0 +1,81 @@
+"""The files that TLS takes, and whether they fit together."""
+
+from __future__ import annotations
+
+import stat
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:  # only who checks files pays for it
+    from cryptography.x509 import Certificate
+
+
+@dataclass(frozen=True, slots=True)
+class TlsFiles:
+    """PEM files, see `fieldcal keys`: who is trusted, who we are, and the private key to it."""
+
+    ca: str
+    certificate: str
+    key: str
+
+
+def tls_faults(files: TlsFiles) -> list[str]:
+    """What is wrong with them, one line each, naming the field, the file and why. Empty where they fit together.
+
+    A certificate whose time is over is no fault of these: a gateway must go on measuring without one (`expiry`).
+    """
+    from cryptography.exceptions import InvalidSignature
+    from cryptography.hazmat.primitives.serialization import load_pem_private_key
+
+    faults: list[str] = []
+    ca, certificate = (_certificate(name, getattr(files, name), faults) for name in ("ca", "certificate"))
+    key = None
+    text = _text("key", files.key, faults)
+    if text is not None:
+        try:
+            key = load_pem_private_key(text, password=None)
+        except (ValueError, TypeError):
+            faults.append(f"key: {files.key}: no private key in PEM without a password")
+        if Path(files.key).stat().st_mode & (stat.S_IROTH | stat.S_IWOTH):
+            faults.append(f"key: {files.key}: everybody can read it: chmod 600")
+    if key is not None and certificate is not None and key.public_key() != certificate.public_key():
+        faults.append(f"key: {files.key}: not the key of {files.certificate}")
+    if ca is not None and certificate is not None:
+        try:
+            certificate.verify_directly_issued_by(ca)
+        except (InvalidSignature, ValueError, TypeError):
+            faults.append(f"certificate: {files.certificate}: not signed by {files.ca}")
+    return faults
+
+
+def expiry(files: TlsFiles) -> datetime:
+    """When the first of both certificates ends. Raises ValueError where one cannot be read."""
+    faults: list[str] = []
+    found = [_certificate(name, getattr(files, name), faults) for name in ("ca", "certificate")]
+    if faults:
+        raise ValueError("; ".join(faults))
+    return min(certificate.not_valid_after_utc for certificate in found if certificate)
+
+
+def _certificate(name: str, path: str, faults: list[str]) -> Certificate | None:
+    from cryptography.x509 import load_pem_x509_certificate
+
+    text = _text(name, path, faults)
+    if text is None:
+        return None
+    try:
+        return load_pem_x509_certificate(text)
+    except ValueError:
+        faults.append(f"{name}: {path}: no certificate in PEM")
+        return None
+
+
+def _text(name: str, path: str, faults: list[str]) -> bytes | None:
+    try:
+        with open(path, "rb") as file:
+            return file.read(1 << 16)
+    except OSError as error:
+        faults.append(f"{name}: {path}: cannot be read: {error.strerror}")
+        return None
