@@ -136,7 +136,7 @@ def _run(
             with LocalAgent(data_dir) as agent:
                 said = agent.send(address, sealed(gateway or agent.gateway))
         answer = msgspec.json.decode(said, type=_Answer)
-    except (OSError, ConnectionError, msgspec.DecodeError) as error:
+    except (OSError, msgspec.DecodeError, ValueError) as error:
         click.echo(f"fieldcal command: {error}", err=True)
         return 1
     if not answer.taken:

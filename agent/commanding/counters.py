@@ -27,7 +27,7 @@ class Counters:
             self._taken = msgspec.json.decode(self._path.read_bytes(), type=dict[str, int])
         except FileNotFoundError:
             self._floor = time.time_ns()
-        except msgspec.DecodeError:
+        except (msgspec.DecodeError, ValueError, RecursionError):
             self._floor = time.time_ns()
             self.set_aside = self._path.with_name(f"{FILE_NAME}.corrupt-{self._floor}")
             self._path.rename(self.set_aside)

@@ -62,7 +62,7 @@ class Envelope:
             raise Refused("bad signature", f"the signature is not that of key {self.key_id}") from None
         try:
             return msgspec.json.decode(self.body, type=Order)
-        except (msgspec.DecodeError, RecursionError) as error:
+        except (msgspec.DecodeError, ValueError, RecursionError) as error:
             raise Refused("malformed", f"not a command: {error}") from None
 
 

@@ -9,6 +9,7 @@ import msgspec
 
 from agent.delivery.history import result_of
 from agent.delivery.keys import Address, parse_key
+from agent.events import CalibrationUpdate, Estimate
 
 LARGEST_RESULT = 256 << 10  # bytes; a calibration, the largest, has 5 kB
 LARGEST_NUMBER = 2**63 - 1
@@ -31,16 +32,19 @@ class Received:
 def receive(key: str, payload: bytes, attachment: bytes | None) -> Received | None:
     """The result in a sample; None for what is none of ours, whatever the bytes are.
 
-    A kind of result that this version knows has all its fields, of the right types; of a kind it does not know only the
-    sequence and the sensor are looked at.
+    A kind of result that this version knows has all its fields, of the right types and shapes; of a kind it does not
+    know only the sequence and the sensor are looked at.
     """
     address = parse_key(key)
     if address is None or len(payload) > LARGEST_RESULT:
         return None
     try:
         fields = msgspec.json.decode(payload, type=dict[str, Any])
-        result_of(address.what, fields)
-    except (msgspec.DecodeError, RecursionError):  # a thousand brackets deep
+        result = result_of(address.what, fields)
+    except (msgspec.DecodeError, ValueError, RecursionError):  # bytes that are no UTF-8; a thousand brackets deep
+        return None
+    calibration = result.calibration if isinstance(result, Estimate) else result
+    if isinstance(calibration, CalibrationUpdate) and not _has_its_shapes(calibration):
         return None
     sequence = fields.get("sequence")
     if type(sequence) is not int or not 0 <= sequence <= LARGEST_NUMBER or fields.get("sensor") != address.sensor:
@@ -50,3 +54,11 @@ def receive(key: str, payload: bytes, attachment: bytes | None) -> Received | No
     if len(attachment) > _DIGITS_MAX or not attachment.isdigit():
         return None
     return Received(key, address, sequence, fields, int(attachment))
+
+
+def _has_its_shapes(calibration: CalibrationUpdate) -> bool:
+    lengths = (calibration.offset, 3), (calibration.standard_uncertainty, 12), (calibration.determined, 12)
+    squares = (calibration.sensitivity, 3), (calibration.covariance, 12)
+    return all(len(values) == n for values, n in lengths) and all(
+        len(rows) == n and all(len(row) == n for row in rows) for rows, n in squares
+    )

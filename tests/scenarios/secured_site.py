@@ -1,0 +1,135 @@
+"""A site under TLS: the router with the file of deploy/zenoh, an agent that takes commands, and keys for all."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+import zenoh
+from click.testing import CliRunner
+
+from agent.delivery.session import session_config
+from agent.delivery.tls import TlsFiles
+from agent.keys.certificates import issue, make_authority
+from agent.keys.command import keys
+from agent.keys.files import write_new
+from tests.scenarios.processes import ROOT, START_S, started, wait_until
+
+READY = ROOT / "deploy" / "zenoh" / "router.json5"
+GATEWAY = "workshop/gateway-1"
+KEY = f"fieldcal/v1/{GATEWAY}"
+OPEN_MS = 2500  # on one machine a session opens in some milliseconds; who is refused waits as long
+
+AGENT = """
+[gateway]
+site = "workshop"
+name = "gateway-1"
+[[devices]]
+name = "mems"
+driver = "serial-csv"
+options = {{ port = "{keys}/no-port", rate_hz = 100 }}
+[[channels]]
+sensor = "mems"
+[zenoh]
+connect = ["{endpoint}"]
+[zenoh.tls]
+ca = "{keys}/ca.pem"
+certificate = "{keys}/workshop.gateway-1.pem"
+key = "{keys}/workshop.gateway-1.key"
+"""
+
+
+@dataclass(frozen=True)
+class SecuredSite:
+    """Paths and the router's endpoint."""
+
+    directory: Path
+    endpoint: str
+
+    @property
+    def keys(self) -> Path:
+        return self.directory / "keys"
+
+    @property
+    def router_log(self) -> str:
+        return (self.directory / "router.log").read_text()
+
+    def files(self, name: str, ca: str = "ca") -> TlsFiles:
+        return TlsFiles(str(self.keys / f"{ca}.pem"), str(self.keys / f"{name}.pem"), str(self.keys / f"{name}.key"))
+
+    def session(self, name: str, ca: str = "ca", endpoint: str | None = None) -> zenoh.Session:
+        """A client session under a name. Raises zenoh.ZError where it is refused."""
+        return self.open(session_config("client", connect=[endpoint or self.endpoint], tls=self.files(name, ca)))
+
+    @staticmethod
+    def open(config: zenoh.Config) -> zenoh.Session:
+        config.insert_json5("connect/timeout_ms", json.dumps(OPEN_MS))
+        return zenoh.open(config)
+
+    def options(self, name: str) -> list[str]:
+        """Of a command, to go over the network under a name."""
+        files = self.files(name)
+        return ["--connect", self.endpoint, "--gateway", GATEWAY, "--ca", files.ca, "--certificate", files.certificate,
+                "--certificate-key", files.key]  # fmt: skip
+
+
+def make_keys(directory: Path) -> None:
+    """The keys of a site as its documentation makes them, and those of people who should not come in."""
+    for arguments in (
+        ["authority"], ["router", "--host", "localhost", "--host", "127.0.0.1"], ["consumer", "dashboard"],
+        ["gateway", "workshop", "gateway-1"], ["gateway", "workshop", "gateway-2"], ["commander", "operator"],
+        ["consumer", "nobody"], ["router", "--name", "elsewhere", "--host", "example.org"],
+    ):  # fmt: skip
+        assert CliRunner().invoke(keys, [*arguments, "--dir", str(directory)], standalone_mode=False).return_value == 0
+    now = datetime.now(UTC)
+    stranger = make_authority("fieldcal authority", 10, now)
+    forged = issue(stranger, GATEWAY, 10, now)
+    ours = make_authority("fieldcal authority", 10, now - timedelta(days=5))
+    late = issue(ours, GATEWAY, 1, now - timedelta(days=5))
+    write_new(directory, {"stranger.pem": stranger.certificate_pem, "late-ca.pem": ours.certificate_pem})
+    write_new(directory, {"forged.pem": forged.certificate_pem, "forged.key": forged.key_pem})
+    write_new(directory, {"late.pem": late.certificate_pem, "late.key": late.key_pem})
+    # One authority for both: only the time is wrong.
+    (directory / "ca-and-late.pem").write_bytes((directory / "ca.pem").read_bytes() + ours.certificate_pem)
+
+
+def router_file(directory: Path, certificate: str = "router", ca: str = "ca-and-late") -> str:
+    """The ready file, at a free port of loopback, with the keys of `directory`."""
+    text = READY.read_text().replace("tls/0.0.0.0:7447", "tls/127.0.0.1:0")
+    text = text.replace("/etc/fieldcal/keys/router", f"{directory}/{certificate}")
+    return text.replace("/etc/fieldcal/keys/ca.pem", f"{directory}/{ca}.pem")
+
+
+@contextmanager
+def router(directory: Path, keys_dir: Path, certificate: str = "router") -> Iterator[str]:
+    """`fieldcal router` on the ready file; yields its endpoint. Its log goes to `directory`/router.log."""
+    file, log = directory / "router.json5", directory / "router.log"
+    file.write_text(router_file(keys_dir, certificate))
+    with ExitStack() as stack:
+        with pytest.MonkeyPatch.context() as patch:
+            # What access control turns away is logged at this level alone.
+            patch.setenv("RUST_LOG", "warn,zenoh::net::routing::interceptor::access_control=trace")
+            process = stack.enter_context(started("router", "--config", file, output=log))
+        wait_until(lambda: log.read_text().startswith("router at ") or process.poll() is not None, START_S, "a router")
+        yield log.read_text().splitlines()[0].removeprefix("router at ").replace("127.0.0.1", "localhost")
+
+
+@contextmanager
+def commanded_agent(site: SecuredSite, name: str) -> Iterator[Path]:
+    """`fieldcal run` at the site, with commands of anna enabled; yields its data directory when it is connected."""
+    printed = CliRunner().invoke(keys, ["command", name, "--dir", str(site.keys)], standalone_mode=False).stdout
+    config, data_dir, log = (site.directory / f"{name}{end}" for end in (".toml", "", ".log"))
+    config.write_text(AGENT.format(keys=site.keys, endpoint=site.endpoint) + printed.replace(', "accept"', ""))
+    with started("run", config, "--data-dir", data_dir, output=log), site.session("operator") as session:
+
+        def answers() -> bool:
+            found = session.get(f"{KEY}/mems/command/hold", target=zenoh.QueryTarget.ALL, timeout=1.0)
+            return any(reply.ok is not None for reply in found)
+
+        wait_until(answers, START_S, "an agent that takes commands")
+        yield data_dir

@@ -1,0 +1,76 @@
+"""A desk with one operator, and the bytes that this operator, or another, would send to it."""
+
+from __future__ import annotations
+
+import time
+from base64 import b64encode
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
+
+from agent.commanding.desk import Answer, CommandDesk
+from agent.commanding.envelope import Order, seal
+from agent.config import Commands
+from agent.delivery.history import FILE_NAME
+from agent.delivery.store import Store
+from agent.events import Command
+from tests.unit.zenoh_site import record
+
+GATEWAY = "workshop/gateway-1"
+# Keys from fixed bytes: the same in every run.
+ANNA = Ed25519PrivateKey.from_private_bytes(bytes(range(32)))
+OTHER = Ed25519PrivateKey.from_private_bytes(bytes(range(1, 33)))
+RIGHTS = ("pose", "hold", "rollback")  # of anna, for the sensor mems alone
+
+
+def settings(*, enabled: bool = True) -> Commands:
+    """Commands of anna, who may do RIGHTS with mems."""
+    public = b64encode(ANNA.public_key().public_bytes(Encoding.Raw, PublicFormat.Raw)).decode()
+    key = {"id": "anna", "public_key": public, "verbs": RIGHTS, "sensors": ["mems"]}
+    return Commands.model_validate({"enabled": enabled, "keys": [key]})
+
+
+class DeskSite:
+    """A desk in a data directory, and what it told of."""
+
+    def __init__(self, directory: Path) -> None:
+        self.directory = directory
+        self.events: list[Command] = []
+        store = directory / FILE_NAME
+        if not store.exists():
+            made = Store(directory, count_from=100)
+            made.commit([record(101, "calibration"), record(102, "window")])
+            made.close()
+        self.desk = CommandDesk(GATEWAY, ["mems", "spare"], settings(), directory, store, self.events.append)
+
+    def send(self, data: bytes, sensor: str = "mems", verb: str = "hold") -> Answer:
+        """The answer to bytes on the address of a sensor and a verb."""
+        return self.desk.receive(f"{sensor}/command/{verb}", data)
+
+
+def sealed(
+    arguments: dict[str, Any] | bytes | None = None,
+    *,
+    sensor: str = "mems",
+    verb: str = "hold",
+    gateway: str = GATEWAY,
+    key_id: str = "anna",
+    key: Ed25519PrivateKey = ANNA,
+    counter: int | None = None,
+    valid_s: float = 60.0,
+) -> bytes:
+    """A command as bytes: good, but for what is said otherwise."""
+    now_ns = time.time_ns()
+    raw = arguments if isinstance(arguments, bytes) else msgspec.json.encode(arguments or {})
+    order = Order(
+        gateway=gateway,
+        sensor=sensor,
+        verb=verb,  # type: ignore[arg-type]
+        arguments=msgspec.Raw(raw),
+        counter=now_ns if counter is None else counter,
+        expires_utc_ns=now_ns + int(valid_s * 1e9),
+    )
+    return seal(order, key_id, key)
