@@ -179,6 +179,12 @@ def _check_time(order: Order, now_utc_ns: int) -> None:
             "expired", f"it is good for {left_s:.0f} s by this gateway's clock, {LONGEST_VALIDITY_S:g} at most"
         )
 
+    ahead_s = (order.counter - now_utc_ns) * 1e-9
+    if ahead_s > CLOCK_TOLERANCE_S:  # taken, it would shut its own key out until then
+        raise Refused(
+            "expired", f"its counter, the time of signing, lies {ahead_s:.0f} s ahead of this gateway's clock"
+        )
+
 
 def _claimed_key(data: bytes) -> str:
     try:

@@ -113,7 +113,9 @@ def _read(connection: socket.socket, most: int, timeout_s: float) -> bytes:
     end_s = time.monotonic() + timeout_s
     said = b""
     while len(said) < most:
-        connection.settimeout(max(1e-3, end_s - time.monotonic()))
+        if (left_s := end_s - time.monotonic()) <= 0:
+            raise TimeoutError
+        connection.settimeout(left_s)
         part = connection.recv(most - len(said))
         if not part:
             break

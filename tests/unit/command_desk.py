@@ -51,6 +51,12 @@ class DeskSite:
         return self.desk.receive(f"{sensor}/command/{verb}", data)
 
 
+def signed(body: bytes) -> bytes:
+    """Any bytes with anna's signature, put together as docs/security.md says."""
+    signature = b64encode(ANNA.sign(b"fieldcal-command-1 anna\n" + body))
+    return b"fieldcal-command-1 anna " + signature + b"\n" + body
+
+
 def sealed(
     arguments: dict[str, Any] | bytes | None = None,
     *,

@@ -15,7 +15,7 @@ from agent.commanding.counters import FILE_NAME
 from agent.commanding.desk import RECORDED_REFUSALS, TAKEN
 from agent.commanding.envelope import LARGEST
 from agent.recording.messages import decode, encode
-from tests.unit.command_desk import OTHER, DeskSite, sealed
+from tests.unit.command_desk import OTHER, DeskSite, sealed, signed
 
 TOO_LONG = b"x" * (LARGEST + 1)
 
@@ -80,6 +80,7 @@ def test_a_rollback_carries_the_calibration_whole(site: DeskSite) -> None:
         ("malformed", "hold", lambda: sealed(verb="reboot")),
         ("malformed", "hold", lambda: sealed(counter=-1)),
         ("malformed", "hold", lambda: sealed(counter=2**63)),
+        ("expired", "hold", lambda: sealed(counter=time.time_ns() + 40_000_000_000)),
         ("malformed", "hold", lambda: sealed(verb="pose")),  # a good one, but sent to another address
         ("malformed", "hold", lambda: sealed(sensor="spare")),
         ("other gateway", "hold", lambda: sealed(gateway="workshop/gateway-2")),
@@ -191,14 +192,19 @@ def test_a_script_that_runs_wild_with_a_good_key_is_slowed(site: DeskSite) -> No
     assert site.desk.counts() == {"taken": taken, "too many": 60 - taken}
 
 
-def test_mutated_commands_are_refused_every_one(site: DeskSite) -> None:
+def test_mutated_commands_are_refused_unless_an_operator_signed_them(site: DeskSite) -> None:
     """2000 here; benchmarks/fuzz.py does 10^5."""
     random_ = random.Random(20)
     good = sealed({"theta_deg": 10, "alpha_deg": 20}, verb="pose")
+    inside = good.split(b"\n", 1)[1]
     for number in range(2000):
-        assert not site.send(mutated(good, random_), verb="pose").taken, number
+        data = mutated(good, random_) if number % 2 else signed(mutated(inside, random_))
+        answer = site.send(data, verb="pose")
+        # A number in a signed pose may be another good one; then it is an operator's command.
+        assert not answer.taken or number % 2 == 0, number
     assert sum(site.desk.counts().values()) == 2000
-    assert site.send(good, verb="pose").taken, "the desk still works"
+    later = sealed(counter=site.desk.counters.last("anna") + 1)
+    assert site.send(later).taken, "the desk still works"
 
 
 def mutated(good: bytes, random_: random.Random) -> bytes:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import time
 import tomllib
 from pathlib import Path
 
 import pytest
 
 from agent.config import ConfigError, load_config, parse_config
-from agent.config.reading import LARGEST_FILE
+from agent.config.reading import LARGEST_FILE, LONGEST_LIST, SHOWN_FAULTS
 
 DEVICES = """
 [[devices]]
@@ -18,6 +19,10 @@ options = { port = "/dev/ttyUSB0", rate_hz = 100 }
 """
 CHANNEL = DEVICES + '[[channels]]\nsensor = "imu"\nprior = {}\n'
 REST = "gravity_mps2 = [0, 0, 9.8]"
+
+
+PUBLIC = 'public_key = "' + "A" * 43 + '="'
+KEY = f'[[commands.keys]]\nid = "anna"\n{PUBLIC}\nverbs = ["hold"]\nsensors = ["imu"]\n'
 
 
 def faults(text: str) -> list[str]:
@@ -39,6 +44,13 @@ def faults(text: str) -> list[str]:
         (CHANNEL + "[recording]\nrotate_s = 1e308", ["recording.rotate_s", "not 1e+308"]),
         (CHANNEL + "[recording]\nrotate_bytes = 1", ["recording.rotate_bytes", "not 1"]),
         (CHANNEL + '[zenoh]\nconnect = ["localhost:7447"]', ["zenoh.connect.0", "not 'localhost:7447'"]),
+        (CHANNEL + '[zenoh]\nconnect = ["tls/h:7447"]', ["zenoh: connect", "zenoh.tls"]),
+        (CHANNEL + "[commands]\nenabled = true", ["commands: enabled without keys"]),
+        (CHANNEL + KEY + KEY, ["commands: keys", "'anna' is used more than once"]),
+        (CHANNEL + KEY.replace("AAA=", "AA=="), ["commands.keys.0.public_key", "31 bytes"]),
+        (CHANNEL + KEY.replace("AAA=", "A*A="), ["commands.keys.0.public_key", "not base64"]),
+        (CHANNEL + KEY.replace('"hold"', '"reboot"'), ["commands.keys.0.verbs.0", "not 'reboot'"]),
+        (CHANNEL + KEY.replace('"imu"', '"other"'), ["commands.keys.0.sensors", "'other' has no channel"]),
         (CHANNEL.replace("serial-csv", "serial-cvs"), ["devices.0.driver", "did you mean 'serial-csv'"]),
         (CHANNEL.replace("rate_hz = 100", "rate_hz = -1"), ["devices.0.options.rate_hz", "not -1"]),
         (DEVICES + '[[channels]]\nsensor = "other"\nprior = {}', ["channels.0.sensor", "'other'"]),
@@ -71,3 +83,43 @@ def test_a_file_that_is_none_is_a_fault(tmp_path: Path, content: bytes | None) -
     with pytest.raises(ConfigError) as caught:
         load_config(path)
     assert all(line.startswith(f"{path}: ") for line in caught.value.faults)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("a = " + "[" * 200_000, "nested too deep"),
+        ("a = " + "{a = " * 100_000, "nested too deep"),
+        ("a = " + "9" * 100_000, "not TOML: "),
+        (CHANNEL + "windows = 0x" + "f" * 100_000, "channels.0.windows: .*a number of 400000 bits"),
+        ("k" * 1_000_000 + " = 1", "kkk"),
+        (".".join(["a"] * 1_000_000) + " = 1", "line 1: a key of more than 16 parts"),
+        ("\n[" + " . ".join(["'a'"] * 300_000) + "]", "line 2: a key of more than 16 parts"),
+        ('x = "' + "y" * 1_000_000 + '"', "x: Extra inputs"),
+        (
+            CHANNEL + "poses = [" + "1, " * 100_000 + "]",
+            f"channels.0.poses: a list of 100000, more than {LONGEST_LIST}",
+        ),
+        ('devices = [{ name = "a" }, ' + '{ name = "a" }, ' * 10_000 + "]", "devices.0.driver"),
+        (DEVICES * 1000 + '[[channels]]\nsensor = "imu"', "at most 100 items"),
+        ("".join(f"k{i} = 1\n" for i in range(10_000)), f"and {10_002 - SHOWN_FAULTS} faults more"),
+    ],
+)
+def test_a_hostile_file_is_refused_soon_and_in_few_words(tmp_path: Path, text: str, said: str) -> None:
+    """Within seconds on a slow machine; unbounded, these took minutes, gigabytes, or ended in a traceback."""
+    path = tmp_path / "f.toml"
+    path.write_text(text)
+    began_s = time.process_time()
+    with pytest.raises(ConfigError, match=said) as caught:
+        load_config(path)
+    assert time.process_time() - began_s < 5.0
+    assert len(caught.value.faults) <= SHOWN_FAULTS + 1
+    assert max(len(fault) for fault in caught.value.faults) < len(str(path)) + 400
+
+
+def test_files_of_tls_are_checked_with_the_rest(tmp_path: Path) -> None:
+    text = CHANNEL + f'[zenoh]\nconnect = []\ntls = {{ ca = "{tmp_path}/a", certificate = "{tmp_path}/b", key = "/c" }}'
+    lines = faults(text + "\nenabled = 7")
+    assert [line.split(": ")[1] for line in lines] == [
+        "zenoh.enabled", "zenoh.tls.ca", "zenoh.tls.certificate", "zenoh.tls.key",
+    ]  # fmt: skip

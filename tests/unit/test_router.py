@@ -60,6 +60,26 @@ def test_a_configuration_file_is_used_and_its_faults_are_one_line(tmp_path: Path
         assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("{listen: " + "[" * 100_000 + "]" * 100_000 + "}", "brackets 100001 deep"),
+        ("{a:" * 100_000 + "1" + "}" * 100_000, "brackets 100000 deep"),
+        ('{mode: "' + "x" * (1 << 20) + '"}', "more than 1048576 bytes"),
+        ("{a: " + "9" * 100_000 + "}", "unknown field"),
+        ("{" + "a: 1," * 100_000 + "}", "unknown field"),
+    ],
+)
+def test_a_file_that_would_end_the_process_is_one_clear_line(tmp_path: Path, text: str, said: str) -> None:
+    """Zenoh's own reader overflows its stack on the first two: each runs in a process of its own."""
+    file = tmp_path / "router.json5"
+    file.write_text(text)
+    router = router_process("--config", str(file))
+    _, faults = router.communicate(timeout=20)
+    assert (router.returncode, faults.count("\n")) == (2, 1)
+    assert said in faults
+
+
 @pytest.mark.parametrize("endpoint", ["7447", "tcp/127.0.0.1:99999", "pigeon/1:2"])
 def test_a_bad_endpoint_is_named(endpoint: str) -> None:
     with pytest.raises(EndpointError, match=endpoint):
