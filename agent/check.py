@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
 from pathlib import Path
 
 import click
 
 from agent.config import ConfigError, load_config
+from agent.delivery.tls import expiry_warning
 
 
 @click.command()
@@ -20,5 +22,7 @@ def check(config: Path) -> int:
             click.echo(fault, err=True)
         return 2
     poses = sum(len(channel.poses) for channel in loaded.channels)
+    if loaded.zenoh.tls and (warning := expiry_warning(loaded.zenoh.tls.files, datetime.now(UTC))):
+        click.echo(f"{config}: zenoh.tls.{warning}", err=True)
     click.echo(f"{config}: good; {len(loaded.devices)} devices, {len(loaded.channels)} channels, {poses} poses")
     return 0

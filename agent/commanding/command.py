@@ -15,7 +15,9 @@ from agent.commanding.desk import LONGEST_VALIDITY_S
 from agent.commanding.envelope import Order, seal
 from agent.commanding.local import LocalAgent
 from agent.commanding.refusal import Refused
+from agent.commanding.sending import send
 from agent.delivery.keys import CHUNK, gateway_key
+from agent.delivery.session import EndpointError
 from agent.delivery.tls_options import tls_files, tls_options
 from agent.keys.files import KeyFileError, SigningKey, read_signing_key
 
@@ -128,14 +130,14 @@ def _run(
     address = f"{sensor}/command/{verb}"
     try:
         if connect:
-            from agent.commanding.sending import send
-
             name = _gateway_name(gateway)
             said = send(connect, files, f"{gateway_key(*name.split('/'))}/{address}", sealed(name))
         else:
             with LocalAgent(data_dir) as agent:
                 said = agent.send(address, sealed(gateway or agent.gateway))
         answer = msgspec.json.decode(said, type=_Answer)
+    except EndpointError as error:
+        raise click.UsageError(str(error)) from None
     except (OSError, msgspec.DecodeError, ValueError) as error:
         click.echo(f"fieldcal command: {error}", err=True)
         return 1

@@ -73,15 +73,23 @@ class CommandDesk:
         self._recorded = Allowance(*RECORDED_REFUSALS)
         self._unrecorded = 0
         self._counts: Counter[str] = Counter()
+        self._closed = False
 
     def counts(self) -> dict[str, int]:
         """How many were taken, and refused by kind, since the start."""
         with self._mutex:
             return dict(sorted(self._counts.items()))
 
+    def close(self) -> None:
+        """Take nothing more: nobody listens to `put` any longer."""
+        with self._mutex:
+            self._closed = True
+
     def receive(self, address: str, data: bytes) -> Answer:
         """A command that came for `address`, `<sensor>/command/<verb>`; whatever the bytes are, there is an answer."""
         with self._mutex:
+            if self._closed:
+                return Answer(False, "the agent is ending")
             try:
                 event = self._check(address, data)
             except Refused as refused:

@@ -44,5 +44,6 @@ class Reception:
         serve_queries(session, self._key, self.desk, open_things)
 
     def close(self) -> None:
-        """Take no more on the gateway itself."""
+        """Take no more, whichever way it comes."""
+        self.desk.close()
         self._open.close()

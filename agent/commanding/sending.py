@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import zenoh
 
 from agent.commanding.envelope import LARGEST
-from agent.delivery.session import EndpointError, session_config
+from agent.delivery.session import session_config
 from agent.delivery.tls import TlsFiles
 
 CONNECT_S = 5.0
@@ -16,11 +16,11 @@ ANSWER_S = 5.0  # the agent answers within one fsync
 
 
 def send(endpoints: Sequence[str], tls: TlsFiles | None, key: str, data: bytes) -> bytes:
-    """Send a command to its `key` through a router; the answer. Raises ConnectionError where nobody answers."""
-    try:
-        config = session_config("client", connect=endpoints, tls=tls)
-    except EndpointError as error:
-        raise ConnectionError(str(error)) from None
+    """Send a command to its `key` through a router; the answer.
+
+    Raises EndpointError, or ConnectionError where nobody answers.
+    """
+    config = session_config("client", connect=endpoints, tls=tls)
     config.insert_json5("connect/timeout_ms", json.dumps(int(CONNECT_S * 1000)))
     try:
         session = zenoh.open(config)

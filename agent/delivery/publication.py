@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from datetime import UTC, datetime
 
 import zenoh
 from zenoh.ext import AdvancedPublisher, CacheConfig, MissDetectionConfig, declare_advanced_publisher
@@ -18,7 +19,7 @@ from agent.delivery.history import History, Record, StoreError
 from agent.delivery.keys import gateway_key, result_key
 from agent.delivery.session import session_config
 from agent.delivery.store import Store
-from agent.delivery.tls import TlsFiles
+from agent.delivery.tls import TlsFiles, expiry_warning
 
 BATCH = 100  # results read from the store at a time
 POLL_S = 0.2  # how soon a router that came back is seen; asking costs a microsecond
@@ -69,6 +70,7 @@ class Publisher:
         self._key = gateway_key(site, gateway)
         self._endpoints = tuple(connect)
         self._config = session_config("peer", connect=connect, tls=tls)
+        self._tls = tls
         self._serve_more = serve
         self._store = store
         self._recent: deque[Record] = deque(maxlen=RECENT_MAX)
@@ -126,6 +128,8 @@ class Publisher:
 
     def _serve(self) -> None:
         with ExitStack() as open_things:
+            if self._tls and (warning := expiry_warning(self._tls, datetime.now(UTC))):
+                _log.warning("zenoh.tls.%s", warning)
             session = open_things.enter_context(zenoh.open(self._config))
             history = open_things.enter_context(History(self._store.path))
             queryable = session.declare_queryable(f"{self._key}/**", zenoh.handlers.FifoChannel(64), complete=True)

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import stat
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # only who checks files pays for it
     from cryptography.x509 import Certificate
+
+# Time to make a certificate, travel and put it in place.
+SOON = timedelta(days=60)
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +27,7 @@ class TlsFiles:
 def tls_faults(files: TlsFiles) -> list[str]:
     """What is wrong with them, one line each, naming the field, the file and why. Empty where they fit together.
 
-    A certificate whose time is over is no fault of these: a gateway must go on measuring without one (`expiry`).
+    A certificate whose time is over is no fault of these: a gateway must go on measuring without one (`expiry_warning`).
     """
     from cryptography.exceptions import InvalidSignature
     from cryptography.hazmat.primitives.serialization import load_pem_private_key
@@ -50,13 +53,17 @@ def tls_faults(files: TlsFiles) -> list[str]:
     return faults
 
 
-def expiry(files: TlsFiles) -> datetime:
-    """When the first of both certificates ends. Raises ValueError where one cannot be read."""
+def expiry_warning(files: TlsFiles, now: datetime) -> str:
+    """What to say of certificates that are over, or will be within SOON; "" where there is nothing to say."""
     faults: list[str] = []
-    found = [_certificate(name, getattr(files, name), faults) for name in ("ca", "certificate")]
-    if faults:
-        raise ValueError("; ".join(faults))
-    return min(certificate.not_valid_after_utc for certificate in found if certificate)
+    for name in ("ca", "certificate"):
+        certificate = _certificate(name, getattr(files, name), faults)
+        if certificate is not None and (left := certificate.not_valid_after_utc - now) < SOON:
+            over = "is over since" if left.total_seconds() < 0 else f"has {left.days} days left, to"
+            faults.append(
+                f"{name}: {getattr(files, name)}: {over} {certificate.not_valid_after_utc:%Y-%m-%d %H:%M} UTC"
+            )
+    return "; ".join(faults)
 
 
 def _certificate(name: str, path: str, faults: list[str]) -> Certificate | None:

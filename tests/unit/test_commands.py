@@ -171,6 +171,14 @@ def test_a_counter_that_cannot_be_kept_refuses_the_command(site: DeskSite) -> No
     assert site.desk.counts() == {"not kept": 1, "taken": 1}
 
 
+def test_a_desk_that_is_closed_takes_nothing_and_costs_no_counter(site: DeskSite) -> None:
+    data = sealed()
+    site.desk.close()
+    assert site.send(data).reason == "the agent is ending"
+    assert (site.events, site.desk.counts()) == ([], {})
+    assert not (site.directory / FILE_NAME).exists()
+
+
 def test_a_flood_is_counted_but_fills_no_recording(site: DeskSite) -> None:
     for _ in range(1000):
         site.send(b"junk")

@@ -14,7 +14,7 @@ from cryptography.x509.oid import NameOID
 from cryptography.x509.verification import PolicyBuilder, Store, VerificationError
 
 from agent.config import Commands
-from agent.delivery.tls import TlsFiles, expiry, tls_faults
+from agent.delivery.tls import TlsFiles, expiry_warning, tls_faults
 from agent.keys.certificates import issue, make_authority
 from agent.keys.command import keys
 from agent.keys.files import KeyFileError, read_signing_key
@@ -80,11 +80,14 @@ def test_the_files_of_one_certificate_fit_together_and_others_do_not(site: Path,
     ca, gateway = str(site / "ca.pem"), str(site / "workshop.gateway-1")
     files = TlsFiles(ca, f"{gateway}.pem", f"{gateway}.key")
     assert tls_faults(files) == []
-    assert expiry(files) - datetime.now(UTC) > timedelta(days=1820)
+    now = datetime.now(UTC)
+    assert expiry_warning(files, now + timedelta(days=1760)) == ""
+    assert "certificate: " in expiry_warning(files, now + timedelta(days=1770))
+    assert " 5" in expiry_warning(files, now + timedelta(days=1770)).split(": ")[2], "days left"
+    assert "is over since" in expiry_warning(files, now + timedelta(days=1830))
     assert tls_faults(TlsFiles(ca, f"{gateway}.pem", str(site / "dashboard.key"))) == [
         f"key: {site}/dashboard.key: not the key of {gateway}.pem"
     ]
-    now = datetime.now(UTC)
     foreign = issue(make_authority("fieldcal authority", 9, now), "workshop/gateway-1", 9, now)
     (tmp_path / "f.pem").write_bytes(foreign.certificate_pem)
     (tmp_path / "f.key").write_bytes(foreign.key_pem)
