@@ -27,7 +27,7 @@ class TlsFiles:
 def tls_faults(files: TlsFiles) -> list[str]:
     """What is wrong with them, one line each, naming the field, the file and why. Empty where they fit together.
 
-    A certificate whose time is over is no fault of these: a gateway must go on measuring without one (`expiry_warning`).
+    A certificate whose time is over is none of these (`expiry_warning`): a gateway must go on measuring without one.
     """
     from cryptography.exceptions import InvalidSignature
     from cryptography.hazmat.primitives.serialization import load_pem_private_key

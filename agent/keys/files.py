@@ -49,7 +49,6 @@ def write_new(directory: Path, files: Mapping[str, bytes]) -> None:
             mode = 0o600 if name.endswith(".key") else 0o644
             descriptor = os.open(directory / name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
             with open(descriptor, "wb") as file:
-                os.fchmod(descriptor, mode)  # whatever the umask is
                 file.write(content)
     except OSError as error:
         raise KeyFileError(f"{error.filename or directory}: {error.strerror}") from None
