@@ -223,7 +223,8 @@ def test_what_is_no_result_is_passed_over(site: Site, gateway: Gateway) -> None:
     wait_for(lambda: gateway.publisher.state().connected)
     follower = Follower(Consumer([site.endpoint]), gateway.base)
     with site.client() as other:
-        for payload in (b"", b"\xff", b"[]", b"{}", b'{"sequence": "7"}'):
+        deep, large = b'{"a":' * 100_000, b"x" * 100_000_000
+        for payload in (b"", b"\xff", b"[]", b"{}", b'{"sequence": "7"}', deep, large):
             other.put("fieldcal/v1/site/gw/mems/window", payload)
             other.put("fieldcal/v1/a", payload)
         other.put("fieldcal/v1/site/gw/mems/window", b'{"sequence": 9}', attachment=b"\xff")
