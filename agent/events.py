@@ -67,8 +67,8 @@ class Command(msgspec.Struct, frozen=True, kw_only=True):
 
     `arguments_json` by verb: pose {"theta_deg", "alpha_deg"} or {"direction", "gravity_mps2"} or {"gravity_mps2"} with
     an optional "position"; hold {} or {"release": true}; accept {"sequence"} of an Estimate; rollback {"sequence"} of
-    a calibration, which the event then carries whole in `calibration_json`. `key_id` is empty where it was given on
-    the gateway itself.
+    a calibration, which the event then carries whole in `calibration_json`. `key_id` is of the key that signed it, in a
+    refused one what the sender said it was; `counter` is 0 there.
     """
 
     sensor: str
