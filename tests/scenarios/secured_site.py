@@ -35,6 +35,7 @@ driver = "serial-csv"
 options = {{ port = "{keys}/no-port", rate_hz = 100 }}
 [[channels]]
 sensor = "mems"
+prior = {{}}
 [zenoh]
 connect = ["{endpoint}"]
 [zenoh.tls]
