@@ -32,4 +32,6 @@ def building_config(building: Building, **keys: Any) -> Config:
         "every_s": p.every_s,
         "guard_s": p.lead_s if p.every_s else 0.5,
     }
-    return parse_config({"devices": devices, "channels": [channel | {"prior": {}} | keys], "zenoh": {"enabled": False}}, "building")
+    return parse_config(
+        {"devices": devices, "channels": [channel | {"prior": {}} | keys], "zenoh": {"enabled": False}}, "building"
+    )
