@@ -42,6 +42,16 @@ class EventQueue:
             event = replace(event, flags=flags)
         self._queue.put(event)
 
+    @property
+    def waiting(self) -> int:
+        """Events that wait for the pipeline."""
+        return self._queue.qsize()
+
+    @property
+    def capacity(self) -> int:
+        """Events with which blocks are dropped."""
+        return self._size
+
     def get(self, timeout_s: float) -> Event | None:
         """The next event, or None after `timeout_s`."""
         try:

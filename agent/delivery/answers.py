@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from pathlib import Path
 
 import zenoh
@@ -18,10 +19,11 @@ _log = logging.getLogger(__name__)
 _Queryable = zenoh.Queryable[zenoh.Handler[zenoh.Query]]
 
 
-def answer_queries(queryable: _Queryable, gateway: str, store: Path) -> None:
+def answer_queries(queryable: _Queryable, gateway: str, store: Path, status: Callable[[], bytes]) -> None:
     """Answer until the queryable is undeclared or its session closes. Runs in a thread of its own.
 
-    `<keys>`: the newest result of each channel that matches; a calibration only where it is in force.
+    `<keys>`: the newest result of each channel that matches; a calibration only where it is in force. And the gateway's
+    own `status`, where that is asked for and not empty.
     `<keys>?after=<sequence>`: the first REPLIES_MAX results after that number, in order. Several come on one key, so
     the query must be sent with consolidation NONE, else Zenoh keeps the last of each key.
     Where retention deleted some of those, an error REMOVED comes before the results.
@@ -31,9 +33,10 @@ def answer_queries(queryable: _Queryable, gateway: str, store: Path) -> None:
         with query:  # a query that stays alive makes the one who asked wait for its whole time
             try:
                 records, removed = _answers(query, gateway, store)
+                told = _reply_status(query, gateway, status())
                 if removed:
                     query.reply_err(f"{REMOVED}{removed}")
-                elif not records:
+                elif not records and not told:
                     query.reply_err(NOTHING)
                 for record in records:
                     query.reply(
@@ -45,6 +48,14 @@ def answer_queries(queryable: _Queryable, gateway: str, store: Path) -> None:
                 query.reply_err(str(error))
             except zenoh.ZError as error:
                 _log.warning("a query could not be answered: %s", error)
+
+
+def _reply_status(query: zenoh.Query, gateway: str, status: bytes) -> bool:
+    key = result_key(gateway, "", "status")
+    if not status or "after" in query.parameters or not query.key_expr.intersects(key):
+        return False
+    query.reply(key, status, encoding=zenoh.Encoding.APPLICATION_JSON)
+    return True
 
 
 def _answers(query: zenoh.Query, gateway: str, store: Path) -> tuple[list[Record], int]:

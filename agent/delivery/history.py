@@ -170,6 +170,10 @@ class History:
         names = [name for channel in channels or () for name in channel]
         return self._records(f"WHERE {where} ORDER BY sequence LIMIT ?", *values, *names, limit)
 
+    def count_after(self, sequence: int) -> int:
+        """How many results came after `sequence`: of the number published last, what the outbox holds."""
+        return int(self._rows("SELECT count(*) FROM results WHERE sequence > ?", sequence)[0][0])
+
     def channels(self) -> list[tuple[str, str]]:
         """All (sensor, what) that ever gave a result."""
         return sorted((sensor, what) for sensor, what, _, _ in self._latest())

@@ -82,6 +82,8 @@ class Publisher:
         self._said = ""
         self._previous = store.published()
         self._publishers: dict[str, AdvancedPublisher] = {}
+        self._status = b""  # the gateway's own, as told last
+        self._status_put = b""
         self._thread = threading.Thread(target=self._run, name="publication", daemon=True)
 
     def start(self) -> None:
@@ -98,6 +100,14 @@ class Publisher:
     def stream(self, sensor: str, block: bytes) -> None:
         """A block of the corrected stream: sent as soon as may be, and not kept. Returns at once."""
         self._blocks.append((sensor, block))  # without a router the oldest fall out
+        self._wake.set()
+
+    def tell_status(self, status: bytes) -> None:
+        """The gateway's own status (JSON) for `<gateway>/status`: only the newest is put, and none is kept on disk.
+
+        It is about this process, no result: it has no sequence, and `?after=` does not bring it. Returns at once.
+        """
+        self._status = status
         self._wake.set()
 
     def state(self) -> PublicationState:
@@ -136,7 +146,7 @@ class Publisher:
             open_things.callback(queryable.undeclare)
             threading.Thread(
                 target=answer_queries,
-                args=(queryable, self._key, self._store.path),
+                args=(queryable, self._key, self._store.path, lambda: self._status),
                 name="answers",
                 daemon=True,
             ).start()
@@ -149,10 +159,12 @@ class Publisher:
             for record in history.latest():
                 if record.sequence <= self._store.published():
                     self._put(session, record, previous=0)
+            self._status_put = b""
             stopping = False
             while not stopping:
                 stopping = self._stop.is_set()  # asked before the last round, so that nothing handed over is left
                 if self._find_router(session):
+                    self._send_status(session)
                     self._send_waiting(session, history)
                     self._send_blocks(session)
                 self._wake.wait(0 if stopping else POLL_S)
@@ -164,6 +176,12 @@ class Publisher:
             self._stop.wait(SETTLE_S)
         self._connected = connected
         return connected
+
+    def _send_status(self, session: zenoh.Session) -> None:
+        status = self._status
+        if status != self._status_put:
+            self._publisher(session, result_key(self._key, "", "status"), cached=1).put(status)
+            self._status_put = status
 
     def _send_waiting(self, session: zenoh.Session, history: History) -> None:
         self._fault = ""
@@ -196,6 +214,10 @@ class Publisher:
 
     def _put(self, session: zenoh.Session, record: Record, previous: int) -> None:
         key = result_key(self._key, record.sensor, record.what)
+        self._publisher(session, key, cached=CACHE_SAMPLES).put(record.payload, attachment=str(previous))
+        self._previous = max(self._previous, record.sequence)
+
+    def _publisher(self, session: zenoh.Session, key: str, cached: int) -> AdvancedPublisher:
         if key not in self._publishers:
             self._publishers[key] = declare_advanced_publisher(
                 session,
@@ -203,12 +225,11 @@ class Publisher:
                 encoding=zenoh.Encoding.APPLICATION_JSON,
                 # Only this thread waits, and on one link a later result cannot then overtake an earlier one.
                 congestion_control=zenoh.CongestionControl.BLOCK,
-                cache=CacheConfig(max_samples=CACHE_SAMPLES),
+                cache=CacheConfig(max_samples=cached),
                 sample_miss_detection=MissDetectionConfig(heartbeat=HEARTBEAT_S),  # type: ignore[call-arg]
                 publisher_detection=True,
             )
-        self._publishers[key].put(record.payload, attachment=str(previous))
-        self._previous = max(self._previous, record.sequence)
+        return self._publishers[key]
 
     def _undeclare_publishers(self) -> None:
         while self._publishers:

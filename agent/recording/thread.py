@@ -49,6 +49,11 @@ class RecordingThread:
         """The next event, where recordings are due to be deleted; None while one is on its way."""
         return None if self._pruning_sent else self._recorder.pruning
 
+    @property
+    def waiting(self) -> int:
+        """Events that wait for the disk; `put` waits from CAPACITY on."""
+        return self._queue.qsize()
+
     def put(
         self, event_sequence: int, event: Event, outputs: Sequence[Output], memories: Sequence[Memory] = ()
     ) -> None:
