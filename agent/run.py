@@ -29,9 +29,20 @@ STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 @click.option("--preset", type=click.Choice(["plain", "faulty"]), default="plain", show_default=True,
               help="Which virtual bench, where there is no CONFIG.")  # fmt: skip
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=1, show_default=True, help="Of the virtual bench.")
+@click.option("--log", type=click.Choice(["plain", "json"]),
+              help="What standard error gets: JSON, one object a line, the default under systemd.")  # fmt: skip
 @click.option("--with-router", is_flag=True, help=f"Start a Zenoh router at {LOOPBACK} unless one is there.")
-def run(config: Path | None, data_dir: Path, duration: float | None, preset: str, seed: int, with_router: bool) -> int:
+def run(
+    config: Path | None,
+    data_dir: Path,
+    duration: float | None,
+    preset: str,
+    seed: int,
+    log: str | None,
+    with_router: bool,
+) -> int:
     """Read, calibrate, record and publish until Ctrl-C. Without CONFIG on the virtual bench."""
+    from agent.supervision.logs import log_as_json, under_journal
     from agent.terminal.watch import Watch
 
     if duration is not None and not math.isfinite(duration):
@@ -40,6 +51,8 @@ def run(config: Path | None, data_dir: Path, duration: float | None, preset: str
     for number in STOP_SIGNALS:
         signal.signal(number, signal.default_int_handler)
     with ExitStack() as stack:
+        if as_json := log == "json" or (log is None and under_journal(os.environ, sys.stderr.fileno())):
+            stack.callback(log_as_json().finish)
         try:
             if config is None:
                 settings, truth = stack.enter_context(virtual_bench(preset, seed))
@@ -50,7 +63,8 @@ def run(config: Path | None, data_dir: Path, duration: float | None, preset: str
                 click.echo(fault, err=True)
             return 2
         said = [stack.enter_context(router(LOOPBACK))] if with_router else []
-        watch = stack.enter_context(Watch(settings, f"virtual bench, {preset}" if truth else str(config), truth))
+        title = f"virtual bench, {preset}" if truth else str(config)
+        watch = stack.enter_context(Watch(settings, title, truth, lines=not as_json))
         for line in said:
             watch.say(line)
         return serve(settings, data_dir, watch, duration)

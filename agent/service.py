@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import os
 import threading
 import time
 import uuid
@@ -25,8 +27,13 @@ from agent.recording.retention import keep_files
 from agent.recording.signing import Signer
 from agent.recording.thread import RecordingThread
 from agent.recording.writer import Recorder
+from agent.supervision.notify import Notifier
+from agent.supervision.plant import Outbox, Plant
+from agent.supervision.supervisor import Supervisor
 from agent.terminal.watch import Watch
 from hw.sensor import Sensor, boot_id, load_driver
+
+_log = logging.getLogger(__name__)
 
 TICK_S = 1.0
 POLL_S = 0.2  # how soon a signal is seen when no device speaks
@@ -58,9 +65,9 @@ class Service:
         signer = Signer.load(config.recording.signing_key) if config.recording.signing_key else None
         self._store = Store(self._data_dir, keep=keep_results(config.results))
         if self._store.set_aside:
-            self._watch.say(f"the state file was corrupt and is kept as {self._store.set_aside}")
+            _log.warning("the state file was corrupt and is kept as %s", self._store.set_aside)
         if found := self._store.recovered.results:
-            self._watch.say(f"{found} results that the state file lacked were found in the recordings")
+            _log.warning("%d results that the state file lacked were found in the recordings", found)
         self._recorder = Recorder(
             self._data_dir,
             [device.name for device in config.devices],
@@ -78,12 +85,15 @@ class Service:
         readers = [Reader(d.name, _sensor(d.name, d.driver, d.options), events) for d in config.devices]
         self._begin()
         writer = RecordingThread(self._recorder, self._deliver, flush_s=config.recording.flush_s)
+        plant = Plant(self._data_dir, events, writer, self._recorder, Outbox(self._store), self._publisher)
+        self._supervisor = Supervisor(config, self._run_id, self._origin_ns, plant, Notifier(os.environ))
         try:
             writer.put(0, self._run_start(continuation=False), [])
             for reader in readers:
                 reader.start()
             self._loop(events, writer, duration_s)
         finally:
+            self._supervisor.closing()
             if self._reception is not None:
                 self._reception.close()
             for reader in readers:
@@ -136,7 +146,7 @@ class Service:
                     memories = history.memories(channel.sensor)
                     kept[channel.sensor] = {identity: memory.state for identity, memory in memories.items()}
         except StoreError as error:
-            self._watch.say(f"the calibration in force cannot be restored: {error}")
+            _log.warning("the calibration in force cannot be restored: %s", error)
         return kept
 
     def _run_start(self, *, continuation: bool) -> RunStart:
@@ -180,11 +190,13 @@ class Service:
         self._sequence += 1
         outputs = self._pipeline.step(event)
         writer.put(self._sequence, event, outputs, self._pipeline.memories(outputs))
-        self._watch.update(event, [item for item in outputs if isinstance(item, Result)])
+        results = [item for item in outputs if isinstance(item, Result)]
+        self._watch.update(event, results)
         if self._publisher is not None:
             for item in outputs:
                 if isinstance(item, Acceleration):
                     self._publisher.stream(item.sensor, encode_acceleration(self._sequence, item))
+        self._supervisor.on_event(event, results)
 
     def _deliver(
         self, event_sequence: int, results: Sequence[Result], recorded: bool, memories: Sequence[Memory]
@@ -195,7 +207,7 @@ class Service:
         try:
             self._store.commit(records, memories)
         except StoreError as error:
-            self._watch.say(f"the store cannot keep results up to event {event_sequence}: {error}")
+            _log.error("the store cannot keep results up to event %d: %s", event_sequence, error)
         if self._publisher is None:
             self._store.mark_published(records[-1].sequence)  # nobody waits for them
             return

@@ -11,6 +11,7 @@ from agent.config.commands import Commands
 from agent.config.devices import Device, Gateway
 from agent.config.section import Section
 from agent.config.sinks import Recording, Results, Zenoh
+from agent.config.supervision import Supervision
 
 
 class Config(Section):
@@ -24,6 +25,7 @@ class Config(Section):
     results: Results = Results()
     zenoh: Zenoh = Zenoh()
     commands: Commands = Commands()
+    supervision: Supervision = Supervision()
 
     @model_validator(mode="after")
     def _names(self) -> Config:

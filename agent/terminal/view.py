@@ -92,13 +92,23 @@ class View(Protocol):
         """Show the end state and leave the terminal as it was. May be called twice."""
 
 
-def open_view(state: ViewState, stream: TextIO) -> View:
-    """A live screen where `stream` is a terminal, plain lines elsewhere."""
+def open_view(state: ViewState, stream: TextIO, *, lines: bool = True) -> View:
+    """A live screen where `stream` is a terminal; elsewhere plain lines, or nothing."""
     if stream.isatty():
         from agent.terminal.screen import Screen
 
         return Screen(state, stream)
-    return Lines(state, stream)
+    return Lines(state, stream) if lines else Nothing()
+
+
+class Nothing:
+    """Shows nothing: the log tells it."""
+
+    def refresh(self, *, now: bool = False) -> None:
+        """Nothing."""
+
+    def close(self) -> None:
+        """Nothing."""
 
 
 class Lines:

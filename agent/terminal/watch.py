@@ -15,15 +15,20 @@ from agent.recording.writer import Recorder
 from agent.terminal.view import DeviceState, RecordingState, Truth, ViewState, open_view
 from hw.block import BlockFlags, SampleBlock
 
+_log = logging.getLogger(__name__)
 RATE_OVER_BLOCKS = 20  # the rate shown is over this many blocks, ten seconds
 
 
 class Watch(logging.Handler):
-    """The view of a run. `update` and `health` are the main loop's; `say` and log records may come from any thread."""
+    """The view of a run. `update` and `health` are the main loop's; `say` and log records may come from any thread.
 
-    def __init__(self, config: Config, title: str, truth: Truth | None) -> None:
+    `lines`: whether what happens is written where there is no terminal; a log that tells it makes them superfluous.
+    """
+
+    def __init__(self, config: Config, title: str, truth: Truth | None, *, lines: bool = True) -> None:
         super().__init__(logging.WARNING)
         gateway = config.gateway
+        self._lines = lines
         self.state = ViewState(title=title, gateway=f"{gateway.site}/{gateway.name}")
         self.state.devices = {d.name: DeviceState(kind=d.driver) for d in config.devices}
         if truth is not None:
@@ -35,7 +40,7 @@ class Watch(logging.Handler):
         self._began_s = time.monotonic()
 
     def __enter__(self) -> Watch:
-        self._view = open_view(self.state, sys.stdout)
+        self._view = open_view(self.state, sys.stdout, lines=self._lines)
         logging.getLogger("agent").addHandler(self)
         return self
 
@@ -46,10 +51,11 @@ class Watch(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """A log record of ours becomes a line."""
-        self.say(record.getMessage())
+        self._said.put(record.getMessage())
 
     def say(self, line: str) -> None:
-        """A line for whoever watches."""
+        """A line for whoever watches, and for the log."""
+        _log.info("%s", line)
         self._said.put(line)
 
     def update(self, event: Event, results: list[Result]) -> None:
@@ -60,7 +66,7 @@ class Watch(logging.Handler):
             self._take_change(event)
         elif isinstance(event, Gap):
             self.state.devices[event.device].gaps += 1
-            self.say(f"{event.device}: {event.dropped} {event.unit} dropped, {event.reason}")
+            self._said.put(f"{event.device}: {event.dropped} {event.unit} dropped, {event.reason}")
         self.state.take(results)
         self._take_said()
         self._view.refresh(now=bool(results))
@@ -101,4 +107,4 @@ class Watch(logging.Handler):
             self._arrivals[change.device].clear()
         else:
             device.rate_hz = 0.0
-            self.say(f"{change.device}: {change.message}")
+            self._said.put(f"{change.device}: {change.message}")

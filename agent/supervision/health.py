@@ -1,0 +1,182 @@
+"""The gateway's status: what its devices, queues, disk and network do, and whether that is well.
+
+It is about this process and this minute, so it is neither a result nor recorded: a replay could not make it again, and
+the recording holds what it is made of (blocks, gaps, device changes, ticks).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import msgspec
+
+from agent.config import Config
+from agent.events import CalibrationUpdate, DeviceChange, Event, Gap, Result, StatusChange, WindowReport
+from agent.supervision.devices import DeviceHealth, DeviceWatch
+from hw.block import SampleBlock
+
+SILENT_S = 5.0  # of an open device: ten blocks of most; the default after which a sensor's status is INVALID, too
+BEHIND = 0.5  # of a queue's capacity: it was never above a tenth on a machine that keeps up
+
+State = Literal["starting", "running", "degraded", "stopping"]
+
+
+class Queue(msgspec.Struct, frozen=True, kw_only=True):
+    """Events that wait between two threads."""
+
+    waiting: int
+    capacity: int
+
+
+class RecordingHealth(msgspec.Struct, frozen=True, kw_only=True):
+    """The file being written."""
+
+    active: bool
+    file: str
+    size_bytes: int
+    fault: str
+
+
+class PublicationHealth(msgspec.Struct, frozen=True, kw_only=True):
+    """The way out. `unpublished` results wait in the store; null where it cannot be read."""
+
+    enabled: bool
+    connected: bool
+    unpublished: int | None
+    fault: str
+
+
+class ProcessHealth(msgspec.Struct, frozen=True, kw_only=True):
+    """This process."""
+
+    rss_bytes: int
+    threads: int
+    open_files: int
+    cpu_s: float
+
+
+class Situation(msgspec.Struct, frozen=True, kw_only=True):
+    """What is measured at one moment, and does not follow from the events."""
+
+    queues: dict[str, Queue]
+    recording: RecordingHealth
+    publication: PublicationHealth
+    disk_free_bytes: int | None
+    process: ProcessHealth
+    faults: list[str] = []  # of the supervision itself
+
+
+class SensorHealth(msgspec.Struct, frozen=True, kw_only=True):
+    """Results of one sensor since the run began."""
+
+    status: str
+    reason: str
+    windows_used: int
+    windows_refused: int
+    calibrations: int
+
+
+class GatewayStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """What is published at `<gateway>/status`. `reasons`: why it is degraded."""
+
+    site: str
+    gateway: str
+    version: str
+    run_id: str
+    t_utc_ns: int
+    uptime_s: float
+    state: State
+    reasons: list[str]
+    devices: dict[str, DeviceHealth]
+    sensors: dict[str, SensorHealth]
+    situation: Situation
+
+    @property
+    def line(self) -> str:
+        """In one line, for people."""
+        if self.reasons:
+            return f"{self.state}: {'; '.join(self.reasons)}"
+        rates = ", ".join(f"{n} {d.rate_hz:.1f} Hz" for n, d in self.devices.items() if d.rate_hz is not None)
+        calibrations = ", ".join(f"{name} {sensor.status}" for name, sensor in self.sensors.items() if sensor.status)
+        return "; ".join(part for part in (self.state, rates, calibrations) if part)
+
+
+class Health:
+    """Follows the events and results of a run. Not thread-safe: it is the main loop's."""
+
+    def __init__(self, config: Config, version: str, run_id: str, origin_ns: int) -> None:
+        self._config = config
+        self._version = version
+        self._run_id = run_id
+        self._origin_ns = origin_ns
+        self._devices = {device.name: DeviceWatch() for device in config.devices}
+        nothing = SensorHealth(status="", reason="", windows_used=0, windows_refused=0, calibrations=0)
+        self._sensors = {channel.sensor: nothing for channel in config.channels}
+
+    @property
+    def started(self) -> bool:
+        """Whether every device was opened, or has said why it cannot be."""
+        return all(device.tried for device in self._devices.values())
+
+    def update(self, event: Event, results: Sequence[Result]) -> None:
+        """An event went through the pipeline, and what came of it."""
+        if isinstance(event, SampleBlock):
+            self._devices[event.device].on_block(event)
+        elif isinstance(event, DeviceChange):
+            self._devices[event.device].on_change(event)
+        elif isinstance(event, Gap):
+            self._devices[event.device].on_gap(event)
+        for result in results:
+            self._take(result)
+
+    def state(self, now_ns: int, situation: Situation) -> tuple[State, list[str]]:
+        """How it is at `now_ns` (CLOCK_MONOTONIC), and why. Cheap."""
+        reasons = [
+            f"{name} {fault}"
+            for name, device in self._devices.items()
+            if (fault := device.fault(now_ns, SILENT_S)) and (device.tried or self.started)
+        ]
+        reasons += self._troubles(situation)
+        return ("degraded" if reasons else "running") if self.started else "starting", reasons
+
+    def status(self, now_ns: int, utc_ns: int, situation: Situation, state: State, reasons: list[str]) -> GatewayStatus:
+        """All of it at `now_ns` (CLOCK_MONOTONIC). Costs some milliseconds a device."""
+        return GatewayStatus(
+            site=self._config.gateway.site,
+            gateway=self._config.gateway.name,
+            version=self._version,
+            run_id=self._run_id,
+            t_utc_ns=utc_ns,
+            uptime_s=(now_ns - self._origin_ns) * 1e-9,
+            state=state,
+            reasons=reasons,
+            devices={name: device.health(now_ns) for name, device in self._devices.items()},
+            sensors=dict(self._sensors),
+            situation=situation,
+        )
+
+    def _take(self, result: Result) -> None:
+        sensor = self._sensors[result.sensor]
+        if isinstance(result, WindowReport):
+            used, refused = sensor.windows_used + result.used, sensor.windows_refused + (not result.used)
+            sensor = msgspec.structs.replace(sensor, windows_used=used, windows_refused=refused)
+        elif isinstance(result, CalibrationUpdate):
+            sensor = msgspec.structs.replace(sensor, calibrations=sensor.calibrations + 1)
+        elif isinstance(result, StatusChange):
+            sensor = msgspec.structs.replace(sensor, status=result.status, reason=result.reason)
+        self._sensors[result.sensor] = sensor
+
+    def _troubles(self, now: Situation) -> list[str]:
+        """Without numbers that change, so that a trouble that goes on is the same words."""
+        least, publication = int(self._config.supervision.least_disk_free), now.publication
+        behind = [name for name, queue in now.queues.items() if queue.waiting > BEHIND * queue.capacity]
+        told = {
+            f"not recording: {now.recording.fault}": not now.recording.active and now.recording.fault,
+            f"less than {least / 1e6:g} MB free on the disk of the data": (now.disk_free_bytes or least) < least,
+            "the store cannot be read": publication.unpublished is None,
+            "no Zenoh router, results wait in the store": publication.enabled and not publication.connected,
+            f"publication: {publication.fault}": publication.fault,
+            f"behind: {', '.join(behind)}": behind,
+        }
+        return [words for words, holds in told.items() if holds] + now.faults

@@ -1,0 +1,131 @@
+"""The gateway's status for Prometheus, at `/metrics`. prometheus_client loads only where it is turned on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import TYPE_CHECKING, get_args
+
+from agent.supervision.devices import ClockQuality, DeviceHealth
+from agent.supervision.health import GatewayStatus, State
+
+if TYPE_CHECKING:
+    from prometheus_client.metrics_core import Metric
+
+CALIBRATION_STATES = ("UNCALIBRATED", "COLLECTING", "VALID", "HELD", "RECALIBRATING", "INVALID")
+
+Number = float | int | bool | None
+Values = Iterable[tuple[tuple[str, ...], Number]]  # by the values of the labels
+# name without prefix: (what it is, whether it only grows, where it stands)
+DEVICE_METRICS: dict[str, tuple[str, bool, Callable[[DeviceHealth], Number]]] = {
+    "up": ("Whether the device is open", False, lambda d: d.state == "open"),
+    "samples": ("Samples that went through the pipeline", True, lambda d: d.samples),
+    "blocks": ("Blocks that went through the pipeline", True, lambda d: d.blocks),
+    "gaps": ("Times that samples were missing", True, lambda d: d.gaps),
+    "missing_samples": ("Samples known to be missing in the gaps", True, lambda d: d.missing),
+    "overruns": ("Blocks before which the device lost samples", True, lambda d: d.overruns),
+    "saturated_blocks": ("Blocks with an indication at the end of the range", True, lambda d: d.saturated),
+    "losses": ("Times that the device was lost", True, lambda d: d.losses),
+    "sample_rate_hertz": ("Rate at which samples came over the last blocks", False, lambda d: d.rate_hz),
+    "nominal_sample_rate_hertz": ("Rate that the device was set to", False, lambda d: d.nominal_rate_hz),
+    "lag_seconds": ("Age of the newest sample", False, lambda d: d.lag_s),
+    "temperature_celsius": ("The device's own temperature", False, lambda d: d.temperature_degc),
+}
+CLOCK_METRICS: dict[str, tuple[str, Callable[[ClockQuality], float]]] = {
+    "rate_hertz": ("The device's rate by the gateway's clock", lambda c: c.rate_hz),
+    "rate_standard_uncertainty_hertz": ("Standard uncertainty of that rate", lambda c: c.u_rate_hz),
+    "residual_seconds": ("Standard deviation of arrivals about the clock model", lambda c: c.residual_sd_s),
+}
+GATEWAY_METRICS: dict[str, tuple[str, bool, Callable[[GatewayStatus], Number]]] = {
+    "uptime_seconds": ("Time since the run began", False, lambda s: s.uptime_s),
+    "status_timestamp_seconds": ("UTC of the report these figures are from", False, lambda s: s.t_utc_ns * 1e-9),
+    "recording_active": ("Whether raw data reach a file", False, lambda s: s.situation.recording.active),
+    "recording_file_bytes": ("Size of the file being written", False, lambda s: s.situation.recording.size_bytes),
+    "disk_free_bytes": ("Free on the disk of the data", False, lambda s: s.situation.disk_free_bytes),
+    "publication_connected": ("Whether a Zenoh router is there", False, lambda s: s.situation.publication.connected),
+    "unpublished_results": ("Results that wait in the store", False, lambda s: s.situation.publication.unpublished),
+    "threads": ("Threads of the agent", False, lambda s: s.situation.process.threads),
+}
+
+
+class StatusCollector:
+    """Turns the newest status into metrics whenever somebody scrapes. `newest` is called in the server's thread."""
+
+    def __init__(self, newest: Callable[[], GatewayStatus | None]) -> None:
+        self._newest = newest
+
+    def collect(self) -> Iterator[Metric]:
+        """All metrics; none before the first status."""
+        status = self._newest()
+        if status is None:
+            return
+        yield from self._gateway(status)
+        yield from self._devices(status)
+        yield from self._sensors(status)
+
+    def _gateway(self, status: GatewayStatus) -> Iterator[Metric]:
+        from prometheus_client.metrics_core import GaugeMetricFamily, InfoMetricFamily
+
+        who = {"site": status.site, "gateway": status.gateway, "version": status.version}
+        yield InfoMetricFamily("fieldcal_gateway", "Who this is", value=who)
+        yield _states("fieldcal_state", "State of the gateway", [], [((), status.state)], get_args(State))
+        for name, (text, grows, value) in GATEWAY_METRICS.items():
+            yield _family(f"fieldcal_{name}", text, grows, [], [((), value(status))])
+        waiting = GaugeMetricFamily("fieldcal_queue_events", "Events that wait between two threads", labels=["queue"])
+        capacity = GaugeMetricFamily("fieldcal_queue_capacity_events", "Events that fit", labels=["queue"])
+        for name, queue in status.situation.queues.items():
+            waiting.add_metric([name], queue.waiting)
+            capacity.add_metric([name], queue.capacity)
+        yield from (waiting, capacity)
+
+    def _devices(self, status: GatewayStatus) -> Iterator[Metric]:
+        for name, (text, grows, value) in DEVICE_METRICS.items():
+            values = [((device,), value(health)) for device, health in status.devices.items()]
+            yield _family(f"fieldcal_device_{name}", text, grows, ["device"], values)
+        clocks = [((device,), health.clock) for device, health in status.devices.items() if health.clock]
+        for name, (text, figure) in CLOCK_METRICS.items():
+            yield _family(
+                f"fieldcal_device_clock_{name}", text, False, ["device"], [(of, figure(c)) for of, c in clocks]
+            )
+        dropped = [((d, unit), n) for d, health in status.devices.items() for unit, n in health.dropped.items()]
+        yield _family("fieldcal_device_dropped", "Read and not usable", True, ["device", "unit"], dropped)
+
+    def _sensors(self, status: GatewayStatus) -> Iterator[Metric]:
+        statuses = [((name,), sensor.status) for name, sensor in status.sensors.items()]
+        yield _states(
+            "fieldcal_calibration_state", "Status of a sensor's calibration", ["sensor"], statuses, CALIBRATION_STATES
+        )
+        windows = [((n, "used"), s.windows_used) for n, s in status.sensors.items()]
+        windows += [((n, "refused"), s.windows_refused) for n, s in status.sensors.items()]
+        yield _family("fieldcal_windows", "Windows of known excitation", True, ["sensor", "verdict"], windows)
+        calibrations = [((name,), sensor.calibrations) for name, sensor in status.sensors.items()]
+        yield _family("fieldcal_calibrations", "Calibrations that came into force", True, ["sensor"], calibrations)
+
+
+def serve_metrics(host: str, port: int, newest: Callable[[], GatewayStatus | None]) -> str:
+    """Answer scrapes, in threads that end with the process; returns the address. Raises OSError."""
+    from prometheus_client import CollectorRegistry, ProcessCollector, start_http_server
+
+    registry = CollectorRegistry()
+    registry.register(StatusCollector(newest))
+    ProcessCollector(registry=registry)
+    server, _ = start_http_server(port, host, registry)
+    return f"http://{host}:{server.server_port}/metrics"
+
+
+def _family(name: str, text: str, grows: bool, labels: list[str], values: Values) -> Metric:
+    """A counter or gauge; what is not known is not there, as Prometheus wants it."""
+    from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily
+
+    family = (CounterMetricFamily if grows else GaugeMetricFamily)(name, text, labels=labels)
+    for of, value in values:
+        if value is not None:
+            family.add_metric(list(of), float(value))
+    return family
+
+
+def _states(
+    name: str, text: str, labels: list[str], now: Iterable[tuple[tuple[str, ...], str]], known: tuple[str, ...]
+) -> Metric:
+    """1 for the state that holds, 0 for the others."""
+    values = (((*of, s), s == state) for of, state in now for s in known)
+    return _family(name, text, False, [*labels, "state"], values)

@@ -1,0 +1,107 @@
+"""The parts of a run that the supervision looks at, and what it measures there."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from agent.delivery.history import History, StoreError
+from agent.delivery.publication import Publisher
+from agent.delivery.store import Store
+from agent.reader import EventQueue
+from agent.recording.thread import CAPACITY, RecordingThread
+from agent.recording.writer import Recorder
+from agent.supervision.health import (
+    ProcessHealth,
+    PublicationHealth,
+    Queue,
+    RecordingHealth,
+    Situation,
+)
+
+_PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
+
+
+class Outbox:
+    """Counts the results that wait in the store; asks it only when that number may have changed."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._asked: tuple[int, int] | None = None
+        self._count: int | None = 0
+
+    def count(self) -> int | None:
+        """Results that are kept and not published; None where the store cannot be read."""
+        now = self._store.published(), self._store.last_sequence()
+        if now != self._asked:
+            self._asked, self._count = now, self._read(*now)
+        return self._count
+
+    def _read(self, published: int, last: int) -> int | None:
+        if published >= last:
+            return 0
+        try:
+            with History(self._store.path) as history:
+                return history.count_after(published)
+        except StoreError:
+            return None
+
+
+@dataclass(frozen=True, slots=True)
+class Plant:
+    """One run. Everything here may be asked from the main loop at any time; nothing of it waits."""
+
+    data_dir: Path
+    events: EventQueue
+    writer: RecordingThread
+    recorder: Recorder
+    outbox: Outbox
+    publisher: Publisher | None
+
+    def situation(self, faults: list[str]) -> Situation:
+        """As it is now; half a millisecond."""
+        path = self.recorder.path
+        return Situation(
+            queues={
+                "pipeline": Queue(waiting=self.events.waiting, capacity=self.events.capacity),
+                "recording": Queue(waiting=self.writer.waiting, capacity=CAPACITY),
+            },
+            recording=RecordingHealth(
+                active=path is not None,
+                file=path.name if path else "",
+                size_bytes=self.recorder.size_bytes,
+                fault=self.recorder.fault,
+            ),
+            publication=self._publication(),
+            disk_free_bytes=_disk_free_bytes(self.data_dir),
+            process=_process(),
+            faults=faults,
+        )
+
+    def _publication(self) -> PublicationHealth:
+        if self.publisher is None:
+            return PublicationHealth(enabled=False, connected=False, unpublished=0, fault="")
+        state = self.publisher.state()
+        return PublicationHealth(
+            enabled=True, connected=state.connected, unpublished=self.outbox.count(), fault=state.fault
+        )
+
+
+def _disk_free_bytes(directory: Path) -> int | None:
+    try:
+        there = os.statvfs(directory)
+    except OSError:
+        return None
+    return there.f_bavail * there.f_frsize
+
+
+def _process() -> ProcessHealth:
+    resident_pages = int(Path("/proc/self/statm").read_text("ascii").split()[1])
+    return ProcessHealth(
+        rss_bytes=resident_pages * _PAGE_BYTES,
+        threads=len(os.listdir("/proc/self/task")),
+        open_files=len(os.listdir("/proc/self/fd")) - 1,  # the listing has one of its own
+        cpu_s=time.process_time(),
+    )

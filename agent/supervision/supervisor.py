@@ -1,0 +1,88 @@
+"""Watches over a run: after every event it knows how the agent is, and tells whoever should know."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Sequence
+
+import msgspec
+
+from agent import __version__
+from agent.config import Config
+from agent.events import Event, Result, Tick
+from agent.supervision.health import GatewayStatus, Health, State
+from agent.supervision.logs import log_event, tell
+from agent.supervision.metrics import serve_metrics
+from agent.supervision.notify import Notifier
+from agent.supervision.plant import Plant
+from hw.block import SampleBlock
+
+_log = logging.getLogger(__name__)
+
+
+class Supervisor:
+    """The main loop's: `on_event` after each event that went through the pipeline and to the recording, `closing` once.
+
+    systemd's watchdog is fed by blocks alone, here at the end of their way: a loop that stands still, a reader that
+    hangs in a driver and a device that says nothing all look the same to it. READY is said when every device was
+    opened or has said why not: an absent one is tried again for ever, and the others go on meanwhile.
+    """
+
+    def __init__(self, config: Config, run_id: str, origin_ns: int, plant: Plant, notifier: Notifier) -> None:
+        self._settings = config.supervision
+        self._health = Health(config, __version__, run_id, origin_ns)
+        self._plant = plant
+        self._notifier = notifier
+        self._ready = False
+        self._told: tuple[State, list[str]] | None = None
+        self._report_at_ns = 0
+        self._newest: GatewayStatus | None = None
+        self._faults: list[str] = []
+        tell("run", f"run {run_id} begins", run_id=run_id, version=__version__, gateway=config.gateway.name)
+        if self._settings.metrics.enabled:
+            self._serve_metrics()
+
+    def on_event(self, event: Event, results: Sequence[Result]) -> None:
+        """An event, and what came of it."""
+        self._health.update(event, results)
+        log_event(event, results)
+        if isinstance(event, SampleBlock):
+            self._notifier.feed()
+        elif isinstance(event, Tick):
+            self._look(event)
+        if not self._ready and self._health.started:
+            self._ready = self._notifier.ready()
+
+    def closing(self) -> None:
+        """The run ends: said before devices and files are closed."""
+        self._notifier.stopping()
+        self._report("stopping", [], time.monotonic_ns(), time.time_ns())
+        self._notifier.close()
+
+    def _look(self, tick: Tick) -> None:
+        state, reasons = self._health.state(tick.t_monotonic_ns, self._plant.situation(self._faults))
+        if (state, reasons) != self._told or tick.t_monotonic_ns >= self._report_at_ns:
+            self._report(state, reasons, tick.t_monotonic_ns, tick.t_utc_ns)
+
+    def _report(self, state: State, reasons: list[str], now_ns: int, utc_ns: int) -> None:
+        self._report_at_ns = now_ns + int(self._settings.status_s * 1e9)
+        status = self._health.status(now_ns, utc_ns, self._plant.situation(self._faults), state, reasons)
+        self._newest = status
+        self._notifier.status(status.line)
+        if self._plant.publisher is not None:
+            self._plant.publisher.tell_status(msgspec.json.encode(status))
+        if (state, reasons) != self._told:
+            self._told = (state, reasons)
+            tell("state", status.line, state == "degraded", state=state, reasons=reasons)
+
+    def _serve_metrics(self) -> None:
+        metrics = self._settings.metrics
+        try:
+            address = serve_metrics(metrics.host, metrics.port, lambda: self._newest)
+        except OSError as error:
+            fault = f"no metrics at {metrics.host}:{metrics.port}: {error.strerror or error}"
+            self._faults.append(fault)
+            _log.warning("%s", fault)
+        else:
+            tell("metrics", f"metrics at {address}", address=address)
