@@ -64,7 +64,6 @@ class Situation(msgspec.Struct, frozen=True, kw_only=True):
     publication: PublicationHealth
     disk_free_bytes: int | None
     process: ProcessHealth
-    faults: list[str] = []  # of the supervision itself
 
 
 class SensorHealth(msgspec.Struct, frozen=True, kw_only=True):
@@ -77,7 +76,7 @@ class SensorHealth(msgspec.Struct, frozen=True, kw_only=True):
     calibrations: int
 
 
-class GatewayStatus(msgspec.Struct, frozen=True, kw_only=True):
+class GatewayStatus(Situation, frozen=True, kw_only=True):
     """What is published at `<gateway>/status`. `reasons`: why it is degraded."""
 
     site: str
@@ -90,7 +89,6 @@ class GatewayStatus(msgspec.Struct, frozen=True, kw_only=True):
     reasons: list[str]
     devices: dict[str, DeviceHealth]
     sensors: dict[str, SensorHealth]
-    situation: Situation
 
     @property
     def line(self) -> str:
@@ -130,14 +128,14 @@ class Health:
         for result in results:
             self._take(result)
 
-    def state(self, now_ns: int, situation: Situation) -> tuple[State, list[str]]:
-        """How it is at `now_ns` (CLOCK_MONOTONIC), and why. Cheap."""
+    def state(self, now_ns: int, situation: Situation, faults: Sequence[str]) -> tuple[State, list[str]]:
+        """How it is at `now_ns` (CLOCK_MONOTONIC), and why; `faults` are the supervision's own. Cheap."""
         reasons = [
             f"{name} {fault}"
             for name, device in self._devices.items()
             if (fault := device.fault(now_ns, SILENT_S)) and (device.tried or self.started)
         ]
-        reasons += self._troubles(situation)
+        reasons += [*self._troubles(situation), *faults]
         return ("degraded" if reasons else "running") if self.started else "starting", reasons
 
     def status(self, now_ns: int, utc_ns: int, situation: Situation, state: State, reasons: list[str]) -> GatewayStatus:
@@ -153,7 +151,7 @@ class Health:
             reasons=reasons,
             devices={name: device.health(now_ns) for name, device in self._devices.items()},
             sensors=dict(self._sensors),
-            situation=situation,
+            **msgspec.structs.asdict(situation),
         )
 
     def _take(self, result: Result) -> None:
@@ -179,4 +177,4 @@ class Health:
             f"publication: {publication.fault}": publication.fault,
             f"behind: {', '.join(behind)}": behind,
         }
-        return [words for words, holds in told.items() if holds] + now.faults
+        return [words for words, holds in told.items() if holds]

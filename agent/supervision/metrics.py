@@ -38,12 +38,12 @@ CLOCK_METRICS: dict[str, tuple[str, Callable[[ClockQuality], float]]] = {
 GATEWAY_METRICS: dict[str, tuple[str, bool, Callable[[GatewayStatus], Number]]] = {
     "uptime_seconds": ("Time since the run began", False, lambda s: s.uptime_s),
     "status_timestamp_seconds": ("UTC of the report these figures are from", False, lambda s: s.t_utc_ns * 1e-9),
-    "recording_active": ("Whether raw data reach a file", False, lambda s: s.situation.recording.active),
-    "recording_file_bytes": ("Size of the file being written", False, lambda s: s.situation.recording.size_bytes),
-    "disk_free_bytes": ("Free on the disk of the data", False, lambda s: s.situation.disk_free_bytes),
-    "publication_connected": ("Whether a Zenoh router is there", False, lambda s: s.situation.publication.connected),
-    "unpublished_results": ("Results that wait in the store", False, lambda s: s.situation.publication.unpublished),
-    "threads": ("Threads of the agent", False, lambda s: s.situation.process.threads),
+    "recording_active": ("Whether raw data reach a file", False, lambda s: s.recording.active),
+    "recording_file_bytes": ("Size of the file being written", False, lambda s: s.recording.size_bytes),
+    "disk_free_bytes": ("Free on the disk of the data", False, lambda s: s.disk_free_bytes),
+    "publication_connected": ("Whether a Zenoh router is there", False, lambda s: s.publication.connected),
+    "unpublished_results": ("Results that wait in the store", False, lambda s: s.publication.unpublished),
+    "threads": ("Threads of the agent", False, lambda s: s.process.threads),
 }
 
 
@@ -72,7 +72,7 @@ class StatusCollector:
             yield _family(f"fieldcal_{name}", text, grows, [], [((), value(status))])
         waiting = GaugeMetricFamily("fieldcal_queue_events", "Events that wait between two threads", labels=["queue"])
         capacity = GaugeMetricFamily("fieldcal_queue_capacity_events", "Events that fit", labels=["queue"])
-        for name, queue in status.situation.queues.items():
+        for name, queue in status.queues.items():
             waiting.add_metric([name], queue.waiting)
             capacity.add_metric([name], queue.capacity)
         yield from (waiting, capacity)

@@ -60,7 +60,7 @@ class Plant:
     outbox: Outbox
     publisher: Publisher | None
 
-    def situation(self, faults: list[str]) -> Situation:
+    def situation(self) -> Situation:
         """As it is now; half a millisecond."""
         path = self.recorder.path
         return Situation(
@@ -77,7 +77,6 @@ class Plant:
             publication=self._publication(),
             disk_free_bytes=_disk_free_bytes(self.data_dir),
             process=_process(),
-            faults=faults,
         )
 
     def _publication(self) -> PublicationHealth:

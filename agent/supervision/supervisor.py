@@ -61,13 +61,13 @@ class Supervisor:
         self._notifier.close()
 
     def _look(self, tick: Tick) -> None:
-        state, reasons = self._health.state(tick.t_monotonic_ns, self._plant.situation(self._faults))
+        state, reasons = self._health.state(tick.t_monotonic_ns, self._plant.situation(), self._faults)
         if (state, reasons) != self._told or tick.t_monotonic_ns >= self._report_at_ns:
             self._report(state, reasons, tick.t_monotonic_ns, tick.t_utc_ns)
 
     def _report(self, state: State, reasons: list[str], now_ns: int, utc_ns: int) -> None:
         self._report_at_ns = now_ns + int(self._settings.status_s * 1e9)
-        status = self._health.status(now_ns, utc_ns, self._plant.situation(self._faults), state, reasons)
+        status = self._health.status(now_ns, utc_ns, self._plant.situation(), state, reasons)
         self._newest = status
         self._notifier.status(status.line)
         if self._plant.publisher is not None:
