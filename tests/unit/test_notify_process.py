@@ -1,0 +1,157 @@
+"""The real agent under what looks like systemd: ready, fed by blocks alone, degraded and back, stopping."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zenoh
+
+from hw.virtual.serial_port import PtyDevice, SampleLines
+from tests.scenarios.processes import ROOT, wait_until
+from tests.unit.zenoh_site import Site
+
+WATCHDOG_S = 2.0
+CONFIG = """
+[gateway]
+site = "site"
+name = "gw"
+[[devices]]
+name = "imu"
+driver = "serial-csv"
+options = {{ port = "{port}", rate_hz = 100, axes = 3, sequence = true, unit = "m/s2" }}
+[[channels]]
+sensor = "imu"
+[zenoh]
+connect = ["{endpoint}"]
+"""
+
+
+class Systemd:
+    """Takes notifications, each with when it came."""
+
+    def __init__(self, path: Path) -> None:
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.bind(str(path))
+        self._socket.setblocking(False)
+        self.environment = {"NOTIFY_SOCKET": str(path), "WATCHDOG_USEC": str(int(WATCHDOG_S * 1e6))}
+        self.told: list[tuple[float, str]] = []
+
+    def has(self, message: str, since_s: float = 0.0) -> bool:
+        """Whether something that begins so has come since then."""
+        while True:
+            try:
+                self.told.append((time.monotonic(), self._socket.recv(4096).decode()))
+            except BlockingIOError:
+                return any(t >= since_s and m.startswith(message) for t, m in self.told)
+
+    def fed_within(self, duration_s: float) -> bool:
+        """Whether the watchdog is fed at all in the time that comes."""
+        since_s = time.monotonic()
+        while time.monotonic() < since_s + duration_s:
+            if self.has("WATCHDOG=1", since_s):
+                return True
+            time.sleep(0.02)  # polls
+        return False
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+@pytest.fixture
+def systemd(tmp_path: Path) -> Iterator[Systemd]:
+    systemd = Systemd(tmp_path / "notify")
+    yield systemd
+    systemd.close()
+
+
+@pytest.fixture
+def site() -> Iterator[Site]:
+    site = Site()
+    yield site
+    site.kill()
+
+
+@pytest.fixture
+def imu(tmp_path: Path) -> Iterator[PtyDevice]:
+    device = PtyDevice(SampleLines(lambda _, n: np.ones((n, 3)), lambda t_s: int(t_s * 100)), link=tmp_path / "imu")
+    device.start()
+    yield device
+    device.stop()
+
+
+@pytest.fixture
+def agent(tmp_path: Path, imu: PtyDevice, site: Site, systemd: Systemd) -> Iterator[subprocess.Popen[bytes]]:
+    config = tmp_path / "gateway.toml"
+    config.write_text(CONFIG.format(port=imu.path, endpoint=site.endpoint))
+    command = [sys.executable, "-m", "agent", "run", config, "--data-dir", tmp_path / "data"]
+    with open(tmp_path / "log", "wb") as log:
+        there = os.fstat(log.fileno())
+        environment = os.environ | systemd.environment | {"JOURNAL_STREAM": f"{there.st_dev}:{there.st_ino}"}
+        process = subprocess.Popen(command, cwd=ROOT, env=environment, stdout=log, stderr=log)
+    yield process
+    process.kill()
+    process.wait()
+
+
+def test_it_tells_how_it_is_from_beginning_to_end(
+    tmp_path: Path, imu: PtyDevice, site: Site, systemd: Systemd, agent: subprocess.Popen[bytes]
+) -> None:
+    with site.client() as client:
+        subscriber = client.declare_subscriber("fieldcal/v1/site/gw/status", zenoh.handlers.RingChannel(100))
+        wait_until(lambda: systemd.has("READY=1"), 20, "ready")
+        wait_until(lambda: systemd.has("STATUS=running; imu "), 20, "a status with the rate")
+        assert systemd.fed_within(WATCHDOG_S / 2)
+        imu.unplug()
+        wait_until(lambda: systemd.has("STATUS=degraded: imu is lost"), 10, "degraded")
+        assert not systemd.fed_within(2 * WATCHDOG_S), "nothing flows"
+        imu.replug()
+        plugged_s = time.monotonic()
+        wait_until(lambda: systemd.has("STATUS=running", plugged_s), 20, "running again")
+        assert systemd.fed_within(WATCHDOG_S / 2)
+        agent.terminate()
+        assert agent.wait(5) == 0
+        assert systemd.has("STOPPING=1")
+        states = []
+        while (sample := subscriber.try_recv()) is not None:
+            states.append(json.loads(sample.payload.to_string())["state"])
+        subscriber.undeclare()
+    assert [s for i, s in enumerate(states) if s != states[i - 1] or i == 0] == [
+        "running",
+        "degraded",
+        "running",
+        "stopping",
+    ]
+    log = [json.loads(line) for line in (tmp_path / "log").read_text().splitlines()]
+    assert {entry["level"] for entry in log} == {"info", "warning"}
+    assert [e["state"] for e in log if e.get("event") == "state"] == ["running", "degraded", "running", "stopping"]
+    assert [e["state"] for e in log if e.get("event") == "device"] == ["open", "lost", "open"]
+
+
+def test_an_agent_that_stands_still_does_not_feed(systemd: Systemd, agent: subprocess.Popen[bytes]) -> None:
+    wait_until(lambda: systemd.has("WATCHDOG=1"), 20, "fed")
+    agent.send_signal(signal.SIGSTOP)
+    systemd.has("")
+    assert not systemd.fed_within(1.5 * WATCHDOG_S)
+    agent.send_signal(signal.SIGCONT)
+    assert systemd.fed_within(WATCHDOG_S)
+
+
+def test_an_absent_device_does_not_keep_it_from_being_ready(
+    imu: PtyDevice, systemd: Systemd, agent: subprocess.Popen[bytes]
+) -> None:
+    imu.unplug()
+    wait_until(lambda: systemd.has("READY=1"), 20, "ready")
+    wait_until(lambda: systemd.has("STATUS=degraded: imu is lost"), 10, "it says what is missing")
+    assert not systemd.has("WATCHDOG=1")
+    agent.terminate()
+    assert agent.wait(5) == 0
