@@ -21,7 +21,7 @@ from typing import Any
 
 import msgspec
 
-from agent.events import Command, DeviceChange, Event, Gap, Result
+from agent.events import Command, DeviceChange, Event, Gap, Pruned, Result
 from agent.recording.messages import RESULT_TOPICS
 from agent.terminal.wording import result_lines
 
@@ -166,6 +166,9 @@ def log_event(event: Event, results: Sequence[Result]) -> None:
     elif isinstance(event, Command):
         refused = f"refused: {event.refused}" if event.refused else "taken"
         tell("command", f"{event.sensor}: command {event.verb} {refused}", bool(event.refused), **_fields(event))
+    elif isinstance(event, Pruned):
+        message = f"recordings {event.first_file} to {event.last_file} were deleted to keep to the limits"
+        tell("pruned", message, first_file=event.first_file, last_file=event.last_file, bytes=event.bytes)
     for result in results:
         tell(RESULT_TOPICS[type(result)], result_lines(result, None)[0], **_fields(result))
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from agent.events import Command, DeviceChange, Gap
+from agent.events import Command, DeviceChange, Gap, Pruned
 from agent.supervision.logs import WAITING_MAX, JsonFormatter, JsonLog, log_event, under_journal, without_secrets
 from tests.unit.results import calibration, status, window
 
@@ -60,16 +60,19 @@ def test_what_happens_is_an_object_a_line_with_its_fields(piped: Piped) -> None:
     change = {"device": "mems", "t_monotonic_ns": 1, "t_utc_ns": 1}
     log_event(DeviceChange(**change, state="lost", message="I2C 1, 0x1d:\nEIO", attempt=2), [])
     log_event(Gap(device="mems", t_monotonic_ns=1, dropped=3, unit="lines", reason="not a number"), [])
+    pruned = {"first_file": 3, "last_file": 5, "last_sha256": "0" * 64, "bytes": 7}
+    log_event(Pruned(t_monotonic_ns=1, t_utc_ns=1, **pruned), [])
     command = Command(sensor="mems", verb="hold", t_monotonic_ns=1, t_utc_ns=1, key_id="k1", refused="expired")
     log_event(command, [window(1), calibration(2, qz_known=False), status(3)])
     entries = piped.entries()
     assert [(e["event"], e["level"]) for e in entries] == [
-        ("device", "warning"), ("gap", "warning"), ("command", "warning"), ("window", "info"), ("calibration", "info"),
+        ("device", "warning"), ("gap", "warning"), ("pruned", "info"), ("command", "warning"), ("window", "info"), ("calibration", "info"),
         ("status", "info"),
     ]  # fmt: skip
-    lost, gap, refused, used, in_force, _ = entries
+    lost, gap, pruning, refused, used, in_force, _ = entries
     assert (lost["message"], lost["state"], lost["attempt"]) == ("mems: lost, I2C 1, 0x1d:\nEIO", "lost", 2)
     assert (gap["dropped"], gap["unit"]) == (3, "lines")
+    assert (pruning["first_file"], pruning["last_file"], pruning["bytes"]) == (3, 5, 7)
     assert (refused["key_id"], refused["refused"]) == ("k1", "expired")
     assert (used["used"], used["points"], used["sequence"]) == (True, 6000, 1)
     assert in_force["sensitivity"][0][0] == 26154.0
