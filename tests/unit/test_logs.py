@@ -66,8 +66,8 @@ def test_what_happens_is_an_object_a_line_with_its_fields(piped: Piped) -> None:
     log_event(command, [window(1), calibration(2, qz_known=False), status(3)])
     entries = piped.entries()
     assert [(e["event"], e["level"]) for e in entries] == [
-        ("device", "warning"), ("gap", "warning"), ("pruned", "info"), ("command", "warning"), ("window", "info"), ("calibration", "info"),
-        ("status", "info"),
+        ("device", "warning"), ("gap", "warning"), ("pruned", "info"), ("command", "warning"), ("window", "info"),
+        ("calibration", "info"), ("status", "info"),
     ]  # fmt: skip
     lost, gap, pruning, refused, used, in_force, _ = entries
     assert (lost["message"], lost["state"], lost["attempt"]) == ("mems: lost, I2C 1, 0x1d:\nEIO", "lost", 2)
