@@ -131,9 +131,7 @@ class Health:
     def state(self, now_ns: int, situation: Situation, faults: Sequence[str]) -> tuple[State, list[str]]:
         """How it is at `now_ns` (CLOCK_MONOTONIC), and why; `faults` are the supervision's own. Cheap."""
         reasons = [
-            f"{name} {fault}"
-            for name, device in self._devices.items()
-            if (fault := device.fault(now_ns, SILENT_S)) and (device.tried or self.started)
+            f"{name} {fault}" for name, device in self._devices.items() if (fault := device.fault(now_ns, SILENT_S))
         ]
         reasons += [*self._troubles(situation), *faults]
         return ("degraded" if reasons else "running") if self.started else "starting", reasons

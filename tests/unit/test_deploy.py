@@ -47,6 +47,15 @@ def test_systemd_thinks_it_tight(unit: Path) -> None:
     assert float(exposure) <= EXPOSURE_MAX, told.stdout
 
 
+def test_what_the_hardening_test_takes_on_is_in_it() -> None:
+    said = directives(UNIT)
+    for key in ("NoNewPrivileges", "MemoryDenyWriteExecute", "RestrictNamespaces", "ProtectHome"):
+        assert said[key] == ["yes"], key
+    assert (said["ProtectSystem"], said["CapabilityBoundingSet"], said["User"]) == (["strict"], [""], ["fieldcal"])
+    assert said["SystemCallFilter"] == ["@system-service", "~@privileged @resources"]
+    assert said["SystemCallErrorNumber"] == ["EPERM"], "OpenBLAS calls mbind when numpy loads, and would be killed"
+
+
 def test_it_is_supervised_and_started_again_for_ever() -> None:
     said = directives(UNIT)
     assert (said["Type"], said["Restart"], said["StartLimitIntervalSec"]) == (["notify"], ["on-failure"], ["0"])

@@ -128,7 +128,7 @@ def test_it_starts_until_every_device_was_tried() -> None:
     health = Health(config(), "0.1", "run", START_NS)
     health.update(change("mems", "open"), [])
     assert not health.started
-    assert report(health, 1.0).state == "starting"
+    assert (report(health, 1.0).state, report(health, 1.0).reasons) == ("starting", ["reference is not open yet"])
     health.update(change("reference", "lost", 0.5, "no such port"), [])
     assert health.started
     told = report(health, 1.0)

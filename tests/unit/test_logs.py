@@ -11,12 +11,14 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from agent.events import Command, DeviceChange, Gap, Pruned
 from agent.supervision.logs import WAITING_MAX, JsonFormatter, JsonLog, log_event, under_journal, without_secrets
+from tests.scenarios.processes import fieldcal
 from tests.unit.results import calibration, status, window
 
 KEY = "-----BEGIN PRIVATE KEY-----\nMC4CAQAwBQYDK2VwBCIEIB\n-----END PRIVATE KEY-----"
@@ -198,3 +200,12 @@ def test_whatever_a_process_tells_on_standard_error_is_json() -> None:
     assert "ZeroDivisionError: division by zero" in messages
     assert messages[-1] == "after the end"
     assert ended.stdout == ""
+
+
+def test_faults_of_a_configuration_are_json_too(tmp_path: Path) -> None:
+    config = tmp_path / "gateway.toml"
+    config.write_text("speed = 1\n")
+    ended = fieldcal("run", config, "--log", "json")
+    assert (ended.returncode, ended.stdout) == (2, "")
+    messages = [json.loads(line)["message"] for line in ended.stderr.splitlines()]
+    assert f"{config}: speed: Extra inputs are not permitted, not 1" in messages
