@@ -63,7 +63,7 @@ class Situation(msgspec.Struct, frozen=True, kw_only=True):
     recording: RecordingHealth
     publication: PublicationHealth
     disk_free_bytes: int | None
-    process: ProcessHealth
+    process: ProcessHealth | None
 
 
 class SensorHealth(msgspec.Struct, frozen=True, kw_only=True):

@@ -43,7 +43,7 @@ GATEWAY_METRICS: dict[str, tuple[str, bool, Callable[[GatewayStatus], Number]]] 
     "disk_free_bytes": ("Free on the disk of the data", False, lambda s: s.disk_free_bytes),
     "publication_connected": ("Whether a Zenoh router is there", False, lambda s: s.publication.connected),
     "unpublished_results": ("Results that wait in the store", False, lambda s: s.publication.unpublished),
-    "threads": ("Threads of the agent", False, lambda s: s.process.threads),
+    "threads": ("Threads of the agent", False, lambda s: s.process.threads if s.process else None),
 }
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sqlite3
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,7 +46,7 @@ class Outbox:
         try:
             with History(self._store.path) as history:
                 return history.count_after(published)
-        except StoreError:
+        except (StoreError, sqlite3.Error):
             return None
 
 
@@ -96,11 +97,14 @@ def _disk_free_bytes(directory: Path) -> int | None:
     return there.f_bavail * there.f_frsize
 
 
-def _process() -> ProcessHealth:
-    resident_pages = int(Path("/proc/self/statm").read_text("ascii").split()[1])
-    return ProcessHealth(
-        rss_bytes=resident_pages * _PAGE_BYTES,
-        threads=len(os.listdir("/proc/self/task")),
-        open_files=len(os.listdir("/proc/self/fd")) - 1,  # the listing has one of its own
-        cpu_s=time.process_time(),
-    )
+def _process() -> ProcessHealth | None:
+    try:
+        resident_pages = int(Path("/proc/self/statm").read_text("ascii").split()[1])
+        return ProcessHealth(
+            rss_bytes=resident_pages * _PAGE_BYTES,
+            threads=len(os.listdir("/proc/self/task")),
+            open_files=len(os.listdir("/proc/self/fd")) - 1,  # the listing has one of its own
+            cpu_s=time.process_time(),
+        )
+    except OSError:  # no file can be opened: the agent goes on with those it has
+        return None
