@@ -59,6 +59,7 @@ driver = "serial-csv"
 options = {{ port = "{port}", rate_hz = {rate_hz}, axes = 3, sequence = true, unit = "m/s2" }}
 [[channels]]
 sensor = "imu"
+prior = {{}}
 guard_s = 0.2
 poses = [{poses}]
 poses_repeat_s = {period_s}

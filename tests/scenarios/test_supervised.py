@@ -31,6 +31,7 @@ driver = "serial-csv"
 options = {{ port = "{port}", rate_hz = 100, axes = 3, sequence = true, unit = "m/s2" }}
 [[channels]]
 sensor = "imu"
+prior = {{}}
 [zenoh]
 connect = ["{endpoint}"]
 """
@@ -108,7 +109,7 @@ def test_it_tells_how_it_is_from_beginning_to_end(
 ) -> None:
     with site.client() as client:
         subscriber = client.declare_subscriber("fieldcal/v1/site/gw/status", zenoh.handlers.RingChannel(100))
-        wait_until(lambda: systemd.has("READY=1"), 20, "ready")
+        wait_until(lambda: systemd.has("READY=1"), 60, "ready")
         wait_until(lambda: systemd.has("STATUS=running; imu "), 20, "a status with the rate")
         assert systemd.fed_within(WATCHDOG_S / 2)
         imu.unplug()
@@ -139,7 +140,7 @@ def test_it_tells_how_it_is_from_beginning_to_end(
 
 
 def test_an_agent_that_stands_still_does_not_feed(systemd: Systemd, agent: subprocess.Popen[bytes]) -> None:
-    wait_until(lambda: systemd.has("WATCHDOG=1"), 20, "fed")
+    wait_until(lambda: systemd.has("WATCHDOG=1"), 60, "fed")
     agent.send_signal(signal.SIGSTOP)
     systemd.has("")
     assert not systemd.fed_within(1.5 * WATCHDOG_S)
@@ -151,7 +152,7 @@ def test_an_absent_device_does_not_keep_it_from_being_ready(
     imu: PtyDevice, systemd: Systemd, agent: subprocess.Popen[bytes]
 ) -> None:
     imu.unplug()
-    wait_until(lambda: systemd.has("READY=1"), 20, "ready")
+    wait_until(lambda: systemd.has("READY=1"), 60, "ready")
     wait_until(lambda: systemd.has("STATUS=degraded: imu is lost"), 10, "it says what is missing")
     assert not systemd.has("WATCHDOG=1")
     agent.terminate()

@@ -34,7 +34,11 @@ RATE_HZ = 1003.3  # true; nominal is 1000
 def config(**supervision: Any) -> Config:
     option = {"port": "/dev/null", "rate_hz": 1000, "axes": 3, "unit": "m/s2"}
     devices = [{"name": n, "driver": "serial-csv", "options": option} for n in ("mems", "reference")]
-    raw = {"devices": devices, "channels": [{"sensor": "mems", "reference": "reference"}], "supervision": supervision}
+    raw = {
+        "devices": devices,
+        "channels": [{"sensor": "mems", "reference": "reference", "prior": {}}],
+        "supervision": supervision,
+    }
     return parse_config(raw, "test")
 
 

@@ -84,6 +84,7 @@ driver = "serial-csv"
 options = {{ port = "{port}", rate_hz = 100, axes = 3, sequence = true, unit = "m/s2" }}
 [[channels]]
 sensor = "imu"
+prior = {{}}
 [zenoh]
 enabled = false
 [supervision]
@@ -106,7 +107,7 @@ def test_the_real_agent_is_scraped_on_loopback(tmp_path: Path, imu: PtyDevice) -
     config, output = tmp_path / "gateway.toml", tmp_path / "output"
     config.write_text(CONFIG.format(port=imu.path))
     with started("run", config, "--data-dir", tmp_path / "data", "--log", "json", output=output) as agent:
-        line = wait_until(lambda: [x for x in output.read_text().splitlines() if "metrics at" in x], 20, "an address")
+        line = wait_until(lambda: [x for x in output.read_text().splitlines() if "metrics at" in x], 60, "an address")
         address = line[0].partition("metrics at ")[2].partition('"')[0]
         assert address.startswith("http://127.0.0.1:")
         samples = wait_until(
