@@ -78,13 +78,19 @@ class I2CBus:
         return None
 
 
-class _Kernel:
+class Kernel:
+    """Files and ioctls of i2c-dev, on the argument structures of smbus2. All methods raise OSError as the kernel would.
+
+    `installed` puts it under smbus2; whatever else carries system calls out of another process may ask it too.
+    """
+
     def __init__(self, nodes: Mapping[str, I2CBus]) -> None:
         self._nodes = nodes
         self._files: dict[int, tuple[I2CBus, int]] = {}
         self._address: dict[int, int] = {}
 
     def open(self, path: str, flags: int) -> int:
+        """A file descriptor for the node of an adapter."""
         bus = self._nodes.get(path)
         if bus is None or not bus.plugged:
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), path)
@@ -93,11 +99,13 @@ class _Kernel:
         return file
 
     def close(self, file: int) -> None:
+        """Give it back."""
         self._files.pop(file)
         self._address.pop(file, None)
         os.close(file)
 
     def ioctl(self, file: int, request: int, argument: Any) -> int:
+        """One request; what it returns is written into `argument`."""
         bus, generation = self._files[file]
         if generation != bus.generation:
             raise _error(errno.EIO)
@@ -157,7 +165,7 @@ def _error(number: int) -> OSError:
 @contextlib.contextmanager
 def installed(nodes: Mapping[str, I2CBus]) -> Iterator[None]:
     """Within, smbus2 finds these adapters (by path, e.g. /dev/i2c-1) and no others."""
-    kernel = _Kernel(nodes)
+    kernel = Kernel(nodes)
     module = vars(s2)
     before = module["ioctl"], module["os"]
     module["ioctl"] = kernel.ioctl
