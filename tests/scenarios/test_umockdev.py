@@ -1,0 +1,196 @@
+"""The program as it is installed, in a process of its own, on register-level twins behind libumockdev's preload."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from agent.events import DeviceChange, Gap
+from agent.recording.reading import RecordingReader
+from hw.block import BlockFlags, SampleBlock
+from hw.virtual.adxl345_twin import Adxl345Twin
+from hw.virtual.adxl355_twin import Adxl355Twin
+from hw.virtual.fifo_twin import Counts, FifoTwin
+from hw.virtual.kernel import I2CBus
+from hw.virtual.lsm6dso_twin import Lsm6dsoTwin
+from hw.virtual.mpu6050_twin import Mpu6050Twin
+from hw.virtual.serial_port import PtyDevice, SampleLines
+from tests.scenarios.processes import ROOT, interrupt, recordings, wait_until
+from tests.scenarios.umockdev_site import UmockdevSite, absence
+
+ABSENCE = absence()
+pytestmark = pytest.mark.skipif(ABSENCE is not None, reason=str(ABSENCE))
+
+NODE = "/dev/i2c-1"
+LAP = 1000
+# Slow enough that no FIFO (the ADXL355's holds 32 samples) runs over while a machine under load does something else.
+DEVICES: dict[str, tuple[type[FifoTwin], int, float]] = {
+    "adxl355": (Adxl355Twin, 0x1D, 125.0),
+    "adxl345": (Adxl345Twin, 0x53, 100.0),
+    "mpu6050": (Mpu6050Twin, 0x68, 100.0),
+    "lsm6dso": (Lsm6dsoTwin, 0x6A, 104.0),
+}
+SERIAL_HZ = 100.0
+
+
+def numbered(first: int, n: int) -> Counts:
+    """x and y tell a sample's number: places in a lap, and laps."""
+    lap, place = np.divmod(np.arange(first, first + n, dtype=np.int32), LAP)
+    return np.column_stack([place, lap, np.full_like(lap, 7)])
+
+
+def number(indications: NDArray[np.generic]) -> NDArray[np.int64]:
+    """The number of each sample, by what `numbered` made of it."""
+    x, y, z = indications.astype(np.int64).T
+    assert (z == 7).all()
+    return np.asarray(LAP * y + x)
+
+
+def since_start(rate_hz: float) -> Callable[[float], int]:
+    began_s = time.monotonic()
+    return lambda t_s: int((t_s - began_s) * rate_hz)
+
+
+@pytest.fixture
+def bus() -> I2CBus:
+    return I2CBus(
+        {address: twin(numbered, since_start(rate_hz), time.monotonic) for twin, address, rate_hz in DEVICES.values()}
+    )
+
+
+@pytest.fixture
+def site(bus: I2CBus) -> Iterator[UmockdevSite]:
+    with UmockdevSite({NODE: bus}) as site:
+        yield site
+
+
+@pytest.fixture
+def port() -> Iterator[PtyDevice]:
+    device = PtyDevice(SampleLines(lambda first, n: numbered(first, n).astype(float), since_start(SERIAL_HZ)))
+    device.start()
+    yield device
+    device.stop()
+
+
+def program(site: UmockdevSite, *arguments: str | Path) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-u", "-m", "agent", *map(str, arguments)],
+        cwd=ROOT,
+        env=os.environ | site.environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def configuration(tmp_path: Path, port: PtyDevice) -> Path:
+    lines = ['[gateway]\nsite = "test"\nname = "gateway"\n[zenoh]\nenabled = false\n[recording]\nflush_s = 0.5\n']
+    lines += [
+        f'[[devices]]\nname = "{name}"\ndriver = "{name}"\n'
+        f"options = {{ bus = 1, address = {address}, rate_hz = {rate_hz} }}\n"
+        for name, (_, address, rate_hz) in DEVICES.items()
+    ]
+    lines.append(
+        '[[devices]]\nname = "serial"\ndriver = "serial-csv"\n'
+        f'options = {{ port = "{port.path}", rate_hz = {SERIAL_HZ}, axes = 3, sequence = true, unit = "m/s2" }}\n'
+    )
+    lines += [f'[[channels]]\nsensor = "{name}"\n' for name in (*DEVICES, "serial")]
+    path = tmp_path / "gateway.toml"
+    path.write_text("".join(lines))
+    return path
+
+
+def events(data_dir: Path) -> list[object]:
+    return [step.event for file in recordings(data_dir) for step in RecordingReader(file).steps()]
+
+
+def of(device: str, seen: list[object]) -> list[SampleBlock]:
+    return [event for event in seen if isinstance(event, SampleBlock) and event.device == device]
+
+
+def test_probe_names_who_answers(site: UmockdevSite, bus: I2CBus) -> None:
+    bus.claimed.add(0x68)
+    process = program(site, "probe", "--json", "-")
+    out, _ = process.communicate(timeout=30)
+    assert process.returncode == 0, out
+    (found,) = json.loads(out)["i2c"]
+    assert (found["number"], found["fault"]) == (1, "")
+    said = {answer["address"]: answer for answer in found["answers"]}
+    assert sorted(said) == [0x1D, 0x53, 0x68, 0x6A]
+    assert said[0x1D]["identity"].startswith("ADXL355 (REVID 0x01)")
+    assert said[0x53]["identity"] == "ADXL345 (DEVID 0xE5)"
+    assert said[0x6A]["drivers"] == ["lsm6dso"]
+    assert "a kernel driver holds the address" in said[0x68]["note"]
+
+
+def test_probe_names_a_bus_that_is_not_there(site: UmockdevSite) -> None:
+    process = program(site, "probe", "--bus", "7")
+    out, _ = process.communicate(timeout=30)
+    assert process.returncode == 1
+    assert "/dev/i2c-7: No such file or directory" in out
+
+
+def test_a_run_loses_no_sample_of_any_device(tmp_path: Path, site: UmockdevSite, port: PtyDevice) -> None:
+    data_dir = tmp_path / "data"
+    process = program(site, "run", configuration(tmp_path, port), "--data-dir", data_dir, "--duration", "6")
+    out, _ = process.communicate(timeout=60)
+    assert process.returncode == 0, out
+    assert "Traceback" not in out
+    seen = events(data_dir)
+    assert [event for event in seen if isinstance(event, Gap)] == []
+    rates_hz = {name: rate_hz for name, (_, _, rate_hz) in DEVICES.items()} | {"serial": SERIAL_HZ}
+    for name, rate_hz in rates_hz.items():
+        blocks = of(name, seen)
+        assert [block.flags for block in blocks] == [BlockFlags.RESTART] + [BlockFlags.NONE] * (len(blocks) - 1), name
+        numbers = np.concatenate([number(block.indications) for block in blocks])
+        assert (np.diff(numbers) == 1).all(), name
+        assert len(numbers) > 4 * rate_hz, name  # of the six seconds, those in which devices open and the last block
+
+
+def test_unplugged_and_back_it_goes_on(tmp_path: Path, site: UmockdevSite, bus: I2CBus, port: PtyDevice) -> None:
+    data_dir = tmp_path / "data"
+    process = program(site, "run", configuration(tmp_path, port), "--data-dir", data_dir)
+    try:
+        wait_until(lambda: all(of(name, events(data_dir)) for name in DEVICES), 30, "samples of all come")
+        site.unplug(NODE)
+        wait_until(lambda: lost(data_dir) == set(DEVICES), 20, "all on the bus are lost")
+        site.replug(NODE)
+        wait_until(lambda: not lost(data_dir), 20, "all are back")
+        for target in bus.targets.values():
+            assert isinstance(target, FifoTwin)
+            target.fail(errno.EREMOTEIO, 3)  # passes
+        before = {name: len(of(name, events(data_dir))) for name in DEVICES}
+        wait_until(
+            lambda: all(len(of(name, events(data_dir))) > n + 1 for name, n in before.items()), 20, "samples go on"
+        )
+    finally:
+        interrupt(process)
+        out, _ = process.communicate(timeout=30)
+    assert process.returncode == 0, out
+    assert "Traceback" not in out
+    seen = events(data_dir)
+    losses = [event for event in seen if isinstance(event, DeviceChange) and event.state == "lost"]
+    assert {event.device for event in losses} == set(DEVICES)
+    assert any("Input/output error" in event.message for event in losses)
+    assert len(of("serial", seen)) > 2
+    for name in DEVICES:
+        blocks = of(name, seen)
+        for block in blocks:
+            assert (np.diff(number(block.indications)) == 1).all(), name
+        assert sum(bool(block.flags & BlockFlags.RESTART) for block in blocks) >= 2
+
+
+def lost(data_dir: Path) -> set[str]:
+    """Devices whose last change is a loss."""
+    last = {event.device: event.state for event in events(data_dir) if isinstance(event, DeviceChange)}
+    return {name for name, state in last.items() if state == "lost"}
