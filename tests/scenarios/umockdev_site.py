@@ -1,9 +1,9 @@
 """Simulated I2C adapters for another, unmodified process: libumockdev's preload library carries its system calls here.
 
-The library hands each ioctl on a node of its test bed to a socket, and reads and writes the process's memory for whoever
-answers there. Requests are three unsigned longs (umockdev, src/libumockdev-preload.c: no documented interface, the same
-since 0.16): 1 ioctl, 7 read and 8 write, each with two arguments, come from the process; 3 ends one with its return
-value and errno, 5 asks for memory, 6 sets it.
+The library hands each ioctl on a node of its test bed to a socket, and reads and writes the process's memory for who
+answers there. A request is three unsigned longs (umockdev, src/libumockdev-preload.c: no documented interface; so in
+0.17.16 and in its newest source): 1 ioctl, 7 read and 8 write, each with two arguments, come from the process; 3 ends
+one with its return value and errno, 5 asks for memory, 6 sets it.
 """
 
 from __future__ import annotations
