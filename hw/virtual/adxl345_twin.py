@@ -1,4 +1,7 @@
-"""An ADXL345 at register level with its live FIFO: 32 samples and one more in the output registers."""
+"""An ADXL345 at register level with its live FIFO: 32 samples and one more in the output registers.
+
+Without the FIFO (bypass) these hold the sample made last.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +40,9 @@ class Adxl345Twin(FifoTwin):
     def _read_fifo(self, count: int) -> bytes:
         self._pointer += min(count, self.word_bytes)
         self._overrun = False
-        return self._take(self.word_bytes)[:count]
+        bypass = not self.registers[FIFO_CTL] & 0xC0
+        sample = self._newest().astype("<i2").tobytes() if bypass else self._take(self.word_bytes)
+        return sample[:count]
 
     def _deflection(self) -> Counts:
         return np.array([200, -200, 300] if self.registers[DATA_FORMAT] & 0x80 else [0, 0, 0], np.int32)
@@ -48,6 +53,8 @@ class Adxl345Twin(FifoTwin):
             return bool(entries) << 7 | (entries >= 32) << 1 | self._overrun
         if register == FIFO_STATUS:
             return entries
+        if DATA < register < DATA + 6:
+            return self._newest().astype("<i2").tobytes()[register - DATA]
         return self.registers[register]
 
     def _set(self, register: int, value: int) -> None:

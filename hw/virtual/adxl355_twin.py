@@ -13,7 +13,7 @@ IDENTITY = bytes([0xAD, 0x1D, 0xED, 0x01])
 EMPTY_ENTRY = b"\x00\x00\x02"
 RESET_S = 0.005  # so long after a reset the shadow registers are not loaded and settings do not take
 SHADOW = bytes([0x4C, 0x21, 0x9A, 0x05, 0x33])  # trim of this part, any constant does
-STATUS, FIFO_ENTRIES, TEMPERATURE, FIFO_DATA = 0x04, 0x05, 0x06, 0x11
+STATUS, FIFO_ENTRIES, TEMPERATURE, DATA, FIFO_DATA = 0x04, 0x05, 0x06, 0x08, 0x11
 FIRST_SETTING, LAST_SETTING, POWER_CTL, RESET, RESET_CODE, SHADOW_1 = 0x1E, 0x2E, 0x2D, 0x2F, 0x52, 0x50
 RESET_VALUES = {0x27: 0x01, 0x29: 0x60, 0x2C: 0x81, POWER_CTL: 0x01}
 
@@ -84,6 +84,8 @@ class Adxl355Twin(FifoTwin):
         if register in (TEMPERATURE, TEMPERATURE + 1):
             raw = self._temperature_raw(self._clock()) & 0xFFF
             return raw >> 8 if register == TEMPERATURE else raw & 0xFF
+        if DATA <= register < DATA + 9:
+            return encode(self._newest()[None])[register - DATA] & (0xFE if register == DATA + 2 else 0xFF)
         if SHADOW_1 <= register < SHADOW_1 + len(SHADOW):
             return SHADOW[register - SHADOW_1] if self._clock() >= self._ready_s else 0
         return self.registers[register]

@@ -68,10 +68,18 @@ class FifoTwin(ABC):
         """What self-test adds (3,)."""
         return np.zeros(3, np.int32)
 
+    def _newest(self) -> Counts:
+        """What the output registers hold (3,): the sample made last, one and the same throughout a message."""
+        if self._latched is None:
+            due = self._samples_due(self._clock())
+            self._latched = self._source(due - 1, 1)[0] + self._deflection() if due else np.zeros(3, np.int32)
+        return self._latched
+
     def power_cycle(self) -> None:
         """Power fails and comes back, or a reset: registers as after it, FIFO empty."""
         self.registers = self._reset_registers()
         self._pointer = 0
+        self._latched: Counts | None = None
         self._empty()
         self._overrun = False
 
@@ -99,6 +107,7 @@ class FifoTwin(ABC):
     def read(self, count: int) -> bytes:
         """One I2C read message, from the register written last on."""
         self._fail()
+        self._latched = None
         self._fill()
         if self._broken_off and self._pointer == self.data_register:
             number, words = self._broken_off

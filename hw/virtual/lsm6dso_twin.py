@@ -9,7 +9,7 @@ from hw.virtual.fifo_twin import Counts, FifoTwin
 FIFO_CTRL1, FIFO_CTRL3, FIFO_CTRL4, WHO_AM_I, CTRL1_XL, CTRL3_C, CTRL9_XL, CTRL10_C = (
     *(0x07, 0x09, 0x0A, 0x0F, 0x10, 0x12, 0x18, 0x19),
 )
-TEMPERATURE, FIFO_STATUS, FREQ_FINE, USER_OFFSET, FIFO_DATA = 0x20, 0x3A, 0x63, 0x73, 0x78
+TEMPERATURE, DATA, FIFO_STATUS, FREQ_FINE, USER_OFFSET, FIFO_DATA = 0x20, 0x28, 0x3A, 0x63, 0x73, 0x78
 SETTINGS = frozenset((*range(FIFO_CTRL1, FIFO_CTRL4 + 1), *range(CTRL1_XL, CTRL10_C + 1), *range(0x73, 0x76)))
 
 
@@ -58,6 +58,8 @@ class Lsm6dsoTwin(FifoTwin):
         if register in (TEMPERATURE, TEMPERATURE + 1):
             raw = self._temperature_raw(self._clock())
             return raw.to_bytes(2, "little", signed=True)[register - TEMPERATURE]
+        if DATA <= register < DATA + 6:
+            return self._newest().astype("<i2").tobytes()[register - DATA]
         return self.registers[register]
 
     def _set(self, register: int, value: int) -> None:

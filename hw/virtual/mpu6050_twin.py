@@ -6,7 +6,7 @@ import numpy as np
 
 from hw.virtual.fifo_twin import Counts, FifoTwin
 
-SMPLRT_DIV, FIFO_EN, INT_ENABLE, INT_STATUS, TEMPERATURE = 0x19, 0x23, 0x38, 0x3A, 0x41
+SMPLRT_DIV, FIFO_EN, INT_ENABLE, INT_STATUS, DATA, TEMPERATURE = 0x19, 0x23, 0x38, 0x3A, 0x3B, 0x41
 USER_CTRL, POWER_1, POWER_2, FIFO_COUNT, FIFO_DATA, WHO_AM_I = 0x6A, 0x6B, 0x6C, 0x72, 0x74, 0x75
 TRIM = bytes([0x12, 0x34, 0x56, 0x78, 0x9A, 0xBC])  # the maker's, any constant does
 
@@ -53,6 +53,8 @@ class Mpu6050Twin(FifoTwin):
         if register in (TEMPERATURE, TEMPERATURE + 1):
             raw = self._temperature_raw(self._clock())
             return raw.to_bytes(2, "big", signed=True)[register - TEMPERATURE]
+        if DATA <= register < DATA + 6:
+            return self._newest().astype(">i2").tobytes()[register - DATA]
         return self.registers[register]
 
     def _set(self, register: int, value: int) -> None:
