@@ -40,6 +40,7 @@ class FifoTwin(ABC):
         self._clock = clock
         self._temperature_raw = temperature_raw or (lambda _: self.temperature_at_25_degc)
         self._failures: list[int] = []
+        self._latched: Counts | None = None
         self._broken_off: tuple[int, int] | None = None
         self.power_cycle()
 
@@ -79,7 +80,7 @@ class FifoTwin(ABC):
         """Power fails and comes back, or a reset: registers as after it, FIFO empty."""
         self.registers = self._reset_registers()
         self._pointer = 0
-        self._latched: Counts | None = None
+        self._latched = None
         self._empty()
         self._overrun = False
 

@@ -8,23 +8,23 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from agent.events import DeviceChange, Gap
 from agent.recording.reading import RecordingReader
 from hw.block import BlockFlags, SampleBlock
 from hw.virtual.adxl345_twin import Adxl345Twin
 from hw.virtual.adxl355_twin import Adxl355Twin
-from hw.virtual.fifo_twin import Counts, FifoTwin
+from hw.virtual.fifo_twin import FifoTwin
 from hw.virtual.kernel import I2CBus
 from hw.virtual.lsm6dso_twin import Lsm6dsoTwin
 from hw.virtual.mpu6050_twin import Mpu6050Twin
 from hw.virtual.serial_port import PtyDevice, SampleLines
+from tests.numbered import number, numbered, since_now
 from tests.scenarios.processes import ROOT, interrupt, recordings, wait_until
 from tests.scenarios.umockdev_site import UmockdevSite, absence
 
@@ -32,7 +32,6 @@ ABSENCE = absence()
 pytestmark = pytest.mark.skipif(ABSENCE is not None, reason=str(ABSENCE))
 
 NODE = "/dev/i2c-1"
-LAP = 1000
 # Slow enough that no FIFO (the ADXL355's holds 32 samples) runs over while a machine under load does something else.
 DEVICES: dict[str, tuple[type[FifoTwin], int, float]] = {
     "adxl355": (Adxl355Twin, 0x1D, 125.0),
@@ -43,28 +42,10 @@ DEVICES: dict[str, tuple[type[FifoTwin], int, float]] = {
 SERIAL_HZ = 100.0
 
 
-def numbered(first: int, n: int) -> Counts:
-    """x and y tell a sample's number: places in a lap, and laps."""
-    lap, place = np.divmod(np.arange(first, first + n, dtype=np.int32), LAP)
-    return np.column_stack([place, lap, np.full_like(lap, 7)])
-
-
-def number(indications: NDArray[np.generic]) -> NDArray[np.int64]:
-    """The number of each sample, by what `numbered` made of it."""
-    x, y, z = indications.astype(np.int64).T
-    assert (z == 7).all()
-    return np.asarray(LAP * y + x)
-
-
-def since_start(rate_hz: float) -> Callable[[float], int]:
-    began_s = time.monotonic()
-    return lambda t_s: int((t_s - began_s) * rate_hz)
-
-
 @pytest.fixture
 def bus() -> I2CBus:
     return I2CBus(
-        {address: twin(numbered, since_start(rate_hz), time.monotonic) for twin, address, rate_hz in DEVICES.values()}
+        {address: twin(numbered, since_now(rate_hz), time.monotonic) for twin, address, rate_hz in DEVICES.values()}
     )
 
 
@@ -76,7 +57,7 @@ def site(bus: I2CBus) -> Iterator[UmockdevSite]:
 
 @pytest.fixture
 def port() -> Iterator[PtyDevice]:
-    device = PtyDevice(SampleLines(lambda first, n: numbered(first, n).astype(float), since_start(SERIAL_HZ)))
+    device = PtyDevice(SampleLines(lambda first, n: numbered(first, n).astype(float), since_now(SERIAL_HZ)))
     device.start()
     yield device
     device.stop()
