@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PRESET ?= plain
 
-.PHONY: run test lint bench lock clean
+.PHONY: run test nightly lint bench lock clean
 
 $(VENV)/runtime: requirements.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "fieldcal needs Python 3.11 or later, this is " + sys.version)'
@@ -22,6 +22,9 @@ run: $(VENV)/runtime  ## the agent on the virtual bench, with a router beside it
 
 test: $(VENV)/development
 	$(BIN)/python -m pytest -n auto --dist loadscope
+
+nightly: $(VENV)/development  ## the twins under Debian's kernel in QEMU; needs qemu-system-x86, busybox-static and Debian's apt
+	$(BIN)/python -m tests.nightly
 
 lint: $(VENV)/development
 	$(BIN)/ruff check .

@@ -1,0 +1,70 @@
+"""`python -m tests.nightly`: start the machine, compare, print the table. Ends with 1 where anything differs."""
+
+from __future__ import annotations
+
+import os
+
+os.environ["OPENBLAS_NUM_THREADS"] = "1"
+
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from tests.nightly import checks, runs
+from tests.nightly.checks import Machine, Row
+from tests.nightly.debian_kernel import fetched
+from tests.nightly.guest import Guest, GuestError
+from tests.nightly.initramfs import initramfs
+from tests.nightly.site import Twins
+from tests.nightly.tiny_usb import TinyUsb
+
+MODULES = [
+    *("virtio_pci", "9pnet_virtio", "9p", "xhci_pci", "i2c_tiny_usb", "i2c_dev", "kfifo_buf", "iio_trig_hrtimer"),
+    *("st_lsm6dsx_i2c", "inv_mpu6050_i2c"),
+]
+# In this order: once the kernel's drivers hold their devices nobody else may, and unplugging ends it all.
+STEPS = (
+    *(checks.i2c_dev, checks.probe, runs.own_drivers, checks.mpu6050, checks.held_address, checks.lsm6dso),
+    *(runs.through_iio, checks.unplugging),
+)
+
+
+def compared() -> Iterator[Row]:
+    """All rows, as they come."""
+    kernel = fetched()
+    print(f"Linux {kernel.release} under QEMU", flush=True)
+    twins = Twins()
+    with tempfile.TemporaryDirectory(prefix="fieldcal-") as name:
+        directory = Path(name)
+        usb = directory / "usb"
+        with (
+            TinyUsb(twins.bus, usb) as adapter,
+            Guest(kernel.image, initramfs(kernel.modules(MODULES)), directory, usb) as guest,
+        ):
+            machine = Machine(guest, twins, adapter)
+            for step in STEPS:
+                yield from step(machine)
+
+
+def main() -> int:
+    """Print a line a row; the exit status, 2 where there is no machine to compare with."""
+    began_s = time.monotonic()
+    differing = rows = 0
+    try:
+        for row in compared():
+            rows += 1
+            differing += not row.agree
+            mark = "  " if row.agree else "! "
+            print(f"{mark}{row.subject:13} {row.what:34} {row.kernel:44} {row.fieldcal}", flush=True)
+    except (FileNotFoundError, subprocess.CalledProcessError, GuestError) as error:
+        print(f"not compared to the end: {error}", file=sys.stderr)
+        return 2
+    print(f"{rows} rows, {differing} differ, {time.monotonic() - began_s:.0f} s")
+    return 1 if differing else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

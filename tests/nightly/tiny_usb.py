@@ -1,0 +1,149 @@
+"""An i2c-tiny-usb adapter for a virtual machine: a USB device in this process, over QEMU's USB redirection.
+
+The device: three vendor requests (Linux, drivers/i2c/busses/i2c-tiny-usb.c). Redirection: usbredir's protocol 0.7 with
+ids of 64 bits (spice, usbredir/docs/usb-redirection-protocol.md): packets of type, length, id and content; this side
+describes the device, then answers control transfers.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import struct
+import threading
+from pathlib import Path
+
+from hw.virtual.kernel import READ, I2CBus
+
+VENDOR, PRODUCT = 0x0403, 0xC631
+FULL_SPEED, VENDOR_CLASS, NO_ENDPOINT = 1, 0xFF, 255
+PACKET_BYTES = 64
+CAPABILITIES = 1 << 4 | 1 << 5 | 1 << 6  # packet sizes, ids of 64 bits, long bulk transfers: QEMU wants them for XHCI
+HELLO_HEAD, HEAD = struct.Struct("<III"), struct.Struct("<IIQ")
+CONTROL = struct.Struct("<BBBBHHH")  # endpoint, request, its type, status, value, index, length
+HELLO, CONNECT, DISCONNECT, RESET, INTERFACES, ENDPOINTS = range(6)
+SET_CONFIGURATION, GET_CONFIGURATION, CONFIGURATION, SET_ALTERNATE, GET_ALTERNATE, ALTERNATE = range(6, 12)
+CONTROL_PACKET = 100
+SUCCESS, STALL = 0, 4
+TO_HOST, STANDARD = 0x80, 0x00  # in a request's type; bits 6:5 tell standard from vendor
+GET_DESCRIPTOR, GET_FUNCTIONS, SET_DELAY, GET_STATUS, TRANSFERS = 6, 1, 2, 3, range(4, 8)
+ACKNOWLEDGED, NOT_ACKNOWLEDGED = b"\x01", b"\x02"
+
+
+def _text(text: str) -> bytes:
+    content = text.encode("utf-16le")
+    return bytes([2 + len(content), 3]) + content
+
+
+DESCRIPTORS = {
+    0x0100: struct.pack(
+        "<BBHBBBBHHHBBBB", 18, 1, 0x0110, VENDOR_CLASS, 0, 0, PACKET_BYTES, VENDOR, PRODUCT, 0x0105, 1, 2, 0, 1
+    ),
+    0x0200: bytes([9, 2, 18, 0, 1, 1, 0, 0x80, 50, 9, 4, 0, 0, 0, VENDOR_CLASS, 0, 0, 0]),
+    0x0300: bytes([4, 3, 9, 4]),
+    0x0301: _text("fieldcal"),
+    0x0302: _text("i2c-tiny-usb"),
+}
+
+
+class TinyUsb:
+    """Context manager: listens at `path` for QEMU and is plugged in from the start."""
+
+    def __init__(self, bus: I2CBus, path: Path) -> None:
+        self._bus = bus
+        self._listener = socket.socket(socket.AF_UNIX)
+        self._listener.bind(str(path))
+        self._listener.listen()
+        self._peer: socket.socket | None = None
+        self._status = ACKNOWLEDGED
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self) -> TinyUsb:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for end in (self._listener, self._peer):
+            if end is not None:
+                with contextlib.suppress(OSError):
+                    end.shutdown(socket.SHUT_RDWR)
+                end.close()
+        self._thread.join()
+
+    def plug(self) -> None:
+        """Put it in."""
+        self._send(INTERFACES, struct.pack("<I", 1) + bytes(32) + bytes([VENDOR_CLASS, *bytes(31)]) + bytes(64))
+        ends = bytes([0, *[NO_ENDPOINT] * 15]) * 2  # the control endpoint, out and in
+        self._send(ENDPOINTS, ends + bytes(64) + struct.pack("<H", PACKET_BYTES) * 32)
+        self._send(CONNECT, struct.pack("<BBBBHH", FULL_SPEED, VENDOR_CLASS, 0, 0, VENDOR, PRODUCT))
+
+    def unplug(self) -> None:
+        """Pull it out."""
+        self._send(DISCONNECT, b"")
+
+    def _run(self) -> None:
+        with contextlib.suppress(OSError, EOFError):
+            self._peer, _ = self._listener.accept()
+            self._peer.sendall(HELLO_HEAD.pack(HELLO, 68, 0) + b"fieldcal".ljust(64, b"\0"))
+            self._peer.sendall(struct.pack("<I", CAPABILITIES))
+            self._receive(HELLO_HEAD.unpack(self._receive(HELLO_HEAD.size))[1])
+            self.plug()
+            while True:
+                kind, length, number = HEAD.unpack(self._receive(HEAD.size))
+                self._answer(kind, number, self._receive(length))
+
+    def _answer(self, kind: int, number: int, content: bytes) -> None:
+        match kind:
+            case 6 | 7:  # SET_CONFIGURATION, GET_CONFIGURATION
+                self._send(CONFIGURATION, bytes([SUCCESS, 1]), number)
+            case 9 | 10:  # SET_ALTERNATE, GET_ALTERNATE
+                self._send(ALTERNATE, bytes([SUCCESS, content[0], 0]), number)
+            case 100:  # CONTROL_PACKET
+                endpoint, request, kind_of_request, _, value, index, length = CONTROL.unpack_from(content)
+                data = self._control(request, kind_of_request, value, index, length, content[CONTROL.size :])
+                status = STALL if data is None else SUCCESS
+                sent = data or b""
+                if kind_of_request & TO_HOST:
+                    length = len(sent)
+                head = CONTROL.pack(endpoint, request, kind_of_request, status, value, index, length)
+                self._send(CONTROL_PACKET, head + (sent if kind_of_request & TO_HOST else b""), number)
+
+    def _control(self, request: int, kind: int, value: int, index: int, length: int, data: bytes) -> bytes | None:
+        """What is sent back, None for a request that is not understood."""
+        if kind & 0x60 == STANDARD:
+            if request == GET_DESCRIPTOR:
+                descriptor = DESCRIPTORS.get(value)
+                return None if descriptor is None else descriptor[:length]
+            return bytes(2)[:length] if kind & TO_HOST else b""
+        if request == GET_FUNCTIONS:
+            return struct.pack("<I", self._bus.functions)
+        if request == SET_DELAY:
+            return b""
+        if request == GET_STATUS:
+            return self._status
+        if request in TRANSFERS:
+            return self._transfer(index, length if value & READ else data)
+        return None
+
+    def _transfer(self, address: int, message: int | bytes) -> bytes:
+        """One I2C message; whether it was acknowledged is asked for afterwards."""
+        try:
+            (read,) = self._bus.transfer([(address, message)])
+        except OSError:
+            self._status = NOT_ACKNOWLEDGED
+            return bytes(message) if isinstance(message, int) else b""
+        self._status = ACKNOWLEDGED
+        return read or b""
+
+    def _send(self, kind: int, content: bytes, number: int = 0) -> None:
+        if self._peer is not None:
+            self._peer.sendall(HEAD.pack(kind, len(content), number) + content)
+
+    def _receive(self, count: int) -> bytes:
+        data = b""
+        while len(data) < count:
+            part = self._peer.recv(count - len(data)) if self._peer else b""
+            if not part:
+                raise EOFError
+            data += part
+        return data
