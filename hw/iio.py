@@ -68,9 +68,14 @@ class Iio:
         """Find it, set it, read it back, start its buffer. Raises DeviceLost or ConfigurationError."""
         self.close()
         self._directory = self._find()
+        if not (self._directory / "buffer").is_dir():
+            raise ConfigurationError(
+                f"{self._directory}: no buffer; most kernel drivers need an interrupt line for one"
+            )
         try:
-            settings = self._configure()
+            # Before anything is set: whoever else has it open keeps it as it is.
             self._file = os.open(DEV / self._directory.name, os.O_RDONLY | os.O_NONBLOCK)
+            settings = self._configure()
         except OSError as error:
             self.close()
             message = f"IIO device {self._options.device}: {error.filename or ''}: {error.strerror}"
@@ -171,7 +176,7 @@ class Iio:
     def _configure(self) -> dict[str, str]:
         """Set all, start the buffer; what stands in the files then."""
         here = self._directory
-        (here / "buffer" / "enable").write_text("0")
+        _write(here / "buffer" / "enable", "0")
         rate = next(
             (path for path in (here / "in_accel_sampling_frequency", here / "sampling_frequency") if path.exists()),
             None,
@@ -182,7 +187,7 @@ class Iio:
             wanted[here / "trigger" / "current_trigger"] = self._options.trigger
         wanted[here / "current_timestamp_clock"] = "monotonic"
         for path, value in wanted.items():
-            path.write_text(value)
+            _write(path, value)
             found = _text(path)
             if found != value and not _same_number(found, value):
                 raise ConfigurationError(f"{path}: wrote {value}, it says {found}")
@@ -190,8 +195,8 @@ class Iio:
         self._scan = iio_scan.layout(self._elements)
         bits = self._elements["accel_x"].bits
         self._cutter.lowest, self._cutter.highest = -(2.0 ** (bits - 1)), 2.0 ** (bits - 1) - 1
-        (here / "buffer" / "length").write_text(str(round(BUFFER_S * self._options.rate_hz)))
-        (here / "buffer" / "enable").write_text("1")
+        _write(here / "buffer" / "length", str(round(BUFFER_S * self._options.rate_hz)))
+        _write(here / "buffer" / "enable", "1")
         kept = [here / "name", here / "in_accel_scale", here / "in_accel_offset", *wanted]
         return {path.name: _text(path) for path in kept if path.exists()}
 
@@ -201,7 +206,7 @@ class Iio:
         for path in sorted(directory.glob("in_*_en")):
             name = path.name.removeprefix("in_").removesuffix("_en")
             chosen = name in (*AXES, "timestamp")
-            path.write_text("1" if chosen else "0")
+            _write(path, "1" if chosen else "0")
             if chosen:
                 index = int(_text(directory / f"in_{name}_index"))
                 elements[name] = iio_scan.Element.parse(index, _text(directory / f"in_{name}_type"))
@@ -213,6 +218,22 @@ class Iio:
 
 def _text(path: Path) -> str:
     return path.read_text("ascii", errors="replace").strip()
+
+
+def _write(path: Path, value: str) -> None:
+    """Set a file of sysfs. ConfigurationError for a value that the kernel driver refuses, else OSError naming it."""
+    try:
+        path.write_text(value)
+    except OSError as error:
+        if error.errno != errno.EINVAL:
+            raise OSError(error.errno, error.strerror, str(path)) from error
+        known = path.with_name(f"{path.name}_available")
+        if path.name == "enable":
+            triggers = ", ".join(_text(name) for name in sorted(SYSFS.glob("trigger*/name"))) or "none"
+            hint = f"; has it a trigger (option trigger, there are: {triggers})?"
+        else:
+            hint = f", it takes {_text(known)}" if known.exists() else ""
+        raise ConfigurationError(f"{path}: {value} is refused{hint}") from error
 
 
 def _same_number(found: str, wanted: str) -> bool:

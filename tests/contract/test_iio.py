@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -101,6 +103,52 @@ class TestIio(SensorContract):
         monkeypatch.setattr(iio, "_text", lambda path: "800.000000" if "frequency" in path.name else path.read_text())
         with pytest.raises(ConfigurationError, match=r"in_accel_sampling_frequency: wrote 1000, it says 800"):
             rig.sensor.open()
+
+    @pytest.mark.parametrize(
+        ("refused", "known", "said"),
+        [
+            (
+                "in_accel_sampling_frequency",
+                ("iio:device0/in_accel_sampling_frequency_available", "12.5 26\n"),
+                r"in_accel_sampling_frequency: 1000 is refused, it takes 12\.5 26$",
+            ),
+            ("enable", ("trigger0/name", "pace\n"), r"buffer/enable: 1 is refused; .*there are: pace\)\?$"),
+        ],
+    )
+    def test_a_value_that_the_kernel_driver_refuses_is_said_with_what_it_takes(
+        self, rig: IioRig, monkeypatch: pytest.MonkeyPatch, refused: str, known: tuple[str, str], said: str
+    ) -> None:
+        def write(path: Path, text: str) -> int:
+            if path.name == refused and text != "0":
+                raise OSError(errno.EINVAL, "Invalid argument")  # as write(2) says it: without a name
+            return plain(path, text)
+
+        path = rig.twin.sysfs / known[0]
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(known[1])
+        plain = Path.write_text
+        monkeypatch.setattr(Path, "write_text", write)
+        with pytest.raises(ConfigurationError, match=said):
+            rig.sensor.open()
+
+    def test_a_device_without_a_buffer_is_refused(self, rig: IioRig) -> None:
+        shutil.rmtree(rig.twin.sysfs / "iio:device0/buffer")
+        with pytest.raises(ConfigurationError, match="iio:device0: no buffer"):
+            rig.sensor.open()
+
+    def test_a_device_that_somebody_else_reads_is_left_as_it_is(
+        self, rig: IioRig, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def busy(path: Path, _flags: int) -> int:
+            raise OSError(errno.EBUSY, "Device or resource busy", str(path))
+
+        enable = rig.twin.sysfs / "iio:device0/buffer/enable"
+        enable.write_text("1")
+        with monkeypatch.context() as patch:
+            patch.setattr(iio.os, "open", busy)
+            with pytest.raises(ConfigurationError, match="iio:device0: Device or resource busy"):
+                rig.sensor.open()
+        assert enable.read_text() == "1"
 
     def test_absent_says_what_there_is(self, rig: IioRig) -> None:
         with pytest.raises(DeviceLost, match=r"no IIO device 'other'; there are twin345 \(iio:device0\)"):
