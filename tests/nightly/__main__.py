@@ -28,7 +28,7 @@ MODULES = [
 # In this order: once the kernel's drivers hold their devices nobody else may, and unplugging ends it all.
 STEPS = (
     *(checks.i2c_dev, checks.probe, runs.own_drivers, checks.mpu6050, checks.held_address, checks.lsm6dso),
-    *(runs.through_iio, checks.unplugging),
+    *(runs.through_iio, runs.iio_refusals, checks.unplugging),
 )
 
 

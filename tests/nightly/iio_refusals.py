@@ -1,0 +1,44 @@
+"""Driver `iio` where the kernel refuses, as JSON. Run in the machine, with the pace in Hz of the trigger there."""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import Any
+
+from hw.iio import Iio, IioOptions
+from hw.sensor import DeviceError
+
+LSM6DSO = {"device": "lsm6dsox_accel", "trigger": "pace"}
+
+
+def opened(options: dict[str, Any]) -> str:
+    """What opening with these options says."""
+    sensor = Iio("sensor", IioOptions.model_validate(options))
+    try:
+        sensor.open()
+    except DeviceError as error:
+        return f"{type(error).__name__}: {error}"
+    sensor.close()
+    return "opened"
+
+
+def refusals(pace_hz: float) -> dict[str, str]:
+    """By question."""
+    found = {
+        "a rate that is rounded": opened(LSM6DSO | {"rate_hz": 100}),
+        "a rate that is refused": opened(LSM6DSO | {"rate_hz": 5000}),
+        "no buffer": opened({"device": "mpu6050", "rate_hz": 50}),
+    }
+    first = Iio("first", IioOptions.model_validate(LSM6DSO | {"rate_hz": pace_hz}))
+    first.open()
+    before = first.read_block()
+    found["somebody else reads it"] = opened(LSM6DSO | {"rate_hz": pace_hz})
+    after = first.read_block()
+    first.close()
+    found["the first reader goes on"] = "samples come" if before and after else "it fell silent"
+    return found
+
+
+if __name__ == "__main__":
+    print(json.dumps(refusals(float(sys.argv[1]))))
