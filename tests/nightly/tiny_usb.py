@@ -11,6 +11,7 @@ import contextlib
 import socket
 import struct
 import threading
+from enum import IntEnum
 from pathlib import Path
 
 from hw.virtual.kernel import READ, I2CBus
@@ -21,13 +22,27 @@ PACKET_BYTES = 64
 CAPABILITIES = 1 << 4 | 1 << 5 | 1 << 6  # packet sizes, ids of 64 bits, long bulk transfers: QEMU wants them for XHCI
 HELLO_HEAD, HEAD = struct.Struct("<III"), struct.Struct("<IIQ")
 CONTROL = struct.Struct("<BBBBHHH")  # endpoint, request, its type, status, value, index, length
-HELLO, CONNECT, DISCONNECT, RESET, INTERFACES, ENDPOINTS = range(6)
-SET_CONFIGURATION, GET_CONFIGURATION, CONFIGURATION, SET_ALTERNATE, GET_ALTERNATE, ALTERNATE = range(6, 12)
-CONTROL_PACKET = 100
 SUCCESS, STALL = 0, 4
 TO_HOST, STANDARD = 0x80, 0x00  # in a request's type; bits 6:5 tell standard from vendor
 GET_DESCRIPTOR, GET_FUNCTIONS, SET_DELAY, GET_STATUS, TRANSFERS = 6, 1, 2, 3, range(4, 8)
 ACKNOWLEDGED, NOT_ACKNOWLEDGED = b"\x01", b"\x02"
+
+
+class Packet(IntEnum):
+    """Kinds of packets that are used here."""
+
+    HELLO = 0
+    CONNECT = 1
+    DISCONNECT = 2
+    INTERFACES = 4
+    ENDPOINTS = 5
+    SET_CONFIGURATION = 6
+    GET_CONFIGURATION = 7
+    CONFIGURATION = 8
+    SET_ALTERNATE = 9
+    GET_ALTERNATE = 10
+    ALTERNATE = 11
+    CONTROL = 100
 
 
 def _text(text: str) -> bytes:
@@ -72,19 +87,19 @@ class TinyUsb:
 
     def plug(self) -> None:
         """Put it in."""
-        self._send(INTERFACES, struct.pack("<I", 1) + bytes(32) + bytes([VENDOR_CLASS, *bytes(31)]) + bytes(64))
+        self._send(Packet.INTERFACES, struct.pack("<I", 1) + bytes(32) + bytes([VENDOR_CLASS, *bytes(31)]) + bytes(64))
         ends = bytes([0, *[NO_ENDPOINT] * 15]) * 2  # the control endpoint, out and in
-        self._send(ENDPOINTS, ends + bytes(64) + struct.pack("<H", PACKET_BYTES) * 32)
-        self._send(CONNECT, struct.pack("<BBBBHH", FULL_SPEED, VENDOR_CLASS, 0, 0, VENDOR, PRODUCT))
+        self._send(Packet.ENDPOINTS, ends + bytes(64) + struct.pack("<H", PACKET_BYTES) * 32)
+        self._send(Packet.CONNECT, struct.pack("<BBBBHH", FULL_SPEED, VENDOR_CLASS, 0, 0, VENDOR, PRODUCT))
 
     def unplug(self) -> None:
         """Pull it out."""
-        self._send(DISCONNECT, b"")
+        self._send(Packet.DISCONNECT, b"")
 
     def _run(self) -> None:
         with contextlib.suppress(OSError, EOFError):
             self._peer, _ = self._listener.accept()
-            self._peer.sendall(HELLO_HEAD.pack(HELLO, 68, 0) + b"fieldcal".ljust(64, b"\0"))
+            self._peer.sendall(HELLO_HEAD.pack(Packet.HELLO, 68, 0) + b"fieldcal".ljust(64, b"\0"))
             self._peer.sendall(struct.pack("<I", CAPABILITIES))
             self._receive(HELLO_HEAD.unpack(self._receive(HELLO_HEAD.size))[1])
             self.plug()
@@ -94,11 +109,11 @@ class TinyUsb:
 
     def _answer(self, kind: int, number: int, content: bytes) -> None:
         match kind:
-            case 6 | 7:  # SET_CONFIGURATION, GET_CONFIGURATION
-                self._send(CONFIGURATION, bytes([SUCCESS, 1]), number)
-            case 9 | 10:  # SET_ALTERNATE, GET_ALTERNATE
-                self._send(ALTERNATE, bytes([SUCCESS, content[0], 0]), number)
-            case 100:  # CONTROL_PACKET
+            case Packet.SET_CONFIGURATION | Packet.GET_CONFIGURATION:
+                self._send(Packet.CONFIGURATION, bytes([SUCCESS, 1]), number)
+            case Packet.SET_ALTERNATE | Packet.GET_ALTERNATE:
+                self._send(Packet.ALTERNATE, bytes([SUCCESS, content[0], 0]), number)
+            case Packet.CONTROL:
                 endpoint, request, kind_of_request, _, value, index, length = CONTROL.unpack_from(content)
                 data = self._control(request, kind_of_request, value, index, length, content[CONTROL.size :])
                 status = STALL if data is None else SUCCESS
@@ -106,7 +121,7 @@ class TinyUsb:
                 if kind_of_request & TO_HOST:
                     length = len(sent)
                 head = CONTROL.pack(endpoint, request, kind_of_request, status, value, index, length)
-                self._send(CONTROL_PACKET, head + (sent if kind_of_request & TO_HOST else b""), number)
+                self._send(Packet.CONTROL, head + (sent if kind_of_request & TO_HOST else b""), number)
 
     def _control(self, request: int, kind: int, value: int, index: int, length: int, data: bytes) -> bytes | None:
         """What is sent back, None for a request that is not understood."""
