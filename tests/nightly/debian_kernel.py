@@ -5,6 +5,7 @@ from __future__ import annotations
 import lzma
 import os
 import re
+import shutil
 import subprocess
 from pathlib import Path
 
@@ -93,5 +94,7 @@ def _downloaded(directory: Path) -> Path:
     ).stdout
     package = directory / uris.split()[1]
     if not package.exists():
+        for older in directory.glob("linux-image-*"):  # half a gigabyte each
+            shutil.rmtree(older) if older.is_dir() else older.unlink()
         subprocess.run(["apt-get", *given, "-qq", "download", name], check=True, cwd=directory)
     return package
