@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Literal
 
+import numpy as np
 from pydantic import Field
 
 from hw import adxl345_registers as chip
@@ -16,7 +17,6 @@ from hw.i2c import READS_MAX
 from hw.self_test import SelfTest
 from hw.sensor import IdentityError
 
-SAMPLES_A_TRANSFER = READS_MAX - 1  # INT_SOURCE goes before them
 LOST = "FIFO ran over, or a read of it broke off"
 
 
@@ -25,8 +25,8 @@ class Adxl345Options(FifoOptions):
 
     rates_hz = tuple(chip.RATE_CODES)
     fifo_samples = chip.FIFO_SAMPLES
-    bytes_a_sample = 9  # address, register, address, six of data: one read a sample
-    bytes_a_poll = 12  # INT_SOURCE, FIFO_STATUS and INT_SOURCE again
+    bytes_a_sample = 11  # address, register, address, INT_SOURCE, DATA_FORMAT, six of data: one read a sample
+    bytes_a_poll = 4  # address, register, address, FIFO_STATUS
 
     address: Literal[0x53, 0x1D] = Field(0x53, description="83 (0x53), or 29 (0x1D) with ALT ADDRESS high")
     rate_hz: float = Field(800.0, description=f"one of {', '.join(f'{rate:g}' for rate in chip.RATE_CODES)}")
@@ -34,10 +34,11 @@ class Adxl345Options(FifoOptions):
 
 
 class Adxl345(FifoSensor):
-    """The entry count in one transfer, then a read of six bytes for each sample, which takes it from the FIFO.
+    """The entry count in one transfer, then a read for each sample, which takes it from the FIFO, up to 21 a transfer.
 
-    Up to 20 such reads go in one transfer behind INT_SOURCE, whose overrun bit reading data would clear. A sample that
-    is read has no mark: once some are lost, all that this poll found goes with them, and the next one starts anew.
+    Each begins at INT_SOURCE, two registers before the data, since reading data clears its overrun bit: an adapter may
+    stall between two reads of one transfer. A sample that is read has no mark: once some are lost, all that this poll
+    found goes with them, and the next one starts anew.
     """
 
     options_model = Adxl345Options
@@ -77,10 +78,11 @@ class Adxl345(FifoSensor):
         left = status & chip.ENTRIES_MASK
         data, lost = b"", False
         while left:
-            samples = min(left, SAMPLES_A_TRANSFER)
-            answer = self._device.read_each([(chip.INT_SOURCE, 1)] + [(chip.DATA, 6)] * samples)
-            lost |= bool(answer[0] & chip.OVERRUN) or self._device.retries > retries
-            data += answer[1:]
+            samples = min(left, READS_MAX)
+            answer = self._device.read_each([(chip.INT_SOURCE, chip.SAMPLE_BYTES)] * samples)
+            reads = np.frombuffer(answer, np.uint8).reshape(samples, chip.SAMPLE_BYTES)
+            lost |= bool((reads[:, 0] & chip.OVERRUN).any()) or self._device.retries > retries
+            data += reads[:, -self.word_bytes :].tobytes()
             left -= samples
         if lost:
             self._drop(LOST, len(data) // self.word_bytes)

@@ -110,19 +110,22 @@ class FifoTwin(ABC):
         self._fail()
         self._latched = None
         self._fill()
-        if self._broken_off and self._pointer == self.data_register:
-            number, words = self._broken_off
-            self._broken_off = None
-            self._take(self.word_bytes * words)
-            raise error(number)
         out = bytearray()
         while len(out) < count:
             if self._pointer == self.data_register:
+                self._break_off()
                 out += self._read_fifo(count - len(out))
             else:
                 out.append(self._get(self._pointer))
                 self._pointer = (self._pointer + 1) & 0xFF
         return bytes(out)
+
+    def _break_off(self) -> None:
+        if self._broken_off is not None:
+            number, words = self._broken_off
+            self._broken_off = None
+            self._take(self.word_bytes * words)
+            raise error(number)
 
     def _read_fifo(self, count: int) -> bytes:
         """What a read of so many bytes from the data register returns."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 from collections.abc import Iterator
 
+import numpy as np
 import pytest
 
 from hw.adxl345 import Adxl345
@@ -73,3 +74,23 @@ class TestAdxl345(I2cContract):
         flags, after = rig.read()
         assert flags == BlockFlags.RESTART | BlockFlags.OVERRUN
         assert after[0] > before[-1] + 30
+
+    def test_overrun_within_a_transfer(self, rig: Adxl345Rig) -> None:
+        # An adapter stalls between two messages of one transfer, as one on USB does.
+        class Stalling(Adxl345Twin):
+            stall_s = 0.0
+
+            def _read_fifo(self, count: int) -> bytes:
+                data = super()._read_fifo(count)
+                if len(self._fifo) == 6 * 5:
+                    rig.t_s, Stalling.stall_s = rig.t_s + Stalling.stall_s, 0.0
+                return data
+
+        rig.put(Stalling(rig.counts, rig.due, lambda: rig.t_s))
+        rig.sensor.open()
+        _, before = rig.read()
+        Stalling.stall_s = 0.05
+        flags, after = rig.read()
+        assert flags == BlockFlags.RESTART | BlockFlags.OVERRUN
+        assert after[0] > before[-1] + 1
+        assert (np.diff(after) == 1).all()
