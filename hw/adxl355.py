@@ -15,7 +15,6 @@ from hw.fifo_sensor import FifoSensor, Registers
 from hw.self_test import SelfTest
 from hw.sensor import DeviceLost, IdentityError, Options
 
-NEARLY_FULL = chip.FIFO_ENTRIES_MAX - 12  # with less room it may run over before it is read
 RESET_WAIT_S = 0.01  # twice the data sheet's 5 ms
 RESET_ATTEMPTS = 5  # as the Linux driver does
 
@@ -26,7 +25,7 @@ class Adxl355Options(FifoOptions):
     rates_hz = chip.RATES_HZ
     fifo_samples = chip.FIFO_ENTRIES_MAX // 3
     bytes_a_sample = 9
-    bytes_a_poll = 8  # address, register, address, STATUS, FIFO_ENTRIES; address, register, address
+    bytes_a_poll = 12  # address, register, address, STATUS, FIFO_ENTRIES; twice address, register, address; STATUS
 
     address: Literal[0x1D, 0x53] = Field(0x1D, description="29 (0x1D), or 83 (0x53) with ASEL high")
     rate_hz: float = Field(1000.0, description=f"one of {', '.join(f'{rate:g}' for rate in chip.RATES_HZ)}")
@@ -103,11 +102,10 @@ class Adxl355(FifoSensor):
         if not whole:
             return Burst(arrival_ns, utc_ns, b"", lost)
         retries = self._device.retries
-        data = chip.without_empty(self._device.read(chip.FIFO_DATA, 3 * whole))
-        if self._device.retries > retries:
-            lost = True
-        elif whole > NEARLY_FULL:
-            lost |= bool(self._device.read(chip.STATUS, 1)[0] & chip.OVERRUN)
+        # STATUS behind the data: between count and data the FIFO may have run over, however few it held.
+        answer = self._device.read_each([(chip.FIFO_DATA, 3 * whole), (chip.STATUS, 1)])
+        lost |= bool(answer[-1] & chip.OVERRUN) or self._device.retries > retries
+        data = chip.without_empty(answer[:-1])
         return Burst(arrival_ns, utc_ns, data, lost)
 
     def _decode(self, data: bytes) -> FifoSamples:

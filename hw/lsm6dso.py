@@ -18,7 +18,6 @@ from hw.sensor import DeviceLost, IdentityError
 RESET_WAIT_S = 0.01
 RESET_ATTEMPTS = 5
 SETTLE_SAMPLES = 5  # AN5192: the first one to four samples after a start are to be thrown away
-NEARLY_FULL = chip.FIFO_WORDS - 32  # with less room it may run over before it is read
 
 
 class Lsm6dsoOptions(FifoOptions):
@@ -27,7 +26,7 @@ class Lsm6dsoOptions(FifoOptions):
     rates_hz = chip.RATES_HZ
     fifo_samples = chip.FIFO_WORDS
     bytes_a_sample = chip.WORD_BYTES
-    bytes_a_poll = 8
+    bytes_a_poll = 13  # count, data and FIFO_STATUS, each behind address, register, address; 2 + 2 bytes of status
 
     address: Literal[0x6A, 0x6B] = Field(0x6A, description="106 (0x6A), or 107 (0x6B) with SA0 high")
     rate_hz: float = Field(833.0, description=f"one of {', '.join(f'{rate:g}' for rate in chip.RATES_HZ)}")
@@ -97,9 +96,12 @@ class Lsm6dso(FifoSensor):
         arrival_ns, utc_ns, status = self._device.read_stamped([(chip.FIFO_STATUS, 2)], self._clock)
         words = min(int.from_bytes(status, "little") & chip.COUNT_MASK, chip.FIFO_WORDS)
         lost = bool(status[1] & chip.OVERRUN)
-        data = self._device.read(chip.FIFO_DATA, chip.WORD_BYTES * words) if words else b""
-        if words > NEARLY_FULL:
-            lost |= bool(self._device.read(chip.FIFO_STATUS, 2)[1] & chip.OVERRUN)
+        data = b""
+        if words:
+            # FIFO_STATUS behind the data: between count and data the FIFO may have run over, however few it held.
+            answer = self._device.read_each([(chip.FIFO_DATA, chip.WORD_BYTES * words), (chip.FIFO_STATUS, 2)])
+            data = answer[:-2]
+            lost |= bool(answer[-1] & chip.OVERRUN)
         return Burst(arrival_ns, utc_ns, data, lost or self._device.retries > retries)
 
     def _decode(self, data: bytes) -> FifoSamples:

@@ -93,7 +93,8 @@ class Lis3dh(FifoSensor):
         arrival_ns, utc_ns, (source,) = self._device.read_stamped([(FIFO_SRC, 1)], self._clock)
         level = 32 if source & OVERRUN else source & LEVEL_MASK
         data = self._device.read(OUT_X | AUTO_INCREMENT, 6 * level) if level else b""
-        lost = level > NEARLY_FULL or self._device.retries > retries
+        made_since = (self._clock()[0] - arrival_ns) * 1e-9 * self._options.rate_hz  # it may have run over meanwhile
+        lost = level + made_since > NEARLY_FULL or self._device.retries > retries
         if lost:  # what a read that broke off left is fewer than the level, and nothing tells how many
             self._drop("FIFO ran over, or a read of it broke off", level)
             data = b""

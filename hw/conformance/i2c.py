@@ -38,6 +38,11 @@ class I2cRig(Rig):
 
     sensor: FifoSensor
 
+    @property
+    def fifo_register(self) -> int:
+        """Where a read that takes samples begins."""
+        return self.twin_class.data_register
+
     def __init__(self) -> None:
         self.saturated = range(0)
         self.temperature_raw: int | None = None
@@ -196,6 +201,25 @@ class I2cContract(SensorContract):
         flags, after = rig.read()
         assert flags == BlockFlags.RESTART | BlockFlags.OVERRUN
         assert after[0] > before[-1] + 1
+
+    def test_fifo_that_runs_over_between_count_and_read(self, rig: I2cRig) -> None:
+        # The process waits for a processor between the two: what is read does not follow what was read before.
+        class Stalling(rig.twin_class):  # type: ignore[name-defined,misc]
+            stall_s = 0.0
+
+            def write(self, data: bytes) -> None:
+                if data == bytes([rig.fifo_register]):
+                    rig.t_s, Stalling.stall_s = rig.t_s + Stalling.stall_s, 0.0
+                super().write(data)
+
+        rig.put(Stalling(rig.counts, rig.due, lambda: rig.t_s))
+        rig.sensor.open()
+        _, before = rig.read()
+        Stalling.stall_s = self.late_s
+        flags, after = rig.read()
+        assert flags == BlockFlags.RESTART | BlockFlags.OVERRUN
+        assert after[0] > before[-1] + 1
+        assert (np.diff(after) == 1).all()
 
     def test_power_lost_underway(self, rig: I2cRig) -> None:
         rig.sensor.open()

@@ -17,6 +17,7 @@ from hw.virtual.adxl345_twin import Adxl345Twin
 class Adxl345Rig(I2cRig):
     driver, twin_class, address, full = Adxl345, Adxl345Twin, 0x53, 4095
     rate_hz = 800.0
+    fifo_register = 0x30  # INT_SOURCE goes before the data
 
     def lose(self) -> None:
         # Nothing of a sample says which one it is: entries vanish without a trace only where a read breaks off.
