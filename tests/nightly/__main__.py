@@ -10,12 +10,12 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from tests.nightly import checks, runs
 from tests.nightly.checks import Machine, Row
-from tests.nightly.debian_kernel import fetched
+from tests.nightly.debian_kernel import DebianKernel, fetched
 from tests.nightly.guest import Guest, GuestError
 from tests.nightly.initramfs import initramfs
 from tests.nightly.site import Twins
@@ -25,27 +25,35 @@ MODULES = [
     *("virtio_pci", "9pnet_virtio", "9p", "xhci_pci", "i2c_tiny_usb", "i2c_dev", "kfifo_buf", "iio_trig_hrtimer"),
     *("st_lsm6dsx_i2c", "inv_mpu6050_i2c"),
 ]
-# In this order: once the kernel's drivers hold their devices nobody else may, and unplugging ends it all.
-STEPS = (
-    *(checks.i2c_dev, checks.probe, runs.own_drivers, checks.mpu6050, checks.held_address, checks.lsm6dso),
-    *(runs.through_iio, runs.iio_refusals, checks.unplugging),
-)
+ADXL355 = "adxl355_i2c"  # Debian's kernel lacks it
+Step = Callable[[Machine], Iterator[Row]]
+
+
+def steps(kernel: DebianKernel) -> list[Step]:
+    """In this order: once the kernel's drivers hold their devices nobody else may, and unplugging ends it all."""
+    before: list[Step] = [checks.i2c_dev, checks.probe, runs.own_drivers]
+    bound: list[Step] = [checks.mpu6050, checks.held_address, checks.lsm6dso]
+    if kernel.has(ADXL355):
+        bound.append(checks.adxl355)
+    return [*before, *bound, runs.through_iio, runs.iio_refusals, checks.unplugging]
 
 
 def compared() -> Iterator[Row]:
     """All rows, as they come."""
     kernel = fetched()
-    print(f"Linux {kernel.release} under QEMU", flush=True)
+    without = "" if kernel.has(ADXL355) else "; no module adxl355_i2c, so the ADXL355 is read by fieldcal alone"
+    print(f"Linux {kernel.release} under QEMU{without}", flush=True)
+    modules = kernel.modules([*MODULES, *([ADXL355] if kernel.has(ADXL355) else [])])
     twins = Twins()
     with tempfile.TemporaryDirectory(prefix="fieldcal-") as name:
         directory = Path(name)
         usb = directory / "usb"
         with (
             TinyUsb(twins.bus, usb) as adapter,
-            Guest(kernel.image, initramfs(kernel.modules(MODULES)), directory, usb) as guest,
+            Guest(kernel.image, initramfs(modules), directory, usb) as guest,
         ):
             machine = Machine(guest, twins, adapter)
-            for step in STEPS:
+            for step in steps(kernel):
                 yield from step(machine)
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from smbus2 import SMBus, i2c_msg
 
-ADXL355, ABSENT = 0x1D, 0x55
+ADXL355, ADXL345, ABSENT = 0x1D, 0x53, 0x55
 GONE_S = 10.0
 
 
@@ -64,12 +64,13 @@ def held(path: str, address: int) -> dict[str, str]:
 
 
 def gone(path: str, say_open: Callable[[], object]) -> dict[str, str]:
-    """The node is open while the adapter goes: what reads say then, and the next opening."""
+    """The node is open while the adapter goes: what reads say then (of an ADXL345: no kernel driver takes it), and the
+    next opening."""
     end_s = time.monotonic() + GONE_S
     with SMBus(path) as bus:
-        bus.read_byte_data(ADXL355, 0)
+        bus.read_byte_data(ADXL345, 0)
         say_open()
-        while (first := outcome(lambda: bus.read_byte_data(ADXL355, 0))).isdigit() and time.monotonic() < end_s:
+        while (first := outcome(lambda: bus.read_byte_data(ADXL345, 0))).isdigit() and time.monotonic() < end_s:
             time.sleep(0.01)
     while (after := outcome(lambda: SMBus(path).close())) != "ENOENT" and time.monotonic() < end_s:
         time.sleep(0.01)

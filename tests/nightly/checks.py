@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
-from hw import adxl345_registers, lsm6dso_registers, mpu6050_registers
+from hw import adxl345_registers, adxl355_registers, lsm6dso_registers, mpu6050_registers
 from hw.fifo_sensor import STANDARD_GRAVITY_MPS2
 from hw.virtual.kernel import installed
 from tests.nightly.answers import answers, held
@@ -14,7 +14,8 @@ from tests.nightly.guest import Guest
 from tests.nightly.site import ADDRESSES, Twins
 from tests.nightly.tiny_usb import TinyUsb
 
-INDICATIONS = ((1, -1, 0), (100, -200, 16384), (32767, -32768, 12345))
+Counts = tuple[int, int, int]
+INDICATIONS: tuple[Counts, ...] = ((1, -1, 0), (100, -200, 16384), (32767, -32768, 12345))
 IIO = "/sys/bus/iio/devices"
 
 
@@ -42,6 +43,7 @@ class Machine:
         self.twins = twins
         self.adapter = adapter
         name = guest.sh("until ls /dev/i2c-* 2>/dev/null; do sleep 0.1; done", 30.0)
+        self.bound: list[str] = []
         self.node = name.split()[0]
         self.bus = int(self.node.removeprefix("/dev/i2c-"))
 
@@ -50,6 +52,7 @@ class Machine:
         address = ADDRESSES[device]
         self.guest.write(f"/sys/bus/i2c/devices/i2c-{self.bus}/new_device", f"{kernel_driver} 0x{address:02x}")
         found = self.guest.sh(f"ls -d {IIO}/*/in_accel_x_raw | xargs -n 1 dirname | xargs -n 1 readlink -f")
+        self.bound.append(device)
         (directory,) = (line for line in found.splitlines() if f"-{address:04x}/" in line)
         return directory
 
@@ -158,9 +161,36 @@ def lsm6dso(machine: Machine) -> Iterator[Row]:
         yield same("lsm6dso", f"CTRL1_XL, {rate_hz:g} Hz", f"0x{max(codes, default=0):02X}", f"0x{wanted:02X}")
 
 
-def raw(device: str, machine: Machine, here: str) -> Iterator[Row]:
+def adxl355(machine: Machine) -> Iterator[Row]:
+    """adxl355_i2c, where there is one, against `hw.adxl355_registers`."""
+    twins, guest, part = machine.twins, machine.guest, adxl355_registers.ADXL355
+    twins.hold(INDICATIONS[0])
+    here = machine.bind("adxl355", "adxl355")
+    yield same("adxl355", "name", guest.read(f"{here}/name"), "adxl355")
+    yield from raw("adxl355", machine, here, (*INDICATIONS, (2**19 - 1, -(2**19), 0)))
+    # The kernel takes 3.9 ug a count, which the data sheet rounds from 1 g / 256000.
+    ours, found = STANDARD_GRAVITY_MPS2 / part.counts_per_g[2], guest.read(f"{here}/in_accel_scale")
+    yield Row("adxl355", "m/s2 a count", found, f"{ours:.9f}", abs(float(found) / ours - 1) <= 2e-3)
+    for rate_hz in adxl355_registers.RATES_HZ[2:]:
+        guest.write(f"{here}/in_accel_sampling_frequency", f"{rate_hz + 1e-9:.3f}")  # 7.8125 is 7.813 there
+        wanted = adxl355_registers.settings(part, rate_hz, 2)[
+            adxl355_registers.FILTER - adxl355_registers.FIRST_SETTING
+        ]
+        found = machine.hex_of("adxl355", adxl355_registers.FILTER)
+        yield same("adxl355", f"FILTER at {rate_hz:g} Hz", found, f"0x{wanted:02X}")
+    offset, factor = (float(guest.read(f"{here}/in_temp_{what}")) for what in ("offset", "scale"))
+    for raw_number in (1400, 1885, 2400):
+        twins.warm("adxl355", raw_number)
+        number = int(guest.read(f"{here}/in_temp_raw"))
+        _, degc = adxl355_registers.temperature(part, raw_number.to_bytes(2, "big"))
+        kernel_degc = 1e-3 * (number + offset) * factor
+        agree = number == raw_number and abs(kernel_degc - degc) < 0.001
+        yield Row("adxl355", f"temperature {raw_number}", f"{kernel_degc:.3f} degC", f"{degc:.3f} degC", agree)
+
+
+def raw(device: str, machine: Machine, here: str, indications: Iterable[Counts] = INDICATIONS) -> Iterator[Row]:
     """The numbers in the output registers."""
-    for counts in INDICATIONS:
+    for counts in indications:
         machine.twins.hold(counts)
         found = " ".join(machine.guest.read(f"{here}/in_accel_{axis}_raw") for axis in "xyz")
         yield same(device, "raw", found, " ".join(map(str, counts)))

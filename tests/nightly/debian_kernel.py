@@ -13,6 +13,7 @@ from pathlib import Path
 SOURCE = "deb [signed-by=/usr/share/keyrings/debian-archive-keyring.gpg] http://deb.debian.org/debian trixie main\n"
 PACKAGE = "linux-image-amd64"
 GIVEN = "FIELDCAL_GUEST_KERNEL"
+MORE_MODULES = "FIELDCAL_GUEST_MODULES"
 
 
 def cache() -> Path:
@@ -21,14 +22,20 @@ def cache() -> Path:
 
 
 class DebianKernel:
-    """An unpacked linux-image package. `release` as `uname -r` says."""
+    """An unpacked linux-image package, and modules built for it elsewhere. `release` as `uname -r` says."""
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, more_modules: Path | None = None) -> None:
         (self.image,) = root.glob("boot/vmlinuz-*")
         self.release = self.image.name.removeprefix("vmlinuz-")
         directory = next(root.glob(f"**/lib/modules/{self.release}"))
         self._built_in = {_key(Path(line).name) for line in (directory / "modules.builtin").read_text().split()}
         self._modules = {_key(path.name): path for path in directory.glob("kernel/**/*.ko*")}
+        if more_modules is not None:
+            self._modules |= {_key(path.name): path for path in more_modules.glob("*.ko")}
+
+    def has(self, module: str) -> bool:
+        """Whether there is such a module."""
+        return _key(module) in self._modules
 
     def modules(self, wanted: list[str]) -> dict[str, bytes]:
         """The wanted modules and what they need, by name, in the order in which they load. KeyError: no such module."""
@@ -55,7 +62,8 @@ def _key(name: str) -> str:
 
 
 def fetched() -> DebianKernel:
-    """Debian's kernel, from the cache if it is the newest; FIELDCAL_GUEST_KERNEL names a package to use instead.
+    """Debian's kernel, from the cache if it is the newest; FIELDCAL_GUEST_KERNEL names a package to use instead,
+    FIELDCAL_GUEST_MODULES a directory of further modules.
 
     Raises subprocess.CalledProcessError where apt cannot get it.
     """
@@ -66,7 +74,8 @@ def fetched() -> DebianKernel:
         half = root.with_suffix(".part")
         subprocess.run(["dpkg-deb", "--extract", package, half], check=True)
         half.rename(root)
-    return DebianKernel(root)
+    more = os.environ.get(MORE_MODULES)
+    return DebianKernel(root, Path(more) if more else None)
 
 
 def _downloaded(directory: Path) -> Path:

@@ -1,15 +1,15 @@
-"""Driver `iio` where the kernel refuses, as JSON. Run in the machine, with the pace in Hz of the trigger there."""
+"""Driver `iio` where the kernel refuses, as JSON. Run in the machine, with the trigger `lsm6dso` there."""
 
 from __future__ import annotations
 
 import json
-import sys
 from typing import Any
 
 from hw.iio import Iio, IioOptions
 from hw.sensor import DeviceError
 
-LSM6DSO = {"device": "lsm6dsox_accel", "trigger": "pace"}
+LSM6DSO = {"device": "lsm6dsox_accel", "trigger": "lsm6dso"}
+RATE_HZ = 26.0
 
 
 def opened(options: dict[str, Any]) -> str:
@@ -23,17 +23,17 @@ def opened(options: dict[str, Any]) -> str:
     return "opened"
 
 
-def refusals(pace_hz: float) -> dict[str, str]:
+def refusals() -> dict[str, str]:
     """By question."""
     found = {
         "a rate that is rounded": opened(LSM6DSO | {"rate_hz": 100}),
         "a rate that is refused": opened(LSM6DSO | {"rate_hz": 5000}),
         "no buffer": opened({"device": "mpu6050", "rate_hz": 50}),
     }
-    first = Iio("first", IioOptions.model_validate(LSM6DSO | {"rate_hz": pace_hz}))
+    first = Iio("first", IioOptions.model_validate(LSM6DSO | {"rate_hz": RATE_HZ}))
     first.open()
     before = first.read_block()
-    found["somebody else reads it"] = opened(LSM6DSO | {"rate_hz": pace_hz})
+    found["somebody else reads it"] = opened(LSM6DSO | {"rate_hz": RATE_HZ})
     after = first.read_block()
     first.close()
     found["the first reader goes on"] = "samples come" if before and after else "it fell silent"
@@ -41,4 +41,4 @@ def refusals(pace_hz: float) -> dict[str, str]:
 
 
 if __name__ == "__main__":
-    print(json.dumps(refusals(float(sys.argv[1]))))
+    print(json.dumps(refusals()))

@@ -7,32 +7,45 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from agent.events import DeviceChange, Gap
+import numpy as np
+
+from agent.events import DeviceChange
 from agent.recording.reading import RecordingReader
-from hw.block import SampleBlock
+from hw.block import BlockFlags, SampleBlock
 from tests.numbered import number
 from tests.scenarios.processes import recordings
 
+TOLD = BlockFlags.GAP | BlockFlags.RESTART
+
 
 def summary(data_dir: Path) -> dict[str, Any]:
-    """Gaps and losses in words; by device the number of each sample, the blocks' flags, bursts as (stamp, samples)."""
-    found: dict[str, Any] = {"faults": [], "devices": {}}
+    """Losses in words; by device the number of each sample, bursts as (stamp, samples so far), how many breaks in the
+    numbers the blocks tell of, the first included, and how many they do not."""
+    losses: list[str] = []
+    devices: dict[str, dict[str, Any]] = {}
     for file in recordings(data_dir):
         for step in RecordingReader(file).steps():
-            match step.event:
-                case SampleBlock() as block:
-                    device = found["devices"].setdefault(block.device, {"numbers": [], "flags": [], "stamps_ns": []})
-                    device["stamps_ns"] += [
-                        (int(stamp_ns), len(device["numbers"]) + int(count))
-                        for stamp_ns, count in zip(block.burst_t_monotonic_ns, block.burst_count, strict=True)
-                    ]
-                    device["numbers"] += number(block.indications).tolist()
-                    device["flags"].append(int(block.flags))
-                case Gap() as gap:
-                    found["faults"].append(f"{gap.device}: {gap.dropped} {gap.unit}: {gap.reason}")
-                case DeviceChange(state="lost") as change:
-                    found["faults"].append(f"{change.device}: {change.message}")
-    return found
+            if isinstance(step.event, SampleBlock):
+                _add(
+                    devices.setdefault(step.event.device, {"numbers": [], "stamps_ns": [], "told": 0, "untold": 0}),
+                    step.event,
+                )
+            elif isinstance(step.event, DeviceChange) and step.event.state == "lost":
+                losses.append(f"{step.event.device}: {step.event.message}")
+    return {"losses": losses, "devices": devices}
+
+
+def _add(device: dict[str, Any], block: SampleBlock) -> None:
+    numbers = number(block.indications).tolist()
+    told = bool(block.flags & TOLD)
+    device["told"] += told
+    follows = [] if told else [*device["numbers"][-1:], numbers[0]]
+    device["untold"] += int((np.diff(follows) != 1).sum() + (np.diff(numbers) != 1).sum())
+    device["stamps_ns"] += [
+        (int(stamp_ns), len(device["numbers"]) + int(count))
+        for stamp_ns, count in zip(block.burst_t_monotonic_ns, block.burst_count, strict=True)
+    ]
+    device["numbers"] += numbers
 
 
 if __name__ == "__main__":

@@ -8,61 +8,69 @@ from typing import Any
 
 import numpy as np
 
-from hw.block import BlockFlags
 from tests.nightly.checks import IIO, Machine, Row, same
 from tests.nightly.site import ADDRESSES, RATES_HZ
 
 RUN_S = 15.0
-SHORTEST_S = 5.0  # of it: before that, devices open one after the other
-TRIGGER = "/sys/kernel/config/iio/triggers/hrtimer/pace"
-PACE_HZ = 26.0
+SHORTEST_S = 3.0  # of it: before that, devices open one after the other
+TRIGGERS = "/sys/kernel/config/iio/triggers/hrtimer"
+NOTHING: dict[str, Any] = {"numbers": [], "stamps_ns": [], "told": 0, "untold": 0}
+PACED = {"lsm6dso": ("lsm6dsox_accel", 26.0), "adxl355": ("adxl355", 31.25)}  # name in the kernel, rate in Hz
 # The stamp is taken at the trigger, the number when the kernel's thread has the processor and the transfer is through:
-# some ms, 130 on a machine under load. Stamps of another clock or unit are off by seconds.
-LATE_S = 0.25
+# some ms, 275 on a machine under heavy load. Stamps of another clock or unit are off by seconds.
+LATE_S = 0.5
 
 
 def own_drivers(machine: Machine) -> Iterator[Row]:
-    """Four FIFOs at once through i2c-dev: no sample may be lost, doubled or shifted."""
+    """Four FIFOs at once through i2c-dev: no sample may be lost, doubled or shifted without being told. (A machine that
+    waits for a processor is late, and FIFOs run over: that is told.)"""
     machine.twins.hold(None)
     devices = {
         name: (name, f"bus = {machine.bus}, address = {address}, rate_hz = {RATES_HZ[name]}")
         for name, address in ADDRESSES.items()
     }
     found = agent_run(machine, "own", devices)
-    yield same("fieldcal run", "gaps and losses", "; ".join(found["faults"]) or "none", "none")
+    yield same("fieldcal run", "losses", "; ".join(found["losses"]) or "none", "none")
     for name in devices:
-        device = found["devices"].get(name, {"numbers": [], "flags": []})
-        steps = np.diff(device["numbers"])
-        restarts = sum(flags != 0 for flags in device["flags"])
-        agree = len(steps) > SHORTEST_S * RATES_HZ[name] and bool((steps == 1).all()) and restarts == 1
-        told = f"{len(device['numbers'])} samples, {int((steps != 1).sum())} out of order, {restarts} restart"
-        yield Row(name, "fieldcal run, FIFO", told, "0 out of order, 1 restart", agree)
+        device = found["devices"].get(name, NOTHING)
+        agree = len(device["numbers"]) > SHORTEST_S * RATES_HZ[name] and device["untold"] == 0
+        told = f"{len(device['numbers'])} samples, {device['told']} told restarts, {device['untold']} untold"
+        yield Row(name, "fieldcal run, FIFO", told, "0 untold", agree)
 
 
 def through_iio(machine: Machine) -> Iterator[Row]:
-    """Driver `iio` on st_lsm6dsx_i2c, paced by the kernel's timer: each number stands at the time of its stamp."""
-    guest = machine.guest
+    """Driver `iio` on the kernel's drivers, paced by its timer: each number stands at the time of its stamp."""
     machine.twins.hold(None)
-    guest.sh(f"mkdir {TRIGGER}")
-    directory = guest.sh(f"grep -l pace {IIO}/trigger*/name | xargs dirname")
-    guest.write(f"{directory}/sampling_frequency", f"{PACE_HZ:g}")
-    options = f'device = "lsm6dsox_accel", rate_hz = {PACE_HZ}, trigger = "pace"'
-    found = agent_run(machine, "iio", {"lsm6dso": ("iio", options)})
-    yield same("driver iio", "losses", "; ".join(found["faults"]) or "none", "none")
-    device = found["devices"].get("lsm6dso", {"numbers": [], "flags": [], "stamps_ns": []})
-    stamps_ns = np.array([stamp_ns for stamp_ns, _ in device["stamps_ns"]], dtype=float)
-    numbers = np.array(device["numbers"])[[count - 1 for _, count in device["stamps_ns"]]]
-    late_s = numbers / RATES_HZ["lsm6dso"] - (stamps_ns - stamps_ns.min(initial=0)) * 1e-9
-    spread_s = float(np.ptp(late_s)) if len(late_s) else float("nan")
-    agree = len(numbers) > SHORTEST_S * PACE_HZ and bool((np.diff(numbers) >= 0).all()) and spread_s < LATE_S
-    gaps = sum(bool(flags & (BlockFlags.GAP | BlockFlags.RESTART)) for flags in device["flags"])
-    told = f"{len(numbers)} samples, stamps within {1e3 * spread_s:.0f} ms, {gaps} breaks"
-    yield Row("driver iio", "sample numbers at their stamps", told, f"in order, within {1e3 * LATE_S:.0f} ms", agree)
+    paced = {name: pace for name, pace in PACED.items() if name in machine.bound}
+    devices = {}
+    for name, (kernel_name, rate_hz) in paced.items():
+        add_trigger(machine, name, rate_hz)
+        devices[name] = "iio", f'device = "{kernel_name}", rate_hz = {rate_hz}, trigger = "{name}"'
+    found = agent_run(machine, "iio", devices)
+    yield same("driver iio", "losses", "; ".join(found["losses"]) or "none", "none")
+    for name, (_, rate_hz) in paced.items():
+        device = found["devices"].get(name, NOTHING)
+        stamps_ns = np.array([stamp_ns for stamp_ns, _ in device["stamps_ns"]], dtype=float)
+        numbers = np.array(device["numbers"])[[count - 1 for _, count in device["stamps_ns"]]]
+        late_s = numbers / RATES_HZ[name] - (stamps_ns - stamps_ns.min(initial=0)) * 1e-9
+        spread_s = float(np.ptp(late_s)) if len(late_s) else float("nan")
+        agree = len(numbers) > SHORTEST_S * rate_hz and bool((np.diff(numbers) >= 0).all()) and spread_s < LATE_S
+        told = f"{len(numbers)} samples, within {1e3 * spread_s:.0f} ms, {device['told']} breaks"
+        yield Row(
+            "driver iio", f"{name}, numbers at their stamps", told, f"in order, within {1e3 * LATE_S:.0f} ms", agree
+        )
+
+
+def add_trigger(machine: Machine, name: str, rate_hz: float) -> None:
+    """A timer of the kernel's that makes its drivers sample."""
+    machine.guest.sh(f"mkdir {TRIGGERS}/{name}")
+    directory = machine.guest.sh(f"grep -l {name} {IIO}/trigger*/name | xargs dirname")
+    machine.guest.write(f"{directory}/sampling_frequency", f"{rate_hz:g}")
 
 
 def iio_refusals(machine: Machine) -> Iterator[Row]:
     """What driver `iio` says where the kernel refuses; LSM6DSO and trigger as `through_iio` left them."""
-    said = json.loads(machine.guest.python("-m", "tests.nightly.iio_refusals", f"{PACE_HZ:g}"))
+    said = json.loads(machine.guest.python("-m", "tests.nightly.iio_refusals"))
     rates = machine.guest.sh(f"cat {IIO}/*/sampling_frequency_available | grep 26.000 | head -n 1")
     wanted = {
         "a rate that is rounded": "wrote 100, it says 104.000000",

@@ -32,10 +32,10 @@ ABSENCE = absence()
 pytestmark = pytest.mark.skipif(ABSENCE is not None, reason=str(ABSENCE))
 
 NODE = "/dev/i2c-1"
-# Slow enough that no FIFO (the ADXL355's holds 32 samples) runs over while a machine under load does something else.
+# Slow enough that no FIFO (the first two hold 32 samples) runs over while a machine under load does something else.
 DEVICES: dict[str, tuple[type[FifoTwin], int, float]] = {
-    "adxl355": (Adxl355Twin, 0x1D, 125.0),
-    "adxl345": (Adxl345Twin, 0x53, 100.0),
+    "adxl355": (Adxl355Twin, 0x1D, 62.5),
+    "adxl345": (Adxl345Twin, 0x53, 50.0),
     "mpu6050": (Mpu6050Twin, 0x68, 100.0),
     "lsm6dso": (Lsm6dsoTwin, 0x6A, 104.0),
 }
