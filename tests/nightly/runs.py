@@ -91,7 +91,7 @@ def agent_run(machine: Machine, name: str, devices: dict[str, tuple[str, str]]) 
     text = '[gateway]\nsite = "nightly"\nname = "guest"\n[zenoh]\nenabled = false\n'
     for device, (driver, options) in devices.items():
         text += f'[[devices]]\nname = "{device}"\ndriver = "{driver}"\noptions = {{ {options} }}\n'
-        text += f'[[channels]]\nsensor = "{device}"\n'
+        text += f'[[channels]]\nsensor = "{device}"\nprior = {{}}\n'
     machine.guest.put(f"/run/{name}.toml", text)
     machine.guest.python(
         *("-m", "agent", "run", f"/run/{name}.toml", "--data-dir", f"/run/{name}", "--duration", f"{RUN_S:g}")

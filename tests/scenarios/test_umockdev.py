@@ -85,7 +85,7 @@ def configuration(tmp_path: Path, port: PtyDevice) -> Path:
         '[[devices]]\nname = "serial"\ndriver = "serial-csv"\n'
         f'options = {{ port = "{port.path}", rate_hz = {SERIAL_HZ}, axes = 3, sequence = true, unit = "m/s2" }}\n'
     )
-    lines += [f'[[channels]]\nsensor = "{name}"\n' for name in (*DEVICES, "serial")]
+    lines += [f'[[channels]]\nsensor = "{name}"\nprior = {{}}\n' for name in (*DEVICES, "serial")]
     path = tmp_path / "gateway.toml"
     path.write_text("".join(lines))
     return path
