@@ -45,7 +45,7 @@ class BufferedSensor(ABC):
         self._options = options
         self._clock = clock
         self._sleep = sleep
-        self._cutter = Cutter(name, options.rate_hz)
+        self._cutter = Cutter(name, np.nan)  # the rate is known once it is open
         self._opened = False
         self._ready: deque[SampleBlock] = deque()
         self._loss: DeviceLost | None = None
@@ -74,6 +74,10 @@ class BufferedSensor(ABC):
     def _ends(self, info: DeviceInfo) -> tuple[float, float]:  # noqa: ARG002 - not every device says
         """Ends of the range, in the indications' unit."""
         return -np.inf, np.inf
+
+    def _temperature(self) -> tuple[int | None, float | None]:
+        """Raw and degC at the end of a block."""
+        return None, None
 
     def open(self) -> DeviceInfo:
         """Find it, set it, start it. Raises DeviceLost, ConfigurationError or IdentityError."""
@@ -142,4 +146,5 @@ class BufferedSensor(ABC):
         arrivals_ns, utc_ns, samples = zip(*reads, strict=True)
         count = np.cumsum([len(part) for part in samples])
         indications = np.ascontiguousarray(np.concatenate(samples))
-        self._ready.extend(self._cutter.cut(Stretch(indications, np.array(arrivals_ns), count, utc_ns[-1])))
+        stretch = Stretch(indications, np.array(arrivals_ns), count, utc_ns[-1], *self._temperature())
+        self._ready.extend(self._cutter.cut(stretch))

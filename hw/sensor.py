@@ -90,6 +90,7 @@ BUILT_IN: Mapping[str, str] = {
     "serial-binary": "hw.serial_binary:SerialBinary",
     "serial-csv": "hw.serial_stream:SerialCsv",
     "sound-card": "hw.sound_card:SoundCard",
+    "virtual": "hw.virtual.device:Virtual",
     "witmotion": "hw.witmotion:WitMotion",
 }
 
