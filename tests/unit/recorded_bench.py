@@ -25,15 +25,15 @@ BLOCK, BURST = 500, 25
 PRIOR = {"sensitivity": COUNTS_PER_MPS2}
 
 
-def record(data_dir: Path, duration_s: float, seed: int = 7) -> Truth:
+def record(data_dir: Path, duration_s: float, seed: int = 7, run_id: str = "run-1") -> Truth:
     """Record the plain preset's first `duration_s` into a data directory with store and one recording."""
     data_dir.mkdir(parents=True, exist_ok=True)
     bench = Bench(plain(seed), seed)
     config = _config(bench)
-    pipeline = Pipeline.begin(config, "run-1", 0, 0, {})
+    pipeline = Pipeline.begin(config, run_id, 0, 0, {})
     recorder, store = Recorder(data_dir, ["mems", "reference"], ["mems"]), Store(data_dir, 0)
     start = RunStart(
-        run_id="run-1", site="virtual", gateway="bench", boot_id="boot", t_monotonic_ns=0, t_utc_ns=EPOCH_NS,
+        run_id=run_id, site="virtual", gateway="bench", boot_id="boot", t_monotonic_ns=0, t_utc_ns=EPOCH_NS,
         config_json=config.model_dump_json(), versions={"fieldcal": "0.1.0", **versions()}, fingerprint=fingerprint(),
         snapshot=pipeline.snapshot(), file_sequence=1, event_sequence=0,
     )  # fmt: skip
