@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import re
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
@@ -13,7 +12,8 @@ from pydantic import Field
 
 from hw.block import DeviceInfo
 from hw.buffered_sensor import BufferedSensor
-from hw.sensor import ConfigurationError, DeviceLost, Options
+from hw.sensor import DeviceLost, Options
+from hw.vendor_library import vendor_library
 
 FULL_SCALE = 2**23  # counts; the interface hands on 24 bits
 CHANNELS = 2
@@ -110,10 +110,4 @@ class SoundCard(BufferedSensor):
 
 
 def _library() -> Any:
-    """sounddevice, imported only by those who name this driver."""
-    try:
-        return importlib.import_module("sounddevice")
-    except (ImportError, OSError) as error:  # OSError: the package is there, PortAudio is not
-        raise ConfigurationError(
-            f"driver sound-card needs sounddevice (pip install 'fieldcal[sound]') and PortAudio: {error}"
-        ) from error
+    return vendor_library("sounddevice", "sound-card", "sound", "PortAudio")

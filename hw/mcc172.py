@@ -1,0 +1,146 @@
+"""Driver `mcc172`: an analog sensor on an MCC 172 (24 bit, IEPE, on a Raspberry Pi's header), through daqhats.
+
+Names and meanings as in daqhats 1.4.1 (daqhats/mcc172.py, hats.py): volts unless asked for counts, +-5 V, a rate of
+51.2 kHz over 1 to 256, a scan that stops when its buffer runs over. The inputs are AC-coupled (MCC 172 data sheet), and
+its filter delays by 39 samples (a_in_clock, trigger_config): a part of the reference's lag.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field, field_validator
+
+from hw.block import DeviceInfo
+from hw.buffered_sensor import BUFFER_S, BufferedSensor, Indications
+from hw.sensor import ConfigurationError, DeviceLost, IdentityError, Options
+from hw.vendor_library import vendor_library
+
+BASE_RATE_HZ, DIVIDERS = 51_200.0, range(1, 257)
+RATE_TOLERANCE = 1e-3
+SYNC_POLL_S, SYNC_POLLS = 0.01, 200  # 128 periods of the slowest rate are 0.64 s
+MV_PER_V = 1e3
+UNSCALED = 1000.0  # mV per unit: what comes is volts
+INVALID_BOARD = "Invalid board type"
+
+
+class Mcc172Options(Options):
+    """Options of `mcc172`."""
+
+    address: int = Field(0, ge=0, le=7, description="of the board, as its jumpers are set")
+    channel: Literal[0, 1] = Field(0, description="input of the board")
+    rate_hz: float = Field(3200.0, gt=0, description="51200 over a whole number from 1 to 256, e.g. 1600, 3200, 6400")
+    iepe: bool = Field(True, description="feed the sensor a constant current; not for a voltage source")
+    serial_number: str = Field("", description="of the sensor, as on its plate")
+
+    @field_validator("rate_hz")
+    @classmethod
+    def _known_rate(cls, value: float) -> float:
+        divider = round(BASE_RATE_HZ / value)
+        if divider not in DIVIDERS or abs(BASE_RATE_HZ / divider - value) > RATE_TOLERANCE * value:
+            near = BASE_RATE_HZ / min(max(divider, 1), 256)
+            raise ValueError(f"{value:g} Hz is not 51200 Hz over 1 to 256; the nearest is {near:g} Hz")
+        return BASE_RATE_HZ / divider
+
+
+class Mcc172(BufferedSensor):
+    """One channel, in mV as calibrated by the board; the sensor's sensitivity is applied elsewhere."""
+
+    options_model: ClassVar[type[Options]] = Mcc172Options
+
+    _board: Any = None
+
+    def _where(self) -> str:
+        return f"MCC 172/address {self._options.address}"
+
+    def _start(self) -> DeviceInfo:
+        options = self._options
+        library = _library()
+        try:
+            self._board = library.mcc172(options.address)
+            settings = self._configure(library)
+            self._scan()
+        except library.HatError as error:
+            raise (IdentityError if INVALID_BOARD in str(error) else DeviceLost)(f"{self._where()}: {error}") from error
+        except Exception as error:
+            if type(error) is not Exception:  # daqhats says so, and only so, that its library in C is missing
+                raise
+            raise ConfigurationError(f"driver mcc172: {error}") from error
+        return DeviceInfo(
+            driver="mcc172",
+            kind="MCC 172",
+            serial_number=options.serial_number,
+            unit="mV",
+            axes=1,
+            nominal_rate_hz=options.rate_hz,
+            settings=settings,
+        )
+
+    def _configure(self, library: Any) -> dict[str, str]:
+        """Set input and clock, read them back."""
+        board, options = self._board, self._options
+        board.iepe_config_write(options.channel, int(options.iepe))
+        board.a_in_sensitivity_write(options.channel, UNSCALED)
+        board.a_in_clock_config_write(library.SourceType.LOCAL, options.rate_hz)
+        for _ in range(SYNC_POLLS):
+            clock = board.a_in_clock_config_read()
+            if clock.synchronized:
+                break
+            self._sleep(SYNC_POLL_S)
+        else:
+            raise DeviceLost(f"{self._where()}: its converters did not synchronise within {SYNC_POLL_S * SYNC_POLLS} s")
+        found = {
+            "iepe": (board.iepe_config_read(options.channel), int(options.iepe)),
+            "mV per unit": (board.a_in_sensitivity_read(options.channel), UNSCALED),
+            "rate_hz": (round(clock.sample_rate_per_channel, 3), round(options.rate_hz, 3)),
+        }
+        wrong = [f"{name} is {is_:g}, not {wanted:g}" for name, (is_, wanted) in found.items() if is_ != wanted]
+        if wrong:
+            raise ConfigurationError(f"{self._where()} is not set as it should be: {', '.join(wrong)}")
+        return {name: f"{is_:g}" for name, (is_, _) in found.items()} | {
+            "channel": str(options.channel),
+            "board": board.serial(),
+            "board calibrated": board.calibration_date(),
+            "firmware": board.firmware_version().version,
+        }
+
+    def _scan(self) -> None:
+        library, options = _library(), self._options
+        kept = round(BUFFER_S * options.rate_hz)
+        self._board.a_in_scan_start(1 << options.channel, kept, library.OptionFlags.CONTINUOUS)
+
+    def _ends(self, info: DeviceInfo) -> tuple[float, float]:  # noqa: ARG002 - the same for every board
+        known = self._board.info()
+        return MV_PER_V * known.AI_MIN_VOLTAGE, MV_PER_V * known.AI_MAX_VOLTAGE
+
+    def _stop(self) -> None:
+        board, self._board = self._board, None
+        if board is not None:
+            _end_scan(board)
+
+    def _take(self) -> tuple[Indications, bool]:
+        board = self._board
+        try:
+            read = board.a_in_scan_read_numpy(-1, 0)
+            overrun = read.hardware_overrun or read.buffer_overrun
+            if overrun:
+                _end_scan(board)
+                self._scan()
+            elif not read.running:
+                raise DeviceLost(f"{self._where()}: its scan ended")
+        except _library().HatError as error:
+            raise DeviceLost(f"{self._where()}: {error}") from error
+        return MV_PER_V * np.asarray(read.data, np.float64)[:, None], overrun
+
+
+def _end_scan(board: Any) -> None:
+    try:
+        board.a_in_scan_stop()
+        board.a_in_scan_cleanup()
+    except _library().HatError:
+        pass  # there was none
+
+
+def _library() -> Any:
+    return vendor_library("daqhats", "mcc172", "mcc", "MCC's library libdaqhats")
