@@ -8,8 +8,11 @@ from pydantic import Field, field_validator, model_validator
 
 from hw.sensor import Options
 
-POLL_SAMPLES = 16  # half of the smallest FIFO here; a deeper one leaves more room for a late read
-LONGEST_POLL_S = 0.1  # at slow rates 16 samples would be seconds
+POLL_SAMPLES = 16  # a read costs as much as a few of them
+FIFO_SHARE = 1 / 4  # of the FIFO: at 1 kHz 32 samples then outlast a stall of 20 ms, which gateways have
+# A sample's time is told by the polls that came just after one: at 125 Hz polls of 100 ms leave errors up to 0.6 ms,
+# polls of 20 ms half of it. Polls are spread over a sample period: at slow rates one takes two of them, up to a limit.
+LONGEST_POLL_S, FEWEST_SAMPLES, SLOWEST_POLL_S = 0.02, 2, 0.1
 FIFO_SHARE_MAX = 7 / 8  # of the FIFO may fill between polls: the rest is for a late one
 BUS_SHARE_MAX = 0.7  # of the bus in use: the rest is for clock stretching, retries and other devices
 BITS_A_BYTE = 9  # with its acknowledge
@@ -26,7 +29,9 @@ class FifoOptions(Options):
 
     bus: int = Field(1, ge=0, description="N of /dev/i2c-N")
     rate_hz: float
-    poll_interval_s: float | None = Field(None, gt=0, description="time between reads; by default that of 16 samples")
+    poll_interval_s: float | None = Field(
+        None, gt=0, description="time between reads; by default a quarter of the FIFO, 20 ms"
+    )
     serial_number: str = Field("", description="as on the plate: these chips have none, and a calibration is one's own")
     bus_khz: float = Field(400.0, gt=0, le=3400, description="clock of the bus, as the machine sets it")
 
@@ -62,4 +67,6 @@ class FifoOptions(Options):
     @property
     def interval_s(self) -> float:
         """Time between reads."""
-        return self.poll_interval_s or min(POLL_SAMPLES / self.rate_hz, LONGEST_POLL_S)
+        samples = min(POLL_SAMPLES, FIFO_SHARE * self.fifo_samples)
+        longest_s = max(LONGEST_POLL_S, min(FEWEST_SAMPLES / self.rate_hz, SLOWEST_POLL_S))
+        return self.poll_interval_s or min(samples / self.rate_hz, longest_s)

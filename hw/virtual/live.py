@@ -47,8 +47,6 @@ class LiveBench:
             "address": ADDRESS,
             "rate_hz": parameters.sensor.clock.nominal_rate_hz,
             "range_g": _range_g(parameters.sensor.nominal_sensitivity),
-            # A quarter of the FIFO: a laptop that also runs the bench is late by 20 ms now and then.
-            "poll_interval_s": 0.008,
         }
         self._lines = serial_lines(self.bench, "reference", self.time)
         self._clock = clock
