@@ -1,7 +1,8 @@
 """Registers of the MPU-6050, MPU-6500 and MPU-9250 and what their bytes mean.
 
 Sources: register maps RM-MPU-6000A, RM-MPU-6500A and RM-MPU-9250A, specification PS-MPU-6000A; identities, FIFO sizes
-and temperature lines also in Linux, drivers/iio/imu/inv_mpu6050 (inv_mpu_iio.h, inv_mpu_core.c).
+and temperature lines also in Linux, drivers/iio/imu/inv_mpu6050 (inv_mpu_iio.h, inv_mpu_core.c: offsets 12420 and 7011
+LSB, 2.941176 and 2.995178 mK/LSB). LSB/g, noise and tolerance of the MPU-9250: PS-MPU-9250A-01, table 2.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ FIFO_RESET, FIFO_ON = 0x04, 0x40
 OVERFLOW = 0x10  # in INT_STATUS and INT_ENABLE
 SAMPLE_BYTES = 6
 COUNTS_PER_G: Mapping[int, int] = {2: 16384, 4: 8192, 8: 4096, 16: 2048}
+SELF_TEST_RANGE_G = 8  # of an MPU-6050: at 2 g its answer and gravity together reach the end (RM-MPU-6000A, 4.1)
 LIMITS = -(2**15), 2**15 - 1
 RATES_HZ = tuple(1000.0 / (divider + 1) for divider in (0, 1, 3, 4, 7, 9, 19, 39, 99, 249))
 _ACCEL_INTO_FIFO = 0x08

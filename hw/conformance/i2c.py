@@ -110,6 +110,7 @@ class I2cContract(SensorContract):
     trimmed: ClassVar[dict[int, int]]  # offsets, high-pass filter, self-test: what somebody may have left on
     late_s: ClassVar[float]  # longer than the FIFO holds
     temperature: ClassVar[tuple[int, float] | None]  # a raw number and its degC
+    self_test_range: ClassVar[float] = 1.0  # times the range that is set
 
     @pytest.mark.parametrize("number", [errno.ENXIO, errno.EREMOTEIO])
     def test_nobody_at_the_address(self, rig: I2cRig, number: int) -> None:
@@ -259,7 +260,7 @@ class I2cContract(SensorContract):
         report = rig.sensor.self_test()
         assert report.faults == []
         assert info.nominal_sensitivity is not None
-        counts_per_g = info.nominal_sensitivity * 9.80665
+        counts_per_g = info.nominal_sensitivity * 9.80665 / self.self_test_range
         # of 0 and 1 in turn, of 0 to 3, of 0 to 7
         assert [g * counts_per_g for g in report.noise_g] == pytest.approx([0.5, 1.118, 2.291], rel=0.01)
         rig.sensor.open()  # and it is off again

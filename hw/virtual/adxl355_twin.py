@@ -26,7 +26,10 @@ def encode(counts: NDArray[np.int32]) -> bytes:
 
 
 class Adxl355Twin(FifoTwin):
-    """See FifoTwin. `identity` are the four ID registers."""
+    """See FifoTwin. `identity` are the four ID registers, by default the part's own."""
+
+    own_identity = IDENTITY
+    self_test_counts = (76800, 76800, 384000)  # at the lowest range; typical by the data sheet: 0.3, 0.3, 1.5 g
 
     fifo_bytes = 96 * 3
     sample_bytes = 9
@@ -40,10 +43,10 @@ class Adxl355Twin(FifoTwin):
         samples_due: Callable[[float], int],
         clock: Callable[[], float],
         *,
-        identity: bytes = IDENTITY,
+        identity: bytes | None = None,
         temperature_raw: Callable[[float], int] | None = None,
     ) -> None:
-        self._identity = identity
+        self._identity = identity or self.own_identity
         super().__init__(source, samples_due, clock, temperature_raw=temperature_raw)
         self._ready_s = clock()  # it was powered long before
 
@@ -70,7 +73,7 @@ class Adxl355Twin(FifoTwin):
         return (EMPTY_ENTRY * (count // 3 + 1))[:count]
 
     def _deflection(self) -> Counts:
-        return np.array([76800, 76800, 384000] if self.registers[LAST_SETTING] & 3 == 3 else [0, 0, 0], np.int32)
+        return np.array(self.self_test_counts if self.registers[LAST_SETTING] & 3 == 3 else (0, 0, 0), np.int32)
 
     def _get(self, register: int) -> int:
         if register == STATUS:
@@ -102,3 +105,16 @@ class Adxl355Twin(FifoTwin):
                 self._empty()
         elif FIRST_SETTING <= register <= LAST_SETTING and not self._filling:
             self.registers[register] = value
+
+
+class Adxl357Twin(Adxl355Twin):
+    """Five times the range, another temperature line."""
+
+    self_test_counts = (15360, 15360, 64000)  # typical by the data sheet in z: 1.25 g
+    temperature_at_25_degc = 1852
+
+
+class Adxl359Twin(Adxl357Twin):
+    """As the ADXL357, with a part ID of its own."""
+
+    own_identity = bytes([0xAD, 0x1D, 0xE9, 0x01])

@@ -41,7 +41,8 @@ class Mpu6050Twin(FifoTwin):
         return counts.astype(">i2").tobytes()
 
     def _deflection(self) -> Counts:
-        return np.array([8000, 8000, 8000] if self.registers[0x1C] & 0xE0 == 0xE0 else [0, 0, 0], np.int32)
+        change = 8000 >> (self.registers[0x1C] >> 3 & 3)  # the same in g at any range
+        return np.full(3, change if self.registers[0x1C] & 0xE0 == 0xE0 else 0, np.int32)
 
     def _get(self, register: int) -> int:
         if register == INT_STATUS:

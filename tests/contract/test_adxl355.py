@@ -12,7 +12,7 @@ from hw.adxl355 import Adxl355, Adxl357, Adxl359
 from hw.block import BlockFlags, Drop
 from hw.conformance.i2c import I2cContract, I2cRig
 from hw.sensor import DeviceLost, IdentityError
-from hw.virtual.adxl355_twin import Adxl355Twin
+from hw.virtual.adxl355_twin import Adxl355Twin, Adxl357Twin, Adxl359Twin
 
 
 class Adxl355Rig(I2cRig):
@@ -20,6 +20,7 @@ class Adxl355Rig(I2cRig):
 
 
 class TestAdxl355(I2cContract):
+    kind, counts_per_g = "ADXL355", 256000  # data sheet, at 2 g
     filter_register = 0x28, "FILTER"
     # offsets somebody trimmed, a high-pass filter somebody turned on, self-test
     trimmed = {0x1E: 0x11, 0x23: 0x11, 0x2E: 0x03}  # noqa: RUF012
@@ -35,10 +36,10 @@ class TestAdxl355(I2cContract):
 
     def test_says_who_it_is_and_how_it_is_set(self, rig: Adxl355Rig) -> None:
         info = rig.sensor.open()
-        assert (info.kind, info.unit, info.axes) == ("ADXL355", "count", 3)
-        # Data sheet: 256000 LSB/g at 2 g, and 20 bits make +-2.048 g of that.
-        assert info.nominal_sensitivity == pytest.approx(256000 / 9.80665, rel=1e-12)
-        assert info.range_mps2 == pytest.approx(2.048 * 9.80665, rel=1e-12)
+        assert (info.kind, info.unit, info.axes) == (self.kind, "count", 3)
+        # 20 bits: +-2.048 g at 256000 LSB/g
+        assert info.nominal_sensitivity == pytest.approx(self.counts_per_g / 9.80665, rel=1e-12)
+        assert info.range_mps2 == pytest.approx(2**19 / self.counts_per_g * 9.80665, rel=1e-12)
         assert len(info.settings) == 18
         registers = rig.twin.registers
         assert info.settings["REVID"] == f"0x{registers[3]:02X}"
@@ -59,7 +60,7 @@ class TestAdxl355(I2cContract):
         assert flags == BlockFlags.RESTART
 
     def test_a_part_that_loses_its_trim_is_not_used(self, rig: Adxl355Rig) -> None:
-        class Worn(Adxl355Twin):
+        class Worn(rig.twin_class):  # type: ignore[name-defined,misc]
             wear = 0
 
             def read(self, count: int) -> bytes:
@@ -107,7 +108,7 @@ class TestAdxl355(I2cContract):
 
     def test_overrun_between_count_and_read(self, rig: Adxl355Rig) -> None:
         # 31 samples are counted, then the process stalls and the oldest go before they are read.
-        class Stalling(Adxl355Twin):
+        class Stalling(rig.twin_class):  # type: ignore[name-defined,misc]
             stall_s = 0.0
 
             def read(self, count: int) -> bytes:
@@ -127,7 +128,7 @@ class TestAdxl355(I2cContract):
 
     def test_overrun_told_by_a_status_that_got_lost(self, rig: Adxl355Rig) -> None:
         # STATUS clears by being read, also when the transfer then fails: the full FIFO must tell.
-        class Garbling(Adxl355Twin):
+        class Garbling(rig.twin_class):  # type: ignore[name-defined,misc]
             garble = False
 
             def read(self, count: int) -> bytes:
@@ -157,28 +158,45 @@ class TestAdxl355(I2cContract):
 
 
 class Adxl357Rig(Adxl355Rig):
-    driver = Adxl357
+    driver, twin_class = Adxl357, Adxl357Twin
+
+
+class TestAdxl357(TestAdxl355):
+    kind, counts_per_g = "ADXL357", 51200  # data sheet, at 10 g
+    temperature = 1671, 45.0  # data sheet: 1852 at 25 degC, -9.05 LSB a degree
+
+    @pytest.fixture
+    def rig(self) -> Iterator[Adxl355Rig]:
+        rig = Adxl357Rig()
+        yield rig
+        rig.close()
 
 
 class Adxl359Rig(Adxl355Rig):
-    driver = Adxl359
-
-    def build_twin(self) -> Adxl355Twin:
-        return Adxl355Twin(self.counts, self.due, lambda: self.t_s, identity=b"\xad\x1d\xe9\x01")
+    driver, twin_class = Adxl359, Adxl359Twin
 
 
-@pytest.mark.parametrize(("rig_class", "revision"), [(Adxl357Rig, 0xED), (Adxl359Rig, 0xE9)])
-def test_the_wide_ranges(rig_class: type[Adxl355Rig], revision: int) -> None:
-    rig = rig_class()
+class TestAdxl359(TestAdxl357):
+    kind = "ADXL359"
+
+    @pytest.fixture
+    def rig(self) -> Iterator[Adxl355Rig]:
+        rig = Adxl359Rig()
+        yield rig
+        rig.close()
+
+    def test_wrong_identity(self, rig: Adxl355Rig) -> None:
+        rig.put(Adxl357Twin(rig.counts, rig.due, lambda: rig.t_s))
+        with pytest.raises(IdentityError, match=r"0x1D on /dev/i2c-1: expected ad 1d e9, found ad 1d ed"):
+            rig.sensor.open()
+
+
+@pytest.mark.parametrize(("range_g", "counts_per_g"), [(10, 51200), (20, 25600), (40, 12800)])
+def test_the_wide_ranges(range_g: int, counts_per_g: int) -> None:
+    rig = Adxl357Rig()
     try:
-        info = rig.open()
-        assert info.kind == rig.driver.part.kind
-        assert rig.twin.registers[2] == revision
-        # Data sheet: 51200 LSB/g at 10 g, and 20 bits make +-10.24 g of that; 1852 LSB at 25 degC.
-        assert info.nominal_sensitivity == pytest.approx(51200 / 9.80665, rel=1e-12)
-        assert info.range_mps2 == pytest.approx(10.24 * 9.80665, rel=1e-12)
-        rig.temperature_raw = 1852
-        (block,) = rig.blocks(0.4)
-        assert (np.diff(rig.number(block.indications)) == 1).all()
+        info = rig.build(range_g=range_g).open()
+        assert info.nominal_sensitivity == pytest.approx(counts_per_g / 9.80665, rel=1e-12)
+        assert info.settings["RANGE"] == {10: "0x81", 20: "0x82", 40: "0x83"}[range_g]
     finally:
         rig.close()

@@ -27,6 +27,7 @@ class TestMpu6050(I2cContract):
     late_s = 0.4
     # Register map: raw / 340 + 36.53
     temperature = -3920, 25.0006
+    self_test_range = 4.0  # 8 g
 
     @pytest.fixture
     def rig(self) -> Iterator[Mpu6050Rig]:
@@ -95,6 +96,7 @@ class TestMpu6500(TestMpu6050):
     trimmed = {0x1B: 0xE0, 0x6C: 0x3F}  # noqa: RUF012
     # Register map: raw / 333.87 + 21
     temperature = 3339, 31.00093
+    self_test_range = 1.0  # AN-MPU-9250A-03: at 2 g
 
     @pytest.fixture
     def rig(self) -> Iterator[Mpu6050Rig]:
