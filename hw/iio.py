@@ -76,6 +76,7 @@ class Iio:
             # Before anything is set: whoever else has it open keeps it as it is.
             self._file = os.open(DEV / self._directory.name, os.O_RDONLY | os.O_NONBLOCK)
             settings = self._configure()
+            scale = _number(self._directory / "in_accel_scale") if "in_accel_scale" in settings else 0.0
         except OSError as error:
             self.close()
             message = f"IIO device {self._options.device}: {error.filename or ''}: {error.strerror}"
@@ -88,7 +89,6 @@ class Iio:
         self._rest = b""
         self._last_ns = None
         self._cutter.flag(BlockFlags.RESTART)
-        scale = float(settings.get("in_accel_scale", "nan"))
         return DeviceInfo(
             driver="iio",
             kind=settings["name"],
@@ -208,7 +208,7 @@ class Iio:
             chosen = name in (*AXES, "timestamp")
             _write(path, "1" if chosen else "0")
             if chosen:
-                index = int(_text(directory / f"in_{name}_index"))
+                index = int(_number(directory / f"in_{name}_index"))
                 elements[name] = iio_scan.Element.parse(index, _text(directory / f"in_{name}_type"))
         absent = [name for name in (*AXES, "timestamp") if name not in elements]
         if absent:
@@ -234,6 +234,15 @@ def _write(path: Path, value: str) -> None:
         else:
             hint = f", it takes {_text(known)}" if known.exists() else ""
         raise ConfigurationError(f"{path}: {value} is refused{hint}") from error
+
+
+def _number(path: Path) -> float:
+    """Raises ConfigurationError for a file that holds none."""
+    text = _text(path)
+    try:
+        return float(text)
+    except ValueError:
+        raise ConfigurationError(f"{path}: {text!r} is no number") from None
 
 
 def _same_number(found: str, wanted: str) -> bool:

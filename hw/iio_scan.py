@@ -13,12 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-_TYPE = re.compile(r"(be|le):([su])(\d+)/(8|16|32|64)>>(\d+)")
+from hw.sensor import ConfigurationError
+
+_TYPE = re.compile(r"(be|le):([su])(\d{1,2})/(8|16|32|64)>>(\d{1,2})", re.ASCII)
 
 
 @dataclass(frozen=True, slots=True)
 class Element:
-    """One number of a scan; `text` is its type as the kernel states it. ValueError for a type that is none."""
+    """One number of a scan."""
 
     index: int
     order: str
@@ -29,12 +31,12 @@ class Element:
 
     @classmethod
     def parse(cls, index: int, text: str) -> Element:
-        """Of the files `*_index` and `*_type`."""
+        """Of the files `*_index` and `*_type`. Raises ConfigurationError for a type that is none, or of several."""
         found = _TYPE.fullmatch(text)
-        if found is None:
-            raise ValueError(f"{text!r} is no type of a scan element")
-        order, sign, bits, storage_bits, shift = found.groups()
-        return cls(index, order, sign == "s", int(bits), int(storage_bits), int(shift))
+        bits, storage_bits, shift = map(int, found.groups()[2:]) if found else (0, 0, 0)
+        if found is None or not 0 < bits <= storage_bits - shift:
+            raise ConfigurationError(f"{text!r} is no type of a scan element that holds one number")
+        return cls(index, found[1], found[2] == "s", bits, storage_bits, shift)
 
     @property
     def dtype(self) -> str:

@@ -39,8 +39,8 @@ def actual_rate_hz(rate_hz: float, freq_fine: int) -> float:
 
 
 def self_test(rate_hz: float) -> SelfTest:
-    """Positive self-test. Data sheet (DS12140, table 2): 50 to 1700 mg at any range; noise 70 ug per root Hz at 2 g, over
-    half the rate."""
+    """Positive self-test. Data sheet (DS12140, table 2): 50 to 1700 mg at any range; noise 70 ug per root Hz at 2 g,
+    over half the rate."""
     noise_g = 70e-6 * (rate_hz / 2) ** 0.5
     return SelfTest(
         writes=((CTRL5_C, 0x01),),

@@ -1,8 +1,8 @@
 """Frames and registers of WitMotion's serial protocol: pure functions, no port.
 
 Source: WitMotion's own WitStandardProtocol_JY901 (wit_c_sdk.c: frames, sum, writing and reading registers; REG.h:
-register numbers and codes) and their protocol description (acceleration in 16 g / 32768, temperature in 0.01 degC: data sheets
-WT901, WT901SDCL; the older JY61 and BWT61CL send what their MPU-6050 says, raw / 340 + 36.53).
+register numbers and codes) and their protocol description (acceleration in 16 g / 32768, temperature in 0.01 degC: data
+sheets WT901, WT901SDCL; the older JY61 and BWT61CL send what their MPU-6050 says, raw / 340 + 36.53).
 """
 
 from __future__ import annotations

@@ -170,7 +170,8 @@ def test_elements_as_the_kernel_states_them() -> None:
     assert Element.parse(0, "le:s12/16>>4").value(np.array([-16, 0x7FF0], np.int16)).tolist() == [-1, 2047]
     assert Element.parse(0, "be:u10/16>>6").value(np.array([0xFFC0], np.uint16)).tolist() == [1023]
     assert Element.parse(0, "le:s20/32>>12").value(np.array([-(2**31)], np.int32)).tolist() == [-(2**19)]
-    with pytest.raises(ValueError, match="is no type of a scan element"):
-        Element.parse(0, "le:s12/16X2>>4")
+    for several_or_none in ("le:s12/16X2>>4", "le:s0/16>>0", "le:s12/16>>5", "le:s12/16>>4\n", "le:s١/8>>0"):
+        with pytest.raises(ConfigurationError, match="is no type of a scan element"):
+            Element.parse(0, several_or_none)
     scan = layout({"b": Element.parse(1, "le:s64/64>>0"), "a": Element.parse(0, "be:s16/16>>0")})
     assert (scan.names, scan.itemsize, scan.fields["b"][1]) == (("a", "b"), 16, 8)  # type: ignore[index]

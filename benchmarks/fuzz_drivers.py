@@ -1,0 +1,177 @@
+"""Random and mutated byte streams through every parser of the drivers: no exception comes out, no memory grows.
+
+`python -m benchmarks.fuzz_drivers [STREAMS [SEED]]`, 10^6 of them by default, shared out evenly.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import os
+import random
+import sys
+import time
+import tracemalloc
+from collections.abc import Callable
+from dataclasses import dataclass
+
+os.environ["OPENBLAS_NUM_THREADS"] = "1"  # as every entry point of the product, before numpy loads
+
+import numpy as np
+
+from agent.recording.messages import MessageError, decode
+from agent.recording.raw_block import encode_block
+from hw import adxl355_registers, iio_scan, lsm6dso_registers
+from hw.block import SampleBlock
+from hw.cutting import Cutter
+from hw.fifo import plain_samples
+from hw.line_stream import LineStream
+from hw.sensor import ConfigurationError
+from hw.serial_binary import BinaryStream, SerialBinaryOptions
+from hw.serial_sensor import Stream
+from hw.sound_card import read_plate
+from hw.virtual import adxl355_twin, lsm6dso_twin, witmotion_twin
+from hw.witmotion import WitStream
+
+STREAMS = 1_000_000
+LONGEST = 120  # bytes of a random stream
+REOPEN = 50  # streams between two openings of a port
+WARM_UP = 2_000  # caches fill, then memory is counted
+COUNTS = np.arange(30, dtype=np.int32).reshape(10, 3)
+
+Parse = Callable[[bytes, int], object]
+"""Bytes, and which of the streams it is."""
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """What one parser did: `grown_bytes` are those still allocated at the end that were not after the warm-up."""
+
+    parser: str
+    streams: int
+    cpu_s: float
+    grown_bytes: int
+
+
+def parsers() -> dict[str, tuple[bytes, Parse]]:
+    """By name: a good stream to mutate, and what takes it."""
+    binary = SerialBinaryOptions.model_validate(
+        {
+            "port": "p", "rate_hz": 100.0, "start": "aa55", "length": 12, "checksum": "sum8",
+            "indications": [{"at": 3, "type": "f32"}], "sequence": {"at": 2, "type": "u8"},
+            "temperature": {"at": 7, "type": "f32"},
+        }
+    )  # fmt: skip
+    frames = b"".join(_closed(bytes([0xAA, 0x55, i, *range(8)])) for i in range(8))
+    wit = b"".join(
+        witmotion_twin.frame(0x50, 0, 0, 0, 5 * i) + witmotion_twin.frame(0x51, 1, 2, 3, 4) for i in range(5)
+    )
+    lines = b"".join(b"%d,1.5,2.5,-3\n" % i for i in range(8))
+    block = SampleBlock("d", "b", 1, 0, 1000.0, np.array([1, 2]), np.array([5, 10], np.int32), COUNTS)
+    return {
+        "adxl355": (adxl355_twin.encode(COUNTS), _adxl355),
+        "lsm6dso": (lsm6dso_twin.words(2, 0, COUNTS), _lsm6dso),
+        "adxl345, mpu6050": (bytes(60), lambda data, i: plain_samples(_whole(data, 6), "<>"[i % 2])),
+        "witmotion": (wit, _fed(WitStream(Cutter("w", 200.0), 200.0))),
+        "serial-binary": (frames, _fed(BinaryStream(Cutter("b", 100.0), binary))),
+        "serial-csv": (lines, _fed(LineStream(Cutter("l", 100.0), 3, sequence=True, longest_gap=1000.0))),
+        "iio": (b"le:s20/32>>12", _iio),
+        "sound-card": (
+            b"333D01 1012345" + b"60540" * 2 + b"210517",
+            lambda data, i: read_plate(_text(data), i % 2 + 1),
+        ),
+        "replay": (encode_block(7, block), _replay),
+    }
+
+
+def fuzz(streams: int, seed: int) -> list[Row]:
+    """Run `streams` through each parser; what is not allowed comes out as it is."""
+    rows = []
+    for name, (good, parse) in parsers().items():
+        draw = random.Random(f"{seed} {name}")
+        for i in range(min(WARM_UP, streams)):
+            parse(_mutated(good, draw), i)
+        gc.collect()
+        tracemalloc.start()
+        before, began_s = tracemalloc.get_traced_memory()[0], time.process_time()
+        for i in range(streams):
+            parse(draw.randbytes(draw.randrange(LONGEST)) if i % 4 == 0 else _mutated(good, draw), i)
+        cpu_s = time.process_time() - began_s
+        gc.collect()
+        rows.append(Row(name, streams, cpu_s, tracemalloc.get_traced_memory()[0] - before))
+        tracemalloc.stop()
+    return rows
+
+
+def _mutated(good: bytes, draw: random.Random) -> bytes:
+    """Up to three bits turned, bytes lost, bytes put in or bytes changed."""
+    data = bytearray(good)
+    for _ in range(draw.randrange(4)):
+        at = draw.randrange(len(data) + 1)
+        kind = draw.randrange(4)
+        if kind == 0 and data:
+            data[at % len(data)] ^= 1 << draw.randrange(8)
+        elif kind == 1:
+            del data[at : at + draw.randrange(9)]
+        elif kind == 2:
+            data[at:at] = draw.randbytes(draw.randrange(9))
+        elif data:
+            data[at % len(data)] = draw.randrange(256)
+    return bytes(data)
+
+
+def _fed(stream: Stream) -> Parse:
+    def parse(data: bytes, i: int) -> None:
+        if i % REOPEN == 0:
+            stream.begin()
+        if data:
+            stream.feed(data, i + 1, i + 1)
+        stream.blocks()
+        stream.take_drops()
+
+    return parse
+
+
+def _adxl355(data: bytes, i: int) -> None:  # noqa: ARG001 - every stream alike
+    adxl355_registers.triples(adxl355_registers.without_empty(_whole(data, 3)))
+
+
+def _lsm6dso(data: bytes, i: int) -> None:
+    lsm6dso_registers.tagged_samples(_whole(data, lsm6dso_registers.WORD_BYTES), None if i % 5 == 0 else i % 4)
+
+
+def _iio(data: bytes, i: int) -> None:  # noqa: ARG001 - every stream alike
+    with contextlib.suppress(ConfigurationError):  # so a file that the kernel cannot have written is told
+        element = iio_scan.Element.parse(0, _text(data))
+        scan = iio_scan.layout({"timestamp": element})
+        element.value(np.frombuffer(_whole(data, scan.itemsize), scan)["timestamp"])
+
+
+def _replay(data: bytes, i: int) -> None:  # noqa: ARG001 - every stream alike
+    with contextlib.suppress(MessageError):  # so a damaged recording is told
+        decode("fieldcal.v1.RawBlock", data)
+
+
+def _closed(body: bytes) -> bytes:
+    return body + bytes([sum(body) & 0xFF])
+
+
+def _whole(data: bytes, size: int) -> bytes:
+    return data[: len(data) // size * size]
+
+
+def _text(data: bytes) -> str:
+    return data.decode("ascii", errors="replace")
+
+
+def main() -> None:
+    """Print a row for each parser, and the sum."""
+    total = int(sys.argv[1]) if len(sys.argv) > 1 else STREAMS
+    rows = fuzz(-(-total // len(parsers())), int(sys.argv[2]) if len(sys.argv) > 2 else 1)
+    for row in rows:
+        print(f"{row.parser}: {row.streams} streams, {row.cpu_s:.0f} s, memory {row.grown_bytes:+d} bytes")
+    print(f"{sum(row.streams for row in rows)} streams, no exception, {sum(row.grown_bytes for row in rows):+d} bytes")
+
+
+if __name__ == "__main__":
+    main()
