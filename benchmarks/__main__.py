@@ -8,7 +8,7 @@ import sys
 
 os.environ["OPENBLAS_NUM_THREADS"] = "1"  # as every entry point of the product, before numpy loads
 
-NAMES = ("agent_cost", "recording", "sums", "torture", "torture_shm")
+NAMES = ("agent_cost", "four_sensors", "recording", "sums", "torture", "torture_shm")
 
 
 def main() -> int:

@@ -1,0 +1,192 @@
+"""Four sensors at 1 kHz and two references for ten minutes: does the agent lose a sample, and what does it cost?
+
+The twins run in another process than the agent: four ADXL355 at register level, each on an I2C bus of its own whose
+transfers go over a socket (the agent's smbus2 is the real one, only the kernel is replaced), and two references that
+write lines on pseudo-terminals. `python -m benchmarks four_sensors`; RUN_SECONDS in the environment for another
+length.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from agent.events import CalibrationUpdate, Event, Gap
+from agent.recording.reading import RecordingReader
+from benchmarks.agent_cost import cpu_s, peak_mb
+from benchmarks.page import machine, write_part
+from hw.block import BlockFlags, SampleBlock
+from hw.virtual.adxl355_twin import Adxl355Twin
+from hw.virtual.bench import Bench
+from hw.virtual.kernel import I2CBus, installed
+from hw.virtual.presets import plain
+from hw.virtual.remote_bus import RemoteBus, serve
+from hw.virtual.serial_bench import serial_lines
+from hw.virtual.serial_port import PtyDevice
+from hw.virtual.timebase import BenchTime
+
+SECONDS = float(os.environ.get("RUN_SECONDS", "600"))
+WARM_UP_S = 6.0  # imports and the first fits are not part of the running cost
+BENCHES, SENSORS = (1, 2), range(4)  # seeds; each bench carries two sensors and a reference
+ADDRESS = 0x1D
+
+
+def bench_of(sensor: int) -> int:
+    """Which of the benches carries a sensor."""
+    return sensor // 2
+
+
+def configuration(directory: Path) -> str:
+    """The agent's, as TOML."""
+    lines = ["[zenoh]", "enabled = false"]
+    for i in SENSORS:
+        options = f"{{ bus = {i}, address = {ADDRESS}, rate_hz = 1000, serial_number = '{i}' }}"
+        lines += ["[[devices]]", f"name = 'mems-{i}'", "driver = 'adxl355'", f"options = {options}"]
+    for i in range(len(BENCHES)):
+        options = f"{{ port = '{directory}/reference-{i}', rate_hz = 1000, axes = 1, sequence = true, unit = 'm/s2' }}"
+        lines += ["[[devices]]", f"name = 'reference-{i}'", "driver = 'serial-csv'", f"options = {options}"]
+    for i in SENSORS:
+        schedule = plain(BENCHES[bench_of(i)]).schedule
+        poses = [
+            f"{{ start_s = {p.start_s}, stop_s = {p.stop_s}, theta_deg = {p.theta_deg}, alpha_deg = {p.alpha_deg} }}"
+            for p in schedule.poses(schedule.duration_s(1))
+        ]
+        lines += ["[[channels]]", f"sensor = 'mems-{i}'", f"reference = 'reference-{bench_of(i)}'"]
+        lines += [f"poses_repeat_s = {schedule.period_s}", f"poses = [{', '.join(poses)}]"]
+    return "\n".join(lines) + "\n"
+
+
+def run_twins(directory: Path) -> None:
+    """Serve all devices until told to stop."""
+    stopped = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: stopped.set())
+    ports = []
+    for i, seed in enumerate(BENCHES):
+        bench, clock = Bench(plain(seed), seed), BenchTime()
+        for sensor in (sensor for sensor in SENSORS if bench_of(sensor) == i):
+            twin = Adxl355Twin(bench.sensor_counts, _begun(bench, clock), time.monotonic)
+            serve(I2CBus({ADDRESS: twin}), directory / f"i2c-{sensor}")
+        ports.append(PtyDevice(serial_lines(bench, "reference", clock), link=directory / f"reference-{i}"))
+        bench.sensor_counts(0, 1)
+        bench.reference_values(0, 1)
+    for port in ports:
+        port.start()
+    stopped.wait()
+    for port in ports:
+        port.stop()
+
+
+def _begun(bench: Bench, clock: BenchTime) -> Any:
+    def due(t_s: float) -> int:
+        if not clock.begun:  # a twin asks for the first time when it is set to measure
+            clock.begin(t_s)
+        return bench.sensor_samples_due(clock(t_s))
+
+    return due
+
+
+def run_agent(directory: Path, seconds: float) -> int:
+    """`fieldcal run` with the kernel replaced; how full its queue was goes into a file."""
+    from agent import service
+    from agent.cli import run_cli
+
+    class Watched(service.EventQueue):
+        longest = 0
+
+        def put(self, device: str, event: Event) -> None:
+            super().put(device, event)
+            Watched.longest = max(Watched.longest, self._queue.qsize())
+
+    service.EventQueue = Watched  # type: ignore[misc]
+    with installed({f"/dev/i2c-{i}": RemoteBus(directory / f"i2c-{i}") for i in SENSORS}):
+        data = str(directory / "data")
+        status = run_cli(["run", str(directory / "config.toml"), "--data-dir", data, "--duration", str(seconds)])
+    (directory / "queue").write_text(str(Watched.longest))
+    return status
+
+
+def measure(directory: Path) -> dict[str, float]:
+    """Run both; CPU shares after the warm-up (s per s), peak memory, longest queue."""
+    (directory / "config.toml").write_text(configuration(directory))
+    command = [sys.executable, "-m", "benchmarks.four_sensors"]
+    twins = subprocess.Popen([*command, "twins", str(directory)])
+    try:
+        while not (directory / f"reference-{len(BENCHES) - 1}").exists():
+            time.sleep(0.05)
+        agent = subprocess.Popen([*command, "agent", str(directory), str(SECONDS)], stdout=subprocess.DEVNULL)
+        time.sleep(WARM_UP_S)
+        before, began = (cpu_s(agent.pid), cpu_s(twins.pid)), time.monotonic()
+        time.sleep(SECONDS - 2 * WARM_UP_S)
+        passed = time.monotonic() - began
+        found = {
+            "agent": (cpu_s(agent.pid) - before[0]) / passed,
+            "twins": (cpu_s(twins.pid) - before[1]) / passed,
+            "peak_mb": peak_mb(agent.pid),
+        }
+        agent.wait(60)
+        return found | {"queue": float((directory / "queue").read_text())}
+    finally:
+        twins.terminate()
+        twins.wait(10)
+
+
+def recorded(directory: Path) -> tuple[Counter[str], dict[str, list[SampleBlock]], int]:
+    """Gaps told by reason, blocks by device (without their samples' sake kept), calibrations."""
+    gaps: Counter[str] = Counter()
+    blocks: dict[str, list[SampleBlock]] = {}
+    calibrations = 0
+    for path in sorted((directory / "data").glob("*.mcap")):
+        for step in RecordingReader(path).steps():
+            if isinstance(step.event, Gap):
+                gaps[step.event.reason] += step.event.dropped
+            elif isinstance(step.event, SampleBlock):
+                blocks.setdefault(step.event.device, []).append(step.event)
+            calibrations += sum(isinstance(result, CalibrationUpdate) for result in step.results)
+    return gaps, blocks, calibrations
+
+
+def main() -> None:
+    """Measure and write the table."""
+    with tempfile.TemporaryDirectory(prefix="fieldcal-") as name:
+        directory = Path(name)
+        found = measure(directory)
+        gaps, blocks, calibrations = recorded(directory)
+    flags = Counter(flag.name for held in blocks.values() for b in held[1:] for flag in BlockFlags if b.flags & flag)
+    missing = sum(b.first_index - a.first_index - a.n for held in blocks.values() for a, b in itertools.pairwise(held))
+    samples = sum(block.n for held in blocks.values() for block in held)
+    lost = ", ".join(f"{name} {n}" for name, n in sorted(flags.items())) or "none"
+    write_part(
+        "four_sensors",
+        f"""
+`python -m benchmarks four_sensors` on {machine()}; four ADXL355 twins at 1 kHz (register level, each on a bus of its
+own) and two references at 1 kHz (serial) in another process, recorded, windows solved; {SECONDS:g} s.
+
+| figure | measured | goal |
+| --- | --- | --- |
+| blocks that tell of a loss (overrun, restart, gap) | {lost} | none |
+| samples missing, of {samples} | {missing} | 0 |
+| dropped between driver and pipeline | {json.dumps(dict(gaps)) if gaps else "nothing"} | nothing |
+| most events that waited in the queue | {found["queue"]:.0f} of {60 * len(blocks)} | |
+| CPU of the agent, of one core | {found["agent"]:.1%} | |
+| CPU of the twins, of one core | {found["twins"]:.1%} | |
+| peak memory of the agent (VmHWM) | {found["peak_mb"]:.0f} MB | |
+| calibrations that it found | {calibrations} | |
+""",
+    )
+
+
+if __name__ == "__main__":
+    if sys.argv[1] == "twins":
+        run_twins(Path(sys.argv[2]))
+    else:
+        sys.exit(run_agent(Path(sys.argv[2]), float(sys.argv[3])))
