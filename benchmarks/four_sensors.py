@@ -108,7 +108,8 @@ def run_agent(directory: Path, seconds: float) -> int:
             Watched.longest = max(Watched.longest, self._queue.qsize())
 
     service.EventQueue = Watched  # type: ignore[misc]
-    with installed({f"/dev/i2c-{i}": RemoteBus(directory / f"i2c-{i}") for i in SENSORS}):
+    buses = {f"/dev/i2c-{i}": RemoteBus(directory / f"i2c-{i}") for i in SENSORS}
+    with installed(buses):
         data = str(directory / "data")
         status = run_cli(["run", str(directory / "config.toml"), "--data-dir", data, "--duration", str(seconds)])
     (directory / "queue").write_text(str(Watched.longest))

@@ -28,6 +28,10 @@ class RemoteBus(I2CBus):
         self._socket.connect(str(path))
         self._turn = threading.Lock()
 
+    def close(self) -> None:
+        """Let go of the other side."""
+        self._socket.close()
+
     def transfer(self, messages: list[tuple[int, int | bytes]]) -> list[bytes | None]:
         """As every bus does it."""
         request = bytearray(_COUNT.pack(len(messages)))
@@ -59,7 +63,7 @@ def _accept(listener: socket.socket, bus: I2CBus) -> None:
 
 
 def _answer(connection: socket.socket, bus: I2CBus) -> None:
-    with contextlib.suppress(OSError):  # the other side is gone
+    with connection, contextlib.suppress(OSError):  # the other side is gone
         while True:
             (count,) = _COUNT.unpack(_receive(connection, _COUNT.size))
             messages: list[tuple[int, int | bytes]] = []
