@@ -156,6 +156,12 @@ def recorded(directory: Path) -> tuple[Counter[str], dict[str, list[SampleBlock]
     return gaps, blocks, calibrations
 
 
+def circumstances() -> str:
+    """What else the machine did, and whether that was kept away."""
+    kept = ", both under SCHED_FIFO" if os.sched_getscheduler(0) == os.SCHED_FIFO else ""
+    return f"; load of the machine {os.getloadavg()[2]:.0f}{kept}"
+
+
 def main() -> None:
     """Measure and write the table."""
     with tempfile.TemporaryDirectory(prefix="fieldcal-") as name:
@@ -170,7 +176,7 @@ def main() -> None:
         "four_sensors",
         f"""
 `python -m benchmarks four_sensors` on {machine()}; four ADXL355 twins at 1 kHz (register level, each on a bus of its
-own) and two references at 1 kHz (serial) in another process, recorded, windows solved; {SECONDS:g} s.
+own) and two references at 1 kHz (serial) in another process, recorded, windows solved; {SECONDS:g} s{circumstances()}.
 
 | figure | measured | goal |
 | --- | --- | --- |

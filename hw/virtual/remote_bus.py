@@ -1,7 +1,7 @@
 """Targets of an I2C bus in another process: the adapter on one side of a socket, its twins on the other.
 
-A transfer is one request (number of messages; each an address, 1 for a read, a length, what is to be written) and one
-answer (errno, 0 when all went well, then what was read).
+A transfer is one packet each way: the messages (an address, 1 for a read, a length, what is to be written), and errno
+(0 when all went well) with what was read. One call each, as an ioctl is one: each is a wait for the interpreter.
 """
 
 from __future__ import annotations
@@ -14,9 +14,10 @@ import struct
 import threading
 from pathlib import Path
 
-from hw.virtual.kernel import I2CBus
+from hw.virtual.kernel import MAX_MESSAGE_BYTES, I2CBus
 
-_COUNT, _MESSAGE, _RESULT = struct.Struct("<B"), struct.Struct("<BBH"), struct.Struct("<i")
+_MESSAGE, _RESULT = struct.Struct("<BBH"), struct.Struct("<i")
+_PACKET_BYTES = 4 * MAX_MESSAGE_BYTES  # more than any driver asks for at once
 
 
 class RemoteBus(I2CBus):
@@ -24,7 +25,7 @@ class RemoteBus(I2CBus):
 
     def __init__(self, path: Path) -> None:
         super().__init__({})
-        self._socket = socket.socket(socket.AF_UNIX)
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._socket.connect(str(path))
         self._turn = threading.Lock()
 
@@ -34,23 +35,32 @@ class RemoteBus(I2CBus):
 
     def transfer(self, messages: list[tuple[int, int | bytes]]) -> list[bytes | None]:
         """As every bus does it."""
-        request = bytearray(_COUNT.pack(len(messages)))
+        request = b""
         for address, content in messages:
-            reading = isinstance(content, int)
-            request += _MESSAGE.pack(address, reading, content if isinstance(content, int) else len(content))
-            request += b"" if isinstance(content, int) else content
+            if isinstance(content, int):
+                request += _MESSAGE.pack(address, 1, content)
+            else:
+                request += _MESSAGE.pack(address, 0, len(content)) + content
         with self._turn:
             self._socket.sendall(request)
-            (number,) = _RESULT.unpack(_receive(self._socket, _RESULT.size))
-            if number:
-                raise OSError(number, os.strerror(number))
-            lengths = [content if isinstance(content, int) else None for _, content in messages]
-            return [None if length is None else _receive(self._socket, length) for length in lengths]
+            answer = self._socket.recv(_PACKET_BYTES)
+        (number,) = _RESULT.unpack_from(answer) if answer else (errno.ENODEV,)  # nothing: the other side is gone
+        if number:
+            raise OSError(number, os.strerror(number))
+        read: list[bytes | None] = []
+        at = _RESULT.size
+        for _, content in messages:
+            if isinstance(content, int):
+                read.append(answer[at : at + content])
+                at += content
+            else:
+                read.append(None)
+        return read
 
 
 def serve(bus: I2CBus, path: Path) -> None:
     """Answer for the bus's targets, from a thread, as long as the process lives."""
-    listener = socket.socket(socket.AF_UNIX)
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     listener.bind(str(path))
     listener.listen()
     threading.Thread(target=_accept, args=(listener, bus), name=f"bus {path}", daemon=True).start()
@@ -64,28 +74,21 @@ def _accept(listener: socket.socket, bus: I2CBus) -> None:
 
 def _answer(connection: socket.socket, bus: I2CBus) -> None:
     with connection, contextlib.suppress(OSError):  # the other side is gone
-        while True:
-            (count,) = _COUNT.unpack(_receive(connection, _COUNT.size))
-            messages: list[tuple[int, int | bytes]] = []
-            for _ in range(count):
-                address, reading, length = _MESSAGE.unpack(_receive(connection, _MESSAGE.size))
-                messages.append((address, length if reading else _receive(connection, length)))
-            connection.sendall(_carried_out(bus, messages))
+        while request := connection.recv(_PACKET_BYTES):
+            try:
+                read = bus.transfer(_messages(request))
+            except OSError as error:
+                connection.sendall(_RESULT.pack(error.errno or errno.EIO))
+            else:
+                connection.sendall(_RESULT.pack(0) + b"".join(part for part in read if part is not None))
 
 
-def _carried_out(bus: I2CBus, messages: list[tuple[int, int | bytes]]) -> bytes:
-    try:
-        read = bus.transfer(messages)
-    except OSError as error:
-        return _RESULT.pack(error.errno or errno.EIO)
-    return _RESULT.pack(0) + b"".join(part for part in read if part is not None)
-
-
-def _receive(connection: socket.socket, count: int) -> bytes:
-    data = b""
-    while len(data) < count:
-        part = connection.recv(count - len(data))
-        if not part:
-            raise OSError(errno.ENODEV, os.strerror(errno.ENODEV))
-        data += part
-    return data
+def _messages(request: bytes) -> list[tuple[int, int | bytes]]:
+    messages: list[tuple[int, int | bytes]] = []
+    at = 0
+    while at < len(request):
+        address, reading, length = _MESSAGE.unpack_from(request, at)
+        at += _MESSAGE.size
+        messages.append((address, length if reading else request[at : at + length]))
+        at += 0 if reading else length
+    return messages
