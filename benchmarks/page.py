@@ -1,4 +1,4 @@
-"""Keeps docs/performance.md and docs/online.md: each benchmark owns the part between its two markers."""
+"""Keeps docs/performance.md, docs/online.md and docs/reliability.md: each benchmark owns the part between its two markers."""
 
 from __future__ import annotations
 
