@@ -1,17 +1,22 @@
-"""Driver `serial-csv-fast`: `serial-csv` with a clock that runs FIELDCAL_SOAK_SPEED times as fast, for the soak."""
+"""Driver `serial-csv-fast`: `serial-csv` with a clock that runs FIELDCAL_FAST times as fast as the machine's.
+
+A device that sends as much faster then makes hours of stamps, windows and rotations in minutes. The agent finds the
+driver as it finds any other of a third party.
+"""
 
 from __future__ import annotations
 
 import os
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from hw.sensor import Clock, system_clock
 from hw.serial_stream import SerialCsv
 
-SPEED = int(os.environ.get("FIELDCAL_SOAK_SPEED", "1"))
-_ORIGIN = system_clock()  # the driver is imported before the run's origin: its stamps are never before that
+SPEED = int(os.environ.get("FIELDCAL_FAST", "1"))
+_ORIGIN_NS, _ = system_clock()  # the driver is imported before the run's origin: its stamps are never before that
 
 
 class FastSerialCsv(SerialCsv):
@@ -25,9 +30,22 @@ class FastSerialCsv(SerialCsv):
         clock: Clock = system_clock,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        super().__init__(name, options, clock=lambda: _scaled(clock()), sleep=lambda pause_s: sleep(pause_s / SPEED))
+        super().__init__(name, options, clock=lambda: _ahead(clock()), sleep=lambda pause_s: sleep(pause_s / SPEED))
 
 
-def _scaled(now: tuple[int, int]) -> tuple[int, int]:
-    monotonic_ns, utc_ns = (first + SPEED * (t - first) for first, t in zip(_ORIGIN, now, strict=True))
-    return monotonic_ns, utc_ns
+def _ahead(now: tuple[int, int]) -> tuple[int, int]:
+    """UTC runs ahead by as much as the monotonic clock: a step of it stays what it is."""
+    ahead_ns = (SPEED - 1) * (now[0] - _ORIGIN_NS)
+    return now[0] + ahead_ns, now[1] + ahead_ns
+
+
+def environment(speed: int, site: Path) -> dict[str, str]:
+    """What a process needs to find the driver; `site` is a directory in which its entry point is written."""
+    plug_in = site / "fieldcal_fast-0.dist-info"
+    plug_in.mkdir(parents=True, exist_ok=True)
+    (plug_in / "METADATA").write_text("Metadata-Version: 2.1\nName: fieldcal-fast\nVersion: 0\n")
+    (plug_in / "entry_points.txt").write_text(
+        "[fieldcal.sensors]\nserial-csv-fast = benchmarks.fast_serial:FastSerialCsv\n"
+    )
+    root = Path(__file__).resolve().parents[1]
+    return {"PYTHONPATH": os.pathsep.join([str(root), str(site)]), "FIELDCAL_FAST": str(speed)}

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from agent.delivery.consumer import Consumer
 from agent.delivery.history import FILE_NAME, History, Record
 from agent.events import CalibrationUpdate
+from benchmarks.fast_serial import environment
 from benchmarks.page import machine, write_part
 from hw.virtual.bench import Bench
 from hw.virtual.presets import plain
@@ -42,7 +43,6 @@ SETTLE_S = 0.5  # a reader throws away what came before its port was set up
 # quarter is left out, in which caches, windows and clock models fill.
 FLAT = 1.02
 ENDPOINT = "tcp/127.0.0.1:{port}"
-ENTRY_POINT = "[fieldcal.sensors]\nserial-csv-fast = benchmarks.fast_serial:FastSerialCsv\n"
 ROLES: tuple[Role, ...] = ("sensor", "reference")
 
 
@@ -135,15 +135,10 @@ def _config(bench: Bench, directory: Path, speed: int, port: int) -> str:
 
 @contextmanager
 def _process(arguments: list[str], directory: Path, speed: int) -> Iterator[subprocess.Popen[bytes]]:
-    plug_in = directory / "site" / "fieldcal_soak-0.dist-info"
-    plug_in.mkdir(parents=True, exist_ok=True)
-    (plug_in / "METADATA").write_text("Metadata-Version: 2.1\nName: fieldcal-soak\nVersion: 0\n")
-    (plug_in / "entry_points.txt").write_text(ENTRY_POINT)
-    path = os.pathsep.join([str(ROOT), str(plug_in.parent)])
-    environment = os.environ | {"PYTHONPATH": path, "FIELDCAL_SOAK_SPEED": str(speed)}
+    variables = os.environ | environment(speed, directory / "site")
     with open(directory / f"{arguments[0]}.output", "wb") as output:
         process = subprocess.Popen(
-            [sys.executable, "-m", "agent", *arguments], stdout=output, stderr=subprocess.STDOUT, env=environment
+            [sys.executable, "-m", "agent", *arguments], stdout=output, stderr=subprocess.STDOUT, env=variables
         )
     try:
         yield process

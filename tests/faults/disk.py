@@ -1,0 +1,201 @@
+"""A disk that loses power, fills up, turns read-only, fails or is slow. File systems are in loop files; needs root."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import random
+import struct
+import subprocess
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from agent.recording.writer import recordings
+from tests.faults.acquisition import LONGEST_S, acquisition
+from tests.faults.invariants import Ledger
+from tests.faults.outcome import Outcome
+from tests.faults.rig import Rig, Witness, stop, witnessed
+
+SEED = 20261121
+LIFE_S = 4.0
+FS_IOC_SHUTDOWN = 0x8004587D
+# What is lost is what was not synced. XFS: 1 flushes the log and 2 does not; ext4 drops an unwritten journal with 2.
+NO_LOG_FLUSH = 2
+SIZE_MB = {"ext4": 64, "xfs": 320}  # XFS makes none below 300 MB
+MAKE = {"ext4": ["mkfs.ext4", "-q", "-F"], "xfs": ["mkfs.xfs", "-q", "-f"]}
+STEADY_S = 3.0  # of calibrations before a disk goes bad, and after it is good again
+BAD_S = 12.0  # longer than the pause between two attempts to record
+SLOW_MS = 500  # a worn card that collects its garbage
+
+
+def nothing() -> None:
+    """The injector begins and ends by itself."""
+
+
+@dataclass(frozen=True, slots=True)
+class Spell:
+    """A time in which the disk is bad. `recorded`: whether recordings go on through it."""
+
+    prefix: Sequence[str] = ()
+    begin: Callable[[], None] = nothing
+    end: Callable[[], None] = nothing
+    recorded: bool = False
+
+
+@contextmanager
+def loop_disk(directory: Path, kind: str, size_mb: int = 0) -> Iterator[Path]:
+    """A new file system of its own, mounted at the path yielded."""
+    image, mount = directory / f"{kind}.image", directory / f"{kind}.mount"
+    mount.mkdir(parents=True)
+    with open(image, "wb") as file:
+        file.truncate((size_mb or SIZE_MB[kind]) << 20)
+    _run(*MAKE[kind], str(image))
+    _mount(image, mount)
+    try:
+        yield mount
+    finally:
+        subprocess.run(["umount", "--lazy", str(mount)], check=False, capture_output=True)
+        image.unlink()
+
+
+def power_cut(directory: Path, kind: str, cuts: int) -> Outcome:
+    """The file system is shut down without its journal under the running agent, mounted again, and looked at."""
+    moments = random.Random(SEED)
+    with loop_disk(directory, kind) as mount, witnessed(directory, SEED, data_dir=mount / "data") as (rig, witness):
+        ledger = Ledger(rig.data_dir)
+        for _ in range(cuts):
+            with rig.agent() as agent:
+                rig.run(agent, moments.uniform(0.0, LIFE_S))
+                at_s = time.monotonic()
+                shut_down(mount)
+                agent.kill()
+                agent.wait()
+            _run("umount", str(mount))
+            _mount(directory / f"{kind}.image", mount)
+            if rig.data_dir.exists():
+                ledger.inspect(witness.before(at_s))
+        outcome = Outcome(f"power cut on {kind}", f"{cuts} cuts, journal dropped, seed {SEED}", ledger.findings)
+        outcome.also = f"{ledger.findings.restored} runs began with the calibration in force before"
+    return outcome
+
+
+def full(directory: Path) -> Outcome:
+    """The disk is filled to its last byte under the running agent, and emptied again."""
+    with (
+        loop_disk(directory, "ext4", 16) as mount,
+        witnessed(directory, SEED, data_dir=mount / "data") as (rig, witness),
+    ):
+
+        def fill() -> None:
+            with suppress(OSError), open(mount / "ballast", "wb", buffering=0) as file:
+                while file.write(bytes(4096)):
+                    pass
+
+        spell = Spell(begin=fill, end=(mount / "ballast").unlink, recorded=False)
+        return _spell("disk full", f"once, for {BAD_S:g} s", rig, witness, spell)
+
+
+def read_only(directory: Path) -> Outcome:
+    """ext4 aborts its journal and turns read-only under the running agent, as after an error of the medium.
+
+    It stays so until it is mounted again: what was not kept by then is gone from the store; consumers have it.
+    """
+    with loop_disk(directory, "ext4") as mount, witnessed(directory, SEED, data_dir=mount / "data") as (rig, witness):
+        ledger = Ledger(rig.data_dir)
+        with rig.agent() as agent:
+            rig.run(agent, until=lambda: len(witness.received) > 20)
+            at_s = time.monotonic()
+            _run("mount", "-o", "remount,abort", str(mount))
+            lives = rig.run(agent, BAD_S)
+            came = len(witness.received) - len(witness.before(at_s))
+            status = stop(agent)
+        _run("umount", str(mount))
+        _mount(directory / "ext4.image", mount)
+        ledger.inspect(witness.before(at_s))
+        with rig.agent() as agent:
+            rig.run(agent, STEADY_S)
+            stop(agent)
+        ledger.inspect(witness.before(at_s))
+    outcome = Outcome("disk turns read-only", f"once, for {BAD_S:g} s, then mounted again", ledger.findings)
+    outcome.also = f"{came} results published meanwhile, ended with {status}"
+    outcome.require(lives, f"the agent ended: {rig.output[-300:]}")
+    outcome.require(came > 20, f"only {came} results while the disk was read-only")
+    outcome.require("Traceback" not in rig.output, "a traceback was shown")
+    return outcome
+
+
+def sync_fails(directory: Path) -> Outcome:
+    """fsync and fdatasync return EIO for a while (strace)."""
+    return _injected(directory, "fsync fails with EIO", "error=EIO:when=20..60", recorded=False)
+
+
+def slow(directory: Path) -> Outcome:
+    """fsync and fdatasync take long for a while (strace)."""
+    return _injected(directory, "slow disk", f"delay_enter={SLOW_MS * 1000}:when=20..40", recorded=True)
+
+
+def _injected(directory: Path, line: str, how: str, *, recorded: bool) -> Outcome:
+    prefix = ["strace", "-f", "-qq", "-o", "/dev/null", "--trace=fsync,fdatasync", f"--inject=fsync,fdatasync:{how}"]
+    with witnessed(directory, SEED) as (rig, witness):
+        return _spell(
+            line, f"fsync and fdatasync of each thread: {how}", rig, witness, Spell(prefix, recorded=recorded)
+        )
+
+
+def _spell(line: str, injected: str, rig: Rig, witness: Witness, spell: Spell) -> Outcome:
+    """A disk that is bad for a while: the agent goes on, and afterwards nothing is missing."""
+    with rig.agent(spell.prefix) as agent:
+        rig.run(agent, until=lambda: len(witness.received) > 20)
+        began_s = time.monotonic()
+        spell.begin()
+        lives = rig.run(agent, BAD_S)
+        meanwhile = len(witness.received) - len(witness.before(began_s))
+        spell.end()
+        files = len(recordings(rig.data_dir))
+        ended_s = time.monotonic()
+        lives = lives and rig.run(agent, BAD_S)
+        after = len(witness.received) - len(witness.before(ended_s))
+        lost_bytes = rig.device.lost_bytes
+        status = stop(agent) if lives else agent.wait()
+    ledger = Ledger(rig.data_dir)
+    ledger.inspect(witness.before(time.monotonic()))
+    read = acquisition(rig.data_dir, rig.speed)
+    outcome = Outcome(line, injected, ledger.findings)
+    unrecorded = sum(not record.recorded for record in ledger.records)
+    outcome.also = (
+        f"{meanwhile} results published meanwhile, {after} after; {unrecorded} marked as not recorded;"
+        f" {lost_bytes} bytes unread at the port; {len(recordings(rig.data_dir)) - files} new recordings after"
+    )
+    if spell.recorded:
+        outcome.also += f"; {read}"
+        outcome.require(read.longest_pause_s < LONGEST_S, f"reading paused {read.longest_pause_s:.2f} s")
+        outcome.require(read.missing + read.gaps == 0, f"{read.missing} samples, {read.gaps} blocks missing")
+    outcome.require(lives and status == 0, f"the agent ended with {status}: {rig.output[-300:]}")
+    outcome.require(lost_bytes == 0, f"{lost_bytes} bytes were not read")
+    outcome.require(meanwhile > 20, f"only {meanwhile} results while the disk was bad")
+    outcome.require(after > 20, f"only {after} results after it was good again")
+    outcome.require(ledger.records[-1].recorded, "recording did not begin again")
+    outcome.require("Traceback" not in rig.output, "a traceback was shown")
+    return outcome
+
+
+def shut_down(mount: Path) -> None:
+    """No more writes reach the file system, and its journal is dropped: as when the power goes."""
+    descriptor = os.open(mount, os.O_RDONLY)
+    try:
+        fcntl.ioctl(descriptor, FS_IOC_SHUTDOWN, struct.pack("I", NO_LOG_FLUSH))
+    finally:
+        os.close(descriptor)
+
+
+def _mount(image: Path, mount: Path) -> None:
+    _run("mount", "-o", "loop", str(image), str(mount))
+
+
+def _run(*command: str) -> None:
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RuntimeError(f"{' '.join(command)}: {done.stderr.strip()}")

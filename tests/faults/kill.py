@@ -1,0 +1,75 @@
+"""kill -9, at random moments and at every nth write."""
+
+from __future__ import annotations
+
+import random
+import time
+from pathlib import Path
+
+from agent.recording.writer import recordings
+from tests.faults.invariants import Ledger
+from tests.faults.outcome import Outcome
+from tests.faults.rig import stop, witnessed
+
+SEED = 20261121
+LIFE_S = 4.0  # start, opening the port, the calibration restored, four rests, new calibrations
+# What SQLite does in a commit, and what closes or names a file; recordings are written by `write`, looked at apart.
+SAVING = "pwrite64,fsync,fdatasync,ftruncate,rename,unlink"
+SURVIVED_S = 3.0  # of a life in which the nth call did not come
+
+
+def at_random_moments(directory: Path, kills: int) -> Outcome:
+    """The agent is killed and started again on the same directory; what it left is looked at in between."""
+    moments = random.Random(SEED)
+    with witnessed(directory, SEED) as (rig, witness):
+        ledger = Ledger(rig.data_dir)
+        for _ in range(kills):
+            with rig.agent() as agent:
+                rig.run(agent, moments.uniform(0.0, LIFE_S))
+                agent.kill()
+                agent.wait()
+            if rig.data_dir.exists():
+                ledger.inspect(witness.before(time.monotonic()))
+        with rig.agent() as agent:
+            rig.run(agent, LIFE_S)
+            status = stop(agent)
+        ledger.inspect(witness.before(time.monotonic()))
+        outcome = Outcome("kill -9 at random moments", f"{kills} kills, seed {SEED}", ledger.findings)
+        outcome.also = (
+            f"{ledger.findings.restored} runs began with the calibration in force before, the others with none"
+        )
+        outcome.require(status == 0, f"the last run ended with {status}")
+        outcome.require("Traceback" not in rig.output, "a traceback was shown")
+    return outcome
+
+
+def at_every_write(directory: Path, step: int = 1) -> Outcome:
+    """Killed by strace as it enters its nth call that saves, n = 1, 1 + step, ... until a life goes without.
+
+    A call is counted in its thread: the main thread's are those of opening the store, the recording thread's those of
+    recording and committing.
+    """
+    kills = 0
+    with witnessed(directory, SEED) as (rig, witness):
+        ledger = Ledger(rig.data_dir)
+        for calls in (SAVING, "write"):
+            n, killed = 1, True
+            while killed:
+                following = (
+                    max((number for number, _ in recordings(rig.data_dir)), default=0) + 1
+                    if rig.data_dir.exists()
+                    else 1
+                )
+                where = ["-P", str(rig.data_dir / f"fieldcal-{following:06d}.mcap.active")] if calls == "write" else []
+                inject = [f"--trace={calls}", f"--inject={calls}:signal=KILL:when={n}"]
+                with rig.agent(["strace", "-f", "-qq", "-o", "/dev/null", *where, *inject]) as agent:
+                    killed = not rig.run(agent, SURVIVED_S)
+                ledger.inspect(witness.before(time.monotonic()))
+                kills += killed
+                n += step
+        outcome = Outcome(
+            "kill -9 at every nth write of a save", f"{kills} kills, n in steps of {step}", ledger.findings
+        )
+        outcome.also = f"calls {SAVING}; write to the recording"
+        outcome.require("Traceback" not in rig.output, "a traceback was shown")
+    return outcome

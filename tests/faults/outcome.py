@@ -1,0 +1,54 @@
+"""What came of one kind of fault: a row of the table in docs/reliability.md."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from tests.faults.invariants import Findings
+
+
+@dataclass
+class Outcome:
+    """`injected` says what was done and how often, `also` what was measured besides; `bad` what must not be."""
+
+    line: str
+    injected: str
+    findings: Findings
+    also: str = ""
+    bad: list[str] = field(default_factory=list)
+
+    @property
+    def good(self) -> bool:
+        """Whether all that must be zero is."""
+        return self.findings.zeros and not self.bad
+
+    def require(self, holds: bool, words: str) -> None:
+        """Remember what does not hold."""
+        if not holds:
+            self.bad.append(words)
+
+    def __str__(self) -> str:
+        return f"{self.line}: {self.injected}; {self.findings}; {self.also}; {self.bad}"
+
+
+HEAD = (
+    "| fault | injected | calibrations accepted | lost | stores unreadable | recordings | not replaying to their last"
+    " flush | calibrations off the truth | also | verdict |\n| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |"
+)
+
+
+def row(outcome: Outcome) -> str:
+    """The outcome as a row under HEAD."""
+    f = outcome.findings
+    verdict = "holds" if outcome.good else "FAILS: " + "; ".join([*outcome.bad, *f.words][:3])
+    cells = [
+        outcome.line,
+        outcome.injected,
+        f.calibrations,
+        f.lost,
+        f.unreadable,
+        f.recordings,
+        f.not_replaying,
+        f.wrong,
+    ]
+    return "| " + " | ".join(str(cell) for cell in [*cells, outcome.also, verdict]) + " |"

@@ -1,0 +1,261 @@
+"""What is broken: the real agent process on a virtual sensor that is turned through six rests, and who watches it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from agent.delivery.consumer import Consumer, Received
+from agent.delivery.router import open_router
+from benchmarks.fast_serial import environment
+from hw.virtual.serial_port import PtyDevice, format_lines
+
+ROOT = Path(__file__).resolve().parents[2]
+SITE, GATEWAY = "faults", "rig"
+SOURCE = f"{SITE}/{GATEWAY}"
+SENSOR = "imu"
+RATE_HZ = 100.0
+# A rest is looked for in blocks of 0.25 s, wants 1 s and leaves 0.25 s at both ends; with the guards this is the least.
+HOLD_S = 2.5
+GUARD_S = 0.25
+SPEED = 10  # a window each 0.25 s instead of 2.5: more is at stake at any moment
+SETTLE_S = 0.1  # a reader throws away what came before its port was set up
+G_MPS2 = 9.80665
+UP = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0], [0, 0, -1], [-1, 0, 0], [0, -1, 0]], dtype=float)
+SENSITIVITY = np.array([[1.03, 0.012, -0.006], [-0.008, 0.97, 0.01], [0.005, -0.011, 1.01]])
+OFFSET = np.array([0.21, -0.34, 0.12])
+NOISE_MPS2 = 0.005
+STOP_S = 10.0
+GIVE_UP_S = 120.0  # what takes seconds; on a machine under load more
+
+
+def never() -> bool:
+    """No condition."""
+    return False
+
+
+class TurnedSensor:
+    """Text of the sensor for a `PtyDevice`: silent until `begin`, then a new position every `HOLD_S` of its clock."""
+
+    def __init__(self, seed: int) -> None:
+        self._random = np.random.default_rng(seed)
+        self._began_s: float | None = None
+        self._next = 0
+
+    def begin(self, t_s: float) -> None:
+        """The first sample is due at `t_s`."""
+        self._next = 0
+        self._began_s = t_s
+
+    @property
+    def silent(self) -> bool:
+        """Whether it waits for `begin`."""
+        return self._began_s is None
+
+    def silence(self) -> None:
+        """No samples until the next `begin`."""
+        self._began_s = None
+
+    def __call__(self, t_s: float) -> bytes:
+        if self._began_s is None:
+            return b""
+        n = int((t_s - self._began_s) * RATE_HZ) - self._next
+        if n <= 0:
+            return b""
+        at_s = (self._next + np.arange(n)) / RATE_HZ
+        position = (at_s / HOLD_S).astype(int) % len(UP)
+        values = G_MPS2 * UP[position] @ SENSITIVITY.T + OFFSET + NOISE_MPS2 * self._random.standard_normal((n, 3))
+        greeting = b"# rests\n" if self._next == 0 else b""
+        text = greeting + format_lines(values, "%.4f", self._next)
+        self._next += n
+        return text
+
+
+class Witness:
+    """A consumer far away: all that left the gateway, with when it came (time.monotonic)."""
+
+    def __init__(self, endpoint: str, last_sequence: Mapping[str, int] | None = None) -> None:
+        self.received: list[tuple[float, Received]] = []
+        self._consumer = Consumer([endpoint], f"fieldcal/v1/{SOURCE}/{SENSOR}/**", last_sequence)
+        self._thread = threading.Thread(target=self._take, name="witness", daemon=True)
+        self._thread.start()
+
+    def _take(self) -> None:
+        for result in self._consumer:
+            self.received.append((time.monotonic(), result))
+
+    def before(self, t_s: float) -> list[Received]:
+        """What had come by then."""
+        return [result for came_s, result in self.received if came_s <= t_s]
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._consumer.close()
+        self._thread.join(5)
+
+
+@dataclass
+class Rig:
+    """A directory with a configuration, a sensor, and whoever listens at `endpoint`."""
+
+    directory: Path
+    endpoint: str
+    speed: int
+    sensor: TurnedSensor
+    device: PtyDevice
+    config: Path
+    data_dir: Path
+
+    @property
+    def output(self) -> str:
+        """All that the agents of this rig have said."""
+        path = self.directory / "output"
+        return path.read_text(errors="replace") if path.exists() else ""
+
+    @contextmanager
+    def agent(
+        self, prefix: Sequence[str] = (), variables: Mapping[str, str] | None = None
+    ) -> Iterator[subprocess.Popen[bytes]]:
+        """The real agent; `prefix` is a command that starts it (strace). Killed at the end if it still runs."""
+        self.sensor.silence()
+        command = [
+            *prefix,
+            sys.executable,
+            "-u",
+            "-m",
+            "agent",
+            "run",
+            str(self.config),
+            "--data-dir",
+            str(self.data_dir),
+        ]
+        known = os.environ | environment(self.speed, self.directory / "site") | (variables or {})
+        with open(self.directory / "output", "ab") as output:
+            process = subprocess.Popen(command, cwd=ROOT, stdout=output, stderr=subprocess.STDOUT, env=known)
+        try:
+            yield process
+        finally:
+            for pid in [*descendants(process.pid), process.pid]:
+                with suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+            process.wait()
+
+    def run(
+        self, process: subprocess.Popen[bytes], seconds: float = float("inf"), until: Callable[[], bool] = never
+    ) -> bool:
+        """Let the agent work for so long or `until` that holds; the rests begin when it opens its port, if silent.
+
+        False where it ended before.
+        """
+        end_s = time.monotonic() + min(seconds, GIVE_UP_S)
+        while process.poll() is None and not until():
+            if time.monotonic() >= end_s:
+                assert seconds < GIVE_UP_S, f"it does not get there: {self.output[-2000:]}"
+                break
+            if self.sensor.silent and self.device.has_reader():
+                time.sleep(SETTLE_S)
+                self.sensor.begin(self.speed * time.monotonic())
+            time.sleep(0.005)  # polls; the conditions decide
+        return process.poll() is None
+
+
+@contextmanager
+def rig(
+    directory: Path, seed: int, *, endpoint: str = "", speed: int = SPEED, data_dir: Path | None = None, extra: str = ""
+) -> Iterator[Rig]:
+    """A rig in `directory`; without `endpoint` nothing is published. `extra` is TOML at the end of the configuration."""
+    directory.mkdir(parents=True, exist_ok=True)
+    sensor = TurnedSensor(seed)
+    device = PtyDevice(sensor, lambda: speed * time.monotonic(), directory / "port")
+    config = directory / "config.toml"
+    config.write_text(_config(device.path, endpoint, speed) + extra)
+    device.start()
+    try:
+        yield Rig(directory, endpoint, speed, sensor, device, config, data_dir or directory / "data")
+    finally:
+        device.stop()
+
+
+def _config(port: Path, endpoint: str, speed: int) -> str:
+    poses = ", ".join(
+        f"{{ start_s = {k * HOLD_S}, stop_s = {(k + 1) * HOLD_S}, gravity_mps2 = {(G_MPS2 * up).tolist()} }}"
+        for k, up in enumerate(UP)
+    )
+    connect = f'connect = ["{endpoint}"]' if endpoint else "enabled = false"
+    return f"""
+[gateway]
+site = "{SITE}"
+name = "{GATEWAY}"
+[[devices]]
+name = "{SENSOR}"
+driver = "serial-csv-fast"
+[devices.options]
+port = "{port}"
+rate_hz = {RATE_HZ}
+axes = 3
+sequence = true
+unit = "m/s2"
+serial_number = "R1"
+[[channels]]
+sensor = "{SENSOR}"
+guard_s = {GUARD_S}
+silence_s = {5 * speed}
+poses = [{poses}]
+poses_repeat_s = {len(UP) * HOLD_S}
+[zenoh]
+{connect}
+"""
+
+
+@contextmanager
+def local_router() -> Iterator[str]:
+    """A router in this process; yields its endpoint."""
+    session, endpoints = open_router("tcp/127.0.0.1:0")
+    try:
+        yield endpoints[0]
+    finally:
+        session.close()
+
+
+@contextmanager
+def witnessed(directory: Path, seed: int, **options: object) -> Iterator[tuple[Rig, Witness]]:
+    """A rig with a router and a witness."""
+    with ExitStack() as stack:
+        endpoint = stack.enter_context(local_router())
+        witness = Witness(endpoint)
+        stack.callback(witness.close)
+        yield stack.enter_context(rig(directory, seed, endpoint=endpoint, **options)), witness  # type: ignore[arg-type]
+
+
+def stop(process: subprocess.Popen[bytes]) -> int:
+    """End an agent as systemd does, also one under strace; its exit status."""
+    for pid in descendants(process.pid) or [process.pid]:
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGTERM)
+    return process.wait(STOP_S)
+
+
+def descendants(pid: int) -> list[int]:
+    """Processes that this one has started, and theirs."""
+    with suppress(OSError):
+        children = [int(c) for c in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+        return [d for child in children for d in [*descendants(child), child]]
+    return []
+
+
+def free_port() -> int:
+    """A port of 127.0.0.1 that nobody has now."""
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        return int(s.getsockname()[1])
