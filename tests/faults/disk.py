@@ -17,7 +17,7 @@ from agent.recording.writer import recordings
 from tests.faults.acquisition import LONGEST_S, acquisition
 from tests.faults.invariants import Ledger
 from tests.faults.outcome import Outcome
-from tests.faults.rig import Rig, Witness, stop, witnessed
+from tests.faults.rig import Rig, Witness, stop, strace, witnessed
 
 SEED = 20261121
 LIFE_S = 4.0
@@ -138,7 +138,7 @@ def slow(directory: Path) -> Outcome:
 
 
 def _injected(directory: Path, line: str, how: str, *, recorded: bool) -> Outcome:
-    prefix = ["strace", "-f", "-qq", "-o", "/dev/null", "--trace=fsync,fdatasync", f"--inject=fsync,fdatasync:{how}"]
+    prefix = strace("fsync,fdatasync", how)
     with witnessed(directory, SEED) as (rig, witness):
         return _spell(
             line, f"fsync and fdatasync of each thread: {how}", rig, witness, Spell(prefix, recorded=recorded)
@@ -154,7 +154,6 @@ def _spell(line: str, injected: str, rig: Rig, witness: Witness, spell: Spell) -
         lives = rig.run(agent, BAD_S)
         meanwhile = len(witness.received) - len(witness.before(began_s))
         spell.end()
-        files = len(recordings(rig.data_dir))
         ended_s = time.monotonic()
         lives = lives and rig.run(agent, BAD_S)
         after = len(witness.received) - len(witness.before(ended_s))
@@ -167,7 +166,7 @@ def _spell(line: str, injected: str, rig: Rig, witness: Witness, spell: Spell) -
     unrecorded = sum(not record.recorded for record in ledger.records)
     outcome.also = (
         f"{meanwhile} results published meanwhile, {after} after; {unrecorded} marked as not recorded;"
-        f" {lost_bytes} bytes unread at the port; {len(recordings(rig.data_dir)) - files} new recordings after"
+        f" {lost_bytes} bytes unread at the port; {len(recordings(rig.data_dir))} recordings"
     )
     if spell.recorded:
         outcome.also += f"; {read}"

@@ -138,7 +138,7 @@ class Ledger:
                 r.sequence: r for r in self.records if r.recorded and r.recording.removesuffix(ACTIVE_SUFFIX) == name
             }
             held = set(_sequences(path))
-            if file.events and not file.equal or (file.fault is not None and file.fault.kind != "torn"):
+            if (file.events and not file.equal) or (file.fault is not None and file.fault.kind != "torn"):
                 found.not_replaying += 1
                 found.say(f"{name}: {file.fault or file.refused or file.first_difference}")
             elif missing := expected.keys() - held:

@@ -9,7 +9,7 @@ from pathlib import Path
 from agent.recording.writer import recordings
 from tests.faults.invariants import Ledger
 from tests.faults.outcome import Outcome
-from tests.faults.rig import stop, witnessed
+from tests.faults.rig import stop, strace, witnessed
 
 SEED = 20261121
 LIFE_S = 4.0  # start, opening the port, the calibration restored, four rests, new calibrations
@@ -55,14 +55,8 @@ def at_every_write(directory: Path, step: int = 1) -> Outcome:
         for calls in (SAVING, "write"):
             n, killed = 1, True
             while killed:
-                following = (
-                    max((number for number, _ in recordings(rig.data_dir)), default=0) + 1
-                    if rig.data_dir.exists()
-                    else 1
-                )
-                where = ["-P", str(rig.data_dir / f"fieldcal-{following:06d}.mcap.active")] if calls == "write" else []
-                inject = [f"--trace={calls}", f"--inject={calls}:signal=KILL:when={n}"]
-                with rig.agent(["strace", "-f", "-qq", "-o", "/dev/null", *where, *inject]) as agent:
+                where = _next_recording(rig.data_dir) if calls == "write" else None
+                with rig.agent(strace(calls, f"signal=KILL:when={n}", where)) as agent:
                     killed = not rig.run(agent, SURVIVED_S)
                 ledger.inspect(witness.before(time.monotonic()))
                 kills += killed
@@ -73,3 +67,8 @@ def at_every_write(directory: Path, step: int = 1) -> Outcome:
         outcome.also = f"calls {SAVING}; write to the recording"
         outcome.require("Traceback" not in rig.output, "a traceback was shown")
     return outcome
+
+
+def _next_recording(data_dir: Path) -> Path:
+    newest = max((number for number, _ in recordings(data_dir)), default=0) if data_dir.exists() else 0
+    return data_dir / f"fieldcal-{newest + 1:06d}.mcap.active"

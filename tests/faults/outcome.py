@@ -31,10 +31,19 @@ class Outcome:
         return f"{self.line}: {self.injected}; {self.findings}; {self.also}; {self.bad}"
 
 
-HEAD = (
-    "| fault | injected | calibrations accepted | lost | stores unreadable | recordings | not replaying to their last"
-    " flush | calibrations off the truth | also | verdict |\n| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |"
+COLUMNS = (
+    "fault",
+    "injected",
+    "calibrations accepted",
+    "lost",
+    "stores unreadable",
+    "recordings",
+    "not replaying to their last flush",
+    "calibrations off the truth",
+    "also",
+    "verdict",
 )
+HEAD = f"| {' | '.join(COLUMNS)} |\n|{' --- |' * len(COLUMNS)}"
 
 
 def row(outcome: Outcome) -> str:

@@ -174,7 +174,7 @@ class Rig:
 def rig(
     directory: Path, seed: int, *, endpoint: str = "", speed: int = SPEED, data_dir: Path | None = None, extra: str = ""
 ) -> Iterator[Rig]:
-    """A rig in `directory`; without `endpoint` nothing is published. `extra` is TOML at the end of the configuration."""
+    """A rig in `directory`; without `endpoint` nothing is published. `extra` is TOML after the configuration."""
     directory.mkdir(parents=True, exist_ok=True)
     sensor = TurnedSensor(seed)
     device = PtyDevice(sensor, lambda: speed * time.monotonic(), directory / "port")
@@ -244,6 +244,25 @@ def stop(process: subprocess.Popen[bytes]) -> int:
         with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGTERM)
     return process.wait(STOP_S)
+
+
+def strace(calls: str, how: str, path: Path | None = None) -> list[str]:
+    """A command before the agent's that spoils these system calls `how`, on `path` alone if given.
+
+    All others go through untouched (seccomp), so that the agent is not slowed down.
+    """
+    where = ["-P", str(path)] if path else []
+    return [
+        "strace",
+        "-f",
+        "--seccomp-bpf",
+        "-qq",
+        "-o",
+        "/dev/null",
+        *where,
+        f"--trace={calls}",
+        f"--inject={calls}:{how}",
+    ]
 
 
 def descendants(pid: int) -> list[int]:
