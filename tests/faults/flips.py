@@ -1,0 +1,158 @@
+"""Bits of a state file and of a recording, flipped one at a time."""
+
+from __future__ import annotations
+
+import random
+import shutil
+import time
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+
+from agent.delivery.history import FILE_NAME, History, Record, StoreError
+from agent.delivery.store import Store
+from agent.recording.integrity import check_integrity
+from agent.recording.messages import encode
+from agent.recording.reading import RecordingReader, open_recording
+from agent.recording.writer import recordings
+from tests.faults.invariants import Findings
+from tests.faults.outcome import Outcome
+from tests.faults.rig import SENSOR, rig, stop
+
+SEED = 20261121
+RUN_S = 8.0  # leaves a state file with two dozen calibrations
+EDGE_BYTES = 64  # of a recording: all bits of its beginning and of its end, where magic, header and footer are
+
+
+def of_state(directory: Path, flips: int) -> Outcome:
+    """Each flip is met by a start: the store is opened and what was in force is read, as the service does."""
+    data_dir = _recorded(directory, RUN_S)
+    whole = (data_dir / FILE_NAME).read_bytes()
+    with History(data_dir / FILE_NAME) as history:
+        right = history.after(-1, limit=10_000_000)
+        in_force = history.in_force(SENSOR)
+    assert in_force is not None
+    became: Counter[str] = Counter()
+    findings, words = Findings(), []
+    for bit in _bits(len(whole) * 8, flips, ()):
+        copy = directory / "flipped"
+        shutil.rmtree(copy, ignore_errors=True)
+        copy.mkdir()
+        (copy / FILE_NAME).write_bytes(_flipped(whole, bit))
+        try:
+            verdict = _start(copy, right, in_force)
+        except Exception as error:
+            verdict = f"crash: {error!r}"
+        if verdict.startswith(("crash", "silently")):
+            words.append(f"bit {bit} of {len(whole) * 8}: {verdict}")
+        became[verdict.split(":")[0]] += 1
+    outcome = Outcome(
+        "bits of the state file", f"{_share(len(whole) * 8, flips)}, seed {SEED}", findings, bad=words[:5]
+    )
+    findings.wrong = became["silently wrong"]
+    outcome.also = _words(became)
+    return outcome
+
+
+def of_recording(directory: Path, flips: int, size_bytes: int) -> Outcome:
+    """Each flip must be a fault for the audit; what is read nevertheless must be events and results as they were.
+
+    A replay's results follow from those and from nothing else, so that it cannot give others.
+    """
+    data_dir = _recorded(directory, RUN_S, size_bytes)
+    [(_, path), *_] = recordings(data_dir)
+    whole = path.read_bytes()
+    right = _read(path)
+    edges = [*range(EDGE_BYTES * 8), *range((len(whole) - EDGE_BYTES) * 8, len(whole) * 8)]
+    became: Counter[str] = Counter()
+    words = []
+    copy = directory / path.name
+    for bit in _bits(len(whole) * 8, flips, edges):
+        copy.write_bytes(_flipped(whole, bit))
+        try:
+            with open_recording(copy) as file:
+                noticed = check_integrity(file, len(whole)).fault_count > 0
+            read = _read(copy)
+        except Exception as error:
+            verdict = f"crash: {error!r}"
+        else:
+            verdict = "noticed" if noticed else "NOT noticed by the audit"
+            if read != right[: len(read)]:
+                verdict = "read as OTHER data"
+        if verdict != "noticed":
+            words.append(f"bit {bit} of {len(whole) * 8}: {verdict}")
+        became[verdict.split(":")[0]] += 1
+    outcome = Outcome(
+        f"bits of a recording of {len(whole) / 1e6:.2f} MB",
+        f"{_share(len(whole) * 8, flips)} and all of the {EDGE_BYTES} first and last bytes, seed {SEED}",
+        Findings(),
+        bad=words[:5],
+    )
+    outcome.also = _words(became)
+    return outcome
+
+
+def _recorded(directory: Path, seconds: float, size_bytes: int = 0) -> Path:
+    with rig(directory, SEED) as r, r.agent() as agent:
+        began_s = time.monotonic()
+
+        def enough() -> bool:
+            files = [path for _, path in recordings(r.data_dir)] if r.data_dir.exists() else []
+            return time.monotonic() - began_s > seconds and sum(path.stat().st_size for path in files) >= size_bytes
+
+        assert r.run(agent, 3600.0, until=enough), r.output
+        assert stop(agent) == 0, r.output
+        return r.data_dir
+
+
+def _start(data_dir: Path, right: list[Record], in_force: Record) -> str:
+    """What a start makes of a state file; "silently wrong" where it takes other values for the truth."""
+    try:
+        store = Store(data_dir)
+    except StoreError:
+        return "refused, with the reason"
+    try:
+        if store.set_aside is not None:
+            return "set aside"
+        with History(store.path) as history:
+            kept, found = history.after(-1, limit=10_000_000), history.in_force(SENSOR)
+            for record in kept:
+                _ = record.result
+        if kept == right and found == in_force and store.last_sequence() >= right[-1].sequence:
+            return "no difference"
+        return "silently wrong"
+    except StoreError:
+        return "refused, with the reason"
+    finally:
+        store.close()
+
+
+def _read(path: Path) -> list[tuple[int, bytes, list[bytes]]]:
+    return [
+        (
+            step.event_sequence,
+            encode(step.event_sequence, step.event),
+            [encode(step.event_sequence, r) for r in step.results],
+        )
+        for step in RecordingReader(path).steps()
+    ]
+
+
+def _bits(bits: int, flips: int, always: object) -> list[int]:
+    chosen = random.Random(SEED).sample(range(bits), min(flips, bits))
+    return sorted({*chosen, *always})  # type: ignore[misc]
+
+
+def _flipped(whole: bytes, bit: int) -> bytes:
+    changed = np.frombuffer(whole, np.uint8).copy()
+    changed[bit // 8] ^= 1 << bit % 8
+    return changed.tobytes()
+
+
+def _share(bits: int, flips: int) -> str:
+    return f"all {bits} bits" if flips >= bits else f"{flips} of {bits} bits"
+
+
+def _words(became: Counter[str]) -> str:
+    return ", ".join(f"{words} {count}" for words, count in sorted(became.items()))
