@@ -10,8 +10,8 @@ import numpy as np
 
 from agent.events import Gap
 from agent.recording.reading import RecordingReader
-from agent.recording.writer import recordings
 from hw.block import BlockFlags, SampleBlock
+from tests.scenarios.processes import recordings
 
 LONGEST_S = 1.0  # that reading may stop
 
@@ -40,7 +40,7 @@ def acquisition(data_dir: Path, speed: int) -> Acquisition:
     """Of all recordings of one run on a sensor whose clock runs `speed` times as fast."""
     last_ns = expected = -1
     pause_ns = missing = openings = gaps = samples = 0
-    for event in _events(path for _, path in recordings(data_dir)):
+    for event in _events(recordings(data_dir)):
         if isinstance(event, Gap):
             gaps += event.dropped
         if not isinstance(event, SampleBlock):

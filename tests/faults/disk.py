@@ -13,11 +13,11 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from agent.recording.writer import recordings
 from tests.faults.acquisition import LONGEST_S, acquisition
 from tests.faults.invariants import Ledger
 from tests.faults.outcome import Outcome
 from tests.faults.rig import Rig, Witness, stop, strace, witnessed
+from tests.scenarios.processes import recordings
 
 SEED = 20261121
 LIFE_S = 4.0

@@ -15,10 +15,10 @@ from agent.delivery.store import Store
 from agent.recording.integrity import check_integrity
 from agent.recording.messages import encode
 from agent.recording.reading import RecordingReader, open_recording
-from agent.recording.writer import recordings
 from tests.faults.invariants import Findings
 from tests.faults.outcome import Outcome
 from tests.faults.rig import SENSOR, rig, stop
+from tests.scenarios.processes import recordings
 
 SEED = 20261121
 RUN_S = 8.0  # leaves a state file with two dozen calibrations
@@ -61,7 +61,7 @@ def of_recording(directory: Path, flips: int, size_bytes: int) -> Outcome:
     A replay's results follow from those and from nothing else, so that it cannot give others.
     """
     data_dir = _recorded(directory, RUN_S, size_bytes)
-    [(_, path), *_] = recordings(data_dir)
+    path = recordings(data_dir)[0]
     whole = path.read_bytes()
     right = _read(path)
     edges = [*range(EDGE_BYTES * 8), *range((len(whole) - EDGE_BYTES) * 8, len(whole) * 8)]
@@ -98,7 +98,7 @@ def _recorded(directory: Path, seconds: float, size_bytes: int = 0) -> Path:
         began_s = time.monotonic()
 
         def enough() -> bool:
-            files = [path for _, path in recordings(r.data_dir)] if r.data_dir.exists() else []
+            files = recordings(r.data_dir)
             return time.monotonic() - began_s > seconds and sum(path.stat().st_size for path in files) >= size_bytes
 
         assert r.run(agent, 3600.0, until=enough), r.output

@@ -19,8 +19,8 @@ from agent.pipeline import Pipeline
 from agent.recording.fingerprint import fingerprint
 from agent.recording.reading import RecordingReader
 from agent.recording.replaying import Replay
-from agent.recording.writer import ACTIVE_SUFFIX, recordings
 from tests.faults.rig import OFFSET, SENSITIVITY
+from tests.scenarios.processes import recordings
 
 # A torn window of 1.25 s shifts its mean by 0.1 m/s2 and more for every sample of the wrong position; noise makes 1e-4.
 S_TOLERANCE = 0.005
@@ -125,8 +125,8 @@ class Ledger:
     def _replay(self) -> None:
         """Every recording gives its results again, bit for bit, and holds those that the store says it does."""
         found = self.findings
-        for _, path in recordings(self.data_dir):
-            name = path.name.removesuffix(ACTIVE_SUFFIX)
+        for path in recordings(self.data_dir):
+            name = path.name.removesuffix(".active")
             size = path.stat().st_size
             if self._replayed.get(name) == size:
                 continue
@@ -135,7 +135,7 @@ class Ledger:
             replay = Replay(Pipeline.restore, fingerprint(), elsewhere=0.0)
             file = replay.run(path)
             expected = {
-                r.sequence: r for r in self.records if r.recorded and r.recording.removesuffix(ACTIVE_SUFFIX) == name
+                r.sequence: r for r in self.records if r.recorded and r.recording.removesuffix(".active") == name
             }
             held = set(_sequences(path))
             if (file.events and not file.equal) or (file.fault is not None and file.fault.kind != "torn"):

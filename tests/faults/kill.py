@@ -6,10 +6,10 @@ import random
 import time
 from pathlib import Path
 
-from agent.recording.writer import recordings
 from tests.faults.invariants import Ledger
 from tests.faults.outcome import Outcome
 from tests.faults.rig import stop, strace, witnessed
+from tests.scenarios.processes import recordings
 
 SEED = 20261121
 LIFE_S = 4.0  # start, opening the port, the calibration restored, four rests, new calibrations
@@ -70,5 +70,6 @@ def at_every_write(directory: Path, step: int = 1) -> Outcome:
 
 
 def _next_recording(data_dir: Path) -> Path:
-    newest = max((number for number, _ in recordings(data_dir)), default=0) if data_dir.exists() else 0
-    return data_dir / f"fieldcal-{newest + 1:06d}.mcap.active"
+    names = [path.name for path in recordings(data_dir)]
+    following = int(names[-1].split("-")[1].split(".")[0]) + 1 if names else 1
+    return data_dir / f"fieldcal-{following:06d}.mcap.active"
