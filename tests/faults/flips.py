@@ -15,14 +15,14 @@ from agent.delivery.store import Store
 from agent.recording.integrity import check_integrity
 from agent.recording.messages import encode
 from agent.recording.reading import RecordingReader, open_recording
-from tests.faults.invariants import Findings
+from tests.faults.invariants import Findings, read_store
 from tests.faults.outcome import Outcome
 from tests.faults.rig import SENSOR, rig, stop
 from tests.scenarios.processes import recordings
 
 SEED = 20261121
+STARTED_S = 2.0  # a start, and the first results
 RUN_S = 8.0  # leaves a state file with two dozen calibrations
-EDGE_BYTES = 64  # of a recording: all bits of its beginning and of its end, where magic, header and footer are
 
 
 def of_state(directory: Path, flips: int) -> Outcome:
@@ -55,8 +55,8 @@ def of_state(directory: Path, flips: int) -> Outcome:
     return outcome
 
 
-def of_recording(directory: Path, flips: int, size_bytes: int) -> Outcome:
-    """Each flip must be a fault for the audit; what is read nevertheless must be events and results as they were.
+def of_recording(directory: Path, flips: int, size_bytes: int, edge_bytes: int) -> Outcome:
+    """Each flip must be a fault for the audit, also all at the ends, where magic, header and footer are; what is read nevertheless must be events and results as they were.
 
     A replay's results follow from those and from nothing else, so that it cannot give others.
     """
@@ -64,7 +64,7 @@ def of_recording(directory: Path, flips: int, size_bytes: int) -> Outcome:
     path = recordings(data_dir)[0]
     whole = path.read_bytes()
     right = _read(path)
-    edges = [*range(EDGE_BYTES * 8), *range((len(whole) - EDGE_BYTES) * 8, len(whole) * 8)]
+    edges = [*range(edge_bytes * 8), *range((len(whole) - edge_bytes) * 8, len(whole) * 8)]
     became: Counter[str] = Counter()
     words = []
     copy = directory / path.name
@@ -85,7 +85,7 @@ def of_recording(directory: Path, flips: int, size_bytes: int) -> Outcome:
         became[verdict.split(":")[0]] += 1
     outcome = Outcome(
         f"bits of a recording of {len(whole) / 1e6:.2f} MB",
-        f"{_share(len(whole) * 8, flips)} and all of the {EDGE_BYTES} first and last bytes, seed {SEED}",
+        f"{_share(len(whole) * 8, flips)} and all of the {edge_bytes} first and last bytes, seed {SEED}",
         Findings(),
         bad=words[:5],
     )
@@ -156,3 +156,54 @@ def _share(bits: int, flips: int) -> str:
 
 def _words(became: Counter[str]) -> str:
     return ", ".join(f"{words} {count}" for words, count in sorted(became.items()))
+
+
+def at_starts(directory: Path, starts: int) -> Outcome:
+    """The real agent is started on a state file with a flipped bit, its recordings beside it."""
+    bits = random.Random(SEED)
+    data_dir = _recorded(directory, RUN_S)
+    whole = (data_dir / FILE_NAME).read_bytes()
+    with History(data_dir / FILE_NAME) as history:
+        in_force = history.in_force(SENSOR)
+    assert in_force is not None
+    before = _calibration(in_force)
+    became: Counter[str] = Counter()
+    words = []
+    for number in range(starts):
+        bit = bits.randrange(len(whole) * 8)
+        with rig(directory / str(number), SEED) as r:
+            shutil.copytree(data_dir, r.data_dir)
+            (r.data_dir / FILE_NAME).write_bytes(_flipped(whole, bit))
+            with r.agent() as agent:
+                lives = r.run(agent, STARTED_S)
+                status = stop(agent) if lives else agent.wait()
+            verdict = _begun(r.data_dir, before)
+            if "Traceback" in r.output or status not in (0, 1):
+                verdict = f"crash, exit status {status}"
+            if verdict.startswith(("crash", "silently")):
+                words.append(f"bit {bit}: {verdict}")
+            became[verdict] += 1
+    outcome = Outcome(
+        "starts on a state file with a flipped bit", f"{starts} starts, seed {SEED}", Findings(), bad=words[:5]
+    )
+    outcome.also = _words(became)
+    return outcome
+
+
+def _begun(data_dir: Path, before: list[object]) -> str:
+    """With what the newest run began."""
+    try:
+        records = read_store(data_dir)
+    except StoreError:
+        return "refused, with the reason"
+    run = [record for record in records if record.run_id == records[-1].run_id]
+    first = next((record for record in run if record.what == "calibration"), None)
+    if first is None:
+        return "began without a calibration"
+    if not any(record.what == "window" and record.sequence < first.sequence for record in run):
+        return "restored" if _calibration(first) == before else "silently wrong"
+    return "began without a calibration"
+
+
+def _calibration(record: Record) -> list[object]:
+    return [record.fields[name] for name in ("sensitivity", "offset", "covariance", "identity")]

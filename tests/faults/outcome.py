@@ -41,12 +41,13 @@ COLUMNS = (
     "not replaying to their last flush",
     "calibrations off the truth",
     "also",
+    "day",
     "verdict",
 )
 HEAD = f"| {' | '.join(COLUMNS)} |\n|{' --- |' * len(COLUMNS)}"
 
 
-def row(outcome: Outcome) -> str:
+def row(outcome: Outcome, day: str) -> str:
     """The outcome as a row under HEAD."""
     f = outcome.findings
     verdict = "holds" if outcome.good else "FAILS: " + "; ".join([*outcome.bad, *f.words][:3])
@@ -60,4 +61,4 @@ def row(outcome: Outcome) -> str:
         f.not_replaying,
         f.wrong,
     ]
-    return "| " + " | ".join(str(cell) for cell in [*cells, outcome.also, verdict]) + " |"
+    return "| " + " | ".join(str(cell) for cell in [*cells, outcome.also, day, verdict]) + " |"

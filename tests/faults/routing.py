@@ -21,7 +21,7 @@ from tests.faults.rig import ROOT, SOURCE, Rig, Witness, free_port, rig, stop
 SEED = 20261121
 SPEED = 50  # 40 results a second
 LEAST_A_SECOND = 10  # on a machine under load
-FROZEN_S = 20.0  # Zenoh gives up a link after 10 s
+FROZEN_S = 15.0  # Zenoh gives up a link after 10 s
 DEAD_S = 5.0
 ALIVE_S = 5.0
 CAUGHT_UP_S = 60.0

@@ -1,0 +1,27 @@
+"""What a fault needs of the machine; tests skip where it is not there, and say what."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+TOOLS = {"strace": "strace", "gcc": "gcc", "mkfs.ext4": "e2fsprogs", "mkfs.xfs": "xfsprogs", "mount": "mount"}
+
+
+def missing(*tools: str, root: bool = True) -> list[str]:
+    """Of these tools (all, if none is named), of root and of loop devices, what is not here."""
+    lacking = [f"{name} (package {TOOLS[name]})" for name in tools or TOOLS if shutil.which(name) is None]
+    if root and os.geteuid() != 0:
+        lacking.append("root")
+    if root and not Path("/dev/loop-control").exists():
+        lacking.append("/dev/loop-control")
+    return lacking
+
+
+def require(*tools: str, root: bool = False) -> None:
+    """Skip the test where something is missing."""
+    if lacking := missing(*tools, root=root):
+        pytest.skip(f"needs {', '.join(lacking)}")
