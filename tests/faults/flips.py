@@ -56,9 +56,9 @@ def of_state(directory: Path, flips: int) -> Outcome:
 
 
 def of_recording(directory: Path, flips: int, size_bytes: int, edge_bytes: int) -> Outcome:
-    """Each flip must be a fault for the audit, also all at the ends, where magic, header and footer are; what is read nevertheless must be events and results as they were.
+    """Each flip must be a fault for the audit, also at the ends, where magic, header and footer are.
 
-    A replay's results follow from those and from nothing else, so that it cannot give others.
+    What is read nevertheless must be events and results as they were: a replay follows from those and nothing else.
     """
     data_dir = _recorded(directory, RUN_S, size_bytes)
     path = recordings(data_dir)[0]

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from agent.delivery.history import FILE_NAME
 from tests.faults import kill
 from tests.faults.invariants import read_store
 from tests.faults.needs import require
