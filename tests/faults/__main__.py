@@ -28,7 +28,7 @@ LINES: dict[str, Callable[[Path], Outcome]] = {
     "eio": disk.sync_fails,
     "slow": disk.slow,
     "unplug": partial(unplug.unplugged, times=100),
-    "router": partial(routing.away, results=10_000),
+    "router": partial(routing.away, results=10_000, speed=50),
     "clock": clock.stepped,
     "state": partial(flips.of_state, flips=10_000),
     "starts": partial(flips.at_starts, starts=20),

@@ -15,7 +15,7 @@ SEED = 20261121
 LIFE_S = 4.0  # start, opening the port, the calibration restored, four rests, new calibrations
 # What SQLite does in a commit, and what closes or names a file; recordings are written by `write`, looked at apart.
 SAVING = "pwrite64,fsync,fdatasync,ftruncate,rename,unlink"
-SURVIVED_S = 3.0  # of a life in which the nth call did not come
+SURVIVED = 12  # results of a life in which the nth call did not come: six windows, their calibrations
 
 
 def at_random_moments(directory: Path, kills: int) -> Outcome:
@@ -57,7 +57,8 @@ def at_every_write(directory: Path, step: int = 1) -> Outcome:
             while killed:
                 where = _next_recording(rig.data_dir) if calls == "write" else None
                 with rig.agent(strace(calls, f"signal=KILL:when={n}", where)) as agent:
-                    killed = not rig.run(agent, SURVIVED_S)
+                    before = len(witness.received)
+                    killed = not rig.run(agent, until=lambda b=before: len(witness.received) >= b + SURVIVED)
                 ledger.inspect(witness.before(time.monotonic()))
                 kills += killed
                 n += step

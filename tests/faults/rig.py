@@ -36,6 +36,7 @@ UP = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0], [0, 0, -1], [-1, 0, 0], [0, -1, 
 SENSITIVITY = np.array([[1.03, 0.012, -0.006], [-0.008, 0.97, 0.01], [0.005, -0.011, 1.01]])
 OFFSET = np.array([0.21, -0.34, 0.12])
 NOISE_MPS2 = 0.005
+LINE_BYTES = 28
 STOP_S = 10.0
 GIVE_UP_S = 120.0  # what takes seconds; on a machine under load more
 
@@ -122,6 +123,11 @@ class Rig:
         """All that the agents of this rig have said."""
         path = self.directory / "output"
         return path.read_text(errors="replace") if path.exists() else ""
+
+    @property
+    def unread_s(self) -> float:
+        """How much of the sensor's text nobody read and the port lost, as a time."""
+        return self.device.lost_bytes / (LINE_BYTES * RATE_HZ * self.speed)
 
     @contextmanager
     def agent(

@@ -19,18 +19,20 @@ from tests.faults.outcome import Outcome
 from tests.faults.rig import ROOT, SOURCE, Rig, Witness, free_port, rig, stop
 
 SEED = 20261121
-SPEED = 50  # 40 results a second
-LEAST_A_SECOND = 10  # on a machine under load
+LEAST_A_SECOND = 5  # results, on a machine under load
 FROZEN_S = 15.0  # Zenoh gives up a link after 10 s
 DEAD_S = 5.0
 ALIVE_S = 5.0
 CAUGHT_UP_S = 60.0
 
 
-def away(directory: Path, results: int) -> Outcome:
-    """No router until the store holds so many results; then one that freezes, is killed, and comes back."""
+def away(directory: Path, results: int, speed: int) -> Outcome:
+    """No router until the store holds so many results; then one that freezes, is killed, and comes back.
+
+    At 50 times the speed there are 40 results a second.
+    """
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    with rig(directory, SEED, endpoint=endpoint, speed=SPEED) as r, r.agent() as agent:
+    with rig(directory, SEED, endpoint=endpoint, speed=speed) as r, r.agent() as agent:
         lives = r.run(agent, results / LEAST_A_SECOND, until=lambda: _kept(r) >= results)
         waiting = _kept(r)
         first = read_store(r.data_dir)[0].sequence
@@ -51,7 +53,7 @@ def away(directory: Path, results: int) -> Outcome:
                 lives &= r.run(agent, DEAD_S)
             with router(endpoint):
                 lives &= r.run(agent, ALIVE_S)
-                lost_bytes = r.device.lost_bytes
+                unread_s = r.unread_s
                 r.device.unplug()
                 kept = _settled(r, agent)
                 r.run(agent, CAUGHT_UP_S, until=lambda: len(witness.received) >= kept)
@@ -73,12 +75,13 @@ def away(directory: Path, results: int) -> Outcome:
         outcome.also = (
             f"{len(ledger.records)} results, {len(missing)} never came, {len(numbers) - len(set(numbers))} came twice,"
             f" {'in' if numbers == sorted(numbers) else 'OUT OF'} order; the {waiting} came within {caught_up_s:.1f} s;"
-            f" {read}; {lost_bytes} bytes unread at the port"
+            f" {read}; {unread_s:.2f} s of the text unread at the port"
         )
         outcome.require(not missing, f"{len(missing)} results never came")
         outcome.require(numbers == sorted(set(numbers)), "out of order or twice")
         outcome.require(read.longest_pause_s < LONGEST_S, f"reading paused {read.longest_pause_s:.2f} s")
-        outcome.require(read.missing + read.gaps == 0, f"{read.missing} samples, {read.gaps} blocks missing")
+        outcome.require(unread_s < LONGEST_S, f"{unread_s:.2f} s of the text were not read")
+        outcome.require(read.gaps == 0, f"{read.gaps} blocks dropped")
         outcome.require(lives and status == 0, f"the agent ended with {status}: {r.output[-300:]}")
         outcome.require("Traceback" not in r.output, "a traceback was shown")
     return outcome

@@ -18,7 +18,7 @@ def test_unplugged(tmp_path: Path) -> None:
 
 
 def test_router_away(tmp_path: Path) -> None:
-    outcome = routing.away(tmp_path, 300)
+    outcome = routing.away(tmp_path, 300, 20)
     assert outcome.good, outcome
 
 
