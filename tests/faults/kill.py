@@ -46,8 +46,8 @@ def at_random_moments(directory: Path, kills: int) -> Outcome:
 def at_every_write(directory: Path, step: int = 1) -> Outcome:
     """Killed by strace as it enters its nth call that saves, n = 1, 1 + step, ... until a life goes without.
 
-    A call is counted in its thread: the main thread's are those of opening the store, the recording thread's those of
-    recording and committing.
+    Calls are counted by name and thread: the main thread's are those of opening the store, the recording thread's those
+    of recording and committing.
     """
     kills = 0
     with witnessed(directory, SEED) as (rig, witness):
