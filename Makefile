@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PRESET ?= plain
 
-.PHONY: run test nightly lint bench lock clean
+.PHONY: run test nightly lint bench faults faults-short soak lock clean
 
 $(VENV)/runtime: requirements.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "fieldcal needs Python 3.11 or later, this is " + sys.version)'
@@ -21,7 +21,7 @@ run: $(VENV)/runtime  ## the agent on the virtual bench, with a router beside it
 	$(BIN)/fieldcal run --preset $(PRESET) --with-router
 
 test: $(VENV)/development
-	$(BIN)/python -m pytest -n auto --dist loadscope
+	$(BIN)/python -m pytest -n auto --dist loadscope -m "not faults"
 
 nightly: $(VENV)/development  ## the twins under Debian's kernel in QEMU; needs qemu-system-x86, busybox-static and Debian's apt
 	$(BIN)/python -m tests.nightly
@@ -34,6 +34,16 @@ lint: $(VENV)/development
 
 bench: $(VENV)/development  ## figures, each a ratio against a named alternative; writes docs/performance.md
 	$(BIN)/python -m benchmarks
+
+faults: $(VENV)/development  ## breaks the agent on purpose, for an hour; needs root and tools; writes docs/reliability.md
+	$(BIN)/python -m tests.faults
+
+faults-short: $(VENV)/development  ## the same in a few minutes; skips what this machine cannot do
+	$(BIN)/python -m pytest -n auto --dist loadscope -m faults tests/faults
+
+soak: $(VENV)/development  ## 24 h in 72 min, then an hour in real time; writes docs/reliability.md
+	$(BIN)/python -m benchmarks.soak --part soak-day
+	$(BIN)/python -m benchmarks.soak --hours 1 --speed 1 --rate-hz 1000 --part soak-hour
 
 lock:  ## make the lock files anew (needs uv)
 	uv pip compile --universal --python-version 3.11 --generate-hashes --no-annotate --extra build pyproject.toml -o requirements.lock

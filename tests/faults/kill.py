@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import random
+import subprocess
 import time
 from pathlib import Path
 
 from tests.faults.invariants import Ledger
 from tests.faults.outcome import Outcome
-from tests.faults.rig import stop, strace, witnessed
+from tests.faults.rig import Rig, Witness, stop, strace, witnessed
 from tests.scenarios.processes import recordings
 
 SEED = 20261121
@@ -57,8 +58,7 @@ def at_every_write(directory: Path, step: int = 1) -> Outcome:
             while killed:
                 where = _next_recording(rig.data_dir) if calls == "write" else None
                 with rig.agent(strace(calls, f"signal=KILL:when={n}", where)) as agent:
-                    before = len(witness.received)
-                    killed = not rig.run(agent, until=lambda b=before: len(witness.received) >= b + SURVIVED)
+                    killed = not _goes_on(rig, agent, witness)
                 ledger.inspect(witness.before(time.monotonic()))
                 kills += killed
                 n += step
@@ -68,6 +68,11 @@ def at_every_write(directory: Path, step: int = 1) -> Outcome:
         outcome.also = f"calls {SAVING}; write to the recording"
         outcome.require("Traceback" not in rig.output, "a traceback was shown")
     return outcome
+
+
+def _goes_on(rig: Rig, agent: subprocess.Popen[bytes], witness: Witness) -> bool:
+    enough = len(witness.received) + SURVIVED
+    return rig.run(agent, until=lambda: len(witness.received) >= enough)
 
 
 def _next_recording(data_dir: Path) -> Path:

@@ -131,7 +131,7 @@ class Rig:
 
     @contextmanager
     def agent(
-        self, prefix: Sequence[str] = (), variables: Mapping[str, str] | None = None
+        self, prefix: Sequence[str] = (), variables: dict[str, str] | None = None
     ) -> Iterator[subprocess.Popen[bytes]]:
         """The real agent; `prefix` is a command that starts it (strace). Killed at the end if it still runs."""
         self.sensor.silence()
@@ -178,14 +178,14 @@ class Rig:
 
 @contextmanager
 def rig(
-    directory: Path, seed: int, *, endpoint: str = "", speed: int = SPEED, data_dir: Path | None = None, extra: str = ""
+    directory: Path, seed: int, *, endpoint: str = "", speed: int = SPEED, data_dir: Path | None = None
 ) -> Iterator[Rig]:
-    """A rig in `directory`; without `endpoint` nothing is published. `extra` is TOML after the configuration."""
+    """A rig in `directory`; without `endpoint` nothing is published."""
     directory.mkdir(parents=True, exist_ok=True)
     sensor = TurnedSensor(seed)
     device = PtyDevice(sensor, lambda: speed * time.monotonic(), directory / "port")
     config = directory / "config.toml"
-    config.write_text(_config(device.path, endpoint, speed) + extra)
+    config.write_text(_config(device.path, endpoint, speed))
     device.start()
     try:
         yield Rig(directory, endpoint, speed, sensor, device, config, data_dir or directory / "data")
@@ -235,13 +235,13 @@ def local_router() -> Iterator[str]:
 
 
 @contextmanager
-def witnessed(directory: Path, seed: int, **options: object) -> Iterator[tuple[Rig, Witness]]:
+def witnessed(directory: Path, seed: int, *, data_dir: Path | None = None) -> Iterator[tuple[Rig, Witness]]:
     """A rig with a router and a witness."""
     with ExitStack() as stack:
         endpoint = stack.enter_context(local_router())
         witness = Witness(endpoint)
         stack.callback(witness.close)
-        yield stack.enter_context(rig(directory, seed, endpoint=endpoint, **options)), witness  # type: ignore[arg-type]
+        yield stack.enter_context(rig(directory, seed, endpoint=endpoint, data_dir=data_dir)), witness
 
 
 def stop(process: subprocess.Popen[bytes]) -> int:
