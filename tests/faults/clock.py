@@ -8,9 +8,9 @@ import time
 from itertools import pairwise
 from pathlib import Path
 
-from agent.delivery.history import Record
+from agent.delivery.history import FILE_NAME, Record
 from tests.faults.acquisition import LONGEST_S, acquisition
-from tests.faults.invariants import Ledger
+from tests.faults.invariants import Ledger, read_store
 from tests.faults.outcome import Outcome
 from tests.faults.rig import stop, witnessed
 
@@ -22,7 +22,7 @@ SHIM = Path(__file__).with_name("clock_shim.c")
 
 
 def stepped(directory: Path) -> Outcome:
-    """One run through all steps, then a run 30 years before the first one."""
+    """One run through all steps, then two runs 30 years before the first one, the second with the state file lost."""
     directory.mkdir(exist_ok=True)
     library, step = directory / "clock_shim.so", directory / "step"
     subprocess.run(["gcc", "-O2", "-shared", "-fPIC", "-o", str(library), str(SHIM)], check=True)
@@ -44,13 +44,25 @@ def stepped(directory: Path) -> Outcome:
             lives &= rig.run(agent, BETWEEN_S)
             status |= stop(agent)
         ledger.inspect(witness.before(time.monotonic()))
-        outcome = Outcome("UTC stepped", f"{', '.join(STEPS_S)}; then a start 30 years earlier", ledger.findings)
+        numbers = [record.sequence for record in ledger.records]
+        for path in rig.data_dir.glob(f"{FILE_NAME}*"):
+            path.unlink()
+        before = len(witness.received)
+        with rig.agent(variables=variables) as agent:
+            lives &= rig.run(agent, BETWEEN_S)
+            status |= stop(agent)
+        anew = len(witness.received) - before
+        outcome = Outcome(
+            "UTC stepped",
+            f"{', '.join(STEPS_S)}; then a start 30 years earlier; then one without a state file",
+            ledger.findings,
+        )
         windows = [record.fields for record in first_run if record.what == "window"]
         torn = [fields for fields in windows if not fields["used"]]
         backwards = sum(b.t_utc_ns < a.t_utc_ns for a, b in pairwise(first_run))
         outcome.also = (
             f"UTC ran backwards between results {backwards} times; {len(windows) - len(torn)} of {len(windows)} windows"
-            f" used; {read}; the calibration in force was restored in {ledger.findings.restored} of 1 later runs"
+            f" used; {read}; the calibration in force was restored in {ledger.findings.restored} of 1 later runs; the store made anew counted on, {anew} results came"
         )
         outcome.require(backwards == 2, f"UTC ran backwards {backwards} times: the steps were not felt")
         outcome.require(not torn, f"windows torn: {torn[:2]}")
@@ -58,6 +70,8 @@ def stepped(directory: Path) -> Outcome:
         outcome.require(read.longest_pause_s < LONGEST_S, f"reading paused {read.longest_pause_s:.2f} s")
         outcome.require(read.gaps == 0, f"{read.gaps} blocks dropped")
         outcome.require(ledger.findings.restored == 1, "the later run began without the calibration in force")
+        outcome.require(read_store(rig.data_dir)[-1].sequence > numbers[-1], "a store made anew counts from before")
+        outcome.require(anew > 5, f"{anew} results came of a store made anew")
         outcome.require(_rising(ledger.records, first_run), "the later run's numbers do not go on")
         outcome.require(lives and status == 0, f"the agent ended with {status}: {rig.output[-300:]}")
         outcome.require("Traceback" not in rig.output, "a traceback was shown")

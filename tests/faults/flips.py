@@ -7,6 +7,7 @@ import shutil
 import time
 from collections import Counter
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -176,7 +177,7 @@ def at_starts(directory: Path, starts: int) -> Outcome:
             shutil.copytree(data_dir, r.data_dir)
             (r.data_dir / FILE_NAME).write_bytes(_flipped(whole, bit))
             with r.agent() as agent:
-                lives = r.run(agent, until=lambda r=r: not r.sensor.silent) and r.run(agent, STARTED_S)
+                lives = r.run(agent, until=partial(getattr, r.sensor, "speaks")) and r.run(agent, STARTED_S)
                 status = stop(agent) if lives else agent.wait()
             verdict = _begun(r.data_dir, before)
             if "Traceback" in r.output or status not in (0, 1):

@@ -60,9 +60,9 @@ class TurnedSensor:
         self._began_s = t_s
 
     @property
-    def silent(self) -> bool:
-        """Whether it waits for `begin`."""
-        return self._began_s is None
+    def speaks(self) -> bool:
+        """Whether it has begun: its port was opened."""
+        return self._began_s is not None
 
     def silence(self) -> None:
         """No samples until the next `begin`."""
@@ -169,7 +169,7 @@ class Rig:
             if time.monotonic() >= end_s:
                 assert seconds < GIVE_UP_S, f"it does not get there: {self.output[-2000:]}"
                 break
-            if self.sensor.silent and self.device.has_reader():
+            if not self.sensor.speaks and self.device.has_reader():
                 time.sleep(SETTLE_S)
                 self.sensor.begin(self.speed * time.monotonic())
             time.sleep(0.005)  # polls; the conditions decide
