@@ -21,28 +21,28 @@ class Acquisition:
     """What the recordings tell of one device, in the order of events.
 
     `longest_pause_s` between two reads of the port, in real time; `missing` samples between blocks of one opening;
-    `openings` how often an index did not go on in time; `gaps` events that say something was dropped.
+    `openings` how often an index did not go on in time; `dropped` blocks for which the agent had no room.
     """
 
     longest_pause_s: float
     missing: int
     openings: int
-    gaps: int
-    samples: int
+    dropped: int
 
     def __str__(self) -> str:
         return (
-            f"reading paused {self.longest_pause_s:.2f} s at most, {self.missing + self.gaps} samples or blocks missing"
+            f"reading paused {self.longest_pause_s:.2f} s at most, {self.missing} samples missing,"
+            f" {self.dropped} blocks dropped"
         )
 
 
 def acquisition(data_dir: Path, speed: int) -> Acquisition:
     """Of all recordings of one run on a sensor whose clock runs `speed` times as fast."""
     last_ns = expected = -1
-    pause_ns = missing = openings = gaps = samples = 0
+    pause_ns = missing = openings = dropped = 0
     for event in _events(recordings(data_dir)):
-        if isinstance(event, Gap):
-            gaps += event.dropped
+        if isinstance(event, Gap) and event.unit == "blocks":
+            dropped += event.dropped
         if not isinstance(event, SampleBlock):
             continue
         stamps = event.burst_t_monotonic_ns
@@ -54,8 +54,7 @@ def acquisition(data_dir: Path, speed: int) -> Acquisition:
             stamps = np.concatenate([[last_ns], stamps])
         pause_ns = max(pause_ns, int(np.diff(stamps).max(initial=0)))
         last_ns, expected = int(stamps[-1]), event.first_index + event.n
-        samples += event.n
-    return Acquisition(pause_ns * 1e-9 / speed, missing, openings, gaps, samples)
+    return Acquisition(pause_ns * 1e-9 / speed, missing, openings, dropped)
 
 
 def _events(paths: Iterable[Path]) -> Iterator[object]:

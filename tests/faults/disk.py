@@ -173,7 +173,7 @@ def _spell(line: str, injected: str, rig: Rig, witness: Witness, spell: Spell) -
     if spell.recorded:
         outcome.also += f"; {read}"
         outcome.require(read.longest_pause_s < LONGEST_S, f"reading paused {read.longest_pause_s:.2f} s")
-        outcome.require(read.gaps == 0, f"{read.gaps} blocks dropped")
+        outcome.require(read.dropped == 0, f"{read.dropped} blocks dropped")
     outcome.require(lives and status == 0, f"the agent ended with {status}: {rig.output[-300:]}")
     outcome.require(unread_s < LONGEST_S, f"{unread_s:.2f} s of the text were not read")
     outcome.require(meanwhile > 5, f"only {meanwhile} results while the disk was bad")

@@ -81,7 +81,7 @@ def away(directory: Path, results: int, speed: int) -> Outcome:
         outcome.require(numbers == sorted(set(numbers)), "out of order or twice")
         outcome.require(read.longest_pause_s < LONGEST_S, f"reading paused {read.longest_pause_s:.2f} s")
         outcome.require(unread_s < LONGEST_S, f"{unread_s:.2f} s of the text were not read")
-        outcome.require(read.gaps == 0, f"{read.gaps} blocks dropped")
+        outcome.require(read.dropped == 0, f"{read.dropped} blocks dropped")
         outcome.require(lives and status == 0, f"the agent ended with {status}: {r.output[-300:]}")
         outcome.require("Traceback" not in r.output, "a traceback was shown")
     return outcome
