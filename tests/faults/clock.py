@@ -41,7 +41,7 @@ def stepped(directory: Path) -> Outcome:
         first_run = ledger.records
         step_clock(step, -YEARS_30_S)
         with rig.agent(variables=variables) as agent:
-            lives &= rig.run(agent, BETWEEN_S)
+            lives &= rig.run(agent, until=lambda: rig.sensor.speaks) and rig.run(agent, BETWEEN_S)
             status |= stop(agent)
         ledger.inspect(witness.before(time.monotonic()))
         numbers = [record.sequence for record in ledger.records]
@@ -49,7 +49,7 @@ def stepped(directory: Path) -> Outcome:
             path.unlink()
         before = len(witness.received)
         with rig.agent(variables=variables) as agent:
-            lives &= rig.run(agent, BETWEEN_S)
+            lives &= rig.run(agent, until=lambda: rig.sensor.speaks) and rig.run(agent, BETWEEN_S)
             status |= stop(agent)
         anew = len(witness.received) - before
         outcome = Outcome(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import fcntl
 import os
-import random
 import struct
 import subprocess
 import time
@@ -12,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from random import Random
 
 from tests.faults.acquisition import LONGEST_S, acquisition
 from tests.faults.invariants import Ledger
@@ -20,13 +20,11 @@ from tests.faults.rig import Rig, Witness, stop, strace, witnessed
 from tests.scenarios.processes import recordings
 
 SEED = 20261121
-LIFE_S = 4.0
 FS_IOC_SHUTDOWN = 0x8004587D
 # What is lost is what was not synced. XFS: 1 flushes the log and 2 does not; ext4 drops an unwritten journal with 2.
 NO_LOG_FLUSH = 2
 SIZE_MB = {"ext4": 64, "xfs": 320}  # XFS makes none below 300 MB
 MAKE = {"ext4": ["mkfs.ext4", "-q", "-F"], "xfs": ["mkfs.xfs", "-q", "-f"]}
-STEADY_S = 3.0  # of calibrations before a disk goes bad, and after it is good again
 BAD_S = 5.0  # longer than the pause between two attempts to record, 10 s of the ten times faster clock
 GOOD_AGAIN_S = 60.0  # what waited for the slow disk must drain first
 AGAIN = 20  # results, the last of them recorded: it is as before
@@ -65,12 +63,12 @@ def loop_disk(directory: Path, kind: str, size_mb: int = 0) -> Iterator[Path]:
 
 def power_cut(directory: Path, kind: str, cuts: int) -> Outcome:
     """The file system is shut down without its journal under the running agent, mounted again, and looked at."""
-    moments = random.Random(SEED)
+    moments = Random(SEED)
     with loop_disk(directory, kind) as mount, witnessed(directory, SEED, data_dir=mount / "data") as (rig, witness):
         ledger = Ledger(rig.data_dir)
         for _ in range(cuts):
             with rig.agent() as agent:
-                rig.run(agent, moments.uniform(0.0, LIFE_S))
+                rig.run_to_a_moment(agent, moments)
                 at_s = time.monotonic()
                 shut_down(mount)
                 agent.kill()
@@ -118,7 +116,7 @@ def read_only(directory: Path) -> Outcome:
         _mount(directory / "ext4.image", mount)
         ledger.inspect(witness.before(at_s))
         with rig.agent() as agent:
-            rig.run(agent, STEADY_S)
+            rig.run(agent, until=lambda: rig.sensor.speaks)
             stop(agent)
         ledger.inspect(witness.before(at_s))
     outcome = Outcome("disk turns read-only", f"once, for {BAD_S:g} s, then mounted again", ledger.findings)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import random
 import subprocess
 import time
 from pathlib import Path
+from random import Random
 
 from tests.faults.invariants import Ledger
 from tests.faults.outcome import Outcome
@@ -13,7 +13,6 @@ from tests.faults.rig import Rig, Witness, stop, strace, witnessed
 from tests.scenarios.processes import recordings
 
 SEED = 20261121
-LIFE_S = 4.0  # start, opening the port, the calibration restored, four rests, new calibrations
 # What SQLite does in a commit, and what closes or names a file; recordings are written by `write`, looked at apart.
 SAVING = "pwrite64,fsync,fdatasync,ftruncate,rename,unlink"
 SURVIVED = 12  # results of a life in which the nth call did not come: six windows, their calibrations
@@ -21,18 +20,18 @@ SURVIVED = 12  # results of a life in which the nth call did not come: six windo
 
 def at_random_moments(directory: Path, kills: int) -> Outcome:
     """The agent is killed and started again on the same directory; what it left is looked at in between."""
-    moments = random.Random(SEED)
+    moments = Random(SEED)
     with witnessed(directory, SEED) as (rig, witness):
         ledger = Ledger(rig.data_dir)
         for _ in range(kills):
             with rig.agent() as agent:
-                rig.run(agent, moments.uniform(0.0, LIFE_S))
+                rig.run_to_a_moment(agent, moments)
                 agent.kill()
                 agent.wait()
             if rig.data_dir.exists():
                 ledger.inspect(witness.before(time.monotonic()))
         with rig.agent() as agent:
-            rig.run(agent, LIFE_S)
+            rig.run(agent, until=lambda: rig.sensor.speaks)
             status = stop(agent)
         ledger.inspect(witness.before(time.monotonic()))
         outcome = Outcome("kill -9 at random moments", f"{kills} kills, seed {SEED}", ledger.findings)

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from random import Random
 
 import numpy as np
 
@@ -38,6 +39,7 @@ OFFSET = np.array([0.21, -0.34, 0.12])
 NOISE_MPS2 = 0.005
 LINE_BYTES = 28
 STOP_S = 10.0
+IN_START, START_S, WORK_S = 0.25, 1.0, 4.0  # rests begin to count after 0.25 s, four determine S and Q
 GIVE_UP_S = 120.0  # what takes seconds; on a machine under load more
 
 
@@ -174,6 +176,17 @@ class Rig:
                 self.sensor.begin(self.speed * time.monotonic())
             time.sleep(0.005)  # polls; the conditions decide
         return process.poll() is None
+
+    def run_to_a_moment(self, process: subprocess.Popen[bytes], random: Random) -> None:
+        """To a moment in which something may happen: one of four within the start, the others while it works.
+
+        Counted from the opening of its port, since a machine under load takes its time for a start.
+        """
+        if random.random() < IN_START:
+            self.run(process, random.uniform(0.0, START_S))
+        else:
+            self.run(process, until=lambda: self.sensor.speaks)
+            self.run(process, random.uniform(0.0, WORK_S))
 
 
 @contextmanager
