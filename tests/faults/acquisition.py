@@ -13,7 +13,7 @@ from agent.recording.reading import RecordingReader
 from hw.block import BlockFlags, SampleBlock
 from tests.scenarios.processes import recordings
 
-LONGEST_S = 1.0  # that reading may stop
+LONGEST_S = 1.0  # that reading may stop, besides what the machine gives nobody time
 
 
 @dataclass(frozen=True, slots=True)

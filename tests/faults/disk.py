@@ -169,11 +169,11 @@ def _spell(line: str, injected: str, rig: Rig, witness: Witness, spell: Spell) -
         f" {unread_s:.2f} s of the text unread at the port; {len(recordings(rig.data_dir))} recordings"
     )
     if spell.recorded:
-        outcome.also += f"; {read}"
-        outcome.require(read.longest_pause_s < LONGEST_S, f"reading paused {read.longest_pause_s:.2f} s")
+        outcome.also += f"; {read} (this process waited {rig.late_s:.2f} s for the machine)"
+        outcome.require(read.longest_pause_s < LONGEST_S + rig.late_s, f"reading paused {read.longest_pause_s:.2f} s")
         outcome.require(read.dropped == 0, f"{read.dropped} blocks dropped")
     outcome.require(lives and status == 0, f"the agent ended with {status}: {rig.output[-300:]}")
-    outcome.require(unread_s < LONGEST_S, f"{unread_s:.2f} s of the text were not read")
+    outcome.require(unread_s < LONGEST_S + rig.late_s, f"{unread_s:.2f} s of the text were not read")
     outcome.require(meanwhile > 5, f"only {meanwhile} results while the disk was bad")
     outcome.require(after > AGAIN, f"only {after} results after it was good again")
     outcome.require(ledger.records[-1].recorded, "recording did not begin again")

@@ -31,7 +31,7 @@ RATE_HZ = 100.0
 HOLD_S = 2.5
 GUARD_S = 0.25
 SPEED = 10  # a window each 0.25 s instead of 2.5: more is at stake at any moment
-SETTLE_S = 0.1  # a reader throws away what came before its port was set up
+POLL_S = 0.005
 G_MPS2 = 9.80665
 UP = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0], [0, 0, -1], [-1, 0, 0], [0, -1, 0]], dtype=float)
 SENSITIVITY = np.array([[1.03, 0.012, -0.006], [-0.008, 0.97, 0.01], [0.005, -0.011, 1.01]])
@@ -119,6 +119,8 @@ class Rig:
     device: PtyDevice
     config: Path
     data_dir: Path
+    late_s: float = 0.0  # the longest that this process itself had to wait for the machine
+    _said: int = 0
 
     @property
     def output(self) -> str:
@@ -137,6 +139,7 @@ class Rig:
     ) -> Iterator[subprocess.Popen[bytes]]:
         """The real agent; `prefix` is a command that starts it (strace). Killed at the end if it still runs."""
         self.sensor.silence()
+        self._said = len(self.output)
         command = [
             *prefix,
             sys.executable,
@@ -159,6 +162,10 @@ class Rig:
                     os.kill(pid, signal.SIGKILL)
             process.wait()
 
+    def _opened(self) -> bool:
+        """Whether the agent has opened the port, and thrown away what came before: then it says the sensor's status."""
+        return self.device.has_reader() and f"{SENSOR}: " in self.output[self._said :]
+
     def run(
         self, process: subprocess.Popen[bytes], seconds: float = float("inf"), until: Callable[[], bool] = never
     ) -> bool:
@@ -171,10 +178,11 @@ class Rig:
             if time.monotonic() >= end_s:
                 assert seconds < GIVE_UP_S, f"it does not get there: {self.output[-2000:]}"
                 break
-            if not self.sensor.speaks and self.device.has_reader():
-                time.sleep(SETTLE_S)
+            if not self.sensor.speaks and self._opened():
                 self.sensor.begin(self.speed * time.monotonic())
-            time.sleep(0.005)  # polls; the conditions decide
+            polled_s = time.monotonic()
+            time.sleep(POLL_S)  # the conditions decide, not the time
+            self.late_s = max(self.late_s, time.monotonic() - polled_s - POLL_S)
         return process.poll() is None
 
     def run_to_a_moment(self, process: subprocess.Popen[bytes], random: Random) -> None:
