@@ -62,7 +62,7 @@ def stepped(directory: Path) -> Outcome:
         backwards = sum(b.t_utc_ns < a.t_utc_ns for a, b in pairwise(first_run))
         outcome.also = (
             f"UTC ran backwards between results {backwards} times; {len(windows) - len(torn)} of {len(windows)} windows"
-            f" used; {read} (this process waited {rig.late_s:.2f} s for the machine); the calibration in force was restored in {ledger.findings.restored} of 1 later runs;"
+            f" used; {read}; the calibration in force was restored in {ledger.findings.restored} of 1 later runs;"
             f" the store made anew counted on, {anew} results came"
         )
         outcome.require(backwards == 2, f"UTC ran backwards {backwards} times: the steps were not felt")

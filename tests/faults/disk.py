@@ -169,7 +169,7 @@ def _spell(line: str, injected: str, rig: Rig, witness: Witness, spell: Spell) -
         f" {unread_s:.2f} s of the text unread at the port; {len(recordings(rig.data_dir))} recordings"
     )
     if spell.recorded:
-        outcome.also += f"; {read} (this process waited {rig.late_s:.2f} s for the machine)"
+        outcome.also += f"; {read}"
         outcome.require(read.longest_pause_s < LONGEST_S + rig.late_s, f"reading paused {read.longest_pause_s:.2f} s")
         outcome.require(read.dropped == 0, f"{read.dropped} blocks dropped")
     outcome.require(lives and status == 0, f"the agent ended with {status}: {rig.output[-300:]}")

@@ -75,7 +75,7 @@ def away(directory: Path, results: int, speed: int) -> Outcome:
         outcome.also = (
             f"{len(ledger.records)} results, {len(missing)} never came, {len(numbers) - len(set(numbers))} came twice,"
             f" {'in' if numbers == sorted(numbers) else 'OUT OF'} order; the {waiting} came within {caught_up_s:.1f} s;"
-            f" {read} (this process waited {r.late_s:.2f} s for the machine); {unread_s:.2f} s of the text unread at the port"
+            f" {read}; {unread_s:.2f} s of the text unread at the port"
         )
         outcome.require(not missing, f"{len(missing)} results never came")
         outcome.require(numbers == sorted(set(numbers)), "out of order or twice")
