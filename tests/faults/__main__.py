@@ -18,7 +18,6 @@ from tests.faults.outcome import HEAD, Outcome, row
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "reliability.md"
 PART = "faults"
-FIRST = -10  # before all else on this machine: the agent is measured, not its neighbours
 LINES: dict[str, Callable[[Path], Outcome]] = {
     "kill": partial(kill.at_random_moments, kills=200),
     "write": kill.at_every_write,
@@ -46,7 +45,8 @@ def main() -> int:
     if missing := needs.missing():
         print(f"not here, and needed: {', '.join(missing)}", file=sys.stderr)
         return 1
-    os.nice(FIRST)
+    # Before all else on this machine: the agent is measured, not its neighbours.
+    os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
     good = True
     for name in names:
         with tempfile.TemporaryDirectory(prefix="fieldcal-faults-") as directory:
