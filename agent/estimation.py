@@ -187,7 +187,7 @@ def _limits(channel: Channel, scale: float) -> GateSettings:
     filled: dict[str, float] = {}
     if given.max_change_offset is None:
         filled["max_change_offset"] = MAX_CHANGE_OFFSET_MPS2 * scale
-    if "least_determined" not in given.model_fields_set:
+    if given.least_determined is None:
         filled["least_determined"] = FIXED_MOUNT_LEAST if channel.fixed_mount else len(PARAMETERS)
     return given.model_copy(update=filled)
 

@@ -165,10 +165,11 @@ class Gate:
     ) -> Decision:
         """The window goes into the state; whether S and Q in force follow is for the policy and what is determined."""
         determined = int(np.count_nonzero(calibration.determined))
-        if not self._calibrated and determined < self._settings.least_determined:
+        least = self._settings.least_determined or 1
+        if not self._calibrated and determined < least:
             missing = [p for p, known in zip(PARAMETERS, calibration.determined, strict=True) if not known]
             self._settling = 0  # nothing in force that could settle
-            numbers |= {"determined": determined, "determined_threshold": self._settings.least_determined}
+            numbers |= {"determined": determined, "determined_threshold": least}
             return self._decision(action, f"not determined yet: {', '.join(missing)}", numbers)
         if self._settings.policy == "propose":
             return self._decision(action, f"{reason}; waits for an operator", numbers, proposal=calibration)

@@ -32,7 +32,10 @@ class GateSettings(Section):
     # One quiet window is consistent with everything; so many in a row are needed to dismiss the held ones.
     dismiss_windows: Annotated[int, Field(ge=1, le=100)] = 3
     settle_windows: Annotated[int, Field(ge=1, le=1000, description="RECALIBRATING after a confirmed jump")] = 5
-    least_determined: Annotated[int, Field(ge=1, le=12, description="parameters, before a first one is in force")] = 1
+    # Left out: all twelve, at a fixed mount what its excitation can tell.
+    least_determined: Annotated[
+        int | None, Field(ge=1, le=12, description="parameters, before a first one is in force")
+    ] = None
 
 
 class DriftOptions(Section):
