@@ -236,6 +236,7 @@ unit = "m/s2"
 serial_number = "R1"
 [[channels]]
 sensor = "{SENSOR}"
+prior = {{}}
 guard_s = {GUARD_S}
 silence_s = {5 * speed}
 poses = [{poses}]
