@@ -161,7 +161,7 @@ def _words(became: Counter[str]) -> str:
 
 
 def at_starts(directory: Path, starts: int) -> Outcome:
-    """The real agent is started on a state file with a flipped bit, its recordings beside it."""
+    """The real agent is started on a state file with a flipped bit beside the recordings, which know what it was."""
     bits = random.Random(SEED)
     data_dir = _recorded(directory, RUN_S)
     whole = (data_dir / FILE_NAME).read_bytes()
@@ -182,7 +182,7 @@ def at_starts(directory: Path, starts: int) -> Outcome:
             verdict = _begun(r.data_dir, before)
             if "Traceback" in r.output or status not in (0, 1):
                 verdict = f"crash, exit status {status}"
-            if verdict.startswith(("crash", "silently")):
+            if verdict != "restored":
                 words.append(f"bit {bit}: {verdict}")
             became[verdict] += 1
     outcome = Outcome(

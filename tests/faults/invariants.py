@@ -60,12 +60,17 @@ class Ledger:
         self.findings = Findings()
         self._seen: dict[int, bytes] = {}
         self._lost: set[int] = set()
+        self._aside: set[Path] = set()
         self._replayed: dict[str, int] = {}
         self.records: list[Record] = []
 
     def inspect(self, witnessed: Iterable[Received] = ()) -> None:
         """Look at the store and at what is new among the recordings. No agent may be running."""
         found = self.findings
+        for path in {*self.data_dir.glob(f"{FILE_NAME}.corrupt-*")} - self._aside:
+            self._aside.add(path)
+            found.unreadable += 1
+            found.say(f"{path.name}: set aside at a start")
         try:
             self.records = read_store(self.data_dir)
         except StoreError as error:
@@ -153,8 +158,9 @@ def read_store(data_dir: Path) -> list[Record]:
     """
     with tempfile.TemporaryDirectory() as name:
         copy = Path(name)
-        for path in data_dir.glob(f"{FILE_NAME}*"):
-            if path.suffix != ".sqlite-shm":  # made anew, as after a power cut
+        for end in ("", "-wal", "-journal"):  # the fourth, -shm, is made anew, as after a power cut
+            path = data_dir / f"{FILE_NAME}{end}"
+            if path.exists():
                 shutil.copy(path, copy)
         if not (copy / FILE_NAME).exists():
             return []  # killed before there was one
@@ -162,8 +168,6 @@ def read_store(data_dir: Path) -> list[Record]:
         store.close()
         if store.set_aside is not None:
             raise StoreError(f"{data_dir / FILE_NAME}: corrupt")
-        if aside := list(copy.glob(f"{FILE_NAME}.corrupt-*")):
-            raise StoreError(f"set aside at a start: {aside[0].name}")
         with History(copy / FILE_NAME) as history:
             return history.after(-1, limit=10_000_000)
 

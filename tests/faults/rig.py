@@ -167,16 +167,16 @@ class Rig:
         return self.device.has_reader() and f"{SENSOR}: " in self.output[self._said :]
 
     def run(
-        self, process: subprocess.Popen[bytes], seconds: float = float("inf"), until: Callable[[], bool] = never
+        self, process: subprocess.Popen[bytes], seconds: float | None = None, until: Callable[[], bool] = never
     ) -> bool:
         """Let the agent work for so long or `until` that holds; the rests begin when it opens its port, if silent.
 
-        False where it ended before.
+        False where it ended before. Without `seconds`, `until` must come.
         """
-        end_s = time.monotonic() + min(seconds, GIVE_UP_S)
+        end_s = time.monotonic() + (GIVE_UP_S if seconds is None else seconds)
         while process.poll() is None and not until():
             if time.monotonic() >= end_s:
-                assert seconds < GIVE_UP_S, f"it does not get there: {self.output[-2000:]}"
+                assert seconds is not None, f"it does not get there: {self.output[-2000:]}"
                 break
             if not self.sensor.speaks and self._opened():
                 self.sensor.begin(self.speed * time.monotonic())

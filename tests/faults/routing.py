@@ -35,6 +35,7 @@ def away(directory: Path, results: int, speed: int) -> Outcome:
     with rig(directory, SEED, endpoint=endpoint, speed=speed) as r, r.agent() as agent:
         lives = r.run(agent, results / LEAST_A_SECOND, until=lambda: _kept(r) >= results)
         waiting = _kept(r)
+        assert waiting >= results, r.output[-500:]
         first = read_store(r.data_dir)[0].sequence
         witness = None
         try:
