@@ -1,4 +1,4 @@
-"""Keeps docs/performance.md, docs/online.md and docs/reliability.md: each benchmark owns the part between its two markers."""
+"""Keeps pages of figures under docs/: each benchmark owns the part between its two markers."""
 
 from __future__ import annotations
 

@@ -126,6 +126,7 @@ def _config(bench: Bench, directory: Path, speed: int, port: int) -> str:
     )
     lines.append(
         f'[[channels]]\nsensor = "sensor"\nreference = "reference"\nposes = [{poses}]\n'
+        f"prior = {{ sensitivity = {bench.parameters.sensor.nominal_sensitivity} }}\n"
         # A pause of the machine is 20 times as long on the fast clock.
         f"silence_s = {30 * speed}\nlate_horizon_s = 60\n"
         f"poses_repeat_s = {bench.parameters.schedule.period_s}"
