@@ -43,6 +43,8 @@ SETTLE_S = 0.5  # a reader throws away what came before its port was set up
 # quarter is left out, in which caches, windows and clock models fill.
 FLAT = 1.02
 ENDPOINT = "tcp/127.0.0.1:{port}"
+# By size alone: a file begins by the agent's clock and ages by the drivers', which is ahead of it.
+ROTATION = "[recording]\nrotate_s = 86400\nrotate_bytes = 2097152"
 ROLES: tuple[Role, ...] = ("sensor", "reference")
 
 
@@ -115,7 +117,7 @@ def soak(hours: float, speed: int, rate_hz: int, port: int) -> Soaked:
 
 def _config(bench: Bench, directory: Path, speed: int, port: int) -> str:
     driver = "serial-csv" if speed == 1 else "serial-csv-fast"
-    lines = [f'[zenoh]\nconnect = ["{ENDPOINT.format(port=port)}"]', "[recording]\nrotate_bytes = 2097152"]
+    lines = [f'[zenoh]\nconnect = ["{ENDPOINT.format(port=port)}"]', ROTATION]
     for role in ROLES:
         options = serial_options(bench, role) | {"port": str(directory / role), "serial_number": "soak"}
         table = ", ".join(f"{key} = {json.dumps(value)}" for key, value in options.items())

@@ -241,6 +241,8 @@ guard_s = {GUARD_S}
 silence_s = {5 * speed}
 poses = [{poses}]
 poses_repeat_s = {len(UP) * HOLD_S}
+[recording]
+rotate_s = 86400  # a file begins by the agent's clock and ages by the driver's, which is ahead of it
 [zenoh]
 {connect}
 """
