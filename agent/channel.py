@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -13,6 +12,7 @@ from agent.config import Channel
 from agent.corrected import acceleration_block
 from agent.estimation import DAY_S, Estimation, Judged
 from agent.events import Acceleration, CalibrationUpdate, Command, DeviceChange, Estimate, Output, Result, Tick
+from agent.identity import identity_of, nominal_of
 from agent.operators import CommandError, answer, commanded_pose
 from agent.outcome import (
     Source,
@@ -30,8 +30,6 @@ from calib.model import Pose, Window
 from calib.timing import HORIZON_S
 from hw.block import SampleBlock
 
-# Ports and speeds name the way to a device, not the device: they may change without the calibration losing its sense.
-WAYS = frozenset({"port", "baud_rate", "bus"})
 REFUSED_IN_A_ROW = 3
 LAG_TURNS = 4  # a lag is found, taken out, looked for again: each turn leaves a thousandth
 # A run that begins long after the one before ended: more is a clock that was wrong, and everything has wandered anyway.
@@ -163,7 +161,7 @@ class ChannelState:
             self.identity, self._unit, self._in_force = identity, info["unit"], None
             self._status = "" if self._status == "INVALID" else self._status  # the one that was silent is another
             try:
-                self._nominal = _nominal_of(info)
+                self._nominal = nominal_of(info)
                 self._estimation = Estimation(self._channel, self._nominal)
             except ValueError as error:
                 self._estimation = None
@@ -384,21 +382,6 @@ class ChannelState:
         self._now_ns = state["now_ns"]
         self._utc_minus_monotonic_ns = state["utc_minus_monotonic_ns"]
         self._plan()
-
-
-def identity_of(info_json: str) -> str:
-    """Who a device is and how it is set: a calibration holds for this and nothing else."""
-    info = json.loads(info_json)
-    settings = {k: v for k, v in info["settings"].items() if k not in WAYS}
-    held = [info["driver"], info["kind"], info["serial_number"], info["unit"], info["axes"], sorted(settings.items())]
-    digest = hashlib.sha256(json.dumps(held).encode()).hexdigest()[:12]
-    return " ".join(part for part in (info["kind"], info["serial_number"], digest) if part)
-
-
-def _nominal_of(info: Mapping[str, Any]) -> float | None:
-    """What the device's data sheet says of its sensitivity; one that tells m/s2 has 1."""
-    nominal = info["nominal_sensitivity"]
-    return 1.0 if nominal is None and info["unit"] == "m/s2" else nominal
 
 
 def _plain(update: CalibrationUpdate | None) -> dict[str, Any] | None:

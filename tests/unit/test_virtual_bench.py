@@ -7,8 +7,8 @@ from dataclasses import asdict
 
 import pytest
 
-from agent.channel import identity_of
 from agent.cli import run_cli
+from agent.identity import identity_of
 from agent.run import virtual_bench
 from hw.sensor import load_driver
 
