@@ -43,9 +43,13 @@ def excited(window: Window) -> Excitation:
     own = _own_power(power, noise[0])
     live = own > 0.0
     share = float(np.max(noise[0][live] / own[live], initial=0.0))
-    reduced = _reduced(window, live, noise)
-    basis, _ = np.linalg.qr(reduced.pose.direction[:, np.flatnonzero(live)])
-    return Excitation(reduced, basis, CORRECTION_SHARE * share)
+    along = _along(power, live)
+    # What a silent channel shows of another's motion turns the direction where it is more than noise and trifles.
+    shown = along**2 @ np.where(live, power.diagonal(), 0.0)
+    askew = shown > np.maximum(OF_STRONGEST * power.diagonal().max(initial=0.0), OVER_NOISE * noise[0])
+    turned = window.pose.direction + window.pose.direction @ np.where(askew[:, None], along, 0.0)
+    basis, _ = np.linalg.qr(turned[:, np.flatnonzero(live)])
+    return Excitation(_reduced(window, live, along, noise), basis, CORRECTION_SHARE * share)
 
 
 def _own_power(power: Array, noise: Array) -> Array:
@@ -65,7 +69,15 @@ def _own_power(power: Array, noise: Array) -> Array:
     return own
 
 
-def _reduced(window: Window, live: NDArray[np.bool_], noise: Array) -> Window:
+def _along(power: Array, live: NDArray[np.bool_]) -> Array:
+    """(m, m) how much of each live channel (column) every silent one (row) moves along with."""
+    along = np.zeros_like(power)
+    if live.any():
+        along[np.ix_(~live, live)] = np.linalg.solve(power[np.ix_(live, live)], power[np.ix_(live, ~live)]).T
+    return along
+
+
+def _reduced(window: Window, live: NDArray[np.bool_], along: Array, noise: Array) -> Window:
     sums, pose, m = window.sums, window.pose, len(live)
     both = np.concatenate([live, live, [True] * 3])
     scatter = np.where(np.outer(both, both), sums.scatter, 0.0)
@@ -75,11 +87,6 @@ def _reduced(window: Window, live: NDArray[np.bool_], noise: Array) -> Window:
             scatter[:, at + k, at + k] = own - np.minimum(sums.count * power[k], MOST_NOISE * own)
     if live.all():
         return replace(window, sums=replace(sums, scatter=scatter))
-    total = sums.scatter.sum(axis=0)
-    along = np.zeros((m, m))
-    if live.any():
-        own = total[:m, :m]
-        along[np.ix_(~live, live)] = np.linalg.solve(own[np.ix_(live, live)], own[np.ix_(live, ~live)]).T
     mean = sums.count @ sums.mean[:, :m] / sums.count.sum()
     direction = np.where(live, pose.direction + pose.direction @ along, 0.0)
     # The means of silent channels (gravity, where the reference feels it) are still felt.
