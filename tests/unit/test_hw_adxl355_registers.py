@@ -111,7 +111,7 @@ def refusal(**options: object) -> str:
 def test_a_bus_that_is_too_slow_is_refused_with_the_arithmetic() -> None:
     # 9 bytes x 9 bit x 1000 Hz + 12 bytes x 9 bit x 125 polls/s = 94.5 kbit/s
     assert "94.5 kbit/s, 94% of bus_khz 100; at most 70%" in refusal(bus_khz=100.0)
-    assert "360 kbit/s" in refusal(rate_hz=4000.0)
+    assert "378 kbit/s" in refusal(rate_hz=4000.0)
     assert Adxl355Options(rate_hz=4000.0, bus_khz=1000.0).interval_s == pytest.approx(0.002)
     assert Adxl355Options(rate_hz=500.0, bus_khz=100.0).interval_s == pytest.approx(0.016)
 
