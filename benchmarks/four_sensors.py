@@ -62,7 +62,7 @@ def configuration(directory: Path) -> str:
             for p in schedule.poses(schedule.duration_s(1))
         ]
         lines += ["[[channels]]", f"sensor = 'mems-{i}'", f"reference = 'reference-{bench_of(i)}'"]
-        lines += [f"poses_repeat_s = {schedule.period_s}", f"poses = [{', '.join(poses)}]"]
+        lines += ["prior = {}", f"poses_repeat_s = {schedule.period_s}", f"poses = [{', '.join(poses)}]"]
     return "\n".join(lines) + "\n"
 
 

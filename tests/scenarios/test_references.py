@@ -50,7 +50,7 @@ def calibrated(reference: str, **channel: Any) -> CalibrationUpdate:
     devices = {role: build(machine, role=role, reference=reference) for role, machine in machines.items()}
     config = {
         "devices": [{"name": role, "driver": "virtual", "options": {"role": role}} for role in devices],
-        "channels": [{"sensor": "sensor", "reference": "reference"} | channel],
+        "channels": [{"sensor": "sensor", "reference": "reference", "prior": {}} | channel],
     }
     pipeline = Pipeline.begin(parse_config(config, "test"), "run", 0, 0, {})
     results: list[Result] = []
@@ -78,7 +78,7 @@ POSES = {
     ("reference", "channel"),
     [
         ("preset", POSES),
-        ("vibrometer", POSES | {"reference_quantity": "velocity"}),
+        ("vibrometer", POSES | {"certificate": {"quantity": "velocity"}}),
         ("tri-axial", {"rotation": ROTATION.ravel().tolist()}),
     ],
 )
@@ -86,7 +86,6 @@ def test_s_and_q_are_found(reference: str, channel: dict[str, Any]) -> None:
     update = calibrated(reference, **channel)
     truth = plain(1).sensor
     error = np.array(update.sensitivity) / truth.nominal_sensitivity - truth.sensitivity / truth.nominal_sensitivity
-    # Without a fault on the bench 0.1 % is ten times what the noise leaves; a wrong unit, axis or phase costs far more.
-    assert np.abs(error).max() < 1e-3
-    # 0.01 m/s2: 1 mg, where the offset is 10 to 50
-    assert np.abs(np.array(update.offset) - truth.offset).max() < 0.01 * truth.nominal_sensitivity
+    # Angles are known to 0.2 deg, the reference to 0.1 %, offsets to 0.05 m/s2: a wrong unit, axis or phase costs more.
+    assert np.abs(error).max() < 3e-3
+    assert np.abs(np.array(update.offset) - truth.offset).max() < 0.05 * truth.nominal_sensitivity

@@ -6,12 +6,13 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
-from agent.config import Config
-from agent.events import CalibrationUpdate, DeviceChange, Event, RunStart
+from agent.events import CalibrationUpdate, DeviceChange, Event
 from agent.pipeline import Pipeline
 from agent.recording.device import Replay, ReplayOptions
 from agent.recording.reading import RecordingReader
-from tests.unit.recorded_bench import record
+from hw.virtual.bench import Bench
+from hw.virtual.presets import plain
+from tests.unit.recorded_bench import EPOCH_NS, _config, record
 
 START_NS = 500 * 10**9
 
@@ -22,7 +23,7 @@ class Machine:
     t_ns = START_NS
 
     def clock(self) -> tuple[int, int]:
-        return self.t_ns, self.t_ns
+        return self.t_ns, self.t_ns - START_NS + EPOCH_NS
 
     def sleep(self, seconds: float) -> None:
         self.t_ns += round(seconds * 1e9)
@@ -33,7 +34,7 @@ def played(path: Path, name: str) -> list[Event]:
     device = Replay(name, ReplayOptions(recordings=(path,)), clock=machine.clock, sleep=machine.sleep)
     info = json.dumps(asdict(device.open()))
     events: list[Event] = [
-        DeviceChange(device=name, state="open", t_monotonic_ns=START_NS, t_utc_ns=START_NS, info_json=info)
+        DeviceChange(device=name, state="open", t_monotonic_ns=START_NS, t_utc_ns=EPOCH_NS, info_json=info)
     ]
     while (block := device.read_block()) is not None:
         events.append(block)
@@ -44,11 +45,9 @@ def test_the_same_calibrations_come_out(tmp_path: Path) -> None:
     record(tmp_path, 57.0)
     (path,) = tmp_path.glob("*.mcap")
     steps = list(RecordingReader(path).steps())
-    start = steps[0].event
-    assert isinstance(start, RunStart)
     recorded = [result for step in steps for result in step.results if isinstance(result, CalibrationUpdate)]
 
-    pipeline = Pipeline.begin(Config.model_validate_json(start.config_json), "again", START_NS, 0, {})
+    pipeline = Pipeline.begin(_config(Bench(plain(7), 7)), "again", START_NS, 0, {})
     events = sorted([*played(path, "mems"), *played(path, "reference")], key=lambda event: event.t_monotonic_ns)
     results = [result for event in events for result in pipeline.step(event)]
     again = [result for result in results if isinstance(result, CalibrationUpdate)]
