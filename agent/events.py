@@ -132,7 +132,7 @@ class CalibrationUpdate(msgspec.Struct, frozen=True, kw_only=True):
     coverage_factor: float
     determined: list[bool]
     method: str
-    uncertainty_kind: str  # "type A, white" until the adjustment is in force
+    uncertainty_kind: str
     windows: int
     residual_sd: list[float]  # per output axis, output unit
     output_unit: str

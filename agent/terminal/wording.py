@@ -8,7 +8,6 @@ import numpy as np
 
 from agent.events import CalibrationUpdate, DriftReport, Estimate, Result, StatusChange, WindowReport
 from agent.terminal.quantity import plus_minus, size
-from calib.method3 import PLAIN
 from calib.model import Array
 
 if TYPE_CHECKING:
@@ -80,9 +79,8 @@ def truth_line(calibration: CalibrationUpdate, truth: Truth) -> str:
     error[~found[:9].reshape(3, 3)] = np.nan
     q = np.where(found[9:], (np.array(calibration.offset) - truth.offset) / main, np.nan)
     main_error, transverse = np.diag(error), error[~np.eye(3, dtype=bool)]
-    whose = "plain Method 3 is " if calibration.method == PLAIN else ""
     return (
-        f"{whose}off the truth by at most: S main {_largest(main_error, 3)} %, transverse {_largest(transverse, 3)} %,"
+        f"off the truth by at most: S main {_largest(main_error, 3)} %, transverse {_largest(transverse, 3)} %,"
         f" Q {_largest(q, 4)} m/s²"
     )
 

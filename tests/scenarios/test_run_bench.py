@@ -112,7 +112,7 @@ def test_ctrl_c_ends_it_in_two_seconds_with_files_closed(run: Run) -> None:
 
 def test_output_says_what_was_found_published_and_recorded(run: Run) -> None:
     assert "Traceback" not in run.output
-    for part in ("fieldcal/v1/virtual/bench", "fieldcal-000001.mcap", "type A, white", "VALID"):
+    for part in ("fieldcal/v1/virtual/bench", "fieldcal-000001.mcap", "combined", "VALID"):
         assert part in run.output, part
 
 
