@@ -43,6 +43,10 @@ def test_documented_commands_run(page: Path, tmp_path: Path, data_dir: Path) -> 
         if words[0] == "make":
             targets = (ROOT / "Makefile").read_text()
             assert re.search(rf"^{re.escape(words[1])}:", targets, re.MULTILINE), line
+        elif words[:3] == ["python", "-m", "pytest"]:
+            assert all((ROOT / word).exists() for word in words[3:] if "/" in word), line
+        elif words[:3] == ["sudo", "apt-get", "install"]:
+            continue  # what a machine is given is not ours to run
         elif words[0] == "fieldcal":
             run_command(words[1:], tmp_path, line)
         else:
