@@ -71,6 +71,10 @@ def audit(files: tuple[Path, ...], public_key: Path | None, strict: bool, json_t
     except (KeyFileError, StoreError) as error:
         click.echo(str(error), err=True)
         return 2
+    if not given.paths and not given.up_to:
+        # Where there were recordings once, all of them being gone is for the audit to say.
+        click.echo(f"{files[0]}: no recordings are there", err=True)
+        return 2
     start = first_event(given.paths[0]) if given.paths else None
     if start is not None:
         compute_as(start.fingerprint)

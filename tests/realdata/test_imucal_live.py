@@ -17,6 +17,7 @@ from tests.realdata.test_calibrate_imucal import as_files
 from tests.scenarios.processes import fieldcal, interrupt, recordings, results, started, wait_until
 
 WITHIN = 1e-3  # of the row's main sensitivity: guards leave out 0.2 s of each rest, imucal takes all of it
+NOMINAL = 208.0  # counts per m/s2, as a data sheet of 2048 per g rounds it
 CONFIG = """
 [gateway]
 site = "test"
@@ -66,7 +67,7 @@ def test_played_over_a_port_the_agent_finds_what_imucal_found(tmp_path: Path, ro
         f"  {{ start_s = {start:.6f}, stop_s = {stop:.6f}, gravity_mps2 = {gravity} }},"
         for start, stop, *gravity in rests.tolist()
     )
-    config.write_text(CONFIG.format(port=port, poses=poses, endpoint=router))
+    config.write_text(CONFIG.format(port=port, poses=poses, endpoint=router, nominal=NOMINAL))
     playing = ("simulate", "--play", tmp_path / "sensor.csv", "--sequence", "--link", port)
     with started(*playing, output=tmp_path / "playing"):
         wait_until(port.is_symlink, 20, "the port")
