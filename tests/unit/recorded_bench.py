@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -25,11 +26,11 @@ BLOCK, BURST = 500, 25
 PRIOR = {"sensitivity": COUNTS_PER_MPS2}
 
 
-def record(data_dir: Path, duration_s: float, seed: int = 7, run_id: str = "run-1") -> Truth:
+def record(data_dir: Path, duration_s: float, seed: int = 7, run_id: str = "run-1", **channel: Any) -> Truth:
     """Record the plain preset's first `duration_s` into a data directory with store and one recording."""
     data_dir.mkdir(parents=True, exist_ok=True)
     bench = Bench(plain(seed), seed)
-    config = _config(bench)
+    config = _config(bench, **channel)
     pipeline = Pipeline.begin(config, run_id, 0, 0, {})
     recorder, store = Recorder(data_dir, ["mems", "reference"], ["mems"]), Store(data_dir, 0)
     start = RunStart(
@@ -41,15 +42,16 @@ def record(data_dir: Path, duration_s: float, seed: int = 7, run_id: str = "run-
     assert recorder.path is not None
     name = recorder.path.name.removesuffix(".active")
     for number, event in enumerate(_events(bench, duration_s), start=1):
-        results: list[Result] = pipeline.step(event)
+        results = pipeline.step(event)
         assert recorder.record(number, event, results)
-        store.commit([Record.of(result, recorded=True, recording=name) for result in results])
+        kept = [r for r in results if isinstance(r, Result)]
+        store.commit([Record.of(r, recorded=True, recording=name) for r in kept], pipeline.memories(results))
     recorder.close()
     store.close()
     return bench.truth
 
 
-def _config(bench: Bench) -> Config:
+def _config(bench: Bench, **channel: Any) -> Config:
     poses = [
         {"start_s": p.start_s, "stop_s": p.stop_s, "theta_deg": p.theta_deg, "alpha_deg": p.alpha_deg}
         for p in bench.poses
@@ -61,7 +63,7 @@ def _config(bench: Bench) -> Config:
             {"name": "mems", "driver": "serial-csv", "options": port | {"axes": 3}},
             {"name": "reference", "driver": "serial-csv", "options": port | {"axes": 1, "unit": "m/s2"}},
         ],
-        "channels": [{"sensor": "mems", "reference": "reference", "prior": PRIOR, "poses": poses}],
+        "channels": [{"sensor": "mems", "reference": "reference", "prior": PRIOR, "poses": poses, **channel}],
         "zenoh": {"enabled": False},
     }
     return parse_config(raw, "bench")
