@@ -32,6 +32,5 @@ def building_config(building: Building, **keys: Any) -> Config:
         "every_s": p.every_s,
         "guard_s": p.lead_s if p.every_s else 0.5,
     }
-    return parse_config(
-        {"devices": devices, "channels": [channel | {"prior": {}} | keys], "zenoh": {"enabled": False}}, "building"
-    )
+    raw = {"devices": devices, "channels": [channel | {"prior": {}} | keys], "zenoh": {"enabled": False}}
+    return parse_config(raw, "building")

@@ -20,11 +20,15 @@ RATE_HZ = 100.0
 
 @dataclass(frozen=True, slots=True)
 class Stated:
-    """Standard uncertainties that the operator writes down; the faults are drawn from them."""
+    """Standard uncertainties that the operator writes down; the faults are drawn from them.
 
-    main_pct: float = 2.0
-    transverse_pct: float = 1.0
-    offset_mps2: float = 0.2
+    So small that five of them are within max_change: a sensor that differs by more from its certificate is held by
+    rule, and no matter of statistics.
+    """
+
+    main_pct: float = 1.0
+    transverse_pct: float = 0.5
+    offset_mps2: float = 0.05
     rotation_deg: float = 0.2
     reference_pct: float = 0.1
     lag_s: float = 0.002
