@@ -13,6 +13,8 @@ import numpy as np
 
 from calib.model import Array
 
+ALIKE = 1e-10  # of unit vectors: directions of the factor closer than this are one
+
 
 class JointState:
     """Named quantities with their joint covariance. Methods change it in place."""
@@ -68,10 +70,26 @@ class JointState:
 
     def replace(self, where: slice, mean: Array, covariance: Array) -> None:
         """Give some quantities this mean and covariance, independent of all others from now on."""
+        self._replace(where, mean, np.zeros((len(mean), len(self))), covariance)
+
+    def restate(self, where: slice, mean: Array, covariance: Array) -> None:
+        """Give some quantities this mean and covariance; what they share with the others they go on sharing.
+
+        Else a reference's error that is in them would count as a new one, and average out. Where they share more than
+        `covariance` has room for, they keep that much.
+        """
+        others = np.delete(self.factor, where, axis=0)
+        length = np.linalg.norm(others, axis=1)
+        others = others[length > 0.0] / length[length > 0.0, None]
+        shared = self.factor[where] @ np.linalg.pinv(others, rcond=ALIKE) @ others
+        self._replace(where, mean, shared, covariance - shared @ shared.T)
+
+    def _replace(self, where: slice, mean: Array, shared: Array, covariance: Array) -> None:
+        """`shared` (k, N) is what is left of the factor's rows, `covariance` comes to it."""
         values, ways = np.linalg.eigh(covariance)
         own = np.zeros((len(self), len(mean)))
         own[where] = ways * np.sqrt(np.maximum(values, 0.0))
-        self.mean[where], self.factor[where] = mean, 0.0
+        self.mean[where], self.factor[where] = mean, shared
         self.factor = _square(np.hstack([self.factor, own]))
 
     def correct(self, step: Array, gain: Array, jacobian: Array, noise: Array) -> None:

@@ -189,14 +189,19 @@ class Recursion:
         self._keep_positions(summary.pose.position)
         self.windows += 1
 
-    def loosen(self, standard_uncertainty: Array, tilt_rad: float = 0.0) -> None:
-        """Something changed: S and Q (12,) may be off by as much more from now on, and a fixed mount be tilted."""
+    def loosen(self, standard_uncertainty: Array, tilt_rad: float = 0.0, *, lag: bool = False) -> None:
+        """Something changed: S and Q (12,) may be off by as much more from now on, and a fixed mount be tilted.
+
+        `lag`: the lag may be another as well, as after a device or its line began anew.
+        """
         self._absorb(len(self._recent))
         variance = np.zeros(len(self._state))
         variance[:12] = standard_uncertainty**2
         for k, name in enumerate(self._state.names):
             if name.startswith("gravity_") and self._fixed:
                 variance[k] = tilt_rad**2
+            elif name == "lag" and lag:
+                variance[k] = self._priors.lag_s**2
         self._state.spread(variance)
         self._base = self._state.copy()
 
@@ -206,10 +211,11 @@ class Recursion:
         self._drop([n for n in self._state.names if n.startswith(("reference", "lag", "rotation_"))])
 
     def put(self, calibration: Calibration) -> None:
-        """S and Q as an operator wants them, with their covariance; independent of the nuisances from then on."""
+        """S and Q as an operator wants them, with their covariance; what the nuisances are in them, they stay."""
         self._absorb(len(self._recent))
+        self._state.mean[:12], self._state.factor[:12] = self._parameters_factor()
         values = np.append(calibration.sensitivity.ravel(), calibration.offset)
-        self._state.replace(slice(0, 12), values, calibration.covariance)
+        self._state.restate(slice(0, 12), values, calibration.covariance)
         self._held = None  # Q itself is known again; the next window of a fixed mount makes the mean output of it
         self._base = self._state.copy()
         self._point = self._state.mean.copy()
@@ -220,6 +226,7 @@ class Recursion:
         other.__dict__.update(self.__dict__)
         other._state, other._base = self._state.copy(), self._base.copy()
         other._recent, other._positions = list(self._recent), list(self._positions)
+        other._point, other._bound = self._point.copy(), self._bound.copy()
         return other
 
     # --- inside
@@ -249,7 +256,7 @@ class Recursion:
         if not self._fixed or self._held is not None or not np.isfinite(summary.held_mps2).all():
             return
         held, terms = held_at(summary, self._priors)
-        u = self._mean_output_u(summary.held_mps2)
+        u = self._mean_output_u(held, {term.name: term.uncertainty for term in terms})
         for state in (self._state, self._base):
             S = state.mean[:9].reshape(3, 3)
             state.replace(slice(9, 12), state.mean[9:12] + S @ summary.held_mps2, np.diag(u**2))
@@ -259,10 +266,12 @@ class Recursion:
             self._append(term.name, term.expected, term.uncertainty)
         self._held = held
 
-    def _mean_output_u(self, held_mps2: Array) -> Array:
-        """(3,) standard uncertainty of the mean output before any data: of Q and S, and never the less for them."""
-        variance = self._state.variance
-        return np.sqrt(variance[9:12] + variance[:9].reshape(3, 3) @ held_mps2**2)
+    def _mean_output_u(self, held: Held, u_terms: Mapping[str, float]) -> Array:
+        """(3,) standard uncertainty of the mean output before any data: of Q, S and tilt; never the less for them."""
+        variance, S = self._state.variance, self._state.mean[:9].reshape(3, 3)
+        felt = variance[9:12] + variance[:9].reshape(3, 3) @ held.mps2**2
+        tilted = sum((S @ moves * u_terms[name]) ** 2 for name, moves in held.by.items())
+        return np.sqrt(felt + tilted)
 
     def _append(self, name: str, mean: float, u: float) -> None:
         if name not in self._state.names:
