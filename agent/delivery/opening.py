@@ -5,7 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import sqlite3
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 
 from agent.delivery.history import connect_read_only
@@ -52,6 +52,7 @@ def open_or_set_aside(path: Path) -> tuple[Path | None, sqlite3.Connection]:
     """
     if not path.exists():
         return None, _open(path)
+    _roll_back(path)
     if not _is_damaged(path):
         try:
             return None, _open(path)
@@ -61,11 +62,19 @@ def open_or_set_aside(path: Path) -> tuple[Path | None, sqlite3.Connection]:
     number = 1
     while (aside := path.with_name(f"{path.name}.corrupt-{number}")).exists():
         number += 1
-    for end in ("-wal", "-shm", ""):
+    for end in ("-wal", "-shm", "-journal", ""):
         source = path.with_name(path.name + end)
         if source.exists():
             source.rename(path.with_name(f"{source.name}.corrupt-{number}"))
     return aside, _open(path)
+
+
+def _roll_back(path: Path) -> None:
+    """Undo what a kill left half done before the file had its log: reading alone may not do that, and would refuse."""
+    if not path.with_name(path.name + "-journal").exists() or path.with_name(path.name + "-wal").exists():
+        return
+    with closing(sqlite3.connect(path, timeout=5.0)) as connection, suppress(sqlite3.Error):  # `_is_damaged` tells why
+        version_of(connection)
 
 
 def _is_damaged(path: Path) -> bool:

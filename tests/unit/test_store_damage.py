@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 import shutil
 import sqlite3
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -89,3 +89,32 @@ def test_a_value_that_changed_within_a_sound_page_is_found(sound: Path, tmp_path
     store = Store(tmp_path, 0)
     assert store.set_aside is not None
     store.close()
+
+
+def test_what_a_kill_left_half_written_is_rolled_back(sound: Path, tmp_path: Path) -> None:
+    right = said(sound)
+    half = tmp_path / "half"
+    shutil.copytree(sound.parent, half)
+    with closing(sqlite3.connect(half / FILE_NAME, isolation_level=None)) as connection:
+        connection.execute("PRAGMA journal_mode = DELETE")
+        connection.execute("PRAGMA cache_size = 1")  # page; what changes reaches the file before it is committed
+        connection.execute("BEGIN IMMEDIATE")
+        connection.execute("UPDATE results SET payload = zeroblob(5000)")
+        killed = tmp_path / "killed"
+        shutil.copytree(half, killed)
+    assert (killed / FILE_NAME).read_bytes() != sound.read_bytes()
+    assert (killed / f"{FILE_NAME}-journal").stat().st_size > 0
+    store = Store(killed, 0)
+    store.close()
+    assert store.set_aside is None
+    assert said(killed / FILE_NAME) == right
+
+
+def test_the_journal_of_a_store_that_is_set_aside_goes_with_it(tmp_path: Path) -> None:
+    (tmp_path / FILE_NAME).write_bytes(b"a store no more, and longer than a header" * 5)
+    (tmp_path / f"{FILE_NAME}-journal").write_bytes(b"nor a journal")
+    (tmp_path / f"{FILE_NAME}-wal").write_bytes(b"nor a log")
+    store = Store(tmp_path, 0)
+    store.close()
+    assert store.set_aside is not None
+    assert (tmp_path / f"{FILE_NAME}-journal.corrupt-1").read_bytes() == b"nor a journal"
