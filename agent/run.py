@@ -87,7 +87,7 @@ def serve(config: Config, data_dir: Path, watch: Any, duration_s: float | None) 
         click.echo(f"fieldcal run: {error}", err=True)
         return 1
     if not ended:
-        # A router that is frozen holds Zenoh's thread; store and files are closed, and nobody can wait for it.
+        # A router that is frozen holds Zenoh's thread, or a disk the recording's; nobody can wait for it.
         watch.__exit__()
         sys.stdout.flush()
         os._exit(0)

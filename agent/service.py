@@ -57,7 +57,7 @@ class Service:
     def run(self, duration_s: float | None) -> bool:
         """Read, calibrate, record and publish until stopped or `duration_s` is over.
 
-        Returns whether all threads have ended; where a frozen router holds one, the process must end by `os._exit`.
+        Returns whether all threads have ended; where a frozen router or disk holds one, `os._exit` must end the process.
         Raises StoreError or OSError where the data directory cannot be used at all, KeyFileError for a bad signing key.
         """
         self._data_dir.mkdir(parents=True, exist_ok=True)
@@ -102,10 +102,11 @@ class Service:
             for reader in readers:
                 if reader.ident is not None:
                     reader.join(max(0.0, deadline - time.monotonic()))
-            writer.close()
+            recorded = writer.close()
             ended = self._publisher.close() if self._publisher is not None else True
-            self._store.close()
-        return ended
+            if recorded:
+                self._store.close()
+        return ended and recorded
 
     def _publication(self) -> Publisher | None:
         if not self._config.zenoh.enabled:
@@ -202,7 +203,7 @@ class Service:
         self, event_sequence: int, results: Sequence[Result], recorded: bool, memories: Sequence[Memory]
     ) -> None:
         """In the recording's thread, when the disk has the results: store, then network."""
-        path = self._recorder.path
+        path = self._recorder.path if recorded else None
         records = [Record.of(r, recorded=recorded, recording=final_name(path) if path else "") for r in results]
         try:
             self._store.commit(records, memories)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import logging
+import math
 import queue
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 
 from agent.delivery.history import Memory
 from agent.events import Event, Output, Pruned, Result, RunStart
@@ -15,6 +18,11 @@ from agent.recording.writer import Recorder
 FLUSH_S = 2.0  # s; a power cut costs at most this much of the recording, for 11 % more disk than one long chunk
 LOOK_S = 10.0  # s; how often it is asked whether recordings are due to be deleted
 CAPACITY = 256  # events; half a minute of two devices and ticks, while a slow card takes its time
+# s; what waits for the disk when a run ends has this long. systemd kills after 10, and files are to be closed first.
+CLOSE_S = 4.0
+HANG_S = 4.0  # s; then for the one call it is in, the store and the end of the file; beyond, the disk does not answer
+
+_log = logging.getLogger(__name__)
 
 Deliver = Callable[[int, Sequence[Result], bool, Sequence[Memory]], None]
 
@@ -29,10 +37,14 @@ class RecordingThread:
     with `recorded` false, could not be); it must not raise. What is raised nevertheless comes out of the next `put`.
     """
 
-    def __init__(self, recorder: Recorder, deliver: Deliver, *, flush_s: float = FLUSH_S) -> None:
+    def __init__(
+        self, recorder: Recorder, deliver: Deliver, *, flush_s: float = FLUSH_S, close_s: float = CLOSE_S
+    ) -> None:
         self._recorder = recorder
         self._deliver = deliver
         self._flush_s = flush_s
+        self._close_s = close_s
+        self._give_up_at = math.inf
         self._queue: queue.Queue[Entry | None] = queue.Queue(CAPACITY)
         self._starts_sent = self._starts_done = 0
         self._pruning_sent = False
@@ -64,13 +76,23 @@ class RecordingThread:
             self._pruning_sent = True
         self._hand_over((event_sequence, event, recorded_ones(outputs), memories))
 
-    def close(self) -> None:
-        """Record what is waiting and finish the file."""
-        self._hand_over(None)
-        self._thread.join()
-        self._raise()
+    def close(self) -> bool:
+        """Record what is waiting, for `close_s` at most, and finish the file; nothing may be put any more.
 
-    def _hand_over(self, entry: Entry | None) -> None:
+        The results of what was not recorded are delivered as such. Returns whether the thread has ended: where the disk
+        does not answer it is left behind, and may still hold what `deliver` uses.
+        """
+        end = self._give_up_at = time.monotonic() + self._close_s
+        if self._thread.is_alive():
+            with suppress(queue.Full):  # then it does not wait for this word
+                self._queue.put(None, timeout=self._close_s)
+        self._thread.join(max(0.0, end - time.monotonic()) + HANG_S)
+        self._raise()
+        if self._thread.is_alive():
+            _log.error("the disk does not answer: the recording is left unfinished, %d events wait", self.waiting)
+        return not self._thread.is_alive()
+
+    def _hand_over(self, entry: Entry) -> None:
         while True:
             self._raise()
             try:
@@ -106,6 +128,9 @@ class RecordingThread:
                 continue
             if entry is None:
                 return
+            if time.monotonic() >= self._give_up_at:
+                self._give_up(entry)
+                return
             event_sequence, event, outputs, memories = entry
             recorded = self._recorder.record(event_sequence, event, outputs)
             results = [item for item in outputs if isinstance(item, Result)]
@@ -114,3 +139,18 @@ class RecordingThread:
                 self._pruning_sent = False
             if results:
                 self._deliver(event_sequence, results, recorded, memories)
+
+    def _give_up(self, entry: Entry) -> None:
+        """The results that wait, from `entry` on, at once: each alone would wait for the disk."""
+        waiting = [entry]
+        with suppress(queue.Empty):
+            while (following := self._queue.get_nowait()) is not None:
+                waiting.append(following)
+        results = [item for _, _, outputs, _ in waiting for item in outputs if isinstance(item, Result)]
+        _log.warning(
+            "the disk is too slow to record what waited: events %d to %d are not recorded, %d results are kept without",
+            entry[0], waiting[-1][0], len(results),
+        )  # fmt: skip
+        if results:
+            memories = [memory for _, _, _, memories in waiting for memory in memories]
+            self._deliver(waiting[-1][0], results, False, memories)

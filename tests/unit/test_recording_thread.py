@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -108,3 +109,58 @@ def test_results_that_could_not_be_recorded_are_delivered_as_such(tmp_path: Path
     thread.put(0, start, pipeline.step(start))
     thread.close()
     assert delivered == [False]
+
+
+def slow_fsync(monkeypatch: pytest.MonkeyPatch, hold: Callable[[], object]) -> None:
+    fsync = os.fsync
+
+    def slow(descriptor: int) -> None:
+        hold()
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", slow)
+
+
+def test_a_slow_disk_does_not_hold_up_the_end_and_no_result_is_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    slow_fsync(monkeypatch, lambda: time.sleep(0.05))
+    delivered: list[tuple[int, int, bool]] = []
+    thread = RecordingThread(
+        Recorder(tmp_path, ["acc", "ref"], ["bridge-1"]),
+        lambda number, results, recorded, _: delivered.append((number, len(results), recorded)),
+        close_s=0.5,
+    )
+    pipeline, rng = StandIn(CONFIG), np.random.default_rng(1)
+    expected = 0
+    for number in range(200):
+        event = run_start(pipeline, 0, 1) if number == 0 else block("acc", number, rng)
+        results = pipeline.step(event)
+        expected += len(results)
+        thread.put(number, event, results)
+    began_s = time.monotonic()
+    assert thread.close()
+    assert time.monotonic() - began_s < 3.0  # all of them would take 10 s
+    assert sum(count for _, count, _ in delivered) == expected
+    *recorded, (last, rest, was_recorded) = delivered
+    assert (last, was_recorded) == (199, False)
+    assert rest > 50
+    assert all(was_recorded for _, _, was_recorded in recorded)
+    *_, held = RecordingReader(tmp_path / "fieldcal-000001.mcap").steps()
+    assert held.event_sequence >= recorded[-1][0]
+    assert f"events {held.event_sequence + 1} to 199 are not recorded" in caplog.text
+
+
+def test_a_disk_that_does_not_answer_is_left_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    answer = threading.Event()
+    slow_fsync(monkeypatch, lambda: answer.wait(PATIENCE_S))
+    monkeypatch.setattr("agent.recording.thread.HANG_S", 0.1)
+    thread = RecordingThread(Recorder(tmp_path, ["acc"], ["bridge-1"]), lambda *_: None, close_s=0.1)
+    thread.put(0, run_start(StandIn(CONFIG), 0, 1), [])
+    assert not thread.close()
+    assert "does not answer" in caplog.text
+    answer.set()
+    thread._thread.join(PATIENCE_S)
+    assert not thread._thread.is_alive()
