@@ -328,6 +328,11 @@ class ChannelState:
             }
         )
 
+    def memories(self) -> dict[str, bytes]:
+        """`memory` by identity, of the device that is there now and of those that were there before."""
+        taught = self._estimation is not None and (self._estimation.recursion.windows or self._in_force is not None)
+        return self._kept | ({self.identity: self.memory()} if taught else {})
+
     def _remember(self, memory: bytes) -> list[Result]:
         assert self._estimation is not None
         state = unpack(memory)
@@ -358,7 +363,7 @@ class ChannelState:
             "status": self._status,
             "after_s": self._after_s,
             "refused": self._refused,
-            "stances": [_stance_state(stance) for stance in self._stances],
+            "stances": [stance.snapshot() for stance in self._stances],
             "now_ns": self._now_ns,
             "utc_minus_monotonic_ns": self._utc_minus_monotonic_ns,
         }
@@ -378,7 +383,7 @@ class ChannelState:
         self._kept = dict(state["kept"])
         self._first_day, self._status, self._after_s = state["first_day"], state["status"], state["after_s"]
         self._refused = state["refused"]
-        self._stances = [_stance_of(s) for s in state["stances"]]
+        self._stances = [Stance.load(stance) for stance in state["stances"]]
         self._now_ns = state["now_ns"]
         self._utc_minus_monotonic_ns = state["utc_minus_monotonic_ns"]
         self._plan()
@@ -390,12 +395,3 @@ def _plain(update: CalibrationUpdate | None) -> dict[str, Any] | None:
 
 def _calibration(state: dict[str, Any] | None) -> CalibrationUpdate | None:
     return None if state is None else CalibrationUpdate(**state)
-
-
-def _stance_state(stance: Stance) -> dict[str, Any]:
-    pose = {name: getattr(stance.pose, name) for name in Pose.__slots__}
-    return {"start_s": stance.start_s, "stop_s": stance.stop_s, "pose": pose}
-
-
-def _stance_of(state: Mapping[str, Any]) -> Stance:
-    return Stance(state["start_s"], state["stop_s"], Pose(**state["pose"]))

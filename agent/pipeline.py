@@ -106,6 +106,13 @@ class Pipeline:
                 found.append(Memory(channel.sensor, channel.identity, own[-1].sequence, channel.memory()))
         return found
 
+    def all_memories(self) -> list[Memory]:
+        """What must outlive the run, of every sensor and every device that it was, as it is after the last event."""
+        last = self._next_sequence - 1
+        return [
+            Memory(c.sensor, identity, last, state) for c in self._channels for identity, state in c.memories().items()
+        ]
+
     @staticmethod
     def _dispatch(channel: ChannelState, event: Event) -> Sequence[Output]:
         if isinstance(event, SampleBlock):

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from agent.config import Channel, PoseInterval
 from calib.geometry import along, at_rest, beside, clamp
@@ -30,6 +31,16 @@ class Stance:
     start_s: float
     stop_s: float
     pose: Pose
+
+    def snapshot(self) -> dict[str, Any]:
+        """State for `load`."""
+        pose = {name: getattr(self.pose, name) for name in Pose.__slots__}
+        return {"start_s": self.start_s, "stop_s": self.stop_s, "pose": pose}
+
+    @staticmethod
+    def load(state: Mapping[str, Any]) -> Stance:
+        """The stance whose `snapshot` this is."""
+        return Stance(state["start_s"], state["stop_s"], Pose(**state["pose"]))
 
 
 def pieces(channel: Channel, after_s: float, stances: Sequence[Stance] = ()) -> Iterator[Piece]:

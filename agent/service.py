@@ -8,6 +8,7 @@ import threading
 import time
 import uuid
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from agent import __version__
@@ -23,6 +24,7 @@ from agent.reader import EventQueue, Reader
 from agent.recording.acceleration import encode_acceleration
 from agent.recording.files import final_name
 from agent.recording.fingerprint import fingerprint, versions
+from agent.recording.recalling import memories_of
 from agent.recording.retention import keep_files
 from agent.recording.signing import Signer
 from agent.recording.thread import RecordingThread
@@ -57,17 +59,19 @@ class Service:
     def run(self, duration_s: float | None) -> bool:
         """Read, calibrate, record and publish until stopped or `duration_s` is over.
 
-        Returns whether all threads have ended; where a frozen router or disk holds one, `os._exit` must end the process.
+        Returns whether all threads have ended; where a frozen router or disk holds one, end the process by `os._exit`.
         Raises StoreError or OSError where the data directory cannot be used at all, KeyFileError for a bad signing key.
         """
         self._data_dir.mkdir(parents=True, exist_ok=True)
         config = self._config
         signer = Signer.load(config.recording.signing_key) if config.recording.signing_key else None
-        self._store = Store(self._data_dir, keep=keep_results(config.results))
+        recall = partial(memories_of, restore=Pipeline.restore)
+        self._store = Store(self._data_dir, keep=keep_results(config.results), recall=recall)
         if self._store.set_aside:
             _log.warning("the state file was corrupt and is kept as %s", self._store.set_aside)
-        if found := self._store.recovered.results:
-            _log.warning("%d results that the state file lacked were found in the recordings", found)
+        if (found := self._store.recovered).results or found.memories:
+            lacked = "%d results that the state file lacked were found in the recordings, and the state of %d devices"
+            _log.warning(lacked, found.results, found.memories)
         self._recorder = Recorder(
             self._data_dir,
             [device.name for device in config.devices],

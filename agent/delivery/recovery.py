@@ -4,23 +4,36 @@ from __future__ import annotations
 
 import logging
 import sqlite3
-from collections.abc import Iterable
+import time
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from agent.delivery.history import Record
-from agent.delivery.schema import RESULT_COLUMNS, checked, insert_results, withdraw, write_latest
+from agent.delivery.history import Memory, Record
+from agent.delivery.schema import (
+    RESULT_COLUMNS,
+    checked,
+    insert_results,
+    withdraw,
+    write_latest,
+    write_memory,
+)
 from agent.recording.files import FILE_METADATA, final_name, recordings
 from agent.recording.scan import scan
 
 _log = logging.getLogger(__name__)
 
+Recall = Callable[[Path], Sequence[Memory]]  # the states of the estimation where a recording ends
+# s; a start waits no longer for states, but for the file it is in: an hour of recording, which is replayed in seconds.
+LONGEST_S = 60.0
+
 
 @dataclass(slots=True)
 class Recovered:
-    """How many results came back, from how many files; the marks that the newest file names."""
+    """How many results came back, from how many files, and states of how many devices; the newest file's marks."""
 
     results: int = 0
+    memories: int = 0
     files: int = 0
     file_sequence: int = 0
     published: int = 0
@@ -56,6 +69,44 @@ def recover(connection: sqlite3.Connection, directory: Path, *, everything: bool
     if recovered.results:
         name_latest(connection)
     return recovered
+
+
+def recover_memories(connection: sqlite3.Connection, directory: Path, recall: Recall) -> int:
+    """Bring the states of the estimation up to what the recordings know; within the caller's transaction.
+
+    The newest file knows every device of its run and all that was kept before it. Then, newest first, the files with
+    calibrations that are newer than what is known of their device. Returns how many devices have another state now.
+    """
+    rows = connection.execute("SELECT sensor, identity, sequence, state, crc FROM memory")
+    known: dict[tuple[str, str], int] = {(row[0], row[1]): row[2] for row in map(checked, rows)}
+    files = {final_name(path): path for _, path in recordings(directory)}
+    end = time.monotonic() + LONGEST_S
+    found: set[tuple[str, str]] = set()
+
+    def take(name: str) -> None:
+        path = files.pop(name, None)
+        for memory in recall(path) if path is not None and time.monotonic() < end else ():
+            device = (memory.sensor, memory.identity)
+            if memory.sequence > known.get(device, 0):
+                write_memory(connection, (*device, memory.sequence, memory.state))
+                known[device] = memory.sequence
+                found.add(device)
+
+    take(next(reversed(files), ""))
+    for sensor, identity, name, sequence in connection.execute(_CALIBRATED).fetchall():
+        if known.get((sensor, identity), 0) < sequence:
+            take(name)
+    return len(found)
+
+
+_CALIBRATED = """
+SELECT sensor, identity, recording, max(sequence) AS newest FROM results
+WHERE what = 'calibration' AND recorded = 1 GROUP BY sensor, identity, recording ORDER BY newest DESC"""
+
+
+def no_memories(_: Path) -> Sequence[Memory]:
+    """Nothing is replayed."""
+    return ()
 
 
 def name_latest(connection: sqlite3.Connection) -> None:

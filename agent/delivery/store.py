@@ -11,7 +11,7 @@ from pathlib import Path
 
 from agent.delivery.history import FILE_NAME, Memory, Record
 from agent.delivery.opening import lock, open_or_set_aside
-from agent.delivery.recovery import Recovered, recover
+from agent.delivery.recovery import Recall, Recovered, no_memories, recover, recover_memories
 from agent.delivery.retention import FOR_EVER, KeepResults, Sweep
 from agent.delivery.schema import (
     DamagedRow,
@@ -39,13 +39,20 @@ class Store:
     May be called from any thread; reading is done by a `History` of one's own on `path`.
     Every page and row is checked at the start. `set_aside` names the damaged file that was found and renamed, None
     where there was none; `recovered` says what was found again in the recordings of `data_dir`: everything that they
-    hold where the store is new, what the last moments before a crash left out where it is not.
+    hold where the store is new, what the last moments before a crash left out where it is not. With results come the
+    states of the estimation: `recall` tells which a recording leaves.
     A new store cannot know which numbers were used before it; it counts on from `count_from`, by default the UTC
     milliseconds, and from beyond what the recordings hold. They still fit a number of JavaScript.
     Raises StoreError where the directory cannot be written or another process has the store.
     """
 
-    def __init__(self, data_dir: Path, count_from: int | None = None, keep: KeepResults = FOR_EVER) -> None:
+    def __init__(
+        self,
+        data_dir: Path,
+        count_from: int | None = None,
+        keep: KeepResults = FOR_EVER,
+        recall: Recall = no_memories,
+    ) -> None:
         first = time.time_ns() // 1_000_000 if count_from is None else count_from
         self.path = data_dir / FILE_NAME
         self._mutex = threading.Lock()
@@ -56,7 +63,7 @@ class Store:
         self._lock = lock(data_dir)
         try:
             self.set_aside, self._connection = open_or_set_aside(self.path)
-            self.recovered = self._begin_run(first)
+            self.recovered = self._begin_run(first, recall)
         except (sqlite3.Error, DamagedRow, OSError) as error:
             os.close(self._lock)
             raise StoreError(f"{self.path}: {error}") from None
@@ -149,7 +156,7 @@ class Store:
         write_mark(self._connection, "published", self._published)
         write_mark(self._connection, "file", self._file_sequence)
 
-    def _begin_run(self, first: int) -> Recovered:
+    def _begin_run(self, first: int, recall: Recall) -> Recovered:
         """Read the marks; make the tables where the file is new; fetch from the recordings what is not here."""
         with self._connection:
             self._connection.execute("BEGIN IMMEDIATE")
@@ -157,7 +164,10 @@ class Store:
             if new:
                 create_tables(self._connection, {"floor": first, "published": first, "clean": 0, "file": 0})
             marks = read_marks(self._connection)
-            recovered = Recovered() if marks["clean"] else recover(self._connection, self.path.parent, everything=new)
+            directory = self.path.parent
+            recovered = Recovered() if marks["clean"] else recover(self._connection, directory, everything=new)
+            if new or recovered.results:
+                recovered.memories = recover_memories(self._connection, directory, recall)
             (kept,) = self._connection.execute("SELECT coalesce(max(sequence), 0) FROM results").fetchone()
             self._last = max(kept, marks["floor"])
             if not marks["clean"] and not new:

@@ -16,7 +16,6 @@ def test_of_the_state_file(tmp_path: Path) -> None:
     assert outcome.good, outcome
 
 
-@pytest.mark.xfail(reason="results found again in the recordings come without the memory of the estimation")
 def test_starts(tmp_path: Path) -> None:
     outcome = flips.at_starts(tmp_path, 3)
     assert outcome.good, outcome

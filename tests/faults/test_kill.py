@@ -20,7 +20,6 @@ def test_at_random_moments(tmp_path: Path) -> None:
     assert outcome.findings.restored >= 4, outcome
 
 
-@pytest.mark.xfail(reason="results found again in the recordings come without the memory of the estimation")
 def test_at_every_fifteenth_write(tmp_path: Path) -> None:
     require("strace")
     outcome = kill.at_every_write(tmp_path, 15)
