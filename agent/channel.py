@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import msgspec
@@ -22,11 +23,13 @@ from agent.outcome import (
     status_change,
     window_report,
 )
-from agent.schedule import Piece, Stance, pieces
+from agent.positions import FOUND_WITHIN_S, FoundPositions
+from agent.schedule import Piece, ToldTimes
 from agent.snapshot import pack, unpack
 from agent.stream import DeviceStream
-from agent.windows import MARGIN_S, Found, windows_in
+from agent.windows import MARGIN_S, Found, refused, windows_in
 from calib.model import Pose, Window
+from calib.placing import Placed
 from calib.timing import HORIZON_S
 from hw.block import SampleBlock
 
@@ -57,12 +60,11 @@ class ChannelState:
         self._kept: dict[str, bytes] = {}
         self._first_day = 0.0  # in the estimation's own count, at the run's origin
         self._status = ""  # nothing said yet
-        self._after_s = 0.0  # the schedule is done up to here, seconds since the sensor's first sample
+        self._finder = FoundPositions(channel) if channel.positions else None
+        self._places = self._finder or ToldTimes(channel)
         self._refused = 0  # windows in a row
-        self._stances: list[Stance] = []  # by command; the configuration's before any
         self._now_ns = 0  # monotonic and UTC of the newest event that carried both
         self._utc_minus_monotonic_ns = 0
-        self._plan()
 
     def begin(self, origin_ns: int, kept: Mapping[str, bytes]) -> None:
         """A new run: seconds count from `origin_ns`; `kept` (`memory`) waits for sensors of those identities."""
@@ -85,6 +87,8 @@ class ChannelState:
             if self._status == "INVALID":
                 self._estimation.gate.regain("")
                 results += self._say_status(f"{self.sensor} speaks again")
+            if self._finder is not None:
+                self._finder.update(block, self._streams[self.sensor], self._estimation.recursion.scale)
             results += self._corrected(block, self._estimation)
         return results + list(self._close_windows())
 
@@ -131,7 +135,7 @@ class ChannelState:
 
     @property
     def _horizon_s(self) -> float:
-        return max(HORIZON_S, self._channel.window_s + 2.0 * MARGIN_S)
+        return max(HORIZON_S, self._channel.window_s + 2.0 * MARGIN_S + (FOUND_WITHIN_S if self._finder else 0.0))
 
     def _clock(self, t_monotonic_ns: int, t_utc_ns: int) -> None:
         # Blocks of two devices may arrive out of order by a read; time here never goes back.
@@ -217,31 +221,19 @@ class ChannelState:
 
     # --- windows
 
-    def _plan(self) -> None:
-        self._upcoming = pieces(self._channel, self._after_s, self._stances)
-        self._piece = next(self._upcoming, None)
-
     def _turn(self, pose: Pose) -> list[Result]:
         first_s = self._streams[self.sensor].first_sample_s
-        now_s = 0.0 if first_s is None else self._now_s() - first_s
-        stood = []
-        if self._piece is not None and self._piece.start_s < now_s:
-            # The pose before holds until now: its window is closed here, a guard taken off as at every change.
-            stood = [Stance(self._piece.start_s - self._channel.guard_s, now_s, self._piece.pose)]
-        self._stances = [*stood, Stance(now_s, float("inf"), pose)]
-        self._plan()
+        self._places.turn(0.0 if first_s is None else self._now_s() - first_s, pose)
         return [self._told(f"stands at {pose.position} from now on")]
 
     def _close_windows(self) -> Iterator[Result]:
         first_s = self._streams[self.sensor].first_sample_s
-        while self._piece is not None and first_s is not None and self._due(self._piece, first_s):
-            piece = self._piece
-            self._after_s = piece.stop_s
-            self._piece = next(self._upcoming, None)
+        while (piece := self._places.piece) is not None and first_s is not None and self._due(piece, first_s):
             yield from self._estimate(piece, first_s)
+            self._places.done(piece)
         keep_from_s = self._now_s() - 2.0 * MARGIN_S
-        if self._piece is not None and first_s is not None:
-            keep_from_s = min(keep_from_s, first_s + self._piece.start_s - 2.0 * MARGIN_S)
+        if first_s is not None:
+            keep_from_s = min(keep_from_s, first_s + self._places.keep_from_s - 2.0 * MARGIN_S)
         for stream in self._streams.values():
             stream.forget_before(keep_from_s)
 
@@ -254,7 +246,12 @@ class ChannelState:
 
     def _estimate(self, piece: Piece, first_s: float) -> Iterator[Result]:
         day = self._first_day + (first_s + piece.stop_s) / DAY_S
-        found, lag_s = self._found(piece, first_s, day)
+        placed = self._placed(piece, first_s, day)
+        if placed.pose is None:
+            found, lag_s = Found([refused(piece, placed.reason)]), 0.0
+        else:
+            found, lag_s = self._found(replace(piece, pose=placed.pose), first_s, day)
+        found = found.told(placed.numbers)
         for window in found.windows:
             if not window.used or self._estimation is None:
                 reason = window.reason or f"{self.sensor} was never opened"
@@ -264,6 +261,13 @@ class ChannelState:
             self._refused = 0
             judged = self._estimation.judge(window, day, lag_s, found.temperature_degc)
             yield from self._results(window, judged, lag_s)
+
+    def _placed(self, piece: Piece, first_s: float, day: float) -> Placed:
+        """How the sensor stands in the piece, where nobody told."""
+        if self._finder is None or self._estimation is None:
+            return Placed(piece.pose, "", {})
+        cut = self._streams[self.sensor].cut(first_s + piece.start_s, first_s + piece.stop_s)
+        return self._finder.place(piece, cut, self._estimation.recursion, day)
 
     def _complain(self, reason: str) -> Iterator[Result]:
         """Windows that are refused one after the other: the status, though it stands, says why nothing is updated."""
@@ -361,9 +365,8 @@ class ChannelState:
             "kept": dict(self._kept),
             "first_day": self._first_day,
             "status": self._status,
-            "after_s": self._after_s,
+            "places": self._places.snapshot(),
             "refused": self._refused,
-            "stances": [stance.snapshot() for stance in self._stances],
             "now_ns": self._now_ns,
             "utc_minus_monotonic_ns": self._utc_minus_monotonic_ns,
         }
@@ -381,12 +384,11 @@ class ChannelState:
             self._estimation.load(state["estimation"])
         self._in_force = _calibration(state["in_force"])
         self._kept = dict(state["kept"])
-        self._first_day, self._status, self._after_s = state["first_day"], state["status"], state["after_s"]
+        self._first_day, self._status = state["first_day"], state["status"]
+        self._places.load(state["places"])
         self._refused = state["refused"]
-        self._stances = [Stance.load(stance) for stance in state["stances"]]
         self._now_ns = state["now_ns"]
         self._utc_minus_monotonic_ns = state["utc_minus_monotonic_ns"]
-        self._plan()
 
 
 def _plain(update: CalibrationUpdate | None) -> dict[str, Any] | None:

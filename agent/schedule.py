@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from agent.config import Channel, PoseInterval
-from calib.geometry import along, at_rest, beside, clamp
+from calib.geometry import beside
 from calib.model import Pose
 
 ROUNDING_S = 1e-6  # of ends that were added up
@@ -33,14 +33,56 @@ class Stance:
     pose: Pose
 
     def snapshot(self) -> dict[str, Any]:
-        """State for `load`."""
+        """State for `load`, bit-exact."""
         pose = {name: getattr(self.pose, name) for name in Pose.__slots__}
         return {"start_s": self.start_s, "stop_s": self.stop_s, "pose": pose}
 
-    @staticmethod
-    def load(state: Mapping[str, Any]) -> Stance:
+    @classmethod
+    def load(cls, state: Mapping[str, Any]) -> Stance:
         """The stance whose `snapshot` this is."""
-        return Stance(state["start_s"], state["stop_s"], Pose(**state["pose"]))
+        return cls(state["start_s"], state["stop_s"], Pose(**state["pose"]))
+
+
+class ToldTimes:
+    """The pieces one after the other, their times told beforehand or by an operator. Seconds as in Piece."""
+
+    def __init__(self, channel: Channel) -> None:
+        self._channel = channel
+        self._after_s = 0.0  # done up to here
+        self._stances: list[Stance] = []  # by command; the configuration's before any
+        self._plan()
+
+    def _plan(self) -> None:
+        self._upcoming = pieces(self._channel, self._after_s, self._stances)
+        self.piece = next(self._upcoming, None)
+
+    def done(self, piece: Piece) -> None:
+        """This piece is through; the next one becomes `piece`."""
+        self._after_s = piece.stop_s
+        self.piece = next(self._upcoming, None)
+
+    @property
+    def keep_from_s(self) -> float:
+        """From when on samples are needed."""
+        return math.inf if self.piece is None else self.piece.start_s
+
+    def turn(self, now_s: float, pose: Pose) -> None:
+        """An operator says how it stands from now on."""
+        stood = []
+        if self.piece is not None and self.piece.start_s < now_s:
+            # The pose before holds until now: its window is closed here, a guard taken off as at every change.
+            stood = [Stance(self.piece.start_s - self._channel.guard_s, now_s, self.piece.pose)]
+        self._stances = [*stood, Stance(now_s, math.inf, pose)]
+        self._plan()
+
+    def snapshot(self) -> dict[str, Any]:
+        """State for `load`, bit-exact."""
+        return {"after_s": self._after_s, "stances": [stance.snapshot() for stance in self._stances]}
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        """Take the state that `snapshot` gave."""
+        self._after_s, self._stances = state["after_s"], [Stance.load(s) for s in state["stances"]]
+        self._plan()
 
 
 def pieces(channel: Channel, after_s: float, stances: Sequence[Stance] = ()) -> Iterator[Piece]:
@@ -50,9 +92,8 @@ def pieces(channel: Channel, after_s: float, stances: Sequence[Stance] = ()) -> 
     """
     stretches = ((s.start_s, s.stop_s, s.pose) for s in stances) if stances else _stretches(channel, after_s)
     for start_s, stop_s, pose in stretches:
-        last_s, k = start_s + channel.guard_s, 0
-        if not math.isfinite(stop_s):
-            k = max(0, int((after_s - last_s) // (channel.every_s or channel.window_s)))
+        last_s = start_s + channel.guard_s
+        k = max(0, int((after_s - last_s) // (channel.every_s or channel.window_s)))
         while last_s < stop_s - channel.guard_s:
             first_s = start_s + channel.guard_s + k * (channel.every_s or channel.window_s)
             last_s, k = min(first_s + channel.window_s, stop_s - channel.guard_s), k + 1
@@ -74,13 +115,4 @@ def _stretches(channel: Channel, after_s: float) -> Iterator[tuple[float, float,
 
 def pose_of(interval: PoseInterval, channel: Channel) -> Pose:
     """The pose that a section of the configuration, or a command, states."""
-    feels_gravity = channel.coupling == "dc"
-    if interval.theta_deg is not None and interval.alpha_deg is not None:
-        theta_rad, alpha_rad = math.radians(interval.theta_deg), math.radians(interval.alpha_deg)
-        g = channel.gravity_mps2 if feels_gravity else 0.0
-        return clamp(theta_rad, alpha_rad, g, channel.static_sign)
-    if interval.direction is not None:
-        gravity = interval.gravity_mps2 if feels_gravity else (0.0, 0.0, 0.0)
-        return along(interval.direction, gravity)
-    assert interval.gravity_mps2 is not None  # the configuration allows no other form
-    return at_rest(interval.gravity_mps2)
+    return interval.pose(channel.gravity_mps2, channel.static_sign, feels_gravity=channel.coupling == "dc")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,6 +32,10 @@ class Found:
     windows: list[Window]
     temperature_degc: float = float("nan")
 
+    def told(self, numbers: Mapping[str, float]) -> Found:
+        """The same with numbers more in each window."""
+        return replace(self, windows=[replace(w, numbers={**w.numbers, **numbers}) for w in self.windows])
+
 
 def windows_in(piece: Piece, first_s: float, channel: Channel, streams: dict[str, DeviceStream], lag_s: float) -> Found:
     """The windows of a stretch in one pose, each with its verdict; one unused window where there is nothing to judge.
@@ -41,22 +46,22 @@ def windows_in(piece: Piece, first_s: float, channel: Channel, streams: dict[str
     start_s, stop_s = first_s + piece.start_s, first_s + piece.stop_s
     cut = streams[channel.sensor].cut(start_s - 0.5 * MARGIN_S, stop_s + 0.5 * MARGIN_S)
     if cut is None:
-        return Found([_refused(piece, f"no samples of {channel.sensor}")])
+        return Found([refused(piece, f"no samples of {channel.sensor}")])
     if fault := _fault(channel.sensor, cut, axes=3):
-        return Found([_refused(piece, fault)])
+        return Found([refused(piece, fault)])
     if channel.reference is None:
         found = _rest(piece, cut, (start_s, stop_s), channel)
     else:
         reference = streams[channel.reference].cut(start_s - MARGIN_S, stop_s + MARGIN_S)
         if reference is None:
-            return Found([_refused(piece, f"no samples of the reference {channel.reference}")])
+            return Found([refused(piece, f"no samples of the reference {channel.reference}")])
         if fault := _fault(f"the reference {channel.reference}", reference, axes=piece.pose.direction.shape[1]):
-            return Found([_refused(piece, fault)])
+            return Found([refused(piece, fault)])
         if reference.saturated:
-            return Found([_refused(piece, f"the reference {channel.reference} was at the end of its range")])
+            return Found([refused(piece, f"the reference {channel.reference} was at the end of its range")])
         found = _motion(piece.pose, cut, reference, channel, (start_s, stop_s), lag_s)
     if not found:
-        return Found([_refused(piece, "the samples of sensor and reference do not meet")])
+        return Found([refused(piece, "the samples of sensor and reference do not meet")])
     if cut.saturated:
         found = [replace(w, used=False, reason=w.reason or "the sensor was at the end of its range") for w in found]
     found = [replace(w, start_s=w.start_s - first_s, stop_s=w.stop_s - first_s) for w in found]
@@ -166,7 +171,8 @@ def _within(time_s: Array, span_s: tuple[float, float]) -> np.ndarray[tuple[int]
     return np.asarray((time_s >= span_s[0]) & (time_s < span_s[1]))
 
 
-def _refused(piece: Piece, reason: str) -> Window:
+def refused(piece: Piece, reason: str) -> Window:
+    """The window of a piece in which there is nothing to judge."""
     m = piece.pose.direction.shape[1]
     nothing = WindowSums(m, np.zeros(0), np.zeros((0, 2 * m + 3)), np.zeros((0, 2 * m + 3, 2 * m + 3)))
     return Window(piece.start_s, piece.stop_s, piece.pose, nothing, False, reason, 0, 0)

@@ -26,7 +26,8 @@ class Pose:
     `direction` is (3, m); `gravity_mps2` (3,) is what an ideal sensor reads at rest there (zeros where the sensor or
     the equation does not feel it; NaN where a sensor feels a gravity that nobody stated: such a window's mean then says
     nothing). `theta_rad`, `alpha_rad` are kept where the pose came from the clamp (Eqs. 9-11).
-    `position` names the pose: windows of one position share its angle and offset errors.
+    `position` names the pose: windows of one position share its angle and offset errors. `u_alpha_rad`, `u_theta_rad`
+    are standard uncertainties of angles that were found, by position; 0 where they were stated.
     """
 
     position: str
@@ -34,6 +35,8 @@ class Pose:
     gravity_mps2: Array
     theta_rad: float | None = None
     alpha_rad: float | None = None
+    u_alpha_rad: float = 0.0
+    u_theta_rad: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -248,12 +248,12 @@ def _clamp_terms(poses: Sequence[Pose], priors: Priors) -> Iterator[Term]:
         theta[p] = np.cross(gravity, motion)
         alpha[p] = 0.0, 0.0, -1.0
     for name, axis, common, single in (
-        ("theta", theta, priors.theta_rad, priors.theta_position_rad),
-        ("alpha", alpha, priors.alpha_common_rad, priors.angle_rad),
+        ("theta", theta, priors.theta_rad, [max(priors.theta_position_rad, poses[p].u_theta_rad) for p in clamped]),
+        ("alpha", alpha, priors.alpha_common_rad, [max(priors.angle_rad, poses[p].u_alpha_rad) for p in clamped]),
     ):
         yield _turned(name, f"{name} common", common, axis)
-        for p in clamped:
-            yield _turned(f"{name}[{poses[p].position}]", f"{name} by position", single, _only(poses, p, axis[p]))
+        for p, u in zip(clamped, single, strict=True):
+            yield _turned(f"{name}[{poses[p].position}]", f"{name} by position", u, _only(poses, p, axis[p]))
 
 
 def _pose_terms(poses: Sequence[Pose], priors: Priors) -> Iterator[Term]:

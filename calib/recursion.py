@@ -107,14 +107,8 @@ class Recursion:
     def result(self) -> Calibration:
         """S and Q as they are; where a parameter is not determined, still what was known beforehand of it."""
         mean, covariance = self._parameters()
-        return Calibration(
-            mean[:9].reshape(3, 3),
-            mean[9:],
-            covariance,
-            self.determined,
-            self._noise.degrees_of_freedom or np.inf,
-            METHOD,
-        )
+        freedom = self._noise.degrees_of_freedom or np.inf
+        return Calibration(mean[:9].reshape(3, 3), mean[9:], covariance, self.determined, freedom, METHOD)
 
     @property
     def coverage_factor(self) -> float:
@@ -131,8 +125,12 @@ class Recursion:
             return self._held.parameters(self._state)
         return self._state.mean[:12].copy(), self._state.factor[:12].copy()
 
-    def law(self) -> Law:
-        """S and Q over temperature, with all that their covariance knows of each other."""
+    def law(self, day: float | None = None) -> Law:
+        """S and Q over temperature, with all that their covariance knows of each other; `day`: wandered on until it."""
+        if day is not None:
+            waited = self.copy()
+            waited._state = self._wandered(self._state, self._day, day)
+            return waited.law()
         order, rows = self._temperature.offset_order, self._temperature.sensitivity_order > 0
         names = [n for k in range(1, order + 1) for n in offset_temperature(k)] + list(MAIN_TEMPERATURE if rows else ())
         more = [self._state.index(name) for name in names]

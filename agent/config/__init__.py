@@ -1,8 +1,9 @@
 """The configuration: one TOML file, checked wholly before anything starts, every fault named at once."""
 
-from agent.config.channel import Channel, PoseInterval
+from agent.config.channel import Channel
 from agent.config.commands import CommandKey, Commands
 from agent.config.devices import Device, Gateway
+from agent.config.pose import PoseInterval
 from agent.config.reading import ConfigError, load_config, parse_config
 from agent.config.sinks import Recording, Results, Tls, Zenoh
 from agent.config.supervision import Metrics, Supervision

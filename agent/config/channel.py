@@ -7,41 +7,14 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from agent.config.knowledge import Knowledge, Nine
-from agent.config.section import Name, Section, Vector
+from agent.config.pose import PoseInterval, Stop, tell_apart
+from agent.config.section import Name, Vector
 from calib.geometry import beside
+from calib.model import Pose
 
 # What is left of a pose after its guards. Shorter ones hold nothing to calibrate by; a typo would flood the store.
 SHORTEST_POSE_S = 0.1
-
-
-class PoseInterval(Section):
-    """How the sensor stands between two times, in seconds since the sensor's first sample.
-
-    One of: theta_deg and alpha_deg (clamp, Eqs. 9-11); direction (unit vector of the motion in the sensor's frame) with
-    gravity_mps2 where the sensor feels it; gravity_mps2 alone (a rest; gravity is the excitation). gravity_mps2 is
-    what an ideal sensor reads at rest there: +g on the axis that points up.
-    """
-
-    start_s: Annotated[float, Field(ge=0)]
-    stop_s: Annotated[float, Field(gt=0)]
-    theta_deg: Annotated[float | None, Field(ge=-90, le=90)] = None
-    alpha_deg: Annotated[float | None, Field(ge=-360, le=360)] = None
-    direction: Vector | None = None
-    gravity_mps2: Vector | None = None
-
-    @model_validator(mode="after")
-    def _one_form(self) -> PoseInterval:
-        if self.stop_s <= self.start_s:
-            raise ValueError(f"stop_s {self.stop_s} is not after start_s {self.start_s}")
-        if (self.theta_deg is None) != (self.alpha_deg is None):
-            raise ValueError("theta_deg and alpha_deg go together")
-        if self.theta_deg is not None and (self.direction or self.gravity_mps2):
-            raise ValueError("theta_deg and alpha_deg exclude direction and gravity_mps2")
-        if self.theta_deg is None and self.direction is None and self.gravity_mps2 is None:
-            raise ValueError("needs theta_deg and alpha_deg, or direction, or gravity_mps2")
-        if self.direction is not None and abs(sum(x * x for x in self.direction) - 1) > 1e-3:
-            raise ValueError(f"direction {self.direction} is not a unit vector")
-        return self
+LEAST_LEANING_DEG = 5.0  # of a clamp whose alpha gravity shall tell: 1 mg of offset is 0.7 deg there
 
 
 class Channel(Knowledge):
@@ -68,6 +41,10 @@ class Channel(Knowledge):
     rotation_gravity_mps2: Vector | None = (0.0, 0.0, 0.0)
     poses: tuple[PoseInterval, ...] = ()
     poses_repeat_s: Annotated[float | None, Field(gt=0)] = None
+    # In place of poses, no times told: the stops in which the sensor may stand, or "free", a clamp at any angles; which
+    # of them, and since when, gravity tells. clamp_theta_deg is the clamp's inclination, where it is known.
+    positions: tuple[Stop, ...] | Literal["free"] = ()
+    clamp_theta_deg: Annotated[float | None, Field(ge=-90, le=90)] = None
 
     @property
     def fixed_mount(self) -> bool:
@@ -91,10 +68,40 @@ class Channel(Knowledge):
                 raise ValueError(
                     f"poses.{i}: less than {SHORTEST_POSE_S} s is left of it after guard_s {self.guard_s} on both sides"
                 )
-            if self.reference is None and (pose.theta_deg is not None or pose.direction is not None):
-                raise ValueError(f"poses.{i} needs a reference (only gravity_mps2 alone does without)")
-            if self.reference is not None and pose.theta_deg is None and pose.direction is None:
-                raise ValueError(f"poses.{i}: a rest (gravity_mps2 alone) is for a channel without a reference")
+            if fault := pose.fault(self.reference is not None):
+                raise ValueError(f"poses.{i}: {fault}")
         if self.poses_repeat_s is not None and self.poses_repeat_s < end:
             raise ValueError(f"poses_repeat_s {self.poses_repeat_s} is shorter than the schedule, {end}")
         return self
+
+    @model_validator(mode="after")
+    def _found_by_gravity(self) -> Channel:
+        if self.clamp_theta_deg is not None and self.positions != "free":
+            raise ValueError('clamp_theta_deg goes with positions = "free"')
+        if not self.positions:
+            return self
+        if self.poses or self.poses_repeat_s or self.rotation is not None:
+            raise ValueError("positions take the place of poses and of rotation")
+        if self.coupling == "ac":
+            raise ValueError('positions are found from gravity, which a sensor of coupling "ac" does not feel')
+        if self.positions == "free":
+            if self.reference is None:
+                raise ValueError('positions = "free" is a clamp, which needs a reference')
+            if self.clamp_theta_deg is not None and abs(self.clamp_theta_deg) < LEAST_LEANING_DEG:
+                raise ValueError(
+                    f"clamp_theta_deg {self.clamp_theta_deg}: below {LEAST_LEANING_DEG:g} gravity tells no alpha"
+                )
+            return self
+        if len(self.positions) < 2:
+            raise ValueError("positions: one alone leaves nothing to find, state it in poses")
+        for i, stop in enumerate(self.positions):
+            if fault := stop.fault(self.reference is not None) or stop.hidden:
+                raise ValueError(f"positions.{i}: {fault}")
+        tell_apart(self.stops)
+        return self
+
+    @property
+    def stops(self) -> list[Pose]:
+        """The positions that were stated."""
+        stated = () if self.positions == "free" else self.positions
+        return [stop.pose(self.gravity_mps2, self.static_sign, feels_gravity=self.coupling == "dc") for stop in stated]
