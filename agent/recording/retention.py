@@ -43,18 +43,17 @@ def keep_files(section: Recording) -> KeepFiles:
     return KeepFiles(section.keep_days, most, int(section.least_free_bytes))
 
 
-def due(directory: Path, keep: KeepFiles, active: Path | None, waiting: str) -> Pruned | None:
+def due(directory: Path, keep: KeepFiles, active: Path | None, waiting: str, *, by_age: bool = True) -> Pruned | None:
     """The next files to delete, consecutive by number; None where none is due.
 
     `active` is the file being written; `waiting` names the recording with the first result that is not published: it
-    and those after it stay. By age one file goes at a time: a clock that jumped ahead by years costs as many recordings
-    as begin before it is set right. Raises OSError.
+    and those after it stay. By age one file goes at a time, and only where `by_age` allows it. Raises OSError.
     """
     if keep == FOR_EVER:
         return None
     files = [(number, path, path.stat()) for number, path in recordings(directory)]
     excess = _excess(directory, keep, sum(status.st_size for _, _, status in files))
-    oldest_ns = time.time_ns() - int(keep.days * DAY_NS) if keep.days is not None else None
+    oldest_ns = time.time_ns() - int(keep.days * DAY_NS) if keep.days is not None and by_age else None
     limit = file_number(waiting)
     chosen: list[tuple[int, Path]] = []
     freed = 0

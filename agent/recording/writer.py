@@ -81,6 +81,9 @@ class Recorder:
         self._pruned = _pruned_before(directory)
         self._due: Pruned | None = None  # files that may go
         self._unsaid = False  # they went while nothing was recorded
+        # By age one file goes for each that begins: a clock that jumped ahead by years costs only as many recordings as
+        # begin before it is set right.
+        self._may_age = True
         self.fault = ""  # why nothing is recorded
 
     @property
@@ -128,7 +131,7 @@ class Recorder:
             return
         try:
             waiting = self._ledger.first_waiting_recording() if self._ledger is not None else ""
-            self._due = due(self._directory, self._keep, self.path, waiting)
+            self._due = due(self._directory, self._keep, self.path, waiting, by_age=self._may_age)
         except Exception as error:  # a disk or a store that fails is told by whoever writes to it
             log.info("whether recordings are to be deleted cannot be seen: %s", error)
 
@@ -155,6 +158,8 @@ class Recorder:
                     self._file.sync()
             if isinstance(event, RunStart):
                 self._number(event.file_sequence)
+                self._may_age = True
+                self.look_for_pruning()
             if isinstance(event, Pruned):
                 self._prune(event)
         except OSError as error:
@@ -228,7 +233,7 @@ class Recorder:
             self._unsaid = True
             self._failures, self._since_ns = 1, self._now_ns - self._retry_ns
         else:
-            self._unsaid, self._due = False, None
+            self._unsaid, self._due, self._may_age = False, None, False
             self.look_for_pruning()
 
     def _fail(self, fault: str) -> None:

@@ -94,6 +94,18 @@ def test_by_age_one_goes_at_a_time(directory: Path) -> None:
     assert due(directory, KeepFiles(days=5.1), None, "") is None
 
 
+def test_a_clock_that_jumped_ahead_costs_one_file_for_each_that_begins(directory: Path) -> None:
+    with begun(directory, KeepFiles(days=0.001)) as recorder:
+        for number in range(1, 4):
+            for _ in range(3):
+                recorder.look_for_pruning()
+                if recorder.pruning is not None:
+                    recorder.record(number, recorder.pruning, [])
+            assert numbers(directory)[0] == 1 + number
+            start = run_start(StandIn(CONFIG), number, recorder.next_file_sequence)
+            recorder.record(number, start, [])
+
+
 def test_what_is_not_published_stays_and_all_after_it(directory: Path) -> None:
     everything = KeepFiles(bytes=1)
     assert span(due(directory, everything, None, "fieldcal-000004.mcap")) == (1, 3)
@@ -155,17 +167,17 @@ def test_where_nothing_can_be_recorded_room_is_made_and_said_later(directory: Pa
     with begun(directory, KeepFiles(least_free_bytes=free_bytes(directory) + (1 << 30))) as recorder:
         recorder._fail("No space left on device")
         pruned = recorder.pruning
-        assert span(pruned) == (1, 7)  # file 7 was given up
+        assert span(pruned) == (1, 6)
         assert pruned is not None
         assert not recorder.record(1, pruned, [])
-        assert numbers(directory) == []
+        assert numbers(directory) == [7], "given up, but it was being written when this was seen"
         assert recorder.pruning is None, "not again as long as nothing is recorded"
         assert recorder.wants_rotation, "at once, now that there is room"
         assert recorder.record(2, run_start(StandIn(CONFIG), 2, recorder.next_file_sequence), [])
-        assert numbers(directory) == [8]
+        assert numbers(directory) == [7, 8]
         assert recorder.pruning == pruned
         assert recorder.record(3, pruned, [])
-        assert recorder.pruning is None
+        assert span(recorder.pruning) == (7, 7)
         assert recorder.path is not None
         assert [step.event for step in RecordingReader(recorder.path).steps()][1:] == [pruned]
 

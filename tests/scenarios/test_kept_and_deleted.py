@@ -1,0 +1,119 @@
+"""The agent with retention and a signing key, killed and started again: what is left, and what an audit says of it."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from hw.virtual.serial_port import PtyDevice
+from tests.replay.test_audit_chain import write_keys
+from tests.scenarios.processes import fieldcal, interrupt, recordings, results, started, wait_until
+
+CONFIG = """
+[[devices]]
+name = "imu"
+driver = "serial-csv"
+options = {{ port = "{port}", rate_hz = 100, axes = 3, sequence = true, unit = "m/s2", serial_number = "A1" }}
+[[channels]]
+sensor = "imu"
+guard_s = 0.1
+poses = [{{ start_s = 0, stop_s = 1, gravity_mps2 = [0, 0, 9.81] }}]
+poses_repeat_s = 1
+[recording]
+rotate_s = 1
+keep_days = 0.00003
+signing_key = "{key}"
+[zenoh]
+enabled = false
+"""
+
+
+@pytest.fixture
+def port(tmp_path: Path) -> Iterator[PtyDevice]:
+    numbers = itertools.count()
+    began_s = time.monotonic()
+    sent = 0
+
+    def text_due(t_s: float) -> bytes:
+        nonlocal sent
+        due = int((t_s - began_s) * 100) - sent
+        sent += due
+        return "".join(f"{next(numbers)},0.01,-0.02,9.81\n" for _ in range(due)).encode()
+
+    device = PtyDevice(text_due, link=tmp_path / "port")
+    device.start()
+    yield device
+    device.stop()
+
+
+def number(path: Path) -> int:
+    return int(path.name.split("-")[1].split(".")[0])
+
+
+@pytest.mark.slow
+def test_a_life_of_recordings(tmp_path: Path, port: PtyDevice) -> None:
+    private, public = write_keys(tmp_path)
+    config, data, output = tmp_path / "config.toml", tmp_path / "data", tmp_path / "output"
+    config.write_text(CONFIG.format(port=port.path, key=private))
+
+    def up_to(least: int) -> None:
+        wait_until(
+            lambda: data.exists() and recordings(data) and number(recordings(data)[-1]) >= least, 40, "it rotates"
+        )
+
+    with started("run", config, "--data-dir", data, output=output) as agent:
+        up_to(9)
+        agent.kill()
+        agent.wait()
+    assert recordings(data)[-1].name.endswith(".active")
+    before = number(recordings(data)[-1])
+    with started("run", config, "--data-dir", data, output=output) as agent:
+        up_to(before + 3)
+        interrupt(agent)
+    left = recordings(data)
+    assert number(left[0]) > 3, "the oldest are deleted"
+    assert number(left[-1]) - number(left[0]) == len(left) - 1
+    said = fieldcal("audit", data, "--public-key", public)
+    assert said.returncode == 0, said.stdout + said.stderr
+
+    taken = left[1].read_bytes()
+    left[1].unlink()
+    said = fieldcal("audit", data)
+    assert said.returncode == 3
+    assert f"recording {number(left[1])} is missing before it" in said.stdout
+    left[1].write_bytes(taken)
+
+    windows = results(data, "window")
+    state = data / "state.sqlite"
+    content = bytearray(state.read_bytes())
+    content[0:16] = bytes(16)
+    state.write_bytes(content)
+    for path in recordings(data)[:-2]:
+        path.unlink()
+    newest = number(recordings(data)[-1])
+    with started("run", config, "--data-dir", data, output=output) as agent:
+        up_to(newest + 1)
+        interrupt(agent)
+    text = output.read_text()
+    assert f"the state file was corrupt and is kept as {data}/state.sqlite.corrupt-1" in text
+    assert "results that the state file lacked were found in the recordings" in text
+    assert "Traceback" not in text
+    again = {window["sequence"]: window for window in results(data, "window")}
+    found = [window for window in windows if window["sequence"] in again]
+    assert found
+    assert all(again[window["sequence"]] == window for window in found)
+    assert json.loads(fieldcal("show", "--data-dir", data, "--json", "-").stdout)["sensors"]["imu"]["windows"]
+
+
+def test_a_signing_key_that_is_none_is_bad_input(tmp_path: Path, port: PtyDevice) -> None:
+    key, config = tmp_path / "key", tmp_path / "config.toml"
+    key.write_text("no key")
+    config.write_text(CONFIG.format(port=port.path, key=key))
+    done = fieldcal("run", config, "--data-dir", tmp_path / "data")
+    assert done.returncode == 2
+    assert done.stderr == f"fieldcal run: recording.signing_key: {key}: not a private key in PEM without a password\n"
