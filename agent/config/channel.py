@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Discriminator, Field, Tag, model_validator
 
 from agent.config.knowledge import Knowledge, Nine
 from agent.config.pose import PoseInterval, Stop, tell_apart
@@ -43,7 +43,10 @@ class Channel(Knowledge):
     poses_repeat_s: Annotated[float | None, Field(gt=0)] = None
     # In place of poses, no times told: the stops in which the sensor may stand, or "free", a clamp at any angles; which
     # of them, and since when, gravity tells. clamp_theta_deg is the clamp's inclination, where it is known.
-    positions: tuple[Stop, ...] | Literal["free"] = ()
+    positions: Annotated[
+        Annotated[tuple[Stop, ...], Tag("stops")] | Annotated[Literal["free"], Tag("free")],
+        Discriminator(lambda stated: "free" if isinstance(stated, str) else "stops"),
+    ] = ()
     clamp_theta_deg: Annotated[float | None, Field(ge=-90, le=90)] = None
 
     @property

@@ -9,7 +9,7 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from benchmarks.online import cost, coverage, day, harm, year
+from benchmarks.online import bench, cost, coverage, day, harm, year
 from benchmarks.page import PAGE, machine, write_part
 from hw.virtual.building import Building
 from hw.virtual.harm import KINDS
@@ -80,11 +80,17 @@ def _day(_workers: int, _runs: int | None) -> tuple[Path, str]:
     return ONLINE, day.table()
 
 
+def _bench(workers: int, runs: int | None) -> tuple[Path, str]:
+    seeds = range(bench.SEED, bench.SEED + (runs or bench.RUNS))
+    return ONLINE, bench.table(spread(bench.day, seeds, workers))
+
+
 def _cost(_workers: int, runs: int | None) -> tuple[Path, str]:
     return PAGE, cost.table(cost.measure(runs or cost.TIMING.windows))
 
 
 PARTS: dict[str, Callable[[int, int | None], tuple[Path, str]]] = {
+    "bench": _bench,
     "year": _year,
     "harm": _harm,
     "coverage": _coverage,

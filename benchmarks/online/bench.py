@@ -1,0 +1,185 @@
+"""A bench day: the sensor is turned by hand from stop to stop, nobody tells when; beside it `fieldcal calibrate`.
+
+The stops are on a clamp at two inclinations, all visited twice. What an operator knows to 0.2 deg or 0.05 m/s2 is off
+by as much, drawn once a run. The agent gets the samples, the list of stops and a data sheet's S and Q; `fieldcal
+calibrate` gets the same samples as files, the same data sheet, and the time and position of every stop.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from click.testing import CliRunner
+
+from agent.calibrate.command import calibrate
+from agent.config import Config, parse_config
+from agent.events import CalibrationUpdate, StatusChange, WindowReport
+from agent.simulate import write_files
+from benchmarks.online.clamp import bench_events
+from benchmarks.online.runner import Run
+from calib.model import PARAMETERS, Array
+from hw.virtual.bench import Bench
+from hw.virtual.noise import Stream
+from hw.virtual.presets import plain
+from hw.virtual.schedule import Schedule, clamped
+from hw.virtual.spread import Spread, drawn
+
+SEED, RUNS = 1, 20
+RATE_HZ = 1000.0
+STOPS = tuple((theta_deg, alpha_deg) for theta_deg in (35.0, 55.0) for alpha_deg in (0.0, 120.0, 240.0))
+HOLD_S, TURN_S, ROUNDS = 25.0, 4.0, 2
+AFTER_S = 12.0  # into the next turning, by which the last stop ends
+# A data sheet's: main sensitivities to 5 %, transverse 3 %, zero-g offset 50 mg.
+U_MAIN_PCT, U_TRANSVERSE_PCT, U_OFFSET_MPS2 = 5.0, 3.0, 0.5
+KNOWN = Spread(
+    angle_deg=0.2,
+    theta_deg=0.2,
+    theta_position_deg=0.1,
+    alpha_common_deg=0.1,
+    offset_mps2=0.05,
+    reference_pct=0.1,
+    transverse_motion_pct=1.0,
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Day:
+    """What agent and `fieldcal calibrate` found of one day, (12,) in m/s2 and 1, and the latter's u. `positions` that
+    the agent found for its windows, "" where it took none; `windows` that both took."""
+
+    online: Array
+    offline: Array
+    u: Array
+    truth: Array
+    positions: Sequence[str]
+    windows: tuple[int, int]
+
+    @property
+    def apart(self) -> Array:
+        """(12,) differences over u."""
+        return np.abs(self.online - self.offline) / self.u
+
+
+def world(seed: int) -> Bench:
+    """The day's bench."""
+    p = plain(seed)
+    stands = tuple(clamped(theta_deg, alpha_deg, HOLD_S) for theta_deg, alpha_deg in STOPS)
+    turned = replace(p, schedule=Schedule(stands, TURN_S, p.schedule.start_s))
+    return Bench(drawn(turned, KNOWN, np.random.default_rng([seed, Stream.PRESET])), seed)
+
+
+def config(bench: Bench, **keys: Any) -> Config:
+    """Stops, no times. `keys` are further ones of the channel."""
+    sensor = bench.parameters.sensor
+    devices = [
+        {
+            "name": name,
+            "driver": "serial-csv",
+            "options": {"port": name, "rate_hz": RATE_HZ, "axes": axes, "unit": unit},
+        }
+        for name, axes, unit in (("sensor", 3, sensor.unit), ("reference", 1, "m/s2"))
+    ]
+    prior = {"sensitivity": sensor.nominal_sensitivity, "u_main_pct": U_MAIN_PCT, "u_offset_mps2": U_OFFSET_MPS2}
+    channel: dict[str, Any] = {
+        "sensor": "sensor",
+        "reference": "reference",
+        "prior": prior | {"u_transverse_pct": U_TRANSVERSE_PCT},
+        "uncertainty": {"theta_position_deg": KNOWN.theta_position_deg},
+        "temperature": {"offset_order": 0},  # `fieldcal calibrate` knows none
+        "positions": [{"theta_deg": theta_deg, "alpha_deg": alpha_deg} for theta_deg, alpha_deg in STOPS],
+    }
+    return parse_config({"devices": devices, "channels": [channel | keys], "zenoh": {"enabled": False}}, "bench day")
+
+
+def day(seed: int) -> Day:
+    """One day both ways."""
+    bench = world(seed)
+    duration_s = bench.parameters.schedule.duration_s(ROUNDS) + AFTER_S
+    update, reports = online(bench, duration_s)
+    told = offline(bench, duration_s)
+    scale = bench.parameters.sensor.nominal_sensitivity
+    found = np.append(np.ravel(update.sensitivity), update.offset)
+    return Day(
+        online=found / scale,
+        offline=np.append(np.ravel(told["sensitivity"]), told["offset"]) / scale,
+        u=np.sqrt(np.diag(told["covariance"])) / scale,
+        truth=np.append(bench.truth.sensitivity.ravel(), bench.truth.offset) / scale,
+        positions=[r.position if r.used else "" for r in reports],
+        windows=(sum(r.used for r in reports), sum(w["used"] for w in told["windows"])),
+    )
+
+
+def online(bench: Bench, duration_s: float, **keys: Any) -> tuple[CalibrationUpdate, list[WindowReport]]:
+    """The agent's last calibration, and its windows. Raises ValueError where it came to none."""
+    run = Run(config(bench, **keys))
+    updates, reports, said = [], [], ""
+    for event in bench_events(bench, bench.recording(duration_s)):
+        for result in run.feed(event):
+            if isinstance(result, CalibrationUpdate):
+                updates.append(result)
+            elif isinstance(result, WindowReport):
+                reports.append(result)
+            elif isinstance(result, StatusChange):
+                said = result.reason
+    run.close()
+    if not updates:
+        raise ValueError(f"no calibration: {said}")
+    return updates[-1], reports
+
+
+def offline(bench: Bench, duration_s: float) -> dict[str, Any]:
+    """What `fieldcal calibrate --json -` prints. Raises ValueError where it refuses."""
+    with TemporaryDirectory() as name:
+        directory = Path(name)
+        write_files(bench, directory, duration_s, {})
+        (directory / "prior.json").write_text(json.dumps(_data_sheet(bench.parameters.sensor.nominal_sensitivity)))
+        files = [
+            part
+            for option in ("sensor", "reference", "poses", "prior")
+            for part in (f"--{option}", str(directory / f"{option}.{'json' if option == 'prior' else 'csv'}"))
+        ]
+        known = ["--u-theta-position-deg", str(KNOWN.theta_position_deg), "--json", "-"]
+        result = CliRunner().invoke(calibrate, [*files, *known], standalone_mode=False)
+    if result.return_value:
+        raise ValueError(result.output)
+    told: dict[str, Any] = json.loads(result.stdout)
+    return told
+
+
+def _data_sheet(nominal: float) -> dict[str, Any]:
+    share = np.where(np.eye(3).ravel() > 0, U_MAIN_PCT, U_TRANSVERSE_PCT) / 100.0
+    covariance = np.diag((nominal * np.append(share, np.full(3, U_OFFSET_MPS2))) ** 2)
+    known = {"sensitivity": nominal * np.eye(3), "offset": np.zeros(3), "covariance": covariance}
+    return {name: value.tolist() for name, value in known.items()}
+
+
+def table(days: Sequence[Day]) -> str:
+    """The worst of all days, by kind of parameter."""
+    apart = np.array([day.apart for day in days])
+    off = np.array([np.abs(day.online - day.truth) / day.u for day in days])
+    u = np.array([day.u for day in days])
+    windows = np.array([day.windows for day in days])
+    lines = [
+        f"{len(days)} days of {len(STOPS)} stops visited {ROUNDS} times, {HOLD_S:g} s each. Windows taken on-line "
+        f"{windows[:, 0].sum()}, by `fieldcal calibrate` {windows[:, 1].sum()}.",
+        "",
+        "| | u of calibrate, mean | on-line less calibrate, worst / u | rms / u | on-line less truth, rms / u |",
+        "| --- | --- | --- | --- | --- |",
+    ]
+    main = [0, 4, 8]
+    for name, unit, columns in (
+        ("main sensitivity", "%", main),
+        ("transverse sensitivity", "%", [k for k in range(9) if k not in main]),
+        ("offset", "mm/s2", range(9, len(PARAMETERS))),
+    ):
+        k = list(columns)
+        size = (100.0 if unit == "%" else 1000.0) * u[:, k].mean()
+        rms = [float(np.sqrt(np.mean(part[:, k] ** 2))) for part in (apart, off)]
+        lines.append(f"| {name} | {size:.2g} {unit} | {apart[:, k].max():.2f} | {rms[0]:.2f} | {rms[1]:.2f} |")
+    return "\n".join(lines)

@@ -1,0 +1,185 @@
+"""A sensor that is turned and nobody tells: blocks into the pipeline, positions out of it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import pytest
+
+from agent.config import Config, ConfigError, parse_config
+from agent.events import Command, DeviceChange, Result, StatusChange, WindowReport
+from agent.pipeline import Pipeline
+from hw.block import BlockFlags, DeviceInfo, SampleBlock
+
+SECOND = 1_000_000_000
+EPOCH_NS = 1_790_000_000 * SECOND
+RATE_HZ = 50.0
+G_MPS2 = 9.80665
+FACES = G_MPS2 * np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0], [0, -1, 0]])
+STAY_S, TURN_S = 17.0, 3.0
+# A change is found to two means of 0.25 s; a window at rest begins and ends with whole pieces of rest, 0.3 s.
+FOUND_S, TRIMMED_S, GUARD_S = 0.5, 0.5, 0.5
+OFFSET_MPS2 = np.array([0.1, -0.2, 0.15])
+NAMES = ("rest (0, 0, 9.80665)", "rest (9.80665, 0, 0)", "rest (0, 9.80665, 0)", "rest (0, -9.80665, 0)")
+
+
+def configured(**keys: Any) -> Config:
+    channel: dict[str, Any] = {
+        "sensor": "s",
+        "prior": {"u_offset_mps2": 0.5},
+        "positions": [{"gravity_mps2": face} for face in FACES.tolist()],
+    }
+    devices = [{"name": n, "driver": "serial-csv", "options": {"port": n, "rate_hz": RATE_HZ}} for n in "sr"]
+    return parse_config({"devices": devices, "channels": [channel | keys]}, "test")
+
+
+def turned(faces: Sequence[np.ndarray], seed: int = 1) -> np.ndarray:
+    """Indications (n, 3): each face for STAY_S, from one to the next in TURN_S."""
+    times, forms = [], []
+    for k, face in enumerate(faces):
+        times += [k * (STAY_S + TURN_S), k * (STAY_S + TURN_S) + STAY_S]
+        forms += [face, face]
+    t = np.arange(round(times[-1] * RATE_HZ)) / RATE_HZ
+    signal = np.column_stack([np.interp(t, times, np.array(forms)[:, i]) for i in range(3)])
+    return signal + OFFSET_MPS2 + 0.01 * np.random.default_rng(seed).normal(size=signal.shape)
+
+
+def opened() -> DeviceChange:
+    info = DeviceInfo("serial-csv", "serial-csv", "1", "m/s2", 3, RATE_HZ)
+    return DeviceChange(
+        device="s", state="open", t_monotonic_ns=0, t_utc_ns=EPOCH_NS, info_json=json.dumps(asdict(info))
+    )
+
+
+def blocks(values: np.ndarray, *, late_s: float = 0.001, lost: slice | None = None) -> list[SampleBlock]:
+    """Half a second each, every sample in a burst of its own; the samples of `lost` never come."""
+    size, made = round(RATE_HZ / 2), []
+    for first in range(0, len(values), size):
+        part = np.arange(first, min(first + size, len(values)))
+        flags = BlockFlags.NONE
+        if lost is not None:
+            part = part[(part < lost.start) | (part >= lost.stop)]
+            flags = BlockFlags.GAP if len(part) and part[0] == lost.stop else flags
+        if len(part):
+            arrivals = np.round(((part + 1) / RATE_HZ + late_s) * SECOND).astype(np.int64)
+            count = np.arange(1, len(part) + 1, dtype=np.int32)
+            utc_ns = EPOCH_NS + int(arrivals[-1])
+            made.append(SampleBlock("s", "boot", utc_ns, int(part[0]), RATE_HZ, arrivals, count, values[part], flags))
+    return made
+
+
+def played(pipeline: Pipeline, events: Sequence[Any]) -> list[Result]:
+    return [result for event in events for result in pipeline.step(event)]
+
+
+def windows(values: np.ndarray, config: Config | None = None, **keys: Any) -> list[WindowReport]:
+    pipeline = Pipeline.begin(config or configured(), "run", 0, 0, {})
+    found = played(pipeline, [opened(), *blocks(values, **keys)])
+    return [r for r in found if isinstance(r, WindowReport)]
+
+
+def test_each_stay_is_one_window_in_the_right_position_a_guard_from_the_turning() -> None:
+    order = [0, 1, 2, 3, 0, 2]
+    found = windows(turned([FACES[k] for k in order]))
+    assert [w.position for w in found] == [NAMES[k] for k in order[:-1]]  # the last stay has no end yet
+    assert all(w.used for w in found)
+    for k, window in enumerate(found):
+        begin_s = k * (STAY_S + TURN_S)
+        end_s = begin_s + STAY_S
+        assert begin_s + GUARD_S - 0.25 <= window.start_s <= begin_s + GUARD_S + FOUND_S + TRIMMED_S + 0.25
+        assert end_s - GUARD_S - FOUND_S - TRIMMED_S <= window.stop_s <= end_s - GUARD_S + 0.25
+        assert window.numbers["position_chi2"] < 21.2
+
+
+def test_times_of_a_change_are_those_of_the_samples_however_late_they_arrive() -> None:
+    values = turned(FACES[:3])
+    early, late = windows(values), windows(values, late_s=3.0)
+    assert [w.position for w in early] == [w.position for w in late]
+    np.testing.assert_allclose([w.start_s for w in early], [w.start_s for w in late], atol=1e-3)
+    np.testing.assert_allclose([w.stop_s for w in early], [w.stop_s for w in late], atol=1e-3)
+
+
+def test_a_long_stay_is_cut_into_windows() -> None:
+    stay = np.tile(FACES[0] + OFFSET_MPS2, (round(100 * RATE_HZ), 1))
+    found = windows(stay, configured(window_s=20))
+    np.testing.assert_allclose([w.start_s for w in found], [0.5, 20.5, 40.5, 60.5], atol=TRIMMED_S)
+    np.testing.assert_allclose([w.stop_s for w in found], [20.5, 40.5, 60.5, 80.5], atol=TRIMMED_S)
+
+
+def test_a_position_that_nobody_stated_is_unknown_and_its_window_refused() -> None:
+    askew = G_MPS2 * np.array([0.6, 0.0, 0.8])
+    found = windows(turned([FACES[0], FACES[1], askew, FACES[2], FACES[3]]))
+    assert [w.used for w in found] == [True, True, False, True]
+    assert found[2].position == "unknown"
+    assert "none of the stated positions" in found[2].reason
+    assert found[2].numbers["position_chi2"] > 21.2
+
+
+def test_two_stops_near_each_other_are_told_apart_once_the_offset_is_known() -> None:
+    lean = G_MPS2 * np.array([np.sin(np.deg2rad(5.0)), 0.0, np.cos(np.deg2rad(5.0))])
+    stops = [*FACES, -FACES[0], -FACES[1], lean]
+    config = configured(positions=[{"gravity_mps2": stop.tolist()} for stop in stops])
+    order = [6, 1, 2, 3, 4, 5, 0, 6, 0]
+    found = windows(turned([stops[k] for k in order]), config)
+    assert [w.used for w in found] == [False, True, True, True, True, True, True, True]
+    assert "1000 to 1 are needed" in found[0].reason
+    assert found[6].position == NAMES[0]
+    assert found[7].position == f"rest ({lean[0]:.6g}, 0, {lean[2]:.6g})"
+
+
+def test_lost_samples_end_a_stretch_and_the_same_stop_is_found_again() -> None:
+    stay = np.tile(FACES[1] + OFFSET_MPS2, (round(60 * RATE_HZ), 1))
+    lost = slice(round(20 * RATE_HZ), round(21 * RATE_HZ))
+    found = windows(stay, configured(window_s=25), lost=lost)
+    assert len(found) == 2
+    times = [(w.start_s, w.stop_s) for w in found]
+    np.testing.assert_allclose(times, [(0.5, 19.5), (21.5, 46.5)], atol=TRIMMED_S + 0.01)
+    assert {w.position for w in found} == {NAMES[1]}
+
+
+def test_an_operators_pose_holds_until_the_next_change() -> None:
+    askew = G_MPS2 * np.array([0.6, 0.0, 0.8])
+    pipeline = Pipeline.begin(configured(), "run", 0, 0, {})
+    events: list[Any] = [opened(), *blocks(turned([FACES[0], askew, FACES[1], FACES[2]]))]
+    told_ns = round((STAY_S + TURN_S + 4.0) * SECOND)
+    command = Command(
+        sensor="s", verb="pose", t_monotonic_ns=told_ns, t_utc_ns=EPOCH_NS + told_ns,
+        arguments_json=json.dumps({"gravity_mps2": askew.tolist(), "position": "askew"}),
+    )  # fmt: skip
+    at = next(k for k, e in enumerate(events) if e.t_monotonic_ns > told_ns)
+    events.insert(at, command)
+    results = played(pipeline, events)
+    found = [r for r in results if isinstance(r, WindowReport)]
+    assert any(isinstance(r, StatusChange) and "askew" in r.reason for r in results)
+    assert [w.position for w in found] == [NAMES[0], "unknown", "askew", NAMES[1]]
+    before, after = found[1], found[2]
+    assert before.stop_s == pytest.approx(told_ns / SECOND - GUARD_S, abs=0.05)
+    assert 0.0 <= after.start_s - (told_ns / SECOND + GUARD_S) <= TRIMMED_S
+    assert after.used
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        ({"coupling": "ac"}, "does not feel"),
+        ({"poses": [{"start_s": 0, "stop_s": 9, "gravity_mps2": [0, 0, 9.8]}]}, "take the place of poses"),
+        ({"positions": [{"gravity_mps2": [0, 0, 9.8]}]}, "one alone"),
+        ({"positions": [{"gravity_mps2": [0, 0, 9.8]}, {"gravity_mps2": [0.1, 0, 9.8]}]}, "positions.0 and"),
+        ({"positions": [{"gravity_mps2": [0, 0, 9.8]}, {"gravity_mps2": [0, 0, 0]}]}, "positions.1"),
+        ({"positions": [{"theta_deg": 35, "alpha_deg": 0}, {"theta_deg": 35, "alpha_deg": 90}]}, "needs a reference"),
+        ({"positions": [{"gravity_mps2": g} for g in FACES.tolist()], "reference": "r"}, "without a reference"),
+        ({"positions": [{"direction": [1, 0, 0]}] * 2, "reference": "r"}, "gravity_mps2 is needed"),
+        ({"positions": "free"}, "needs a reference"),
+        ({"positions": "free", "reference": "r", "clamp_theta_deg": 2}, "tells no alpha"),
+        ({"clamp_theta_deg": 35}, 'goes with positions = "free"'),
+        ({"positions": [{"start_s": 0, "gravity_mps2": [0, 0, 9.8]}] * 2}, "positions.stops.0.start_s"),
+    ],
+)  # fmt: skip
+def test_a_configuration_that_cannot_be_is_refused(keys: dict[str, Any], words: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        configured(**keys)
+    assert any(words in fault for fault in error.value.faults), error.value.faults
