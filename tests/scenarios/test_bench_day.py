@@ -1,0 +1,63 @@
+"""A bench day: nobody tells how the sensor stands or since when, and S and Q come out as if somebody had."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from agent.events import WindowReport
+from agent.pipeline import Pipeline
+from agent.recording.fingerprint import fingerprint
+from agent.recording.replaying import Replay
+from benchmarks.online import bench
+from benchmarks.online.clamp import bench_events
+from benchmarks.online.runner import Run
+
+SEED = 1
+
+
+def test_s_and_q_are_those_of_fieldcal_calibrate_told_everything() -> None:
+    day = bench.day(SEED)
+    stops = [f"theta {theta_deg:g} deg, alpha {alpha_deg:g} deg" for theta_deg, alpha_deg in bench.STOPS]
+    # Before the first motion the reference is calm; that window is used by nobody.
+    assert [position for position in day.positions if position] == stops * bench.ROUNDS
+    assert day.windows == (len(stops) * bench.ROUNDS,) * 2
+    assert day.apart.max() < 0.2
+    assert day.u[[0, 4, 8]].max() < 0.002  # of 5 % that the data sheet left
+
+
+def test_with_free_angles_s_and_q_are_within_their_uncertainty() -> None:
+    """No stop is told either. 12 parameters within 4 u: by chance outside once in 1300 such days."""
+    world = bench.world(SEED)
+    duration_s = world.parameters.schedule.duration_s(1) + bench.AFTER_S
+    update, reports = bench.online(world, duration_s, positions="free", gate={"least_determined": 3})
+    found = np.append(np.ravel(update.sensitivity), update.offset)
+    truth = np.append(world.truth.sensitivity.ravel(), world.truth.offset)
+    u = np.array(update.standard_uncertainty)
+    assert np.all(np.abs(found - truth) < 4.0 * u)
+    nominal = world.parameters.sensor.nominal_sensitivity
+    assert np.all(u[[0, 4, 8]] < 0.005 * nominal)  # of 5 % that the data sheet left
+    alphas = [r.numbers["found_alpha_deg"] for r in reports if "found_alpha_deg" in r.numbers and r.used]
+    assert alphas
+    stated = np.array([alpha_deg for _, alpha_deg in bench.STOPS])
+    apart = np.abs((np.array(alphas)[:, None] - stated + 180.0) % 360.0 - 180.0).min(axis=1)
+    assert apart.max() < 10.0
+
+
+@pytest.mark.parametrize("positions", ["stops", "free"])
+def test_its_recording_replays_bit_for_bit(positions: str, tmp_path: Path) -> None:
+    world = bench.world(SEED)
+    keys = {} if positions == "stops" else {"positions": "free"}
+    run = Run(bench.config(world, **keys), tmp_path)
+    duration_s = world.parameters.schedule.duration_s(1) / 2
+    results = [r for event in bench_events(world, world.recording(duration_s)) for r in run.feed(event)]
+    run.close()
+    assert sum(isinstance(r, WindowReport) for r in results) >= 2
+    (path,) = tmp_path.glob("*.mcap")
+    replay = Replay(Pipeline.restore, fingerprint(), elsewhere=0.0)
+    found = replay.run(path)
+    assert replay.first_difference is None
+    assert found.equal
+    assert found.results == len(results)
