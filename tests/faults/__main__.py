@@ -27,6 +27,7 @@ LINES: dict[str, Callable[[Path], Outcome]] = {
     "read-only": disk.read_only,
     "eio": disk.sync_fails,
     "slow": disk.slow,
+    "slow-end": disk.slow_at_the_end,
     "unplug": partial(unplug.unplugged, times=100),
     "router": partial(routing.away, results=10_000, speed=50),
     "clock": clock.stepped,

@@ -29,6 +29,7 @@ BAD_S = 5.0  # longer than the pause between two attempts to record, 10 s of the
 GOOD_AGAIN_S = 60.0  # what waited for the slow disk must drain first
 AGAIN = 20  # results, the last of them recorded: it is as before
 SLOW_MS = 500  # a worn card that collects its garbage
+BACKLOG_S = 8.0  # of results, each of which waits for half a second and more
 
 
 def nothing() -> None:
@@ -135,6 +136,33 @@ def sync_fails(directory: Path) -> Outcome:
 def slow(directory: Path) -> Outcome:
     """fsync and fdatasync take long for a while (strace)."""
     return _injected(directory, "slow disk", f"delay_enter={SLOW_MS * 1000}:when=20..40", recorded=True)
+
+
+def slow_at_the_end(directory: Path) -> Outcome:
+    """fsync and fdatasync take long from some time on, and the agent is stopped with much waiting for the disk."""
+    prefix = strace("fsync,fdatasync", f"delay_enter={SLOW_MS * 1000}:when=20+")
+    with witnessed(directory, SEED) as (rig, witness):
+        with rig.agent(prefix) as agent:
+            rig.run(agent, until=lambda: len(witness.received) > 20)
+            rig.run(agent, BACKLOG_S)
+            began_s = time.monotonic()
+            status = stop(agent)
+            took_s = time.monotonic() - began_s
+        ledger = Ledger(rig.data_dir)
+        ledger.inspect(witness.before(time.monotonic()))
+        with rig.agent() as agent:
+            rig.run(agent, until=lambda: len(witness.received) > len(ledger.records))
+            again = stop(agent)
+        ledger.inspect(witness.before(time.monotonic()))
+    outcome = Outcome(
+        "stop on a slow disk", f"{SLOW_MS} ms for each fsync, {BACKLOG_S:g} s of backlog", ledger.findings
+    )
+    unrecorded = sum(not record.recorded for record in ledger.records)
+    outcome.also = f"ended with {status} after {took_s:.1f} s; {unrecorded} results kept and not recorded"
+    outcome.require((status, again) == (0, 0), f"it ended with {status}, then {again}: {rig.output[-300:]}")
+    outcome.require(unrecorded > 0 and "too slow to record" in rig.output, "nothing was left to record at the end")
+    outcome.require("Traceback" not in rig.output, "a traceback was shown")
+    return outcome
 
 
 def _injected(directory: Path, line: str, how: str, *, recorded: bool) -> Outcome:

@@ -45,3 +45,9 @@ def test_slow(tmp_path: Path) -> None:
     require("strace")
     outcome = disk.slow(tmp_path)
     assert outcome.good, outcome
+
+
+def test_slow_at_the_end(tmp_path: Path) -> None:
+    require("strace")
+    outcome = disk.slow_at_the_end(tmp_path)
+    assert outcome.good, outcome
