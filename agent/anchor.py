@@ -49,6 +49,11 @@ class Anchor:
         sensitivity, offset = self._value[:9].reshape(3, 3).copy(), self._value[9:].copy()
         return Calibration(sensitivity, offset, np.diag(self._u**2), self._fixed.copy(), np.inf, "accepted")
 
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """(12,) whose anchor is known to within max_change; an offset that nothing limits is not."""
+        return self._fixed & np.isfinite(self._max_change())
+
     def change(self, calibration: Calibration) -> Change:
         """From the anchor to this calibration, held against the limits."""
         value = _values(calibration)

@@ -11,7 +11,7 @@ import numpy as np
 from agent.config import Channel
 from agent.config.gate import GateSettings
 from agent.gate import Decision, Evidence, Gate
-from calib.correction import Law, constant
+from calib.correction import Law
 from calib.distributions import chi2_quantile
 from calib.drift import DriftTest, DriftVerdict
 from calib.innovation import Innovation
@@ -81,8 +81,9 @@ class Estimation:
         trial = self.recursion.copy()
         trial.update(summary)
         candidate = trial.result()
-        held = [*self._held, summary]
-        adopted = self._adopted(held) if len(held) >= self._channel.gate.confirm_windows else None
+        confirm = self._channel.gate.confirm_windows
+        held = [*self._held, summary][-confirm:]
+        adopted = self._adopted(held) if len(held) == confirm else None
         evidence = Evidence(day * DAY_S, innovation.statistic, innovation.degrees_of_freedom)
         decision = self.gate.judge(evidence, candidate, None if adopted is None else adopted.result())
         if decision.action == "take":
@@ -96,30 +97,32 @@ class Estimation:
         drift: Sequence[DriftVerdict] = ()
         if decision.action in ("take", "hold"):
             drift = self.drift.update(day * DAY_S, innovation.score, innovation.information)
+            if not self.gate.held:  # else it is for windows that agree to confirm it
+                self._follow()
         if decision.in_force:
             self.in_force, self.law = self.recursion.result(), self.recursion.law()
             self.residual_sd = self.recursion.residual_sd
         if decision.action == "hold":
             decision = replace(decision, reason=f"{decision.reason}; {_most(innovation, self.recursion.scale)}")
-        self._follow(drift)
         return Judged(decision, innovation, drift)
 
     def put(self, calibration: Calibration) -> None:
         """An operator put this in force: the state goes on from it, unless it is there anyway."""
-        self.in_force, self.law = calibration, constant(calibration)
         now = self.recursion.result()
         if not (
             np.array_equal(now.sensitivity, calibration.sensitivity) and np.array_equal(now.offset, calibration.offset)
         ):
             self.recursion.put(calibration)
             self.drift.restart(np.ones(12, dtype=bool))
+        # How S and Q go with temperature is the state's as before.
+        self.in_force, self.law = calibration, replace(self.recursion.law(), determined=calibration.determined)
         self._held = []
 
-    def _follow(self, drift: Sequence[DriftVerdict]) -> None:
+    def _follow(self) -> None:
         """A step so small that each window alone was consistent: the state may follow it."""
         loose = np.zeros(12)
         for k, verdict in enumerate(self.drift.result()):
-            if verdict in drift and verdict.verdict == "stepped":
+            if verdict.verdict == "stepped" and verdict.statistic > verdict.threshold:
                 loose[k] = abs(verdict.change)
         if loose.any():
             self.recursion.loosen(loose, self._tilt_rad(loose[9:]))
@@ -137,7 +140,8 @@ class Estimation:
 
     def _jumped(self, held: Sequence[Summary], tilt_rad: float) -> Recursion | None:
         trial = self.recursion.copy()
-        trial.loosen(self._jump(held), tilt_rad)
+        # A line that was plugged anew may be late by another time; that is no change of S or Q.
+        trial.loosen(self._jump(held), tilt_rad, lag=True)
         for k, summary in enumerate(held):
             told = trial.innovation(summary)
             limit = chi2_quantile(1.0 - self._channel.gate.false_holds, told.degrees_of_freedom)

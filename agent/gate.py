@@ -34,8 +34,8 @@ class Decision:
 
     `take`: it goes into the state; `hold`: it is kept aside; `adopt`: all that were kept aside go in; `refuse`: it is
     left out. `in_force`: S and Q in force are now the state's. `propose`: publish `proposal` as an Estimate and give
-    its number to `Gate.published`. `held`: the newest windows to keep aside, at most `confirm_windows`, so that a wild
-    one among them does not stand in the way for ever; the others are dismissed.
+    its number to `Gate.published`, several in their order. `held`: the newest windows to keep aside, at most
+    `confirm_windows`, so that a wild one among them does not stand in the way for ever; the others are dismissed.
     """
 
     action: Literal["take", "hold", "adopt", "refuse"]
@@ -164,10 +164,12 @@ class Gate:
         self, action: Literal["take", "adopt"], calibration: Calibration, reason: str, numbers: dict[str, float]
     ) -> Decision:
         """The window goes into the state; whether S and Q in force follow is for the policy and what is determined."""
-        determined = int(np.count_nonzero(calibration.determined))
+        # What a certificate tells well the data need not tell better.
+        known = calibration.determined | self._anchor.known
+        determined = int(np.count_nonzero(known))
         least = self._settings.least_determined or 1
         if not self._calibrated and determined < least:
-            missing = [p for p, known in zip(PARAMETERS, calibration.determined, strict=True) if not known]
+            missing = [p for p, told in zip(PARAMETERS, known, strict=True) if not told]
             self._settling = 0  # nothing in force that could settle
             numbers |= {"determined": determined, "determined_threshold": least}
             return self._decision(action, f"not determined yet: {', '.join(missing)}", numbers)
@@ -191,12 +193,14 @@ class Gate:
         if self._settings.policy == "observe":
             proposal = None
         if proposal is not None:
-            self._proposals = [*self._proposals, (0, proposal)][-PROPOSALS_KEPT:]
+            self._proposals.append((0, proposal))
         return Decision(action, self.status, reason, numbers or {}, in_force, proposal, self._held)
 
     def published(self, sequence: int) -> None:
-        """The newest proposal went out as this Estimate."""
-        self._proposals[-1] = (sequence, self._proposals[-1][1])
+        """The oldest proposal without a number went out as this Estimate."""
+        k = next(k for k, (number, _) in enumerate(self._proposals) if not number)
+        self._proposals[k] = (sequence, self._proposals[k][1])
+        self._proposals = self._proposals[-PROPOSALS_KEPT:]
 
     # --- events and operators
 

@@ -36,16 +36,31 @@ class Law:
 
     def at(self, degc: float) -> Calibration:
         """S and Q at a temperature; without one (NaN), at the reference temperature and as uncertain as the range."""
+        if np.isnan(degc):
+            return self._anywhere()
         map_, base = self._map(degc)
         covariance = map_ @ self.covariance @ map_.T
         beyond = max(self.low_degc - degc, degc - self.high_degc, 0.0)
         if np.isfinite(beyond):
             covariance[range(9, 12), range(9, 12)] += (self.u_beyond * beyond**2) ** 2
+        return self._calibration(base, covariance)
+
+    def _anywhere(self) -> Calibration:
+        """At the reference temperature, as uncertain as if it were as often at one end of the range as at the other."""
+        map_, base = self._map(self.reference_degc)
+        covariance = map_ @ self.covariance @ map_.T
+        if np.isfinite(self.low_degc):
+            ends = [self._map(degc) for degc in (self.low_degc, self.high_degc)]
+            parts = [m @ self.covariance @ m.T + np.outer(value - base, value - base) for m, value in ends]
+            covariance = np.mean(parts, axis=0)
+        return self._calibration(base, covariance)
+
+    def _calibration(self, base: Array, covariance: Array) -> Calibration:
         return Calibration(base[:9].reshape(3, 3), base[9:], covariance, self.determined, np.inf, "corrected")
 
     def _map(self, degc: float) -> tuple[Array, Array]:
         """Derivative (12, n) of S and Q there by `mean`, and their values (12,)."""
-        above = degc - self.reference_degc if np.isfinite(degc) else 0.0
+        above = degc - self.reference_degc
         map_ = np.zeros((12, len(self.mean)))
         map_[range(12), range(12)] = 1.0
         value = self.mean[:12].copy()
@@ -92,9 +107,3 @@ def calibration_part(acceleration: Array, calibration: Calibration) -> Array:
     inverse = np.linalg.inv(calibration.sensitivity)
     through = inverse @ J
     return np.asarray(through @ calibration.covariance @ through.T)
-
-
-def constant(calibration: Calibration) -> Law:
-    """The law of a calibration that says nothing of temperature."""
-    mean = np.append(calibration.sensitivity.ravel(), calibration.offset)
-    return Law(mean, calibration.covariance, determined=calibration.determined)

@@ -232,7 +232,7 @@ class Recursion:
     def _rows(self, summary: Summary) -> WindowRows:
         reference_degc = self._temperature.reference_degc
         held = self._held.mps2 if self._held is not None else np.zeros(3) if self._fixed else None
-        return WindowRows(summary, self._priors, self.scale, reference_degc, held)
+        return WindowRows(summary, self._priors, self.scale, reference_degc, held, self.temperature_range_degc)
 
     def _wandered(self, state: JointState, since: float | None, day: float) -> JointState:
         """A copy of the state, wandered on to `day`; earlier days are as now."""

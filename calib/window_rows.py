@@ -101,11 +101,18 @@ class WindowRows:
 
     `scale` is the sensor's output unit per m/s2. `held_mps2` (3,) makes it the window of a fixed mount: the quantities
     Q are then the mean output under that constant input acceleration (see calib.recursion), and columns of S in
-    directions that were not excited get no part in the slopes. None: the mount turns.
+    directions that were not excited get no part in the slopes. None: the mount turns. `seen_degc` is the range of
+    temperatures of windows before: one without a temperature may have had any of them.
     """
 
     def __init__(
-        self, summary: Summary, priors: Priors, scale: float, reference_degc: float, held_mps2: Array | None
+        self,
+        summary: Summary,
+        priors: Priors,
+        scale: float,
+        reference_degc: float,
+        held_mps2: Array | None,
+        seen_degc: tuple[float, float],
     ) -> None:
         self.summary, self.data = summary, summary.data
         self.nuisances = Nuisances([summary.moved], self.data.channels, priors, Applied(summary.lag_s))
@@ -114,6 +121,8 @@ class WindowRows:
         self._priors, self._held_mps2 = priors, held_mps2
         above = summary.temperature_degc - reference_degc
         self._temperature_k = above if np.isfinite(above) else 0.0
+        told = np.isfinite(above) or not np.isfinite(seen_degc).all()
+        self._perhaps_k = () if told else tuple(degc - reference_degc for degc in seen_degc)
         self._live = np.repeat(np.diag(self.data.root[0]) > 0.0, 3)
 
     @property
@@ -146,7 +155,9 @@ class WindowRows:
         if slope.size:
             parts.append(_weighed(slope, d_slope, weights, covariance))
         if self.equations.known[0]:
-            parts.append(_weighed(mean, d_mean, *self._mean_covariances(noise)))
+            perhaps = self._perhaps(state, at)
+            weights, covariance = self._mean_covariances(noise)
+            parts.append(_weighed(mean, d_mean, weights + perhaps, covariance + perhaps))
         if not parts:
             return Rows(np.zeros(0), np.zeros((0, len(state))), np.zeros((0, 0)), 0)
         residual, jacobian, roots = zip(*parts, strict=True)
@@ -179,6 +190,18 @@ class WindowRows:
             k = state.index(term.name)
             x[12 + j], chain[12 + j, k] = at[k] - term.applied, 1.0
         return x, chain
+
+    def _perhaps(self, state: JointState, at: Array) -> Array:
+        """(3, 3) covariance of the weighed means for a temperature nobody told: one end of the range or the other."""
+        found = np.zeros((3, 3))
+        for above in self._perhaps_k:
+            moved = np.zeros(3)
+            for power in (1, 2):
+                for i, name in enumerate(offset_temperature(power)):
+                    if name in state.names:
+                        moved[i] += at[state.index(name)] * above**power * self.equations.mean_weight[0, i]
+            found += np.outer(moved, moved) / len(self._perhaps_k)
+        return found
 
     def _slope_covariances(self, noise: Noise) -> tuple[Array, Array]:
         """For weights and true, of the live slopes in units of the noise within the window.

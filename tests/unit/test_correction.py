@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from agent.events import Acceleration
 from agent.recording.messages import decode, encode, schema_of, topic_of
-from calib.correction import Law, calibration_part, constant, corrected
+from calib.correction import Law, calibration_part, corrected
 from calib.model import Calibration
 
 S = np.array([[1.02, 0.01, -0.02], [0.015, 0.98, 0.005], [-0.01, 0.02, 1.01]])
@@ -80,8 +80,18 @@ def test_beyond_the_range_it_grows_less_sure() -> None:
     law = Law(np.append(S.ravel(), Q), covariance(4), 0, False, 20.0, 10.0, 30.0, 1e-3)
     inside, outside = (law.at(t).standard_uncertainty[9:] for t in (30.0, 40.0))
     np.testing.assert_allclose(outside**2 - inside**2, (1e-3 * 10**2) ** 2, rtol=1e-9)
-    np.testing.assert_array_equal(law.at(20.0).standard_uncertainty, law.at(float("nan")).standard_uncertainty)
-    np.testing.assert_array_equal(constant(calibration(covariance(4))).at(90.0).covariance, covariance(4))
+    unseen = Law(np.append(S.ravel(), Q), covariance(4))
+    np.testing.assert_array_equal(unseen.at(90.0).covariance, covariance(4))
+    np.testing.assert_array_equal(unseen.at(float("nan")).covariance, covariance(4))
+
+
+def test_at_no_temperature_told_it_is_as_uncertain_as_the_range() -> None:
+    per_k = np.array([0.01, -0.02, 0.0])
+    law = Law(np.concatenate([S.ravel(), Q, per_k]), 1e-10 * np.eye(15), 1, False, 20.0, 5.0, 35.0)
+    nowhere = law.at(float("nan"))
+    np.testing.assert_array_equal(nowhere.offset, Q)
+    # At an end, 15 K away, Q is another by so much; of the coefficients' own 1e-5 a K another 15e-5.
+    np.testing.assert_allclose(nowhere.standard_uncertainty[9:], [0.15, 0.3, 1.5e-4], rtol=5e-3)
 
 
 @given(n=st.integers(1, 40), seed=st.integers(0, 2**32 - 1))

@@ -181,6 +181,22 @@ def test_temperature_is_told_from_drift() -> None:
     assert (low, high) == pytest.approx((12.0, 28.0), abs=0.2)
 
 
+def test_a_window_without_a_temperature_may_have_had_any_of_those_before() -> None:
+    random, found = np.random.default_rng(14), mounted(model=TemperatureModel(1, u_offset_mps2=(0.05, 0.0)))
+    per_k = np.array([0.01, -0.03, 0.02])
+    for k in range(48):
+        above = 10.0 * np.sin(2 * np.pi * k / 24)
+        found.update(Summary.of(building_window(random, Q=Q_TRUE + per_k * above), k / 24, 0.0, 20.0 + above))
+    output = found.result().sensitivity @ GRAVITY + found.result().offset
+    for k in range(48, 52):
+        window = building_window(random, Q=Q_TRUE + per_k * 8.0)
+        told = found.innovation(Summary.of(window, k / 24))
+        assert told.statistic < 45  # 12 degrees of freedom: one in 10^5
+        found.update(Summary.of(window, k / 24))
+    moved = found.result().sensitivity @ GRAVITY + found.result().offset - output
+    np.testing.assert_allclose(moved, 0.0, atol=2e-3)  # 80 to 240 mm/s2 would be taking 28 degC for 20
+
+
 def test_the_innovation_is_chi_squared_and_each_score_normal() -> None:
     scores, statistics, freedom = [], [], 0
     for seed in range(60):
