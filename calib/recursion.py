@@ -19,7 +19,7 @@ the uncertainties of S, G and tilt. Were Q in the state, a mean that drifts woul
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -42,7 +42,6 @@ ITERATIONS = 6
 # 5e-6 of S.
 STRAIGHT = 1e-3
 STRAIGHT_LAG_S = 5e-5  # (omega lag)^2 / 2 of it at 10 Hz is as much
-MOST_NOISE_FREEDOM = 400.0  # degrees of freedom: beyond, the oldest windows' scatter is forgotten
 MOST_POSITIONS = 48  # whose own nuisances are kept; of the oldest ones nothing but their effect on S and Q remains
 METHOD = "3 (recursive adjustment)"
 
@@ -179,7 +178,7 @@ class Recursion:
         self._settle()
         if len(self._recent) > MOST_RECENT:
             self._absorb(1)
-        self._noise = _pooled(self._noise, rows.noise)
+        self._noise = self._noise.pooled(rows.noise)
         self._residual_sd = summary.data.type_a.noise.copy()
         if np.isfinite(summary.temperature_degc):
             low, high = self._temperature_range
@@ -386,18 +385,6 @@ def _gain(jacobian: Array, factor: Array) -> Array:
     """(N, R) L A' (A A' + 1)^-1, A = H L: nothing larger than the rows is inverted, and the 1 bounds it."""
     a = jacobian @ factor
     return np.asarray(np.linalg.solve(a @ a.T + np.eye(len(a)), a @ factor.T).T)
-
-
-def _pooled(noise: Noise, own: Noise) -> Noise:
-    """Both by their degrees of freedom, the older ones forgotten beyond MOST_NOISE_FREEDOM."""
-    kept = min(noise.degrees_of_freedom, MOST_NOISE_FREEDOM - min(own.degrees_of_freedom, MOST_NOISE_FREEDOM))
-    total = kept + own.degrees_of_freedom
-    if total <= 0.0:
-        return replace(noise, slopes=own.slopes, means=own.means) if noise.degrees_of_freedom <= 0.0 else noise
-    share = kept / total
-    return Noise(
-        share * noise.slopes + (1.0 - share) * own.slopes, share * noise.means + (1.0 - share) * own.means, total
-    )
 
 
 def _later(day: float | None, other: float) -> float:

@@ -28,10 +28,21 @@ class Noise:
     means: float = 1.0
     degrees_of_freedom: float = 0.0
 
+    def pooled(self, own: Noise) -> Noise:
+        """With another window's, by their degrees of freedom; the older ones forgotten beyond MOST_FREEDOM."""
+        kept = min(self.degrees_of_freedom, MOST_FREEDOM - min(own.degrees_of_freedom, MOST_FREEDOM))
+        total = kept + own.degrees_of_freedom
+        if total <= 0.0:
+            return own if self.degrees_of_freedom <= 0.0 else self
+        share = kept / total
+        slopes, means = share * self.slopes, share * self.means
+        return Noise(slopes + (1.0 - share) * own.slopes, means + (1.0 - share) * own.means, total)
+
 
 # A window's own covariance of slopes, from its segments alone, is drawn to the pooled one by as many degrees of freedom
 # as it has rows, three times: estimated from fewer it would be too sure of some direction.
 SHRINKAGE = 3.0
+MOST_FREEDOM = 400.0  # degrees of freedom: beyond, the oldest windows' scatter is forgotten
 LEAST_INFLATION = 0.25  # variance ratios below it are the luck of few segments
 
 

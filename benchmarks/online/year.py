@@ -47,7 +47,7 @@ def parameters(seed: int, elsewhere: float = 0.0) -> BuildingParameters:
 def config(building: Building, **keys: Any) -> Config:
     """What an operator states of it. `keys` are further ones of the channel, or sections in the place of these."""
     stated = {
-        "prior": {"sensitivity": 1.0, "u_main_pct": 2.0, "u_transverse_pct": 1.0, "u_offset_mps2": 0.2},
+        "prior": {"sensitivity": 1.0, "u_main_pct": 2.0, "u_transverse_pct": 1.0, "u_offset_mps2": 0.5},
         "certificate": {"u_sensitivity_pct": 0.1, "noise_mps2": 0.001},
         "uncertainty": {"offset_mps2": 0.002, "tilt_deg": 0.1, "gravity_mps2": 0.005},
         "temperature": {"offset_order": 1, "reference_degc": building.parameters.weather.mean_degc},
