@@ -29,6 +29,7 @@ from agent.recording.retention import keep_files
 from agent.recording.signing import Signer
 from agent.recording.thread import RecordingThread
 from agent.recording.writer import Recorder
+from agent.stalls import few_objects
 from agent.supervision.notify import Notifier
 from agent.supervision.plant import Outbox, Plant
 from agent.supervision.supervisor import Supervisor
@@ -93,9 +94,10 @@ class Service:
         self._supervisor = Supervisor(config, self._run_id, self._origin_ns, plant, Notifier(os.environ))
         try:
             writer.put(0, self._run_start(continuation=False), [])
-            for reader in readers:
-                reader.start()
-            self._loop(events, writer, duration_s)
+            with few_objects():
+                for reader in readers:
+                    reader.start()
+                self._loop(events, writer, duration_s)
         finally:
             self._supervisor.closing()
             if self._reception is not None:

@@ -1,0 +1,81 @@
+"""What would hold all threads of a run up: modules loaded late, and a garbage collector with much to look at."""
+
+from __future__ import annotations
+
+import gc
+import json
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+from agent.config import parse_config
+from agent.service import Service
+from agent.terminal.watch import Watch
+from tests.scenarios.processes import ROOT, wait_until
+from tests.unit.recorded_bench import record
+
+# A service has loaded all; then it gets events until windows were judged, and records them and what came of them.
+STEPS = """
+import json, sys
+from pathlib import Path
+import agent.service
+from agent.config import Config
+from agent.events import CalibrationUpdate, WindowReport
+from agent.pipeline import Pipeline
+from agent.recording.reading import RecordingReader
+from agent.recording.writer import Recorder
+
+start, *events = (step.event for step in RecordingReader(Path(sys.argv[1])).steps())
+pipeline = Pipeline.begin(Config.model_validate_json(start.config_json), "run", 0, 0, {})
+recorder = Recorder(Path(sys.argv[2]), ["mems", "reference"], ["mems"])
+recorder.record(0, start, [])
+before = set(sys.modules)
+used = 0
+for number, event in enumerate(events, start=1):
+    results = pipeline.step(event)
+    pipeline.memories(results)
+    recorder.record(number, event, results)
+    used += sum(isinstance(result, WindowReport) and result.used for result in results)
+pipeline.snapshot()
+recorder.close()
+print(json.dumps({"used": used, "late": sorted(set(sys.modules) - before)}))
+"""
+
+
+def test_all_that_windows_need_is_loaded_with_the_service(tmp_path: Path) -> None:
+    record(tmp_path / "bench", 32.0)
+    (recording,) = (tmp_path / "bench").glob("*.mcap")
+    (tmp_path / "again").mkdir()
+    command = [sys.executable, "-c", STEPS, str(recording), str(tmp_path / "again")]
+    told = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=True)
+    assert json.loads(told.stdout) == {"used": 2, "late": []}
+
+
+STANDS = {"start_s": 0, "stop_s": 3600, "gravity_mps2": [0, 0, 9.81]}
+FEW = 10_000  # objects, walked through in 2 ms; a run makes about 700, modules alone are 50,000
+
+
+def test_the_collector_walks_through_what_the_run_made_only(tmp_path: Path) -> None:
+    options = {"port": str(tmp_path / "absent"), "rate_hz": 100, "axes": 3, "unit": "m/s2"}
+    config = parse_config(
+        {
+            "gateway": {"site": "test", "name": "stalls"},
+            "devices": [{"name": "imu", "driver": "serial-csv", "options": options}],
+            "channels": [{"sensor": "imu", "prior": {}, "poses": [STANDS]}],
+            "zenoh": {"enabled": False},
+        },
+        "test",
+    )
+    assert len(gc.get_objects()) > 4 * FEW
+    with Watch(config, "test", None) as watch:
+        service = Service(config, tmp_path / "data", watch)
+        runner = threading.Thread(target=service.run, args=(None,))
+        runner.start()
+        try:
+            wait_until(lambda: len(gc.get_objects()) < FEW, 20, "the collector has few objects")
+        finally:
+            service.stop()
+            runner.join(10)
+    assert not runner.is_alive()
+    assert len(gc.get_objects()) > 4 * FEW
