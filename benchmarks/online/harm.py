@@ -91,8 +91,9 @@ def wrong(update: CalibrationUpdate, drawn: Node, harmed: bool) -> str:
 
 
 def plain(reason: str) -> str:
-    """A reason without its numbers, for counting."""
-    return re.sub(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?", "#", reason)
+    """A reason without its numbers and parameters, for counting."""
+    words = re.split(r"; |: (?=[SQ][xyz]|common)", reason)[0]
+    return re.sub(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?", "#", words)
 
 
 def table(outcomes: Iterable[Outcome]) -> str:
