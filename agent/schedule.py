@@ -70,8 +70,10 @@ class ToldTimes:
         """An operator says how it stands from now on."""
         stood = []
         if self.piece is not None and self.piece.start_s < now_s:
-            # The pose before holds until now: its window is closed here, a guard taken off as at every change.
-            stood = [Stance(self.piece.start_s - self._channel.guard_s, now_s, self.piece.pose)]
+            # The pose before holds until now: its window is closed here, a guard taken off as at every change. One that
+            # ended before, and waits for late samples, holds no longer than it did.
+            stop_s = min(now_s, self.piece.stop_s + self._channel.guard_s)
+            stood = [Stance(self.piece.start_s - self._channel.guard_s, stop_s, self.piece.pose)]
         self._stances = [*stood, Stance(now_s, math.inf, pose)]
         self._plan()
 
