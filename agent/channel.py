@@ -14,6 +14,7 @@ from agent.corrected import acceleration_block
 from agent.estimation import DAY_S, Estimation, Judged
 from agent.events import Acceleration, CalibrationUpdate, Command, DeviceChange, Estimate, Output, Result, Tick
 from agent.identity import identity_of, nominal_of
+from agent.kept import keep, plain, take_up, update_of
 from agent.operators import CommandError, answer, commanded_pose
 from agent.outcome import (
     Source,
@@ -25,7 +26,6 @@ from agent.outcome import (
 )
 from agent.positions import FOUND_WITHIN_S, FoundPositions
 from agent.schedule import Piece, ToldTimes
-from agent.snapshot import pack, unpack
 from agent.stream import DeviceStream
 from agent.windows import MARGIN_S, Found, refused, windows_in
 from calib.model import Pose, Window
@@ -120,7 +120,7 @@ class ChannelState:
         try:
             if command.verb == "pose":
                 return self._turn(commanded_pose(command, self._channel))
-            said = answer(command, self._estimation)
+            said = answer(command, self._estimation, self.identity)
         except CommandError as error:
             return [self._told(f"{command.verb} refused: {error}")]
         if said.refused:
@@ -159,6 +159,7 @@ class ChannelState:
         if self._estimation is None or identity != self.identity:
             if self._estimation is not None:
                 self._kept[self.identity] = self.memory()
+                self._streams[self.sensor].clear()  # samples of the device before are nothing to this one
                 reason = f"{self.sensor} is now {identity}, was {self.identity}"
             elif self._kept and identity not in self._kept:
                 reason = f"the calibration kept belongs to {', '.join(sorted(self._kept))}, this is {identity}"
@@ -171,19 +172,21 @@ class ChannelState:
                 self._estimation = None
                 return self._change("INVALID", str(error))
             if identity in self._kept:
-                results += self._remember(self._kept.pop(identity))
-                reason = "restored from the run before"
+                results, reason = self._remember(self._kept.pop(identity))
         if self._status == "INVALID":
             # A port that opens is no sensor that speaks: one that was INVALID stays so until a block comes.
             self._estimation.gate.lose("")
         return results + self._say_status(reason)
 
     def _identify_reference(self, info_json: str) -> list[Result]:
-        identity = identity_of(info_json)
-        if self._reference and identity != self._reference and self._estimation is not None:
-            self._estimation.recursion.forget_reference()
-        self._reference = identity
-        return []
+        before, self._reference = self._reference, identity_of(info_json)
+        if not before or before == self._reference:
+            return []
+        assert self._channel.reference is not None
+        self._streams[self._channel.reference].clear()
+        if self._estimation is not None:
+            self._estimation.forget_reference()
+        return [self._told(f"the reference is now {self._reference}, was {before}")]
 
     def _lose(self, reason: str) -> list[Result]:
         if self._estimation is not None:
@@ -320,36 +323,36 @@ class ChannelState:
 
     # --- state
 
+    @property
+    def known(self) -> bool:
+        """Whether there is a device with anything to remember."""
+        return self._estimation is not None
+
     def memory(self) -> bytes:
         """What outlives a run, of the device that is there now."""
         assert self._estimation is not None
-        return pack(
-            {
-                "estimation": self._estimation.snapshot(),
-                "in_force": _plain(self._in_force),
-                "day": self._first_day + self._now_s() / DAY_S,
-                "t_utc_ns": self._utc_ns(),
-            }
-        )
+        day = self._first_day + self._now_s() / DAY_S
+        return keep(self._channel, self._estimation, self._in_force, self._reference, day, self._utc_ns())
 
     def memories(self) -> dict[str, bytes]:
         """`memory` by identity, of the device that is there now and of those that were there before."""
         taught = self._estimation is not None and (self._estimation.recursion.windows or self._in_force is not None)
         return self._kept | ({self.identity: self.memory()} if taught else {})
 
-    def _remember(self, memory: bytes) -> list[Result]:
-        assert self._estimation is not None
-        state = unpack(memory)
-        self._estimation.load(state["estimation"])
+    def _remember(self, memory: bytes) -> tuple[list[Result], str]:
+        kept = take_up(memory, self._channel, self._nominal)
+        self._estimation = kept.estimation
         self._estimation.gate.regain("")
-        pause_days = (self._utc_ns() - state["t_utc_ns"]) * 1e-9 / DAY_S
+        if self._reference and kept.reference and kept.reference != self._reference:
+            self._estimation.forget_reference()
+        self._reference = self._reference or kept.reference
+        pause_days = (self._utc_ns() - kept.t_utc_ns) * 1e-9 / DAY_S
         pause_days = pause_days if 0.0 <= pause_days <= LONGEST_PAUSE_DAYS else 0.0
-        self._first_day = state["day"] + pause_days - self._now_s() / DAY_S
-        kept = _calibration(state["in_force"])
-        if kept is None:
-            return []
-        self._in_force = msgspec.structs.replace(kept, t_utc_ns=self._utc_ns())
-        return [self._in_force]
+        self._first_day = kept.day + pause_days - self._now_s() / DAY_S
+        if kept.in_force is None:
+            return [], kept.reason
+        self._in_force = msgspec.structs.replace(kept.in_force, t_utc_ns=self._utc_ns())
+        return [self._in_force], kept.reason
 
     def snapshot(self) -> dict[str, Any]:
         """State for `load`, bit-exact."""
@@ -361,7 +364,7 @@ class ChannelState:
             "reference": self._reference,
             "nominal": self._nominal,
             "estimation": None if self._estimation is None else self._estimation.snapshot(),
-            "in_force": _plain(self._in_force),
+            "in_force": plain(self._in_force),
             "kept": dict(self._kept),
             "first_day": self._first_day,
             "status": self._status,
@@ -382,18 +385,10 @@ class ChannelState:
         if state["estimation"] is not None:
             self._estimation = Estimation(self._channel, self._nominal)
             self._estimation.load(state["estimation"])
-        self._in_force = _calibration(state["in_force"])
+        self._in_force = update_of(state["in_force"])
         self._kept = dict(state["kept"])
         self._first_day, self._status = state["first_day"], state["status"]
         self._places.load(state["places"])
         self._refused = state["refused"]
         self._now_ns = state["now_ns"]
         self._utc_minus_monotonic_ns = state["utc_minus_monotonic_ns"]
-
-
-def _plain(update: CalibrationUpdate | None) -> dict[str, Any] | None:
-    return None if update is None else msgspec.structs.asdict(update)
-
-
-def _calibration(state: dict[str, Any] | None) -> CalibrationUpdate | None:
-    return None if state is None else CalibrationUpdate(**state)

@@ -118,6 +118,12 @@ class Estimation:
         self.in_force, self.law = calibration, replace(self.recursion.law(), determined=calibration.determined)
         self._held = []
 
+    def forget_reference(self) -> None:
+        """Another reference stands there: neither its error nor windows kept aside are of the one before."""
+        self.recursion.forget_reference()
+        self.gate.dismiss()
+        self._held = []
+
     def _follow(self) -> None:
         """A step so small that each window alone was consistent: the state may follow it."""
         loose = np.zeros(12)

@@ -212,8 +212,12 @@ class Gate:
     def regain(self, reason: str) -> Answer:
         """It speaks again; windows kept aside are from before, and dismissed."""
         self._lost = False
-        self._held = self._agreeing = 0
+        self.dismiss()
         return Answer(self.status, reason)
+
+    def dismiss(self) -> None:
+        """Windows kept aside tell nothing more: what they were made with is another now."""
+        self._held = self._agreeing = 0
 
     def hold(self, key: str) -> Answer:
         """An operator stops all change."""

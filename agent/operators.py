@@ -6,6 +6,7 @@ import json
 from typing import Any
 
 import msgspec
+import numpy as np
 from pydantic import ValidationError
 
 from agent.config import Channel, PoseInterval
@@ -14,7 +15,7 @@ from agent.events import CalibrationUpdate, Command
 from agent.gate import Answer
 from agent.outcome import calibration_of
 from agent.schedule import pose_of
-from calib.model import Pose
+from calib.model import Calibration, Pose
 
 LOCAL = "an operator at the gateway"
 
@@ -23,8 +24,11 @@ class CommandError(ValueError):
     """A command that makes no sense; the message says why."""
 
 
-def answer(command: Command, estimation: Estimation) -> Answer:
-    """The gate's answer to hold, accept or rollback, carried out. Raises CommandError on what no gate understands."""
+def answer(command: Command, estimation: Estimation, identity: str) -> Answer:
+    """The gate's answer to hold, accept or rollback, carried out. Raises CommandError on what no gate understands.
+
+    `identity` is the device's that is there now.
+    """
     arguments, key = _arguments(command), command.key_id or LOCAL
     if command.verb == "hold":
         return estimation.gate.release(key) if arguments.get("release") else estimation.gate.hold(key)
@@ -34,18 +38,31 @@ def answer(command: Command, estimation: Estimation) -> Answer:
             raise CommandError(f"accept needs the sequence of an estimate, not {sequence!r}")
         found = estimation.gate.accept(sequence, key)
     else:
-        try:
-            update = msgspec.convert(_numbers(json.loads(command.calibration_json)), CalibrationUpdate)
-        except ValueError as error:  # of json and of msgspec
-            raise CommandError(f"rollback carries no calibration: {error}") from None
-        found = estimation.gate.rollback(calibration_of(update), key)
+        found = estimation.gate.rollback(_earlier(command, identity), key)
     if found.calibration is not None:
         estimation.put(found.calibration)
     return found
 
 
+def _earlier(command: Command, identity: str) -> Calibration:
+    """The calibration that a rollback carries. Raises CommandError where it is none, or another device's."""
+    try:
+        update = msgspec.convert(_numbers(json.loads(command.calibration_json)), CalibrationUpdate)
+        calibration = calibration_of(update)
+    except ValueError as error:  # of json, of msgspec, and of numpy where rows differ in length
+        raise CommandError(f"rollback carries no calibration: {error}") from None
+    if update.identity != identity:
+        raise CommandError(f"calibration {update.sequence} belongs to {update.identity}, this is {identity}")
+    shapes = (calibration.sensitivity.shape, calibration.offset.shape, calibration.covariance.shape)
+    if shapes != ((3, 3), (3,), (12, 12)) or not np.isfinite(calibration.covariance).all():
+        raise CommandError(f"calibration {update.sequence} is not whole: S, Q and a finite covariance of both")
+    return calibration
+
+
 def commanded_pose(command: Command, channel: Channel) -> Pose:
     """How the sensor stands from now on. Raises CommandError where the arguments are none of a pose."""
+    if channel.rotation is not None:
+        raise CommandError("a sensor beside a tri-axial reference stands as rotation says; it takes no poses")
     arguments = _arguments(command)
     position = arguments.pop("position", None)
     try:

@@ -17,10 +17,12 @@ from agent.events import (
     CalibrationUpdate,
     Command,
     DeviceChange,
+    Estimate,
     Event,
     Output,
     Result,
     RunStart,
+    StatusChange,
     Tick,
     WindowReport,
 )
@@ -102,7 +104,7 @@ class Pipeline:
         found = []
         for channel in self._channels:
             own = [r for r in results if r.sensor == channel.sensor and isinstance(r, Result) and changes_state(r)]
-            if own:
+            if own and channel.known:
                 found.append(Memory(channel.sensor, channel.identity, own[-1].sequence, channel.memory()))
         return found
 
@@ -127,5 +129,7 @@ class Pipeline:
 
 
 def changes_state(result: Result) -> bool:
-    """Whether a result tells of a window taken, or of a calibration put in force."""
-    return isinstance(result, CalibrationUpdate) or (isinstance(result, WindowReport) and result.used)
+    """Whether a result tells of a window taken, of a calibration put in force or proposed, or of an operator's word."""
+    if isinstance(result, StatusChange):
+        return bool(result.before)  # the first status of a run is no news of the device
+    return isinstance(result, CalibrationUpdate | Estimate) or (isinstance(result, WindowReport) and result.used)

@@ -126,6 +126,10 @@ class DeviceStream:
         while len(self._blocks) > 1 and (self._blocks[0].t_monotonic_ns - self._origin_ns) * 1e-9 < time_s:
             self._blocks.popleft()
 
+    def clear(self) -> None:
+        """Drop all samples: they are of another device than the next ones."""
+        self._blocks.clear()
+
     def snapshot(self) -> dict[str, Any]:
         """State for `restore`, bit-exact."""
         return {

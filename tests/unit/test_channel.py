@@ -1,0 +1,183 @@
+"""A channel through swapped devices, restarts, another configuration, and states that nobody can read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from agent.events import Estimate
+from agent.snapshot import pack, unpack
+from calib.recursion import Recursion
+from tests.building_windows import GRAVITY
+from tests.clamp_windows import S_TRUE
+from tests.unit.mounted_site import WINDOW_S, Site, begun, said, site_config, updates, windows
+
+OF_B = S_TRUE * 0.97
+
+
+def test_a_to_b_to_a_goes_on_where_each_was() -> None:
+    site = begun(site_config())
+    of_a = updates(site.play(4))[-1]
+    site.open("s", "B")
+    of_b = updates(site.play(4, S=OF_B))[-1]
+    assert abs(of_b.sensitivity[1][1] - OF_B[1, 1]) < 3e-3
+    [again] = updates(site.open("s", "A"))
+    assert (again.sensitivity, again.covariance, again.windows) == (of_a.sensitivity, of_a.covariance, of_a.windows)
+    later = updates(site.play(3))[-1]
+    assert later.identity == of_a.identity
+    assert later.windows > of_a.windows
+    assert abs(later.sensitivity[1][1] - S_TRUE[1, 1]) < 2e-3
+    assert set(site.kept()) == {of_a.identity, of_b.identity}
+
+
+def test_samples_of_the_device_before_are_nothing_to_the_next() -> None:
+    site = begun(site_config())
+    site.play(2)
+    site.play(1, devices="s")  # the reference is late: this window waits for it
+    site.lose("s")
+    site.open("s", "B")
+    closed = windows(site.play(1, devices="r")) + windows(site.wait(10))
+    assert closed
+    assert {(w.used, w.reason) for w in closed} == {(False, "no samples of s")}
+    assert updates(site.results)[-1].identity.startswith("serial-csv A ")
+
+
+def test_a_device_that_comes_back_goes_on_with_the_next_window() -> None:
+    site = begun(site_config())
+    site.play(3)
+    site.lose("s")
+    site.wait(60)
+    assert said(site.results)[-1][0] == "INVALID"
+    site.open("s", "A")
+    assert any(w.used for w in windows(site.play(3)))
+    assert ("VALID", "s speaks again") in said(site.results)
+
+
+def test_another_reference_is_told_and_taken_by_its_own_certificate() -> None:
+    site = begun(site_config(certificate={"u_sensitivity_pct": 0.3}))
+    site.play(4)
+    assert said(site.open("r", "A")) == []
+    [(_, reason)] = said(site.open("r", "C"))
+    assert reason.startswith("the reference is now serial-csv C ")
+    assert [w.used for w in windows(site.play(3))][-2:] == [True, True]
+    assert abs(updates(site.results)[-1].sensitivity[1][1] - S_TRUE[1, 1]) < 3e-3
+
+
+@pytest.mark.parametrize("order", ["rs", "sr"])
+def test_another_reference_after_a_restart_is_not_taken_for_the_one_before(
+    order: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    forgotten: list[float] = []
+    forget = Recursion.forget_reference
+
+    def counted(self: Recursion) -> None:
+        forgotten.append(self.windows)
+        forget(self)
+
+    monkeypatch.setattr(Recursion, "forget_reference", counted)
+    site = begun(site_config())
+    site.play(4)
+    for serial_number, times in (("A", 0), ("C", 1)):
+        again = Site(site_config(), kept=site.kept(), day=1.0)
+        for device in order:
+            again.open(device, serial_number if device == "r" else "A")
+        assert len(forgotten) == times
+        assert said(again.results)[0] == ("VALID", "restored from the run before")
+
+
+def test_restored_after_a_kill_it_is_the_calibration_of_before() -> None:
+    site = begun(site_config())
+    before = updates(site.play(4))[-1]
+    again = begun(site_config(), kept=site.kept(), day=30.0, last=before.sequence)
+    [update] = updates(again.results)
+    assert (update.sensitivity, update.offset, update.covariance) == (
+        before.sensitivity, before.offset, before.covariance,
+    )  # fmt: skip
+    assert said(again.results) == [("VALID", "restored from the run before")]
+    # A month of wandering is in it: S may have gone 0.03 %, Q 11 mm/s2 and what the drift rate leaves.
+    later = updates(again.play(3))[0]
+    assert later.windows == before.windows + 1
+    assert abs(later.sensitivity[1][1] - S_TRUE[1, 1]) < 2e-3
+
+
+def test_restored_in_the_midst_it_goes_on_bit_for_bit() -> None:
+    site = begun(site_config(gate={"policy": "propose"}))
+    site.play(3)
+    state = site.pipeline.snapshot()
+    restored = type(site.pipeline).restore(site_config(gate={"policy": "propose"}).model_dump_json(), state)
+    assert restored.snapshot() == state
+    site.play(2)
+    assert [r for r in site.results if isinstance(r, Estimate)]
+
+
+def test_a_state_made_with_another_configuration_is_not_gone_on_with() -> None:
+    site = begun(site_config())
+    before = updates(site.play(4))[-1]
+    changed = site_config(temperature={"offset_order": 2, "sensitivity_order": 1}, uncertainty={"tilt_deg": 0.5})
+    again = begun(changed, kept=site.kept(), day=1.0, last=before.sequence)
+    assert said(again.results) == [
+        (
+            "VALID",
+            "begun anew from the calibration in force: the configuration has another temperature, uncertainty",
+        )
+    ]
+    [update] = updates(again.results)
+    assert (update.sensitivity, update.offset) == (before.sensitivity, before.offset)
+    later = updates(again.play(3))[-1]
+    assert len(later.offset_temperature) == 2
+    assert abs(later.sensitivity[1][1] - S_TRUE[1, 1]) < 2e-3
+    output = np.array(later.sensitivity) @ GRAVITY + later.offset
+    np.testing.assert_allclose(output, np.array(before.sensitivity) @ GRAVITY + before.offset, rtol=0, atol=0.02)
+
+
+def test_how_fast_things_may_change_is_no_other_state() -> None:
+    site = begun(site_config())
+    site.play(3)
+    again = begun(site_config(process={"offset_mps2": 0.01}, gate={"confirm_windows": 7}), kept=site.kept(), day=1.0)
+    assert said(again.results) == [("VALID", "restored from the run before")]
+
+
+def test_a_new_prior_is_an_operators_word() -> None:
+    site = begun(site_config())
+    site.play(3)
+    again = begun(site_config(prior={"sensitivity": 1.01}), kept=site.kept(), day=1.0)
+    assert updates(again.results) == []
+    assert said(again.results) == [("UNCALIBRATED", "begun anew from the prior: the configuration has another prior")]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "status", "reason"),
+    [
+        (lambda state: state[:-1], "UNCALIBRATED", "begun anew: what was kept cannot be read: "),
+        (lambda state: pack({"estimation": unpack(state)["estimation"]}), "UNCALIBRATED", "begun anew: what was kept "),
+        (lambda state: without(state, "recursion"), "VALID", "begun anew from the calibration in force: its state "),
+        (lambda state: without(state, "gate"), "VALID", "begun anew from the calibration in force: its state "),
+    ],
+)
+def test_a_state_that_cannot_be_read_is_said_and_not_the_end(
+    spoil: Callable[[bytes], bytes], status: str, reason: str
+) -> None:
+    site = begun(site_config())
+    site.play(3)
+    kept = {identity: spoil(state) for identity, state in site.kept().items()}
+    again = begun(site_config(), kept=kept, day=1.0)
+    [(is_, why)] = said(again.results)
+    assert is_ == status
+    assert why.startswith(reason)
+    assert any(w.used for w in windows(again.play(3)))
+
+
+def without(state: bytes, part: str) -> bytes:
+    """A state that another version of the program wrote, in which a part is missing."""
+    held = unpack(state)
+    del held["estimation"][part]
+    return pack(held)
+
+
+def test_windows_refused_for_ever_are_told() -> None:
+    site = begun(site_config())
+    site.play(5, devices="s")
+    site.wait(2 * WINDOW_S)
+    assert [reason for _, reason in said(site.results)].count("nothing is updated: no samples of the reference r") == 1
