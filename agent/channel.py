@@ -186,7 +186,8 @@ class ChannelState:
         self._streams[self._channel.reference].clear()
         if self._estimation is not None:
             self._estimation.forget_reference()
-        return [self._told(f"the reference is now {self._reference}, was {before}")]
+        reason = f"the reference is now {self._reference}, was {before}"
+        return self._say_status(reason) or [self._told(reason)]
 
     def _lose(self, reason: str) -> list[Result]:
         if self._estimation is not None:

@@ -65,6 +65,15 @@ def test_another_reference_is_told_and_taken_by_its_own_certificate() -> None:
     assert abs(updates(site.results)[-1].sensitivity[1][1] - S_TRUE[1, 1]) < 3e-3
 
 
+def test_windows_held_for_a_wrong_reference_go_with_it() -> None:
+    site = begun(site_config())
+    site.play(3)
+    site.play(4, S=S_TRUE * 1.6)
+    assert said(site.results)[-1][0] == "HELD"
+    assert [status for status, _ in said(site.open("r", "C"))] == ["VALID"]
+    assert [w.used for w in windows(site.play(3))][-2:] == [True, True]
+
+
 @pytest.mark.parametrize("order", ["rs", "sr"])
 def test_another_reference_after_a_restart_is_not_taken_for_the_one_before(
     order: str, monkeypatch: pytest.MonkeyPatch
