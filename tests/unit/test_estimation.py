@@ -106,6 +106,14 @@ def test_another_lag_after_a_line_began_anew_is_no_end_of_it() -> None:
     np.testing.assert_allclose(found.in_force.sensitivity, before, rtol=0, atol=3e-3)
 
 
+def test_another_reference_is_late_as_its_certificate_says_until_windows_tell() -> None:
+    random = np.random.default_rng(11)
+    found = settled(random, certificate={"lag_s": 0.01, "u_lag_s": 0.001})
+    assert abs(found.lag_s) < 1e-4
+    found.forget_reference()
+    assert found.lag_s == -0.01
+
+
 def test_a_wild_window_among_the_held_ones_does_not_stand_in_the_way() -> None:
     random = np.random.default_rng(5)
     found = settled(random)
