@@ -117,13 +117,16 @@ class Onsets:
         moved, moved_times, i, i_times, i_squares = self._sums[_MOVED:, onset, series]
         # A level beside the slope: the onset is known only as one of those kept.
         spread = i_squares - i_times**2 / i
+        if not spread > 0.0:  # all windows at one time: pieces of a stretch with samples missing in it
+            return self._change(series, onset, 0.0, 0.0, np.inf)
         return self._change(series, onset, gain, (moved_times - moved * i_times / i) / spread, 1.0 / spread)
 
     def _best(self, series: int, moved: int, information: int) -> tuple[int, float]:
         statistic = self._statistic(slice(series, series + 1))[:, 0]
         # Only where the test itself speaks: a wild window before the onset would else draw the onset to it.
         loud = np.flatnonzero(statistic >= statistic.max() / 2)
-        gains = self._sums[moved, loud, series] ** 2 / (2.0 * self._sums[information, loud, series])
+        told = 2.0 * self._sums[information, loud, series]
+        gains = np.divide(self._sums[moved, loud, series] ** 2, told, out=np.zeros_like(told), where=told > 0.0)
         best = len(loud) - 1 - int(np.argmax(gains[::-1]))  # of equals the youngest: windows between told nothing
         return int(loud[best]), float(gains[best])
 

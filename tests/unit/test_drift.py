@@ -158,6 +158,16 @@ def test_a_single_wild_window_trips_nothing(wild: float) -> None:
     assert feed.verdicts == []
 
 
+def test_windows_of_one_time_tell_of_a_step_and_of_no_rate() -> None:
+    """A stretch with samples missing in it gives several windows at once; warnings would fail this."""
+    test, found = DriftTest(HOURLY), []
+    for _ in range(12):
+        found += test.update(HOUR_S, np.full(12, 3.0), np.full(12, 1.0))
+    assert {verdict.verdict for verdict in found} == {"stepped"}
+    assert len(found) == 12
+    assert all(np.isfinite([verdict.change, verdict.u_change]).all() for verdict in found)
+
+
 def test_windows_that_tell_nothing_change_nothing() -> None:
     """S_yy is told of by a window in 20; the others hold NaN, or no information, or what is not finite."""
     sparse, dense = DriftTest(HOURLY), DriftTest(HOURLY)
