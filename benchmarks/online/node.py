@@ -53,8 +53,15 @@ class Stated:
                 "tilt_deg": 0.0,
             },
             "temperature": {"offset_order": 0},
-            # What moves in one direction alone never tells Q better than the transverse sensitivities are known.
-            "gate": {"least_determined": 1},
+            "gate": {
+                # What moves in one direction alone never tells Q better than the transverse sensitivities are known.
+                "least_determined": 1,
+                # The defaults, or five standard uncertainties of what is not known as well as that.
+                "max_change_main_pct": max(5.0, 5 * self.main_pct),
+                "max_change_transverse_pct": max(3.0, 5 * self.transverse_pct),
+                "max_change_rotation_deg": max(3.0, 5 * self.transverse_pct),
+                "max_change_offset": max(0.5, 5 * self.offset_mps2),
+            },
         }  # fmt: skip
 
 

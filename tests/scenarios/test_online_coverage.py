@@ -1,0 +1,34 @@
+"""U on-line covers the truth: a few runs here, 300 in docs/online.md (`python -m benchmarks.online coverage`)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from benchmarks.online import coverage
+from calib.distributions import chi2_quantile
+
+RUNS = 12
+
+
+def test_errors_are_as_large_as_u_says() -> None:
+    ratios = np.array([coverage.one(coverage.SEED + k) for k in range(RUNS)])
+    assert np.isfinite(ratios).all()  # all twelve are determined by motion in three directions
+    squares = np.sum((2 * ratios) ** 2, axis=0)  # U is 2 u at the degrees of freedom of a run
+    # Chi-squared of 12 degrees of freedom; 24 bounds, all together at 99.9 %. u half or double what is true fails.
+    low, high = (chi2_quantile(p, RUNS) for p in (0.001 / 24, 1 - 0.001 / 24))
+    assert np.all(squares > low), squares
+    assert np.all(squares < high), squares
+
+
+def test_the_band_is_the_binomial_one() -> None:
+    low, high = coverage.band(300, 12)
+    assert (low, high) == (268, 297)
+    probability = [_within(300, low, high, share) for share in (0.95, 0.85, 0.999)]
+    assert 1 - probability[0] < 0.001 / 12
+    assert probability[1] < 0.02  # what covers 85 % is found
+    assert probability[2] < 0.1  # and so is what is far too careful
+
+
+def _within(n: int, low: int, high: int, share: float) -> float:
+    draws = np.random.default_rng(1).binomial(n, share, 200_000)
+    return float(np.mean((draws >= low) & (draws <= high)))

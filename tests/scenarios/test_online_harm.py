@@ -1,0 +1,65 @@
+"""What befalls sensor or reference does not get into S and Q in force; what is harmless is taken.
+
+Two runs a kind here; a thousand are in docs/online.md (`python -m benchmarks.online harm`).
+"""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+
+from agent.events import CalibrationUpdate, Result
+from benchmarks.online import harm
+from benchmarks.online.node import Node, node
+from benchmarks.online.runner import Run, visits
+from hw.virtual.harm import KINDS
+
+# Kinds of which no window can be right: each is refused or held. Of the others some draws are harmless (a dead channel
+# of the reference where nothing moves along it, samples lost and told, a step of UTC).
+HOPELESS = ("reference unplugged", "dead channel of the sensor", "swapped axes", "knocked off its mount", "clipping")
+
+
+@pytest.mark.parametrize("kind", list(KINDS))
+def test_nothing_wrong_gets_in(kind: str) -> None:
+    for seed in (harm.SEED + 7, harm.SEED + 8):
+        outcome = harm.harmed(kind, seed)
+        assert outcome.wrong == ""
+        if kind in HOPELESS:
+            assert outcome.updates == 0
+            assert outcome.used == 0
+
+
+def test_harmless_windows_are_taken() -> None:
+    outcomes = [harm.harmed("", harm.SEED + 100_000 + k) for k in range(12)]
+    assert [o.wrong for o in outcomes] == [""] * 12
+    windows, used = sum(o.windows for o in outcomes), sum(o.used for o in outcomes)
+    assert windows >= 12 * harm.TIMING.windows
+    # At 95 % about seven of 144 would be refused; a sound window in 10,000 is held.
+    assert used >= windows - 2
+    assert all(o.updates == o.used for o in outcomes)
+    assert {o.status for o in outcomes} == {"VALID"}
+
+
+def test_the_judge_finds_what_is_wrong() -> None:
+    drawn = node(harm.SEED, all_axes=True, timing=harm.TIMING)
+    update = last_update(drawn)
+    assert harm.wrong(update, drawn, harmed=False) == ""
+    u = update.coverage_factor / 2 * np.array(update.standard_uncertainty)
+    off = [row.copy() for row in update.sensitivity]
+    truth = drawn.building.truth(0.0).sensitivity
+    off[1][2] = float(truth[1, 2] + 4.1 * u[5])
+    assert harm.wrong(msgspec.structs.replace(update, sensitivity=off), drawn, harmed=False).startswith("Syz is off")
+    off[1][2] = float(truth[1, 2] + 3.9 * u[5])
+    assert harm.wrong(msgspec.structs.replace(update, sensitivity=off), drawn, harmed=False) == ""
+    off[0][0] = 1.06
+    unsure = msgspec.structs.replace(update, sensitivity=off, standard_uncertainty=[0.1] * 12)
+    assert harm.wrong(unsure, drawn, harmed=False).startswith("Sxx is further than max_change")
+    nothing = msgspec.structs.replace(unsure, determined=[False] * 12)
+    assert harm.wrong(nothing, drawn, harmed=False) == ""
+
+
+def last_update(drawn: Node) -> CalibrationUpdate:
+    run = Run(drawn.config)
+    results: list[Result] = [r for event in visits(drawn.building, range(6)) for r in run.feed(event)]
+    return [r for r in results if isinstance(r, CalibrationUpdate)][-1]
