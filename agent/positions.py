@@ -12,7 +12,7 @@ import numpy as np
 from agent.config import Channel
 from agent.schedule import Piece, Stance, pieces
 from agent.stream import Cut, DeviceStream
-from calib.model import Pose
+from calib.model import Array, Pose
 from calib.placing import SHORTEST_S, Knowledge, Placed, clamp_angles, mean_output, nearest_stop
 from calib.recursion import Recursion
 from calib.standing import KEPT, MEAN_S, Standing
@@ -146,34 +146,27 @@ class FoundPositions:
             self._standing.interrupt()
             self._stretches, self._angles = [], {}
             self._begin_at(block.first_index)
-        self._pass_over(block, stream)
-        values = np.asarray(block.indications, dtype=np.float64) / scale
         size = max(round(MEAN_S * block.nominal_rate_hz), 1)
-        at = 0
-        while at < block.n:
-            part = values[at : at + size - self._passed]
-            finite = part[np.isfinite(part.sum(axis=1))]
-            self._sum, self._count, self._passed = (
-                self._sum + finite.sum(0),
-                self._count + len(finite),
-                self._passed + len(part),
-            )
-            at += len(part)
-            if self._passed >= size:
-                self._take(size, stream)
+        missing = 0 if self._expected is None else block.first_index - self._expected
+        if self._expected is None or not 0 <= missing < size:
+            self._end(self._standing.interrupt(), size, stream)
+            self._begin_at(block.first_index)
+            missing = 0
+        values = np.asarray(block.indications, dtype=np.float64) / scale
+        self._average(np.vstack([np.full((missing, 3), np.nan), values]), size, stream)
         self._expected = block.first_index + block.n
         self._cleared_s = self._time_of(self._standing.cleared, size, stream)
         self._oldest_s = self._time_of(self._standing.oldest, size, stream)
 
-    def _pass_over(self, block: SampleBlock, stream: DeviceStream) -> None:
-        """Samples that are missing before the block: part of a short mean, or more than a stretch outlives."""
-        size = max(round(MEAN_S * block.nominal_rate_hz), 1)
-        missing = 0 if self._expected is None else block.first_index - self._expected
-        if self._expected is None or missing < 0 or self._passed + missing >= size:
-            self._end(self._standing.interrupt(), size, stream)
-            self._begin_at(block.first_index)
-        else:
-            self._passed += missing
+    def _average(self, values: Array, size: int, stream: DeviceStream) -> None:
+        """Means of `size` samples, as they become whole; missing ones (NaN) have their place."""
+        while len(values):
+            part, values = np.split(values, [size - self._passed])
+            finite = part[np.isfinite(part.sum(axis=1))]
+            self._sum = self._sum + finite.sum(axis=0)
+            self._count, self._passed = self._count + len(finite), self._passed + len(part)
+            if self._passed >= size:
+                self._take(size, stream)
 
     def _begin_at(self, index: int) -> None:
         self._origin, self._expected = (index, self._standing.next), index

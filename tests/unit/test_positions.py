@@ -55,20 +55,19 @@ def opened() -> DeviceChange:
     )
 
 
-def blocks(values: np.ndarray, *, late_s: float = 0.001, lost: slice | None = None) -> list[SampleBlock]:
+def blocks(values: np.ndarray, *, late_s: float = 0.001, lost: Sequence[slice] = ()) -> list[SampleBlock]:
     """Half a second each, every sample in a burst of its own; the samples of `lost` never come."""
-    size, made = round(RATE_HZ / 2), []
+    size, made, come = round(RATE_HZ / 2), [], np.ones(len(values), dtype=bool)
+    for gap in lost:
+        come[gap] = False
     for first in range(0, len(values), size):
-        part = np.arange(first, min(first + size, len(values)))
-        flags = BlockFlags.NONE
-        if lost is not None:
-            part = part[(part < lost.start) | (part >= lost.stop)]
-            flags = BlockFlags.GAP if len(part) and part[0] == lost.stop else flags
-        if len(part):
-            arrivals = np.round(((part + 1) / RATE_HZ + late_s) * SECOND).astype(np.int64)
-            count = np.arange(1, len(part) + 1, dtype=np.int32)
-            utc_ns = EPOCH_NS + int(arrivals[-1])
-            made.append(SampleBlock("s", "boot", utc_ns, int(part[0]), RATE_HZ, arrivals, count, values[part], flags))
+        part = first + np.flatnonzero(come[first : first + size])
+        for run in np.split(part, np.flatnonzero(np.diff(part) > 1) + 1):
+            if len(run):
+                arrivals = np.round(((run + 1) / RATE_HZ + late_s) * SECOND).astype(np.int64)
+                flags = BlockFlags.NONE if run[0] == 0 or come[run[0] - 1] else BlockFlags.GAP
+                count, utc_ns = np.arange(1, len(run) + 1, dtype=np.int32), EPOCH_NS + int(arrivals[-1])
+                made.append(SampleBlock("s", "boot", utc_ns, int(run[0]), RATE_HZ, arrivals, count, values[run], flags))
     return made
 
 
@@ -131,10 +130,27 @@ def test_two_stops_near_each_other_are_told_apart_once_the_offset_is_known() -> 
     assert found[7].position == f"rest ({lean[0]:.6g}, 0, {lean[2]:.6g})"
 
 
+@pytest.mark.parametrize("window_s", [14.0, 16.6, 17.5, 19.0])
+def test_no_window_reaches_into_a_turning_wherever_it_would_end(window_s: float) -> None:
+    found = windows(turned(FACES), configured(window_s=window_s))
+    assert {w.position for w in found if w.used} == set(NAMES[:3])
+    for window in found:
+        stay = int(window.start_s // (STAY_S + TURN_S))
+        assert window.stop_s <= stay * (STAY_S + TURN_S) + STAY_S - GUARD_S + 0.25
+
+
+def test_samples_lost_here_and_there_change_no_times() -> None:
+    values = turned(FACES[:3])
+    lost = [slice(k, k + 3) for k in range(40, len(values) - 3, 30)]  # one in ten
+    whole, holed = windows(values), windows(values, lost=lost)
+    assert [w.position for w in whole] == [w.position for w in holed]
+    np.testing.assert_allclose([w.stop_s for w in holed], [w.stop_s for w in whole], atol=0.51)  # a piece of rest
+
+
 def test_lost_samples_end_a_stretch_and_the_same_stop_is_found_again() -> None:
     stay = np.tile(FACES[1] + OFFSET_MPS2, (round(60 * RATE_HZ), 1))
     lost = slice(round(20 * RATE_HZ), round(21 * RATE_HZ))
-    found = windows(stay, configured(window_s=25), lost=lost)
+    found = windows(stay, configured(window_s=25), lost=[lost])
     assert len(found) == 2
     times = [(w.start_s, w.stop_s) for w in found]
     np.testing.assert_allclose(times, [(0.5, 19.5), (21.5, 46.5)], atol=TRIMMED_S + 0.01)

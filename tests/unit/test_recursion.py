@@ -311,3 +311,16 @@ def test_truth_is_what_the_tests_take_it_for() -> None:
     assert np.array_equal(TRUTH, np.append(S_TRUE.ravel(), Q_TRUE))
     assert BESIDE.direction.shape == (3, 3)
     assert sums_of(np.zeros((4, 3)), np.zeros((4, 3)), np.ones((4, 3)), 2).count.tolist() == [2.0, 2.0]
+
+
+def test_the_law_of_a_later_day_has_wandered_on_and_changes_nothing() -> None:
+    found = turned(Priors(), Wander(0.001, 0.01, 0.004, 0.0, 0.0, 0.0))
+    for k, window in enumerate(clamp_points(np.random.default_rng(3)).windows):
+        found.update(Summary.of(window, k * 1e-3))
+    before = found.snapshot()
+    now, later = found.law().at(20.0), found.law(100.0).at(20.0)
+    grown = later.standard_uncertainty[9:] ** 2 - now.standard_uncertainty[9:] ** 2
+    # 0.01 per square-root day and a rate known to 0.004 a day at first, over 100 days.
+    rate_u = np.array([found.quantity(name)[1] for name in ("Qx_rate", "Qy_rate", "Qz_rate")])
+    np.testing.assert_allclose(grown, 100.0 * 0.01**2 + (100.0 * rate_u) ** 2, rtol=0.02)
+    assert repr(found.snapshot()) == repr(before)
