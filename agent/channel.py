@@ -160,6 +160,8 @@ class ChannelState:
             if self._estimation is not None:
                 self._kept[self.identity] = self.memory()
                 self._streams[self.sensor].clear()  # samples of the device before are nothing to this one
+                if self._finder is not None:
+                    self._finder.forget()
                 reason = f"{self.sensor} is now {identity}, was {self.identity}"
             elif self._kept and identity not in self._kept:
                 reason = f"the calibration kept belongs to {', '.join(sorted(self._kept))}, this is {identity}"

@@ -142,10 +142,7 @@ class FoundPositions:
         if block.indications.ndim != 2 or block.indications.shape[1] != 3:
             return
         if block.flags & BlockFlags.RESTART:
-            # The stream knows no times of the samples before any more, nor their windows.
-            self._standing.interrupt()
-            self._stretches, self._angles = [], {}
-            self._begin_at(block.first_index)
+            self.forget()
         size = max(round(MEAN_S * block.nominal_rate_hz), 1)
         missing = 0 if self._expected is None else block.first_index - self._expected
         if self._expected is None or not 0 <= missing < size:
@@ -157,6 +154,11 @@ class FoundPositions:
         self._expected = block.first_index + block.n
         self._cleared_s = self._time_of(self._standing.cleared, size, stream)
         self._oldest_s = self._time_of(self._standing.oldest, size, stream)
+
+    def forget(self) -> None:
+        """The stream has dropped its samples and knows no times of them any more, nor are there windows of them."""
+        self._standing.interrupt()
+        self._stretches, self._angles, self._expected = [], {}, None
 
     def _average(self, values: Array, size: int, stream: DeviceStream) -> None:
         """Means of `size` samples, as they become whole; missing ones (NaN) have their place."""

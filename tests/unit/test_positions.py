@@ -48,10 +48,10 @@ def turned(faces: Sequence[np.ndarray], seed: int = 1) -> np.ndarray:
     return signal + OFFSET_MPS2 + 0.01 * np.random.default_rng(seed).normal(size=signal.shape)
 
 
-def opened() -> DeviceChange:
-    info = DeviceInfo("serial-csv", "serial-csv", "1", "m/s2", 3, RATE_HZ)
+def opened(serial_number: str = "1", t_ns: int = 0) -> DeviceChange:
+    info = DeviceInfo("serial-csv", "serial-csv", serial_number, "m/s2", 3, RATE_HZ)
     return DeviceChange(
-        device="s", state="open", t_monotonic_ns=0, t_utc_ns=EPOCH_NS, info_json=json.dumps(asdict(info))
+        device="s", state="open", t_monotonic_ns=t_ns, t_utc_ns=EPOCH_NS + t_ns, info_json=json.dumps(asdict(info))
     )
 
 
@@ -199,3 +199,15 @@ def test_a_configuration_that_cannot_be_is_refused(keys: dict[str, Any], words: 
     with pytest.raises(ConfigError) as error:
         configured(**keys)
     assert any(words in fault for fault in error.value.faults), error.value.faults
+
+
+def test_another_device_stands_nowhere_until_it_has_shown_it() -> None:
+    """What the one before read is no part of its windows, though it counts its samples on."""
+    pipeline = Pipeline.begin(configured(), "run", 0, 0, {})
+    made = blocks(turned([FACES[0], FACES[0], FACES[1]]))  # turned once, from 37 to 40 s
+    at = next(k for k, block in enumerate(made) if block.t_monotonic_ns > 10 * SECOND)
+    events: list[Any] = [opened(), *made[:at], opened("2", made[at - 1].t_monotonic_ns), *made[at:]]
+    [window] = [r for r in played(pipeline, events) if isinstance(r, WindowReport)]
+    assert window.position == NAMES[0]
+    assert 10.0 + GUARD_S - 0.25 <= window.start_s <= 10.0 + GUARD_S + FOUND_S + TRIMMED_S + 0.25
+    assert window.stop_s <= 37.0 - GUARD_S + 0.25
