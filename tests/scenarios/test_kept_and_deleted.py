@@ -21,6 +21,7 @@ driver = "serial-csv"
 options = {{ port = "{port}", rate_hz = 100, axes = 3, sequence = true, unit = "m/s2", serial_number = "A1" }}
 [[channels]]
 sensor = "imu"
+prior = {{}}
 guard_s = 0.1
 poses = [{{ start_s = 0, stop_s = 1, gravity_mps2 = [0, 0, 9.81] }}]
 poses_repeat_s = 1

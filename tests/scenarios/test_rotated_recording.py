@@ -29,13 +29,14 @@ driver = "serial-csv"
 options = {{ port = "{link}-reference", rate_hz = 1000, axes = 1, sequence = true, unit = "m/s2" }}
 [[channels]]
 sensor = "mems"
-prior = {{}}
+prior = {{ sensitivity = 26105 }}
 reference = "reference"
 poses = [
   {{ start_s = 3, stop_s = 13, theta_deg = 35, alpha_deg = 0 }},
   {{ start_s = 16, stop_s = 26, theta_deg = 35, alpha_deg = 30 }},
   {{ start_s = 29, stop_s = 39, theta_deg = 35, alpha_deg = 120 }},
 ]
+poses_repeat_s = 52
 [recording]
 rotate_s = 11
 [zenoh]
@@ -53,7 +54,7 @@ def data_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
         started("simulate", "--preset", "plain", "--link", link, output=directory / "simulate"),
         started("run", config, "--data-dir", data_dir, output=directory / "run") as agent,
     ):
-        wait_until(lambda: results(data_dir, "calibration"), 60, "a calibration")
+        wait_until(lambda: results(data_dir, "calibration"), 170, "a calibration")  # the bench goes round
         interrupt(agent)
     return data_dir
 

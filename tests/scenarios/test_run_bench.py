@@ -21,7 +21,8 @@ from tests.scenarios.processes import fieldcal, interrupt, recordings, results, 
 ENDPOINT = "tcp/127.0.0.1:7447"
 KEY = "fieldcal/v1/virtual/bench/mems/calibration"
 SEED = 1
-THROUGH_S = 60.0  # of bench time: the four positions are through, S and Q in force
+# Of bench time: S and Q are in force after 39 to 52 s, on a busy machine that lost samples once round later.
+THROUGH_S = 112.0
 
 
 @dataclass(frozen=True)
