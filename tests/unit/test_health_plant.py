@@ -39,7 +39,7 @@ def plant(data_dir: Path, store: Store, **parts: Any) -> Plant:
 def test_memory_threads_files_and_disk_are_the_processs_own(tmp_path: Path, store: Store) -> None:
     looked_at = plant(tmp_path, store)
     before = looked_at.situation()
-    # Mapped by itself: what the allocator kept from earlier tests could serve an ordinary array without the process growing.
+    # Mapped by itself: an ordinary array could come from what the allocator kept of earlier tests.
     held = mmap.mmap(-1, 64 << 20)
     held.write(b"\1" * len(held))
     opened = [open(os.devnull) for _ in range(7)]  # noqa: SIM115 - counted, then closed
