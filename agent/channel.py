@@ -13,17 +13,10 @@ from agent.config import Channel
 from agent.corrected import acceleration_block
 from agent.estimation import DAY_S, Estimation, Judged
 from agent.events import Acceleration, CalibrationUpdate, Command, DeviceChange, Estimate, Output, Result, Tick
-from agent.identity import identity_of, nominal_of
-from agent.kept import keep, plain, take_up, update_of
+from agent.identity import identity_of, nominal_of, not_certified
+from agent.kept import keep, plain, shelved, take_up, update_of
 from agent.operators import CommandError, answer, commanded_pose
-from agent.outcome import (
-    Source,
-    calibration_update,
-    drift_report,
-    estimate,
-    status_change,
-    window_report,
-)
+from agent.outcome import Source, calibration_update, drift_report, estimate, status_change, window_report
 from agent.positions import FOUND_WITHIN_S, FoundPositions
 from agent.schedule import Piece, ToldTimes
 from agent.stream import DeviceStream
@@ -55,6 +48,7 @@ class ChannelState:
         self._unit = ""
         self._nominal: float | None = None  # sensitivity by the device's own data sheet
         self._reference = ""  # identity
+        self._not_certified = ""  # why the certificate is not the reference's
         self._estimation: Estimation | None = None
         self._in_force: CalibrationUpdate | None = None
         self._kept: dict[str, bytes] = {}
@@ -158,7 +152,7 @@ class ChannelState:
         results: list[Result] = []
         if self._estimation is None or identity != self.identity:
             if self._estimation is not None:
-                self._kept[self.identity] = self.memory()
+                self._kept = shelved(self._kept, self.identity, self.memory())
                 self._streams[self.sensor].clear()  # samples of the device before are nothing to this one
                 if self._finder is not None:
                     self._finder.forget()
@@ -182,13 +176,14 @@ class ChannelState:
 
     def _identify_reference(self, info_json: str) -> list[Result]:
         before, self._reference = self._reference, identity_of(info_json)
+        self._not_certified = not_certified(info_json, self._channel.certificate)
         if not before or before == self._reference:
-            return []
+            return [self._told(f"nothing is updated: {self._not_certified}")] if self._not_certified else []
         assert self._channel.reference is not None
         self._streams[self._channel.reference].clear()
         if self._estimation is not None:
             self._estimation.forget_reference()
-        reason = f"the reference is now {self._reference}, was {before}"
+        reason = self._not_certified or f"the reference is now {self._reference}, was {before}"
         return self._say_status(reason) or [self._told(reason)]
 
     def _lose(self, reason: str) -> list[Result]:
@@ -253,8 +248,8 @@ class ChannelState:
     def _estimate(self, piece: Piece, first_s: float) -> Iterator[Result]:
         day = self._first_day + (first_s + piece.stop_s) / DAY_S
         placed = self._placed(piece, first_s, day)
-        if placed.pose is None:
-            found, lag_s = Found([refused(piece, placed.reason)]), 0.0
+        if placed.pose is None or self._not_certified:
+            found, lag_s = Found([refused(piece, self._not_certified or placed.reason)]), 0.0
         else:
             found, lag_s = self._found(replace(piece, pose=placed.pose), first_s, day)
         found = found.told(placed.numbers)
@@ -365,6 +360,7 @@ class ChannelState:
             "unit": self._unit,
             "identity": self.identity,
             "reference": self._reference,
+            "not_certified": self._not_certified,
             "nominal": self._nominal,
             "estimation": None if self._estimation is None else self._estimation.snapshot(),
             "in_force": plain(self._in_force),
@@ -384,6 +380,7 @@ class ChannelState:
             n: DeviceStream.restore(self._origin_ns, s, self._horizon_s) for n, s in state["streams"].items()
         }
         self._unit, self.identity, self._reference = state["unit"], state["identity"], state["reference"]
+        self._not_certified = state["not_certified"]
         self._nominal, self._estimation = state["nominal"], None
         if state["estimation"] is not None:
             self._estimation = Estimation(self._channel, self._nominal)

@@ -7,6 +7,8 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
+from agent.config.knowledge import Certificate
+
 # Ports and speeds name the way to a device, not the device: they may change without the calibration losing its sense.
 WAYS = frozenset({"port", "baud_rate", "bus"})
 
@@ -24,3 +26,11 @@ def nominal_of(info: Mapping[str, Any]) -> float | None:
     """What the device's data sheet says of its sensitivity; one that tells m/s2 has 1."""
     nominal = info["nominal_sensitivity"]
     return 1.0 if nominal is None and info["unit"] == "m/s2" else nominal
+
+
+def not_certified(info_json: str, certificate: Certificate) -> str:
+    """Why the certificate is not this reference's, "" where it may be: a device that tells no number says nothing."""
+    told, stated = json.loads(info_json)["serial_number"], certificate.serial_number
+    if not told or not stated or told == stated:
+        return ""
+    return f"the certificate is of serial number {stated}, the reference is {told}"

@@ -6,12 +6,14 @@ of the program wrote it, the estimation begins anew: from the calibration in for
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import msgspec
 
 from agent.config import Channel
+from agent.delivery.schema import MOST_MEMORIES
 from agent.estimation import Estimation
 from agent.events import CalibrationUpdate
 from agent.outcome import calibration_of
@@ -90,6 +92,12 @@ def take_up(kept: bytes, channel: Channel, nominal: float | None) -> Kept:
             return Kept(Estimation(channel, nominal), None, reference, day, t_utc_ns, f"begun anew: {why}; {refused}")
     fresh.put(calibration_of(in_force))
     return Kept(fresh, in_force, reference, day, t_utc_ns, f"begun anew from the calibration in force: {why}")
+
+
+def shelved(kept: Mapping[str, bytes], identity: str, memory: bytes) -> dict[str, bytes]:
+    """With what is kept of one more device; the one that was here longest ago goes."""
+    newest = {name: state for name, state in kept.items() if name != identity} | {identity: memory}
+    return dict(list(newest.items())[-MOST_MEMORIES:])
 
 
 def plain(update: CalibrationUpdate | None) -> dict[str, Any] | None:

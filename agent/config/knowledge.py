@@ -57,8 +57,8 @@ def scale_of(S: Array) -> float:
 
 
 class Certificate(Section):
-    """The reference's certificate. `serial_number` and `calibrated` are for the record; a device with another serial
-    number is refused."""
+    """The reference's certificate. Where it states a `serial_number`, a reference that tells another one is not used;
+    `calibrated` is for the record."""
 
     quantity: Literal["acceleration", "velocity"] = "acceleration"
     sensitivity: Annotated[float, Field(gt=0, description="indication per m/s2, or per m/s")] = 1.0

@@ -200,8 +200,10 @@ class History:
         return {record.identity: record for record in records}
 
     def memories(self, sensor: str) -> dict[str, Memory]:
-        """The newest state of every device that this sensor ever was, by identity."""
-        rows = self._rows("SELECT sensor, identity, sequence, state, crc FROM memory WHERE sensor = ?", sensor)
+        """The newest state of the devices that this sensor was last, by identity, oldest first."""
+        rows = self._rows(
+            "SELECT sensor, identity, sequence, state, crc FROM memory WHERE sensor = ? ORDER BY sequence", sensor
+        )
         try:
             return {row[1]: Memory(*checked(row)) for row in rows}
         except DamagedRow as error:

@@ -14,6 +14,7 @@ from typing import Any
 import msgspec
 
 SCHEMA_VERSION = 2
+MOST_MEMORIES = 8  # devices that stood in one place, one after the other; 0.1 MB each
 MARKS = frozenset({"floor", "published", "clean", "file"})
 RESULT_COLUMNS = "sequence, run_id, sensor, what, payload, t_utc_ns, recorded, recording, identity"
 _RESULTS = """CREATE TABLE results (
@@ -103,10 +104,17 @@ def insert_results(connection: sqlite3.Connection, rows: Iterable[tuple[object, 
 
 
 def write_memory(connection: sqlite3.Connection, row: tuple[str, str, int, bytes]) -> None:
-    """Keep the state of a device's estimation in place of the one before: sensor, identity, sequence, state."""
+    """Keep the state of a device's estimation in place of the one before: sensor, identity, sequence, state.
+
+    Of the devices that stood in one place the newest MOST_MEMORIES stay.
+    """
     connection.execute(
         "INSERT OR REPLACE INTO memory (sensor, identity, sequence, state, crc) VALUES (?, ?, ?, ?, ?)",
         (*row, row_crc(*row)),
+    )
+    newest = "SELECT identity FROM memory WHERE sensor = ? ORDER BY sequence DESC LIMIT ?"
+    connection.execute(
+        f"DELETE FROM memory WHERE sensor = ? AND identity NOT IN ({newest})", (row[0], row[0], MOST_MEMORIES)
     )
 
 

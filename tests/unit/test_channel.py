@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 
 import numpy as np
 import pytest
 
+from agent.config.knowledge import Certificate
 from agent.events import Estimate
+from agent.identity import not_certified
+from agent.kept import shelved
+from agent.pipeline import Pipeline
 from agent.snapshot import pack, unpack
 from calib.recursion import Recursion
 from tests.building_windows import GRAVITY
@@ -63,6 +68,33 @@ def test_another_reference_is_told_and_taken_by_its_own_certificate() -> None:
     assert reason.startswith("the reference is now serial-csv C ")
     assert [w.used for w in windows(site.play(3))][-2:] == [True, True]
     assert abs(updates(site.results)[-1].sensitivity[1][1] - S_TRUE[1, 1]) < 3e-3
+
+
+def test_a_reference_that_is_not_the_certificates_is_not_used() -> None:
+    config = site_config(certificate={"serial_number": "A"})
+    site = Site(config)
+    site.open("s", "A")
+    told = [reason for _, reason in said(site.open("r", "C"))]
+    reason = "the certificate is of serial number A, the reference is C"
+    assert told == [f"nothing is updated: {reason}"]
+    assert {(w.used, w.reason) for w in windows(site.play(3))} == {(False, reason)}
+    restored = Pipeline.restore(config.model_dump_json(), site.pipeline.snapshot())
+    assert restored.snapshot() == site.pipeline.snapshot()
+    assert said(site.open("r", "A"))
+    assert [w.used for w in windows(site.play(3))][-2:] == [True, True]
+
+
+@pytest.mark.parametrize(("stated", "told"), [("", "C"), ("A", ""), ("A", "A")])
+def test_a_certificate_or_reference_without_a_number_may_be_the_one(stated: str, told: str) -> None:
+    info_json = json.dumps({"serial_number": told})
+    assert not_certified(info_json, Certificate(serial_number=stated)) == ""
+
+
+def test_states_of_many_devices_in_one_place_the_oldest_go() -> None:
+    kept: dict[str, bytes] = {}
+    for n in [*range(12), 5]:
+        kept = shelved(kept, str(n), b"%d" % n)
+    assert list(kept) == ["4", "6", "7", "8", "9", "10", "11", "5"]
 
 
 def test_windows_held_for_a_wrong_reference_go_with_it() -> None:

@@ -13,7 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from agent.delivery.history import FILE_NAME, History, Record, StoreError
+from agent.delivery.history import FILE_NAME, History, Memory, Record, StoreError
+from agent.delivery.schema import MOST_MEMORIES
 from agent.delivery.store import UNKEPT_MAX, WAITING_MAX, Store
 from agent.events import CalibrationUpdate, StatusChange
 
@@ -87,6 +88,20 @@ def test_only_the_calibration_of_the_same_device_may_be_restored(tmp_path: Path)
         kept = history.calibrations("mems")
         assert {identity: r.sequence for identity, r in kept.items()} == {"chip A": 2, "chip B": 3}
         assert history.calibrations("other") == {}
+    store.close()
+
+
+def test_of_many_devices_in_one_place_the_states_of_the_newest_stay(tmp_path: Path) -> None:
+    store = Store(tmp_path, 0)
+    store.commit([], [Memory("other", "chip", 1, b"its")])
+    for n in range(1, MOST_MEMORIES + 4):
+        store.commit([], [Memory("mems", f"chip {n}", n, b"%d" % n)])
+    store.commit([], [Memory("mems", "chip 4", MOST_MEMORIES + 4, b"again")])
+    with History(store.path) as history:
+        kept = history.memories("mems")
+        assert list(kept) == [f"chip {n}" for n in [*range(5, MOST_MEMORIES + 4), 4]]
+        assert kept["chip 4"].state == b"again"
+        assert set(history.memories("other")) == {"chip"}
     store.close()
 
 
