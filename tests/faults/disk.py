@@ -27,7 +27,9 @@ SIZE_MB = {"ext4": 64, "xfs": 320}  # XFS makes none below 300 MB
 MAKE = {"ext4": ["mkfs.ext4", "-q", "-F"], "xfs": ["mkfs.xfs", "-q", "-f"]}
 BAD_S = 5.0  # longer than the pause between two attempts to record, 10 s of the ten times faster clock
 GOOD_AGAIN_S = 60.0  # what waited for the slow disk must drain first
-AGAIN = 20  # results, the last of them recorded: it is as before
+# So many results in so many seconds, the last of them recorded: it is as before. A good disk takes 2.5 s for them, a
+# slow one 10 s or more, and while it is slow a stop leaves results unrecorded.
+AGAIN, AGAIN_S = 20, 5.0
 SLOW_MS = 500  # a worn card that collects its garbage
 BACKLOG_S = 8.0  # of results, each of which waits for half a second and more
 
@@ -210,8 +212,8 @@ def _spell(line: str, injected: str, rig: Rig, witness: Witness, spell: Spell) -
 
 
 def _good_again(witness: Witness, since_s: float) -> bool:
-    came = [result for came_s, result in witness.received if came_s > since_s]
-    return len(came) > AGAIN and bool(came[-1].fields["recorded"])
+    came = [(came_s, result) for came_s, result in witness.received if came_s > since_s][-AGAIN - 1 :]
+    return len(came) > AGAIN and came[-1][0] - came[0][0] < AGAIN_S and bool(came[-1][1].fields["recorded"])
 
 
 def shut_down(mount: Path) -> None:
