@@ -150,7 +150,8 @@ def _motion(
     if found is None:
         return []
     windows = motion_windows(pose, found.points, _limits(channel))
-    return [_told(window, found) for window in windows]
+    u_lag_s = float(np.hypot(cut.clock.u_offset_s, reference.clock.u_offset_s))
+    return [replace(_told(window, found), u_lag_s=u_lag_s) for window in windows]
 
 
 def _told(window: Window, found: Signals) -> Window:

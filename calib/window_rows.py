@@ -49,7 +49,8 @@ LEAST_INFLATION = 0.25  # variance ratios below it are the luck of few segments
 @dataclass(frozen=True, slots=True, eq=False)
 class Summary:
     """All that is kept of a window: its slopes and means, the directions (3, k) that were excited and what the
-    correction for noise leaves, its time in days, the lag that the front end took out, and its temperature.
+    correction for noise leaves, its time in days, the lag that the front end took out, what the clocks leave of it, and
+    its temperature.
 
     `pose` as stated, `moved` as `calib.excited` leaves it. `held_mps2` (3,) is the mean input acceleration by the pose
     as stated, NaN where nobody stated gravity.
@@ -64,6 +65,7 @@ class Summary:
     day: float
     lag_s: float = 0.0
     temperature_degc: float = np.nan
+    u_lag_s: float = 0.0
 
     @classmethod
     def of(cls, window: Window, day: float, lag_s: float = 0.0, temperature_degc: float = np.nan) -> Summary:
@@ -73,7 +75,10 @@ class Summary:
         held = window.pose.gravity_mps2 + window.pose.direction @ mean
         data = condense([found.window])
         moved = found.window.pose
-        return cls(window.pose, moved, held, data, found.directions, found.attenuation, day, lag_s, temperature_degc)
+        return cls(
+            window.pose, moved, held, data, found.directions, found.attenuation, day, lag_s, temperature_degc,
+            window.u_lag_s,
+        )  # fmt: skip
 
     def snapshot(self) -> dict[str, Any]:
         """Plain values and arrays."""
@@ -220,7 +225,7 @@ class WindowRows:
         In both are what two clocks differ by from window to window, and what the correction for noise leaves.
         """
         live, m = self._live, self.data.channels
-        jitter = self._priors.lag_window_s * self._jitter.loading[0][live]
+        jitter = max(self._priors.lag_window_s, self.summary.u_lag_s) * self._jitter.loading[0][live]
         signal = np.zeros(6 * m)
         signal[: 3 * m] = (self.data.slopes[0, :m] / self.data.type_a.noise).ravel()
         left = self.summary.attenuation * signal[live]

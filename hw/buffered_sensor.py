@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 
 from hw.block import BlockFlags, DeviceInfo, Drop, SampleBlock
 from hw.cutting import Cutter, Stretch
-from hw.sensor import Clock, DeviceLost, Options, system_clock
+from hw.sensor import GOLDEN, Clock, DeviceLost, Options, system_clock
 
 BLOCK_S, POLL_S = 0.5, 0.02
-GOLDEN = (5**0.5 - 1) / 2
 BUFFER_S = 1.0  # what a driver asks its library to keep: fifty polls
 OVERFLOW = "input overflow"
 

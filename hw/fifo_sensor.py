@@ -16,11 +16,10 @@ from hw.cutting import Break, Cutter, Stretch
 from hw.fifo import Burst, FifoSamples
 from hw.i2c import I2CDevice
 from hw.self_test import SelfTest, SelfTestReport
-from hw.sensor import Clock, ConfigurationError, DeviceError, DeviceLost, Options, system_clock
+from hw.sensor import GOLDEN, Clock, ConfigurationError, DeviceError, DeviceLost, Options, system_clock
 
 STANDARD_GRAVITY_MPS2 = 9.80665
 BLOCK_S = 0.5
-GOLDEN = (5**0.5 - 1) / 2
 OUT_OF_STEP = "FIFO entries out of step"
 
 Registers = Mapping[int, tuple[str, int]]

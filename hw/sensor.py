@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict
 from hw.block import DeviceInfo, Drop, SampleBlock
 
 ENTRY_POINT_GROUP = "fieldcal.sensors"
+GOLDEN = (5**0.5 - 1) / 2  # of a sample period, by which each poll is later than the one before: the two never beat
 
 Clock = Callable[[], tuple[int, int]]
 """Returns (CLOCK_MONOTONIC, UTC), both in ns, read one right after the other."""

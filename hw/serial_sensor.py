@@ -14,13 +14,12 @@ import serial
 from pydantic import Field
 
 from hw.block import DeviceInfo, Drop, SampleBlock
-from hw.sensor import Clock, ConfigurationError, DeviceLost, Options, system_clock
+from hw.sensor import GOLDEN, Clock, ConfigurationError, DeviceLost, Options, system_clock
 
 BLOCK_S = 0.5
 GATHER_S = 0.010  # a wake-up for ten samples at 1 kHz, not for each; 115 B of the kernel's 4 kB at 115200 baud
 SLOW_RATE_HZ = 100.0  # below, a sample is read as it comes: the port wakes the reader, and GATHER_SLOW_S lets it end
 GATHER_SLOW_S = 0.002
-GOLDEN = (5**0.5 - 1) / 2
 READ_BYTES = 65536  # bounds a single read
 BLOCK_BYTES = 262144  # bounds a block's memory: 0.5 s at 4 Mbaud is 200 kB
 LONGEST_GAP_S = 10.0  # a longer jump in the sequence is a counter that began anew, or a damaged number

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -82,7 +83,11 @@ def _day(_workers: int, _runs: int | None) -> tuple[Path, str]:
 
 def _bench(workers: int, runs: int | None) -> tuple[Path, str]:
     seeds = range(bench.SEED, bench.SEED + (runs or bench.RUNS))
-    return ONLINE, bench.table(spread(bench.day, seeds, workers))
+    tables = [
+        bench.table(spread(functools.partial(bench.day, rate_hz=rate_hz), seeds, workers), rate_hz)
+        for rate_hz in bench.RATES_HZ
+    ]
+    return ONLINE, "\n\n".join(tables)
 
 
 def _cost(_workers: int, runs: int | None) -> tuple[Path, str]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hw.sensor import GOLDEN
 from hw.virtual.noise import BLOCK, Stream, generator
 
 Array = NDArray[np.float64]
@@ -62,20 +63,26 @@ class Clock:
 
 @dataclass(frozen=True, slots=True)
 class Bursts:
-    """When a gateway reads a device: every `poll_s`, late by `least_late_s` + an exponential, rarely by a stall."""
+    """When a gateway reads a device: every `poll_s`, late by `least_late_s` + an exponential, rarely by a stall.
+
+    `apart_s`: each read is set later by a share of it that the golden ratio gives, as the drivers of hw do with the
+    sample period so that reads and samples do not beat; 0 for a gateway that does not.
+    """
 
     poll_s: float = 0.016
     least_late_s: float = 80e-6
     mean_late_s: float = 200e-6
     stall_probability: float = 0.01
     longest_stall_s: float = 0.015
+    apart_s: float = 0.0
     spread: bool = False  # stamps go back from a burst's arrival at the nominal rate instead of being all alike
 
     def arrivals(self, seed: int, stream: Stream, until_s: float) -> Array:
         """Arrival times (B,) of the reads up to `until_s`, never running backwards."""
         reads = int(until_s / self.poll_s)
         late = np.concatenate([self._lateness(seed, stream, block) for block in range(reads // BLOCK + 1)])
-        times = self.poll_s * np.arange(1, reads + 1) + late[:reads]
+        number = np.arange(1, reads + 1)
+        times = self.poll_s * number + self.apart_s * (number * GOLDEN % 1.0) + late[:reads]
         times = np.maximum.accumulate(times)
         return np.asarray(times[times <= until_s])
 

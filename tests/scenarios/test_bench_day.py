@@ -18,8 +18,9 @@ from benchmarks.online.runner import Run
 SEED = 1
 
 
-def test_s_and_q_are_those_of_fieldcal_calibrate_told_everything() -> None:
-    day = bench.day(SEED)
+@pytest.mark.parametrize("rate_hz", bench.RATES_HZ)
+def test_s_and_q_are_those_of_fieldcal_calibrate_told_everything(rate_hz: float) -> None:
+    day = bench.day(SEED, rate_hz)
     stops = [f"theta {theta_deg:g} deg, alpha {alpha_deg:g} deg" for theta_deg, alpha_deg in bench.STOPS]
     # Before the first motion the reference is calm; that window is used by nobody.
     assert [position for position in day.positions if position] == stops * bench.ROUNDS
