@@ -17,8 +17,6 @@ from agent.outcome import calibration_of
 from agent.schedule import pose_of
 from calib.model import Calibration, Pose
 
-LOCAL = "an operator at the gateway"
-
 
 class CommandError(ValueError):
     """A command that makes no sense; the message says why."""
@@ -29,7 +27,7 @@ def answer(command: Command, estimation: Estimation, identity: str) -> Answer:
 
     `identity` is the device's that is there now.
     """
-    arguments, key = _arguments(command), command.key_id or LOCAL
+    arguments, key = _arguments(command), command.key_id
     if command.verb == "hold":
         return estimation.gate.release(key) if arguments.get("release") else estimation.gate.hold(key)
     if command.verb == "accept":
@@ -63,6 +61,8 @@ def commanded_pose(command: Command, channel: Channel) -> Pose:
     """How the sensor stands from now on. Raises CommandError where the arguments are none of a pose."""
     if channel.rotation is not None:
         raise CommandError("a sensor beside a tri-axial reference stands as rotation says; it takes no poses")
+    if channel.fixed_mount:
+        raise CommandError("the configuration states a single pose, so a mount that never turns; it takes no other")
     arguments = _arguments(command)
     position = arguments.pop("position", None)
     try:

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import msgspec
 import numpy as np
+import pytest
 
-from agent.events import Estimate
+from agent.config import parse_config
+from agent.events import Command, Estimate
+from agent.operators import CommandError, commanded_pose
 from tests.clamp_windows import S_TRUE
 from tests.unit.mounted_site import Site, begun, said, site_config, updates, windows
 
@@ -128,3 +131,20 @@ def test_a_sensor_beside_a_tri_axial_reference_takes_no_pose() -> None:
     [(_, reason)] = said(site.command("pose", theta_deg=35.0, alpha_deg=0.0))
     assert reason == ("pose refused: a sensor beside a tri-axial reference stands as rotation says; it takes no poses")
     assert {w.used for w in windows(site.play(2))} == {True}
+
+
+def test_a_mount_that_never_turns_takes_no_pose() -> None:
+    poses = [{"start_s": 0.0, "stop_s": 60.0, "theta_deg": 35.0, "alpha_deg": 0.0}]
+    raw = {"devices": [{"name": n, "driver": "serial-csv", "options": {"port": n, "rate_hz": 100}} for n in "sr"]}
+    for count in (1, 2):
+        stated = [pose | {"start_s": 60.0 * k, "stop_s": 60.0 * k + 50.0} for k, pose in enumerate(poses * count)]
+        parts = {"sensor": "s", "reference": "r", "prior": {"sensitivity": 1.0}, "poses": stated}
+        [channel] = parse_config(raw | {"channels": [parts]}, "").channels
+        command = Command(
+            sensor="s", verb="pose", t_monotonic_ns=0, t_utc_ns=0, arguments_json='{"theta_deg": 35, "alpha_deg": 120}'
+        )
+        if count == 1:
+            with pytest.raises(CommandError, match="a single pose, so a mount that never turns"):
+                commanded_pose(command, channel)
+        else:
+            assert commanded_pose(command, channel).alpha_rad == pytest.approx(np.radians(120.0))
