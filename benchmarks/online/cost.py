@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import time
 import tracemalloc
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,7 +34,7 @@ def measure(windows: int = TIMING.windows) -> list[Cost]:
     drawn = node(1, all_axes=True, timing=TIMING)
     run = Run(drawn.config)
     tracemalloc.start()
-    spent: list[float] = []
+    spent: deque[float] = deque(maxlen=NEAR)
     costs: list[Cost] = []
     counted, cpu_s = 0, 0.0
     for event in visits(drawn.building, range(windows)):
@@ -43,7 +45,8 @@ def measure(windows: int = TIMING.windows) -> list[Cost]:
             spent.append(cpu_s)
             counted, cpu_s = counted + 1, 0.0
             if counted in AT:
-                near = spent[-min(NEAR, max(counted // 2, 5)) :]
+                near = list(spent)[-max(counted // 2, 5) :]
+                gc.collect()  # what nothing holds any more is no growth
                 memory = tracemalloc.get_traced_memory()[0]
                 costs.append(Cost(counted, 1e3 * float(np.median(near)), len(run.pipeline.snapshot()), memory / 1024))
     tracemalloc.stop()
