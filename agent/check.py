@@ -22,7 +22,9 @@ def check(config: Path) -> int:
             click.echo(fault, err=True)
         return 2
     poses = sum(len(channel.poses) for channel in loaded.channels)
+    stops = sum(len(channel.positions) for channel in loaded.channels if isinstance(channel.positions, tuple))
     if loaded.zenoh.tls and (warning := expiry_warning(loaded.zenoh.tls.files, datetime.now(UTC))):
         click.echo(f"{config}: zenoh.tls.{warning}", err=True)
-    click.echo(f"{config}: good; {len(loaded.devices)} devices, {len(loaded.channels)} channels, {poses} poses")
+    told = f"{poses} poses" + (f", {stops} positions to be found" if stops else "")
+    click.echo(f"{config}: good; {len(loaded.devices)} devices, {len(loaded.channels)} channels, {told}")
     return 0

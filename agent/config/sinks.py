@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated
 
@@ -9,6 +10,8 @@ from pydantic import ByteSize, Field, model_validator
 
 from agent.config.section import Endpoint, Section
 from agent.delivery.tls import TlsFiles
+
+_SECRET = re.compile("key|password|secret|token", re.IGNORECASE)  # in what stands behind an endpoint's '#'
 
 
 class Recording(Section):
@@ -60,4 +63,15 @@ class Zenoh(Section):
     def _tls_for_tls(self) -> Zenoh:
         if self.tls is None and any(endpoint.startswith("tls/") for endpoint in self.connect):
             raise ValueError("connect: an endpoint tls/.. needs the section zenoh.tls")
+        return self
+
+    @model_validator(mode="after")
+    def _no_secret(self) -> Zenoh:
+        for endpoint in self.connect:
+            place, _, said = endpoint.partition("#")
+            if _SECRET.search(said):  # not shown: faults are printed and logged
+                raise ValueError(
+                    f"connect: {place}#... names a key or password; every recording holds the configuration, so give "
+                    "files in zenoh.tls"
+                )
         return self

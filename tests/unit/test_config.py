@@ -65,6 +65,14 @@ def test_a_fault_is_one_line_with_its_path_and_value(text: str, said: list[str])
         assert part in line
 
 
+@pytest.mark.parametrize("said", ["connect_private_key_base64=S3cr3t", "iface=eth0;password=S3cr3t"])
+def test_an_endpoint_with_a_secret_is_refused_and_not_shown(said: str) -> None:
+    (line,) = faults(CHANNEL + f'[zenoh]\nconnect = ["tcp/h:7447#{said}"]')
+    assert "zenoh: connect: tcp/h:7447#... names a key or password" in line
+    assert "S3cr3t" not in line
+    parse_config(tomllib.loads(CHANNEL + '[zenoh]\nconnect = ["tcp/h:7447#iface=eth0"]'), "")
+
+
 def test_all_faults_come_at_once() -> None:
     lines = faults(CHANNEL.replace("rate_hz = 100", "rate = 100") + "silence_s = 0\n[zenoh]\nconnect = 7")
     assert sorted(line.split(": ")[1] for line in lines) == [
