@@ -232,9 +232,9 @@ def _unbroken(time_s: Array) -> Iterator[tuple[int, int]]:
 
 
 def _pieces(first: int, stop: int, longest: int) -> Iterator[tuple[int, int]]:
-    """Equal pieces no longer than `longest`; none of an empty stretch or of a single sample."""
+    """Equal pieces no longer than `longest`, none of a single sample."""
     if stop - first > 1:
-        count = -(-(stop - first) // max(longest, 2))
+        count = min(-(-(stop - first) // max(longest, 2)), (stop - first) // 2)
         yield from itertools.pairwise(np.linspace(first, stop, count + 1).round().astype(int).tolist())
 
 

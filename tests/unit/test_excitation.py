@@ -6,6 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 
 from calib import detection
 from calib.excitation import Points, motion_parts, motion_windows, rest_sd, rest_window
@@ -333,3 +335,18 @@ def test_an_axis_that_never_changes_is_dead() -> None:
     (window,) = motion_windows(pose, Points(t, V, u, np.gradient(u[:, 0], t)[:, None]))
     assert not window.used
     assert window.reason == "dead: 1 of the sensor's axes do not change at all"
+
+
+@given(seed=st.integers(0, 2**32 - 1), share=st.floats(0.0005, 1.0), longest_s=st.floats(0.01, 60.0))
+@settings(max_examples=60)
+@example(seed=0, share=0.0625, longest_s=0.0625)
+def test_of_whatever_samples_are_left_windows_are_made(seed: int, share: float, longest_s: float) -> None:
+    random = np.random.default_rng(seed)
+    data = points()
+    kept = np.flatnonzero(random.random(len(data.V)) < share)
+    if len(kept) < 2:
+        kept = np.array([0, len(data.V) - 1])
+    left = Points(*(column[kept] for column in data))
+    windows = motion_windows(POSE, left, Limits(longest_s=longest_s))
+    assert sum(w.points + w.left_out for w in windows) <= len(kept)
+    assert all(w.stop_s > w.start_s for w in windows)
