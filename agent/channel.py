@@ -246,6 +246,13 @@ class ChannelState:
         return all(stream.reaches(end_s) for stream in self._streams.values())
 
     def _estimate(self, piece: Piece, first_s: float) -> Iterator[Result]:
+        try:
+            yield from self._windows(piece, first_s)
+        except (ArithmeticError, ValueError) as error:  # LinAlgError is one: of samples such as 1e200
+            reason = f"these samples cannot be reckoned with: {error}"
+            yield from self._refuse(refused(piece, reason), reason)
+
+    def _windows(self, piece: Piece, first_s: float) -> Iterator[Result]:
         day = self._first_day + (first_s + piece.stop_s) / DAY_S
         placed = self._placed(piece, first_s, day)
         if placed.pose is None or self._not_certified:
@@ -255,9 +262,7 @@ class ChannelState:
         found = found.told(placed.numbers)
         for window in found.windows:
             if not window.used or self._estimation is None:
-                reason = window.reason or f"{self.sensor} was never opened"
-                yield window_report(self._source(), window, used=False, reason=reason, numbers={})
-                yield from self._complain(reason)
+                yield from self._refuse(window, window.reason or f"{self.sensor} was never opened")
                 continue
             self._refused = 0
             judged = self._estimation.judge(window, day, lag_s, found.temperature_degc)
@@ -270,8 +275,9 @@ class ChannelState:
         cut = self._streams[self.sensor].cut(first_s + piece.start_s, first_s + piece.stop_s)
         return self._finder.place(piece, cut, self._estimation.recursion, day)
 
-    def _complain(self, reason: str) -> Iterator[Result]:
-        """Windows that are refused one after the other: the status, though it stands, says why nothing is updated."""
+    def _refuse(self, window: Window, reason: str) -> Iterator[Result]:
+        """Of several in a row the status, though it stands, says why nothing is updated."""
+        yield window_report(self._source(), window, used=False, reason=reason, numbers={})
         self._refused += 1
         if self._refused == REFUSED_IN_A_ROW:
             yield self._told(f"nothing is updated: {reason}")

@@ -50,6 +50,7 @@ class Site:
         self.t_s = 0
         self.results: list[Result] = []
         self.memories: dict[str, Memory] = {}
+        self.spoiled: dict[str, float] = {}  # by device: all that it shows is as many times too large
 
     def step(self, event: Any) -> list[Result]:
         outputs = self.pipeline.step(event)
@@ -96,7 +97,7 @@ class Site:
             self.t_s += BLOCK_S
             for device, values in (("s", V), ("r", a)):
                 if device in devices:
-                    found += self.step(self._block(device, int(index[0]), values))
+                    found += self.step(self._block(device, int(index[0]), values * self.spoiled.get(device, 1.0)))
         return found
 
     def wait(self, seconds: int) -> list[Result]:
