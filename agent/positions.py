@@ -19,6 +19,8 @@ from calib.standing import KEPT, MEAN_S, Standing
 from hw.block import BlockFlags, SampleBlock
 
 FOUND_WITHIN_S = KEPT * MEAN_S  # of samples that may still turn out to belong to a stretch
+# A garbled line may say 1e20; beside it every departure would look small. No motion that gravity is seen in is larger.
+LARGEST_MPS2 = 200.0
 LEAST_SHARE = 0.5  # of a short mean's samples; with fewer nobody knows what happened meanwhile
 # How it stands in a stretch before `place` has looked.
 OPEN = Pose("unknown", np.zeros((3, 0)), np.full(3, np.nan))
@@ -149,7 +151,7 @@ class FoundPositions:
             self._end(self._standing.interrupt(), size, stream)
             self._begin_at(block.first_index)
             missing = 0
-        values = np.asarray(block.indications, dtype=np.float64) / scale
+        values = np.clip(np.asarray(block.indications, dtype=np.float64) / scale, -LARGEST_MPS2, LARGEST_MPS2)
         self._average(np.vstack([np.full((missing, 3), np.nan), values]), size, stream)
         self._expected = block.first_index + block.n
         self._cleared_s = self._time_of(self._standing.cleared, size, stream)

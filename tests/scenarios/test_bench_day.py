@@ -15,6 +15,7 @@ from agent.recording.replaying import Replay
 from benchmarks.online import bench
 from benchmarks.online.clamp import bench_events
 from benchmarks.online.runner import Run
+from hw.block import SampleBlock
 from hw.virtual.bench import Bench
 
 SEED = 1
@@ -29,6 +30,22 @@ def test_s_and_q_are_those_of_fieldcal_calibrate_told_everything(rate_hz: float)
     assert day.windows == (len(stops) * bench.ROUNDS,) * 2
     assert day.apart.max() < 0.2
     assert day.u[[0, 4, 8]].max() < 0.002  # of 5 % that the data sheet left
+
+
+@pytest.mark.parametrize("said", [1e5, 1e20])
+def test_a_garbled_line_makes_no_place_deaf(said: float) -> None:
+    """Counted large, every later turn would be small beside it."""
+    world = bench.world(SEED, 200.0)
+    run = Run(bench.config(world))
+    duration_s = world.parameters.schedule.duration_s(1) + bench.AFTER_S
+    found: list[str] = []
+    for event in bench_events(world, world.recording(duration_s)):
+        if isinstance(event, SampleBlock) and event.device == "sensor" and 10.0 < event.t_monotonic_ns * 1e-9 < 15.1:
+            event.indications[50:60] = said * world.parameters.sensor.nominal_sensitivity
+        found += [r.position for r in run.feed(event) if isinstance(r, WindowReport) and r.used]
+    assert (
+        found[-5:] == [f"theta {theta_deg:g} deg, alpha {alpha_deg:g} deg" for theta_deg, alpha_deg in bench.STOPS][1:]
+    )
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
