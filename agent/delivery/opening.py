@@ -21,6 +21,7 @@ from agent.delivery.schema import (
 
 LOCK_NAME = "state.lock"
 LOG_PAGES = 256  # 1 MiB; a full disk has to have room for the log as well
+CACHE_KIB = 512  # of pages in memory; SQLite's own 2 MiB fill over hours and save nothing where each row is written once
 # What SQLite says of a sound file on a machine that is not: anything else means that the file is damaged.
 _OF_THE_MACHINE = frozenset(
     {
@@ -109,6 +110,7 @@ def _open(path: Path) -> sqlite3.Connection:
         connection.execute("PRAGMA journal_mode = WAL")
         connection.execute("PRAGMA synchronous = FULL")
         connection.execute(f"PRAGMA wal_autocheckpoint = {LOG_PAGES}")
+        connection.execute(f"PRAGMA cache_size = -{CACHE_KIB}")
         version = version_of(connection)
         if not known_version(version) and version != 0:
             raise StoreError(f"{path}: written in version {version}, this program writes version {SCHEMA_VERSION}")
