@@ -21,7 +21,7 @@ from agent.delivery.schema import (
 
 LOCK_NAME = "state.lock"
 LOG_PAGES = 256  # 1 MiB; a full disk has to have room for the log as well
-CACHE_KIB = 512  # of pages in memory; SQLite's own 2 MiB fill over hours and save nothing where each row is written once
+CACHE_KIB = 512  # of pages in memory; SQLite's own 2 MiB fill over hours, and each row is written once
 # What SQLite says of a sound file on a machine that is not: anything else means that the file is damaged.
 _OF_THE_MACHINE = frozenset(
     {
