@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 Progress = Callable[[int], Any]  # called with the bytes just read
 
 CHUNK_BYTES = 1 << 18  # stays in the second-level cache while it is parsed
+LARGEST = 1e15  # no indication or time needs more, and squares and sums of it stay finite
 SENSOR = ("time_s", "vx", "vy", "vz")
 TEMPERATURE = "temperature_degc"
 REFERENCES = (("ax", "ay", "az"), ("a",), ("v",))
@@ -153,7 +154,7 @@ def _rows(path: Path, first_line: int, text: bytes, header: Sequence[str]) -> Ar
         rows = np.loadtxt(io.BytesIO(text), delimiter=",", comments=None, ndmin=2)
     except ValueError:
         rows = np.empty((0, 0))
-    if rows.shape == (text.count(b"\n"), len(header)) and np.isfinite(rows).all():
+    if rows.shape == (text.count(b"\n"), len(header)) and (np.abs(rows) <= LARGEST).all():
         return rows
     parsed = []
     for line, content in enumerate(text.decode("utf-8", "replace").splitlines(), start=first_line):
@@ -170,13 +171,15 @@ def fields_of(path: Path, line: int, fields: list[str], header: Sequence[str]) -
 
 
 def number_of(path: Path, line: int, column: str, text: str) -> float:
-    """A finite number. Raises TableError."""
+    """A finite number, and no larger than LARGEST. Raises TableError."""
     try:
         value = float(text)
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
         raise TableError(f"{path}, line {line}, column {column}: {text.strip()!r} is not a finite number")
+    if abs(value) > LARGEST:
+        raise TableError(f"{path}, line {line}, column {column}: {text.strip()!r} is larger than {LARGEST:g}")
     return value
 
 

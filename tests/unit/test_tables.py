@@ -69,6 +69,7 @@ def test_a_file_of_many_chunks_is_the_same(tmp_path: Path, monkeypatch: pytest.M
         (HEADER + "0,1,2,3\n0.1,1,2\n0.2,1,2,3\n", "line 3: 3 fields, the header has 4"),
         (HEADER + "0,1,2,3\n0.1,1,x2,3\n0.2,1,2,3\n", "line 3, column vy: 'x2' is not a finite number"),
         (HEADER + "0,1,2,3\n0.1,1,2,nan\n0.2,1,2,3\n", "line 3, column vz: 'nan' is not a finite number"),
+        (HEADER + "0,1,2,3\n0.1,1,2,1e200\n0.2,1,2,3\n", "line 3, column vz: '1e200' is larger than 1e\\+15"),
         (HEADER + "0,1,2,3\n0.1,,2,1\n", "line 3, column vx: '' is not a finite number"),
         (HEADER + "0,1,2,3\n\n0.1,1,2,3\n", "line 3: 1 fields, the header has 4"),
         (HEADER + "0,1,2,3\n", "1 rows of data, at least 2 are needed"),
