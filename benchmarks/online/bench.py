@@ -37,6 +37,13 @@ HOLD_S, TURN_S, ROUNDS = 25.0, 4.0, 2
 AFTER_S = 12.0  # into the next turning, by which the last stop ends
 # A data sheet's: main sensitivities to 5 %, transverse 3 %, zero-g offset 50 mg.
 U_MAIN_PCT, U_TRANSVERSE_PCT, U_OFFSET_MPS2 = 5.0, 3.0, 0.5
+FREE_GATE = {"least_determined": 3}  # S_xy and S_yx no free angle tells
+MAIN = [0, 4, 8]
+KINDS = (
+    ("main sensitivity", "%", MAIN),
+    ("transverse sensitivity", "%", [k for k in range(9) if k not in MAIN]),
+    ("offset", "mm/s2", list(range(9, len(PARAMETERS)))),
+)
 KNOWN = Spread(
     angle_deg=0.2,
     theta_deg=0.2,
@@ -185,14 +192,36 @@ def table(days: Sequence[Day], rate_hz: float) -> str:
         "| | u of calibrate, mean | on-line less calibrate, worst / u | rms / u | on-line less truth, rms / u |",
         "| --- | --- | --- | --- | --- |",
     ]
-    main = [0, 4, 8]
-    for name, unit, columns in (
-        ("main sensitivity", "%", main),
-        ("transverse sensitivity", "%", [k for k in range(9) if k not in main]),
-        ("offset", "mm/s2", range(9, len(PARAMETERS))),
-    ):
-        k = list(columns)
+    for name, unit, k in KINDS:
         size = (100.0 if unit == "%" else 1000.0) * u[:, k].mean()
         rms = [float(np.sqrt(np.mean(part[:, k] ** 2))) for part in (apart, off)]
         lines.append(f"| {name} | {size:.2g} {unit} | {apart[:, k].max():.2f} | {rms[0]:.2f} | {rms[1]:.2f} |")
+    return "\n".join(lines)
+
+
+def free_day(seed: int) -> tuple[Array, Array]:
+    """One day on a clamp whose angles nobody states: errors over u (12,), and u (12,) in m/s2 and 1."""
+    bench = world(seed)
+    scale = bench.parameters.sensor.nominal_sensitivity
+    update, _ = online(bench, bench.parameters.schedule.duration_s(ROUNDS) + AFTER_S, positions="free", gate=FREE_GATE)
+    found = np.append(np.ravel(update.sensitivity), update.offset)
+    truth = np.append(bench.truth.sensitivity.ravel(), bench.truth.offset)
+    u = np.array(update.standard_uncertainty)
+    return (found - truth) / u, u / scale
+
+
+def free_table(days: Sequence[tuple[Array, Array]]) -> str:
+    """Errors of all days, by kind of parameter."""
+    errors, u = (np.array(part) for part in zip(*days, strict=True))
+    inside = 100.0 * np.mean(np.abs(errors) <= 2.0)
+    lines = [
+        f'{len(days)} days with `positions = "free"` at {RATES_HZ[0]:g} Hz; {inside:.1f} % of all errors within 2 u.',
+        "",
+        "| | u on-line, mean | errors, rms / u | worst / u |",
+        "| --- | --- | --- | --- |",
+    ]
+    for name, unit, k in KINDS:
+        size = (100.0 if unit == "%" else 1000.0) * u[:, k].mean()
+        off = errors[:, k]
+        lines.append(f"| {name} | {size:.2g} {unit} | {np.sqrt(np.mean(off**2)):.2f} | {np.abs(off).max():.2f} |")
     return "\n".join(lines)

@@ -87,6 +87,7 @@ def _bench(workers: int, runs: int | None) -> tuple[Path, str]:
         bench.table(spread(functools.partial(bench.day, rate_hz=rate_hz), seeds, workers), rate_hz)
         for rate_hz in bench.RATES_HZ
     ]
+    tables.append(bench.free_table(spread(bench.free_day, seeds, workers)))
     return ONLINE, "\n\n".join(tables)
 
 

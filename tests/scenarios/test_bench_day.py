@@ -68,7 +68,7 @@ def test_with_free_angles_s_and_q_are_within_their_uncertainty() -> None:
     """No stop is told either. 12 parameters within 4 u: by chance outside once in 1300 such days."""
     world = bench.world(SEED)
     duration_s = world.parameters.schedule.duration_s(1) + bench.AFTER_S
-    update, reports = bench.online(world, duration_s, positions="free", gate={"least_determined": 3})
+    update, reports = bench.online(world, duration_s, positions="free", gate=bench.FREE_GATE)
     found = np.append(np.ravel(update.sensitivity), update.offset)
     truth = np.append(world.truth.sensitivity.ravel(), world.truth.offset)
     u = np.array(update.standard_uncertainty)
