@@ -43,6 +43,7 @@ def config(bench: Bench) -> Config:
             {
                 "sensor": "sensor",
                 "reference": "reference",
+                "prior": {"sensitivity": bench.parameters.sensor.nominal_sensitivity},
                 "poses": poses,
                 "poses_repeat_s": bench.parameters.schedule.period_s,
             }
