@@ -290,7 +290,7 @@ class ChannelState:
             used = [w for w in found.windows if w.used]
             if self._estimation is None or not used or self._channel.reference is None:
                 break
-            better_s = self._estimation.lag_after(used, day, lag_s)
+            better_s = self._estimation.lag_after(used, day, lag_s, found.temperature_degc)
             if better_s == lag_s:
                 break
             lag_s = better_s

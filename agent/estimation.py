@@ -15,7 +15,7 @@ from calib.correction import Law
 from calib.distributions import chi2_quantile
 from calib.drift import DriftTest, DriftVerdict
 from calib.innovation import Innovation
-from calib.model import PARAMETERS, Array, Calibration, Window
+from calib.model import PARAMETERS, Array, Calibration, Window, WindowSums
 from calib.recursion import Recursion
 from calib.window_rows import Summary
 
@@ -40,6 +40,16 @@ class Judged:
     drift: Sequence[DriftVerdict]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Tried:
+    """A window tried on the state: what it says, and the recursion that has taken it."""
+
+    window_sums: WindowSums
+    summary: Summary
+    innovation: Innovation
+    after: Recursion
+
+
 class Estimation:
     """The state, what is in force and what is kept aside. `judge` and the operator's verbs change it."""
 
@@ -60,26 +70,28 @@ class Estimation:
         self.gate = Gate(_limits(channel, self.recursion.scale), self.in_force)
         self.drift = DriftTest(channel.drift.settings())
         self._held: list[Summary] = []
+        self._tried: Tried | None = None  # what `lag_after` did, for `judge` right after it
 
     @property
     def lag_s(self) -> float:
         """By which the sensor's indications come after the reference's, as far as known."""
         return self.recursion.lag_s if "lag" in self.recursion.names else -self._channel.certificate.lag_s
 
-    def lag_after(self, windows: Sequence[Window], day: float, lag_s: float) -> float:
+    def lag_after(self, windows: Sequence[Window], day: float, lag_s: float, temperature_degc: float) -> float:
         """The lag once these windows were taken, or `lag_s` where they leave too little of it to matter."""
-        trial = self.recursion.copy()
-        for window in windows:
-            trial.update(Summary.of(window, day, lag_s))
+        self._tried = self._try(windows[0], day, lag_s, temperature_degc)
+        trial = self._tried.after
+        for window in windows[1:]:
+            _, trial = trial.with_window(Summary.of(window, day, lag_s, temperature_degc))
         left = trial.lag_s - lag_s
         return trial.lag_s if abs(largest_omega(windows) * left) ** 3 / 6.0 > PHASE_LEFT else lag_s
 
     def judge(self, window: Window, day: float, lag_s: float, temperature_degc: float) -> Judged:
         """Take, keep aside or refuse one used window."""
-        summary = Summary.of(window, day, lag_s, temperature_degc)
-        innovation = self.recursion.innovation(summary)
-        trial = self.recursion.copy()
-        trial.update(summary)
+        tried, self._tried = self._tried, None
+        if tried is None or tried.window_sums is not window.sums or tried.summary.lag_s != lag_s:
+            tried = self._try(window, day, lag_s, temperature_degc)
+        summary, innovation, trial = tried.summary, tried.innovation, tried.after
         candidate = trial.result()
         confirm = self._channel.gate.confirm_windows
         held = [*self._held, summary][-confirm:]
@@ -105,6 +117,10 @@ class Estimation:
         if decision.action == "hold":
             decision = replace(decision, reason=f"{decision.reason}; {_most(innovation, self.recursion.scale)}")
         return Judged(decision, innovation, drift)
+
+    def _try(self, window: Window, day: float, lag_s: float, temperature_degc: float) -> Tried:
+        summary = Summary.of(window, day, lag_s, temperature_degc)
+        return Tried(window.sums, summary, *self.recursion.with_window(summary))
 
     def put(self, calibration: Calibration) -> None:
         """An operator put this in force: the state goes on from it, unless it is there anyway."""

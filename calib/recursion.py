@@ -88,10 +88,19 @@ class Recursion:
 
     def innovation(self, summary: Summary) -> Innovation:
         """What the window says against the state at its time."""
+        return self._against(summary)[0]
+
+    def with_window(self, summary: Summary) -> tuple[Innovation, Recursion]:
+        """What the window says against the state at its time, and a copy that has taken it."""
+        told, trial, rows, wandered = self._against(summary)
+        trial._take(rows, wandered)
+        return told, trial
+
+    def _against(self, summary: Summary) -> tuple[Innovation, Recursion, WindowRows, JointState]:
         trial = self.copy()
         rows = trial._know(summary)
         state = trial._wandered(trial._state, trial._day, summary.day)
-        return innovation(rows.at(state, state.mean, trial._noise), state)
+        return innovation(rows.at(state, state.mean, trial._noise), state), trial, rows, state
 
     @property
     def lag_s(self) -> float:
@@ -172,7 +181,11 @@ class Recursion:
     def update(self, summary: Summary) -> None:
         """Take a window: one correction of everything."""
         rows = self._know(summary)
-        self._state = self._taken(self._state, self._day, rows)
+        self._take(rows, self._wandered(self._state, self._day, summary.day))
+
+    def _take(self, rows: WindowRows, wandered: JointState) -> None:
+        summary = rows.summary
+        self._state = self._corrected(wandered, rows)
         self._day = _later(self._day, summary.day)
         self._recent.append(summary)
         self._settle()
@@ -287,8 +300,10 @@ class Recursion:
         return rows
 
     def _taken(self, before: JointState, since: float | None, rows: WindowRows) -> JointState:
-        """The state after one window, linearised at the point."""
-        state = self._wandered(before, since, rows.summary.day)
+        return self._corrected(self._wandered(before, since, rows.summary.day), rows)
+
+    def _corrected(self, state: JointState, rows: WindowRows) -> JointState:
+        """The state, at its day already, after one window, linearised at the point."""
         own = rows.at(state, self._point, self._noise)
         gain = _gain(own.jacobian, state.factor)
         step = gain @ (own.residual + own.jacobian @ (self._point - state.mean))
