@@ -15,7 +15,7 @@ from calib.band import band_above_noise, lowpass, noise_in_band
 from calib.excitation import Points, motion_windows, rest_window
 from calib.model import Array, Pose, Window, WindowSums
 from calib.resampling import VELOCITY_BAND_HZ, differentiate, resample
-from calib.window_verdict import Limits
+from calib.window_verdict import DEFAULT_LIMITS, Limits
 
 # Samples beyond a window's ends, the reference's (the sensor's half of it): half the taps of resampling, of
 # differentiating and of the low-pass filter at 100 Hz and above.
@@ -88,11 +88,13 @@ class Signals:
     """The sensor's samples with the reference at their times, in the band of the motion, and the reference's noise.
 
     `clipped_points` at the end of the range: a filter leaves nothing of them to be seen, so they are counted before.
+    `independent`: the share of the points that a filter leaves independent.
     """
 
     points: Points
     reference_noise: Array
     clipped_points: int
+    independent: float
 
 
 def signals(cut: Cut, reference: Cut, channel: Channel, span_s: tuple[float, float], lag_s: float) -> Signals | None:
@@ -106,8 +108,9 @@ def signals(cut: Cut, reference: Cut, channel: Channel, span_s: tuple[float, flo
     columns[~at.usable] = np.nan
     band_hz, noise = _band(raw, at.u[at.usable], channel, rate_hz)
     sensor_rate_hz = float((len(time_s) - 1) / (time_s[-1] - time_s[0])) if len(time_s) > 1 else 0.0
-    clipped = 0
+    clipped, independent = 0, 1.0
     if band_hz is not None:
+        independent = min(1.0, 2.0 * FILTER_BAND * band_hz / sensor_rate_hz)
         clipped = _clipped(columns[np.isfinite(columns).all(axis=1) & _within(time_s, span_s)])
         columns = lowpass(columns, sensor_rate_hz, band_hz)
     usable = np.isfinite(columns).all(axis=1) & _within(time_s, span_s)
@@ -115,7 +118,8 @@ def signals(cut: Cut, reference: Cut, channel: Channel, span_s: tuple[float, flo
         return None
     m = u.shape[1]
     kept = columns[usable]
-    return Signals(Points(time_s[usable], kept[:, :3], kept[:, 3 : 3 + m], kept[:, 3 + m :]), noise, clipped)
+    points = Points(time_s[usable], kept[:, :3], kept[:, 3 : 3 + m], kept[:, 3 + m :])
+    return Signals(points, noise, clipped, independent)
 
 
 def _clipped(columns: Array) -> int:
@@ -155,8 +159,14 @@ def _motion(
 
 
 def _told(window: Window, found: Signals) -> Window:
-    """The window with what was known before the filter."""
-    window = replace(window, reference_noise=found.reference_noise)
+    """The window with what was known before the filter, and what the filter left."""
+    window = replace(window, reference_noise=found.reference_noise, independent=found.independent)
+    points, least = found.independent * window.points, float(DEFAULT_LIMITS.least_points)
+    if window.used and points < least:
+        # A regression on hardly more points than it has unknowns leaves no residual to judge it by.
+        count = {"independent_points": points, "independent_points_threshold": least}
+        reason = f"too few points: {points:.0f} are independent in the band of the motion, {least:.0f} needed"
+        return replace(window, used=False, reason=reason, numbers={**window.numbers, **count})
     if not found.clipped_points:
         return window
     count = {"clipped_points": float(found.clipped_points), "clipped_points_threshold": 0.0}

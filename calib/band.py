@@ -8,6 +8,7 @@ V = S a + Q stays true, whatever the filter.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 
@@ -58,7 +59,7 @@ def band_above_noise(x: Array, rate_hz: float) -> tuple[float | None, Array]:
         return None, np.zeros(m)
     powers = np.stack([_spectrum([x[:, k : k + 1]], size)[0] for k in range(m)])
     segments = len(x) // size
-    window = np.hanning(size)
+    window = hanning(size)
     # A line's power is a mean of `segments` exponentials: its median is the mean but for one part in 3 segments.
     floor = np.median(powers[:, 1:-1], axis=1) / (1.0 - 1.0 / (3.0 * segments))
     ratio = np.convolve(
@@ -113,9 +114,17 @@ def lowpass_lost(rate_hz: float, band_hz: float) -> int:
     return int(np.ceil((STOP_BAND_DB - 8.0) / (2.285 * np.pi * band_hz / rate_hz) / 2.0))
 
 
+@lru_cache(maxsize=4)
+def hanning(size: int) -> Array:
+    """Hann's window (size,), not to be written to: every window of data asks for the same one."""
+    window = np.hanning(size)
+    window.flags.writeable = False
+    return window
+
+
 def _spectrum(stretches: Sequence[Array], size: int) -> tuple[Array, int]:
     """Mean power (size // 2 + 1,) over channels, Hann-windowed segments of `size`, and their number."""
-    window = np.hanning(size)[:, None]
+    window = hanning(size)[:, None]
     total, count = np.zeros(size // 2 + 1), 0
     for x in stretches:
         for start in range(0, len(x) - size + 1, size):

@@ -7,6 +7,7 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.band import hanning
 from calib.model import Array
 
 Mask = NDArray[np.bool_]
@@ -30,7 +31,7 @@ ROUNDING = 1e-9  # of the range: what is less is no noise
 
 def moving(u: Array, rate_hz: float) -> list[Stretch]:
     """Stretches in which the reference u (n, m) moves, relative to the liveliest part of it."""
-    width = band_width(u, rate_hz)
+    width = band_width(u, rate_hz, white_noise(u))
     slow = averaged(u - np.median(u, axis=0), width) if len(u) else u
     size = max(1, round(FRAME_S * rate_hz / width))
     frames = len(slow) // size
@@ -96,9 +97,10 @@ def _all_differ(v: Array, noise: float) -> bool:
     return noise > ROUNDING * float(np.ptp(v)) and len(np.unique(inside)) >= DISTINCT * len(inside) > 0
 
 
-def band_width(u: Array, rate_hz: float) -> int:
-    """How many samples of u (n, m) may be averaged and leave most of the motion's power; white noise falls."""
-    power = _power(u) - float(np.sum(white_noise(u) ** 2)) if len(u) else 0.0
+def band_width(u: Array, rate_hz: float, noise: Array) -> int:
+    """How many samples of u (n, m), `white_noise` (m,), may be averaged and leave most of the motion's power; the noise
+    falls."""
+    power = _power(u) - float(np.sum(noise**2)) if len(u) else 0.0
     width = max(1, min(int(rate_hz / SLOW_BAND_HZ), len(u)))
     while width > 1 and _power(averaged(u, width)) < MOST_POWER * power:
         width //= 2
@@ -125,7 +127,7 @@ def white_noise(x: Array) -> Array:
         return np.zeros(x.shape[1])
     starts = np.unique(np.linspace(0, len(x) - size, SPECTRA).astype(int))
     parts = np.stack([x[k : k + size] for k in starts])
-    window = np.hanning(size)[:, None]
+    window = hanning(size)[:, None]
     lines = np.fft.rfft((parts - parts.mean(axis=1, keepdims=True)) * window, axis=1)[:, 1:-1]
     power = np.median(np.abs(lines) ** 2, axis=(0, 1)) / np.sum(window**2)
     # The power of a line of white noise is exponentially distributed: its mean is the median over ln 2.

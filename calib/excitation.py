@@ -164,7 +164,8 @@ def _motion_numbers(sums: WindowSums, basis: Array, V: Array, rate_hz: float) ->
     """Level, noise and coherence in the band of the motion; drift of the mean. `basis` (n, 1 + 2 m) is [1, u, du]."""
     m = sums.reference_channels
     u = basis[:, 1 : 1 + m]
-    width = detection.band_width(u, rate_hz)
+    noise = detection.white_noise(u)
+    width = detection.band_width(u, rate_hz, noise)
     slow, slow_v = detection.averaged(basis, width), detection.averaged(V, width)
     solution, *_ = np.linalg.lstsq(slow, slow_v, rcond=None)
     total = float(np.sum((slow_v - slow_v.mean(axis=0)) ** 2))
@@ -173,7 +174,7 @@ def _motion_numbers(sums: WindowSums, basis: Array, V: Array, rate_hz: float) ->
     return {
         "reference_rms_mps2": float(np.sqrt(np.sum(np.var(slow[:, 1 : 1 + m], axis=0)))),
         # Of a constant channel rounding alone is left of both; it is silent.
-        "reference_noise_mps2": float(np.sqrt(np.sum(detection.white_noise(u) ** 2) / width) + 1e-12 * np.abs(u).max()),
+        "reference_noise_mps2": float(np.sqrt(np.sum(noise**2) / width) + 1e-12 * np.abs(u).max()),
         "coherence": 1.0 - rest / total if total > 0 else 0.0,
         "drift_mps2": _drift(sums) / scale if scale > 0 else np.inf,
     }

@@ -60,7 +60,8 @@ class Window:
 
     `kind`: the reference moved, the sensor rested under a known gravity, or the reference was calm (not used by itself;
     it measures the noise of the reference). `numbers` are the statistics behind the verdict, unit in the name.
-    `u_lag_s`: by how much this window's lag may differ from the others', as the two clocks tell.
+    `u_lag_s`: by how much this window's lag may differ from the others', as the two clocks tell. `independent`: the share
+    of its points that are, less than 1 where both signals were limited to a band.
     """
 
     start_s: float
@@ -74,6 +75,7 @@ class Window:
     kind: Literal["motion", "rest", "quiet"] = "motion"
     numbers: Mapping[str, float] = field(default_factory=dict)
     u_lag_s: float = 0.0
+    independent: float = 1.0
     reference_noise: Array | None = None  # (2, m) rms of the reference's own noise in u, m/s2, and in du/dt, m/s3
 
 

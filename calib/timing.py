@@ -53,7 +53,7 @@ class ClockFit:
         i = np.asarray(index, dtype=float)
         if len(self.knot_index) == 1:
             return np.asarray(self.knot_time_s[0] + (i - self.knot_index[0]) * self.knot_period_s[0])
-        k = np.clip(np.searchsorted(self.knot_index, i, side="right") - 1, 0, len(self.knot_index) - 2)
+        k = self._piece(self.knot_index, i)
         width = self.knot_index[k + 1] - self.knot_index[k]
         x = (i - self.knot_index[k]) / width
         inside = np.clip(x, 0.0, 1.0)
@@ -68,12 +68,19 @@ class ClockFit:
         t = np.asarray(time_s, dtype=float)
         if len(self.knot_index) == 1:
             return np.asarray(self.knot_index[0] + (t - self.knot_time_s[0]) / self.knot_period_s[0])
-        k = np.clip(np.searchsorted(self.knot_time_s, t, side="right") - 1, 0, len(self.knot_index) - 2)
+        k = self._piece(self.knot_time_s, t)
         slope = (self.knot_time_s[k + 1] - self.knot_time_s[k]) / (self.knot_index[k + 1] - self.knot_index[k])
         index = self.knot_index[k] + (t - self.knot_time_s[k]) / slope
         for _ in range(3):  # periods differ by less than 1e-2 within a piece: each turn gains two digits or more
             index = index + (t - self.time_of(index)) / slope
         return np.asarray(index)
+
+    @staticmethod
+    def _piece(knots: Array, at: Array) -> IntArray | int:
+        """In which piece these are; of a live clock there is one, and nothing need be looked up for each sample."""
+        if len(knots) == 2:
+            return 0
+        return np.clip(np.searchsorted(knots, at, side="right") - 1, 0, len(knots) - 2)
 
 
 class ClockModel:

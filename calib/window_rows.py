@@ -43,6 +43,7 @@ class Noise:
 # as it has rows, three times: estimated from fewer it would be too sure of some direction.
 SHRINKAGE = 3.0
 MOST_FREEDOM = 400.0  # degrees of freedom: beyond, the oldest windows' scatter is forgotten
+FEWEST_FREEDOM = 10.0  # degrees of freedom: from fewer, a mean of squares is off by 40 % and more
 LEAST_INFLATION = 0.25  # variance ratios below it are the luck of few segments
 
 
@@ -66,6 +67,7 @@ class Summary:
     lag_s: float = 0.0
     temperature_degc: float = np.nan
     u_lag_s: float = 0.0
+    independent: float = 1.0
 
     @classmethod
     def of(cls, window: Window, day: float, lag_s: float = 0.0, temperature_degc: float = np.nan) -> Summary:
@@ -77,7 +79,7 @@ class Summary:
         moved = found.window.pose
         return cls(
             window.pose, moved, held, data, found.directions, found.attenuation, day, lag_s, temperature_degc,
-            window.u_lag_s,
+            window.u_lag_s, window.independent,
         )  # fmt: skip
 
     def snapshot(self) -> dict[str, Any]:
@@ -148,15 +150,18 @@ class WindowRows:
 
     @property
     def noise(self) -> Noise:
-        """What this window's own segments say."""
-        type_a, live = self.data.type_a, self._live
-        if not np.isfinite(type_a.degrees_of_freedom):
-            return Noise()
-        slopes = float(np.diag(type_a.slopes)[live].mean()) if live.any() else 1.0
-        return Noise(slopes, float(np.diag(type_a.means).mean()), type_a.degrees_of_freedom)
+        """What this window's own segments say; where they are few, the rest is what a filter makes of white noise."""
+        type_a, live, filtered = self.data.type_a, self._live, 1.0 / self.summary.independent
+        freedom = type_a.degrees_of_freedom if np.isfinite(type_a.degrees_of_freedom) else 0.0
+        own = min(freedom / FEWEST_FREEDOM, 1.0)
+        slopes = float(np.diag(type_a.slopes)[live].mean()) if live.any() else filtered
+        means = float(np.diag(type_a.means).mean())
+        return Noise(own * slopes + (1.0 - own) * filtered, own * means + (1.0 - own) * filtered, freedom)
 
     def at(self, state: JointState, at: Array, noise: Noise) -> Rows:
-        """Rows at the values `at` (N,) of the state's quantities; `noise` is the pooled one."""
+        """Rows at the values `at` (N,) of the state's quantities; `noise` is the pooled one, to which this window's is
+        added: the first window of all has no other."""
+        noise = noise.pooled(self.noise)
         x, chain = self._own(state, at)
         rows = self.equations.at(x)
         slope, d_slope = rows.slope.reshape(-1), rows.d_slope.reshape(-1, len(x))
