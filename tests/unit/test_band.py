@@ -49,6 +49,22 @@ def test_a_missing_sample_takes_its_neighbourhood_with_it() -> None:
     np.testing.assert_allclose(out[kept], whole[kept], atol=1e-12)
 
 
+@pytest.mark.parametrize("n", [1009, 1024, 1500])
+def test_it_is_a_filter_whatever_the_length(n: int) -> None:
+    """Linear and unmoved by time: a pulse gives its taps, wherever it stands, and they sum to one."""
+    half = lowpass_lost(200.0, 10.0)
+    pulse = np.zeros((n, 2))
+    pulse[500, 0] = pulse[510, 1] = 1.0
+    shown = lowpass(pulse, 200.0, 10.0)
+    taps = shown[500 - half : 501 + half, 0]
+    assert np.abs(taps - shown[510 - half : 511 + half, 1]).max() < 1e-15
+    assert np.abs(taps - taps[::-1]).max() < 1e-15
+    assert taps.sum() == pytest.approx(1.0, abs=1e-12)
+    assert np.isnan(shown[:half]).all()
+    assert np.isnan(shown[-half:]).all()
+    assert np.isfinite(shown[half:-half]).all()
+
+
 def test_the_band_is_that_of_the_motion() -> None:
     rng = np.random.default_rng(2)
     t = np.arange(int(60 * RATE_HZ)) / RATE_HZ
