@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import gc
+import os
 import time
-import tracemalloc
-from collections import deque
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -21,20 +20,19 @@ NEAR = 200  # windows around each, at most; the median of them is told
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """Around one window: CPU time of all events of a window (ms, median), state (bytes of the snapshot), memory."""
+    """Around one window: CPU time of all events of a window (ms, median), snapshot, memory of the process."""
 
     window: int
     cpu_ms: float
     snapshot_bytes: int
-    traced_kb: float
+    resident_mb: float
 
 
 def measure(windows: int = TIMING.windows) -> list[Cost]:
     """One run of so many windows, an hour apart, at 100 Hz."""
     drawn = node(1, all_axes=True, timing=TIMING)
     run = Run(drawn.config)
-    tracemalloc.start()
-    spent: deque[float] = deque(maxlen=NEAR)
+    spent: list[float] = []
     costs: list[Cost] = []
     counted, cpu_s = 0, 0.0
     for event in visits(drawn.building, range(windows)):
@@ -45,16 +43,19 @@ def measure(windows: int = TIMING.windows) -> list[Cost]:
             spent.append(cpu_s)
             counted, cpu_s = counted + 1, 0.0
             if counted in AT:
-                near = list(spent)[-max(counted // 2, 5) :]
-                gc.collect()  # what nothing holds any more is no growth
-                memory = tracemalloc.get_traced_memory()[0]
-                costs.append(Cost(counted, 1e3 * float(np.median(near)), len(run.pipeline.snapshot()), memory / 1024))
-    tracemalloc.stop()
+                near = spent[-min(NEAR, max(counted // 2, 5)) :]
+                costs.append(Cost(counted, 1e3 * float(np.median(near)), len(run.pipeline.snapshot()), resident_mb()))
     return costs
+
+
+def resident_mb() -> float:
+    """Memory of this process that is in RAM."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
 def table(costs: list[Cost]) -> str:
     """A row a window number."""
-    lines = ["| window | CPU a window, ms | state, kB | Python memory in use, kB |", "| --- | --- | --- | --- |"]
-    lines += [f"| {c.window} | {c.cpu_ms:.2f} | {c.snapshot_bytes / 1024:.1f} | {c.traced_kb:.0f} |" for c in costs]
+    lines = ["| window | CPU a window, ms | state, kB | memory of the process, MB |", "| --- | --- | --- | --- |"]
+    lines += [f"| {c.window} | {c.cpu_ms:.2f} | {c.snapshot_bytes / 1024:.1f} | {c.resident_mb:.1f} |" for c in costs]
     return "\n".join(lines)

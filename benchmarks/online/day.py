@@ -47,6 +47,7 @@ def config(bench: Bench) -> Config:
                 "prior": {"sensitivity": bench.parameters.sensor.nominal_sensitivity},
                 "poses": poses,
                 "poses_repeat_s": bench.parameters.schedule.period_s,
+                "prior": {"sensitivity": bench.parameters.sensor.nominal_sensitivity},
             }
         ],
         "zenoh": {"enabled": False},
@@ -76,8 +77,10 @@ def events(bench: Bench, duration_s: float) -> Iterator[Event]:
     late_ns = np.random.default_rng(1).exponential(2e5, len(count)).astype(np.int64)
     for k in range(int(duration_s / BLOCK_S)):
         arrivals_ns = ((k * n + count) * (1e9 / RATE_HZ)).astype(np.int64) + late_ns
-        for device, values in zip(("sensor", "reference"), held[k % blocks], strict=True):
-            yield SampleBlock(device, "boot", int(arrivals_ns[-1]), k * n, RATE_HZ, arrivals_ns, count, values)
+        counts, reference = held[k % blocks]
+        common = ("boot", int(arrivals_ns[-1]), k * n, RATE_HZ, arrivals_ns, count)
+        yield SampleBlock("sensor", *common, counts)
+        yield SampleBlock("reference", *common, reference)
         yield tick((k + 1) * BLOCK_S)
 
 

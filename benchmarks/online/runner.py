@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Protocol
 
 from agent.config import Config
-from agent.events import DeviceChange, Event, Result, RunStart, Tick
+from agent.events import Acceleration, DeviceChange, Event, Result, RunStart, Tick
 from agent.pipeline import Pipeline
 from agent.recording.fingerprint import fingerprint, versions
 from agent.recording.writer import Recorder
@@ -55,8 +55,8 @@ class Run:
         return self.now_ns * 1e-9
 
     def feed(self, event: Event) -> list[Result]:
-        """Step the pipeline; what follows from the event."""
-        results = self.pipeline.step(event)
+        """Step the pipeline; what follows from the event. The corrected stream, where it is on, is left out."""
+        results = [result for result in self.pipeline.step(event) if not isinstance(result, Acceleration)]
         self.now_ns = max(self.now_ns, event.t_monotonic_ns)
         self.events += 1
         self._record(event, results)

@@ -1,0 +1,38 @@
+"""What a window costs does not grow with the windows before it; ten thousand are in docs/performance.md."""
+
+from __future__ import annotations
+
+import itertools
+import sys
+from typing import Any
+
+from agent.events import WindowReport
+from benchmarks.online.node import Timing, node
+from benchmarks.online.runner import Run, visits
+
+WINDOWS = 170
+EARLY, LATE = range(60, 70), range(160, 170)  # the newest 48 windows are kept in summary, no more
+
+
+def test_work_and_state_are_flat() -> None:
+    """Python functions called a window, and bytes of the snapshot: no clock, so that a busy machine does not matter."""
+    drawn = node(2, all_axes=True, timing=Timing(10.0, 3600.0, WINDOWS))
+    run = Run(drawn.config)
+    calls = itertools.count()
+
+    def counting(_frame: Any, what: str, _argument: Any) -> None:
+        if what == "call":
+            next(calls)
+
+    at, sizes = [0], []
+    for event in visits(drawn.building, range(WINDOWS)):
+        sys.setprofile(counting)
+        results = run.feed(event)
+        sys.setprofile(None)
+        if any(isinstance(result, WindowReport) and result.used for result in results):
+            at.append(next(calls))
+            sizes.append(len(run.pipeline.snapshot()))
+    assert len(sizes) > 0.95 * WINDOWS
+    early, late = (sum(at[k + 1] - at[k] for k in part) for part in (EARLY, LATE))
+    assert late < 1.1 * early  # it was some thousand calls a window
+    assert max(sizes[k] for k in LATE) < 1.05 * max(sizes[k] for k in EARLY)
