@@ -20,6 +20,8 @@ from calib.window_verdict import DEFAULT_LIMITS, Limits
 # Samples beyond a window's ends, the reference's (the sensor's half of it): half the taps of resampling, of
 # differentiating and of the low-pass filter at 100 Hz and above.
 MARGIN_S = 1.0
+# Of many holes pieces of a second are left: too short for the reference's noise, and for type A by segments.
+MOST_MISSING_PCT = 5.0
 NOISE_MATTERS = 1e-5  # of the motion's power: a filter against less of it would cost its ends for nothing
 FILTER_BAND = 1.25  # times its band, where calib.band.lowpass is 6 dB down
 RESAMPLED_BAND = 0.35  # of the reference's rate, to which interpolation itself passes noise
@@ -59,6 +61,9 @@ def windows_in(piece: Piece, first_s: float, channel: Channel, streams: dict[str
             return Found([refused(piece, fault)])
         if reference.saturated:
             return Found([refused(piece, f"the reference {channel.reference} was at the end of its range")])
+        for device, samples in ((channel.sensor, cut), (f"the reference {channel.reference}", reference)):
+            if fault := _gaps(device, samples):
+                return Found([refused(piece, fault)])
         found = _motion(piece.pose, cut, reference, channel, (start_s, stop_s), lag_s)
     if not found:
         return Found([refused(piece, "the samples of sensor and reference do not meet")])
@@ -73,6 +78,14 @@ def _fault(device: str, cut: Cut, axes: int) -> str:
     if cut.axes != axes:
         return f"{device} has {cut.axes} {'axis' if cut.axes == 1 else 'axes'}, this pose needs {axes}"
     return "" if cut.in_time else f"{device}: its sample numbers and arrivals do not make a clock"
+
+
+def _gaps(device: str, cut: Cut) -> str:
+    """Why so much of a device is missing that what is left tells little; "" where it is not."""
+    missing_pct = 100.0 * float(np.mean(np.isnan(cut.indications).any(axis=1)))
+    if missing_pct <= MOST_MISSING_PCT:
+        return ""
+    return f"{missing_pct:.1f} % of the samples of {device} are missing, {MOST_MISSING_PCT:g} % at most"
 
 
 def _rest(piece: Piece, cut: Cut, span_s: tuple[float, float], channel: Channel) -> list[Window]:
@@ -136,8 +149,7 @@ def _band(raw: Array, u: Array, channel: Channel, rate_hz: float) -> tuple[float
     """Where to limit both signals, None where that gains nothing, and the reference's noise (2, m) in what is left."""
     certificate, m = channel.certificate, raw.shape[1]
     velocity = certificate.quantity == "velocity"
-    whole = raw[np.isfinite(raw).all(axis=1)]
-    found_hz, density = band_above_noise(whole, rate_hz)
+    found_hz, density = band_above_noise(raw, rate_hz)
     density = np.maximum(density, certificate.noise_mps2 / np.sqrt(0.5 * rate_hz))
     widest_hz = min(VELOCITY_BAND_HZ, RESAMPLED_BAND * rate_hz) if velocity else RESAMPLED_BAND * rate_hz
     unlimited = noise_in_band(density, widest_hz, differentiated=velocity)

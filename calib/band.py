@@ -21,6 +21,7 @@ SMOOTHED = 5  # lines
 MARGIN = 1.25  # the filter passes all of the band and a quarter more
 FEWEST_LINES = 64
 TINY = 1e-300
+SHORT_HOLE = 2  # samples; a straight line over them leaves 3 % of a motion at a twelfth of the rate
 WIDEST = 0.35  # of the sampling rate: beyond, a filter has nothing left to take away
 STOP_BAND_DB = 66.0
 
@@ -51,14 +52,18 @@ def band_above_noise(x: Array, rate_hz: float) -> tuple[float | None, Array]:
     """Upper end in Hz of where x (n, m) has more power than the white noise in it, and that noise (m,) per root Hz.
 
     Motion must leave more than half of the spectrum free. None where it does not, where nothing stands out, or where
-    too little is known; the noise is zero then.
+    too little is known; the noise is zero then. NaN where samples are missing.
     """
     m = x.shape[1]
     size = min(int(SEGMENT_S * rate_hz), len(x) // LEAST_SEGMENTS)
     if size < FEWEST_LINES:
         return None, np.zeros(m)
-    powers = np.stack([_spectrum([x[:, k : k + 1]], size)[0] for k in range(m)])
-    segments = len(x) // size
+    x, segments = _bridged(x), 0
+    while 2 * segments < LEAST_SEGMENTS:  # of shorter ones more are without a hole
+        spectra = [_spectrum([x[:, k : k + 1]], size) for k in range(m)]
+        powers, segments = np.stack([power for power, _ in spectra]), spectra[0][1]
+        if 2 * segments < LEAST_SEGMENTS and (size := size // 2) < FEWEST_LINES:
+            return None, np.zeros(m)
     window = hanning(size)
     # A line's power is a mean of `segments` exponentials: its median is the mean but for one part in 3 segments.
     floor = np.median(powers[:, 1:-1], axis=1) / (1.0 - 1.0 / (3.0 * segments))
@@ -72,6 +77,20 @@ def band_above_noise(x: Array, rate_hz: float) -> tuple[float | None, Array]:
     if band_hz >= WIDEST * rate_hz:
         return None, np.zeros(m)
     return band_hz, np.sqrt(floor / (0.5 * rate_hz * np.sum(window**2)))
+
+
+def _bridged(x: Array) -> Array:
+    """x (n, m) with a straight line over holes of a sample or two, which spectra hardly see; longer ones all NaN."""
+    missing = np.isnan(x).any(axis=1)
+    if not missing.any() or missing.all():
+        return x
+    out, index = x.copy(), np.arange(len(x))
+    for k in range(x.shape[1]):
+        out[missing, k] = np.interp(index[missing], index[~missing], x[~missing, k])
+    edges = np.flatnonzero(np.diff(missing.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
+    for first, stop in edges[edges[:, 1] - edges[:, 0] > SHORT_HOLE].tolist():
+        out[first:stop] = np.nan
+    return out
 
 
 def noise_in_band(density: Array, band_hz: float, *, differentiated: bool) -> Array:
@@ -129,12 +148,14 @@ def hanning(size: int) -> Array:
 
 
 def _spectrum(stretches: Sequence[Array], size: int) -> tuple[Array, int]:
-    """Mean power (size // 2 + 1,) over channels, Hann-windowed segments of `size`, and their number."""
+    """Mean power (size // 2 + 1,) over channels, Hann-windowed whole segments of `size`, and their number."""
     window = hanning(size)[:, None]
     total, count = np.zeros(size // 2 + 1), 0
     for x in stretches:
         for start in range(0, len(x) - size + 1, size):
             part = x[start : start + size]
+            if np.isnan(part).any():
+                continue  # what lies on both sides of a hole, put together, would be a jump and no noise
             total += np.sum(np.abs(np.fft.rfft((part - part.mean(axis=0)) * window, axis=0)) ** 2, axis=1)
             count += 1
     return total / max(count, 1), count

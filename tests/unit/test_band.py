@@ -10,7 +10,7 @@ import pytest
 
 from agent.cli import run_cli
 from agent.simulate import write_files
-from calib.band import lowpass, lowpass_lost, moving_band_hz
+from calib.band import band_above_noise, lowpass, lowpass_lost, moving_band_hz
 from hw.virtual.bench import Bench
 from hw.virtual.motion import ambient
 from hw.virtual.parameters import BenchParameters, ReferenceParameters, SensorParameters
@@ -97,3 +97,23 @@ def test_a_lag_is_found_under_the_noise_of_the_reference(tmp_path: Path, capsys:
     u = np.array(found["standard_uncertainty"]["sensitivity"])
     assert np.abs((np.array(found["sensitivity"]) - S_TRUE) / u).max() < 3.5  # of nine
     assert u.max() < 5e-3
+
+
+@pytest.mark.parametrize(("run", "every"), [(1, 20), (1, 100), (2, 50), (16, 320), (16, 640), (200, 4000)])
+def test_holes_are_no_noise(run: int, every: int) -> None:
+    """Up to a twentieth of the samples missing: the noise found is that of the whole.
+
+    To 20 % of its power, and 2e-4 of the motion's, which a straight line over single samples leaves: so much, taken for
+    noise, moves S by 2e-4.
+    """
+    random = np.random.default_rng(1)
+    n, rate_hz, noise_mps2 = 6000, 100.0, 0.001
+    shape = np.fft.rfftfreq(n, 1 / rate_hz) < 8.0
+    motion = np.fft.irfft(shape * (random.normal(size=(len(shape), 2)) @ [1, 1j]), n)
+    x = (0.1 * motion / motion.std() + noise_mps2 * random.normal(size=n))[:, None]
+    for first in range(every // 2, n, every):
+        x[first : first + run] = np.nan
+    band_hz, density = band_above_noise(x, rate_hz)
+    assert band_hz is not None
+    assert 8.0 <= band_hz < 18.0  # lines are 0.8 Hz apart where holes leave short segments only
+    assert abs(density[0] ** 2 * 0.5 * rate_hz - noise_mps2**2) < 0.2 * noise_mps2**2 + 2e-4 * 0.1**2
