@@ -116,3 +116,9 @@ class JointState:
 def _square(wide: Array) -> Array:
     """A square factor of the same product with itself."""
     return np.asarray(np.linalg.qr(wide.T, mode="r"), dtype=np.float64).T
+
+
+def gain_of(jacobian: Array, factor: Array) -> Array:
+    """(N, R) L A' (A A' + 1)^-1, A = H L: nothing larger than the rows is inverted, and the 1 bounds it."""
+    a = jacobian @ factor
+    return np.asarray(np.linalg.solve(a @ a.T + np.eye(len(a)), a @ factor.T).T)

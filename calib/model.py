@@ -60,8 +60,8 @@ class Window:
 
     `kind`: the reference moved, the sensor rested under a known gravity, or the reference was calm (not used by itself;
     it measures the noise of the reference). `numbers` are the statistics behind the verdict, unit in the name.
-    `u_lag_s`: by how much this window's lag may differ from the others', as the two clocks tell. `independent`: the share
-    of its points that are, less than 1 where both signals were limited to a band.
+    `u_lag_s`: by how much this window's lag may differ from the others', as the two clocks tell. `independent`: the
+    share of its points that are, less than 1 where both signals were limited to a band.
     """
 
     start_s: float

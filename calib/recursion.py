@@ -29,7 +29,7 @@ from calib.distributions import coverage_factor
 from calib.fixed_mount import Held, held_at
 from calib.gauss_newton import Flags
 from calib.innovation import Innovation, innovation
-from calib.joint_state import JointState
+from calib.joint_state import JointState, gain_of
 from calib.model import PARAMETERS, Array, Calibration
 from calib.nuisances import Priors
 from calib.wander import MAIN_TEMPERATURE, RATES, TemperatureModel, Wander, offset_temperature
@@ -305,7 +305,7 @@ class Recursion:
     def _corrected(self, state: JointState, rows: WindowRows) -> JointState:
         """The state, at its day already, after one window, linearised at the point."""
         own = rows.at(state, self._point, self._noise)
-        gain = _gain(own.jacobian, state.factor)
+        gain = gain_of(own.jacobian, state.factor)
         step = gain @ (own.residual + own.jacobian @ (self._point - state.mean))
         state.correct(step, gain, own.jacobian, own.noise)
         return state
@@ -394,12 +394,6 @@ class Recursion:
         self._residual_sd = np.array(state["residual_sd"])
         self._held = None if state["held"] is None else Held(**state["held"])
         self.windows, self.scale = state["windows"], state["scale"]
-
-
-def _gain(jacobian: Array, factor: Array) -> Array:
-    """(N, R) L A' (A A' + 1)^-1, A = H L: nothing larger than the rows is inverted, and the 1 bounds it."""
-    a = jacobian @ factor
-    return np.asarray(np.linalg.solve(a @ a.T + np.eye(len(a)), a @ factor.T).T)
 
 
 def _later(day: float | None, other: float) -> float:

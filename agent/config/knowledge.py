@@ -84,7 +84,7 @@ class Uncertainty(Section):
     offset_position_mps2: NotNegative = 0.0
     gravity_mps2: NotNegative = 0.03  # standard gravity is up to 0.3 % off
     lag_s: NotNegative = 0.02
-    lag_window_s: NotNegative = 2e-4  # between windows, besides what the clocks themselves say
+    lag_window_s: NotNegative = 5e-4  # between windows, besides what the clocks themselves say
 
 
 class Process(Section):

@@ -49,7 +49,6 @@ def config(bench: Bench) -> Config:
                 "prior": {"sensitivity": bench.parameters.sensor.nominal_sensitivity},
                 "poses": poses,
                 "poses_repeat_s": bench.parameters.schedule.period_s,
-                "prior": {"sensitivity": bench.parameters.sensor.nominal_sensitivity},
             }
         ],
         "zenoh": {"enabled": False},
@@ -100,11 +99,10 @@ def measure(duration_s: float) -> tuple[float, int, int]:
     world = bench()
     run = Run(config(world))
     feed = events(world, duration_s)
-    # The generating is done by the first block.
-    before = list(itertools.islice(feed, 3))
+    first = next(feed)  # by then all is generated
     begin = time.process_time()
     windows = updates = 0
-    for event in itertools.chain(before, feed):
+    for event in itertools.chain([first], feed):
         for result in run.feed(event):
             windows += isinstance(result, WindowReport) and result.used
             updates += isinstance(result, CalibrationUpdate)
