@@ -100,10 +100,10 @@ def test_another_lag_after_a_line_began_anew_is_no_end_of_it() -> None:
     random = np.random.default_rng(4)
     found = settled(random)
     before = found.in_force.sensitivity
-    windows = [late(building_window(random), 1.5e-3) for _ in range(8)]
+    windows = [late(building_window(random), 3.5e-3) for _ in range(8)]
     assert actions(hours(found, windows, first=10)) == ["hold"] * 4 + ["adopt"] + ["take"] * 3
-    assert abs(found.lag_s - 1.5e-3) < 1e-4
-    np.testing.assert_allclose(found.in_force.sensitivity, before, rtol=0, atol=3e-3)
+    assert abs(found.lag_s - 3.5e-3) < 2e-4
+    np.testing.assert_allclose(found.in_force.sensitivity, before, rtol=0, atol=3.5e-3)
 
 
 def test_another_reference_is_late_as_its_certificate_says_until_windows_tell() -> None:
