@@ -285,13 +285,13 @@ class ChannelState:
     def _found(self, piece: Piece, first_s: float, day: float) -> tuple[Found, float]:
         """The windows, made again until no lag is left in them that matters."""
         lag_s = 0.0 if self._estimation is None else self._estimation.lag_s
-        for _ in range(LAG_TURNS):
+        for turn in range(LAG_TURNS):
             found = windows_in(piece, first_s, self._channel, self._streams, lag_s)
             used = [w for w in found.windows if w.used]
             if self._estimation is None or not used or self._channel.reference is None:
                 break
             better_s = self._estimation.lag_after(used, day, lag_s, found.temperature_degc)
-            if better_s == lag_s:
+            if better_s == lag_s or turn == LAG_TURNS - 1:
                 break
             lag_s = better_s
         return found, lag_s
