@@ -43,7 +43,7 @@ def spread(work: Callable[[Any], Any], items: Sequence[Any], workers: int) -> li
     if workers == 1:
         return [work(item) for item in items]
     with ProcessPoolExecutor(workers) as pool:
-        return list(pool.map(work, items, chunksize=8))
+        return list(pool.map(work, items, chunksize=max(1, len(items) // (8 * workers))))
 
 
 def _harm(workers: int, runs: int | None) -> tuple[Path, str]:
