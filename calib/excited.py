@@ -88,12 +88,12 @@ def _reduced(window: Window, live: NDArray[np.bool_], along: Array, noise: Array
     if live.all():
         return replace(window, sums=replace(sums, scatter=scatter))
     mean = sums.count @ sums.mean[:, :m] / sums.count.sum()
-    direction = np.where(live, pose.direction + pose.direction @ along, 0.0)
     # The means of silent channels (gravity, where the reference feels it) are still felt.
     gravity = pose.gravity_mps2 + pose.direction @ np.where(live, 0.0, mean - along @ mean)
     # What silent channels did from segment to segment must not come back as scatter between them.
     return replace(
         window,
-        pose=replace(pose, direction=direction, gravity_mps2=gravity),
+        # Stated directions stay: what moved along with a live channel was measured by the silent one, with its error.
+        pose=replace(pose, gravity_mps2=gravity, along=np.diag(live.astype(float)) + along),
         sums=WindowSums(sums.reference_channels, sums.count, np.where(both, sums.mean, 0.0), scatter),
     )

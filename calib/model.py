@@ -27,7 +27,8 @@ class Pose:
     the equation does not feel it; NaN where a sensor feels a gravity that nobody stated: such a window's mean then says
     nothing). `theta_rad`, `alpha_rad` are kept where the pose came from the clamp (Eqs. 9-11).
     `position` names the pose: windows of one position share its angle and offset errors. `u_alpha_rad`, `u_theta_rad`
-    are standard uncertainties of angles that were found, by position; 0 where they were stated.
+    are standard uncertainties of angles that were found, by position; 0 where they were stated. `along` (m, m) where
+    some channels only move along with others: the motion is then `direction @ along @ u`, their columns zero.
     """
 
     position: str
@@ -37,6 +38,7 @@ class Pose:
     alpha_rad: float | None = None
     u_alpha_rad: float = 0.0
     u_theta_rad: float = 0.0
+    along: Array | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

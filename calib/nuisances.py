@@ -126,9 +126,14 @@ class Nuisances:
     def __init__(self, poses: Sequence[Pose], channels: int, priors: Priors, applied: Applied) -> None:
         self.terms = [t for t in _terms(poses, channels, priors, applied) if t.uncertainty > 0.0]
         n = len(poses)
-        self.direction = np.zeros((n, 3, channels))
+        self._stated = np.zeros((n, 3, channels))
+        self._along = np.tile(np.eye(channels), (n, 1, 1))
         for p, pose in enumerate(poses):
-            self.direction[p, :, : pose.direction.shape[1]] = pose.direction
+            m = pose.direction.shape[1]
+            self._stated[p, :, :m] = pose.direction
+            if pose.along is not None:
+                self._along[p, :m, :m] = pose.along
+        self.direction = self._stated @ self._along
         self.gravity = np.array([pose.gravity_mps2 for pose in poses])
         self._real = own_channels(channels)
         self._magnitude = np.maximum(np.linalg.norm(self.gravity, axis=1), np.finfo(float).tiny)
@@ -160,7 +165,7 @@ class Nuisances:
         """Inputs where the nuisances have the values `z` (J,)."""
         turn = rotations(np.einsum("j,jpk->pk", z, self._turn_direction))
         scale = 1.0 + np.einsum("j,jm->m", z, self._reference)
-        sideways = self.direction.copy()
+        sideways = self._stated.copy()
         if sideways.shape[2]:
             sideways[:, :, 0] += np.einsum("j,jpk->pk", z, self._transverse)
         real = self._real
@@ -183,13 +188,13 @@ class Nuisances:
             unstretched / self._magnitude[:, None]
         )
         return Inputs(
-            direction,
+            direction @ self._along,
             np.einsum("jpk,j->pk", d_quadrature, z),
             gravity,
             z @ self.lag,
             float(z @ self.reference_corner),
             float(z @ self.sensor_corner),
-            d_direction,
+            d_direction @ self._along,
             d_quadrature,
             d_gravity,
         )

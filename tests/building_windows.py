@@ -20,10 +20,14 @@ def building_window(
     Q: np.ndarray = Q_TRUE,
     noise_mps2: float = 0.005,
     reference_noise_mps2: float = 0.0,
-    reference_error: float = 0.0,
+    reference_error: float | np.ndarray = 0.0,
+    direction: np.ndarray | None = None,
     gravity_mps2: np.ndarray = GRAVITY,
 ) -> Window:
-    """A minute of five tones between 0.7 and 6 Hz in each direction, phases drawn; white noise in both."""
+    """A minute of five tones between 0.7 and 6 Hz in each direction, phases drawn; white noise in both.
+
+    `direction` (3,): what would go along y goes that way, and nothing else.
+    """
     t = np.arange(round(RATE_HZ * SECONDS)) / RATE_HZ
     a, da = np.zeros((len(t), 3)), np.zeros((len(t), 3))
     for k, level in enumerate(level_mps2):
@@ -31,6 +35,8 @@ def building_window(
             phase = random.uniform(0, 2 * np.pi)
             a[:, k] += level * np.sqrt(0.4) * np.sin(2 * np.pi * f * t + phase)
             da[:, k] += level * np.sqrt(0.4) * 2 * np.pi * f * np.cos(2 * np.pi * f * t + phase)
+    if direction is not None:
+        a, da = (np.outer(x[:, 1], direction) for x in (a, da))
     V = (a + gravity_mps2) @ S.T + Q + noise_mps2 * random.normal(size=a.shape)
     u = a * (1.0 + reference_error) + reference_noise_mps2 * random.normal(size=a.shape)
     return Window(0.0, SECONDS, BESIDE, sums_of(u, da, V, SEGMENTS), True, "", len(t), 0)

@@ -148,6 +148,19 @@ def test_a_reference_known_to_a_tenth_of_a_per_cent_is_never_known_better() -> N
     assert abs(found.result().sensitivity[1, 1] - S_TRUE[1, 1]) < 2 * 1.1e-3
 
 
+def test_nor_by_motion_askew_to_its_channels() -> None:
+    """Which way it goes was measured by two channels, each with its own error: their ratio is no third standard."""
+    random, found = np.random.default_rng(12), mounted(replace(FIXED, reference=1e-3))
+    off = np.array([1.5e-3, -1.0e-3, 0.5e-3])
+    for k in range(150):
+        way = random.normal(size=3)
+        window = building_window(random, direction=way / np.linalg.norm(way), reference_error=off)
+        found.update(Summary.of(window, k / 24))
+    u = found.result().standard_uncertainty
+    assert u[[0, 4, 8]].min() > 0.97e-3
+    np.testing.assert_allclose(found.result().sensitivity @ np.diag(1.0 + off), S_TRUE, rtol=0, atol=1e-3)
+
+
 def test_wandering_never_makes_less_known_than_before_any_data() -> None:
     random, found = np.random.default_rng(5), mounted(wander=Wander(0.01, 0.1, 1e-3, 1e-3, 0.01, 0.0))
     found.update(Summary.of(building_window(random), 0.0))
