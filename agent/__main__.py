@@ -15,7 +15,7 @@ def main() -> None:
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # an output without a plus-minus sign is better than none
     try:
-        from agent.cli import run_cli
+        from agent.cli.main import run_cli
 
         status = run_cli()
     except KeyboardInterrupt:  # while modules load

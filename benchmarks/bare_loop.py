@@ -13,9 +13,9 @@ os.environ["OPENBLAS_NUM_THREADS"] = "1"
 import time
 from pathlib import Path
 
+from agent.acquisition.reader import EventQueue, Reader
 from agent.config import load_config
-from agent.events import RunStart
-from agent.reader import EventQueue, Reader
+from agent.core.events import RunStart
 from agent.recording.writer import Recorder
 from hw.sensor import boot_id, load_driver
 

@@ -11,10 +11,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from calib.drift import DriftSettings
-from calib.false_alarms import false_alarm_rate, false_alarm_threshold
+from calib.estimate.drift import DriftSettings
+from calib.estimate.false_alarms import false_alarm_rate, false_alarm_threshold
+from calib.estimate.onsets import CLIP, FEWEST, SPAN, Onsets
 from calib.model import PARAMETERS, Array
-from calib.onsets import CLIP, FEWEST, SPAN, Onsets
 
 WINDOWS_A_YEAR = 8766.0
 RATE = DriftSettings().false_alarms_a_year / (len(PARAMETERS) * WINDOWS_A_YEAR)  # a window, one parameter
@@ -43,7 +43,7 @@ def false_alarms(threshold: float, windows: int, series: int = 1000) -> int:
 
 
 class Glr:
-    """The test of calib.onsets at the product's threshold."""
+    """The test of calib.estimate.onsets at the product's threshold."""
 
     def __init__(self) -> None:
         self._onsets, self._k = Onsets(SERIES), 0

@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from agent.events import CalibrationUpdate, Event, Gap
+from agent.core.events import CalibrationUpdate, Event, Gap
 from agent.recording.reading import RecordingReader
 from benchmarks.agent_cost import cpu_s, peak_mb
 from benchmarks.page import machine, write_part
@@ -102,8 +102,8 @@ def _begun(bench: Bench, clock: BenchTime) -> Any:
 
 def run_agent(directory: Path, seconds: float) -> int:
     """`fieldcal run` with the kernel replaced; how full its queue was goes into a file."""
-    from agent import service
-    from agent.cli import run_cli
+    from agent.acquisition import service
+    from agent.cli.main import run_cli
 
     class Watched(service.EventQueue):
         longest = 0

@@ -13,8 +13,8 @@ import numpy as np
 import zstandard
 
 from agent.config import Config
-from agent.events import Event, RunStart
-from agent.pipeline import Pipeline
+from agent.core.events import Event, RunStart
+from agent.core.pipeline import Pipeline
 from agent.recording.integrity import check_integrity
 from agent.recording.reading import RecordingReader
 from agent.recording.records import walk

@@ -23,9 +23,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.core.events import CalibrationUpdate
 from agent.delivery.consumer import Consumer
 from agent.delivery.history import FILE_NAME, History, Record
-from agent.events import CalibrationUpdate
 from benchmarks.fast_serial import environment
 from benchmarks.page import machine, write_part
 from hw.virtual.bench import Bench

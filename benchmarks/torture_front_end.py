@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib.adjustment import Adjustment, adjust
-from calib.corner import integral, with_integral, without_corner
-from calib.excitation import Points, judged
+from calib.estimate.adjustment import Adjustment, adjust
+from calib.estimate.nuisances import Applied, Priors
+from calib.excitation.sums import window_sums
+from calib.excitation.windows import Points, judged
 from calib.geometry import clamp
-from calib.method3 import fit
 from calib.model import Pose, Window, WindowSums
-from calib.nuisances import Applied, Priors
-from calib.resampling import differentiate, resample
-from calib.stamps import clock_from_stamps
-from calib.sums import window_sums
+from calib.paper.method3 import fit
+from calib.signal.corner import integral, with_integral, without_corner
+from calib.signal.resampling import differentiate, resample
+from calib.signal.stamps import clock_from_stamps
 from hw.virtual.bench import Recording
 from hw.virtual.schedule import PoseInterval
 

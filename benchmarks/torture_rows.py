@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.nuisances import Priors
+from calib.estimate.nuisances import Priors
 from hw.virtual.motion import multisine
 from hw.virtual.parameters import BenchParameters, Knocks, SensorParameters
 from hw.virtual.schedule import Schedule, clamped

@@ -22,14 +22,14 @@ import numpy as np
 
 from benchmarks.page import machine, write_part
 from benchmarks.torture_rows import FIXED, Q_TRUE, S_TRUE
-from calib.adjustment import adjust
-from calib.band import lowpass, moving_band_hz
-from calib.excitation import Points, judged
+from calib.estimate.adjustment import adjust
+from calib.excitation.windows import Points, judged
 from calib.geometry import beside
-from calib.method3 import fit
 from calib.model import Window
-from calib.resampling import resample
-from calib.stamps import clock_from_stamps
+from calib.paper.method3 import fit
+from calib.signal.band import lowpass, moving_band_hz
+from calib.signal.resampling import resample
+from calib.signal.stamps import clock_from_stamps
 from hw.virtual.bench import Bench, Recording
 from hw.virtual.motion import ambient
 from hw.virtual.parameters import BenchParameters, ReferenceParameters, SensorParameters

@@ -47,7 +47,7 @@ class WindowSums:
 
     Columns of z, q = 2 m + 3: the reference's m channels u, their m time derivatives du/dt, then V_x, V_y, V_z.
     `count` (K,) samples; `mean` (K, q); `scatter` (K, q, q) = sum (z - mean)(z - mean)'. Centred, so that nothing is
-    lost to cancellation; merged by Chan's formula (calib.sums).
+    lost to cancellation; merged by Chan's formula (calib.excitation.sums).
     """
 
     reference_channels: int
@@ -101,3 +101,8 @@ class Calibration:
     def standard_uncertainty(self) -> Array:
         """(12,) square roots of the covariance's diagonal."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+
+def own_channels(channels: int) -> int:
+    """Channels of a reference itself: 1 or 3, where their integrals follow them (2 or 6) as well."""
+    return {0: 0, 1: 1, 2: 1, 3: 3, 6: 3}[channels]

@@ -18,8 +18,8 @@ from paper_reproduced.faults import AMPLITUDE_MPS2, FREQUENCIES_HZ, STATED, alon
 from paper_reproduced.monte_carlo import monte_carlo
 from paper_reproduced.page import Findings, page
 
-from calib.amplitudes import Run
-from calib.sine_fit import four_parameter
+from calib.paper.amplitudes import Run
+from calib.paper.sine_fit import four_parameter
 
 SEED = 2018
 AMPLITUDES_MPS2 = (2.0, 5.0, AMPLITUDE_MPS2, 20.0)

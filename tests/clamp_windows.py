@@ -1,6 +1,6 @@
 """Windows on the paper's clamp with known truth and stated faults, from Eqs. (8)-(11), for the estimator's tests.
 
-The geometry is written out here a second time, so that calib.geometry and calib.nuisances are not tested by themselves.
+The geometry is written out here a second time, so that calib's geometry and nuisances are not tested by themselves.
 """
 
 from __future__ import annotations

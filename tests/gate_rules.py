@@ -7,7 +7,7 @@ from itertools import product
 
 import numpy as np
 
-from agent.gate import Evidence
+from agent.core.gate import Evidence
 from calib.model import Array, Calibration
 
 NOMINAL = np.array([[2.0, 0.01, 0.0], [0.0, 1.9, -0.02], [0.01, 0.0, 2.1]])

@@ -12,13 +12,13 @@ from agent.calibrate.frontend import FrontEnd
 from agent.calibrate.outcome import NuisanceValue, Outcome, nothing_used
 from agent.calibrate.priors import priors_of, row_contradictions, u_gravity_mps2
 from agent.calibrate.tables import SensorTable
-from calib.adjustment import Adjustment, adjust
-from calib.excitation import rests_anywhere
+from calib.estimate.adjustment import Adjustment, adjust
+from calib.estimate.norm_fit import norm_fit
+from calib.estimate.nuisances import Applied, Priors
+from calib.excitation.windows import rests_anywhere
 from calib.geometry import STANDARD_GRAVITY_MPS2
 from calib.model import PARAMETERS, Window
-from calib.norm_fit import norm_fit
-from calib.nuisances import Applied, Priors
-from calib.stamps import clock_from_stamps
+from calib.signal.stamps import clock_from_stamps
 
 PASSES = 4
 # Of a lag that the windows still have: (omega lag)^3 / 6 is what the adjustment's own second order leaves of it.

@@ -10,11 +10,11 @@ import numpy as np
 from agent.calibrate.frontend import FrontEnd
 from agent.calibrate.outcome import Outcome, nothing_used
 from agent.calibrate.priors import contradictions, priors_of
-from calib import method1, method2
-from calib.amplitudes import AmplitudeCalibration, Run
+from calib.estimate.verdict import dead_reasons
 from calib.model import PARAMETERS
-from calib.statistics import rel_s_pct, transverse_excess
-from calib.verdict import dead_reasons
+from calib.paper import method1, method2
+from calib.paper.amplitudes import AmplitudeCalibration, Run
+from calib.paper.statistics import rel_s_pct, transverse_excess
 
 SOLVE = {"1": method1.solve, "2": method2.solve}
 

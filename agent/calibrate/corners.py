@@ -9,10 +9,10 @@ import numpy as np
 
 from agent.calibrate.poses import PoseInterval
 from agent.calibrate.tables import ReferenceTable, SensorTable, TableError
-from calib.corner import integral, with_integral, without_corner
+from calib.estimate.nuisances import Priors
 from calib.model import Array
-from calib.nuisances import Priors
-from calib.stamps import clock_from_stamps
+from calib.signal.corner import integral, with_integral, without_corner
+from calib.signal.stamps import clock_from_stamps
 
 
 def uncoupled(

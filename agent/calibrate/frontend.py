@@ -12,14 +12,14 @@ import numpy as np
 
 from agent.calibrate.poses import PoseInterval
 from agent.calibrate.tables import ReferenceTable, SensorTable, TableError
-from calib.alignment import Drift, drift
-from calib.band import lowpass, lowpass_lost, moving_band_hz
-from calib.excitation import Points, judged, motion_parts, rest_sd, rest_window
+from calib.excitation.alignment import Drift, drift
+from calib.excitation.window_verdict import DEFAULT_LIMITS, Limits
+from calib.excitation.windows import Points, judged, motion_parts, rest_sd, rest_window
 from calib.model import Array, Pose, Window, WindowSums
-from calib.resampling import HALF, NODES, differentiate, resample
-from calib.stamps import clock_from_stamps
-from calib.timing import ClockFit
-from calib.window_verdict import DEFAULT_LIMITS, Limits
+from calib.signal.band import lowpass, lowpass_lost, moving_band_hz
+from calib.signal.resampling import HALF, NODES, differentiate, resample
+from calib.signal.stamps import clock_from_stamps
+from calib.signal.timing import ClockFit
 
 GUARD_S = 0.1  # left out at both ends of a pose: hands, and what the clocks do not know
 LEVEL_STRETCH_S = 3600.0  # of reference looked at in one go for where it moves; bounds memory

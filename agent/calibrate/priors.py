@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from agent.calibrate.tables import TableError
+from calib.estimate.nuisances import Priors
 from calib.model import PARAMETERS, Array, Calibration
-from calib.nuisances import Priors
 
 # Without a local value gravity is the standard one, which is up to 0.3 % off (poles and equator differ by 0.05 m/s2).
 U_STANDARD_GRAVITY_MPS2 = 0.03

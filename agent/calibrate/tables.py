@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.calibrate.decimals import decimals
-from calib.stamps import kind_of
+from calib.signal.stamps import kind_of
 
 Array = NDArray[np.float64]
 Progress = Callable[[int], Any]  # called with the bytes just read

@@ -18,9 +18,9 @@ from agent.commanding.counters import Counters
 from agent.commanding.envelope import Order, parse_envelope
 from agent.commanding.refusal import Refused
 from agent.config.commands import CommandKey, Commands
+from agent.core.events import Command
 from agent.delivery.history import History, StoreError
 from agent.delivery.keys import CHUNK
-from agent.events import Command
 
 # A gateway that asks for the time is right within a second; one that just woke up gets half a minute.
 CLOCK_TOLERANCE_S = 30.0

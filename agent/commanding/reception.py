@@ -13,8 +13,8 @@ from agent.commanding.desk import CommandDesk
 from agent.commanding.local import LocalDoor
 from agent.commanding.network import serve_queries
 from agent.config import Config
+from agent.core.events import Command
 from agent.delivery.keys import gateway_key
-from agent.events import Command
 
 _log = logging.getLogger(__name__)
 

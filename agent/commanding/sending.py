@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import zenoh
 
 from agent.commanding.envelope import LARGEST
+from agent.config.tls import TlsFiles
 from agent.delivery.session import session_config
-from agent.delivery.tls import TlsFiles
 
 CONNECT_S = 5.0
 ANSWER_S = 5.0  # the agent answers within one fsync

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from agent.config.section import Section
-from calib.drift import DriftSettings
+from calib.estimate.drift import DriftSettings
 
 
 class GateSettings(Section):
@@ -45,5 +45,5 @@ class DriftOptions(Section):
     windows_a_year: Annotated[float | None, Field(gt=0, description="none: as they come")] = None
 
     def settings(self) -> DriftSettings:
-        """For calib.drift.DriftTest."""
+        """For calib.estimate.drift.DriftTest."""
         return DriftSettings(self.false_alarms_a_year, self.windows_a_year)

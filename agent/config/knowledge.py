@@ -9,9 +9,9 @@ from pydantic import Field, model_validator
 
 from agent.config.gate import DriftOptions, GateSettings
 from agent.config.section import Section, Vector
+from calib.estimate.nuisances import Priors
+from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import Array
-from calib.nuisances import Priors
-from calib.wander import TemperatureModel, Wander
 
 Percent = Annotated[float, Field(gt=0, le=100)]
 Positive = Annotated[float, Field(gt=0)]

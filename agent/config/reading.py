@@ -11,8 +11,8 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from agent.config.sinks import Tls
+from agent.config.tls import tls_faults
 from agent.config.whole import Config
-from agent.delivery.tls import tls_faults
 from hw.sensor import DeviceError, load_driver
 
 LARGEST_FILE = 4 << 20  # bytes; a day of a pose each second has as many

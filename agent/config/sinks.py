@@ -9,7 +9,7 @@ from typing import Annotated
 from pydantic import ByteSize, Field, model_validator
 
 from agent.config.section import Endpoint, Section
-from agent.delivery.tls import TlsFiles
+from agent.config.tls import TlsFiles
 
 _SECRET = re.compile("key|password|secret|token", re.IGNORECASE)  # in what stands behind an endpoint's '#'
 

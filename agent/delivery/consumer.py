@@ -16,12 +16,12 @@ from typing import Self
 import zenoh
 from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
+from agent.config.tls import TlsFiles
 from agent.delivery import memory as memory_file
 from agent.delivery.answers import NOTHING, REMOVED
 from agent.delivery.keys import PREFIX, narrow
 from agent.delivery.received import Received, receive
 from agent.delivery.session import session_config
-from agent.delivery.tls import TlsFiles
 
 INBOX = 1000  # samples that may wait, or be held; what is dropped is fetched from the gateway's store
 ANSWER_S = 5.0  # for one query

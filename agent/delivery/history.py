@@ -14,6 +14,8 @@ from urllib.parse import quote
 
 import msgspec
 
+from agent.core.events import CalibrationUpdate, DriftReport, Estimate, Result, StatusChange, WindowReport
+from agent.core.memory import Memory
 from agent.delivery.schema import (
     RESULT_COLUMNS,
     SCHEMA_VERSION,
@@ -25,9 +27,8 @@ from agent.delivery.schema import (
     row_crc,
     version_of,
 )
-from agent.events import CalibrationUpdate, DriftReport, Estimate, Result, StatusChange, WindowReport
 
-__all__ = ["FILE_NAME", "History", "Memory", "Record", "Removed", "StoreError", "connect_read_only"]
+__all__ = ["FILE_NAME", "History", "Record", "Removed", "StoreError", "connect_read_only"]
 
 FILE_NAME = "state.sqlite"
 _TYPES: dict[str, type[Result]] = {
@@ -38,16 +39,6 @@ _TYPES: dict[str, type[Result]] = {
     "status": StatusChange,
 }
 _KINDS = {kind: what for what, kind in _TYPES.items()}
-
-
-@dataclass(frozen=True, slots=True)
-class Memory:
-    """What outlives a run of the estimation on one device: its state after the result with this number."""
-
-    sensor: str
-    identity: str
-    sequence: int
-    state: bytes
 
 
 @dataclass(frozen=True, slots=True)

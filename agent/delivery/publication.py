@@ -14,12 +14,12 @@ from datetime import UTC, datetime
 import zenoh
 from zenoh.ext import AdvancedPublisher, CacheConfig, MissDetectionConfig, declare_advanced_publisher
 
+from agent.config.tls import TlsFiles, expiry_warning
 from agent.delivery.answers import answer_queries
 from agent.delivery.history import History, Record, StoreError
 from agent.delivery.keys import gateway_key, result_key
 from agent.delivery.session import session_config
 from agent.delivery.store import Store
-from agent.delivery.tls import TlsFiles, expiry_warning
 
 BATCH = 100  # results read from the store at a time
 POLL_S = 0.2  # how soon a router that came back is seen; asking costs a microsecond

@@ -7,9 +7,9 @@ from typing import Any
 
 import msgspec
 
+from agent.core.events import CalibrationUpdate, Estimate
 from agent.delivery.history import result_of
 from agent.delivery.keys import Address, parse_key
-from agent.events import CalibrationUpdate, Estimate
 
 LARGEST_RESULT = 256 << 10  # bytes; a calibration, the largest, has 5 kB
 LARGEST_NUMBER = 2**63 - 1
@@ -18,7 +18,7 @@ _DIGITS_MAX = 19
 
 @dataclass(frozen=True, slots=True)
 class Received:
-    """One result. `fields` is its JSON: the fields of agent.events, and `recorded`."""
+    """One result. `fields` is its JSON: the fields of agent.core.events, and `recorded`."""
 
     key: str
     address: Address

@@ -9,15 +9,9 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from agent.delivery.history import Memory, Record
-from agent.delivery.schema import (
-    RESULT_COLUMNS,
-    checked,
-    insert_results,
-    withdraw,
-    write_latest,
-    write_memory,
-)
+from agent.core.memory import Memory
+from agent.delivery.history import Record
+from agent.delivery.schema import RESULT_COLUMNS, checked, insert_results, withdraw, write_latest, write_memory
 from agent.recording.files import FILE_METADATA, final_name, recordings
 from agent.recording.scan import scan
 

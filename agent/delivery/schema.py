@@ -13,8 +13,9 @@ from typing import Any
 
 import msgspec
 
+from agent.core.memory import MOST_MEMORIES
+
 SCHEMA_VERSION = 2
-MOST_MEMORIES = 8  # devices that stood in one place, one after the other; 0.1 MB each
 MARKS = frozenset({"floor", "published", "clean", "file"})
 RESULT_COLUMNS = "sequence, run_id, sensor, what, payload, t_utc_ns, recorded, recording, identity"
 _RESULTS = """CREATE TABLE results (

@@ -8,7 +8,7 @@ from typing import Literal
 
 import zenoh
 
-from agent.delivery.tls import TlsFiles
+from agent.config.tls import TlsFiles
 
 # Bytes. A block of corrected accelerations at 10 kHz has a fifth of it; Zenoh's own limit is a GiB.
 LARGEST_MESSAGE = 1 << 20

@@ -9,7 +9,8 @@ import time
 from collections.abc import Iterable
 from pathlib import Path
 
-from agent.delivery.history import FILE_NAME, Memory, Record
+from agent.core.memory import Memory
+from agent.delivery.history import FILE_NAME, Record
 from agent.delivery.opening import lock, open_or_set_aside
 from agent.delivery.recovery import Recall, Recovered, no_memories, recover, recover_memories
 from agent.delivery.retention import FOR_EVER, KeepResults, Sweep

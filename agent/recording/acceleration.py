@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from agent.events import Acceleration
+from agent.core.events import Acceleration
 from agent.proto import fieldcal_pb2 as pb
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from agent.events import Pruned
+from agent.core.events import Pruned
 from agent.recording.pruned_ranges import Ranges, first_outside
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from agent.events import Acceleration, Output, WindowReport
+from agent.core.events import Acceleration, Output, WindowReport
 from agent.recording.messages import topic_of
 
 OTHER_CPU = (

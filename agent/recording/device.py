@@ -11,7 +11,7 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from agent.events import DeviceChange, Event, RunStart
+from agent.core.events import DeviceChange, Event, RunStart
 from agent.recording.reading import RecordingReader, first_event
 from hw.block import BlockFlags, DeviceInfo, Drop, SampleBlock
 from hw.sensor import Clock, ConfigurationError, DeviceLost, Options, boot_id, system_clock

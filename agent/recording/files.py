@@ -11,7 +11,7 @@ from typing import IO, cast
 
 from mcap.writer import CompressionType, Writer
 
-from agent.events import RunStart
+from agent.core.events import RunStart
 from agent.recording.messages import schema_data, schema_of
 from agent.recording.signing import SIGNATURE_METADATA, Signer
 

@@ -14,7 +14,7 @@ import numpy as np
 from google.protobuf import descriptor_pb2
 from google.protobuf.message import DecodeError, Message
 
-from agent.events import (
+from agent.core.events import (
     Acceleration,
     CalibrationUpdate,
     Command,

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
-from agent.delivery.history import Memory
-from agent.events import Event, Output, RunStart
+from agent.core.events import Event, Output, RunStart
+from agent.core.memory import Memory
 from agent.recording.messages import recorded_ones
 from agent.recording.reading import RecordingReader
 
@@ -16,7 +16,7 @@ _log = logging.getLogger(__name__)
 
 
 class Remembering(Protocol):
-    """What is stepped: agent.pipeline.Pipeline."""
+    """What is stepped: agent.core.pipeline.Pipeline."""
 
     def step(self, event: Event) -> list[Output]: ...
     def all_memories(self) -> list[Memory]: ...

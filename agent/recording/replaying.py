@@ -8,7 +8,7 @@ from typing import Protocol, cast
 
 import msgspec
 
-from agent.events import CalibrationUpdate, Event, Output, Pruned, RunStart, WindowReport
+from agent.core.events import CalibrationUpdate, Event, Output, Pruned, RunStart, WindowReport
 from agent.recording.comparison import Difference, compare
 from agent.recording.messages import decode, encode, recorded_ones, schema_of, topic_of
 from agent.recording.reading import RecordingReader, Step
@@ -16,7 +16,7 @@ from agent.recording.records import Fault
 
 
 class PipelineLike(Protocol):
-    """What is replayed: agent.pipeline.Pipeline."""
+    """What is replayed: agent.core.pipeline.Pipeline."""
 
     def step(self, event: Event) -> list[Output]: ...
     def snapshot(self) -> bytes: ...

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from agent.events import Pruned
+from agent.core.events import Pruned
 from agent.recording.files import file_number, recordings, sync_directory
 
 if TYPE_CHECKING:

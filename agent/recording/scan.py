@@ -14,7 +14,7 @@ from typing import BinaryIO
 from mcap.opcode import Opcode
 from mcap.records import Channel, Metadata, Schema
 
-from agent.events import Result
+from agent.core.events import Result
 from agent.recording.messages import MessageError, decode, is_result_topic
 from agent.recording.reading import open_recording
 from agent.recording.records import MAGIC, RECORD_LIMIT, ChunkMessage, Record, RecordError, content, parse, unpack

@@ -10,8 +10,8 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 
-from agent.delivery.history import Memory
-from agent.events import Event, Output, Pruned, Result, RunStart
+from agent.core.events import Event, Output, Pruned, Result, RunStart
+from agent.core.memory import Memory
 from agent.recording.messages import recorded_ones
 from agent.recording.writer import Recorder
 

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol
 
-from agent.events import Event, Output, Pruned, RunStart
+from agent.core.events import Event, Output, Pruned, RunStart
 from agent.recording.files import RecordingFile, newest, recordings, sync_directory
 from agent.recording.messages import EVENTS_TOPIC, RESULT_TOPICS, encode, topic_of
 from agent.recording.pruned_ranges import PRUNED_METADATA, Ranges, from_metadata, merged, to_metadata

@@ -10,8 +10,8 @@ from typing import Any
 import msgspec
 
 from agent.calibrate.origin import SourceFile, source_file
+from agent.core.events import CalibrationUpdate, StatusChange, WindowReport
 from agent.delivery.history import FILE_NAME, History, StoreError
-from agent.events import CalibrationUpdate, StatusChange, WindowReport
 from agent.recording.files import recordings
 from agent.report.recorded import Recorded, RecordingError, read_recordings, sensors_of
 from agent.report.result import (

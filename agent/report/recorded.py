@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 
 from agent.config import Channel, Config
-from agent.events import CalibrationUpdate, DeviceChange, Event, Output, RunStart, StatusChange, WindowReport
+from agent.core.events import CalibrationUpdate, DeviceChange, Event, Output, RunStart, StatusChange, WindowReport
+from agent.core.schedule import pieces
+from agent.core.snapshot import unpack
+from agent.core.stream import DeviceStream
+from agent.core.windows import MARGIN_S, signals
 from agent.recording.reading import RecordingReader
 from agent.recording.records import Fault
 from agent.report.trace import Trace
-from agent.schedule import pieces
-from agent.snapshot import unpack
-from agent.stream import DeviceStream
-from agent.windows import MARGIN_S, signals
 from calib.model import Pose
 from hw.block import SampleBlock
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.calibrate.origin import SourceFile
-from agent.events import CalibrationUpdate
+from agent.core.events import CalibrationUpdate
 from calib.model import PARAMETERS, Array
 
 Item = TypeVar("Item")

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from agent.calibrate.command import read_files
+from agent.calibrate.calibrating import read_files
 from agent.calibrate.frontend import FrontEnd
 from agent.calibrate.origin import SourceFile, source_file
 from agent.calibrate.tables import TableError

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from agent.events import CalibrationUpdate
+from agent.core.events import CalibrationUpdate
 from agent.report.result import CalibrationResult, WindowVerdict
 from agent.report.style import AXIS_COLOURS, INK, PALE, REFUSED, SHADES, USED, bare, figure
 from agent.report.units import output_unit, position_name

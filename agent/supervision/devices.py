@@ -8,12 +8,12 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from agent.events import DeviceChange, Gap
-from calib.timing import ClockModel
+from agent.core.events import DeviceChange, Gap
+from calib.signal.timing import ClockModel
 from hw.block import BlockFlags, SampleBlock
 
 RATE_OVER_BLOCKS = 20  # ten seconds of most devices: what a person calls "now"
-CLOCK_FROM_BURSTS = 20  # before, the model gives the nominal rate back (calib.timing)
+CLOCK_FROM_BURSTS = 20  # before, the model gives the nominal rate back (calib.signal.timing)
 
 
 class ClockQuality(msgspec.Struct, frozen=True, kw_only=True):

@@ -12,7 +12,7 @@ from typing import Literal
 import msgspec
 
 from agent.config import Config
-from agent.events import CalibrationUpdate, DeviceChange, Event, Gap, Result, StatusChange, WindowReport
+from agent.core.events import CalibrationUpdate, DeviceChange, Event, Gap, Result, StatusChange, WindowReport
 from agent.supervision.devices import DeviceHealth, DeviceWatch
 from hw.block import SampleBlock
 

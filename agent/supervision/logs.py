@@ -21,7 +21,7 @@ from typing import Any
 
 import msgspec
 
-from agent.events import Command, DeviceChange, Event, Gap, Pruned, Result
+from agent.core.events import Command, DeviceChange, Event, Gap, Pruned, Result
 from agent.recording.messages import RESULT_TOPICS
 from agent.terminal.wording import result_lines
 

@@ -7,11 +7,11 @@ import sqlite3
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 from agent.delivery.history import History, StoreError
 from agent.delivery.publication import Publisher
 from agent.delivery.store import Store
-from agent.reader import EventQueue
 from agent.recording.thread import CAPACITY, RecordingThread
 from agent.recording.writer import Recorder
 from agent.supervision.health import (
@@ -23,6 +23,15 @@ from agent.supervision.health import (
 )
 
 _PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
+
+
+class Waiting(Protocol):
+    """A bounded queue: how many entries wait in it, and with how many it is full."""
+
+    @property
+    def waiting(self) -> int: ...
+    @property
+    def capacity(self) -> int: ...
 
 
 class Outbox:
@@ -55,7 +64,7 @@ class Plant:
     """One run. Everything here may be asked from the main loop at any time; nothing of it waits."""
 
     data_dir: Path
-    events: EventQueue
+    events: Waiting
     writer: RecordingThread
     recorder: Recorder
     outbox: Outbox

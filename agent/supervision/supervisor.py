@@ -10,7 +10,7 @@ import msgspec
 
 from agent import __version__
 from agent.config import Config
-from agent.events import Event, Result, Tick
+from agent.core.events import Event, Result, Tick
 from agent.supervision.health import GatewayStatus, Health, State
 from agent.supervision.logs import log_event, tell
 from agent.supervision.metrics import serve_metrics

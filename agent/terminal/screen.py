@@ -11,9 +11,9 @@ from rich.console import Console, ConsoleOptions
 from rich.live import Live
 from rich.text import Text
 
-from agent.events import CalibrationUpdate
+from agent.core.events import CalibrationUpdate
 from agent.terminal.quantity import duration
-from agent.terminal.view import ViewState
+from agent.terminal.state import ViewState
 from agent.terminal.wording import (
     STATUS_STYLES,
     calibration_cells,

@@ -9,10 +9,11 @@ import time
 from collections import deque
 
 from agent.config import Config
+from agent.core.events import DeviceChange, Event, Gap, Result
 from agent.delivery.publication import PublicationState
-from agent.events import DeviceChange, Event, Gap, Result
 from agent.recording.writer import Recorder
-from agent.terminal.view import DeviceState, RecordingState, Truth, ViewState, open_view
+from agent.terminal.state import DeviceState, RecordingState, Truth, ViewState
+from agent.terminal.view import open_view
 from hw.block import BlockFlags, SampleBlock
 
 _log = logging.getLogger(__name__)

@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from agent.events import CalibrationUpdate, DriftReport, Estimate, Result, StatusChange, WindowReport
+from agent.core.events import CalibrationUpdate, DriftReport, Estimate, Result, StatusChange, WindowReport
 from agent.terminal.quantity import plus_minus, size
 from calib.model import Array
 
 if TYPE_CHECKING:
     from agent.delivery.publication import PublicationState
-    from agent.terminal.view import RecordingState, Truth
+    from agent.terminal.state import RecordingState, Truth
 
 STATUS_STYLES = {"VALID": "bold green", "HELD": "yellow", "RECALIBRATING": "yellow", "INVALID": "bold red"}
 

@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 from click.testing import CliRunner
 
-from agent.calibrate.command import calibrate
+from agent.cli.calibrate import calibrate
+from agent.cli.simulate import write_files
 from agent.config import Config, parse_config
-from agent.events import CalibrationUpdate, StatusChange, WindowReport
-from agent.simulate import write_files
+from agent.core.events import CalibrationUpdate, StatusChange, WindowReport
 from benchmarks.online.clamp import bench_events
 from benchmarks.online.runner import Run
 from calib.model import PARAMETERS, Array

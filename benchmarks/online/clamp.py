@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.events import Event
+from agent.core.events import Event
 from benchmarks.online.runner import EPOCH_NS, opened, tick, ticked
 from hw.block import DeviceInfo, SampleBlock
 from hw.virtual.bench import Bench, Recording

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from agent.events import WindowReport
+from agent.core.events import WindowReport
 from benchmarks.online.node import Timing, node
 from benchmarks.online.runner import Run, visits
 

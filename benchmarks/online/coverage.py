@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.events import CalibrationUpdate
+from agent.core.events import CalibrationUpdate
 from benchmarks.online.node import Stated, Timing, node
 from benchmarks.online.runner import EPOCH_NS, Run, visits
 from calib.model import PARAMETERS

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from agent.config import Config, parse_config
-from agent.events import CalibrationUpdate, Event, WindowReport
+from agent.core.events import CalibrationUpdate, Event, WindowReport
 from benchmarks.online.runner import Run, opened, tick
 from hw.block import DeviceInfo, SampleBlock
 from hw.virtual.bench import Bench

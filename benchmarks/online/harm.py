@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from agent.events import CalibrationUpdate, DriftReport, Estimate, Result, StatusChange, WindowReport
+from agent.core.events import CalibrationUpdate, DriftReport, Estimate, Result, StatusChange, WindowReport
 from benchmarks.online.node import Node, Timing, node
 from benchmarks.online.runner import EPOCH_NS, Run, visits
 from calib.model import PARAMETERS

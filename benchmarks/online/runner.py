@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Protocol
 
 from agent.config import Config
-from agent.events import Acceleration, DeviceChange, Event, Result, RunStart, Tick
-from agent.pipeline import Pipeline
+from agent.core.events import Acceleration, DeviceChange, Event, Result, RunStart, Tick
+from agent.core.pipeline import Pipeline
 from agent.recording.fingerprint import fingerprint, versions
 from agent.recording.writer import Recorder
 from hw.block import DeviceInfo, SampleBlock

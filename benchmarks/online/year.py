@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.config import Config
-from agent.events import CalibrationUpdate, DriftReport, StatusChange, WindowReport
+from agent.core.events import CalibrationUpdate, DriftReport, StatusChange, WindowReport
 from benchmarks.online.config import building_config
 from benchmarks.online.runner import EPOCH_NS, Run, visits
 from hw.virtual.building import DAY_S, Building, BuildingParameters

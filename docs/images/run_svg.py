@@ -14,8 +14,8 @@ os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
 from rich.console import Console
 
-from agent.run import LOOPBACK, router, virtual_bench
-from agent.service import Service
+from agent.acquisition.service import Service
+from agent.cli.run import LOOPBACK, router, virtual_bench
 from agent.terminal.screen import Picture
 from agent.terminal.watch import Watch
 

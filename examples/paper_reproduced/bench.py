@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.amplitudes import Run
+from calib.estimate.nuisances import Priors
 from calib.geometry import STANDARD_GRAVITY_MPS2, clamp, on_axis
 from calib.model import Pose
-from calib.nuisances import Priors
+from calib.paper.amplitudes import Run
 from hw.virtual.bench import Bench
 from hw.virtual.motion import sine
 from hw.virtual.parameters import BenchParameters, ClampErrors, ReferenceParameters, SensorParameters

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib import method1, method2, method3, method3_budget
-from calib.amplitudes import AmplitudeCalibration, Run
+from calib.estimate.nuisances import Priors
+from calib.excitation.sums import window_sums
 from calib.model import Array, Window, WindowSums
-from calib.nuisances import Priors
-from calib.propagation import Statement
-from calib.sine_fit import cycle_edges, four_parameter
-from calib.statistics import differences_pct, rel_s_pct, repeatability
-from calib.sums import window_sums
+from calib.paper import method1, method2, method3, method3_budget
+from calib.paper.amplitudes import AmplitudeCalibration, Run
+from calib.paper.propagation import Statement
+from calib.paper.sine_fit import cycle_edges, four_parameter
+from calib.paper.statistics import differences_pct, rel_s_pct, repeatability
 from paper_reproduced.bench import Device
 
 MAIN = np.array([0, 4, 8])

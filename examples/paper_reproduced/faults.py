@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from calib.estimate.nuisances import Priors
 from calib.model import Array
-from calib.nuisances import Priors
 from paper_reproduced.bench import Device, Faults, poses, record
 from paper_reproduced.comparison import MAIN, Comparison, compare
 from paper_reproduced.published import OFFSET, corrected_pct
@@ -139,7 +139,7 @@ def _columns(base: Comparison) -> dict[str, Array]:
         pairs = {(m, 1): relative[m] - relative[1] for m in (2, 3)}
         column = _numbers(base.device, pairs, np.nan_to_num(changes[3][9:]))
         if name == SQUARED_LAG:
-            columns[name] = column / np.sqrt(3)  # stated with its scatter, see calib.propagation
+            columns[name] = column / np.sqrt(3)  # stated with its scatter, see calib.paper.propagation
         elif not name.endswith("second order") and np.abs(column).max() > 1e-6:
             columns[name] = column
     return columns

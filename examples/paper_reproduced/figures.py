@@ -10,8 +10,8 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from calib.amplitudes import Run
 from calib.model import Array
+from calib.paper.amplitudes import Run
 from paper_reproduced.bench import Device
 from paper_reproduced.comparison import MAIN, METHODS, Comparison
 from paper_reproduced.published import REPEATABILITY_PCT, corrected_pct

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.adjustment import adjust
+from calib.estimate.adjustment import adjust
+from calib.estimate.nuisances import Priors
 from calib.model import Array
-from calib.nuisances import Priors
 from paper_reproduced.bench import Device, drawn, record
 from paper_reproduced.comparison import MAIN, METHODS, compare
 

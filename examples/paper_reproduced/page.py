@@ -76,8 +76,8 @@ What the bench is *stated* to be known to, as standard uncertainties; the paper 
 
 {stated}
 
-Methods 1 and 2 are `calib/method1.py` and `calib/method2.py`, Method 3 as printed `calib/method3.py`, Appendix A
-`calib/statistics.py`, the sine fit of ISO 16063 `calib/sine_fit.py`, the budgets `calib/propagation.py`.
+Methods 1 and 2 are `method1.py` and `method2.py` in `calib/paper/`, Method 3 as printed `method3.py`, Appendix A
+`statistics.py`, the sine fit of ISO 16063 `sine_fit.py`, the budgets `propagation.py`.
 
 ![Outputs and reference inputs over one period](paper/figure-2.svg)
 
@@ -178,7 +178,7 @@ the budgets.
 ![Budget by source](paper/budgets.svg)
 
 Half a degree in θ is what makes Method 3 a method of 3 %; transverse sensitivities that are only known to be small make
-Method 2 one of 5 %. The adjustment (`calib/adjustment.py`, "3, adjusted") takes the recordings of Method 3 and the same
+Method 2 one of 5 %. The adjustment (`calib/estimate/`, "3, adjusted") takes the recordings of Method 3 and the same
 stated uncertainties; it sees θ in the data of the DC-coupled sensor."""
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from agent.events import DeviceChange, Event, Tick
+from agent.core.events import DeviceChange, Event, Tick
 from agent.recording.device import Replay, ReplayOptions
 from agent.recording.reading import RecordingReader
 from hw.block import BlockFlags, DeviceInfo, SampleBlock

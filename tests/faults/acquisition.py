@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from agent.events import Gap
+from agent.core.events import Gap
 from agent.recording.reading import RecordingReader
 from hw.block import BlockFlags, SampleBlock
 from tests.scenarios.processes import recordings

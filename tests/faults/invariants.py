@@ -11,11 +11,11 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from agent.core.events import CalibrationUpdate
+from agent.core.pipeline import Pipeline
 from agent.delivery.consumer import Received
 from agent.delivery.history import FILE_NAME, History, Record, StoreError
 from agent.delivery.store import Store
-from agent.events import CalibrationUpdate
-from agent.pipeline import Pipeline
 from agent.recording.fingerprint import fingerprint
 from agent.recording.reading import RecordingReader
 from agent.recording.replaying import Replay

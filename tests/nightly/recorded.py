@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from agent.events import DeviceChange
+from agent.core.events import DeviceChange
 from agent.recording.reading import RecordingReader
 from hw.block import BlockFlags, SampleBlock
 from tests.numbered import number

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from agent.config import Config, parse_config
-from agent.events import DeviceChange, Event, Gap, Tick
+from agent.core.events import DeviceChange, Event, Gap, Tick
 from hw.block import BlockFlags, DeviceInfo, SampleBlock
 
 SECOND = 1_000_000_000

@@ -8,9 +8,9 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calib.adjustment import adjust
+from calib.estimate.adjustment import adjust
+from calib.estimate.nuisances import Priors
 from calib.model import Window
-from calib.nuisances import Priors
 from tests.clamp_windows import Faults, clamp_points
 
 SEEDS = st.integers(0, 2**32 - 1)

@@ -10,8 +10,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from agent.config import Config, parse_config
-from agent.events import Event, WindowReport
-from agent.pipeline import Pipeline
+from agent.core.events import Event, WindowReport
+from agent.core.pipeline import Pipeline
 from hw.block import SampleBlock
 from tests.properties.happenings import ORIGIN_NS, RATE_HZ, SECOND, happenings
 

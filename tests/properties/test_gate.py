@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agent.config.gate import GateSettings
-from agent.gate import Answer, Decision, Evidence, Gate
-from agent.snapshot import pack, unpack
+from agent.core.gate import Answer, Decision, Evidence, Gate
+from agent.core.snapshot import pack, unpack
 from calib.model import Calibration
 from tests.gate_rules import NOMINAL, calibration, consistent, jumped, unsupported, within_max_change
 

@@ -8,8 +8,8 @@ import numpy as np
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from agent.events import CalibrationUpdate, Result, StatusChange, WindowReport
-from agent.pipeline import Pipeline
+from agent.core.events import CalibrationUpdate, Result, StatusChange, WindowReport
+from agent.core.pipeline import Pipeline
 from tests.properties.happenings import EPOCH_NS, ORIGIN_NS, config, happenings
 
 EVENTS = 300

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agent.cli import run_cli
+from agent.cli.main import run_cli
 from tests.realdata.datasets import dataset
 
 RATE_HZ = 204.8

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agent.cli import run_cli
+from agent.cli.main import run_cli
 from tests.realdata.datasets import dataset
 from tests.realdata.test_mpu9150 import GRAVITY_MPS2, LIMIT_Q_MPS2, LIMIT_S, PUBLISHED, RATE_HZ, _expected
 

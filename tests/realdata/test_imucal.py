@@ -6,10 +6,10 @@ import json
 
 import numpy as np
 
-from calib.adjustment import adjust
+from calib.estimate.adjustment import adjust
+from calib.estimate.nuisances import Priors
 from calib.geometry import at_rest
 from calib.model import Window, WindowSums
-from calib.nuisances import Priors
 from tests.realdata.datasets import dataset
 
 GRAVITY_MPS2 = 9.81  # as imucal takes it

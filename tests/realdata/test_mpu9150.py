@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from calib.estimate.norm_fit import norm_fit
+from calib.excitation.rests import find_rests
 from calib.geometry import at_rest
 from calib.model import Window, WindowSums
-from calib.norm_fit import norm_fit
-from calib.rests import find_rests
 from tests.realdata.datasets import dataset
 
 GRAVITY_MPS2 = 9.81  # as the authors took it

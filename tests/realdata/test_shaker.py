@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib.adjustment import Adjustment, adjust
+from calib.estimate.adjustment import Adjustment, adjust
+from calib.estimate.nuisances import Applied, Priors
+from calib.excitation.sums import window_sums
 from calib.geometry import along
 from calib.model import Window
-from calib.nuisances import Applied, Priors
-from calib.resampling import resample
-from calib.stamps import clock_from_stamps
-from calib.sums import window_sums
+from calib.signal.resampling import resample
+from calib.signal.stamps import clock_from_stamps
 from tests.realdata.datasets import dataset
 
 ALONG_X = along([1.0, 0.0, 0.0])

@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from agent.events import (
+from agent.core.events import (
     CalibrationUpdate,
     DeviceChange,
     Event,

@@ -14,8 +14,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from agent.audit import Given, audit_files, recordings_of, run_audit
-from agent.events import RunStart
+from agent.cli.audit import Given, audit_files, recordings_of, run_audit
+from agent.core.events import RunStart
 from agent.recording.comparison import OTHER_CPU
 from agent.recording.files import recordings
 from agent.recording.fingerprint import environment_for, fingerprint
@@ -154,7 +154,7 @@ record_run(Path(sys.argv[1]))
 AUDIT = """
 import sys
 from pathlib import Path
-from agent.audit import Given, run_audit
+from agent.cli.audit import Given, run_audit
 from agent.recording.fingerprint import compute_as
 from agent.recording.reading import first_event
 from tests.replay.stand_in import StandIn

@@ -11,7 +11,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
 
-from agent.audit import audit, audit_files, recordings_of, run_audit
+from agent.cli.audit import audit, audit_files, recordings_of, run_audit
 from agent.delivery.store import Store
 from agent.recording.files import recordings
 from agent.recording.retention import KeepFiles

@@ -11,7 +11,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from agent.events import CalibrationUpdate, Event, Result, RunStart, StatusChange, WindowReport
+from agent.cli.replay import run_replay
+from agent.core.events import CalibrationUpdate, Event, Result, RunStart, StatusChange, WindowReport
 from agent.recording.comparison import OTHER_CPU
 from agent.recording.files import recordings
 from agent.recording.fingerprint import fingerprint
@@ -19,7 +20,6 @@ from agent.recording.messages import encode
 from agent.recording.records import walk
 from agent.recording.replaying import Replay, ReplayedFile
 from agent.recording.writer import Recorder
-from agent.replay import run_replay
 from tests.replay.stand_in import CONFIG, SECOND, Recorded, StandIn, happenings, record_run, run_start
 
 BLOCKS = 14

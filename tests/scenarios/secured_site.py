@@ -13,10 +13,10 @@ import pytest
 import zenoh
 from click.testing import CliRunner
 
+from agent.cli.keys import keys
+from agent.config.tls import TlsFiles
 from agent.delivery.session import session_config
-from agent.delivery.tls import TlsFiles
 from agent.keys.certificates import issue, make_authority
-from agent.keys.command import keys
 from agent.keys.files import write_new
 from tests.scenarios.processes import ROOT, START_S, started, wait_until
 

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from agent.acquisition.service import Service
 from agent.config import parse_config
-from agent.events import DeviceChange, Gap
+from agent.core.events import DeviceChange, Gap
 from agent.recording.reading import RecordingReader
-from agent.service import Service
 from agent.terminal.watch import Watch
 from hw.block import SampleBlock
 from hw.virtual.adxl355_twin import Adxl355Twin

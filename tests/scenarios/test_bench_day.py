@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agent.events import WindowReport
-from agent.pipeline import Pipeline
+from agent.core.events import WindowReport
+from agent.core.pipeline import Pipeline
 from agent.recording.fingerprint import fingerprint
 from agent.recording.replaying import Replay
 from benchmarks.online import bench

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import zenoh
 
+from agent.core.events import Acceleration, CalibrationUpdate
 from agent.delivery.publication import Publisher
 from agent.delivery.router import open_router
 from agent.delivery.store import Store
-from agent.events import Acceleration, CalibrationUpdate
 from agent.recording.acceleration import decode_acceleration, encode_acceleration
 from agent.recording.reading import RecordingReader
 from hw.block import SampleBlock

@@ -6,7 +6,7 @@ import itertools
 import sys
 from typing import Any
 
-from agent.events import WindowReport
+from agent.core.events import WindowReport
 from benchmarks.online.node import Timing, node
 from benchmarks.online.runner import Run, visits
 

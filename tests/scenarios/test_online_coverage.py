@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from agent.events import CalibrationUpdate
+from agent.core.events import CalibrationUpdate
 from benchmarks.online import coverage
 from benchmarks.online.node import Timing, node
 from benchmarks.online.runner import EPOCH_NS, Run, visits

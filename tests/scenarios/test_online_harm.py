@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from agent.events import CalibrationUpdate, Result
+from agent.core.events import CalibrationUpdate, Result
 from benchmarks.online import harm
 from benchmarks.online.node import Node, node
 from benchmarks.online.runner import Run, visits

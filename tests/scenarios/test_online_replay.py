@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from agent.config import Config
-from agent.events import Event, Result, RunStart
-from agent.pipeline import Pipeline
+from agent.core.events import Event, Result, RunStart
+from agent.core.pipeline import Pipeline
 from agent.recording.fingerprint import fingerprint
 from agent.recording.reading import RecordingReader
 from agent.recording.replaying import Replay

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from agent.config import parse_config
-from agent.events import CalibrationUpdate, DeviceChange, Result
-from agent.pipeline import Pipeline
+from agent.core.events import CalibrationUpdate, DeviceChange, Result
+from agent.core.pipeline import Pipeline
 from hw.sensor import Sensor
 from hw.virtual.device import ROTATION, Virtual, VirtualOptions
 from hw.virtual.presets import plain

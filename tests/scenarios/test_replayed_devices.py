@@ -6,8 +6,8 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
-from agent.events import CalibrationUpdate, DeviceChange, Event
-from agent.pipeline import Pipeline
+from agent.core.events import CalibrationUpdate, DeviceChange, Event
+from agent.core.pipeline import Pipeline
 from agent.recording.device import Replay, ReplayOptions
 from agent.recording.reading import RecordingReader
 from hw.virtual.bench import Bench

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from agent.events import RunStart
-from agent.pipeline import Pipeline
+from agent.core.events import RunStart
+from agent.core.pipeline import Pipeline
 from agent.recording.reading import RecordingReader
 from tests.scenarios.processes import ROOT, fieldcal, interrupt, recordings, results, started, wait_until
 

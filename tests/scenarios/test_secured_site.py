@@ -13,13 +13,13 @@ import pytest
 import zenoh
 from click.testing import CliRunner
 
+from agent.cli.command import command
 from agent.commanding.arguments import Hold
-from agent.commanding.command import command
 from agent.commanding.envelope import Order, seal
 from agent.commanding.sending import send
+from agent.core.events import Command, RunStart
 from agent.delivery.consumer import Consumer
 from agent.delivery.session import session_config
-from agent.events import Command, RunStart
 from agent.keys.files import read_signing_key
 from agent.recording.reading import RecordingReader
 from tests.scenarios.processes import fieldcal, recordings, wait_until

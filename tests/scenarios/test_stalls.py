@@ -9,8 +9,8 @@ import sys
 import threading
 from pathlib import Path
 
+from agent.acquisition.service import Service
 from agent.config import parse_config
-from agent.service import Service
 from agent.terminal.watch import Watch
 from tests.scenarios.processes import ROOT, wait_until
 from tests.unit.recorded_bench import record
@@ -19,10 +19,10 @@ from tests.unit.recorded_bench import record
 STEPS = """
 import json, sys
 from pathlib import Path
-import agent.service
+import agent.acquisition.service
 from agent.config import Config
-from agent.events import CalibrationUpdate, WindowReport
-from agent.pipeline import Pipeline
+from agent.core.events import CalibrationUpdate, WindowReport
+from agent.core.pipeline import Pipeline
 from agent.recording.reading import RecordingReader
 from agent.recording.writer import Recorder
 

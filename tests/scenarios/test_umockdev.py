@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agent.events import DeviceChange, Gap
+from agent.core.events import DeviceChange, Gap
 from agent.recording.reading import RecordingReader
 from hw.block import BlockFlags, SampleBlock
 from hw.virtual.adxl345_twin import Adxl345Twin

@@ -14,9 +14,9 @@ from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 from agent.commanding.desk import Answer, CommandDesk
 from agent.commanding.envelope import Order, seal
 from agent.config import Commands
+from agent.core.events import Command
 from agent.delivery.history import FILE_NAME
 from agent.delivery.store import Store
-from agent.events import Command
 from tests.unit.zenoh_site import record
 
 GATEWAY = "workshop/gateway-1"

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from agent.config import Config, parse_config
-from agent.delivery.history import Memory, Record
-from agent.events import CalibrationUpdate, Command, DeviceChange, Result, StatusChange, Tick, WindowReport
-from agent.pipeline import Pipeline
+from agent.core.events import CalibrationUpdate, Command, DeviceChange, Result, StatusChange, Tick, WindowReport
+from agent.core.memory import Memory
+from agent.core.pipeline import Pipeline
+from agent.delivery.history import Record
 from hw.block import BlockFlags, DeviceInfo, SampleBlock
 from tests.building_windows import GRAVITY
 from tests.clamp_windows import Q_TRUE, S_TRUE

@@ -11,10 +11,10 @@ import msgspec
 import numpy as np
 
 from agent.config import Config, parse_config
+from agent.core.events import DeviceChange, Event, Result, RunStart, Tick
+from agent.core.pipeline import Pipeline
 from agent.delivery.history import Record
 from agent.delivery.store import Store
-from agent.events import DeviceChange, Event, Result, RunStart, Tick
-from agent.pipeline import Pipeline
 from agent.recording.fingerprint import fingerprint, versions
 from agent.recording.writer import Recorder
 from hw.block import DeviceInfo, SampleBlock

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from agent.events import CalibrationUpdate, StatusChange, WindowReport
+from agent.core.events import CalibrationUpdate, StatusChange, WindowReport
 
 
 def window(sequence: int, *, used: bool = True, reason: str = "", left_out: int = 0) -> WindowReport:

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.adjustment import adjust
+from calib.estimate.adjustment import adjust
+from calib.estimate.nuisances import Applied, Priors
 from calib.model import Pose
-from calib.nuisances import Applied, Priors
 from tests.clamp_windows import G_MPS2, Q_TRUE, S_TRUE, TRUTH, Faults, clamp_points, window_of
 
 DEGREE = np.deg2rad(1.0)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from agent.calibrate.command import calibrate
+from agent.cli.calibrate import calibrate
 from hw.virtual.bench import Bench, Recording
 from hw.virtual.motion import multisine
 from hw.virtual.parameters import BenchParameters, ReferenceParameters, SensorParameters

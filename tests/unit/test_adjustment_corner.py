@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.adjustment import Adjustment, adjust
-from calib.corner import integral, with_integral, without_corner
+from calib.estimate.adjustment import Adjustment, adjust
+from calib.estimate.nuisances import Applied, Priors
 from calib.model import Pose
-from calib.nuisances import Applied, Priors
+from calib.signal.corner import integral, with_integral, without_corner
 from tests.clamp_windows import ALPHAS_DEG, G_MPS2, S_TRUE, TRUTH, frame, window_of
 
 RATE_HZ, SECONDS, CORNER_HZ = 200.0, 20.0, 0.16

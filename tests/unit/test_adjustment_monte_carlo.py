@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import optimize
 
-from calib.adjustment import adjust
-from calib.nuisances import Priors
+from calib.estimate.adjustment import adjust
+from calib.estimate.nuisances import Priors
 from tests.clamp_windows import ALPHAS_DEG, G_MPS2, Q_TRUE, S_TRUE, Faults, clamp_points, frame
 
 DEGREE = np.deg2rad(1.0)

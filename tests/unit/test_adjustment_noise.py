@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.adjustment import adjust
+from calib.estimate.adjustment import adjust
+from calib.estimate.nuisances import Priors
 from calib.model import Pose, Window
-from calib.nuisances import Priors
 from tests.clamp_windows import S_TRUE, Faults, clamp_points, window_of
 
 RATE_HZ, SECONDS, STRETCH_S = 100.0, 300.0, 10.0

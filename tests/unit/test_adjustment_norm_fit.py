@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from calib.estimate.norm_fit import norm_fit
 from calib.geometry import at_rest
 from calib.model import Window, WindowSums
-from calib.norm_fit import norm_fit
 from tests.clamp_windows import Q_TRUE
 
 G_MPS2 = 9.81

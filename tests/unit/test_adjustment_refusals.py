@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.adjustment import Adjustment, adjust
+from calib.estimate.adjustment import Adjustment, adjust
+from calib.estimate.nuisances import Priors
 from calib.model import Pose, Window
-from calib.nuisances import Priors
 from tests.clamp_windows import S_TRUE, Faults, clamp_points, window_of
 
 DEGREE = np.deg2rad(1.0)

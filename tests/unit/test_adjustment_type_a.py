@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.condense import condense
+from calib.estimate.condense import condense
 from calib.model import Pose, Window
 from tests.clamp_windows import window_of
 

@@ -10,11 +10,11 @@ import pytest
 from agent.calibrate.frontend import FrontEnd, Options
 from agent.calibrate.poses import PoseInterval
 from agent.calibrate.tables import ReferenceTable, SensorTable
-from calib.alignment import drift, segment_lags
-from calib.excitation import Points, motion_windows
+from calib.excitation.alignment import drift, segment_lags
+from calib.excitation.windows import Points, motion_windows
 from calib.geometry import beside, clamp
-from calib.method3 import fit
 from calib.model import Pose, Window
+from calib.paper.method3 import fit
 
 RATE_HZ = 500.0
 S = np.array([[1.02, 0.01, -0.02], [0.015, 0.98, 0.005], [-0.01, 0.02, 1.01]])

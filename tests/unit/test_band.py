@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agent.cli import run_cli
-from agent.simulate import write_files
-from calib.band import band_above_noise, lowpass, lowpass_lost, moving_band_hz
+from agent.cli.main import run_cli
+from agent.cli.simulate import write_files
+from calib.signal.band import band_above_noise, lowpass, lowpass_lost, moving_band_hz
 from hw.virtual.bench import Bench
 from hw.virtual.motion import ambient
 from hw.virtual.parameters import BenchParameters, ReferenceParameters, SensorParameters

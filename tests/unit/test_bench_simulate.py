@@ -20,9 +20,9 @@ import pytest
 import serial
 from numpy.testing import assert_allclose
 
-from agent.cli import run_cli
-from agent.playback import PlaybackError, Player, read_track
+from agent.cli.main import run_cli
 from hw.virtual.bench import Bench
+from hw.virtual.playback import PlaybackError, Player, read_track
 from hw.virtual.presets import PRESETS
 
 SENSOR = "time_s,vx,vy,vz\n10.0,1,-2.50,3e-1\n10.01,4,5,6\n10.01,7,8,9\n10.03,10,11,12\n"

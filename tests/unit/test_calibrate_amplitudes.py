@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agent.cli import run_cli
-from agent.simulate import write_files
+from agent.cli.main import run_cli
+from agent.cli.simulate import write_files
 from hw.virtual.bench import Bench
 from hw.virtual.motion import multisine, sine
 from hw.virtual.parameters import BenchParameters, ReferenceParameters

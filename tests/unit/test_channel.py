@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from agent.config.knowledge import Certificate
-from agent.events import Estimate
-from agent.identity import not_certified
-from agent.kept import shelved
-from agent.pipeline import Pipeline
-from agent.snapshot import pack, unpack
-from calib.recursion import Recursion
+from agent.core.events import Estimate
+from agent.core.identity import not_certified
+from agent.core.kept import shelved
+from agent.core.pipeline import Pipeline
+from agent.core.snapshot import pack, unpack
+from calib.estimate.recursion import Recursion
 from tests.building_windows import GRAVITY
 from tests.clamp_windows import S_TRUE
 from tests.unit.mounted_site import WINDOW_S, Site, begun, said, site_config, updates, windows

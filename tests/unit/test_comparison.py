@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from agent.events import CalibrationUpdate, Result, StatusChange, WindowReport
+from agent.core.events import CalibrationUpdate, Result, StatusChange, WindowReport
 from agent.recording.comparison import OTHER_CPU, compare, differences
 from tests.replay.stand_in import CONFIG, StandIn, block
 

@@ -6,9 +6,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agent.events import Acceleration
+from agent.core.events import Acceleration
 from agent.recording.messages import decode, encode, schema_of, topic_of
-from calib.correction import Law, calibration_part, corrected
+from calib.estimate.correction import Law, calibration_part, corrected
 from calib.model import Calibration
 
 S = np.array([[1.02, 0.01, -0.02], [0.015, 0.98, 0.005], [-0.01, 0.02, 1.01]])

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from agent.run import run
+from agent.cli.run import run
 from tests.faults.limits import directives
 
 UNIT = Path(__file__).parents[2] / "deploy" / "fieldcal.service"

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agent.snapshot import pack, unpack
-from calib.drift import DriftSettings, DriftTest, DriftVerdict
-from calib.false_alarms import false_alarm_rate, false_alarm_threshold
+from agent.core.snapshot import pack, unpack
+from calib.estimate.drift import DriftSettings, DriftTest, DriftVerdict
+from calib.estimate.false_alarms import false_alarm_rate, false_alarm_threshold
+from calib.estimate.onsets import CLIP, FEWEST, SPAN, Onsets
 from calib.model import PARAMETERS, Array
-from calib.onsets import CLIP, FEWEST, SPAN, Onsets
 
 HOUR_S = 3600.0
 SYY = PARAMETERS.index("Syy")

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from agent.config import parse_config
-from agent.estimation import Estimation, Judged
-from agent.snapshot import pack, unpack
+from agent.core.estimation import Estimation, Judged
+from agent.core.snapshot import pack, unpack
 from calib.model import Window
 from tests.building_windows import GRAVITY, building_window
 from tests.clamp_windows import Q_TRUE, S_TRUE

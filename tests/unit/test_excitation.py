@@ -9,11 +9,10 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from calib import detection
-from calib.excitation import Points, motion_parts, motion_windows, rest_sd, rest_window
+from calib.excitation.window_verdict import Limits, judge
+from calib.excitation.windows import Points, detection, motion_parts, motion_windows, rest_sd, rest_window
 from calib.geometry import along, at_rest, beside, clamp
 from calib.model import Window, WindowSums
-from calib.window_verdict import Limits, judge
 
 RATE_HZ = 500.0
 S = np.array([[1.02, 0.01, -0.02], [0.015, 0.98, 0.005], [-0.01, 0.02, 1.01]])

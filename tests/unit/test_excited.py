@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.condense import condense
-from calib.excited import excited
+from calib.estimate.condense import condense
+from calib.excitation.excited import excited
+from calib.excitation.sums import window_sums
 from calib.geometry import beside
 from calib.model import Window
-from calib.sums import window_sums
 
 NOISE_MPS2 = 0.001
 S = np.array([[1.01, 0.02, 0.0], [0.0, 0.99, -0.01], [0.03, 0.0, 1.02]])

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agent.audit import Given, audit_files
+from agent.cli.audit import Given, audit_files
 from agent.recording.files import recordings
 from agent.recording.thread import RecordingThread
 from agent.recording.writer import Recorder
@@ -27,7 +27,7 @@ ON_A_SMALL_DISK = """
 import json, sys
 from pathlib import Path
 import numpy as np
-from agent.audit import Given, audit_files
+from agent.cli.audit import Given, audit_files
 from agent.delivery.history import History, Record, StoreError
 from agent.delivery.store import Store
 from agent.recording.files import recordings

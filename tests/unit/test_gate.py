@@ -8,11 +8,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from agent.anchor import Anchor, rotation_rad
 from agent.config.gate import DriftOptions, GateSettings
-from agent.gate import Answer, Decision, Evidence, Gate
-from agent.snapshot import pack, unpack
-from calib.drift import DriftSettings
+from agent.core.anchor import Anchor, rotation_rad
+from agent.core.gate import Answer, Decision, Evidence, Gate
+from agent.core.snapshot import pack, unpack
+from calib.estimate.drift import DriftSettings
 from calib.model import Calibration
 from tests.gate_rules import (
     DOF,

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from agent.config import Config, parse_config
-from agent.events import DeviceChange, Event, Gap, Tick
+from agent.core.events import DeviceChange, Event, Gap, Tick
 from agent.supervision.devices import DeviceWatch
 from agent.supervision.health import (
     SILENT_S,

@@ -13,8 +13,8 @@ from typing import Any
 
 import pytest
 
+from agent.acquisition.reader import EventQueue
 from agent.delivery.store import Store
-from agent.reader import EventQueue
 from agent.supervision.plant import Outbox, Plant
 from tests.unit.zenoh_site import record
 

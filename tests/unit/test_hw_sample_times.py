@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.timing import ClockModel
+from calib.signal.timing import ClockModel
 from hw.adxl355 import Adxl355
 from hw.fifo_sensor import FifoSensor
 from hw.lsm6dso import Lsm6dso

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib import adjustment
-from calib.adjustment import Adjustment, adjust
 from calib.distributions import chi2_quantile
+from calib.estimate import adjustment
+from calib.estimate.adjustment import Adjustment, adjust
+from calib.estimate.nuisances import Priors
+from calib.excitation.sums import window_sums
 from calib.geometry import clamp
 from calib.model import Array, Window
-from calib.nuisances import Priors
-from calib.sums import window_sums
 
 RATE_HZ, SECONDS, NOISE = 200.0, 8.0, 0.01
 FREQUENCIES_HZ = np.array([1.3, 2.9, 4.7, 7.1])

@@ -13,10 +13,10 @@ from cryptography import x509
 from cryptography.x509.oid import NameOID
 from cryptography.x509.verification import PolicyBuilder, Store, VerificationError
 
+from agent.cli.keys import keys
 from agent.config import Commands
-from agent.delivery.tls import TlsFiles, expiry_warning, tls_faults
+from agent.config.tls import TlsFiles, expiry_warning, tls_faults
 from agent.keys.certificates import issue, make_authority
-from agent.keys.command import keys
 from agent.keys.files import KeyFileError, read_signing_key
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner, Result
 
-from agent.commanding.command import command
+from agent.cli.command import command
 from agent.commanding.local import SOCKET_NAME, LocalAgent, LocalDoor
 from agent.keys.files import SigningKey, write_new
 from tests.unit.command_desk import ANNA, GATEWAY, DeskSite, sealed

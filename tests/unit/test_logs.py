@@ -18,7 +18,7 @@ from typing import Any
 
 import pytest
 
-from agent.events import Command, DeviceChange, Gap, Pruned
+from agent.core.events import Command, DeviceChange, Gap, Pruned
 from agent.supervision.logs import WAITING_MAX, JsonFormatter, JsonLog, log_event, under_journal, without_secrets
 from tests.scenarios.processes import fieldcal
 from tests.unit.results import calibration, status, window

@@ -17,7 +17,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agent.events import (
+from agent.core.events import (
     CalibrationUpdate,
     Command,
     DeviceChange,

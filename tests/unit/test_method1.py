@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from calib import method1
-from calib.amplitudes import Run
+from calib.estimate.nuisances import Priors
 from calib.geometry import along, clamp, on_axis
 from calib.model import Pose
-from calib.nuisances import Priors
+from calib.paper import method1
+from calib.paper.amplitudes import Run
 
 S_TRUE = np.array([[1.02, 0.03, -0.02], [0.015, 0.98, 0.025], [-0.03, 0.02, -1.01]])  # z with its polarity turned
 G = 9.81

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from calib import method2
-from calib.amplitudes import AmplitudeCalibration, Run
+from calib.estimate.nuisances import Priors
 from calib.geometry import clamp, on_axis
-from calib.nuisances import Priors
+from calib.paper import method2
+from calib.paper.amplitudes import AmplitudeCalibration, Run
 
 G, F, THETA = 9.81, 3.0, 35.0
 

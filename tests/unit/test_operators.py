@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from agent.config import parse_config
-from agent.events import Command, Estimate
-from agent.operators import CommandError, commanded_pose
+from agent.core.events import Command, Estimate
+from agent.core.operators import CommandError, commanded_pose
 from tests.clamp_windows import S_TRUE
 from tests.unit.mounted_site import Site, begun, said, site_config, updates, windows
 

@@ -10,8 +10,8 @@ from numpy.testing import assert_allclose
 from paper_reproduced.bench import MEMS, PIEZO, Device, Faults, drawn, record
 from paper_reproduced.comparison import METHODS, Comparison, compare, joint_difference
 
-from calib.nuisances import Priors
-from calib.propagation import joint_covariance
+from calib.estimate.nuisances import Priors
+from calib.paper.propagation import joint_covariance
 
 # no noise, and straight, so that no products of two faults are left to compare
 QUIET = replace(MEMS, noise_mps2=0.0, sensitivity=np.diag(np.diag(MEMS.sensitivity)))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from paper_reproduced.published import DIFFERENCES_PCT, MISPRINT, decimals
 
-from calib.statistics import d_rel_32_pct
+from calib.paper.statistics import d_rel_32_pct
 
 ROWS = [(device, f, axis) for device in ("piezo", "mems") for f in (3, 6) for axis in range(3)]
 

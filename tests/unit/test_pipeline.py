@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from agent.config import parse_config
-from agent.events import CalibrationUpdate, DeviceChange, Result, StatusChange, Tick, WindowReport
-from agent.pipeline import Pipeline
+from agent.core.events import CalibrationUpdate, DeviceChange, Result, StatusChange, Tick, WindowReport
+from agent.core.pipeline import Pipeline
 from hw.block import BlockFlags, DeviceInfo, SampleBlock
 
 SECOND = 1_000_000_000

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from calib.excitation.placing import WIDER, Knowledge, MeanOutput, clamp_angles, mean_output, nearest_stop
 from calib.geometry import at_rest
 from calib.model import Calibration, Pose
-from calib.placing import WIDER, Knowledge, MeanOutput, clamp_angles, mean_output, nearest_stop
 from tests.clamp_windows import frame
 
 G_MPS2 = 9.80665

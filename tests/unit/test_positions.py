@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from agent.config import Config, ConfigError, parse_config
-from agent.events import Command, DeviceChange, Result, StatusChange, WindowReport
-from agent.pipeline import Pipeline
+from agent.core.events import Command, DeviceChange, Result, StatusChange, WindowReport
+from agent.core.pipeline import Pipeline
 from hw.block import BlockFlags, DeviceInfo, SampleBlock
 
 SECOND = 1_000_000_000

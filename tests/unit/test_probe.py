@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from agent.cli import run_cli
+from agent.cli.main import run_cli
 from hw.virtual.adxl345_twin import Adxl345Twin
 from hw.virtual.adxl355_twin import Adxl355Twin
 from hw.virtual.kernel import FUNCTIONS, I2CBus, installed

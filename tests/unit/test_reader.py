@@ -6,8 +6,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from agent.events import DeviceChange, Event
-from agent.reader import BLOCKS_A_SECOND, QUEUE_S, EventQueue, Reader
+from agent.acquisition.reader import BLOCKS_A_SECOND, QUEUE_S, EventQueue, Reader
+from agent.core.events import DeviceChange, Event
 from hw.block import BlockFlags, DeviceInfo, Drop, SampleBlock
 from hw.sensor import DeviceLost, Options
 from tests.scenarios.processes import wait_until

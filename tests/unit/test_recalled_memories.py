@@ -10,15 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agent.delivery.history import History, Memory, Record
+from agent.core.events import CalibrationUpdate, Event, Result, RunStart
+from agent.core.memory import Memory
+from agent.core.pipeline import Pipeline
+from agent.core.snapshot import unpack
+from agent.delivery.history import History, Record
 from agent.delivery.store import Store
-from agent.events import CalibrationUpdate, Event, Result, RunStart
-from agent.pipeline import Pipeline
 from agent.recording.files import recordings
 from agent.recording.reading import RecordingReader
 from agent.recording.recalling import memories_of
 from agent.recording.writer import Recorder
-from agent.snapshot import unpack
 from tests.replay.stand_in import record_run
 from tests.unit.test_pipeline import EPOCH_NS, OFFSET, POSE_S, SENSITIVITY, block, opened, pipeline
 

@@ -19,7 +19,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
-from agent.events import Gap, Tick
+from agent.core.events import Gap, Tick
 from agent.recording.files import FILE_METADATA, recordings
 from agent.recording.integrity import check_integrity
 from agent.recording.messages import encode

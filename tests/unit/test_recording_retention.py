@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from agent.events import Pruned
+from agent.core.events import Pruned
 from agent.recording.files import recordings
 from agent.recording.reading import RecordingReader, open_recording
 from agent.recording.retention import KeepFiles, due, free_bytes

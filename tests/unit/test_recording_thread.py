@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agent.events import Result
+from agent.core.events import Result
 from agent.recording.reading import RecordingReader
 from agent.recording.thread import RecordingThread
 from agent.recording.writer import Recorder

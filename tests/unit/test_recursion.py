@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agent.snapshot import pack
-from calib.adjustment import adjust
+from agent.core.snapshot import pack
+from calib.estimate.adjustment import adjust
+from calib.estimate.nuisances import Priors
+from calib.estimate.recursion import Recursion
+from calib.estimate.wander import TemperatureModel, Wander
+from calib.estimate.window_rows import Summary
 from calib.model import Calibration
-from calib.nuisances import Priors
-from calib.recursion import Recursion
-from calib.wander import TemperatureModel, Wander
-from calib.window_rows import Summary
 from tests.building_windows import BESIDE, GRAVITY, building_window
 from tests.clamp_windows import ALPHAS_DEG, G_MPS2, Q_TRUE, S_TRUE, TRUTH, Faults, clamp_points, sums_of
 

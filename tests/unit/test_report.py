@@ -14,11 +14,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from agent.cli import run_cli
-from agent.report import as_object, left_over
+from agent.cli.main import run_cli
 from agent.report.material import Material, gather
 from agent.report.page import page
 from agent.report.result import parse
+from agent.report.writing import as_object, left_over
 from hw.virtual.bench import Truth
 from tests.unit.recorded_bench import record
 from tests.unit.test_report_numbers import fields, moving

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.resampling import differentiate, resample
-from calib.stamps import clock_from_stamps
+from calib.signal.resampling import differentiate, resample
+from calib.signal.stamps import clock_from_stamps
 
 RATE_HZ = 1000.0
 t_ref = 0.0123 + np.arange(5000) / RATE_HZ

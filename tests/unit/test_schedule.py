@@ -6,7 +6,7 @@ import pytest
 
 from agent.config import parse_config
 from agent.config.channel import Channel
-from agent.schedule import ToldTimes
+from agent.core.schedule import ToldTimes
 from calib.geometry import clamp
 from calib.model import Pose
 

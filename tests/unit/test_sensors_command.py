@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from agent.cli import run_cli
+from agent.cli.main import run_cli
 from hw.sensor import BUILT_IN, load_driver
 from tests.unit.test_hw_registry import GOOD, install
 

@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner, Result
 
+from agent.cli.show import show
+from agent.core.events import Result as PipelineResult
 from agent.delivery.history import FILE_NAME, Record
 from agent.delivery.store import Store
-from agent.events import Result as PipelineResult
-from agent.show import show
 from tests.unit.results import calibration, status, window
 
 
@@ -112,7 +112,7 @@ def test_a_reader_who_may_not_write_sees_a_store_that_was_closed(tmp_path: Path)
     fill(tmp_path, calibration(1), status(2)).close()
     # Another one as root first, so that all modules are loaded, which that user might not be allowed to read.
     command = (
-        "import os, sys; from agent.show import show; show(['--data-dir', sys.argv[2]], standalone_mode=False); "
+        "import os, sys; from agent.cli.show import show; show(['--data-dir', sys.argv[2]], standalone_mode=False); "
         "os.setuid(65534); sys.exit(show(['--data-dir', sys.argv[1]], standalone_mode=False))"
     )
     copy = Path("/var/tmp") / f"fieldcal-show-{os.getpid()}"

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from calib.sine_fit import acceleration, cycle_edges, four_parameter, three_parameter
+from calib.paper.sine_fit import acceleration, cycle_edges, four_parameter, three_parameter
 
 A, NOISE = 2.0, 0.02
 

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from calib import stamps as stamps_module
-from calib.stamps import arrivals_from_stamps, clock_from_stamps
+from calib.signal import stamps as stamps_module
+from calib.signal.stamps import arrivals_from_stamps, clock_from_stamps
 from tests.unit.test_timing import polled, sample_times
 
 TRUE, NEWEST, ARRIVAL = polled(100.0, 1013.0, 0.016, seed=1, wander=50e-6)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.standing import DEPARTURE_MPS2, KEPT, MEAN_S, STEADY, Standing
+from calib.excitation.standing import DEPARTURE_MPS2, KEPT, MEAN_S, STEADY, Standing
 
 G_MPS2 = 9.80665
 RATE_HZ = 100

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from calib.statistics import d_rel_32_pct, d_rel_pct, differences_pct, rel_s_pct, repeatability, transverse_excess
+from calib.paper.statistics import d_rel_32_pct, d_rel_pct, differences_pct, rel_s_pct, repeatability, transverse_excess
 
 
 def test_mean_sd_and_s_rel_of_six_cycles() -> None:

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from agent.delivery.history import FILE_NAME, History, Memory, Record, StoreError
-from agent.delivery.schema import MOST_MEMORIES
+from agent.core.events import CalibrationUpdate, StatusChange
+from agent.core.memory import MOST_MEMORIES, Memory
+from agent.delivery.history import FILE_NAME, History, Record, StoreError
 from agent.delivery.store import UNKEPT_MAX, WAITING_MAX, Store
-from agent.events import CalibrationUpdate, StatusChange
 
 
 def record(sequence: int, what: str = "window", sensor: str = "mems", **fields: object) -> Record:

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from agent.core.events import Result
 from agent.delivery.history import FILE_NAME, History, Record
 from agent.delivery.store import UNKEPT_MAX, Store
-from agent.events import Result
 from agent.recording.files import recordings
 from agent.recording.scan import scan
 from agent.recording.writer import Recorder

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from agent.core.events import CalibrationUpdate
 from agent.delivery.history import FILE_NAME, History, StoreError
 from agent.delivery.schema import row_crc
 from agent.delivery.store import Store
-from agent.events import CalibrationUpdate
 
 VERSION_1 = Path(__file__).parent / "stores" / "version-1.sqlite"
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.timing import ClockFit, ClockModel
+from calib.signal.timing import ClockFit, ClockModel
 
 Bursts = tuple[np.ndarray, np.ndarray, np.ndarray]
 

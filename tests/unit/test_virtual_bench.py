@@ -7,9 +7,9 @@ from dataclasses import asdict
 
 import pytest
 
-from agent.cli import run_cli
-from agent.identity import identity_of
-from agent.run import virtual_bench
+from agent.cli.main import run_cli
+from agent.cli.run import virtual_bench
+from agent.core.identity import identity_of
 from hw.sensor import load_driver
 
 

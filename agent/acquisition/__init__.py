@@ -1,0 +1,1 @@
+"""Devices read by threads, and the one loop that feeds the pipeline."""

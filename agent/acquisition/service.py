@@ -1,0 +1,228 @@
+"""The agent at work: readers -> one queue -> pipeline -> recording -> store -> network. One loop, one order."""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+import uuid
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+from agent import __version__
+from agent.acquisition.reader import EventQueue, Reader
+from agent.acquisition.stalls import few_objects
+from agent.commanding.reception import Reception
+from agent.config import Config
+from agent.core.events import Acceleration, Event, Result, RunStart, Tick
+from agent.core.memory import Memory
+from agent.core.pipeline import Pipeline
+from agent.delivery.history import History, Record, StoreError
+from agent.delivery.publication import Publisher
+from agent.delivery.retention import keep_results
+from agent.delivery.store import Store
+from agent.recording.acceleration import encode_acceleration
+from agent.recording.files import final_name
+from agent.recording.fingerprint import fingerprint, versions
+from agent.recording.recalling import memories_of
+from agent.recording.retention import keep_files
+from agent.recording.signing import Signer
+from agent.recording.thread import RecordingThread
+from agent.recording.writer import Recorder
+from agent.supervision.notify import Notifier
+from agent.supervision.plant import Outbox, Plant
+from agent.supervision.supervisor import Supervisor
+from agent.terminal.watch import Watch
+from hw.sensor import Sensor, boot_id, load_driver
+
+_log = logging.getLogger(__name__)
+
+TICK_S = 1.0
+POLL_S = 0.2  # how soon a signal is seen when no device speaks
+READER_STOP_S = 0.7  # a reader ends within one block; one that hangs in a driver is left behind
+
+
+class Service:
+    """One run. `stop` may be called from a signal handler; `run` returns when all files are closed."""
+
+    def __init__(self, config: Config, data_dir: Path, watch: Watch) -> None:
+        self._config = config
+        self._data_dir = data_dir
+        self._watch = watch
+        self._stop_request = threading.Event()
+        self._sequence = 0
+
+    def stop(self) -> None:
+        """End the run; `run` returns within two seconds."""
+        self._stop_request.set()
+
+    def run(self, duration_s: float | None) -> bool:
+        """Read, calibrate, record and publish until stopped or `duration_s` is over.
+
+        Returns whether all threads have ended; where a frozen router or disk holds one, end the process by `os._exit`.
+        Raises StoreError or OSError where the data directory cannot be used at all, KeyFileError for a bad signing key.
+        """
+        self._data_dir.mkdir(parents=True, exist_ok=True)
+        config = self._config
+        signer = Signer.load(config.recording.signing_key) if config.recording.signing_key else None
+        recall = partial(memories_of, restore=Pipeline.restore)
+        self._store = Store(self._data_dir, keep=keep_results(config.results), recall=recall)
+        if self._store.set_aside:
+            _log.warning("the state file was corrupt and is kept as %s", self._store.set_aside)
+        if (found := self._store.recovered).results or found.memories:
+            lacked = "%d results that the state file lacked were found in the recordings, and the state of %d devices"
+            _log.warning(lacked, found.results, found.memories)
+        self._recorder = Recorder(
+            self._data_dir,
+            [device.name for device in config.devices],
+            [channel.sensor for channel in config.channels],
+            max_bytes=int(config.recording.rotate_bytes),
+            max_age_s=config.recording.rotate_s,
+            keep=keep_files(config.recording),
+            ledger=self._store,
+            signer=signer,
+        )
+        self._recorder.close_torn()
+        events = EventQueue(len(config.devices))
+        self._reception = self._command_reception(events)
+        self._publisher = self._publication()
+        readers = [Reader(d.name, _sensor(d.name, d.driver, d.options), events) for d in config.devices]
+        self._begin()
+        writer = RecordingThread(self._recorder, self._deliver, flush_s=config.recording.flush_s)
+        plant = Plant(self._data_dir, events, writer, self._recorder, Outbox(self._store), self._publisher)
+        self._supervisor = Supervisor(config, self._run_id, self._origin_ns, plant, Notifier(os.environ))
+        try:
+            writer.put(0, self._run_start(continuation=False), [])
+            with few_objects():
+                for reader in readers:
+                    reader.start()
+                self._loop(events, writer, duration_s)
+        finally:
+            self._supervisor.closing()
+            if self._reception is not None:
+                self._reception.close()
+            for reader in readers:
+                reader.stop()
+            deadline = time.monotonic() + READER_STOP_S
+            for reader in readers:
+                if reader.ident is not None:
+                    reader.join(max(0.0, deadline - time.monotonic()))
+            recorded = writer.close()
+            ended = self._publisher.close() if self._publisher is not None else True
+            if recorded:
+                self._store.close()
+        return ended and recorded
+
+    def _publication(self) -> Publisher | None:
+        if not self._config.zenoh.enabled:
+            return None
+        gateway = self._config.gateway
+        zenoh = self._config.zenoh
+        publisher = Publisher(
+            gateway.site,
+            gateway.name,
+            zenoh.connect,
+            self._store,
+            tls=zenoh.tls.files if zenoh.tls else None,
+            serve=self._reception.serve if self._reception else None,
+        )
+        publisher.start()
+        return publisher
+
+    def _command_reception(self, events: EventQueue) -> Reception | None:
+        if not self._config.commands.enabled:
+            return None
+        return Reception(
+            self._config, self._data_dir, self._store.path, lambda command: events.put(command.sensor, command)
+        )
+
+    def _begin(self) -> None:
+        self._origin_ns = time.monotonic_ns()
+        self._run_id = uuid.uuid4().hex
+        self._pipeline = Pipeline.begin(
+            self._config, self._run_id, self._origin_ns, self._store.last_sequence(), self._kept()
+        )
+
+    def _kept(self) -> dict[str, dict[str, bytes]]:
+        """What runs before left of every device, by sensor. What cannot be read is said and left."""
+        kept: dict[str, dict[str, bytes]] = {}
+        try:
+            with History(self._store.path) as history:
+                for channel in self._config.channels:
+                    memories = history.memories(channel.sensor)
+                    kept[channel.sensor] = {identity: memory.state for identity, memory in memories.items()}
+        except StoreError as error:
+            _log.warning("the calibration in force cannot be restored: %s", error)
+        return kept
+
+    def _run_start(self, *, continuation: bool) -> RunStart:
+        gateway = self._config.gateway
+        return RunStart(
+            run_id=self._run_id,
+            site=gateway.site,
+            gateway=gateway.name,
+            boot_id=boot_id(),
+            t_monotonic_ns=time.monotonic_ns() if continuation else self._origin_ns,
+            t_utc_ns=time.time_ns(),
+            config_json=self._config.model_dump_json(),
+            versions={"fieldcal": __version__, **versions()},
+            fingerprint=fingerprint(),
+            snapshot=self._pipeline.snapshot(),
+            file_sequence=self._recorder.next_file_sequence,
+            event_sequence=self._sequence,
+            continuation=continuation,
+        )
+
+    def _loop(self, events: EventQueue, writer: RecordingThread, duration_s: float | None) -> None:
+        next_tick = time.monotonic() + TICK_S
+        end = float("inf") if duration_s is None else time.monotonic() + duration_s
+        while not self._stop_request.is_set() and time.monotonic() < end:
+            for gap in events.take_gaps():
+                self._step(gap, writer)
+            event = events.get(min(POLL_S, next_tick - time.monotonic(), end - time.monotonic()))
+            if event is not None:
+                self._step(event, writer)
+            if time.monotonic() >= next_tick:
+                next_tick += TICK_S
+                self._step(Tick(t_monotonic_ns=time.monotonic_ns(), t_utc_ns=time.time_ns()), writer)
+                self._watch.health(self._recorder, self._publisher.state() if self._publisher else None)
+            if (pruned := writer.take_pruning()) is not None:
+                self._step(pruned, writer)
+            if writer.wants_rotation:
+                self._sequence += 1
+                writer.put(self._sequence, self._run_start(continuation=True), [])
+
+    def _step(self, event: Event, writer: RecordingThread) -> None:
+        self._sequence += 1
+        outputs = self._pipeline.step(event)
+        writer.put(self._sequence, event, outputs, self._pipeline.memories(outputs))
+        results = [item for item in outputs if isinstance(item, Result)]
+        self._watch.update(event, results)
+        if self._publisher is not None:
+            for item in outputs:
+                if isinstance(item, Acceleration):
+                    self._publisher.stream(item.sensor, encode_acceleration(self._sequence, item))
+        self._supervisor.on_event(event, results)
+
+    def _deliver(
+        self, event_sequence: int, results: Sequence[Result], recorded: bool, memories: Sequence[Memory]
+    ) -> None:
+        """In the recording's thread, when the disk has the results: store, then network."""
+        path = self._recorder.path if recorded else None
+        records = [Record.of(r, recorded=recorded, recording=final_name(path) if path else "") for r in results]
+        try:
+            self._store.commit(records, memories)
+        except StoreError as error:
+            _log.error("the store cannot keep results up to event %d: %s", event_sequence, error)
+        if self._publisher is None:
+            self._store.mark_published(records[-1].sequence)  # nobody waits for them
+            return
+        for record in records:
+            self._publisher.publish(record)
+
+
+def _sensor(name: str, driver: str, options: dict[str, object]) -> Sensor:
+    factory = load_driver(driver)
+    return factory(name, factory.options_model.model_validate(options))

@@ -1,0 +1,238 @@
+"""`fieldcal audit`: is every byte of a recording as it was written, and do its results follow from its data?"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+import msgspec
+
+from agent.delivery.history import FILE_NAME, History, StoreError
+from agent.recording.chain import Link, chain_faults, missing_after
+from agent.recording.comparison import OTHER_CPU
+from agent.recording.files import FILE_METADATA, recordings
+from agent.recording.integrity import Integrity, check_integrity
+from agent.recording.pruned_ranges import PRUNED_METADATA, from_metadata, merged
+from agent.recording.reading import open_recording
+from agent.recording.records import Fault
+from agent.recording.repair import REPAIR_METADATA
+from agent.recording.replaying import Replay, ReplayedFile, Restore
+from agent.recording.signing import SIGNATURE_METADATA, verify_file
+
+if TYPE_CHECKING:
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+
+
+class AuditedFile(msgspec.Struct, kw_only=True):
+    """The verdict on one file. `reasons` is empty where it passed; `notes` say what could not be decided."""
+
+    path: str
+    ok: bool
+    incomplete: bool
+    repaired: bool  # torn by a crash, closed later
+    reasons: list[str]
+    notes: list[str]
+    size: int
+    sha256: str
+    good_bytes: int
+    faults: list[Fault]  # the first of `fault_count`
+    fault_count: int
+    chunks: int
+    messages: int
+    replay: ReplayedFile
+
+
+@click.command()
+@click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="FILE.mcap...")
+@click.option(
+    "--public-key", metavar="K", type=click.Path(path_type=Path), help="Require signatures by this key (PEM)."
+)
+@click.option("--strict", is_flag=True, help="Fail also where something cannot be decided here, or was repaired.")
+@click.option("--json", "json_to", type=click.Choice(["-"]), help="One JSON object on standard output.")
+def audit(files: tuple[Path, ...], public_key: Path | None, strict: bool, json_to: str | None) -> int:
+    """Check recordings, in order: every byte, whether the results follow from the data, whether any is missing.
+
+    A data directory instead of files: all its recordings, none of which may be missing. Exit status 0 when all is as it
+    should be, 3 when not, 2 when a file cannot be read.
+    """
+    from agent.core.pipeline import Pipeline
+    from agent.recording.fingerprint import compute_as
+    from agent.recording.reading import first_event
+    from agent.recording.signing import KeyFileError, load_public_key
+
+    try:
+        key = load_public_key(public_key) if public_key is not None else None
+        given = recordings_of(files)
+    except (KeyFileError, StoreError) as error:
+        click.echo(str(error), err=True)
+        return 2
+    if not given.paths and not given.up_to:
+        # Where there were recordings once, all of them being gone is for the audit to say.
+        click.echo(f"{files[0]}: no recordings are there", err=True)
+        return 2
+    start = first_event(given.paths[0]) if given.paths else None
+    if start is not None:
+        compute_as(start.fingerprint)
+    return run_audit(given, Pipeline.restore, as_json=json_to is not None, strict=strict, key=key)
+
+
+@dataclass(frozen=True, slots=True)
+class Given:
+    """Recordings to audit. Of a whole directory none may be missing: `up_to` is the highest number it ever had."""
+
+    paths: Sequence[Path]
+    up_to: int | None = None
+
+
+def recordings_of(paths: Sequence[Path]) -> Given:
+    """The files, or those of the one directory. Raises StoreError."""
+    if len(paths) != 1 or not paths[0].is_dir():
+        return Given(paths)
+    files = recordings(paths[0])
+    store = paths[0] / FILE_NAME
+    highest = files[-1][0] if files else 0
+    if store.exists():
+        with History(store) as history:
+            highest = max(highest, history.file_sequence())
+    return Given([path for _, path in files], highest)
+
+
+def run_audit(
+    given: Given, restore: Restore, *, as_json: bool, strict: bool = False, key: Ed25519PublicKey | None = None
+) -> int:
+    """Audit, print, and return the exit status. With a `key` signatures are asked for."""
+    try:
+        audited = audit_files(given, restore, strict=strict, key=key)
+    except OSError as error:
+        click.echo(f"{error.filename}: {error.strerror}", err=True)
+        return 2
+    numbers = [file.replay.file_sequence for file in audited]
+    lost = missing_after(max(numbers, default=0), given.up_to or 0)
+    ok = not lost and all(file.ok for file in audited)
+    if as_json:
+        undecidable = sum(file.replay.undecidable for file in audited)
+        unsealed = sum(file.repaired for file in audited)
+        verdict = {"ok": ok, "undecidable": undecidable, "unsealed": unsealed, "missing": lost, "files": audited}
+        click.echo(msgspec.json.encode(verdict).decode())
+    else:
+        for file in audited:
+            click.echo(describe(file))
+        if lost:
+            click.echo(f"FAILED: {lost}")
+    return 0 if ok else 3
+
+
+def audit_files(
+    given: Given, restore: Restore, *, strict: bool = False, key: Ed25519PublicKey | None = None
+) -> list[AuditedFile]:
+    """The verdict on each file; neighbours, in order, are also held against each other. Raises OSError."""
+    from agent.recording.fingerprint import fingerprint
+
+    replayed = Replay(restore, fingerprint(), elsewhere=OTHER_CPU)
+    audited: list[AuditedFile] = []
+    links: list[Link] = []
+    said: list[tuple[int, int]] = []  # recordings that retention deleted
+    with ExitStack() as held:  # until all are done: retention deletes none meanwhile
+        files = [held.enter_context(open_recording(path)) for path in given.paths]
+        for path, file in zip(given.paths, files, strict=True):
+            sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+            size = file.tell()
+            file.seek(0)
+            integrity = check_integrity(file, size)
+            verdict = _verdict(path, sha256, size, integrity, replayed.run(path))
+            if key is not None:
+                fault = verify_file(file, size, integrity.metadata.get(SIGNATURE_METADATA), key)
+                verdict.reasons += [fault] if fault else []
+            if strict:
+                verdict.reasons += verdict.notes
+            audited.append(verdict)
+            links.append(_link(verdict, integrity))
+            said += from_metadata(integrity.metadata.get(PRUNED_METADATA))
+    pruned = [event for verdict in audited for event in verdict.replay.pruned]
+    deleted = merged([*said, *((event.first_file, event.last_file) for event in pruned)])
+    for index, fault in chain_faults(links, pruned, deleted, from_first=given.up_to is not None):
+        audited[index].reasons.append(fault)
+    for verdict in audited:
+        verdict.ok = not verdict.reasons
+    return audited
+
+
+def _verdict(path: Path, sha256: str, size: int, integrity: Integrity, replay: ReplayedFile) -> AuditedFile:
+    repair = integrity.metadata.get(REPAIR_METADATA)
+    notes = list(replay.notes)
+    if repair is not None:
+        notes.append(f"unsealed: left open by a crash, closed later, {repair.get('torn_bytes')} torn bytes set aside")
+    return AuditedFile(
+        path=str(path),
+        ok=False,
+        incomplete=not integrity.finished and all(fault.kind == "torn" for fault in integrity.faults),
+        repaired=repair is not None,
+        reasons=_reasons(integrity, replay) + _metadata_reasons(integrity, replay),
+        notes=notes,
+        size=size,
+        sha256=sha256,
+        good_bytes=integrity.good_bytes,
+        faults=integrity.faults,
+        fault_count=integrity.fault_count,
+        chunks=integrity.chunks,
+        messages=integrity.messages,
+        replay=replay,
+    )
+
+
+def _link(verdict: AuditedFile, integrity: Integrity) -> Link:
+    return Link(
+        path=verdict.path,
+        gateway=verdict.replay.gateway,
+        file_sequence=verdict.replay.file_sequence,
+        sha256=verdict.sha256,
+        incomplete=verdict.incomplete,
+        repaired=verdict.repaired,
+        previous_sha256=integrity.metadata.get(FILE_METADATA, {}).get("previous_sha256", ""),
+    )
+
+
+def _reasons(integrity: Integrity, replay: ReplayedFile) -> list[str]:
+    reasons = []
+    for fault in integrity.faults:
+        incomplete = f"incomplete, last good byte {integrity.good_bytes}: " if fault.kind == "torn" else ""
+        reasons.append(f"{incomplete}{fault}")
+    if integrity.fault_count > len(integrity.faults):
+        reasons.append(f"{integrity.fault_count - len(integrity.faults)} more faults")
+    if replay.fault is not None and not integrity.faults:
+        reasons.append(str(replay.fault))
+    if replay.refused:
+        reasons.append(f"cannot be replayed: {replay.refused}")
+    if replay.first_difference is not None:
+        reasons.append(f"the results do not follow from the data: {replay.first_difference}")
+    if replay.different > 1:
+        reasons.append(f"results differ after {replay.different} events")
+    if not replay.events:
+        reasons.append("it holds no events")
+    return reasons
+
+
+def _metadata_reasons(integrity: Integrity, replay: ReplayedFile) -> list[str]:
+    """What does not fit between a file and its own metadata."""
+    metadata = integrity.metadata.get(FILE_METADATA)
+    if metadata is None:
+        return [f"no metadata record {FILE_METADATA}"] if replay.events else []
+    if replay.events and metadata.get("file_sequence") != str(replay.file_sequence):
+        return [f"its metadata says file {metadata.get('file_sequence')}, its RunStart {replay.file_sequence}"]
+    return []
+
+
+def describe(file: AuditedFile) -> str:
+    """The verdict in a line, and a line more for each reason and note."""
+    replay = file.replay
+    how = f"equal within {replay.tolerance:g}" if replay.tolerance else "equal bit for bit"
+    verdict = f"passed, {replay.results} results {how}" if file.ok else "FAILED"
+    lines = [f"{file.path}: {verdict}; {file.size} bytes, {file.chunks} chunks, {replay.events} events replayed"]
+    lines += [f"  {reason}" for reason in file.reasons]
+    lines += [f"  note: {note}" for note in file.notes if note not in file.reasons]
+    return "\n".join(lines)

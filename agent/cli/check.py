@@ -1,0 +1,30 @@
+"""`fieldcal check`: all faults of a configuration at once."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+import click
+
+from agent.config import ConfigError, load_config
+from agent.config.tls import expiry_warning
+
+
+@click.command()
+@click.argument("config", type=click.Path(path_type=Path))
+def check(config: Path) -> int:
+    """Say every fault of CONFIG, each with its path and value. Exit status 2 if there is one."""
+    try:
+        loaded = load_config(config)
+    except ConfigError as error:
+        for fault in error.faults:
+            click.echo(fault, err=True)
+        return 2
+    poses = sum(len(channel.poses) for channel in loaded.channels)
+    stops = sum(len(channel.positions) for channel in loaded.channels if isinstance(channel.positions, tuple))
+    if loaded.zenoh.tls and (warning := expiry_warning(loaded.zenoh.tls.files, datetime.now(UTC))):
+        click.echo(f"{config}: zenoh.tls.{warning}", err=True)
+    told = f"{poses} poses" + (f", {stops} positions to be found" if stops else "")
+    click.echo(f"{config}: good; {len(loaded.devices)} devices, {len(loaded.channels)} channels, {told}")
+    return 0

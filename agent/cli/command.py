@@ -1,0 +1,162 @@
+"""`fieldcal command`: signs a command and sends it to an agent, over Zenoh or on the gateway itself."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+import msgspec
+
+from agent.cli.tls_options import tls_files, tls_options
+from agent.commanding.arguments import Arguments, Verb, parse_arguments
+from agent.commanding.desk import LONGEST_VALIDITY_S
+from agent.commanding.envelope import Order, seal
+from agent.commanding.local import LocalAgent
+from agent.commanding.refusal import Refused
+from agent.commanding.sending import send
+from agent.delivery.keys import CHUNK, gateway_key
+from agent.delivery.session import EndpointError
+from agent.keys.files import KeyFileError, SigningKey, read_signing_key
+
+VALID_S = 60.0  # a command is for now
+
+
+class _Answer(msgspec.Struct):
+    taken: bool
+    reason: str = ""
+
+
+_OPTIONS: list[Callable[[Callable[..., Any]], Callable[..., Any]]] = [
+    click.option("--sensor", required=True, help="Whom it is about."),
+    click.option("--key", "key_file", required=True, metavar="F", type=click.Path(path_type=Path),
+                 help="Private key that signs, from `fieldcal keys command`."),
+    click.option("--data-dir", type=click.Path(path_type=Path), default=Path("data"), show_default=True,
+                 help="Of the agent on this machine."),
+    click.option("--connect", multiple=True, metavar="ENDPOINT", help="A router: send over Zenoh instead."),
+    click.option("--gateway", metavar="SITE/NAME", help="Which gateway, with --connect."),
+    tls_options,
+    click.option("--valid", "valid_s", type=click.FloatRange(1, LONGEST_VALIDITY_S), default=VALID_S,
+                 show_default=True, metavar="S", help="How long the command may take to arrive."),
+]  # fmt: skip
+
+
+def common_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """What every command needs besides its arguments."""
+    for option in reversed(_OPTIONS):
+        command = option(command)
+    return command
+
+
+@click.group()
+def command() -> None:
+    """Sign a command and send it. Exit status: 0 taken, 3 refused with the reason, 1 nobody answers."""
+
+
+@command.command()
+@click.option("--theta-deg", type=float, help="Clamp angle theta (with --alpha-deg).")
+@click.option("--alpha-deg", type=float, help="Rotation alpha about the clamp's axis.")
+@click.option("--direction", type=float, nargs=3, metavar="X Y Z", help="Unit vector of the motion, sensor's frame.")
+@click.option("--gravity", "gravity_mps2", type=float, nargs=3, metavar="X Y Z",
+              help="What an ideal sensor reads at rest, m/s2; alone: a rest.")  # fmt: skip
+@click.option("--position", help="A name for it.")
+@common_options
+def pose(
+    theta_deg: float | None,
+    alpha_deg: float | None,
+    direction: tuple[float, float, float] | None,
+    gravity_mps2: tuple[float, float, float] | None,
+    position: str | None,
+    **options: Any,
+) -> int:
+    """Say how the sensor stands from now on."""
+    given = {"theta_deg": theta_deg, "alpha_deg": alpha_deg, "direction": direction, "gravity_mps2": gravity_mps2,
+             "position": position}  # fmt: skip
+    return _run("pose", {name: value for name, value in given.items() if value is not None}, **options)
+
+
+@command.command()
+@click.option("--release", is_flag=True, help="End it.")
+@common_options
+def hold(release: bool, **options: Any) -> int:
+    """Change nothing of the calibration in force until released."""
+    return _run("hold", {"release": True} if release else {}, **options)
+
+
+@command.command()
+@click.option("--sequence", type=int, required=True, help="Number of the estimate.")
+@common_options
+def accept(sequence: int, **options: Any) -> int:
+    """Bring an estimate into force."""
+    return _run("accept", {"sequence": sequence}, **options)
+
+
+@command.command()
+@click.option("--sequence", type=int, required=True, help="Number of the calibration, see `fieldcal show`.")
+@common_options
+def rollback(sequence: int, **options: Any) -> int:
+    """Bring an earlier calibration into force again."""
+    return _run("rollback", {"sequence": sequence}, **options)
+
+
+def _run(
+    verb: Verb,
+    given: dict[str, Any],
+    *,
+    sensor: str,
+    key_file: Path,
+    data_dir: Path,
+    connect: tuple[str, ...],
+    gateway: str | None,
+    ca: str | None,
+    certificate: str | None,
+    certificate_key: str | None,
+    valid_s: float,
+) -> int:
+    if not CHUNK.fullmatch(sensor):
+        raise click.BadParameter(f"{sensor!r} is no name of a sensor", param_hint="--sensor")
+    try:
+        arguments = parse_arguments(verb, msgspec.json.encode(given))
+        key = read_signing_key(key_file)
+    except (Refused, KeyFileError) as error:
+        raise click.UsageError(str(error)) from None
+    files = tls_files(connect, ca, certificate, certificate_key)
+
+    def sealed(to: str) -> bytes:
+        return _sealed(key, to, sensor, verb, arguments, valid_s)
+
+    address = f"{sensor}/command/{verb}"
+    try:
+        if connect:
+            name = _gateway_name(gateway)
+            said = send(connect, files, f"{gateway_key(*name.split('/'))}/{address}", sealed(name))
+        else:
+            with LocalAgent(data_dir) as agent:
+                said = agent.send(address, sealed(gateway or agent.gateway))
+        answer = msgspec.json.decode(said, type=_Answer)
+    except EndpointError as error:
+        raise click.UsageError(str(error)) from None
+    except (OSError, msgspec.DecodeError, ValueError) as error:
+        click.echo(f"fieldcal command: {error}", err=True)
+        return 1
+    if not answer.taken:
+        click.echo(f"refused: {answer.reason}", err=True)
+        return 3
+    click.echo(f"taken: {verb} of {sensor}")
+    return 0
+
+
+def _gateway_name(gateway: str | None) -> str:
+    if gateway is None:
+        raise click.UsageError("--connect needs --gateway SITE/NAME: a command is signed for one gateway")
+    site, _, name = gateway.partition("/")
+    if not (CHUNK.fullmatch(site) and CHUNK.fullmatch(name)):
+        raise click.BadParameter(f"{gateway!r} is not SITE/NAME", param_hint="--gateway")
+    return gateway
+
+
+def _sealed(key: SigningKey, gateway: str, sensor: str, verb: Verb, arguments: Arguments, valid_s: float) -> bytes:
+    now_ns = time.time_ns()
+    return seal(Order.of(gateway, sensor, verb, arguments, now_ns, now_ns + int(valid_s * 1e9)), key.key_id, key.key)

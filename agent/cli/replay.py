@@ -1,0 +1,121 @@
+"""`fieldcal replay`: run recordings through the same pipeline and print the calibrations."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+import msgspec
+
+from agent.core.events import CalibrationUpdate
+from agent.recording.replaying import Replay, ReplayedFile, Restore
+
+SHOWN = 12  # lines of a table; `--json` has them all
+
+
+@click.command()
+@click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="FILE.mcap...")
+@click.option("--json", "json_to", type=click.Choice(["-"]), help="One JSON object on standard output.")
+def replay(files: tuple[Path, ...], json_to: str | None) -> int:
+    """Run recordings through the pipeline, in the order given, and print the calibrations.
+
+    Exit status 0 when the recorded results came out again bit for bit; 3 when not; 2 when a file cannot be read.
+    """
+    from agent.core.pipeline import Pipeline
+    from agent.recording.fingerprint import compute_as
+    from agent.recording.reading import first_event
+
+    start = first_event(files[0])
+    if start is not None:
+        compute_as(start.fingerprint)
+    return run_replay(files, Pipeline.restore, as_json=json_to is not None)
+
+
+def run_replay(files: Sequence[Path], restore: Restore, *, as_json: bool) -> int:
+    """Replay, print, and return the exit status."""
+    from agent.recording.fingerprint import fingerprint
+
+    replayed = Replay(restore, fingerprint(), elsewhere=0.0)
+    unreadable = []
+    for path in files:
+        try:
+            file = replayed.run(path)
+        except OSError as error:
+            unreadable.append(f"{path}: {error.strerror or error}")
+            continue
+        if not file.events:
+            unreadable.append(f"{path}: {file.fault or 'no recording of fieldcal'}")
+    if as_json:
+        click.echo(msgspec.json.encode(as_object(replayed)).decode())
+    elif not unreadable:
+        _print(replayed)
+    for line in unreadable:
+        click.echo(line, err=True)
+    if unreadable:
+        return 2
+    corrupt = any(file.fault and file.fault.kind == "corrupt" for file in replayed.files)
+    return 0 if all(file.equal for file in replayed.files) and not corrupt else 3
+
+
+def as_object(replayed: Replay) -> dict[str, Any]:
+    """What `--json -` prints."""
+    files = replayed.files
+    return {
+        "files": files,
+        "runs": list(dict.fromkeys(file.run_id for file in files)),
+        "calibrations": replayed.calibrations,
+        "windows": replayed.windows,
+        "equal": bool(files) and all(file.equal for file in files),
+        "first_difference": replayed.first_difference,
+        "events": sum(file.events for file in files),
+        "results": sum(file.results for file in files),
+        "torn": [file.path for file in files if file.fault],
+    }
+
+
+def _print(replayed: Replay) -> None:
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(highlight=False, width=None if sys.stdout.isatty() else 120)
+    table = Table(box=box.SIMPLE, title="Calibrations, with expanded uncertainty")
+    for name in ("sensor", "result", "windows", "Sxx", "Syy", "Szz", "Qx", "Qy", "Qz", "unit"):
+        table.add_column(name, overflow="fold")
+    for update in replayed.calibrations[-SHOWN:]:
+        table.add_row(update.sensor, str(update.sequence), str(update.windows), *_cells(update), update.output_unit)
+    console.print(table)
+    if len(replayed.calibrations) > SHOWN:
+        console.print(f"the last {SHOWN} of {len(replayed.calibrations)} calibrations")
+    for file in replayed.files:
+        console.print(describe(file), markup=False, soft_wrap=True)
+
+
+def describe(file: ReplayedFile) -> str:
+    """One file in a line, and a line more for each thing to say of it."""
+    how = "goes on from the file before" if file.in_chain else "alone, from its own snapshot"
+    lines = [f"{file.path}: {file.events} events, {file.results} results, {how}"]
+    if file.refused:
+        lines.append(f"  cannot be replayed: {file.refused}")
+    elif file.first_difference:
+        lines.append(f"  results differ after {file.different} events, first {file.first_difference}")
+    elif not file.results:
+        lines.append("  no results, as recorded")
+    elif file.tolerance:
+        lines.append(f"  results equal the recorded ones within {file.tolerance:g}")
+    else:
+        lines.append("  results equal the recorded ones bit for bit")
+    if file.fault:
+        lines.append(f"  {'ends early' if file.fault.kind == 'torn' else 'damaged'} at {file.fault}")
+        lines.append(f"  last good byte {file.good_bytes}")
+    lines += [f"  {note}" for note in file.notes]
+    return "\n".join(lines)
+
+
+def _cells(update: CalibrationUpdate) -> list[str]:
+    values = [update.sensitivity[axis][axis] for axis in range(3)] + update.offset
+    u = [update.standard_uncertainty[i] for i in (0, 4, 8, 9, 10, 11)]
+    return [f"{value:.6g} ± {update.coverage_factor * s:.2g}" for value, s in zip(values, u, strict=True)]

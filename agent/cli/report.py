@@ -1,0 +1,71 @@
+"""`fieldcal report`: figures, one HTML page and the JSON of a calibration. Drawing needs the extra `report`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+if TYPE_CHECKING:
+    from agent.report.material import Material
+
+
+@click.command()
+@click.argument("inputs", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="INPUT...")
+@click.option("-o", "--output", type=click.Path(path_type=Path, file_okay=False), required=True, metavar="DIR",
+              help="Where report.html, report.json and the figures go.")  # fmt: skip
+@click.option("--unit", metavar="UNIT", help="Of the indications, where the result does not say it: mV, m/s2, count.")
+@click.option("--sensor", metavar="NAME", help="Which one, where the input holds several; the name on the page.")
+def report(inputs: tuple[Path, ...], output: Path, unit: str | None, sensor: str | None) -> int:
+    """Figures and one page of a calibration.
+
+    INPUT is RESULT.json of `fieldcal calibrate --json -` (several are compared), a recording (several are read one
+    after the other), or the data directory of an agent: the calibration in force, with its history.
+
+    Exit status 3 where the data were refused: the report then shows why. 2 where the input cannot be used.
+    """
+    try:
+        import matplotlib  # noqa: F401 - asked for before any work is done
+    except ImportError:
+        click.echo("fieldcal report: figures need matplotlib: pip install 'fieldcal[report]'", err=True)
+        return 1
+    from agent.report.material import MaterialError, gather
+    from agent.report.writing import write
+
+    try:
+        material = gather(inputs, sensor)
+        _name_unit(material, unit)
+    except MaterialError as error:
+        click.echo(f"fieldcal report: {error}", err=True)
+        return 2
+    for notice in material.notices:
+        click.echo(f"fieldcal report: {notice}", err=True)
+    try:
+        write(material, output)
+    except OSError as error:
+        click.echo(f"fieldcal report: {error.filename or output}: {error.strerror}", err=True)
+        return 2
+    click.echo(output / "report.html")
+    return _status(material)
+
+
+def _status(material: Material) -> int:
+    refused = [result for result in material.results if result.refused]
+    for result in refused:
+        for reason in result.reasons:
+            click.echo(f"refused: {reason}", err=True)
+    return 3 if refused else 0
+
+
+def _name_unit(material: Material, unit: str | None) -> None:
+    """Name the unit where results do not; all must be in one. Raises MaterialError."""
+    from agent.report.material import MaterialError
+    from agent.report.units import output_unit
+
+    if unit is not None:
+        material.results = [replace(r, unit=r.unit or unit) for r in material.results]
+    units = {output_unit(r.unit) for r in material.results} | ({output_unit(unit)} if unit else set())
+    if len(units) > 1:
+        raise MaterialError(f"one report has one unit of the indications, here are {', '.join(sorted(units))}")

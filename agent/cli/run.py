@@ -1,0 +1,149 @@
+"""`fieldcal run`: the agent on a configuration, or on the virtual bench."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import click
+
+from agent.config import Config, ConfigError, load_config, parse_config
+from agent.delivery.history import StoreError
+
+LOOPBACK = "tcp/127.0.0.1:7447"
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+@click.command()
+@click.argument("config", required=False, type=click.Path(path_type=Path))
+@click.option("--data-dir", type=click.Path(path_type=Path), default=Path("data"), show_default=True,
+              help="Recordings and state.")  # fmt: skip
+@click.option("--duration", type=click.FloatRange(min=0, min_open=True), metavar="S", help="End after S seconds.")
+@click.option("--preset", type=click.Choice(["plain", "faulty"]), default="plain", show_default=True,
+              help="Which virtual bench, where there is no CONFIG.")  # fmt: skip
+@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=1, show_default=True, help="Of the virtual bench.")
+@click.option("--log", type=click.Choice(["plain", "json"]),
+              help="What standard error gets: JSON, one object a line, the default under systemd.")  # fmt: skip
+@click.option("--with-router", is_flag=True, help=f"Start a Zenoh router at {LOOPBACK} unless one is there.")
+def run(
+    config: Path | None,
+    data_dir: Path,
+    duration: float | None,
+    preset: str,
+    seed: int,
+    log: str | None,
+    with_router: bool,
+) -> int:
+    """Read, calibrate, record and publish until Ctrl-C. Without CONFIG on the virtual bench."""
+    from agent.supervision.logs import log_as_json, under_journal
+    from agent.terminal.watch import Watch
+
+    if duration is not None and not math.isfinite(duration):
+        raise click.BadParameter(f"{duration} is not a time", param_hint="--duration")
+    # Until the service takes them over: as Ctrl-C, so that a router or a bench started here does not stay behind.
+    for number in STOP_SIGNALS:
+        signal.signal(number, signal.default_int_handler)
+    with ExitStack() as stack:
+        if as_json := log == "json" or (log is None and under_journal(os.environ, sys.stderr.fileno())):
+            stack.callback(log_as_json().finish)
+        try:
+            if config is None:
+                settings, truth = stack.enter_context(virtual_bench(preset, seed))
+            else:
+                settings, truth = load_config(config), None
+        except ConfigError as error:
+            for fault in error.faults:
+                click.echo(fault, err=True)
+            return 2
+        said = [stack.enter_context(router(LOOPBACK))] if with_router else []
+        title = f"virtual bench, {preset}" if truth else str(config)
+        watch = stack.enter_context(Watch(settings, title, truth, lines=not as_json))
+        for line in said:
+            watch.say(line)
+        return serve(settings, data_dir, watch, duration)
+
+
+def serve(config: Config, data_dir: Path, watch: Any, duration_s: float | None) -> int:
+    """Run the service until a signal or `duration_s`; the exit status."""
+    from agent.acquisition.service import Service
+    from agent.recording.signing import KeyFileError
+
+    service = Service(config, data_dir, watch)
+    for number in STOP_SIGNALS:
+        signal.signal(number, lambda *_: service.stop())
+    try:
+        ended = service.run(duration_s)
+    except KeyFileError as error:
+        click.echo(f"fieldcal run: recording.signing_key: {error}", err=True)
+        return 2
+    except (StoreError, OSError) as error:
+        click.echo(f"fieldcal run: {error}", err=True)
+        return 1
+    if not ended:
+        # A router that is frozen holds Zenoh's thread, or a disk the recording's; nobody can wait for it.
+        watch.__exit__()
+        sys.stdout.flush()
+        os._exit(0)
+    return 0
+
+
+@contextmanager
+def virtual_bench(preset: str, seed: int) -> Iterator[tuple[Config, Any]]:
+    """The paper's bench under the real drivers: its configuration and its truth."""
+    from hw.virtual import presets
+    from hw.virtual.live import LiveBench
+
+    parameters = getattr(presets, preset)(seed)
+    with LiveBench(parameters, seed) as live:
+        poses = [
+            {"start_s": p.start_s, "stop_s": p.stop_s, "theta_deg": p.theta_deg, "alpha_deg": p.alpha_deg}
+            for p in live.bench.poses
+        ]
+        number = f"{preset}-{seed}"  # each is a sensor of its own: one's calibration is not another's
+        raw = {
+            "gateway": {"site": "virtual", "name": "bench"},
+            "devices": [
+                {"name": "mems", "driver": "adxl355", "options": live.sensor_options | {"serial_number": number}},
+                {"name": "reference", "driver": "serial-csv", "options": live.reference_options},
+            ],
+            "channels": [
+                {
+                    "sensor": "mems",
+                    "reference": "reference",
+                    "prior": {},
+                    "certificate": {"quantity": parameters.reference.quantity},
+                    "poses": poses,
+                    "poses_repeat_s": parameters.schedule.period_s,
+                }
+            ],
+        }
+        yield parse_config(raw, "virtual bench"), live.bench.truth
+
+
+@contextmanager
+def router(endpoint: str) -> Iterator[str]:
+    """A router process beside the agent, or the one that is there; yields what to tell the user."""
+    from agent.delivery.router import router_running
+
+    if router_running(endpoint):
+        yield f"using the Zenoh router that is already at {endpoint}"
+        return
+    command = [sys.executable, "-m", "agent", "router", "--listen", endpoint]
+    # In a session of its own: Ctrl-C in the terminal must let the agent say its last words through it.
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True, env=os.environ)
+    try:
+        yield f"started a Zenoh router at {endpoint}"
+    finally:
+        process.terminate()
+        try:
+            process.wait(2.0)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()

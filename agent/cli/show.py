@@ -1,0 +1,178 @@
+"""`fieldcal show`: what a data directory knows of its sensors, also while the agent runs."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime as dt
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+import msgspec
+
+from agent import __version__
+from agent.core.events import CalibrationUpdate, StatusChange, WindowReport
+from agent.delivery.history import FILE_NAME, History, Record, StoreError
+from agent.terminal.quantity import size
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+HISTORY_SHOWN = 10  # newest calibrations and windows of a sensor
+
+
+@click.command()
+@click.option("--data-dir", type=click.Path(path_type=Path), default=Path("data"), show_default=True, metavar="D",
+              help="Where the agent keeps recordings and state.")  # fmt: skip
+@click.option("--json", "json_to", type=click.Choice(["-"]), help="One JSON object on standard output.")
+@click.option("--limit", type=click.IntRange(1), default=HISTORY_SHOWN, show_default=True, metavar="N",
+              help="Show the newest N calibrations and windows of each sensor.")  # fmt: skip
+def show(data_dir: Path, json_to: str | None, limit: int) -> int:
+    """Calibration in force, status, history and recordings of a data directory.
+
+    Exit status 2 where there is no store, or it cannot be read.
+    """
+    try:
+        overview = read_overview(data_dir, limit)
+        if json_to:
+            click.echo(msgspec.json.encode(as_object(overview)).decode())
+        else:
+            _print(overview)
+    except StoreError as error:
+        click.echo(f"fieldcal show: {error}", err=True)
+        return 2
+    return 0
+
+
+@dataclass(frozen=True, slots=True)
+class SensorHistory:
+    """What is kept of one sensor; lists are newest first."""
+
+    status: Record | None
+    calibration: Record | None  # in force
+    calibrations: list[Record]
+    windows: list[Record]
+    drift: list[Record]  # empty until drift is watched
+
+
+@dataclass(frozen=True, slots=True)
+class Overview:
+    """What a data directory holds: sensors by name, and (name, size in bytes) of each recording in order."""
+
+    data_dir: Path
+    sensors: dict[str, SensorHistory]
+    recordings: list[tuple[str, int]]
+
+
+def read_overview(data_dir: Path, limit: int) -> Overview:
+    """Read it, the newest `limit` results of each kind. Raises StoreError."""
+    from agent.recording.files import recordings
+
+    with History(data_dir / FILE_NAME) as history:
+        history.check()
+        in_force = {record.sensor: record for record in history.latest() if record.what == "calibration"}
+        sensors = {
+            sensor: SensorHistory(
+                status=next(iter(history.newest(sensor, "status", limit=1)), None),
+                calibration=in_force.get(sensor),
+                calibrations=history.newest(sensor, "calibration", limit=limit),
+                windows=history.newest(sensor, "window", limit=limit),
+                drift=history.newest(sensor, "drift", limit=limit),
+            )
+            for sensor in sorted({sensor for sensor, _ in history.channels() if sensor})
+        }
+    sizes = []
+    for _, path in recordings(data_dir):
+        with contextlib.suppress(FileNotFoundError):  # the agent renames a file when it closes it
+            sizes.append((path.name, path.stat().st_size))
+    return Overview(data_dir, sensors, sizes)
+
+
+def as_object(overview: Overview) -> dict[str, Any]:
+    """For JSON, with results as they are published (fields of agent.core.events)."""
+    return {
+        "version": __version__,
+        "data_dir": str(overview.data_dir),
+        "sensors": {
+            sensor: {
+                "status": held.status.fields if held.status else None,
+                "calibration": held.calibration.fields if held.calibration else None,
+                "history": [record.fields for record in held.calibrations],
+                "windows": [record.fields for record in held.windows],
+                "drift": [record.fields for record in held.drift],
+            }
+            for sensor, held in overview.sensors.items()
+        },
+        "recordings": [
+            {"file": name, "size_bytes": octets, "finished": name.endswith(".mcap")}
+            for name, octets in overview.recordings
+        ],
+    }
+
+
+def _print(overview: Overview) -> None:
+    from rich.console import Console
+
+    console = Console(highlight=False, markup=False)
+    if not overview.sensors:
+        console.print(f"{overview.data_dir}: no results yet", soft_wrap=True)
+    for sensor, held in overview.sensors.items():
+        _print_sensor(console, sensor, held)
+    names = [name for name, _ in overview.recordings]
+    span = f": {' to '.join(dict.fromkeys((names[0], names[-1])))}" if names else ""
+    total = size(sum(octets for _, octets in overview.recordings))
+    console.print(f"{len(names)} recordings in {overview.data_dir}, {total}{span}", soft_wrap=True)
+
+
+def _print_sensor(console: Console, sensor: str, held: SensorHistory) -> None:
+    from rich.text import Text
+
+    from agent.terminal.wording import STATUS_STYLES, calibration_cells, verdict, window_span
+
+    name, said = "UNCALIBRATED", "no status yet"
+    if held.status and isinstance(status := held.status.result, StatusChange):
+        name, said = status.status, f"since {_time(status.t_utc_ns)}  {status.reason}"
+    heading = Text.assemble((sensor, "bold"), "  ", (name, STATUS_STYLES.get(name, "cyan")), f"  {said}")
+    console.print(heading, soft_wrap=True)
+    if held.calibration and isinstance(calibration := held.calibration.result, CalibrationUpdate):
+        _print_calibration(console, calibration)
+    else:
+        console.print("  no calibration in force")
+    console.print("  newest calibrations" if held.calibrations else "  no calibration yet", style="dim")
+    for record in held.calibrations:
+        if isinstance(update := record.result, CalibrationUpdate):
+            cells = calibration_cells(update)
+            main = "  ".join(f"S{axis}{axis} {cells[i][i]}" for i, axis in enumerate("xyz"))
+            console.print(f"    {_time(update.t_utc_ns)}  {update.windows:3d} windows  {main}", soft_wrap=True)
+    console.print("  newest windows" if held.windows else "  no window yet", style="dim")
+    for record in held.windows:
+        if isinstance(window := record.result, WindowReport):
+            words = f"{window_span(window)}  {window.position}  {verdict(window)}"
+            console.print(f"    {_time(window.t_utc_ns)}  {words}", soft_wrap=True)
+    console.print()
+
+
+def _print_calibration(console: Console, calibration: CalibrationUpdate) -> None:
+    from rich import box
+    from rich.table import Table
+
+    from agent.terminal.wording import calibration_cells, uncertainty_words
+
+    unit = calibration.output_unit.replace("m/s2", "m/s²")
+    table = Table(box=box.SIMPLE_HEAD)
+    for heading in ("", "Sx", "Sy", "Sz", "Q"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for axis, cells in zip("xyz", calibration_cells(calibration), strict=True):
+        table.add_row(axis, *cells)
+    console.print(table)
+    for line in (
+        f"S in {unit} per m/s², Q in {unit}, {uncertainty_words(calibration)}",
+        f"{calibration.method}, {calibration.windows} windows, in force since {_time(calibration.t_utc_ns)}",
+        f"of {calibration.identity}",
+    ):
+        console.print(f"  {line}", soft_wrap=True)
+
+
+def _time(t_utc_ns: int) -> str:
+    return dt.datetime.fromtimestamp(t_utc_ns / 1e9, dt.UTC).strftime("%Y-%m-%d %H:%M:%S UTC")

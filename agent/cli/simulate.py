@@ -1,0 +1,202 @@
+"""`fieldcal simulate`: virtual devices on pseudo-terminals, a recording played back, or files with known truth."""
+
+from __future__ import annotations
+
+import json
+import signal
+import threading
+import time
+from contextlib import ExitStack
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+from numpy.typing import NDArray
+
+from hw.virtual.bench import Bench, Truth
+from hw.virtual.playback import PlaybackError, Player, read_track
+from hw.virtual.presets import PRESETS
+from hw.virtual.serial_bench import Role, decimals_of, serial_lines, serial_options
+from hw.virtual.serial_port import PtyDevice
+from hw.virtual.timebase import BenchTime
+
+ROLES: tuple[Role, ...] = ("sensor", "reference")
+POLL_S = 0.05
+# A reader opens a port, sets it up and throws away what came until then: pyserial needs a few ms for it.
+SETTLE_S = 0.25
+LINGER_S = 1.0  # after the last sample, so that a reader gets it before the port hangs up
+
+
+@click.command()
+@click.option("--preset", type=click.Choice(list(PRESETS)), help="A virtual bench: sensor and reference.")
+@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=1, show_default=True, help="Of the bench.")
+@click.option("--csv", "directory", type=click.Path(path_type=Path, file_okay=False), help="Write files there.")
+@click.option("--duration", "duration_s", type=click.FloatRange(1, 1e6), help="Seconds; else three repetitions.")
+@click.option("--play", type=click.Path(path_type=Path), help="Serve this sensor.csv or reference.csv.")
+@click.option("--rate-hz", type=click.FloatRange(1e-3, 1e5), help="Play at this rate instead of by column time_s.")
+@click.option("--axes", help="Columns to play, as vx,vy,vz; by default those of sensor.csv or reference.csv.")
+@click.option("--sequence", is_flag=True, help="Begin each played line with its number.")
+@click.option("--loop", is_flag=True, help="Play for ever.")
+@click.option(
+    "--link", type=click.Path(path_type=Path), help="Path of the port; a bench appends -sensor and -reference."
+)
+def simulate(
+    preset: str | None,
+    seed: int,
+    directory: Path | None,
+    duration_s: float | None,
+    play: Path | None,
+    rate_hz: float | None,
+    axes: str | None,
+    sequence: bool,
+    loop: bool,
+    link: Path | None,
+) -> int:
+    """Serve virtual devices on pseudo-terminals, or write a recording with known truth.
+
+    \b
+    --preset plain --csv DIR   sensor.csv, reference.csv, poses.csv and truth.json for `fieldcal calibrate`
+    --preset plain             sensor and reference, each on a port, until Ctrl-C
+    --play FILE                a recording on a port, at its own pace, to its end
+
+    Nothing is sent until somebody reads; then time begins with the first sample.
+    """
+    if (preset is None) == (play is None):
+        raise click.UsageError("give one of --preset and --play")
+    if preset is not None and (rate_hz or axes or sequence or loop):
+        raise click.UsageError("--rate-hz, --axes, --sequence and --loop go with --play")
+    if play is not None and directory is not None:
+        raise click.UsageError("--csv goes with --preset")
+    if duration_s is not None and directory is None:
+        raise click.UsageError("--duration goes with --csv")
+    try:
+        if play is not None:
+            track = read_track(play, tuple(axes.split(",")) if axes else None, rate_hz)
+            return _serve_track(Player(track, sequence=sequence, loop=loop), link)
+        assert preset is not None
+        bench = Bench(PRESETS[preset](seed), seed)
+        if directory is None:
+            return _serve_bench(bench, link)
+        write_files(bench, directory, duration_s, {"preset": preset, "seed": seed})
+    except PlaybackError as error:
+        click.echo(str(error), err=True)
+        return 2
+    except (FileExistsError, FileNotFoundError, NotADirectoryError, PermissionError) as error:
+        click.echo(f"{error.filename2 or error.filename}: {error.strerror}", err=True)
+        return 2
+    click.echo(
+        f"fieldcal calibrate --sensor {directory}/sensor.csv --reference {directory}/reference.csv"
+        f" --poses {directory}/poses.csv --nominal {bench.parameters.sensor.nominal_sensitivity:.6g} --u-nominal-pct 20"
+    )
+    return 0
+
+
+def write_files(bench: Bench, directory: Path, duration_s: float | None, origin: dict[str, Any]) -> None:
+    """Write sensor.csv, reference.csv, poses.csv (formats of `fieldcal calibrate`) and truth.json.
+
+    `duration_s` of the bench's clock, by default three repetitions of its schedule, which is one on the clamp. `origin`
+    goes into truth.json.
+    """
+    p = bench.parameters
+    recording = bench.recording(p.schedule.duration_s(3) if duration_s is None else duration_s)
+    directory.mkdir(parents=True, exist_ok=True)
+    number = f"%.{decimals_of(p.sensor.resolution)}f"
+    _write_csv(
+        directory / "sensor.csv",
+        "time_s,vx,vy,vz,temperature_degc",
+        ["%.6f", number, number, number, "%.2f"],
+        np.column_stack([recording.sensor_stamp_s, recording.v, recording.temperature_degc]),
+    )
+    number = f"%.{decimals_of(p.reference.resolution)}f"
+    _write_csv(
+        directory / "reference.csv",
+        "time_s,ax,ay,az" if p.reference.channels == 3 else f"time_s,{p.reference.quantity[0]}",
+        ["%.6f", *[number] * p.reference.channels],
+        np.column_stack([recording.reference_stamp_s, recording.reference]),
+    )
+    poses = np.array([pose[:4] for pose in recording.poses], dtype=float).reshape(-1, 4)
+    _write_csv(directory / "poses.csv", "start_s,stop_s,theta_deg,alpha_deg", ["%.6f", "%.6f", "%g", "%g"], poses)
+    truth = origin | {
+        "unit": p.sensor.unit,
+        "nominal_sensitivity": p.sensor.nominal_sensitivity,
+        **_json_ready(recording.truth),
+    }
+    (directory / "truth.json").write_text(json.dumps(truth, indent=2) + "\n")
+
+
+def _write_csv(path: Path, header: str, formats: list[str], rows: NDArray[np.float64]) -> None:
+    np.savetxt(path, rows, fmt=formats, delimiter=",", header=header, comments="")
+
+
+def _json_ready(truth: Truth) -> dict[str, Any]:
+    return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in asdict(truth).items()}
+
+
+def _serve_track(player: Player, link: Path | None) -> int:
+    with _Serving() as serving:
+        device = serving.start(PtyDevice(player, link=link))
+        click.echo(device.path)
+        if serving.wait_for_reader(device):
+            player.begin(time.monotonic())
+            while not player.finished and serving.goes_on():
+                pass
+            serving.linger(device)
+    return 0
+
+
+def _serve_bench(bench: Bench, link: Path | None) -> int:
+    bench_time = BenchTime()
+    with _Serving() as serving:
+        devices: dict[Role, PtyDevice] = {}
+        for role in ROLES:
+            own_link = link and link.with_name(f"{link.name}-{role}")
+            devices[role] = serving.start(PtyDevice(serial_lines(bench, role, bench_time), link=own_link))
+        for role, device in devices.items():
+            options = ", ".join(f"{name} = {json.dumps(value)}" for name, value in serial_options(bench, role).items())
+            click.echo(f"{role} {device.path}  # serial-csv: {options}")
+        if serving.wait_for_reader(devices["sensor"]):
+            bench_time.begin(time.monotonic())
+            while serving.goes_on():
+                pass
+    return 0
+
+
+class _Serving:
+    """Serves ports until told to stop; SIGINT and SIGTERM end it in order, so that links do not stay behind."""
+
+    def __init__(self) -> None:
+        self._stopped = threading.Event()
+        self._undo = ExitStack()
+
+    def __enter__(self) -> _Serving:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._undo.callback(signal.signal, number, signal.signal(number, lambda *_: self._stopped.set()))
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._undo.close()
+
+    def start(self, device: PtyDevice) -> PtyDevice:
+        """Serve this port until the end."""
+        self._undo.callback(device.stop)
+        device.start()
+        return device
+
+    def goes_on(self) -> bool:
+        """Wait a moment; False once told to stop."""
+        return not self._stopped.wait(POLL_S)
+
+    def wait_for_reader(self, device: PtyDevice) -> bool:
+        """Wait until somebody has opened and set up the port; False once told to stop."""
+        while self.goes_on():
+            if device.has_reader():
+                return not self._stopped.wait(SETTLE_S)
+        return False
+
+    def linger(self, device: PtyDevice) -> None:
+        """Leave the reader time to take the rest."""
+        end = time.monotonic() + LINGER_S
+        while time.monotonic() < end and device.has_reader() and self.goes_on():
+            pass

@@ -1,0 +1,400 @@
+"""One sensor with its reference: streams -> windows -> estimation -> results."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import msgspec
+
+from agent.config import Channel
+from agent.core.corrected import acceleration_block
+from agent.core.estimation import DAY_S, Estimation, Judged
+from agent.core.events import Acceleration, CalibrationUpdate, Command, DeviceChange, Estimate, Output, Result, Tick
+from agent.core.identity import identity_of, nominal_of, not_certified
+from agent.core.kept import keep, plain, shelved, take_up, update_of
+from agent.core.operators import CommandError, answer, commanded_pose
+from agent.core.outcome import Source, calibration_update, drift_report, estimate, status_change, window_report
+from agent.core.positions import FOUND_WITHIN_S, FoundPositions
+from agent.core.schedule import Piece, ToldTimes
+from agent.core.stream import DeviceStream
+from agent.core.windows import MARGIN_S, Found, refused, windows_in
+from calib.excitation.placing import Placed
+from calib.model import Pose, Window
+from calib.signal.timing import HORIZON_S
+from hw.block import SampleBlock
+
+REFUSED_IN_A_ROW = 3
+LAG_TURNS = 4  # a lag is found, taken out, looked for again: each turn leaves a thousandth
+# A run that begins long after the one before ended: more is a clock that was wrong, and everything has wandered anyway.
+LONGEST_PAUSE_DAYS = 3650.0
+
+
+class ChannelState:
+    """All that is known of one channel; changes with events only.
+
+    The first status comes with the first news of the sensor. `kept` states are by the identity of a device: one that
+    was there before goes on where it was.
+    """
+
+    def __init__(self, channel: Channel) -> None:
+        self._channel = channel
+        self.sensor = channel.sensor
+        self.identity = ""
+        self._origin_ns = 0
+        self._streams: dict[str, DeviceStream] = {}
+        self._unit = ""
+        self._nominal: float | None = None  # sensitivity by the device's own data sheet
+        self._reference = ""  # identity
+        self._not_certified = ""  # why the certificate is not the reference's
+        self._estimation: Estimation | None = None
+        self._in_force: CalibrationUpdate | None = None
+        self._kept: dict[str, bytes] = {}
+        self._first_day = 0.0  # in the estimation's own count, at the run's origin
+        self._status = ""  # nothing said yet
+        self._finder = FoundPositions(channel) if channel.positions else None
+        self._places = self._finder or ToldTimes(channel)
+        self._refused = 0  # windows in a row
+        self._now_ns = 0  # monotonic and UTC of the newest event that carried both
+        self._utc_minus_monotonic_ns = 0
+
+    def begin(self, origin_ns: int, kept: Mapping[str, bytes]) -> None:
+        """A new run: seconds count from `origin_ns`; `kept` (`memory`) waits for sensors of those identities."""
+        self._origin_ns = origin_ns
+        self._now_ns = origin_ns
+        self._kept = dict(kept)
+        for name in self._devices():
+            self._streams[name] = DeviceStream(origin_ns, self._horizon_s)
+
+    # --- events
+
+    def on_block(self, block: SampleBlock) -> list[Output]:
+        """A block of the sensor or its reference; others are not this channel's."""
+        if block.device not in self._streams:
+            return []
+        self._clock(block.t_monotonic_ns, block.t_utc_ns)
+        self._streams[block.device].update(block)
+        results: list[Output] = []
+        if block.device == self.sensor and self._estimation is not None:
+            if self._status == "INVALID":
+                self._estimation.gate.regain("")
+                results += self._say_status(f"{self.sensor} speaks again")
+            if self._finder is not None:
+                self._finder.update(block, self._streams[self.sensor], self._estimation.recursion.scale)
+            results += self._corrected(block, self._estimation)
+        return results + list(self._close_windows())
+
+    def on_tick(self, tick: Tick) -> list[Result]:
+        """Time passed: late windows are refused, a silent sensor turns the status INVALID."""
+        self._clock(tick.t_monotonic_ns, tick.t_utc_ns)
+        return list(self._close_windows()) + self._watch_silence()
+
+    def on_device(self, change: DeviceChange) -> list[Result]:
+        """A device of this channel was opened or lost."""
+        if change.device not in self._streams:
+            return []
+        self._clock(change.t_monotonic_ns, change.t_utc_ns)
+        if change.state == "lost":
+            if change.device != self.sensor:
+                return [self._told(f"the reference {change.device} is lost, nothing is updated: {change.message}")]
+            return self._lose(f"{self.sensor} is lost: {change.message}")
+        if change.device == self.sensor:
+            return self._identify(change.info_json)
+        return self._identify_reference(change.info_json)
+
+    def on_command(self, command: Command) -> list[Result]:
+        """An operator's word; what was refused before it came here changes nothing."""
+        if command.sensor != self.sensor or command.refused:
+            return []
+        self._clock(command.t_monotonic_ns, command.t_utc_ns)
+        if self._estimation is None:
+            return [self._told(f"{command.verb} refused: {self.sensor} was never there")]
+        try:
+            if command.verb == "pose":
+                return self._turn(commanded_pose(command, self._channel))
+            said = answer(command, self._estimation, self.identity)
+        except CommandError as error:
+            return [self._told(f"{command.verb} refused: {error}")]
+        if said.refused:
+            return [self._told(f"{command.verb} refused: {said.refused}")]
+        results: list[Result] = [self._put_in_force()] if said.calibration is not None else []
+        return [*results, *(self._say_status(said.reason) or [self._told(said.reason)])]
+
+    # --- time and identity
+
+    def _devices(self) -> list[str]:
+        return [self.sensor] + ([self._channel.reference] if self._channel.reference else [])
+
+    @property
+    def _horizon_s(self) -> float:
+        return max(HORIZON_S, self._channel.window_s + 2.0 * MARGIN_S + (FOUND_WITHIN_S if self._finder else 0.0))
+
+    def _clock(self, t_monotonic_ns: int, t_utc_ns: int) -> None:
+        # Blocks of two devices may arrive out of order by a read; time here never goes back.
+        if t_monotonic_ns >= self._now_ns:
+            self._now_ns = t_monotonic_ns
+            self._utc_minus_monotonic_ns = t_utc_ns - t_monotonic_ns
+
+    def _utc_ns(self) -> int:
+        return self._now_ns + self._utc_minus_monotonic_ns
+
+    def _now_s(self) -> float:
+        return (self._now_ns - self._origin_ns) * 1e-9
+
+    def _source(self) -> Source:
+        return Source(self.sensor, self.identity, self._unit, self._utc_ns())
+
+    def _identify(self, info_json: str) -> list[Result]:
+        info, identity = json.loads(info_json), identity_of(info_json)
+        reason = f"{self.sensor} opened"
+        results: list[Result] = []
+        if self._estimation is None or identity != self.identity:
+            if self._estimation is not None:
+                self._kept = shelved(self._kept, self.identity, self.memory())
+                self._streams[self.sensor].clear()  # samples of the device before are nothing to this one
+                if self._finder is not None:
+                    self._finder.forget()
+                reason = f"{self.sensor} is now {identity}, was {self.identity}"
+            elif self._kept and identity not in self._kept:
+                reason = f"the calibration kept belongs to {', '.join(sorted(self._kept))}, this is {identity}"
+            self.identity, self._unit, self._in_force = identity, info["unit"], None
+            self._status = "" if self._status == "INVALID" else self._status  # the one that was silent is another
+            try:
+                self._nominal = nominal_of(info)
+                self._estimation = Estimation(self._channel, self._nominal)
+            except ValueError as error:
+                self._estimation = None
+                return self._change("INVALID", str(error))
+            if identity in self._kept:
+                results, reason = self._remember(self._kept.pop(identity))
+        if self._status == "INVALID":
+            # A port that opens is no sensor that speaks: one that was INVALID stays so until a block comes.
+            self._estimation.gate.lose("")
+        return results + self._say_status(reason)
+
+    def _identify_reference(self, info_json: str) -> list[Result]:
+        before, self._reference = self._reference, identity_of(info_json)
+        self._not_certified = not_certified(info_json, self._channel.certificate)
+        if not before or before == self._reference:
+            return [self._told(f"nothing is updated: {self._not_certified}")] if self._not_certified else []
+        assert self._channel.reference is not None
+        self._streams[self._channel.reference].clear()
+        if self._estimation is not None:
+            self._estimation.forget_reference()
+        reason = self._not_certified or f"the reference is now {self._reference}, was {before}"
+        return self._say_status(reason) or [self._told(reason)]
+
+    def _lose(self, reason: str) -> list[Result]:
+        if self._estimation is not None:
+            self._estimation.gate.lose(reason)
+        return self._change("INVALID", reason)
+
+    def _watch_silence(self) -> list[Result]:
+        newest_s = self._streams[self.sensor].newest_arrival_s
+        silent_s = self._now_s() - (newest_s if newest_s is not None else 0.0)
+        if silent_s <= self._channel.silence_s:
+            return []
+        return self._lose(f"no block of {self.sensor} for more than {self._channel.silence_s:g} s")
+
+    def _say_status(self, reason: str) -> list[Result]:
+        return [] if self._estimation is None else self._change(self._estimation.gate.status, reason)
+
+    def _change(self, status: str, reason: str) -> list[Result]:
+        if status == self._status:
+            return []
+        before, self._status = self._status, status
+        return [status_change(self._source(), status, before, reason)]
+
+    def _told(self, reason: str) -> Result:
+        return status_change(self._source(), self._status or "UNCALIBRATED", self._status, reason)
+
+    def _corrected(self, block: SampleBlock, estimation: Estimation) -> list[Acceleration]:
+        if self._channel.acceleration == "off":
+            return []
+        found = acceleration_block(
+            block, self._streams[self.sensor], self._origin_ns + self._utc_minus_monotonic_ns,
+            estimation.law, estimation.residual_sd, self._in_force,
+            dynamic_only=self._channel.coupling == "ac", recorded=self._channel.acceleration == "record",
+        )  # fmt: skip
+        return [] if found is None else [found]
+
+    # --- windows
+
+    def _turn(self, pose: Pose) -> list[Result]:
+        first_s = self._streams[self.sensor].first_sample_s
+        self._places.turn(0.0 if first_s is None else self._now_s() - first_s, pose)
+        return [self._told(f"stands at {pose.position} from now on")]
+
+    def _close_windows(self) -> Iterator[Result]:
+        first_s = self._streams[self.sensor].first_sample_s
+        while (piece := self._places.piece) is not None and first_s is not None and self._due(piece, first_s):
+            yield from self._estimate(piece, first_s)
+            self._places.done(piece)
+        keep_from_s = self._now_s() - 2.0 * MARGIN_S
+        if first_s is not None:
+            keep_from_s = min(keep_from_s, first_s + self._places.keep_from_s - 2.0 * MARGIN_S)
+        for stream in self._streams.values():
+            stream.forget_before(keep_from_s)
+
+    def _due(self, piece: Piece, first_s: float) -> bool:
+        """All samples of the piece are there, or they are later than anybody waits for."""
+        end_s = first_s + piece.stop_s + MARGIN_S
+        if self._now_s() > end_s + self._channel.late_horizon_s:
+            return True
+        return all(stream.reaches(end_s) for stream in self._streams.values())
+
+    def _estimate(self, piece: Piece, first_s: float) -> Iterator[Result]:
+        try:
+            yield from self._windows(piece, first_s)
+        except (ArithmeticError, ValueError) as error:  # LinAlgError is one: of samples such as 1e200
+            reason = f"these samples cannot be reckoned with: {error}"
+            yield from self._refuse(refused(piece, reason), reason)
+
+    def _windows(self, piece: Piece, first_s: float) -> Iterator[Result]:
+        day = self._first_day + (first_s + piece.stop_s) / DAY_S
+        placed = self._placed(piece, first_s, day)
+        if placed.pose is None or self._not_certified:
+            found, lag_s = Found([refused(piece, self._not_certified or placed.reason)]), 0.0
+        else:
+            found, lag_s = self._found(replace(piece, pose=placed.pose), first_s, day)
+        found = found.told(placed.numbers)
+        for window in found.windows:
+            if not window.used or self._estimation is None:
+                yield from self._refuse(window, window.reason or f"{self.sensor} was never opened")
+                continue
+            self._refused = 0
+            judged = self._estimation.judge(window, day, lag_s, found.temperature_degc)
+            yield from self._results(window, judged, lag_s)
+
+    def _placed(self, piece: Piece, first_s: float, day: float) -> Placed:
+        """How the sensor stands in the piece, where nobody told."""
+        if self._finder is None or self._estimation is None:
+            return Placed(piece.pose, "", {})
+        cut = self._streams[self.sensor].cut(first_s + piece.start_s, first_s + piece.stop_s)
+        return self._finder.place(piece, cut, self._estimation.recursion, day)
+
+    def _refuse(self, window: Window, reason: str) -> Iterator[Result]:
+        """Of several in a row the status, though it stands, says why nothing is updated."""
+        yield window_report(self._source(), window, used=False, reason=reason, numbers={})
+        self._refused += 1
+        if self._refused == REFUSED_IN_A_ROW:
+            yield self._told(f"nothing is updated: {reason}")
+
+    def _found(self, piece: Piece, first_s: float, day: float) -> tuple[Found, float]:
+        """The windows, made again until no lag is left in them that matters."""
+        lag_s = 0.0 if self._estimation is None else self._estimation.lag_s
+        for turn in range(LAG_TURNS):
+            found = windows_in(piece, first_s, self._channel, self._streams, lag_s)
+            used = [w for w in found.windows if w.used]
+            if self._estimation is None or not used or self._channel.reference is None:
+                break
+            better_s = self._estimation.lag_after(used, day, lag_s, found.temperature_degc)
+            if better_s == lag_s or turn == LAG_TURNS - 1:
+                break
+            lag_s = better_s
+        return found, lag_s
+
+    def _results(self, window: Window, judged: Judged, lag_s: float) -> Iterator[Result]:
+        assert self._estimation is not None
+        decision, source = judged.decision, self._source()
+        used = decision.action in ("take", "adopt")
+        numbers = {**decision.numbers, "lag_applied_s": lag_s}
+        yield window_report(source, window, used=used, reason="" if used else decision.reason, numbers=numbers)
+        origin_utc_ns = self._utc_ns() - round((self._first_day * DAY_S + self._now_s()) * 1e9)
+        for verdict in judged.drift:
+            yield drift_report(source, verdict, self._channel.drift.false_alarms_a_year, origin_utc_ns)
+        if decision.proposal is not None:
+            update = calibration_update(source, decision.proposal, self._estimation.recursion)
+            yield estimate(source, decision.reason, update)
+        if decision.in_force:
+            yield self._put_in_force()
+        yield from self._say_status(decision.reason)
+
+    def _put_in_force(self) -> CalibrationUpdate:
+        assert self._estimation is not None
+        self._in_force = calibration_update(self._source(), self._estimation.in_force, self._estimation.recursion)
+        return self._in_force
+
+    def number(self, results: Sequence[Result]) -> None:
+        """The results as they leave, with their numbers: what is in force and what waits is known by them."""
+        for result in results:
+            if isinstance(result, CalibrationUpdate):
+                self._in_force = result
+            elif isinstance(result, Estimate) and self._estimation is not None:
+                self._estimation.gate.published(result.sequence)
+
+    # --- state
+
+    @property
+    def known(self) -> bool:
+        """Whether there is a device with anything to remember."""
+        return self._estimation is not None
+
+    def memory(self) -> bytes:
+        """What outlives a run, of the device that is there now."""
+        assert self._estimation is not None
+        day = self._first_day + self._now_s() / DAY_S
+        return keep(self._channel, self._estimation, self._in_force, self._reference, day, self._utc_ns())
+
+    def memories(self) -> dict[str, bytes]:
+        """`memory` by identity, of the device that is there now and of those that were there before."""
+        taught = self._estimation is not None and (self._estimation.recursion.windows or self._in_force is not None)
+        return self._kept | ({self.identity: self.memory()} if taught else {})
+
+    def _remember(self, memory: bytes) -> tuple[list[Result], str]:
+        kept = take_up(memory, self._channel, self._nominal)
+        self._estimation = kept.estimation
+        self._estimation.gate.regain("")
+        if self._reference and kept.reference and kept.reference != self._reference:
+            self._estimation.forget_reference()
+        self._reference = self._reference or kept.reference
+        pause_days = (self._utc_ns() - kept.t_utc_ns) * 1e-9 / DAY_S
+        pause_days = pause_days if 0.0 <= pause_days <= LONGEST_PAUSE_DAYS else 0.0
+        self._first_day = kept.day + pause_days - self._now_s() / DAY_S
+        if kept.in_force is None:
+            return [], kept.reason
+        self._in_force = msgspec.structs.replace(kept.in_force, t_utc_ns=self._utc_ns())
+        return [self._in_force], kept.reason
+
+    def snapshot(self) -> dict[str, Any]:
+        """State for `load`, bit-exact."""
+        return {
+            "origin_ns": self._origin_ns,
+            "streams": {name: stream.snapshot() for name, stream in self._streams.items()},
+            "unit": self._unit,
+            "identity": self.identity,
+            "reference": self._reference,
+            "not_certified": self._not_certified,
+            "nominal": self._nominal,
+            "estimation": None if self._estimation is None else self._estimation.snapshot(),
+            "in_force": plain(self._in_force),
+            "kept": dict(self._kept),
+            "first_day": self._first_day,
+            "status": self._status,
+            "places": self._places.snapshot(),
+            "refused": self._refused,
+            "now_ns": self._now_ns,
+            "utc_minus_monotonic_ns": self._utc_minus_monotonic_ns,
+        }
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        """Take the state that `snapshot` gave."""
+        self._origin_ns = state["origin_ns"]
+        self._streams = {
+            n: DeviceStream.restore(self._origin_ns, s, self._horizon_s) for n, s in state["streams"].items()
+        }
+        self._unit, self.identity, self._reference = state["unit"], state["identity"], state["reference"]
+        self._not_certified = state["not_certified"]
+        self._nominal, self._estimation = state["nominal"], None
+        if state["estimation"] is not None:
+            self._estimation = Estimation(self._channel, self._nominal)
+            self._estimation.load(state["estimation"])
+        self._in_force = update_of(state["in_force"])
+        self._kept = dict(state["kept"])
+        self._first_day, self._status = state["first_day"], state["status"]
+        self._places.load(state["places"])
+        self._refused = state["refused"]
+        self._now_ns = state["now_ns"]
+        self._utc_minus_monotonic_ns = state["utc_minus_monotonic_ns"]

@@ -1,0 +1,239 @@
+"""One sensor's S and Q on-line: recursion, gate and drift test, window by window (method: recursion, acceptance)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from agent.config import Channel
+from agent.config.gate import GateSettings
+from agent.core.gate import Decision, Evidence, Gate
+from calib.distributions import chi2_quantile
+from calib.estimate.correction import Law
+from calib.estimate.drift import DriftTest, DriftVerdict
+from calib.estimate.innovation import Innovation
+from calib.estimate.recursion import Recursion
+from calib.estimate.window_rows import Summary
+from calib.model import PARAMETERS, Array, Calibration, Window, WindowSums
+
+DAY_S = 86400.0
+# Of a lag that a window still has: (omega lag)^3 / 6 is what the equations' own second order leaves of it.
+PHASE_LEFT = 1e-5
+# A jump that is being confirmed may be of any size up to what an operator would hardly accept: 10 % of S, and in the
+# offset two m/s2, which is a mount that leans by 12 deg.
+JUMP_SENSITIVITY = 0.1
+JUMP_OFFSET_MPS2 = 2.0
+STANDARD_GRAVITY_MPS2 = 9.80665
+MAX_CHANGE_OFFSET_MPS2 = 0.5  # as much as a mount that leans by 3 deg
+FIXED_MOUNT_LEAST = 4  # parameters: three of Q, and one of S; without turning, all twelve may never be
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Judged:
+    """What became of a window: the gate's decision, the innovation, and drift verdicts that changed."""
+
+    decision: Decision
+    innovation: Innovation
+    drift: Sequence[DriftVerdict]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tried:
+    """A window tried on the state: what it says, and the recursion that has taken it."""
+
+    window_sums: WindowSums
+    summary: Summary
+    innovation: Innovation
+    after: Recursion
+
+
+class Estimation:
+    """The state, what is in force and what is kept aside. `judge` and the operator's verbs change it."""
+
+    def __init__(self, channel: Channel, nominal: float | None) -> None:
+        """`nominal` is the device's own sensitivity by its data sheet.
+
+        Raises ValueError where nothing tells a sensitivity to begin with.
+        """
+        self._channel = channel
+        mean = channel.prior.mean(nominal)
+        u = channel.prior.standard_uncertainty(mean)
+        fixed = channel.fixed_mount
+        self.recursion = Recursion(
+            mean, u, channel.priors(fixed_mount=fixed), channel.wander(), channel.temperature_model(), fixed=fixed
+        )
+        self.in_force, self.law = self.recursion.result(), self.recursion.law()
+        self.residual_sd = self.recursion.residual_sd
+        self.gate = Gate(_limits(channel, self.recursion.scale), self.in_force)
+        self.drift = DriftTest(channel.drift.settings())
+        self._held: list[Summary] = []
+        self._tried: Tried | None = None  # what `lag_after` did, for `judge` right after it
+
+    @property
+    def lag_s(self) -> float:
+        """By which the sensor's indications come after the reference's, as far as known."""
+        return self.recursion.lag_s if "lag" in self.recursion.names else -self._channel.certificate.lag_s
+
+    def lag_after(self, windows: Sequence[Window], day: float, lag_s: float, temperature_degc: float) -> float:
+        """The lag once these windows were taken, or `lag_s` where they leave too little of it to matter."""
+        self._tried = self._try(windows[0], day, lag_s, temperature_degc)
+        trial = self._tried.after
+        for window in windows[1:]:
+            _, trial = trial.with_window(Summary.of(window, day, lag_s, temperature_degc))
+        left = trial.lag_s - lag_s
+        return trial.lag_s if abs(largest_omega(windows) * left) ** 3 / 6.0 > PHASE_LEFT else lag_s
+
+    def judge(self, window: Window, day: float, lag_s: float, temperature_degc: float) -> Judged:
+        """Take, keep aside or refuse one used window."""
+        tried, self._tried = self._tried, None
+        if tried is None or tried.window_sums is not window.sums or tried.summary.lag_s != lag_s:
+            tried = self._try(window, day, lag_s, temperature_degc)
+        summary, innovation, trial = tried.summary, tried.innovation, tried.after
+        candidate = trial.result()
+        confirm = self._channel.gate.confirm_windows
+        held = [*self._held, summary][-confirm:]
+        adopted = self._adopted(held) if len(held) == confirm else None
+        evidence = Evidence(day * DAY_S, innovation.statistic, innovation.degrees_of_freedom)
+        decision = self.gate.judge(evidence, candidate, None if adopted is None else adopted.result())
+        if decision.action == "take":
+            self.recursion = trial
+        elif decision.action == "adopt":
+            assert adopted is not None
+            self.recursion = adopted
+            self.drift.restart(innovation.information > 0.0)
+        kept = held if decision.action == "hold" else self._held
+        self._held = kept[-self.gate.held :] if self.gate.held else []
+        drift: Sequence[DriftVerdict] = ()
+        if decision.action in ("take", "hold"):
+            drift = self.drift.update(day * DAY_S, innovation.score, innovation.information)
+            if not self.gate.held:  # else it is for windows that agree to confirm it
+                self._follow()
+        if decision.in_force:
+            self.in_force, self.law = self.recursion.result(), self.recursion.law()
+            self.residual_sd = self.recursion.residual_sd
+        if decision.action == "hold":
+            decision = replace(decision, reason=f"{decision.reason}; {_most(innovation, self.recursion.scale)}")
+        return Judged(decision, innovation, drift)
+
+    def _try(self, window: Window, day: float, lag_s: float, temperature_degc: float) -> Tried:
+        summary = Summary.of(window, day, lag_s, temperature_degc)
+        return Tried(window.sums, summary, *self.recursion.with_window(summary))
+
+    def put(self, calibration: Calibration) -> None:
+        """An operator put this in force: the state goes on from it, unless it is there anyway."""
+        now = self.recursion.result()
+        if not (
+            np.array_equal(now.sensitivity, calibration.sensitivity) and np.array_equal(now.offset, calibration.offset)
+        ):
+            self.recursion.put(calibration)
+            self.drift.restart(np.ones(12, dtype=bool))
+        # How S and Q go with temperature is the state's as before.
+        self.in_force, self.law = calibration, replace(self.recursion.law(), determined=calibration.determined)
+        self._held = []
+
+    def forget_reference(self) -> None:
+        """Another reference stands there: neither its error nor windows kept aside are of the one before."""
+        self.recursion.forget_reference()
+        self.gate.dismiss()
+        self._held = []
+
+    def _follow(self) -> None:
+        """A step so small that each window alone was consistent: the state may follow it."""
+        loose = np.zeros(12)
+        for k, verdict in enumerate(self.drift.result()):
+            if verdict.verdict == "stepped" and verdict.statistic > verdict.threshold:
+                loose[k] = abs(verdict.change)
+        if loose.any():
+            self.recursion.loosen(loose, self._tilt_rad(loose[9:]))
+            self.drift.restart(loose > 0.0)
+
+    def _adopted(self, held: Sequence[Summary]) -> Recursion | None:
+        """Where the windows kept aside lead if something jumped before them; None where they do not agree."""
+        first = self._jumped(held, 0.0)
+        if first is None:
+            return None
+        before, after = self.recursion.result(), first.result()
+        moved = np.abs(after.offset - before.offset)
+        significant = moved > 3.0 * np.hypot(after.standard_uncertainty[9:], 0.0)
+        return self._jumped(held, self._tilt_rad(np.where(significant, moved, 0.0)))
+
+    def _jumped(self, held: Sequence[Summary], tilt_rad: float) -> Recursion | None:
+        trial = self.recursion.copy()
+        # A line that was plugged anew may be late by another time; that is no change of S or Q.
+        trial.loosen(self._jump(held), tilt_rad, lag=True)
+        for k, summary in enumerate(held):
+            told = trial.innovation(summary)
+            limit = chi2_quantile(1.0 - self._channel.gate.false_holds, told.degrees_of_freedom)
+            if k and told.statistic > limit:
+                return None
+            trial.update(summary)
+        return trial
+
+    def _jump(self, held: Sequence[Summary]) -> Array:
+        """(12,) how far S and Q may have jumped: only what these windows tell of, so that no other column moves."""
+        scale = self.recursion.scale
+        told = np.any([self.recursion.innovation(summary).information > 0.0 for summary in held], axis=0)
+        size = np.append(np.full(9, JUMP_SENSITIVITY), np.full(3, JUMP_OFFSET_MPS2)) * scale
+        return np.where(told, size, 0.0)
+
+    def _tilt_rad(self, offset: Array) -> float:
+        """The tilt of the mount that would move the mean output as much: the data cannot tell it from an offset."""
+        return float(np.abs(offset).max(initial=0.0) / (self.recursion.scale * STANDARD_GRAVITY_MPS2))
+
+    # --- state
+
+    def snapshot(self) -> dict[str, Any]:
+        """State for `load`, bit-exact."""
+        return {
+            "recursion": self.recursion.snapshot(),
+            "gate": self.gate.snapshot(),
+            "drift": self.drift.snapshot(),
+            "held": [summary.snapshot() for summary in self._held],
+            "in_force": {name: getattr(self.in_force, name) for name in Calibration.__slots__},
+            "law": {name: getattr(self.law, name) for name in Law.__slots__},
+            "residual_sd": self.residual_sd,
+        }
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Take the state that `snapshot` gave."""
+        self.recursion.load(state["recursion"])
+        self.gate.load(state["gate"])
+        self.drift.load(state["drift"])
+        self._held = [Summary.load(summary) for summary in state["held"]]
+        self.in_force, self.law = Calibration(**state["in_force"]), Law(**state["law"])
+        self.residual_sd = np.array(state["residual_sd"])
+
+
+def _limits(channel: Channel, scale: float) -> GateSettings:
+    """The gate's settings with what they leave open: a jump of the offset, and how much a first calibration needs."""
+    given = channel.gate
+    filled: dict[str, float] = {}
+    if given.max_change_offset is None:
+        filled["max_change_offset"] = MAX_CHANGE_OFFSET_MPS2 * scale
+    if given.least_determined is None:
+        filled["least_determined"] = FIXED_MOUNT_LEAST if channel.fixed_mount else len(PARAMETERS)
+    return given.model_copy(update=filled)
+
+
+def _most(innovation: Innovation, scale: float) -> str:
+    """The parameter that a window contradicts most, if it alone had changed."""
+    size = np.abs(np.nan_to_num(innovation.score))
+    p = int(np.argmax(size))
+    if size[p] == 0.0:
+        return "no single parameter explains it"
+    change = innovation.score[p] / np.sqrt(innovation.information[p]) / scale
+    told = f"{change:+.3g} m/s2" if p >= 9 else f"{100.0 * change:+.3g} %"
+    return f"most of {PARAMETERS[p]}, as if it were off by {told} ({size[p]:.1f} standard deviations)"
+
+
+def largest_omega(windows: Sequence[Window]) -> float:
+    """Largest angular frequency (rad/s) that any window's power stands for; 0 at rest."""
+    largest = 0.0
+    for window in windows:
+        m, power = window.sums.reference_channels, np.diag(window.sums.scatter.sum(axis=0))
+        if m and power[:m].sum() > 0.0:
+            largest = max(largest, float(np.sqrt(power[m : 2 * m].sum() / power[:m].sum())))
+    return largest

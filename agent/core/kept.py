@@ -1,0 +1,123 @@
+"""What of one device outlives a run, and what a later run makes of it.
+
+A state holds only for what it was made with. Where the configuration states something else since, or another version
+of the program wrote it, the estimation begins anew: from the calibration in force, or from the prior if that is new.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+
+from agent.config import Channel
+from agent.core.estimation import Estimation
+from agent.core.events import CalibrationUpdate
+from agent.core.memory import MOST_MEMORIES
+from agent.core.outcome import calibration_of
+from agent.core.snapshot import pack, unpack
+
+# What the numbers of a state mean; how fast they may wander and when they are believed may change at any time.
+BASIS = frozenset(
+    {"prior", "certificate", "uncertainty", "temperature", "coupling", "gravity_mps2", "static_sign"}
+    | {"rotation", "rotation_gravity_mps2"}
+)
+MALFORMED = (ValueError, KeyError, TypeError, AttributeError, IndexError)  # a state of other fields or shapes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Kept:
+    """An estimation as a later run takes it up; `in_force` None: nothing was. `reason` tells what was made of it.
+
+    `reference` is the identity of the reference that it was made with, `day` its own count when it was kept.
+    """
+
+    estimation: Estimation
+    in_force: CalibrationUpdate | None
+    reference: str
+    day: float
+    t_utc_ns: int
+    reason: str
+
+
+def keep(
+    channel: Channel,
+    estimation: Estimation,
+    in_force: CalibrationUpdate | None,
+    reference: str,
+    day: float,
+    t_utc_ns: int,
+) -> bytes:
+    """All that `take_up` needs."""
+    return pack(
+        {
+            "in_force": plain(in_force),
+            "basis": _basis(channel),
+            "estimation": estimation.snapshot(),
+            "reference": reference,
+            "day": day,
+            "t_utc_ns": t_utc_ns,
+        }
+    )
+
+
+def take_up(kept: bytes, channel: Channel, nominal: float | None) -> Kept:
+    """The estimation that `keep` took, as far as it still holds. Raises ValueError as Estimation does."""
+    fresh = Estimation(channel, nominal)
+    try:
+        state = unpack(kept)
+        in_force, day, t_utc_ns = update_of(state["in_force"]), float(state["day"]), int(state["t_utc_ns"])
+    except MALFORMED as error:
+        return Kept(fresh, None, "", 0.0, 0, f"begun anew: what was kept cannot be read: {_said(error)}")
+    try:
+        changed = _changed(state["basis"], _basis(channel))
+        reference = str(state["reference"])
+        if not changed:
+            fresh.load(state["estimation"])
+            return Kept(fresh, in_force, reference, day, t_utc_ns, "restored from the run before")
+        why = f"the configuration has another {', '.join(changed)}"
+    except MALFORMED as error:
+        changed, reference, why = [], "", f"its state cannot be read: {_said(error)}"
+    fresh = Estimation(channel, nominal)
+    if in_force is None or "prior" in changed:
+        return Kept(fresh, None, reference, day, t_utc_ns, f"begun anew from the prior: {why}")
+    try:
+        fresh.gate.load(state["estimation"]["gate"])  # an operator's hold, and what changes are counted from
+    except MALFORMED:
+        refused = fresh.gate.rollback(calibration_of(in_force), "").refused
+        fresh.gate.release("")
+        if refused:
+            return Kept(Estimation(channel, nominal), None, reference, day, t_utc_ns, f"begun anew: {why}; {refused}")
+    fresh.put(calibration_of(in_force))
+    return Kept(fresh, in_force, reference, day, t_utc_ns, f"begun anew from the calibration in force: {why}")
+
+
+def shelved(kept: Mapping[str, bytes], identity: str, memory: bytes) -> dict[str, bytes]:
+    """With what is kept of one more device; the one that was here longest ago goes."""
+    newest = {name: state for name, state in kept.items() if name != identity} | {identity: memory}
+    return dict(list(newest.items())[-MOST_MEMORIES:])
+
+
+def plain(update: CalibrationUpdate | None) -> dict[str, Any] | None:
+    """As a snapshot can hold it."""
+    return None if update is None else msgspec.structs.asdict(update)
+
+
+def update_of(state: dict[str, Any] | None) -> CalibrationUpdate | None:
+    """What `plain` took."""
+    return None if state is None else CalibrationUpdate(**state)
+
+
+def _basis(channel: Channel) -> dict[str, str]:
+    whole = channel.model_dump(mode="json", include=set(BASIS)) | {"fixed_mount": channel.fixed_mount}
+    return {name: msgspec.json.encode(value, order="deterministic").decode() for name, value in whole.items()}
+
+
+def _changed(before: dict[str, str], now: dict[str, str]) -> list[str]:
+    return sorted(name for name in before.keys() | now.keys() if before.get(name) != now.get(name))
+
+
+def _said(error: Exception) -> str:
+    return str(error).splitlines()[0] if str(error) else type(error).__name__

@@ -1,0 +1,98 @@
+"""What an estimation found, as results."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from agent.core.events import CalibrationUpdate, DriftReport, Estimate, StatusChange, WindowReport
+from calib.estimate.drift import DriftVerdict
+from calib.estimate.recursion import Recursion
+from calib.estimate.wander import MAIN_TEMPERATURE, RATES, offset_temperature
+from calib.model import Array, Calibration, Window
+
+UNCERTAINTY = "combined"
+MOST_TEMPERATURE_ORDER = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Whose results these are, and when they are made; run and sequence are given by the pipeline."""
+
+    sensor: str
+    identity: str
+    output_unit: str
+    t_utc_ns: int
+
+
+def calibration_update(source: Source, calibration: Calibration, recursion: Recursion) -> CalibrationUpdate:
+    """S and Q with all that belongs to them: temperature, drift, how many windows."""
+    powers = [k for k in range(1, MOST_TEMPERATURE_ORDER + 1) if offset_temperature(k)[0] in recursion.names]
+    by_power = [_both(recursion, offset_temperature(k)) for k in powers]
+    S_temperature = _both(recursion, MAIN_TEMPERATURE) if MAIN_TEMPERATURE[0] in recursion.names else ([], [])
+    rate, u_rate = _both(recursion, RATES)
+    low, high = recursion.temperature_range_degc
+    return CalibrationUpdate(
+        run_id="", sequence=0, sensor=source.sensor, t_utc_ns=source.t_utc_ns,
+        sensitivity=calibration.sensitivity.tolist(), offset=calibration.offset.tolist(),
+        standard_uncertainty=calibration.standard_uncertainty.tolist(), covariance=calibration.covariance.tolist(),
+        coverage_factor=recursion.coverage_factor, determined=calibration.determined.tolist(),
+        method=calibration.method, uncertainty_kind=UNCERTAINTY, windows=recursion.windows,
+        residual_sd=recursion.residual_sd.tolist(), output_unit=source.output_unit, identity=source.identity,
+        reference_temperature_degc=recursion.reference_temperature_degc,
+        temperature_low_degc=low, temperature_high_degc=high,
+        offset_temperature=[value for value, _ in by_power], u_offset_temperature=[u for _, u in by_power],
+        sensitivity_temperature=S_temperature[0], u_sensitivity_temperature=S_temperature[1],
+        offset_rate=rate, u_offset_rate=u_rate,
+    )  # fmt: skip
+
+
+def calibration_of(update: CalibrationUpdate) -> Calibration:
+    """What `calibration_update` was made of."""
+    return Calibration(
+        np.array(update.sensitivity), np.array(update.offset), np.array(update.covariance),
+        np.array(update.determined, dtype=bool), np.inf, update.method,
+    )  # fmt: skip
+
+
+def estimate(source: Source, reason: str, update: CalibrationUpdate) -> Estimate:
+    """A proposal that waits for an operator."""
+    return Estimate(
+        run_id="", sequence=0, sensor=source.sensor, t_utc_ns=source.t_utc_ns, reason=reason, calibration=update
+    )
+
+
+def drift_report(source: Source, verdict: DriftVerdict, false_alarms_a_year: float, origin_utc_ns: int) -> DriftReport:
+    """A verdict of the sequential test, its onset in UTC."""
+    onset = round(verdict.onset_s * 1e9) + origin_utc_ns if np.isfinite(verdict.onset_s) else 0
+    return DriftReport(
+        run_id="", sequence=0, sensor=source.sensor, t_utc_ns=source.t_utc_ns, parameter=verdict.parameter,
+        verdict=verdict.verdict, change=verdict.change, u_change=verdict.u_change, rate=verdict.rate,
+        u_rate=verdict.u_rate, onset_utc_ns=onset, statistic=verdict.statistic, threshold=verdict.threshold,
+        false_alarms_a_year=false_alarms_a_year, reason=verdict.reason,
+    )  # fmt: skip
+
+
+def window_report(
+    source: Source, window: Window, *, used: bool, reason: str, numbers: dict[str, float]
+) -> WindowReport:
+    """The verdict on a window, the gate's numbers after the excitation's."""
+    return WindowReport(
+        run_id="", sequence=0, sensor=source.sensor, t_utc_ns=source.t_utc_ns, start_s=window.start_s,
+        stop_s=window.stop_s, position=window.pose.position, used=used, reason=reason, points=window.points,
+        left_out=window.left_out, numbers={**window.numbers, **numbers},
+    )  # fmt: skip
+
+
+def status_change(source: Source, status: str, before: str, reason: str) -> StatusChange:
+    """A change of status, or why a command changed nothing."""
+    return StatusChange(
+        run_id="", sequence=0, sensor=source.sensor, t_utc_ns=source.t_utc_ns,
+        status=status, before=before, reason=reason,  # type: ignore[arg-type]
+    )  # fmt: skip
+
+
+def _both(recursion: Recursion, names: tuple[str, str, str]) -> tuple[list[float], list[float]]:
+    found: Array = np.array([recursion.quantity(name) for name in names])
+    return found[:, 0].tolist(), found[:, 1].tolist()

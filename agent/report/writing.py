@@ -1,0 +1,50 @@
+"""The files of a report: report.html, report.json and the figures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from agent import __version__
+from agent.delivery.history import Record
+from agent.report.figures import draw
+from agent.report.material import Material
+from agent.report.page import page
+from agent.report.result import plain
+from agent.report.trace import Residuals, residuals
+
+
+def write(material: Material, output: Path) -> None:
+    """Write report.html, report.json and figures/ into `output`, made if need be. Raises OSError."""
+    seen = left_over(material)
+    figures = draw(material, seen[-1] if seen else None, output / "figures")
+    (output / "report.html").write_text(page(material, figures, seen), encoding="utf-8")
+    held = msgspec.json.format(msgspec.json.encode(as_object(material, seen, [drawn.name for drawn in figures])))
+    (output / "report.json").write_bytes(held + b"\n")
+
+
+def left_over(material: Material) -> list[Residuals]:
+    """Residuals of the windows at hand, for the first result; those of which it covers no axis are left out."""
+    seen = [residuals(trace, material.results[0]) for trace in material.traces.values()]
+    return [r for r in seen if np.isfinite(r.rms).any()]
+
+
+def as_object(material: Material, seen: list[Residuals], figures: list[str]) -> dict[str, Any]:
+    """What report.json holds: results as in `fieldcal calibrate --json -`, with their unit."""
+    return {
+        "version": __version__,
+        "sensor": material.sensor,
+        "results": [plain(r.fields) | {"output_unit": r.unit or None} for r in material.results],
+        "history": [Record.of(update, recorded=True, recording="").fields for update in material.history],
+        "residuals": [
+            {"position": r.position, "start_s": plain(r.time_s[0]), "stop_s": plain(r.time_s[-1]), "rms": plain(r.rms)}
+            for r in seen
+        ],
+        "facts": plain(material.facts),
+        "files": material.files,
+        "notices": material.notices,
+        "figures": figures,
+    }

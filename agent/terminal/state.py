@@ -1,0 +1,81 @@
+"""What a run shows to the person at the terminal: the state that the views draw."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal, Protocol
+
+from agent.core.events import CalibrationUpdate, Result, StatusChange, WindowReport
+from calib.model import Array
+
+if TYPE_CHECKING:
+    from agent.delivery.publication import PublicationState
+
+
+class Truth(Protocol):
+    """What a virtual sensor really has: S (3, 3) in output unit per m/s2, Q (3,) in output unit."""
+
+    @property
+    def sensitivity(self) -> Array: ...
+    @property
+    def offset(self) -> Array: ...
+
+
+@dataclass
+class DeviceState:
+    """A device as it is now. `gaps` counts the times samples were lost."""
+
+    kind: str
+    state: Literal["opening", "open", "lost"] = "opening"
+    rate_hz: float = 0.0
+    blocks: int = 0
+    gaps: int = 0
+
+
+@dataclass
+class RecordingState:
+    """The file being written."""
+
+    path: str
+    size_bytes: int
+    recording: bool  # false where the disk refuses
+
+
+@dataclass
+class ViewState:
+    """All that is shown. The agent's main loop changes it and refreshes the view from the same thread."""
+
+    title: str
+    gateway: str
+    uptime_s: float = 0.0
+    devices: dict[str, DeviceState] = field(default_factory=dict)
+    windows: deque[WindowReport] = field(default_factory=lambda: deque(maxlen=100))
+    windows_used: int = 0
+    windows_refused: int = 0
+    calibrations: dict[str, CalibrationUpdate] = field(default_factory=dict)
+    statuses: dict[str, StatusChange] = field(default_factory=dict)
+    truths: dict[str, Truth] = field(default_factory=dict)
+    publication: PublicationState | None = None
+    recording: RecordingState | None = None
+    messages: deque[str] = field(default_factory=lambda: deque(maxlen=50))
+    messages_said: int = 0
+
+    def take(self, results: Iterable[Result]) -> None:
+        """What the pipeline found."""
+        for result in results:
+            match result:
+                case WindowReport():
+                    self.windows.append(result)
+                    self.windows_used += result.used
+                    self.windows_refused += not result.used
+                case CalibrationUpdate():
+                    self.calibrations[result.sensor] = result
+                case StatusChange():
+                    self.statuses[result.sensor] = result
+
+    def say(self, message: str) -> None:
+        """A line for the person who watches."""
+        self.messages.append(message)
+        self.messages_said += 1

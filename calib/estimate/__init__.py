@@ -1,0 +1,1 @@
+"""S, Q and everything else that moves the data, estimated together."""

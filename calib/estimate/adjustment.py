@@ -1,0 +1,169 @@
+"""Method 3 by adjustment: S, Q and the nuisances of all windows together, each nuisance with its stated prior.
+
+With every nuisance fixed it is plain Method 3 (section 2.3). The steps, each a file beside this one: condense
+the windows (condense), solve their equations (equations, gauss_newton), say where the uncertainty comes from (budget)
+and whether the result may be used (verdict).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.distributions import coverage_factor
+from calib.estimate.budget import Budget, budget
+from calib.estimate.condense import Condensed, condense
+from calib.estimate.equations import Equations
+from calib.estimate.gauss_newton import Flags, Solution, slope_residuals, solve
+from calib.estimate.jitter import LagScatter, estimated
+from calib.estimate.nuisances import Applied, Nuisances, Priors
+from calib.estimate.verdict import misfit, nuisance_pull, reasons, turned_windows
+from calib.model import Array, Calibration, Pose, Window
+
+DETERMINED_SHARE = 0.5  # of the prior u, which the data must halve (contract)
+JITTER_TURNS = 3  # the first solution is bent by what it takes for exact; the estimate settles in two
+JITTER_SETTLED = 0.05
+DETERMINED_U = 0.1  # of the largest main sensitivity, where there is no prior (contract)
+
+
+@dataclass(frozen=True, slots=True)
+class Nuisance:
+    """A nuisance after the adjustment, in total with what the front end applied."""
+
+    name: str
+    value: float
+    standard_uncertainty: float
+    prior_uncertainty: float
+    unit: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Adjustment:
+    """What the windows say of S and Q, what that rests on, and whether it may be used.
+
+    `calibration` has NaN where the data do not determine a parameter. `contributions` {source: (12,) standard
+    uncertainties} is the budget. `reasons`: why it is refused, empty if it is not. `rank` of the input vectors, 4 at
+    most. `offset_scatter_mps2`, `slope_scatter` (relative) and `lag_scatter_s`: between windows, as estimated.
+    `misfit`: what S a + Q leaves of the signal. `nuisance_pull`: how far the nuisances moved from what was stated, in
+    standard deviations, worst direction. `mean` (N,) and `covariance` (N, N): joint state of [S, Q, nuisances], nothing
+    blanked.
+    """
+
+    calibration: Calibration
+    nuisances: tuple[Nuisance, ...]
+    contributions: Mapping[str, Array]
+    coverage_factor: float
+    reasons: tuple[str, ...]
+    rank: int
+    chi2: float
+    chi2_degrees_of_freedom: float
+    offset_scatter_mps2: float
+    slope_scatter: float
+    lag_scatter_s: float
+    misfit: float
+    nuisance_pull: float
+    mean: Array
+    covariance: Array
+
+    @property
+    def expanded_uncertainty(self) -> Array:
+        """(12,) for about 95 % coverage."""
+        return self.coverage_factor * self.calibration.standard_uncertainty
+
+    @property
+    def invariant(self) -> Array:
+        """S S' (3, 3): what a rotation of the frame, which leaves no trace in the data, does not change."""
+        return np.asarray(self.calibration.sensitivity @ self.calibration.sensitivity.T)
+
+
+def adjust(
+    windows: Sequence[Window],
+    priors: Priors | None = None,
+    applied: Applied | None = None,
+    quiet: Sequence[Window] = (),
+) -> Adjustment:
+    """Adjust all used windows together; `quiet` ones (see calib.estimate.condense) correct for the reference's noise.
+
+    `applied`: what the front end took out of the data beforehand. Raises ValueError where no window is used.
+    """
+    priors, applied = priors or Priors(), applied or Applied()
+    used = [w for w in windows if w.used]
+    if not used:
+        raise ValueError("no window is used")
+    data = condense(used, quiet)
+    jitter = LagScatter.of(data, priors.lag_window_s)
+    solution = _solution(used, data, priors, applied, jitter)
+    for _ in range(JITTER_TURNS if priors.lag_s > 0.0 else 0):
+        found = estimated(jitter, *slope_residuals(solution), data.type_a.slopes)
+        if found.scatter_s <= (1.0 + JITTER_SETTLED) * jitter.scatter_s:
+            break
+        jitter = found
+        solution = _solution(used, data, priors, applied, jitter)
+    shares = budget(solution, priors.offset_mps2)
+    determined = _determined(solution, shares)
+
+    def turned(static: int, polarity: int) -> Solution:
+        return _solution(turned_windows(used, static, polarity), data, priors, applied, jitter)
+
+    return Adjustment(
+        calibration=_calibration(solution, shares, determined),
+        nuisances=_reported(solution, shares),
+        contributions=shares.contributions,
+        coverage_factor=coverage_factor(float(np.min(shares.degrees_of_freedom[determined], initial=np.inf))),
+        reasons=tuple(reasons(used, solution, shares, determined, turned)),
+        rank=solution.equations.rank,
+        chi2=shares.consistency[0],
+        chi2_degrees_of_freedom=shares.consistency[1],
+        offset_scatter_mps2=shares.offset_scatter_mps2,
+        slope_scatter=shares.slope_scatter,
+        lag_scatter_s=jitter.scatter_s,
+        misfit=misfit(solution),
+        nuisance_pull=nuisance_pull(solution, shares.covariance)[0],
+        mean=solution.x,
+        covariance=shares.covariance,
+    )
+
+
+def _solution(
+    windows: Sequence[Window], data: Condensed, priors: Priors, applied: Applied, jitter: LagScatter
+) -> Solution:
+    poses: list[Pose] = []
+    index: dict[tuple[str, bytes, bytes], int] = {}
+    pose_of = []
+    for window in windows:
+        pose = window.pose
+        key = (pose.position, pose.direction.tobytes(), pose.gravity_mps2.tobytes())
+        if key not in index:
+            index[key] = len(poses)
+            poses.append(pose)
+        pose_of.append(index[key])
+    nuisances = Nuisances(poses, data.channels, priors, applied)
+    return solve(Equations(data, nuisances, pose_of, priors.offset_mps2, jitter), priors)
+
+
+def _determined(solution: Solution, shares: Budget) -> Flags:
+    """(12,) of S row by row and Q: the data halve the prior's u, or leave less than a tenth of the largest main one."""
+    u = np.sqrt(np.diag(shares.covariance)[:12])
+    before = np.sqrt(1.0 / np.diag(solution.prior_precision)[:12])
+    if solution.bounded.any():
+        known = np.flatnonzero(solution.bounded)
+        before[known] = np.sqrt(np.diag(np.linalg.inv(solution.prior_precision[np.ix_(known, known)])))
+    limit = DETERMINED_U * float(np.abs(solution.x[[0, 4, 8]]).max())
+    return np.asarray(np.where(solution.bounded, u < DETERMINED_SHARE * before, solution.equations.seen & (u <= limit)))
+
+
+def _calibration(solution: Solution, shares: Budget, determined: Flags) -> Calibration:
+    values = np.where(determined, solution.x[:12], np.nan)
+    covariance = np.where(np.outer(determined, determined), shares.covariance[:12, :12], np.nan)
+    freedom = solution.equations.data.type_a.degrees_of_freedom
+    return Calibration(values[:9].reshape(3, 3), values[9:], covariance, determined, freedom, "3 (adjustment)")
+
+
+def _reported(solution: Solution, shares: Budget) -> tuple[Nuisance, ...]:
+    uncertainty = np.sqrt(np.diag(shares.covariance)[12:])
+    return tuple(
+        Nuisance(t.name, float(value) + t.applied, float(u), t.uncertainty, t.unit)
+        for t, value, u in zip(solution.equations.nuisances.terms, solution.x[12:], uncertainty, strict=True)
+    )

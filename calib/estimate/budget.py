@@ -1,0 +1,90 @@
+"""Where the uncertainty of S and Q comes from: one standard uncertainty a source, and the degrees of freedom of all.
+
+The covariance is that of the estimate, H^-1 (J' C J + P) H^-1 with C the scatter that the windows show and P the
+priors; a term of C or P is a source. It stays true where residuals are coloured, though they are weighted as white.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.estimate.gauss_newton import Solution, slope_residuals
+from calib.estimate.scatter import between_windows
+from calib.model import Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Budget:
+    """`covariance` (N, N) of [S, Q, nuisances]; `contributions` {source: (12,)}, whose squares sum to its diagonal.
+
+    `degrees_of_freedom` (12,) effective (Welch-Satterthwaite, GUM G.2b). `offset_scatter_mps2` between windows as
+    estimated, `slope_scatter` relative; both 0 where noise and priors explain all.
+    """
+
+    covariance: Array
+    contributions: Mapping[str, Array]
+    degrees_of_freedom: Array
+    offset_scatter_mps2: float
+    slope_scatter: float
+    consistency: tuple[float, float]  # chi-squared of the window equations against what was stated, and its mean
+
+
+def budget(solution: Solution, stated_offset_scatter_mps2: float) -> Budget:
+    """Sources of the covariance at a solution."""
+    seen = between_windows(solution)
+    noise = _type_a(solution)
+    sources = {"type A": (noise, solution.equations.data.type_a.degrees_of_freedom)}
+    jitter = solution.equations.jitter
+    if jitter.scatter_s > 0.0:
+        sources["lag between windows"] = (
+            jitter.scatter_s**2 * jitter.term(slope_residuals(solution)[1]),
+            jitter.degrees_of_freedom,
+        )
+    if stated_offset_scatter_mps2 > 0.0:
+        larger = max(stated_offset_scatter_mps2, seen.offset.scatter)
+        freedom = seen.offset.degrees_of_freedom if larger > stated_offset_scatter_mps2 else np.inf
+        sources["offset between windows"] = (larger**2 * seen.offset.term, freedom)
+    if seen.slope.scatter > 0.0:
+        sources["slopes between windows"] = (seen.slope.scatter**2 * seen.slope.term, seen.slope.degrees_of_freedom)
+    half = solution.half
+    sources["prior of S and Q"] = (half[:12].T @ solution.prior_precision[:12, :12] @ half[:12], np.inf)
+    terms = solution.equations.nuisances.terms
+    for source in dict.fromkeys(t.source for t in terms):
+        own = np.array([half[12 + j] / t.uncertainty for j, t in enumerate(terms) if t.source == source])
+        sources[source] = (own.T @ own, np.inf)
+    total = np.sum([middle for middle, _ in sources.values()], axis=0)
+    variances = {name: _variances(half[:12], middle) for name, (middle, _) in sources.items()}
+    spent = np.sum([variances[name] ** 2 / freedom for name, (_, freedom) in sources.items()], axis=0)
+    with np.errstate(divide="ignore"):
+        effective = _variances(half[:12], total) ** 2 / spent
+    return Budget(
+        covariance=half @ total @ half.T,
+        contributions={name: np.sqrt(v) for name, v in variances.items()},
+        degrees_of_freedom=effective,
+        offset_scatter_mps2=seen.offset.scatter,
+        slope_scatter=seen.slope.scatter,
+        consistency=seen.consistency,
+    )
+
+
+def _variances(half: Array, middle: Array) -> Array:
+    """Diagonal of half middle half'."""
+    return np.asarray(np.maximum(np.einsum("in,in->i", half @ middle, half), 0.0))
+
+
+def _type_a(solution: Solution) -> Array:
+    """Scatter within windows, (J half)' C (J half), (N, N)."""
+    equations = solution.equations
+    _, mean_rows = equations.split(solution.jacobian)
+    type_a = equations.data.type_a
+    slope_rows = equations.jitter.whiten(slope_residuals(solution)[1])
+    mean_rows = mean_rows * np.sqrt(equations.white_share)[..., None]
+    return _quadratic(slope_rows, type_a.slopes) + _quadratic(mean_rows, type_a.means)
+
+
+def _quadratic(rows: Array, covariance: Array) -> Array:
+    """Sum over blocks of rows' C rows: rows (B, D, N), C (D, D)."""
+    return np.asarray(np.tensordot(rows, covariance @ rows, axes=([0, 1], [0, 1])))

@@ -1,0 +1,109 @@
+"""Corrected acceleration a = S^-1 (V - Q) with its uncertainty, S and Q at the temperature of the data.
+
+The calibration's part of the covariance is S^-1 J Sigma J' S^-T with J = [a' (x) I, I] and the full Sigma of [S, Q]: at
+rest its diagonal alone would give 63 where 1 mm/s2 is right. The noise of single samples is apart.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from calib.estimate.gauss_newton import Flags
+from calib.model import Array, Calibration
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Law:
+    """S and Q over temperature T, with one joint covariance; `determined` (12,) as in calib.model.Calibration.
+
+    Q(T) = Q + sum_k c_k (T - T0)^k; row i of S is multiplied by 1 + d_i (T - T0). `mean` is [S row by row, Q, c_1 (3),
+    .. c_K (3), d (3) if modelled], `covariance` of the same; T0 = `reference_degc`. Seen from `low_degc` to `high_degc`
+    (NaN: never): beyond, `u_beyond` (output unit per K2) times the distance squared is added to u(Q): the power that
+    nobody looked for.
+    """
+
+    mean: Array
+    covariance: Array
+    order: int = 0
+    rows: bool = False
+    reference_degc: float = 20.0
+    low_degc: float = np.nan
+    high_degc: float = np.nan
+    u_beyond: float = 0.0
+    determined: Flags = field(default_factory=lambda: np.ones(12, dtype=bool))
+
+    def at(self, degc: float) -> Calibration:
+        """S and Q at a temperature; without one (NaN), at the reference temperature and as uncertain as the range."""
+        if np.isnan(degc):
+            return self._anywhere()
+        map_, base = self._map(degc)
+        covariance = map_ @ self.covariance @ map_.T
+        beyond = max(self.low_degc - degc, degc - self.high_degc, 0.0)
+        if np.isfinite(beyond):
+            covariance[range(9, 12), range(9, 12)] += (self.u_beyond * beyond**2) ** 2
+        return self._calibration(base, covariance)
+
+    def _anywhere(self) -> Calibration:
+        """At the reference temperature, as uncertain as if it were as often at one end of the range as at the other."""
+        map_, base = self._map(self.reference_degc)
+        covariance = map_ @ self.covariance @ map_.T
+        if np.isfinite(self.low_degc):
+            ends = [self._map(degc) for degc in (self.low_degc, self.high_degc)]
+            parts = [m @ self.covariance @ m.T + np.outer(value - base, value - base) for m, value in ends]
+            covariance = np.mean(parts, axis=0)
+        return self._calibration(base, covariance)
+
+    def _calibration(self, base: Array, covariance: Array) -> Calibration:
+        return Calibration(base[:9].reshape(3, 3), base[9:], covariance, self.determined, np.inf, "corrected")
+
+    def _map(self, degc: float) -> tuple[Array, Array]:
+        """Derivative (12, n) of S and Q there by `mean`, and their values (12,)."""
+        above = degc - self.reference_degc
+        map_ = np.zeros((12, len(self.mean)))
+        map_[range(12), range(12)] = 1.0
+        value = self.mean[:12].copy()
+        for k in range(self.order):
+            at = 12 + 3 * k + np.arange(3)
+            map_[range(9, 12), at] = above ** (k + 1)
+            value[9:] += self.mean[at] * above ** (k + 1)
+        if self.rows:
+            at = np.repeat(12 + 3 * self.order + np.arange(3), 3)
+            map_[range(9), range(9)] = 1.0 + self.mean[at] * above
+            map_[range(9), at] = self.mean[:9] * above
+            value[:9] *= 1.0 + self.mean[at] * above
+        return map_, value
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Corrected:
+    """`acceleration` (N, 3) in m/s2; `covariance` (3, 3) of the calibration's part at the mean, `noise` (3,) SD of one
+    sample."""
+
+    acceleration: Array
+    covariance: Array
+    noise: Array
+
+
+def corrected(indications: Array, calibration: Calibration, residual_sd: Array) -> Corrected:
+    """Indications (N, 3) in output units as accelerations; `residual_sd` (3,) of single samples, output unit.
+
+    Raises numpy.linalg.LinAlgError where S has no inverse.
+    """
+    inverse = np.linalg.inv(calibration.sensitivity)
+    acceleration = (indications - calibration.offset) @ inverse.T
+    covariance = calibration_part(np.nanmean(acceleration, axis=0), calibration)
+    noise = np.sqrt((inverse**2) @ residual_sd**2)
+    return Corrected(acceleration, covariance, noise)
+
+
+def calibration_part(acceleration: Array, calibration: Calibration) -> Array:
+    """Covariance (3, 3) in m2/s4 that S and Q put into one acceleration (3,)."""
+    J = np.zeros((3, 12))
+    for i in range(3):
+        J[i, 3 * i : 3 * i + 3] = acceleration
+        J[i, 9 + i] = 1.0
+    inverse = np.linalg.inv(calibration.sensitivity)
+    through = inverse @ J
+    return np.asarray(through @ calibration.covariance @ through.T)

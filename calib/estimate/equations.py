@@ -1,0 +1,189 @@
+"""The window equations of the adjustment: what slopes and means should be, and how they move with every unknown.
+
+For output axis i, with D and G of the pose (calib.estimate.nuisances) and S_i a row of S,
+
+    slope on u      S_i D (1 - lag_i^2 omega^2 / 2)
+    slope on du/dt  -S_i D lag_i + S_i D' / omega
+    mean of V       S_i (D mean(u) + G) + Q_i + S_i (D' / omega - lag_i D) mean(du/dt) + offset of the position
+
+The term in omega^2 = <du^2> / <u^2> is the projection of d2u/dt2 on u: exact for a sine, and for any motion once the
+front end has taken out the lag that was found.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.estimate.condense import Condensed
+from calib.estimate.jitter import LagScatter
+from calib.estimate.nuisances import Inputs, Nuisances
+from calib.model import Array
+
+# Below this part of the largest singular value (columns scaled to one) a direction was not excited: positions 0/1/2 deg
+# stand at 3e-6, what rounding leaves of an unseen direction at 1e-15.
+RANK_TOLERANCE = 1e-10
+UNSEEN_SHARE = 1e-3  # of an unseen direction that a parameter may have and still count as seen
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rows:
+    """Whitened residuals (observed less predicted) and Jacobian with respect to [S row by row, Q, nuisances].
+
+    Slopes: `slope` (B, 2M, 3) and `d_slope` (B, 2M, 3, N); means: `mean` (W, 3) and `d_mean` (W, 3, N).
+    """
+
+    slope: Array
+    d_slope: Array
+    mean: Array
+    d_mean: Array
+
+    def stacked(self) -> tuple[Array, Array]:
+        """Residuals (rows,) and Jacobian (rows, N): slopes first."""
+        n = self.d_mean.shape[-1]
+        residual = np.concatenate([self.slope.ravel(), self.mean.ravel()])
+        return residual, np.vstack([self.d_slope.reshape(-1, n), self.d_mean.reshape(-1, n)])
+
+
+class Equations:
+    """Condensed windows, the pose of each, and the weights: the functions that Gauss-Newton needs."""
+
+    def __init__(
+        self,
+        data: Condensed,
+        nuisances: Nuisances,
+        pose_of: list[int],
+        offset_scatter_mps2: float,
+        jitter: LagScatter,
+        output_per_mps2: float | None = None,
+    ) -> None:
+        """`pose_of` (W,) the nuisances' pose of a window; `offset_scatter_mps2` and `jitter` between windows;
+        `output_per_mps2` the sensor's scale, None: as the data show."""
+        self.data, self.nuisances, self.jitter = data, nuisances, jitter
+        self.pose_of_window = np.array(pose_of)
+        self.pose_of_block = self.pose_of_window[data.block_window]
+        known = np.isfinite(nuisances.gravity).all(axis=1)[self.pose_of_window]
+        self.known = known
+        self.output_per_mps2 = self._output_per_mps2() if output_per_mps2 is None else output_per_mps2
+        self.unseen = self._unseen_inputs()
+        self.rank = 4 - len(self.unseen)
+        self.seen = self._seen()
+        noise2 = data.type_a.noise**2 / data.count[:, None]
+        variance = noise2 + (offset_scatter_mps2 * self.output_per_mps2) ** 2
+        # A mean whose gravity nobody stated says nothing: no weight.
+        self.mean_weight = np.where(known[:, None], 1.0 / np.sqrt(variance), 0.0)
+        self.white_share = np.where(known[:, None], noise2 / variance, 0.0)
+
+    def _unseen_inputs(self) -> Array:
+        """Directions (k, 4) of (a_x, a_y, a_z, 1) square to every input vector, angles as stated; 4 - k is the rank."""
+        data, nuisances, m = self.data, self.nuisances, self.data.channels
+        moved = np.einsum("brc,bkc->brk", data.root[:, :m, :m], nuisances.direction[self.pose_of_block])
+        held = np.einsum("wkm,wm->wk", nuisances.direction[self.pose_of_window], data.mean_x[:, :m])
+        held = np.pad(held + nuisances.gravity[self.pose_of_window], ((0, 0), (0, 1)), constant_values=1.0)
+        rows = np.vstack(
+            [np.pad(moved.reshape(-1, 3), ((0, 0), (0, 1))), (np.sqrt(data.count)[:, None] * held)[self.known]]
+        )
+        scale = np.linalg.norm(rows, axis=0)
+        scale[scale == 0.0] = 1.0
+        _, singular, ways = np.linalg.svd(np.vstack([rows / scale, np.zeros((4, 4))]), full_matrices=False)
+        return np.asarray(ways[singular <= RANK_TOLERANCE * singular[0]] / scale)
+
+    def _seen(self) -> NDArray[np.bool_]:
+        """(12,) which of S row by row and Q have no part in a direction that nobody excited."""
+        parts = np.abs(self.unseen) / np.linalg.norm(self.unseen, axis=1, keepdims=True)
+        free = parts.max(axis=0, initial=0.0) > UNSEEN_SHARE
+        return ~np.concatenate([np.tile(free[:3], 3), np.repeat(free[3], 3)])
+
+    def _output_per_mps2(self) -> float:
+        """The sensor's scale: root mean square of output over input, of all slopes and means."""
+        data, m = self.data, self.data.channels
+        moved = np.einsum("brc,bkc->brk", data.root[:, :m, :m], self.nuisances.direction[self.pose_of_block])
+        gravity, n = self.nuisances.gravity[self.pose_of_window][self.known], data.count[self.known]
+        held, level = np.zeros((1, 3)), np.zeros((1, 3))
+        if n.size:
+            held = np.sqrt(n)[:, None] * (gravity - n @ gravity / n.sum())
+            level = np.sqrt(n)[:, None] * (data.mean_v[self.known] - n @ data.mean_v[self.known] / n.sum())
+        inputs = float((moved**2).sum() + (held**2).sum())
+        outputs = float((data.slopes[:, :m] ** 2).sum() + (level**2).sum())
+        return float(np.sqrt(outputs / inputs)) if inputs > 0.0 and outputs > 0.0 else 1.0
+
+    def at(self, x: Array) -> Rows:
+        """Rows at x = [S row by row, Q, nuisances]."""
+        S, Q, z = x[:9].reshape(3, 3), x[9:12], x[12:]
+        inputs = self.nuisances.at(z)
+        return Rows(*self._slopes(S, inputs), *self._means(S, Q, z, inputs))
+
+    def split(self, rows: Array) -> tuple[Array, Array]:
+        """Stacked rows (rows, ...) back into slopes (B, 2M, 3, ...) and means (W, 3, ...)."""
+        slopes = self.data.slopes
+        return (
+            rows[: slopes.size].reshape(*slopes.shape, *rows.shape[1:]),
+            rows[slopes.size :].reshape(*self.data.mean_v.shape, *rows.shape[1:]),
+        )
+
+    def _slopes(self, S: Array, inputs: Inputs) -> tuple[Array, Array]:
+        data, D = self.data, inputs.direction[self.pose_of_block]
+        omega2 = data.omega2[:, None]
+        on_u = 1.0 - 0.5 * inputs.lag_s**2 * omega2  # (B, 3)
+        on_du = np.broadcast_to(-inputs.lag_s, on_u.shape)
+        ideal = np.einsum("ik,bkm->bim", S, D)
+        per_omega = np.divide(1.0, np.sqrt(omega2), out=np.zeros_like(omega2), where=omega2 > 0.0)
+        across = inputs.quadrature[self.pose_of_block] * per_omega  # (B, 3), felt by the first channel's du/dt
+        on_rate = ideal * on_du[..., None]
+        on_rate[:, :, :1] += (across @ S.T)[..., None]
+        slopes = np.concatenate([ideal * on_u[..., None], on_rate], axis=2)  # (B, 3, 2M)
+        residual = data.slopes - np.einsum("brc,bic->bri", data.root, slopes)
+
+        nuisances = self.nuisances
+        d_ideal = np.einsum("ik,jbkm->bimj", S, inputs.d_direction[:, self.pose_of_block])
+        d_on_u = -inputs.lag_s[:, None] * omega2[..., None] * nuisances.lag.T
+        d_on_du = np.broadcast_to(-nuisances.lag.T, d_on_u.shape)
+        d_on_rate = d_ideal * on_du[..., None, None] + ideal[..., None] * d_on_du[:, :, None, :]
+        d_across = inputs.d_quadrature[:, self.pose_of_block] * per_omega
+        d_on_rate[:, :, :1] += np.einsum("ik,jbk->bij", S, d_across)[:, :, None]
+        d_z = np.concatenate(
+            [d_ideal * on_u[..., None, None] + ideal[..., None] * d_on_u[:, :, None, :], d_on_rate], axis=2
+        )
+        n = 12 + len(nuisances)
+        jacobian = np.zeros((*data.slopes.shape, n))  # (B, 2M, 3, N)
+        per_row = np.concatenate([D[:, None] * on_u[..., None, None], D[:, None] * on_du[..., None, None]], axis=3)
+        per_row[:, :, :, D.shape[2] : D.shape[2] + 1] += across[:, None, :, None]
+        for i in range(3):
+            jacobian[:, :, i, 3 * i : 3 * i + 3] = np.einsum("brc,bkc->brk", data.root, per_row[:, i])
+        jacobian[..., 12:] = np.einsum("brc,bicj->brij", data.root, d_z)
+        noise = data.type_a.noise
+        return self._whitened(residual / noise), self._whitened(jacobian / noise[:, None])
+
+    def _whitened(self, slopes: Array) -> Array:
+        """Rows (B, 2M, 3, ...) with the scatter of the lag between windows taken into their weight."""
+        flat = slopes.reshape(len(slopes), -1, *slopes.shape[3:])
+        return self.jitter.whiten(flat).reshape(slopes.shape)
+
+    def _means(self, S: Array, Q: Array, z: Array, inputs: Inputs) -> tuple[Array, Array]:
+        data, nuisances, m = self.data, self.nuisances, self.data.channels
+        D = inputs.direction[self.pose_of_window]
+        moved = np.einsum("wkm,wm->wk", D, data.mean_x[:, :m])
+        rate = np.einsum("wkm,wm->wk", D, data.mean_x[:, m:])
+        G = np.nan_to_num(inputs.gravity[self.pose_of_window])
+        # A window of no whole number of cycles has a mean of du/dt, which lag and quadrature pass on.
+        per_omega = np.divide(
+            1.0, np.sqrt(data.mean_omega2), out=np.zeros_like(data.count), where=data.mean_omega2 > 0.0
+        )
+        share = (data.mean_x[:, m] if m else 0.0 * data.count) * per_omega
+        across = inputs.quadrature[self.pose_of_window] * share[:, None]
+        felt = (moved + across + G)[:, None] - inputs.lag_s[:, None] * rate[:, None]  # (W, 3, 3): axis, direction
+        predicted = np.einsum("ik,wik->wi", S, felt) + Q
+        predicted += self.output_per_mps2 * np.einsum("j,jwi->wi", z, nuisances.offset[:, self.pose_of_window])
+        jacobian = np.zeros((*data.mean_v.shape, 12 + len(nuisances)))
+        for i in range(3):
+            jacobian[:, i, 3 * i : 3 * i + 3] = felt[:, i]
+            jacobian[:, i, 9 + i] = 1.0
+        d_input = np.einsum("jwkm,wm->jwk", inputs.d_direction[:, self.pose_of_window], data.mean_x[:, :m])
+        d_input = d_input + np.nan_to_num(inputs.d_gravity[:, self.pose_of_window])
+        d_input = d_input + inputs.d_quadrature[:, self.pose_of_window] * share[:, None]
+        jacobian[..., 12:] = np.einsum("ik,jwk->wij", S, d_input)
+        jacobian[..., 12:] += self.output_per_mps2 * nuisances.offset[:, self.pose_of_window].transpose(1, 2, 0)
+        jacobian[..., 12:] -= np.einsum("wi,ij->wij", rate @ S.T, nuisances.lag.T)
+        return (data.mean_v - predicted) * self.mean_weight, jacobian * self.mean_weight[..., None]

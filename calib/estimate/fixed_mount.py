@@ -1,0 +1,43 @@
+"""The constant input acceleration at a fixed mount, and Q out of the mean output under it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.estimate.joint_state import JointState
+from calib.estimate.nuisances import Applied, Nuisances, Priors, Term
+from calib.estimate.window_rows import Summary
+from calib.model import Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Held:
+    """The constant input acceleration (3,) at a fixed mount, as stated, and how nuisances move it, by name (3,)."""
+
+    mps2: Array
+    by: Mapping[str, Array]
+
+    def parameters(self, state: JointState) -> tuple[Array, Array]:
+        """S and Q (12,) and a factor (12, N) of their covariance, of a state with the mean output in the place of Q."""
+        mean, factor = state.mean[:12].copy(), state.factor[:12].copy()
+        S, felt = mean[:9].reshape(3, 3), self.mps2.copy()
+        for name, moves in self.by.items():
+            felt += state.mean[state.index(name)] * moves
+        mean[9:] -= S @ felt
+        factor[9:] -= np.einsum("k,ikn->in", felt, factor[:9].reshape(3, 3, -1))
+        for name, moves in self.by.items():
+            factor[9:] -= np.outer(S @ moves, state.factor[state.index(name)])
+        return mean, factor
+
+
+def held_at(summary: Summary, priors: Priors) -> tuple[Held, Sequence[Term]]:
+    """What a window's pose and its reference's mean tell of it; with all nuisances of that pose."""
+    nuisances = Nuisances([summary.pose], summary.data.channels, priors, Applied())
+    inputs = nuisances.at(np.zeros(len(nuisances)))
+    mean = summary.data.mean_x[0][: inputs.direction.shape[2]]
+    moves = inputs.d_gravity[:, 0] + inputs.d_direction[:, 0] @ mean
+    by = {t.name: m for t, m in zip(nuisances.terms, moves, strict=True) if np.any(m)}
+    return Held(summary.held_mps2.copy(), by), nuisances.terms

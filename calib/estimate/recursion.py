@@ -1,0 +1,400 @@
+"""Method 3 by adjustment, window by window: S, Q and every persistent nuisance as one state with its joint covariance.
+
+The priors enter once, when the state begins and when a window brings a nuisance of its own (a position never seen);
+what belongs to a window alone (its offset, its lag's scatter) is in the weight of its rows. Each window is one
+least-squares correction of the state, so that the cost does not depend on how long it has run.
+
+All windows are linearised at one point. At points of their own the same unseen direction (an inclination against the
+main sensitivities, say) would be another in each, and a little of it would seem seen: after twelve windows on a clamp u
+came out a third too small. So the newest windows are kept in summary, and are taken anew where the estimate has moved
+away from the point; a window that leaves them is part of the base for good. With no wandering the result is that of
+calib.estimate.adjustment for all windows at once.
+
+At a fixed mount the mean of V is m = Q + S (G + tilt x G) under a gravity that never changes, so that the data tell m
+and no part of it. The state then has m in the place of Q; Q = m - S (G + tilt x G) is made of it when it is read, with
+the uncertainties of S, G and tilt. Were Q in the state, a mean that drifts would move the column of S along gravity
+(by 1.9 % where it drifted by 0.24 m/s2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from calib.distributions import coverage_factor
+from calib.estimate.correction import Law
+from calib.estimate.fixed_mount import Held, held_at
+from calib.estimate.gauss_newton import Flags
+from calib.estimate.innovation import Innovation, innovation
+from calib.estimate.joint_state import JointState, gain_of
+from calib.estimate.nuisances import Priors
+from calib.estimate.wander import MAIN_TEMPERATURE, RATES, TemperatureModel, Wander, offset_temperature
+from calib.estimate.window_rows import Noise, Summary, WindowRows
+from calib.model import PARAMETERS, Array, Calibration
+
+DETERMINED_SHARE = 0.5  # of the prior's u, which the data must halve (contract)
+MOST_RECENT = 48  # windows: four times round twelve positions
+ITERATIONS = 6
+# Relative change of S, or rad of an angle, up to which the point need not move: its product with an angle's 0.3 deg is
+# 5e-6 of S.
+STRAIGHT = 1e-3
+STRAIGHT_LAG_S = 5e-5  # (omega lag)^2 / 2 of it at 10 Hz is as much
+MOST_POSITIONS = 48  # whose own nuisances are kept; of the oldest ones nothing but their effect on S and Q remains
+METHOD = "3 (recursive adjustment)"
+
+
+class Recursion:
+    """The state of one sensor. `predict`, `update` and `loosen` change it; `innovation` and `result` read.
+
+    `mean` and `standard_uncertainty` (12,) are what was known of S, Q beforehand, in output units; `fixed` mounts do
+    not turn. Days count from any origin.
+    """
+
+    def __init__(
+        self,
+        mean: Array,
+        standard_uncertainty: Array,
+        priors: Priors,
+        wander: Wander,
+        temperature: TemperatureModel,
+        *,
+        fixed: bool,
+    ) -> None:
+        self._priors, self._wander, self._temperature, self._fixed = priors, wander, temperature, fixed
+        self.scale = float(np.sqrt(np.mean(mean[[0, 4, 8]] ** 2)))
+        self._state = JointState(PARAMETERS, mean, standard_uncertainty)
+        for name in RATES:
+            self._state.append(name, 0.0, wander.offset_rate_mps2 * self.scale)
+        for name, u in temperature.terms(self.scale):
+            self._state.append(name, 0.0, u)
+        self._prior_u = np.array(standard_uncertainty, dtype=np.float64)
+        self._bound = self._state.variance.copy()  # what wandering may not exceed
+        self._base = self._state.copy()  # before the recent windows
+        self._base_day: float | None = None
+        self._recent: list[Summary] = []
+        self._point = self._state.mean.copy()
+        self._positions: list[str] = []
+        self._noise = Noise()
+        self._day: float | None = None
+        self._temperature_range = (np.inf, -np.inf)
+        self._residual_sd = np.full(3, np.nan)
+        self._held: Held | None = None  # at a fixed mount, from the first window on
+        self.windows = 0
+
+    # --- reading
+
+    def innovation(self, summary: Summary) -> Innovation:
+        """What the window says against the state at its time."""
+        return self._against(summary)[0]
+
+    def with_window(self, summary: Summary) -> tuple[Innovation, Recursion]:
+        """What the window says against the state at its time, and a copy that has taken it."""
+        told, trial, rows, wandered = self._against(summary)
+        trial._take(rows, wandered)
+        return told, trial
+
+    def _against(self, summary: Summary) -> tuple[Innovation, Recursion, WindowRows, JointState]:
+        trial = self.copy()
+        rows = trial._know(summary)
+        state = trial._wandered(trial._state, trial._day, summary.day)
+        return innovation(rows.at(state, state.mean, trial._noise), state), trial, rows, state
+
+    @property
+    def lag_s(self) -> float:
+        """By which the sensor's indications come late; 0 before any window told."""
+        return float(self._state.mean[self._state.index("lag")]) if "lag" in self._state.names else 0.0
+
+    @property
+    def determined(self) -> Flags:
+        """(12,) whose standard uncertainty is below half of that before any data."""
+        return np.asarray(np.sqrt(np.diag(self._parameters()[1])) < DETERMINED_SHARE * self._prior_u)
+
+    def result(self) -> Calibration:
+        """S and Q as they are; where a parameter is not determined, still what was known beforehand of it."""
+        mean, covariance = self._parameters()
+        freedom = self._noise.degrees_of_freedom or np.inf
+        return Calibration(mean[:9].reshape(3, 3), mean[9:], covariance, self.determined, freedom, METHOD)
+
+    @property
+    def coverage_factor(self) -> float:
+        """For about 95 % coverage."""
+        return coverage_factor(self._noise.degrees_of_freedom or np.inf)
+
+    def _parameters(self) -> tuple[Array, Array]:
+        """S and Q (12,) and their covariance."""
+        mean, factor = self._parameters_factor()
+        return mean, np.asarray(factor @ factor.T)
+
+    def _parameters_factor(self) -> tuple[Array, Array]:
+        if self._held is not None:
+            return self._held.parameters(self._state)
+        return self._state.mean[:12].copy(), self._state.factor[:12].copy()
+
+    def law(self, day: float | None = None) -> Law:
+        """S and Q over temperature, with all that their covariance knows of each other; `day`: wandered on until it."""
+        if day is not None:
+            waited = self.copy()
+            waited._state = self._wandered(self._state, self._day, day)
+            return waited.law()
+        order, rows = self._temperature.offset_order, self._temperature.sensitivity_order > 0
+        names = [n for k in range(1, order + 1) for n in offset_temperature(k)] + list(MAIN_TEMPERATURE if rows else ())
+        more = [self._state.index(name) for name in names]
+        mean, factor = self._parameters_factor()
+        mean, factor = np.append(mean, self._state.mean[more]), np.vstack([factor, self._state.factor[more]])
+        low, high = self.temperature_range_degc
+        u_beyond = self._temperature.u_offset_mps2[1] * self.scale
+        return Law(
+            mean, factor @ factor.T, order, rows, self.reference_temperature_degc, low, high, u_beyond, self.determined
+        )
+
+    def quantity(self, name: str) -> tuple[float, float]:
+        """(value, standard uncertainty) of anything in the state. Raises ValueError where it is not in it."""
+        k = self._state.index(name)
+        return float(self._state.mean[k]), float(np.sqrt(self._state.variance[k]))
+
+    @property
+    def residual_sd(self) -> Array:
+        """(3,) of single points in the newest window, output unit; NaN before any."""
+        return self._residual_sd.copy()
+
+    @property
+    def reference_temperature_degc(self) -> float:
+        """To which S and Q refer."""
+        return self._temperature.reference_degc
+
+    @property
+    def names(self) -> list[str]:
+        """Of all quantities in the state."""
+        return list(self._state.names)
+
+    @property
+    def temperature_range_degc(self) -> tuple[float, float]:
+        """Lowest and highest temperature of a window taken; NaN before any."""
+        low, high = self._temperature_range
+        return (low, high) if low <= high else (np.nan, np.nan)
+
+    # --- changing
+
+    def update(self, summary: Summary) -> None:
+        """Take a window: one correction of everything."""
+        rows = self._know(summary)
+        self._take(rows, self._wandered(self._state, self._day, summary.day))
+
+    def _take(self, rows: WindowRows, wandered: JointState) -> None:
+        summary = rows.summary
+        self._state = self._corrected(wandered, rows)
+        self._day = _later(self._day, summary.day)
+        self._recent.append(summary)
+        self._settle()
+        if len(self._recent) > MOST_RECENT:
+            self._absorb(1)
+        self._noise = self._noise.pooled(rows.noise)
+        self._residual_sd = summary.data.type_a.noise.copy()
+        if np.isfinite(summary.temperature_degc):
+            low, high = self._temperature_range
+            self._temperature_range = (min(low, summary.temperature_degc), max(high, summary.temperature_degc))
+        self._keep_positions(summary.pose.position)
+        self.windows += 1
+
+    def loosen(self, standard_uncertainty: Array, tilt_rad: float = 0.0, *, lag: bool = False) -> None:
+        """Something changed: S and Q (12,) may be off by as much more from now on, and a fixed mount be tilted.
+
+        `lag`: the lag may be another as well, as after a device or its line began anew.
+        """
+        self._absorb(len(self._recent))
+        variance = np.zeros(len(self._state))
+        variance[:12] = standard_uncertainty**2
+        for k, name in enumerate(self._state.names):
+            if name.startswith("gravity_") and self._fixed:
+                variance[k] = tilt_rad**2
+            elif name == "lag" and lag:
+                variance[k] = self._priors.lag_s**2
+        self._state.spread(variance)
+        self._base = self._state.copy()
+
+    def forget_reference(self) -> None:
+        """Another reference: what is known of the old one's own sensitivity and lag holds no more."""
+        self.put(self.result())
+        self._drop([n for n in self._state.names if n.startswith(("reference", "lag", "rotation_"))])
+
+    def put(self, calibration: Calibration) -> None:
+        """S and Q as an operator wants them, with their covariance; what the nuisances are in them, they stay."""
+        self._absorb(len(self._recent))
+        self._state.mean[:12], self._state.factor[:12] = self._parameters_factor()
+        values = np.append(calibration.sensitivity.ravel(), calibration.offset)
+        self._state.restate(slice(0, 12), values, calibration.covariance)
+        self._held = None  # Q itself is known again; the next window of a fixed mount makes the mean output of it
+        self._base = self._state.copy()
+        self._point = self._state.mean.copy()
+
+    def copy(self) -> Recursion:
+        """An independent copy, to try windows on."""
+        other = object.__new__(Recursion)
+        other.__dict__.update(self.__dict__)
+        other._state, other._base = self._state.copy(), self._base.copy()
+        other._recent, other._positions = list(self._recent), list(self._positions)
+        other._point, other._bound = self._point.copy(), self._bound.copy()
+        return other
+
+    # --- inside
+
+    def _rows(self, summary: Summary) -> WindowRows:
+        reference_degc = self._temperature.reference_degc
+        held = self._held.mps2 if self._held is not None else np.zeros(3) if self._fixed else None
+        return WindowRows(summary, self._priors, self.scale, reference_degc, held, self.temperature_range_degc)
+
+    def _wandered(self, state: JointState, since: float | None, day: float) -> JointState:
+        """A copy of the state, wandered on to `day`; earlier days are as now."""
+        state = state.copy()
+        elapsed = 0.0 if since is None else max(day - since, 0.0)
+        if elapsed > 0.0:
+            drift = np.eye(len(state))
+            for i, name in enumerate(RATES):
+                drift[9 + i, state.index(name)] = elapsed
+            state.transform(drift)
+            tilted = 0.0 if self._held is None else float(np.linalg.norm(self._held.mps2))
+            wanted = self._wander.variance_a_day(state.names, self.scale, tilted) * elapsed
+            room = np.maximum(self._bound - state.variance, 0.0)
+            state.spread(np.minimum(wanted, room))
+        return state
+
+    def _mount(self, summary: Summary) -> None:
+        """At the first window of a fixed mount: Q gives its place to the mean output there."""
+        if not self._fixed or self._held is not None or not np.isfinite(summary.held_mps2).all():
+            return
+        held, terms = held_at(summary, self._priors)
+        u = self._mean_output_u(held, {term.name: term.uncertainty for term in terms})
+        for state in (self._state, self._base):
+            S = state.mean[:9].reshape(3, 3)
+            state.replace(slice(9, 12), state.mean[9:12] + S @ summary.held_mps2, np.diag(u**2))
+        self._point[9:12] = self._state.mean[9:12]
+        self._bound[9:12] = u**2
+        for term in terms:
+            self._append(term.name, term.expected, term.uncertainty)
+        self._held = held
+
+    def _mean_output_u(self, held: Held, u_terms: Mapping[str, float]) -> Array:
+        """(3,) standard uncertainty of the mean output before any data: of Q, S and tilt; never the less for them."""
+        variance, S = self._state.variance, self._state.mean[:9].reshape(3, 3)
+        felt = variance[9:12] + variance[:9].reshape(3, 3) @ held.mps2**2
+        tilted = sum((S @ moves * u_terms[name]) ** 2 for name, moves in held.by.items())
+        return np.sqrt(felt + tilted)
+
+    def _append(self, name: str, mean: float, u: float) -> None:
+        if name not in self._state.names:
+            self._state.append(name, mean, u)
+            self._base.append(name, mean, u)
+            self._point = np.append(self._point, mean)
+            # A mount may come to lean by more than anybody stated of the day it was made.
+            self._bound = np.append(self._bound, (2.0 * u) ** 2)
+
+    def _know(self, summary: Summary) -> WindowRows:
+        """Nuisances that no window had before come in with their priors; the window's rows."""
+        self._mount(summary)
+        rows = self._rows(summary)
+        for name, mean, u in rows.unknowns:
+            self._append(name, mean, u)
+        return rows
+
+    def _taken(self, before: JointState, since: float | None, rows: WindowRows) -> JointState:
+        return self._corrected(self._wandered(before, since, rows.summary.day), rows)
+
+    def _corrected(self, state: JointState, rows: WindowRows) -> JointState:
+        """The state, at its day already, after one window, linearised at the point."""
+        own = rows.at(state, self._point, self._noise)
+        gain = gain_of(own.jacobian, state.factor)
+        step = gain @ (own.residual + own.jacobian @ (self._point - state.mean))
+        state.correct(step, gain, own.jacobian, own.noise)
+        return state
+
+    def _settle(self) -> None:
+        """Take the recent windows anew, from the base on, until the point is where the estimate is."""
+        for _ in range(ITERATIONS):
+            if not self._moved():
+                return
+            self._point = self._state.mean.copy()
+            state, since = self._base, self._base_day
+            for summary in self._recent:
+                state = self._taken(state, since, self._rows(summary))
+                since = _later(since, summary.day)
+            self._state = state
+
+    def _moved(self) -> bool:
+        """Whether the products of S and the nuisances, which are all that bends, have left the point."""
+        moved = np.abs(self._state.mean - self._point)
+        limit = np.full(len(moved), STRAIGHT)
+        limit[:9] *= self.scale
+        for k, name in enumerate(self._state.names):
+            if name in PARAMETERS[9:] or name.startswith(("Q", "offset")):
+                limit[k] = np.inf  # these are linear
+            elif name.startswith("lag"):
+                limit[k] = STRAIGHT_LAG_S
+            elif name == "gravity":
+                limit[k] = 10.0 * STRAIGHT
+        return bool(np.any(moved > limit))
+
+    def _absorb(self, count: int) -> None:
+        """The oldest recent windows become part of the base, linearised as they are now."""
+        for summary in self._recent[:count]:
+            self._base = self._taken(self._base, self._base_day, self._rows(summary))
+            self._base_day = _later(self._base_day, summary.day)
+        del self._recent[:count]
+
+    def _keep_positions(self, position: str) -> None:
+        if position in self._positions:
+            self._positions.remove(position)
+        self._positions.append(position)
+        while len(self._positions) > MOST_POSITIONS:
+            end = f"[{self._positions.pop(0)}]"
+            self._absorb(len(self._recent))
+            self._drop([name for name in self._state.names if name.endswith(end)])
+
+    def _drop(self, names: list[str]) -> None:
+        kept = [name not in names for name in self._state.names]
+        self._bound, self._point = self._bound[kept], self._point[kept]
+        self._state.drop(names)
+        self._base = self._state.copy()
+
+    # --- state
+
+    def snapshot(self) -> dict[str, Any]:
+        """All that changes, exactly."""
+        return {
+            "state": self._state.snapshot(),
+            "base": self._base.snapshot(),
+            "base_day": self._base_day,
+            "recent": [summary.snapshot() for summary in self._recent],
+            "point": self._point.copy(),
+            "prior_u": self._prior_u.copy(),
+            "bound": self._bound.copy(),
+            "positions": list(self._positions),
+            "noise": asdict(self._noise),
+            "day": self._day,
+            "temperature_range": list(self._temperature_range),
+            "residual_sd": self._residual_sd.copy(),
+            "held": None if self._held is None else {"mps2": self._held.mps2, "by": dict(self._held.by)},
+            "windows": self.windows,
+            "scale": self.scale,
+        }
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        """Go on from a snapshot of a recursion that was made with the same settings."""
+        self._state, self._base = JointState.load(state["state"]), JointState.load(state["base"])
+        self._base_day, self._point = state["base_day"], np.array(state["point"])
+        self._recent = [Summary.load(s) for s in state["recent"]]
+        self._prior_u, self._bound = np.array(state["prior_u"]), np.array(state["bound"])
+        self._positions = list(state["positions"])
+        self._noise = Noise(**state["noise"])
+        self._day = state["day"]
+        low, high = state["temperature_range"]
+        self._temperature_range = (low, high)
+        self._residual_sd = np.array(state["residual_sd"])
+        self._held = None if state["held"] is None else Held(**state["held"])
+        self.windows, self.scale = state["windows"], state["scale"]
+
+
+def _later(day: float | None, other: float) -> float:
+    return other if day is None else max(day, other)

@@ -1,0 +1,145 @@
+"""Type A: how much slopes and means of a window scatter, from segment to segment, pooled over all windows.
+
+Residuals are not white (AR(1) 0.99: the true uncertainty is 11 times the white one), so a segment's residual sums
+(its scores) are the unit that scatters; the correlation of neighbouring segments is taken into account as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.excitation.sums import NOISE_FLOOR
+from calib.model import Array
+
+# Correlation of neighbours above which segments are joined in pairs: they are shorter than 3 correlation times.
+RHO_COARSEN = 0.35
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Segments:
+    """Sums of K segments about one centre: counts (K,), x x' (K, 2M, 2M), x V' (K, 2M, 3), V V' (K, 3, 3), sums of
+    [x, V] (K, 2M + 3); `mean` (2M + 3,) is that centre."""
+
+    count: Array
+    xx: Array
+    xv: Array
+    vv: Array
+    total: Array
+    mean: Array
+
+    def sums(self) -> tuple[Array, Array, Array, Array, Array]:
+        """All that adds up, in the order of the fields."""
+        return self.count, self.xx, self.xv, self.vv, self.total
+
+    def less(self, xx: Array, xv: Array, weight: float = 1.0) -> Segments:
+        """`weight` times the same segments, from each of their points these mean x x' and x V' taken."""
+        n = self.count[:, None, None]
+        return replace(self, xx=weight * (self.xx - n * xx), xv=weight * (self.xv - n * xv))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TypeA:
+    """`noise` (3,): SD of the residuals within windows, output unit. `slopes` (6M, 6M) in the order basis, axis and
+    `means` (3, 3): covariance of the whitened slopes and means, identities if the residuals were white and
+    independent between axes. `degrees_of_freedom` of both, inf where single segments allow no such estimate."""
+
+    noise: Array
+    slopes: Array
+    means: Array
+    degrees_of_freedom: float
+
+
+def pooled(
+    windows: Sequence[Segments],
+    blocks: Sequence[Segments],
+    window_block: Sequence[int],
+    roots: Sequence[Array],
+    whiteners: Sequence[Array],
+) -> TypeA:
+    """Scatter of the whitened scores over all windows (means) and blocks (slopes, whitened by T = `whiteners`)."""
+    slopes = [t.T @ (t @ b.xv.sum(0)) for t, b in zip(whiteners, blocks, strict=True)]
+    own = [(slopes[b], roots[b]) for b in window_block]
+    noise = _noise(windows, own)
+    size = roots[0].shape[0]
+    slope_scores, mean_scores = [], []
+    for block, beta, t in zip(blocks, slopes, whiteners, strict=True):
+        score = np.einsum("rc,kci->kri", t, block.xv - block.xx @ beta) / noise
+        slope_scores.append(score.reshape(len(score), 3 * size))
+    for window, (beta, _) in zip(windows, own, strict=True):
+        score = (window.total[:, -3:] - window.total[:, :-3] @ beta) / noise
+        mean_scores.append(score / np.sqrt(window.count.sum()))
+    live = np.repeat([any(r[j, j] > 0.0 for r in roots) for j in range(size)], 3)
+    slope_cov, slope_dof = _scatter(slope_scores, live)
+    mean_cov, mean_dof = _scatter(mean_scores, np.ones(3, dtype=bool))
+    return TypeA(noise, slope_cov, mean_cov, min(slope_dof, mean_dof))
+
+
+def _noise(windows: Sequence[Segments], own: Sequence[tuple[Array, Array]]) -> Array:
+    """SD of the residuals within windows, by each window's (slopes, root)."""
+    left, freedom, signal, counts = np.zeros(3), 0.0, np.zeros(3), 0.0
+    for window, (beta, root) in zip(windows, own, strict=True):
+        xx, xv, vv = window.xx.sum(0), window.xv.sum(0), np.diag(window.vv.sum(0))
+        left += vv - 2.0 * np.einsum("ci,ci->i", beta, xv) + np.einsum("ci,cd,di->i", beta, xx, beta)
+        signal += vv + window.count.sum() * window.mean[-3:] ** 2
+        freedom += window.count.sum() - 1 - np.count_nonzero(np.diag(root))
+        counts += float(window.count.sum())
+    floor = NOISE_FLOOR * np.sqrt(signal.max() / counts) or 1.0
+    return np.asarray(np.sqrt(np.maximum(left, 0.0) / max(freedom, 1.0)).clip(min=floor))
+
+
+def _scatter(scores: list[Array], live: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> tuple[Array, float]:
+    """Covariance (D, D) of a window's summed scores and its degrees of freedom; `live` (D,) are those with data."""
+    lengths = np.array([len(s) for s in scores])
+    freedom = float(np.sum(lengths - 1))
+    if freedom < 1 or not live.any():
+        return np.eye(len(live)), np.inf
+    covariance = np.sum([len(s) * s.T @ s for s in scores], axis=0) / freedom
+    gamma0, gamma1 = _neighbours([s[:, live] for s in scores])
+    if gamma0 <= 0.0:
+        return covariance, freedom
+    rho = gamma1 / gamma0
+    if rho > RHO_COARSEN and lengths.max() >= 4:
+        return _scatter([_paired(s) for s in scores], live)
+    if rho <= 1.0 / np.sqrt(freedom * live.sum()):  # within its own SD of none at all
+        return covariance, freedom
+    typical = float(lengths.mean())
+    naive = gamma0 - 2.0 * gamma1 / typical  # what the covariance above expects, neighbours being correlated
+    inflation = max(1.0, (gamma0 + 2.0 * (1.0 - 1.0 / typical) * gamma1) / naive)
+    return covariance * inflation, freedom / (1.0 + 0.5 * inflation)  # rho itself is known from as little
+
+
+def _neighbours(scores: list[Array]) -> tuple[float, float]:
+    """Variance of a score and covariance of two neighbours, unbiased though each window's scores sum to zero.
+
+    With K scores g and r = g - mean(g): E sum r_k^2 and E sum r_k r_{k+1} are linear in both; solved over all windows.
+    """
+    scores = [s for s in scores if len(s) > 2]
+    k = np.array([float(len(s)) for s in scores])
+    none, mean_square = np.zeros_like(k), np.array([k, 2.0 * (k - 1.0)]) / k**2  # of mean(g), by gamma0, gamma1
+    matrix = np.array(
+        [
+            (np.array([k, none]) - k * mean_square).sum(axis=1),
+            (np.array([none, k - 1.0]) - (k + 1.0) * mean_square + 2.0 / k).sum(axis=1),
+        ]
+    )
+    own = sum(len(s) * float(np.vdot(s, s)) for s in scores)
+    next_to = sum(len(s) * float(np.vdot(s[1:], s[:-1])) for s in scores)
+    observed = np.array([own, next_to]) / max(scores[0].shape[1] if scores else 1, 1)
+    if abs(np.linalg.det(matrix)) < 1e-9:
+        return 0.0, 0.0
+    gamma0, gamma1 = np.linalg.solve(matrix, observed)
+    return float(gamma0), float(gamma1)
+
+
+def _paired(scores: Array) -> Array:
+    """Neighbours summed; an odd last one goes with the pair before it, a single one stays."""
+    if len(scores) < 2:
+        return scores
+    even = scores[: len(scores) // 2 * 2]
+    pairs = np.asarray(even.reshape(-1, 2, even.shape[1]).sum(1))
+    if len(even) < len(scores):
+        pairs[-1] += scores[-1]
+    return pairs

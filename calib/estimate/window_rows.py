@@ -1,0 +1,282 @@
+"""The equations of one window, as weighed rows in the unknowns of a joint state."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from calib.estimate.condense import Condensed, condense
+from calib.estimate.equations import Equations
+from calib.estimate.jitter import LagScatter
+from calib.estimate.joint_state import JointState
+from calib.estimate.nuisances import Applied, Nuisances, Priors
+from calib.estimate.type_a import TypeA
+from calib.estimate.wander import MAIN_TEMPERATURE, offset_temperature
+from calib.excitation.excited import excited
+from calib.model import Array, Pose, Window
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """Scatter of segments over that of white noise, pooled over windows: variance ratios of slopes and means, and the
+    degrees of freedom behind them."""
+
+    slopes: float = 1.0
+    means: float = 1.0
+    degrees_of_freedom: float = 0.0
+
+    def pooled(self, own: Noise) -> Noise:
+        """With another window's, by their degrees of freedom; the older ones forgotten beyond MOST_FREEDOM."""
+        kept = min(self.degrees_of_freedom, MOST_FREEDOM - min(own.degrees_of_freedom, MOST_FREEDOM))
+        total = kept + own.degrees_of_freedom
+        if total <= 0.0:
+            return own if self.degrees_of_freedom <= 0.0 else self
+        share = kept / total
+        slopes, means = share * self.slopes, share * self.means
+        return Noise(slopes + (1.0 - share) * own.slopes, means + (1.0 - share) * own.means, total)
+
+
+# A window's own covariance of slopes, from its segments alone, is drawn to the pooled one by as many degrees of freedom
+# as it has rows, three times: estimated from fewer it would be too sure of some direction.
+SHRINKAGE = 3.0
+MOST_FREEDOM = 400.0  # degrees of freedom: beyond, the oldest windows' scatter is forgotten
+FEWEST_FREEDOM = 10.0  # degrees of freedom: from fewer, a mean of squares is off by 40 % and more
+LEAST_INFLATION = 0.25  # variance ratios below it are the luck of few segments
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Summary:
+    """All that is kept of a window: its slopes and means, the directions (3, k) that were excited and what the
+    correction for noise leaves, its time in days, the lag that the front end took out, what the clocks leave of it, and
+    its temperature.
+
+    `pose` as stated, `moved` as `excited` leaves it. `held_mps2` (3,) is the mean input acceleration by the pose
+    as stated, NaN where nobody stated gravity.
+    """
+
+    pose: Pose
+    moved: Pose
+    held_mps2: Array
+    data: Condensed
+    directions: Array
+    attenuation: float
+    day: float
+    lag_s: float = 0.0
+    temperature_degc: float = np.nan
+    u_lag_s: float = 0.0
+    independent: float = 1.0
+
+    @classmethod
+    def of(cls, window: Window, day: float, lag_s: float = 0.0, temperature_degc: float = np.nan) -> Summary:
+        """The summary of a window that is used."""
+        found, sums, m = excited(window), window.sums, window.pose.direction.shape[1]
+        mean = sums.count @ sums.mean[:, :m] / sums.count.sum()
+        held = window.pose.gravity_mps2 + window.pose.direction @ mean
+        data = condense([found.window])
+        moved = found.window.pose
+        return cls(
+            window.pose, moved, held, data, found.directions, found.attenuation, day, lag_s, temperature_degc,
+            window.u_lag_s, window.independent,
+        )  # fmt: skip
+
+    def snapshot(self) -> dict[str, Any]:
+        """Plain values and arrays."""
+        held = {f.name: getattr(self, f.name) for f in fields(self)}
+        data = {f.name: getattr(self.data, f.name) for f in fields(self.data)}
+        data["type_a"] = {f.name: getattr(self.data.type_a, f.name) for f in fields(self.data.type_a)}
+        poses = {
+            name: {f.name: getattr(pose, f.name) for f in fields(pose)}
+            for name, pose in (("pose", self.pose), ("moved", self.moved))
+        }
+        return held | poses | {"data": data}
+
+    @classmethod
+    def load(cls, state: Mapping[str, Any]) -> Summary:
+        """The summary whose snapshot this is."""
+        data = Condensed(**{**state["data"], "type_a": TypeA(**state["data"]["type_a"])})
+        return cls(**{**state, "pose": Pose(**state["pose"]), "moved": Pose(**state["moved"]), "data": data})
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rows:
+    """Observed less predicted (R,) and Jacobian (R, N), slopes first, in units in which they are weighed alike.
+
+    `noise` (R, R) is a factor of their covariance: near the identity, since the weights take the noise of segments for
+    white, as calib.estimate.adjustment does, and the covariance is what the segments show.
+    """
+
+    residual: Array
+    jacobian: Array
+    noise: Array
+    slopes: int
+
+
+class WindowRows:
+    """One window's equations on the names of a joint state.
+
+    `scale` is the sensor's output unit per m/s2. `held_mps2` (3,) makes it the window of a fixed mount: the quantities
+    Q are then the mean output under that constant input acceleration (see recursion.py), and columns of S in
+    directions that were not excited get no part in the slopes. None: the mount turns. `seen_degc` is the range of
+    temperatures of windows before: one without a temperature may have had any of them.
+    """
+
+    def __init__(
+        self,
+        summary: Summary,
+        priors: Priors,
+        scale: float,
+        reference_degc: float,
+        held_mps2: Array | None,
+        seen_degc: tuple[float, float],
+    ) -> None:
+        self.summary, self.data = summary, summary.data
+        self.nuisances = Nuisances([summary.moved], self.data.channels, priors, Applied(summary.lag_s))
+        self._jitter = LagScatter.of(self.data, 0.0)
+        self.equations = Equations(self.data, self.nuisances, [0], priors.offset_mps2, self._jitter, scale)
+        self._priors, self._held_mps2 = priors, held_mps2
+        above = summary.temperature_degc - reference_degc
+        self._temperature_k = above if np.isfinite(above) else 0.0
+        told = np.isfinite(above) or not np.isfinite(seen_degc).all()
+        self._perhaps_k = () if told else tuple(degc - reference_degc for degc in seen_degc)
+        self._live = np.repeat(np.diag(self.data.root[0]) > 0.0, 3)
+
+    @property
+    def unknowns(self) -> list[tuple[str, float, float]]:
+        """(name, mean, standard uncertainty) of its nuisances before any data."""
+        return [(t.name, t.expected, t.uncertainty) for t in self.nuisances.terms]
+
+    @property
+    def noise(self) -> Noise:
+        """What this window's own segments say; where they are few, the rest is what a filter makes of white noise."""
+        type_a, live, filtered = self.data.type_a, self._live, 1.0 / self.summary.independent
+        freedom = type_a.degrees_of_freedom if np.isfinite(type_a.degrees_of_freedom) else 0.0
+        own = min(freedom / FEWEST_FREEDOM, 1.0)
+        slopes = float(np.diag(type_a.slopes)[live].mean()) if live.any() else filtered
+        means = float(np.diag(type_a.means).mean())
+        return Noise(own * slopes + (1.0 - own) * filtered, own * means + (1.0 - own) * filtered, freedom)
+
+    def at(self, state: JointState, at: Array, noise: Noise) -> Rows:
+        """Rows at the values `at` (N,) of the state's quantities; `noise` is the pooled one, to which this window's is
+        added: the first window of all has no other."""
+        noise = noise.pooled(self.noise)
+        x, chain = self._own(state, at)
+        rows = self.equations.at(x)
+        slope, d_slope = rows.slope.reshape(-1), rows.d_slope.reshape(-1, len(x))
+        mean, d_mean = rows.mean.reshape(-1), rows.d_mean.reshape(-1, len(x))
+        slope, d_slope = slope[self._live], d_slope[self._live]
+        weights, covariance = self._slope_covariances(noise)
+        if self._held_mps2 is not None:
+            mean, d_mean = self._fixed_means(x, self._held_mps2)
+            d_slope, missed = self._without_silent(d_slope, state)
+            weights, covariance = weights + np.diag(missed), covariance + np.diag(missed)
+        parts = []
+        if slope.size:
+            parts.append(_weighed(slope, d_slope, weights, covariance))
+        if self.equations.known[0]:
+            perhaps = self._perhaps(state, at)
+            weights, covariance = self._mean_covariances(noise)
+            parts.append(_weighed(mean, d_mean, weights + perhaps, covariance + perhaps))
+        if not parts:
+            return Rows(np.zeros(0), np.zeros((0, len(state))), np.zeros((0, 0)), 0)
+        residual, jacobian, roots = zip(*parts, strict=True)
+        root = np.zeros((sum(map(len, roots)),) * 2)
+        root[: len(roots[0]), : len(roots[0])] = roots[0]
+        root[len(roots[0]) :, len(roots[0]) :] = roots[-1] if len(roots) > 1 else 0.0
+        return Rows(np.concatenate(residual), np.vstack(jacobian) @ chain, root, slope.size)
+
+    def _own(self, state: JointState, at: Array) -> tuple[Array, Array]:
+        """The equations' own unknowns [S, Q, nuisances] at this temperature, and their derivatives (n, N)."""
+        n, t = 12 + len(self.nuisances), self._temperature_k
+        x, chain = np.zeros(n), np.zeros((n, len(state)))
+        stretch = np.ones(3)
+        for i, name in enumerate(MAIN_TEMPERATURE):
+            if name in state.names:
+                k = state.index(name)
+                stretch[i] += at[k] * t
+                chain[3 * i : 3 * i + 3, k] = at[3 * i : 3 * i + 3] * t
+        x[:9] = at[:9] * np.repeat(stretch, 3)
+        x[9:12] = at[9:12]
+        chain[range(9), range(9)] = np.repeat(stretch, 3)
+        chain[range(9, 12), range(9, 12)] = 1.0
+        for power in (1, 2):
+            for i, name in enumerate(offset_temperature(power)):
+                if name in state.names:
+                    k = state.index(name)
+                    x[9 + i] += at[k] * t**power
+                    chain[9 + i, k] = t**power
+        for j, term in enumerate(self.nuisances.terms):
+            k = state.index(term.name)
+            x[12 + j], chain[12 + j, k] = at[k] - term.applied, 1.0
+        return x, chain
+
+    def _perhaps(self, state: JointState, at: Array) -> Array:
+        """(3, 3) covariance of the weighed means for a temperature nobody told: one end of the range or the other."""
+        found = np.zeros((3, 3))
+        for above in self._perhaps_k:
+            moved = np.zeros(3)
+            for power in (1, 2):
+                for i, name in enumerate(offset_temperature(power)):
+                    if name in state.names:
+                        moved[i] += at[state.index(name)] * above**power * self.equations.mean_weight[0, i]
+            found += np.outer(moved, moved) / len(self._perhaps_k)
+        return found
+
+    def _slope_covariances(self, noise: Noise) -> tuple[Array, Array]:
+        """For weights and true, of the live slopes in units of the noise within the window.
+
+        In both are what two clocks differ by from window to window, and what the correction for noise leaves.
+        """
+        live, m = self._live, self.data.channels
+        jitter = max(self._priors.lag_window_s, self.summary.u_lag_s) * self._jitter.loading[0][live]
+        signal = np.zeros(6 * m)
+        signal[: 3 * m] = (self.data.slopes[0, :m] / self.data.type_a.noise).ravel()
+        left = self.summary.attenuation * signal[live]
+        both = np.outer(jitter, jitter) + np.outer(left, left)
+        own, white = self._drawn(self.data.type_a.slopes[np.ix_(live, live)], noise.slopes)
+        return white + both, own + both
+
+    def _mean_covariances(self, noise: Noise) -> tuple[Array, Array]:
+        """The same of the weighted means: the noise in their share, the offset between windows in the rest."""
+        share = self.equations.white_share[0]
+        own, white = self._drawn(self.data.type_a.means, noise.means)
+        within, between = np.sqrt(np.outer(share, share)), np.diag(1.0 - share)
+        return within * white + between, within * own + between
+
+    def _drawn(self, own: Array, pooled: float) -> tuple[Array, Array]:
+        """A window's own covariance drawn to the pooled ratio, and white noise of that ratio."""
+        white = max(pooled, LEAST_INFLATION) * np.eye(len(own))
+        freedom = self.data.type_a.degrees_of_freedom
+        if not np.isfinite(freedom):
+            return white, white
+        pull = SHRINKAGE * len(own)
+        return (freedom * own + pull * white) / (freedom + pull), white
+
+    def _fixed_means(self, x: Array, held_mps2: Array) -> tuple[Array, Array]:
+        """Weighted residuals (3,) and Jacobian (3, n) of the means at a fixed mount: the mean output alone."""
+        weight = self.equations.mean_weight[0]
+        away = x[:9].reshape(3, 3) @ np.nan_to_num(self.summary.held_mps2 - held_mps2)
+        jacobian = np.zeros((3, len(x)))
+        jacobian[range(3), range(9, 12)] = weight
+        return (self.data.mean_v[0] - x[9:12] - away) * weight, jacobian
+
+    def _without_silent(self, d_slope: Array, state: JointState) -> tuple[Array, Array]:
+        """The slopes' Jacobian without the columns of S along directions that were not excited, and the variance that
+        these columns' uncertainty puts into the rows: second order, since nothing moved there but by a nuisance."""
+        silent = np.eye(3) - self.summary.directions @ self.summary.directions.T
+        missed, kept = np.zeros(len(d_slope)), d_slope.copy()
+        for i in range(3):
+            own = d_slope[:, 3 * i : 3 * i + 3] @ silent
+            kept[:, 3 * i : 3 * i + 3] -= own
+            missed += np.sum((own @ state.factor[3 * i : 3 * i + 3]) ** 2, axis=1)
+        return kept, missed
+
+
+def _weighed(residual: Array, jacobian: Array, weights: Array, covariance: Array) -> tuple[Array, Array, Array]:
+    """Rows in which `weights` is the identity, and the factor of `covariance` there."""
+    root = np.linalg.cholesky(weights)
+    both = np.linalg.solve(root, np.column_stack([residual, jacobian, np.linalg.cholesky(covariance)]))
+    n = jacobian.shape[1]
+    return both[:, 0], both[:, 1 : 1 + n], both[:, 1 + n :]

@@ -1,0 +1,1 @@
+"""Where a sensor moves or rests, windows of known excitation and their sums."""

@@ -1,0 +1,160 @@
+"""Where the reference moves, and which points were struck or clipped, found from the data (rests: rests.py)."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.model import Array
+from calib.signal.band import hanning
+
+Mask = NDArray[np.bool_]
+Stretch = tuple[int, int]  # [first, stop) of samples
+
+FRAME_S = 0.25  # resolution with which motion begins and ends; three quarters of a cycle at 3 Hz
+BRIDGE_S = 1.0  # motion that pauses for less is one stretch
+# Of the level in the liveliest tenth of the frames: a random motion's slow spells stay above, a pause falls below.
+MOVING_LEVEL = 0.4
+KNOCK_SD = 5.0  # robust SDs: one white-noise point in 1.7 million
+KNOCK_PASSES = 8
+# Least eigenvalue of the columns' cosines: normal equations are right to 1e-10 then, and ten times as fast.
+INDEPENDENT = 1e-6
+SLOW_BAND_HZ = 50.0  # first band tried for the motion; widened until it holds most of the motion's power
+MOST_POWER = 0.7
+SPECTRUM_SAMPLES, SPECTRA, FEWEST_FOR_SPECTRUM = 4096, 4, 16
+CLIPPED_POINTS = 3  # as many points at the very same extreme, and beyond it by the motion, are no chance
+DISTINCT = 0.99  # of the points within the range differ: then three at an extreme are no chance either
+ROUNDING = 1e-9  # of the range: what is less is no noise
+
+
+def moving(u: Array, rate_hz: float) -> list[Stretch]:
+    """Stretches in which the reference u (n, m) moves, relative to the liveliest part of it."""
+    width = band_width(u, rate_hz, white_noise(u))
+    slow = averaged(u - np.median(u, axis=0), width) if len(u) else u
+    size = max(1, round(FRAME_S * rate_hz / width))
+    frames = len(slow) // size
+    if frames < 2:
+        return [(0, len(u))] if len(u) else []
+    level = np.sqrt(np.mean(slow[: frames * size].reshape(frames, -1) ** 2, axis=1))
+    on = level > MOVING_LEVEL * np.quantile(level, 0.9)
+    return _stretches(_bridged(on, round(BRIDGE_S / FRAME_S)), size * width, len(u))
+
+
+def knocked(V: Array, basis: Array, finest: Array) -> tuple[Mask, Array]:
+    """Points (n,) whose residual about the regression of V (n, 3) on `basis` (n, p) is beyond five robust SDs.
+
+    Also the residuals (n, 3) about the regression of the others. `finest` (3,): the resolution of V (`least_step`).
+    """
+    columns, outputs = np.ascontiguousarray(basis.T), np.ascontiguousarray(V.T)
+    struck: Mask = np.zeros(len(V), dtype=bool)
+    for _ in range(KNOCK_PASSES):
+        kept = np.flatnonzero(~struck) if struck.any() else slice(None)
+        residual = outputs - _regression(columns[:, kept], outputs[:, kept]) @ columns
+        away = np.abs(residual)
+        limit = KNOCK_SD * np.maximum(1.4826 * np.median(away[:, kept], axis=1), 0.5 * finest)
+        now = np.asarray((away > limit[:, None]).any(axis=0))
+        if np.array_equal(now, struck):
+            break
+        struck = now
+    return struck, residual.T
+
+
+def _regression(columns: Array, outputs: Array) -> Array:
+    """(3, p) least squares of outputs (3, n) on columns (p, n); by a factorisation of all points where they must."""
+    norm = np.linalg.norm(columns, axis=1)
+    norm[norm == 0.0] = 1.0
+    gram = columns @ columns.T / np.outer(norm, norm)
+    if np.linalg.eigvalsh(gram)[0] > INDEPENDENT:
+        return np.asarray(np.linalg.solve(gram, columns @ outputs.T / norm[:, None]).T / norm)
+    solution, *_ = np.linalg.lstsq(columns.T, outputs.T, rcond=None)
+    return np.asarray(solution.T)
+
+
+def clipped(V: Array, residual: Array, finest: Array) -> int:
+    """Points of V (n, 3) held at an end of the range: several at the very same extreme while the motion goes beyond, or
+    where no two points within the range are alike.
+
+    `residual` (n, 3) of V about the motion, `finest` (3,) the resolution of V.
+    """
+    points = 0
+    for axis in range(V.shape[1]):
+        v, r = V[:, axis], residual[:, axis]
+        for end, sign in ((v.max(), 1.0), (v.min(), -1.0)):
+            held = np.flatnonzero(v == end)
+            if len(held) < CLIPPED_POINTS:
+                continue
+            noise = 1.4826 * float(np.median(np.abs(r)))
+            if _all_differ(v, noise) or -sign * float(r[held].mean()) > noise + finest[axis]:
+                points += len(held)
+    return points
+
+
+def _all_differ(v: Array, noise: float) -> bool:
+    """Whether the resolution of v (n,) is so fine that points within its range hardly ever agree."""
+    inside = v[(v > v.min()) & (v < v.max())]
+    return noise > ROUNDING * float(np.ptp(v)) and len(np.unique(inside)) >= DISTINCT * len(inside) > 0
+
+
+def band_width(u: Array, rate_hz: float, noise: Array) -> int:
+    """How many samples of u (n, m), `white_noise` (m,), may be averaged and leave most of the motion's power; the noise
+    falls."""
+    power = _power(u) - float(np.sum(noise**2)) if len(u) else 0.0
+    width = max(1, min(int(rate_hz / SLOW_BAND_HZ), len(u)))
+    while width > 1 and _power(averaged(u, width)) < MOST_POWER * power:
+        width //= 2
+    return width
+
+
+def averaged(x: Array, width: int) -> Array:
+    """Means of every `width` samples of x (n, m); what is left over at the end is dropped."""
+    n = len(x) // width
+    # A channel a row: numpy sums along what lies together several times faster.
+    rows = np.ascontiguousarray(x[: n * width].T)
+    return np.asarray(rows.reshape(x.shape[1], n, width).mean(axis=2).T)
+
+
+def _power(x: Array) -> float:
+    """Sum of the variances of the channels of x (n, m)."""
+    return float(np.sum(np.var(np.ascontiguousarray(x.T), axis=1)))
+
+
+def white_noise(x: Array) -> Array:
+    """SD (m,) of white noise in x (n, m), by the median of its spectrum: motion in under half the band leaves it."""
+    size = min(SPECTRUM_SAMPLES, 1 << max(len(x).bit_length() - 1, 0))
+    if size < FEWEST_FOR_SPECTRUM:
+        return np.zeros(x.shape[1])
+    starts = np.unique(np.linspace(0, len(x) - size, SPECTRA).astype(int))
+    parts = np.stack([x[k : k + size] for k in starts])
+    window = hanning(size)[:, None]
+    lines = np.fft.rfft((parts - parts.mean(axis=1, keepdims=True)) * window, axis=1)[:, 1:-1]
+    power = np.median(np.abs(lines) ** 2, axis=(0, 1)) / np.sum(window**2)
+    # The power of a line of white noise is exponentially distributed: its mean is the median over ln 2.
+    return np.asarray(np.sqrt(power / np.log(2.0)))
+
+
+def least_step(V: Array) -> Array:
+    """(3,) the smallest change between neighbouring samples: the resolution of counts, next to nothing of decimals."""
+    steps = np.abs(np.diff(V, axis=0))
+    least = np.min(steps, axis=0, where=steps > 0, initial=np.inf)
+    return np.where(np.isfinite(least), least, 0.0)
+
+
+def _bridged(on: Mask, longest: int) -> Mask:
+    """Pauses shorter than `longest` frames between two moving ones count as moving."""
+    out = on.copy()
+    edges = np.flatnonzero(on)
+    for a, b in itertools.pairwise(edges):
+        if 1 < b - a <= longest:
+            out[a:b] = True
+    return out
+
+
+def _stretches(on: Mask, size: int, n: int) -> list[Stretch]:
+    """Frames to samples; what is left after the last whole frame goes with it."""
+    change = np.flatnonzero(np.diff(np.concatenate([[False], on, [False]]).astype(np.int8)))
+    pairs = [(int(a) * size, int(b) * size) for a, b in zip(change[::2], change[1::2], strict=True)]
+    if pairs and pairs[-1][1] == len(on) * size:
+        pairs[-1] = (pairs[-1][0], n)
+    return pairs

@@ -1,0 +1,243 @@
+"""Windows of known excitation out of a stretch in which the sensor stands in one pose, each with its verdict.
+
+Motion is found from the reference itself; rests under a known gravity from the sensor. What a window must keep to be
+used is in calib.excitation.window_verdict.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from calib.excitation import detection
+from calib.excitation.rests import find_rests
+from calib.excitation.sums import factor, pool, window_sums
+from calib.excitation.window_verdict import DEFAULT_LIMITS, Limits, Verdict, judge
+from calib.geometry import at_rest
+from calib.model import Array, Pose, Window, WindowSums
+
+SHORTEST_QUIET_S = 1.0  # shorter pauses tell nothing of the reference's noise
+
+
+Kind = Literal["motion", "rest", "quiet"]
+
+
+class Points(NamedTuple):
+    """Samples that all have a reference: times (n,), rising, V (n, 3), u and du (n, m)."""
+
+    time_s: Array
+    V: Array
+    u: Array
+    du: Array
+
+    def part(self, first: int, stop: int) -> Points:
+        """Samples [first, stop)."""
+        return Points(*(column[first:stop] for column in self))
+
+
+def motion_windows(
+    pose: Pose, points: Points, limits: Limits = DEFAULT_LIMITS, *, leave_out: bool = True
+) -> list[Window]:
+    """Windows in samples of one pose throughout, found from the reference itself; calm parts are of kind `quiet`.
+
+    `leave_out` False keeps all points, knocks included (Method 3 as printed).
+    """
+    return [
+        window
+        for kind, first, stop in motion_parts(points.u, _rate(points.time_s))
+        for window in judged(kind, pose, points.part(first, stop), limits, leave_out=leave_out)
+    ]
+
+
+def motion_parts(u: Array, rate_hz: float) -> list[tuple[Kind, int, int]]:
+    """A reference's samples u (n, m) cut where it begins and ceases to move; short pauses at an end are left out."""
+    edges = [0, *itertools.chain(*detection.moving(u, rate_hz)), len(u)]
+    parts: list[tuple[Kind, int, int]] = []
+    for k, (first, stop) in enumerate(itertools.pairwise(edges)):
+        if k % 2:
+            parts.append(("motion", first, stop))
+        elif stop - first >= SHORTEST_QUIET_S * rate_hz or len(edges) == 2:
+            parts.append(("quiet", first, stop))
+    return parts
+
+
+def judged(
+    kind: Kind, pose: Pose, points: Points, limits: Limits = DEFAULT_LIMITS, *, leave_out: bool = True
+) -> list[Window]:
+    """The windows, with their verdicts, of a part in which the reference moves (or is calm): cut where samples are
+    missing and where they would be longer than `limits.longest_s`."""
+    windows = []
+    for first, stop in _unbroken(points.time_s):
+        longest = round(limits.longest_s * _rate(points.time_s[first:stop]))
+        for a, b in _pieces(first, stop, longest):
+            windows.append(_motion(kind, pose, points.part(a, b), limits, leave_out))
+    return windows
+
+
+def rest_window(
+    pose: Pose,
+    time_s: Array,
+    V: Array,
+    limits: Limits = DEFAULT_LIMITS,
+    *,
+    floor: Array | None = None,
+    leave_out: bool = True,
+) -> Window:
+    """The window of all rests in samples (n,), n >= 2, of one static pose: times and V (n, 3).
+
+    Parts that move are not in it. `floor` (3,): SD that the sensor has at rest elsewhere (`rest_sd`), to tell a sensor
+    that shakes all the time from one at rest.
+    """
+    rate_hz = _rate(time_s)
+    rests = find_rests(V, rate_hz)
+    if not rests:
+        numbers = {"points": float(len(V)), "left_out_pct": 0.0}
+        return _window("rest", pose, time_s, _rest_sums(V, rate_hz, limits), _never(numbers), 0)
+    at_rest = np.concatenate([np.arange(a, b) for a, b in rests])
+    t, v = time_s[at_rest], V[at_rest]
+    finest = detection.least_step(v)
+    struck, _ = detection.knocked(v, np.ones((len(v), 1)), finest)
+    clean = sums = _rest_sums(v[~struck], rate_hz, limits)
+    if not leave_out:
+        sums = _rest_sums(v, rate_hz, limits)
+    numbers = {"at_rest_pct": 100.0 * len(v) / len(V)}
+    if floor is not None:
+        least = np.maximum(np.maximum(floor, finest), np.finfo(float).tiny)
+        numbers["sd_over_floor"] = float(np.max(_within_sd(clean) / least))
+    left_out = int(struck.sum()) if leave_out else 0
+    return _window("rest", pose, t, sums, judge(sums, struck, numbers, limits), left_out)
+
+
+def rests_anywhere(time_s: Array, V: Array, gravity_mps2: float, limits: Limits = DEFAULT_LIMITS) -> list[Window]:
+    """A window for each rest in samples (n,), in positions that nobody stated: only gravity's magnitude is known there.
+
+    Their pose says gravity on z, which is not so: a norm fit does not look at it.
+    """
+    rate_hz = _rate(time_s)
+    windows = []
+    for k, (first, stop) in enumerate(find_rests(V, rate_hz)):
+        pose = at_rest([0.0, 0.0, gravity_mps2], position=f"rest {k + 1}")
+        v = V[first:stop]
+        struck, _ = detection.knocked(v, np.ones((len(v), 1)), detection.least_step(v))
+        sums = _rest_sums(v[~struck], rate_hz, limits)
+        verdict = judge(sums, struck, {}, limits)
+        windows.append(_window("rest", pose, time_s[first:stop], sums, verdict, int(struck.sum())))
+    return windows
+
+
+def rest_sd(V: Array, rate_hz: float) -> Array | None:
+    """SD (3,) of V (n, 3) within its rests, None where it never rests."""
+    rests = find_rests(V, rate_hz)
+    return np.median([V[a:b].std(axis=0) for a, b in rests], axis=0) if rests else None
+
+
+def _motion(kind: Kind, pose: Pose, points: Points, limits: Limits, leave_out: bool) -> Window:
+    """One window. It is judged without the knocks, also where they stay in its sums."""
+    t, _, u, du = points
+    V = np.asfortranarray(points.V)  # medians and extremes of an axis are several times faster this way
+    rate_hz = _rate(t)
+    if len(V) < max(limits.least_points, 2 * u.shape[1] + 2):
+        sums = _sums(V, u, du, rate_hz, limits)
+        return _window(kind, pose, t, sums, judge(sums, np.zeros(len(V), dtype=bool), {}, limits), 0)
+    basis = np.column_stack([np.ones(len(u)), u, du])
+    finest = detection.least_step(V)
+    struck, residual = detection.knocked(V, basis, finest)
+    clean = sums = _sums(V, u, du, rate_hz, limits)
+    if struck.any():
+        kept = ~struck
+        clean = _sums(V[kept], u[kept], du[kept], rate_hz, limits)
+        if leave_out:
+            sums = clean
+    numbers = _motion_numbers(clean, basis[~struck], V[~struck], rate_hz)
+    numbers["stuck_axes"] = float(np.sum(np.ptp(V, axis=0) == 0.0))
+    numbers["clipped_points"] = float(detection.clipped(V, residual, finest))
+    verdict = judge(sums, struck, numbers, limits)
+    if kind == "quiet" and verdict.used:
+        verdict = Verdict(False, "the reference is calm here", verdict.numbers)
+    return _window(kind, pose, t, sums, verdict, int(struck.sum()) if leave_out else 0)
+
+
+def _motion_numbers(sums: WindowSums, basis: Array, V: Array, rate_hz: float) -> dict[str, float]:
+    """Level, noise and coherence in the band of the motion; drift of the mean. `basis` (n, 1 + 2 m) is [1, u, du]."""
+    m = sums.reference_channels
+    u = basis[:, 1 : 1 + m]
+    noise = detection.white_noise(u)
+    width = detection.band_width(u, rate_hz, noise)
+    slow, slow_v = detection.averaged(basis, width), detection.averaged(V, width)
+    solution, *_ = np.linalg.lstsq(slow, slow_v, rcond=None)
+    total = float(np.sum((slow_v - slow_v.mean(axis=0)) ** 2))
+    rest = float(np.sum((slow_v - slow @ solution) ** 2))
+    scale = float(np.linalg.norm(solution[1 : 1 + m], 2))
+    return {
+        "reference_rms_mps2": float(np.sqrt(np.sum(np.var(slow[:, 1 : 1 + m], axis=0)))),
+        # Of a constant channel rounding alone is left of both; it is silent.
+        "reference_noise_mps2": float(np.sqrt(np.sum(noise**2) / width) + 1e-12 * np.abs(u).max()),
+        "coherence": 1.0 - rest / total if total > 0 else 0.0,
+        "drift_mps2": _drift(sums) / scale if scale > 0 else np.inf,
+    }
+
+
+def _never(numbers: Mapping[str, float]) -> Verdict:
+    return Verdict(False, "the sensor is never at rest here", numbers)
+
+
+def _drift(sums: WindowSums) -> float:
+    """How far a segment's mean strays from what the window's own regression foretells, worst axis, output unit."""
+    m = sums.reference_channels
+    part = factor(sums, derivative=True)
+    solution, *_ = np.linalg.lstsq(part.r, part.rhs, rcond=1e-12)
+    whole = sums.count >= 0.5 * sums.count.max()
+    basis = np.hstack([np.ones((len(sums.count), 1)), sums.mean[:, : 2 * m]])
+    return float(np.abs((sums.mean[:, 2 * m :] - basis @ solution)[whole]).max())
+
+
+def _sums(V: Array, u: Array, du: Array, rate_hz: float, limits: Limits) -> WindowSums:
+    """Sums by segments of `segment_s`; what is left over at the end goes into the last one."""
+    size = max(1, round(limits.segment_s * rate_hz))
+    edges = np.arange(0, max(len(V) - size // 2, 1), size)
+    return window_sums(u, du, V, np.append(edges, len(V)))
+
+
+def _rest_sums(V: Array, rate_hz: float, limits: Limits) -> WindowSums:
+    return _sums(V, np.empty((len(V), 0)), np.empty((len(V), 0)), rate_hz, limits)
+
+
+def _within_sd(sums: WindowSums) -> Array:
+    """(3,) SD of V within segments."""
+    return np.asarray(np.sqrt(np.diagonal(sums.scatter[:, -3:, -3:].sum(axis=0)) / sums.count.sum()))
+
+
+def _window(
+    kind: Kind,
+    pose: Pose,
+    time_s: Array,
+    sums: WindowSums,
+    verdict: Verdict,
+    left_out: int,
+) -> Window:
+    points = int(pool(sums).count[0])
+    start, stop = float(time_s[0]), float(time_s[-1])
+    return Window(start, stop, pose, sums, verdict.used, verdict.reason, points, left_out, kind, verdict.numbers)
+
+
+def _unbroken(time_s: Array) -> Iterator[tuple[int, int]]:
+    """Stretches without missing samples: steps beyond two and a half usual ones cut."""
+    if len(time_s) < 2:
+        return
+    steps = np.diff(time_s)
+    cuts = np.flatnonzero(steps > 2.5 * np.median(steps)) + 1
+    yield from ((a, b) for a, b in itertools.pairwise([0, *cuts.tolist(), len(time_s)]) if b - a > 1)
+
+
+def _pieces(first: int, stop: int, longest: int) -> Iterator[tuple[int, int]]:
+    """Equal pieces no longer than `longest`, none of a single sample."""
+    if stop - first > 1:
+        count = min(-(-(stop - first) // max(longest, 2)), (stop - first) // 2)
+        yield from itertools.pairwise(np.linspace(first, stop, count + 1).round().astype(int).tolist())
+
+
+def _rate(time_s: Array) -> float:
+    return float((len(time_s) - 1) / (time_s[-1] - time_s[0]))

@@ -1,0 +1,1 @@
+"""Sample times, resampling, bands and filters."""

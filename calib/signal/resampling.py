@@ -1,0 +1,123 @@
+"""The reference at the sensor's sample times, with its time derivative; and the acceleration behind a velocity.
+
+Interpolation by sixteen taps whose weights are polynomials of the fractional position (Farrow 1988), so that the value
+and its derivative come from the same sums. Up to 0.25 of the reference's sampling rate the value is right to 1e-5 and
+the derivative to 1e-4 of its amplitude; above 0.3 both fall off.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+from calib.model import Array
+from calib.signal.timing import ClockFit
+
+TAPS, DEGREE = 16, 7
+HALF = TAPS // 2
+BAND = 0.3  # of the sampling rate: the taps are the best for motion below
+RIDGE = 1e-11  # holds the noise amplification at one: more costs accuracy, less costs noise
+NODES = 64  # samples between the points at which the clock is inverted: straight in between to 1 ns
+CHUNK = 8192  # output samples worked on at a time, in cache
+# Velocity is differentiated up to here and damped from twice as much: the paper's range and three octaves above it.
+VELOCITY_BAND_HZ = 50.0
+VELOCITY_BAND_LARGEST = 0.15  # of the sampling rate
+# A differentiator's ripple counts against the slope at the motion's frequency, which is as much smaller than the band.
+STOP_BAND_DB = 110.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Resampled:
+    """The reference at given times: u (n, m) and du/dt (n, m); `usable` (n,) where all taps were there."""
+
+    u: Array
+    du: Array
+    usable: NDArray[np.bool_]
+
+
+def resample(x: Array, clock: ClockFit, time_s: Array, first_index: int = 0, margin: int = 0) -> Resampled:
+    """Reference `x` (M, m), samples `first_index` on of the device that `clock` times, at `time_s` (n,), rising.
+
+    At most some minutes at a time: one rate turns the derivative into seconds. Not usable are times within half the
+    taps (and `margin` samples more) of an end, within those and `NODES` samples of a gap, and beyond.
+    """
+    nodes = np.linspace(time_s[0], time_s[-1], len(time_s) // NODES + 2)
+    position = np.interp(time_s, nodes, clock.index_of(nodes))
+    base = np.floor(position).astype(np.int64)
+    fraction = position - base
+    start = base - first_index - (HALF - 1)
+    usable = (start >= margin) & (start + TAPS + margin <= len(x))
+    for gap in clock.gaps:
+        usable &= np.abs(base - gap) > HALF + margin + NODES
+    middle = clock.index_of(np.median(time_s))
+    rate = 1.0 / float(clock.time_of(middle + 0.5) - clock.time_of(middle - 0.5))
+    # A channel a row: what is done to a channel afterwards finds its samples side by side.
+    u, du = np.zeros((x.shape[1], len(position))), np.zeros((x.shape[1], len(position)))
+    inside = np.nonzero(usable)[0]
+    for k in range(0, len(inside), CHUNK):
+        part = inside[k : k + CHUNK]
+        low, high = int(start[part].min()), int(start[part].max()) + TAPS
+        for channel in range(x.shape[1]):
+            taps = np.ascontiguousarray(sliding_window_view(x[low:high, channel], TAPS).T)
+            value, slope = _horner((_weights() @ taps).take(start[part] - low, axis=1), fraction[part])
+            u[channel, part], du[channel, part] = value, slope * rate
+    return Resampled(u.T, du.T, usable)
+
+
+def differentiate(velocity: Array, rate_hz: float, band_hz: float = VELOCITY_BAND_HZ) -> tuple[Array, int]:
+    """Acceleration (M, m) in m/s2 of a velocity (M, m) in m/s, sample by sample, and how many at each end are wrong.
+
+    Eq. (12) holds for amplitudes only. Right to 5e-5 up to `band_hz` (at most 0.15 of the rate), damped by 110 dB
+    from twice that on, since differentiation raises noise with frequency.
+    """
+    band = min(band_hz / rate_hz, VELOCITY_BAND_LARGEST)
+    half = int(
+        np.ceil((STOP_BAND_DB - 8.0) / (2.285 * 2 * np.pi * band) / 2)
+    )  # Kaiser's length for a transition `band`
+    n = np.arange(-half, half + 1)
+    cut = 1.5 * band
+    window = np.kaiser(2 * half + 1, 0.1102 * (STOP_BAND_DB - 8.7))
+    phase = 2 * np.pi * cut * n
+    with np.errstate(invalid="ignore", divide="ignore"):
+        taps = np.where(n == 0, 0.0, (phase * np.cos(phase) - np.sin(phase)) / (np.pi * n**2)) * window
+    taps *= rate_hz / -(taps @ n)  # a ramp's slope is exact
+    out = np.column_stack([np.convolve(channel, taps, mode="same") for channel in velocity.T])
+    return out, half
+
+
+def _horner(sums: Array, fraction: Array) -> tuple[Array, Array]:
+    """Polynomials `sums` (DEGREE + 1, n), rising powers, at `fraction` (n,): values and derivatives."""
+    value, slope = sums[DEGREE].copy(), np.zeros(len(fraction))
+    for k in range(DEGREE - 1, -1, -1):
+        slope *= fraction
+        slope += value
+        value *= fraction
+        value += sums[k]
+    return value, slope
+
+
+@lru_cache(maxsize=1)
+def _weights() -> Array:
+    """(DEGREE + 1, TAPS) coefficients, rising powers of the fraction, of the weight of each tap.
+
+    For every fraction: least mean square error over frequencies up to BAND, cubic motion exact.
+    """
+    taps = np.arange(-HALF + 1, HALF + 1)
+    nodes = 0.5 - 0.5 * np.cos(np.pi * (np.arange(4 * DEGREE) + 0.5) / (4 * DEGREE))
+    normal = 2 * BAND * np.sinc(2 * BAND * (taps[:, None] - taps)) + RIDGE * np.eye(TAPS)
+    powers = np.arange(4)
+    moments = (taps / HALF) ** powers[:, None]
+    system = np.block([[normal, moments.T], [moments, np.zeros((4, 4))]])
+    wanted = np.hstack([2 * BAND * np.sinc(2 * BAND * (taps - nodes[:, None])), (nodes[:, None] / HALF) ** powers])
+    weights = np.linalg.solve(system, wanted.T)[:TAPS].T
+    chebyshev = np.polynomial.chebyshev.chebfit(2 * nodes - 1, weights, DEGREE)
+    to_powers = np.zeros((DEGREE + 1, DEGREE + 1))
+    for k in range(DEGREE + 1):
+        shifted = np.polynomial.Polynomial([-1.0, 2.0])
+        in_powers = np.polynomial.Polynomial(np.polynomial.chebyshev.cheb2poly(np.eye(DEGREE + 1)[k]))(shifted)
+        to_powers[: len(in_powers.coef), k] = in_powers.coef
+    return np.asarray(to_powers @ chebyshev)

@@ -1,0 +1,163 @@
+"""The clock behind a file's time stamps, whatever they are: a grid, arrivals of bursts, spread or jittery ones."""
+
+from __future__ import annotations
+
+import bisect
+import itertools
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.model import Array
+from calib.signal.timing import HORIZON_S, ClockFit, Edge, IntArray, parabola
+
+Kind = Literal["grid", "bursts", "spread", "jittery"]
+SAME_BURST = 0.3  # of the mean period: samples cannot have been taken that close together
+MANY = 0.3  # of all steps: so many short ones are no accident
+GRID = 0.02  # of the mean period: what a step may differ from the usual one on a grid
+FEW = 1e-3  # of all steps: odd steps of a grid (samples missing)
+NEIGHBOURS = 32  # bursts on each side that tell a gap (all later ones stay late) from a stall (they catch up)
+FEWEST_NEIGHBOURS = 4  # the last burst of a file may be cut off, its newest sample is then none
+# Of the usual period. Less cannot be told from the scatter of bursts, and then costs less than it does; exact stamps
+# show each missing sample.
+LEAST_GAP, LEAST_GAP_ON_GRID = 5.0, 0.5
+
+
+BLOCK_ROWS = 1 << 20  # looked at in one go: a quarter of an hour at 1 kHz, bounds memory
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Arrivals:
+    """What stamps say: the newest sample of each burst (B,) and when it arrived (B,), and how the stamps were made."""
+
+    kind: Kind
+    index: IntArray
+    arrival_s: Array
+
+
+def clock_from_stamps(stamp_s: Array) -> ClockFit:
+    """The clock of a device from the stamps (n,) of its consecutive samples, n >= 2.
+
+    Parabolas over a minute each, joined; anew after each gap and every `BLOCK_ROWS` rows. Raises ValueError where time
+    does not pass at all.
+    """
+    edges = np.linspace(0, len(stamp_s), -(-len(stamp_s) // BLOCK_ROWS) + 1).astype(int).tolist()
+    pieces: list[ClockFit] = []
+    gaps: list[int] = []
+    edge: Edge | None = None
+    for first, stop in itertools.pairwise(edges):
+        arrivals = arrivals_from_stamps(stamp_s[first:stop])
+        period = _usual_period(arrivals)
+        found = _gaps(arrivals, period)
+        cuts = [0, *np.searchsorted(arrivals.index, found).tolist(), len(arrivals.index)]
+        parts = [(arrivals.index[a:b], arrivals.arrival_s[a:b]) for a, b in itertools.pairwise(cuts)]
+        edge = edge or _edge(arrivals.kind, *max(parts, key=lambda part: len(part[0])))
+        bounds = [0, *found.tolist(), stop - first]
+        for (index, arrival_s), (a, b) in zip(parts, itertools.pairwise(bounds), strict=True):
+            pieces.append(_piece(index + first, arrival_s, first + a, first + b - 1, 1.0 / period, edge))
+        gaps += [first + gap for gap in found.tolist()]
+    return replace(
+        pieces[-1],
+        knot_index=np.concatenate([p.knot_index for p in pieces]),
+        knot_time_s=np.concatenate([p.knot_time_s for p in pieces]),
+        knot_period_s=np.concatenate([p.knot_period_s for p in pieces]),
+        gaps=np.array(gaps, dtype=np.int64),
+    )
+
+
+def arrivals_from_stamps(stamp_s: Array) -> Arrivals:
+    """Bursts out of stamps (n,): equal or close ones are one, so are those spread at a nominal rate; else each is."""
+    t = np.asarray(stamp_s, dtype=float)
+    kind, breaks = _classified(t)
+    index = np.append(np.flatnonzero(breaks), len(t) - 1)
+    return Arrivals(kind, index, t[index])
+
+
+def kind_of(stamp_s: Array) -> Kind:
+    """How the stamps (n,) were made. Raises ValueError where time does not pass at all."""
+    return _classified(np.asarray(stamp_s, dtype=float))[0]
+
+
+def _classified(t: Array) -> tuple[Kind, NDArray[np.bool_]]:
+    """The kind of stamps, and after which of them (n - 1,) a burst ends."""
+    steps = np.diff(t)
+    period = (t[-1] - t[0]) / len(steps) if len(steps) else 0.0
+    if not period > 0:
+        raise ValueError(f"time must pass between the first stamp and the last, from {t[0]} s to {t[-1]} s")
+    short = steps < SAME_BURST * period
+    usual = float(np.median(steps))
+    if np.mean(short) >= MANY and usual < SAME_BURST * period:
+        return "bursts", ~short
+    odd = np.abs(steps - usual) > max(GRID * usual, 1.5 * _resolution(t))
+    each = np.ones(len(steps), dtype=bool)
+    if np.mean(odd) < FEW or np.count_nonzero(odd) < 2:
+        return "grid", each
+    return ("spread", odd) if np.mean(odd) < 0.5 else ("jittery", each)
+
+
+def _resolution(t: Array) -> float:
+    """The decimal step the stamps are rounded to, 0 where finer than a microsecond."""
+    some = t[:4096] - t[0]
+    for decimals in range(2, 7):
+        if np.abs(some - np.round(some, decimals)).max() < 1e-9:
+            return float(10.0**-decimals)
+    return 0.0
+
+
+def _edge(kind: Kind, index: IntArray, arrival_s: Array) -> Edge:
+    """Exact or symmetrically scattering stamps stand for the sample itself; all others come after it.
+
+    Scatter is symmetrical where its lower tail is at least half as long as its upper one.
+    """
+    if kind != "jittery":
+        return "mean" if kind == "grid" else "early"
+    x, y = (index - index[0])[:20_000], (arrival_s - arrival_s[0])[:20_000]
+    low, middle, high = np.quantile(y - np.polyval(np.polyfit(x, y, 1), x), [0.02, 0.5, 0.98])
+    return "mean" if middle - low > 0.5 * (high - middle) else "early"
+
+
+def _usual_period(arrivals: Arrivals) -> float:
+    """Median of the mean periods over neighbouring bursts: gaps do not move it."""
+    span = min(NEIGHBOURS, len(arrivals.index) - 1)
+    index, arrival_s = arrivals.index, arrivals.arrival_s
+    return float(np.median((arrival_s[span:] - arrival_s[:-span]) / (index[span:] - index[:-span])))
+
+
+def _gaps(arrivals: Arrivals, period: float) -> IntArray:
+    """Sample numbers before which samples are missing: all bursts from there on are later than those before."""
+    late = arrivals.arrival_s - period * arrivals.index
+    least = period * (LEAST_GAP_ON_GRID if arrivals.kind == "grid" else LEAST_GAP)
+    steps = np.diff(late)
+    found = [0, len(late)]
+    # The largest first: a stall just before a gap would else be taken for it.
+    for b in sorted((np.flatnonzero(steps > least) + 1).tolist(), key=lambda b: -steps[b - 1]):
+        right = bisect.bisect(found, b)
+        before = late[max(found[right - 1], b - NEIGHBOURS) : b]
+        after = late[b : min(found[right], b + NEIGHBOURS)]
+        if min(len(before), len(after)) < FEWEST_NEIGHBOURS:
+            continue
+        if min(after.min() - before.min(), np.median(after) - np.median(before)) > least:
+            found.insert(right, b)
+    return arrivals.index[np.array(found[1:-1], dtype=np.int64) - 1] + 1
+
+
+def _piece(index: IntArray, arrival_s: Array, first: int, last: int, nominal_hz: float, edge: Edge) -> ClockFit:
+    """Samples `first` to `last` without a gap: a parabola over each minute, knots half a minute apart."""
+    begin, end = float(arrival_s[0]), float(arrival_s[-1])
+    if end - begin <= HORIZON_S:
+        return parabola(index, arrival_s, nominal_hz, edge).clock(first, last)
+    centres = np.linspace(begin, end, max(3, round(2 * (end - begin) / HORIZON_S) + 1))[1:-1]
+    fits = []
+    for centre in centres:
+        a, b = np.searchsorted(arrival_s, [centre - HORIZON_S / 2, centre + HORIZON_S / 2])
+        fits.append(parabola(index[a:b], arrival_s[a:b], nominal_hz, edge))
+    knots = np.array([first, *np.interp(centres, arrival_s, index), last], dtype=float)
+    at = [fits[0], *fits, fits[-1]]
+    return replace(
+        fits[-1].clock(first, last),
+        knot_index=knots,
+        knot_time_s=np.array([float(f.at(k)) for f, k in zip(at, knots, strict=True)]),
+        knot_period_s=np.array([float(f.period_at(k)) for f, k in zip(at, knots, strict=True)]),
+    )

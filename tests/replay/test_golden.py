@@ -1,0 +1,74 @@
+"""Recordings and states of every format that was released stay readable, and give the results that stand beside them.
+
+`expected.json` holds what this version of the program computes from a recording. Where a change of the estimator moves
+a result on purpose, `python -m tests.replay.golden_files` writes the file anew, and CHANGELOG.md says why.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from agent.config import Config
+from agent.core.events import CalibrationUpdate, DeviceChange
+from agent.core.pipeline import Pipeline
+from agent.delivery.history import History
+from agent.delivery.store import Store
+from agent.recording.reading import RecordingReader
+from tests.replay.golden_files import EXPECTED, FORMATS, RECORDING, STATE, config_of, results_of
+
+TOLERANCE = 1e-9  # relative: kernels of other CPUs differ by 1e-12 at most
+
+
+def differing(found: Any, expected: Any, path: str = "") -> list[str]:
+    """Where two results are not the same to TOLERANCE; what is missing, NaN or more on one side is a difference."""
+    if isinstance(found, dict) and isinstance(expected, dict):
+        if found.keys() != expected.keys():
+            return [f"{path}: members {sorted(found.keys() ^ expected.keys())}"]
+        return [d for name in found for d in differing(found[name], expected[name], f"{path}.{name}")]
+    if isinstance(found, list) and isinstance(expected, list):
+        if len(found) != len(expected):
+            return [f"{path}: {len(found)} entries, {len(expected)} expected"]
+        return [d for k, pair in enumerate(zip(found, expected, strict=True)) for d in differing(*pair, f"{path}[{k}]")]
+    if isinstance(found, float) and isinstance(expected, float | int):
+        alike = math.isclose(found, expected, rel_tol=TOLERANCE, abs_tol=TOLERANCE**2)
+        return [] if alike else [f"{path}: {found!r}, {expected!r} expected"]
+    return [] if found == expected else [f"{path}: {found!r}, {expected!r} expected"]
+
+
+@pytest.mark.parametrize("directory", FORMATS, ids=lambda path: path.name)
+def test_a_released_format_replays_to_the_results_beside_it(directory: Path) -> None:
+    expected = json.loads((directory / EXPECTED).read_text())
+    assert sum(r["what"] == "CalibrationUpdate" for r in expected) >= 1
+    assert differing(results_of(directory / RECORDING), expected) == []
+
+
+@pytest.mark.parametrize("directory", FORMATS, ids=lambda path: path.name)
+def test_a_state_of_a_released_format_is_brought_up_to_date(directory: Path, tmp_path: Path) -> None:
+    (tmp_path / STATE).write_bytes((directory / STATE).read_bytes())
+    store = Store(tmp_path, 0)
+    assert store.set_aside is None
+    with History(store.path) as history:
+        kept = {identity: memory.state for identity, memory in history.memories("mems").items()}
+        in_force = history.in_force("mems")
+    store.close()
+    assert in_force is not None
+    config = Config.model_validate_json(config_of(directory / RECORDING))
+    pipeline = Pipeline.begin(config, "later", 0, store.last_sequence(), {"mems": kept})
+    events = (step.event for step in RecordingReader(directory / RECORDING).steps())
+    opened = next(e for e in events if isinstance(e, DeviceChange) and e.device == "mems")
+    (again,) = [result for result in pipeline.step(opened) if isinstance(result, CalibrationUpdate)]
+    assert again.sensitivity == in_force.fields["sensitivity"]
+    assert again.offset == in_force.fields["offset"]
+    assert again.covariance == in_force.fields["covariance"]
+
+
+def test_a_difference_of_one_part_in_a_million_is_seen() -> None:
+    assert differing({"a": [1.0, 2.0]}, {"a": [1.0, 2.0 * (1.0 + 1e-6)]}) != []
+    assert differing({"a": 1.0}, {"b": 1.0}) != []
+    assert differing([1.0], [1.0, 2.0]) != []
+    assert differing(math.nan, 1.0) != []

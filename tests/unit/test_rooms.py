@@ -1,0 +1,36 @@
+"""What the deterministic core loads, and how long a file may be; import-linter holds who imports whom."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+LONGEST_FILE = 350  # lines
+FORBIDDEN = ("sqlite3", "zenoh", "mcap", "serial", "click")
+WALK = """
+import importlib, pkgutil, sys
+import agent.core, calib
+for package in (agent.core, calib):
+    for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
+        importlib.import_module(module.name)
+print(*sorted(sys.modules))
+"""
+
+
+def test_the_core_and_the_library_load_no_input_or_output() -> None:
+    run = subprocess.run([sys.executable, "-c", WALK], cwd=ROOT, capture_output=True, text=True, check=True)
+    loaded = run.stdout.split()
+    assert "agent.core.pipeline" in loaded
+    assert "calib.paper.method3" in loaded
+    assert [name for name in loaded if name.partition(".")[0] in FORBIDDEN] == []
+
+
+def test_no_file_is_too_long() -> None:
+    generated = ROOT / "agent" / "proto"
+    files = [path for room in ("agent", "calib", "hw", "tests", "benchmarks", "examples", "docs")
+             for path in (ROOT / room).rglob("*.py") if generated not in path.parents]  # fmt: skip
+    assert len(files) > 300
+    lengths = {str(path.relative_to(ROOT)): len(path.read_text().splitlines()) for path in files}
+    assert {name: length for name, length in lengths.items() if length > LONGEST_FILE} == {}
