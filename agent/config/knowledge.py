@@ -12,6 +12,7 @@ from agent.config.section import Section, Vector
 from calib.estimate.nuisances import Priors
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import Array
+from calib.signal.instrument import Instrument
 
 Percent = Annotated[float, Field(gt=0, le=100)]
 Positive = Annotated[float, Field(gt=0)]
@@ -68,6 +69,11 @@ class Certificate(Section):
     noise_mps2: Annotated[float, Field(ge=0, description="rms over its whole band; 0: as the data show")] = 0.0
     serial_number: str = ""
     calibrated: str = ""
+
+    @property
+    def instrument(self) -> Instrument:
+        """What the front end must know of the reference."""
+        return Instrument(self.quantity, self.sensitivity, self.noise_mps2)
 
 
 class Uncertainty(Section):

@@ -20,7 +20,8 @@ from agent.core.outcome import Source, calibration_update, drift_report, estimat
 from agent.core.positions import FOUND_WITHIN_S, FoundPositions
 from agent.core.schedule import Piece, ToldTimes
 from agent.core.stream import DeviceStream
-from agent.core.windows import MARGIN_S, Found, refused, windows_in
+from agent.core.windows import Found, margin_of, refused, windows_in
+from calib.excitation.front_end import most_margin_s
 from calib.excitation.placing import Placed
 from calib.model import Pose, Window
 from calib.signal.timing import HORIZON_S
@@ -66,7 +67,7 @@ class ChannelState:
         self._now_ns = origin_ns
         self._kept = dict(kept)
         for name in self._devices():
-            self._streams[name] = DeviceStream(origin_ns, self._horizon_s)
+            self._streams[name] = DeviceStream(name, origin_ns, self._horizon_s)
 
     # --- events
 
@@ -129,7 +130,8 @@ class ChannelState:
 
     @property
     def _horizon_s(self) -> float:
-        return max(HORIZON_S, self._channel.window_s + 2.0 * MARGIN_S + (FOUND_WITHIN_S if self._finder else 0.0))
+        around_s = 2.0 * most_margin_s(self._channel.certificate.instrument)
+        return max(HORIZON_S, self._channel.window_s + around_s + (FOUND_WITHIN_S if self._finder else 0.0))
 
     def _clock(self, t_monotonic_ns: int, t_utc_ns: int) -> None:
         # Blocks of two devices may arrive out of order by a read; time here never goes back.
@@ -232,15 +234,16 @@ class ChannelState:
         while (piece := self._places.piece) is not None and first_s is not None and self._due(piece, first_s):
             yield from self._estimate(piece, first_s)
             self._places.done(piece)
-        keep_from_s = self._now_s() - 2.0 * MARGIN_S
+        around_s = 2.0 * margin_of(self._channel, self._streams)
+        keep_from_s = self._now_s() - around_s
         if first_s is not None:
-            keep_from_s = min(keep_from_s, first_s + self._places.keep_from_s - 2.0 * MARGIN_S)
+            keep_from_s = min(keep_from_s, first_s + self._places.keep_from_s - around_s)
         for stream in self._streams.values():
             stream.forget_before(keep_from_s)
 
     def _due(self, piece: Piece, first_s: float) -> bool:
         """All samples of the piece are there, or they are later than anybody waits for."""
-        end_s = first_s + piece.stop_s + MARGIN_S
+        end_s = first_s + piece.stop_s + margin_of(self._channel, self._streams)
         if self._now_s() > end_s + self._channel.late_horizon_s:
             return True
         return all(stream.reaches(end_s) for stream in self._streams.values())
@@ -383,7 +386,7 @@ class ChannelState:
         """Take the state that `snapshot` gave."""
         self._origin_ns = state["origin_ns"]
         self._streams = {
-            n: DeviceStream.restore(self._origin_ns, s, self._horizon_s) for n, s in state["streams"].items()
+            n: DeviceStream.restore(n, self._origin_ns, s, self._horizon_s) for n, s in state["streams"].items()
         }
         self._unit, self.identity, self._reference = state["unit"], state["identity"], state["reference"]
         self._not_certified = state["not_certified"]

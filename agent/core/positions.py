@@ -11,11 +11,12 @@ import numpy as np
 
 from agent.config import Channel
 from agent.core.schedule import Piece, Stance, pieces
-from agent.core.stream import Cut, DeviceStream
+from agent.core.stream import DeviceStream
 from calib.estimate.recursion import Recursion
 from calib.excitation.placing import SHORTEST_S, Knowledge, Placed, clamp_angles, mean_output, nearest_stop
 from calib.excitation.standing import KEPT, MEAN_S, Standing
 from calib.model import Array, Pose
+from calib.signal.samples import Samples
 from hw.block import BlockFlags, SampleBlock
 
 FOUND_WITHIN_S = KEPT * MEAN_S  # of samples that may still turn out to belong to a stretch
@@ -109,12 +110,12 @@ class FoundPositions:
 
     # --- how it stands
 
-    def place(self, piece: Piece, cut: Cut | None, known: Recursion, day: float) -> Placed:
+    def place(self, piece: Piece, cut: Samples | None, known: Recursion, day: float) -> Placed:
         """How the sensor stands in a piece, by the mean of its samples `cut` and what is known of it on that day."""
         if piece.pose is not OPEN:
             return Placed(piece.pose, "", {})
         usable = cut is not None and cut.axes == 3 and cut.in_time
-        mean = mean_output(cut.indications, cut.clock.rate_hz) if cut is not None and usable else None
+        mean = mean_output(cut.values, cut.clock.rate_hz) if cut is not None and usable else None
         if cut is None or mean is None:
             return Placed(None, f"less than {SHORTEST_S:g} s of samples: too few to tell how it stands", {})
         knowledge, calibration = self._knowledge(known.scale), known.law(day).at(cut.temperature_degc)

@@ -9,10 +9,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from agent.config import Channel, PoseInterval
+from calib.excitation.pieces import pieces_of
 from calib.geometry import beside
 from calib.model import Pose
-
-ROUNDING_S = 1e-6  # of ends that were added up
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,13 +93,8 @@ def pieces(channel: Channel, after_s: float, stances: Sequence[Stance] = ()) -> 
     """
     stretches = ((s.start_s, s.stop_s, s.pose) for s in stances) if stances else _stretches(channel, after_s)
     for start_s, stop_s, pose in stretches:
-        last_s = start_s + channel.guard_s
-        k = max(0, int((after_s - last_s) // (channel.every_s or channel.window_s)))
-        while last_s < stop_s - channel.guard_s:
-            first_s = start_s + channel.guard_s + k * (channel.every_s or channel.window_s)
-            last_s, k = min(first_s + channel.window_s, stop_s - channel.guard_s), k + 1
-            if first_s > after_s - ROUNDING_S and first_s < last_s:
-                yield Piece(first_s, last_s, pose)
+        cut = pieces_of(start_s, stop_s, channel.window_s, channel.guard_s, channel.every_s, after_s)
+        yield from (Piece(first_s, last_s, pose) for first_s, last_s in cut)
 
 
 def _stretches(channel: Channel, after_s: float) -> Iterator[tuple[float, float, Pose]]:

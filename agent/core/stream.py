@@ -3,44 +3,17 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calib.signal.samples import Samples
 from calib.signal.timing import HORIZON_S, ClockFit, ClockModel
 from hw.block import BlockFlags, SampleBlock
 
 # Times its nominal rate, more than any clock is off: a count in microseconds, say, is none of samples, and the holes
 # in it would fill the memory.
 FASTEST = 10.0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Cut:
-    """Samples between two times, one after the other without a hole: what is missing is NaN.
-
-    `indications` (n, C) from sample `first_index` on; `clock` says when each was taken. `in_time` tells whether those
-    times rise and lie where they were asked for: of a device whose count jumps at will no arrivals make a clock.
-    """
-
-    first_index: int
-    indications: NDArray[np.float64]
-    clock: ClockFit
-    saturated: bool
-    in_time: bool
-    temperature_degc: float = float("nan")  # mean over the blocks; NaN where the device tells none
-
-    @property
-    def axes(self) -> int:
-        """Axes of the device."""
-        return int(self.indications.shape[1])
-
-    @property
-    def time_s(self) -> NDArray[np.float64]:
-        """(n,) in seconds since the run's origin."""
-        return self.clock.time_of(self.first_index + np.arange(len(self.indications)))
 
 
 class DeviceStream:
@@ -50,8 +23,9 @@ class DeviceStream:
     time) empties the buffer and starts the clock model anew.
     """
 
-    def __init__(self, origin_ns: int, horizon_s: float = HORIZON_S) -> None:
+    def __init__(self, name: str, origin_ns: int, horizon_s: float = HORIZON_S) -> None:
         """`horizon_s`: how far back the clock model must know the times."""
+        self._name = name
         self._origin_ns = origin_ns
         self._horizon_s = horizon_s
         self._blocks: deque[SampleBlock] = deque()
@@ -75,6 +49,11 @@ class DeviceStream:
         self._blocks.append(block)
         self.newest_arrival_s = float(arrivals_s[-1])
 
+    @property
+    def nominal_rate_hz(self) -> float | None:
+        """As the newest block tells it; None before any."""
+        return self._blocks[-1].nominal_rate_hz if self._blocks else None
+
     def reaches(self, time_s: float) -> bool:
         """Whether samples up to `time_s` are there."""
         # A sample never arrives before it was taken: as long as nothing arrived since, the clock need not be asked.
@@ -94,7 +73,7 @@ class DeviceStream:
             self._fitted = self._clock.result()
         return self._fitted
 
-    def cut(self, start_s: float, stop_s: float) -> Cut | None:
+    def cut(self, start_s: float, stop_s: float) -> Samples | None:
         """All samples with start_s <= t < stop_s by the clock model as it is now; None if there are none."""
         if not self._blocks:
             return None
@@ -105,7 +84,7 @@ class DeviceStream:
         if stop <= first:
             return None
         if stop - first > FASTEST * rate_hz * (stop_s - start_s) + 1:
-            return Cut(first, np.empty((0, axes)), clock, saturated=False, in_time=False)
+            return Samples(self._name, first, np.empty((0, axes)), clock, in_time=False)
         times_s = clock.time_of(np.arange(first, stop))
         within = start_s - 1 / rate_hz <= times_s[0] and times_s[-1] <= stop_s + 1 / rate_hz
         in_time = bool(within and (np.diff(times_s) > 0).all())
@@ -119,7 +98,7 @@ class DeviceStream:
                 held[a - first : b - first] = block.indications[a - block.first_index : b - block.first_index]
                 saturated |= bool(block.flags & BlockFlags.SATURATED)
         degc = float(np.mean(temperatures)) if temperatures else float("nan")
-        return Cut(first, held, clock, saturated, in_time, degc)
+        return Samples(self._name, first, held, clock, saturated, in_time, degc)
 
     def forget_before(self, time_s: float) -> None:
         """Drop whole blocks that ended before `time_s` (by arrival, which is never early)."""
@@ -140,9 +119,9 @@ class DeviceStream:
         }
 
     @classmethod
-    def restore(cls, origin_ns: int, state: dict[str, Any], horizon_s: float = HORIZON_S) -> DeviceStream:
+    def restore(cls, name: str, origin_ns: int, state: dict[str, Any], horizon_s: float = HORIZON_S) -> DeviceStream:
         """The stream whose `snapshot` this is."""
-        stream = cls(origin_ns, horizon_s)
+        stream = cls(name, origin_ns, horizon_s)
         if state["clock"] is not None:
             stream._clock = ClockModel.restore(state["clock"])
         stream._blocks.extend(_block_of(s) for s in state["blocks"])

@@ -14,10 +14,11 @@ from agent.core.events import CalibrationUpdate, DeviceChange, Event, Output, Ru
 from agent.core.schedule import pieces
 from agent.core.snapshot import unpack
 from agent.core.stream import DeviceStream
-from agent.core.windows import MARGIN_S, signals
+from agent.core.windows import margin_of
 from agent.recording.reading import RecordingReader
 from agent.recording.records import Fault
 from agent.report.trace import Trace
+from calib.excitation.front_end import aligned, most_margin_s
 from calib.model import Pose
 from hw.block import SampleBlock
 
@@ -113,8 +114,8 @@ class _Windows:
     def __init__(self, channel: Channel, start: RunStart) -> None:
         self._channel = channel
         held = unpack(start.snapshot)["channels"][channel.sensor]
-        self._streams = {n: DeviceStream.restore(held["origin_ns"], s) for n, s in held["streams"].items()}
-        self._keep_s = channel.window_s + channel.late_horizon_s + 2 * MARGIN_S
+        self._streams = {n: DeviceStream.restore(n, held["origin_ns"], s) for n, s in held["streams"].items()}
+        self._keep_s = channel.window_s + channel.late_horizon_s + 2 * most_margin_s(channel.certificate.instrument)
 
     def update(self, event: Event) -> None:
         if isinstance(event, SampleBlock) and event.device in self._streams:
@@ -133,12 +134,14 @@ class _Windows:
         if cut is None:
             return None
         if self._channel.reference is None:
-            whole = np.isfinite(cut.indications).all(axis=1)
+            whole = np.isfinite(cut.values).all(axis=1)
             nothing = np.empty((int(whole.sum()), 0))
-            return Trace(cut.time_s[whole] - first_s, cut.indications[whole], nothing, nothing, pose)
-        reference = self._streams[self._channel.reference].cut(start_s - MARGIN_S, stop_s + MARGIN_S)
+            return Trace(cut.time_s[whole] - first_s, cut.values[whole], nothing, nothing, pose)
+        around_s = margin_of(self._channel, self._streams)
+        reference = self._streams[self._channel.reference].cut(start_s - around_s, stop_s + around_s)
         lag_s = window.numbers.get("lag_applied_s", 0.0)
-        found = None if reference is None else signals(cut, reference, self._channel, (start_s, stop_s), lag_s)
+        instrument, span_s = self._channel.certificate.instrument, (start_s, stop_s)
+        found = None if reference is None else aligned(cut, reference, instrument, span_s, lag_s)
         if found is None:
             return None
         points = found.points

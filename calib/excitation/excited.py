@@ -46,7 +46,8 @@ def excited(window: Window) -> Excitation:
     # What a silent channel shows of another's motion turns the direction where it is more than noise and trifles.
     shown = along**2 @ np.where(live, power.diagonal(), 0.0)
     askew = shown > np.maximum(OF_STRONGEST * power.diagonal().max(initial=0.0), OVER_NOISE * noise[0])
-    turned = window.pose.direction + window.pose.direction @ np.where(askew[:, None], along, 0.0)
+    direction = window.pose.direction[:, :m]
+    turned = direction + direction @ np.where(askew[:, None], along, 0.0)
     basis, _ = np.linalg.qr(turned[:, np.flatnonzero(live)])
     return Excitation(_reduced(window, live, along, noise), basis, CORRECTION_SHARE * share)
 
@@ -78,9 +79,11 @@ def _along(power: Array, live: NDArray[np.bool_]) -> Array:
 
 def _reduced(window: Window, live: NDArray[np.bool_], along: Array, noise: Array) -> Window:
     sums, pose, m = window.sums, window.pose, len(live)
-    both = np.concatenate([live, live, [True] * 3])
+    channels = sums.reference_channels  # of the reference; where a corner is to be found, their integrals behind them
+    every = np.tile(live, channels // m)
+    both = np.concatenate([every, every, [True] * 3])
     scatter = np.where(np.outer(both, both), sums.scatter, 0.0)
-    for power, at in zip(noise, (0, m), strict=True):
+    for power, at in zip(noise, (0, channels), strict=True):
         for k in np.flatnonzero(live):
             own = scatter[:, at + k, at + k]
             scatter[:, at + k, at + k] = own - np.minimum(sums.count * power[k], MOST_NOISE * own)
@@ -88,11 +91,12 @@ def _reduced(window: Window, live: NDArray[np.bool_], along: Array, noise: Array
         return replace(window, sums=replace(sums, scatter=scatter))
     mean = sums.count @ sums.mean[:, :m] / sums.count.sum()
     # The means of silent channels (gravity, where the reference feels it) are still felt.
-    gravity = pose.gravity_mps2 + pose.direction @ np.where(live, 0.0, mean - along @ mean)
+    gravity = pose.gravity_mps2 + pose.direction[:, :m] @ np.where(live, 0.0, mean - along @ mean)
+    moving: Array = np.kron(np.eye(channels // m), np.diag(live.astype(float)) + along)
     # What silent channels did from segment to segment must not come back as scatter between them.
     return replace(
         window,
         # Stated directions stay: what moved along with a live channel was measured by the silent one, with its error.
-        pose=replace(pose, gravity_mps2=gravity, along=np.diag(live.astype(float)) + along),
-        sums=WindowSums(sums.reference_channels, sums.count, np.where(both, sums.mean, 0.0), scatter),
+        pose=replace(pose, gravity_mps2=gravity, along=moving),
+        sums=WindowSums(channels, sums.count, np.where(both, sums.mean, 0.0), scatter),
     )

@@ -93,14 +93,14 @@ def _bridged(x: Array) -> Array:
     return out
 
 
-def noise_in_band(density: Array, band_hz: float, *, differentiated: bool) -> Array:
-    """(2, m) rms of white noise of `density` (m,) per root Hz in a signal limited to `band_hz`, and in its derivative.
+def noise_in_band(density: Array, band_hz: float, derivatives: int) -> Array:
+    """(2, m) rms of white noise of `density` (m,) per root Hz in the acceleration limited to `band_hz`, and in its
+    derivative.
 
-    `differentiated`: the signal itself is the derivative of what is so noisy (acceleration of a velocity).
+    `derivatives`: how many times what is so noisy was differentiated to give the acceleration.
     """
-    first = 1 if differentiated else 0
     turn = 2.0 * np.pi
-    powers = [turn ** (2 * k) * band_hz ** (2 * k + 1) / (2 * k + 1) for k in (first, first + 1)]
+    powers = [turn ** (2 * k) * band_hz ** (2 * k + 1) / (2 * k + 1) for k in (derivatives, derivatives + 1)]
     return np.asarray(np.sqrt(np.array(powers))[:, None] * density)
 
 

@@ -16,10 +16,20 @@ from calib.model import Array, Pose
 
 
 def integral(x: Array, rate_hz: float) -> Array:
-    """2 pi times the integral of samples x (n, m) of a whole recording, in m/s2 s: as large as x itself at 1 Hz.
+    """2 pi times the integral of samples x (n, m) in m/s2 s: as large as x itself at 1 Hz.
 
-    It is held to no mean and no trend: an instrument's own zero would else run away in it.
+    Each run of samples without a hole has an integral of its own, NaN in the holes: its constant is lost in the
+    window's own. It is held to no mean and no trend: an instrument's own zero would else run away in it.
     """
+    out = np.full(x.shape, np.nan)
+    whole = np.isfinite(x).all(axis=1)
+    edges = np.flatnonzero(np.diff(whole.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
+    for first, stop in edges.tolist():
+        out[first:stop] = _integral(x[first:stop], rate_hz)
+    return out
+
+
+def _integral(x: Array, rate_hz: float) -> Array:
     rising = (np.cumsum(x, axis=0) - 0.5 * x) / rate_hz
     line = np.linspace(-1.0, 1.0, len(x))[:, None]
     trend = np.sum(line * rising, axis=0) / np.sum(line * line)

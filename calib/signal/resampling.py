@@ -23,9 +23,9 @@ BAND = 0.3  # of the sampling rate: the taps are the best for motion below
 RIDGE = 1e-11  # holds the noise amplification at one: more costs accuracy, less costs noise
 NODES = 64  # samples between the points at which the clock is inverted: straight in between to 1 ns
 CHUNK = 8192  # output samples worked on at a time, in cache
-# Velocity is differentiated up to here and damped from twice as much: the paper's range and three octaves above it.
-VELOCITY_BAND_HZ = 50.0
-VELOCITY_BAND_LARGEST = 0.15  # of the sampling rate
+# A signal is differentiated up to here and damped from twice as much: the paper's range and three octaves above it.
+DIFFERENTIATED_BAND_HZ = 50.0
+DIFFERENTIATED_BAND_LARGEST = 0.15  # of the sampling rate
 # A differentiator's ripple counts against the slope at the motion's frequency, which is as much smaller than the band.
 STOP_BAND_DB = 110.0
 
@@ -46,6 +46,9 @@ def resample(x: Array, clock: ClockFit, time_s: Array, first_index: int = 0, mar
     taps (and `margin` samples more) of an end, within those and `NODES` samples of a gap, and beyond.
     """
     nodes = np.linspace(time_s[0], time_s[-1], len(time_s) // NODES + 2)
+    if len(clock.knot_time_s) > 2:  # the rate may bend at a knot
+        knots = clock.knot_time_s
+        nodes = np.union1d(nodes, knots[(knots > time_s[0]) & (knots < time_s[-1])])
     position = np.interp(time_s, nodes, clock.index_of(nodes))
     base = np.floor(position).astype(np.int64)
     fraction = position - base
@@ -68,16 +71,17 @@ def resample(x: Array, clock: ClockFit, time_s: Array, first_index: int = 0, mar
     return Resampled(u.T, du.T, usable)
 
 
-def differentiate(velocity: Array, rate_hz: float, band_hz: float = VELOCITY_BAND_HZ) -> tuple[Array, int]:
-    """Acceleration (M, m) in m/s2 of a velocity (M, m) in m/s, sample by sample, and how many at each end are wrong.
+def differentiate(x: Array, rate_hz: float, order: int = 1) -> tuple[Array, int]:
+    """Derivative (M, m) of `order` 1 of samples x (M, m), one a sample, in x's unit per s; and how many at each end are
+    wrong.
 
-    Eq. (12) holds for amplitudes only. Right to 5e-5 up to `band_hz` (at most 0.15 of the rate), damped by 110 dB
-    from twice that on, since differentiation raises noise with frequency.
+    Eq. (12) holds for amplitudes only. Right to 5e-5 up to DIFFERENTIATED_BAND_HZ (at most 0.15 of the rate), damped by
+    110 dB from twice that on, since differentiation raises noise with frequency. Raises ValueError for another order.
     """
-    band = min(band_hz / rate_hz, VELOCITY_BAND_LARGEST)
-    half = int(
-        np.ceil((STOP_BAND_DB - 8.0) / (2.285 * 2 * np.pi * band) / 2)
-    )  # Kaiser's length for a transition `band`
+    if order != 1:
+        raise ValueError(f"a derivative of order {order} is not known, only of order 1")
+    band = _differentiated_band(rate_hz)
+    half = differentiator_lost(rate_hz, order)
     n = np.arange(-half, half + 1)
     cut = 1.5 * band
     window = np.kaiser(2 * half + 1, 0.1102 * (STOP_BAND_DB - 8.7))
@@ -85,8 +89,20 @@ def differentiate(velocity: Array, rate_hz: float, band_hz: float = VELOCITY_BAN
     with np.errstate(invalid="ignore", divide="ignore"):
         taps = np.where(n == 0, 0.0, (phase * np.cos(phase) - np.sin(phase)) / (np.pi * n**2)) * window
     taps *= rate_hz / -(taps @ n)  # a ramp's slope is exact
-    out = np.column_stack([np.convolve(channel, taps, mode="same") for channel in velocity.T])
+    out = np.column_stack([np.convolve(channel, taps, mode="same") for channel in x.T])
     return out, half
+
+
+def differentiator_lost(rate_hz: float, order: int) -> int:
+    """Samples at each end for which `differentiate` has no full support (Kaiser's length for a transition `band`)."""
+    if order == 0:
+        return 0
+    return int(np.ceil((STOP_BAND_DB - 8.0) / (2.285 * 2 * np.pi * _differentiated_band(rate_hz)) / 2))
+
+
+def _differentiated_band(rate_hz: float) -> float:
+    """Of the sampling rate, up to where a derivative is right."""
+    return min(DIFFERENTIATED_BAND_HZ / rate_hz, DIFFERENTIATED_BAND_LARGEST)
 
 
 def _horner(sums: Array, fraction: Array) -> tuple[Array, Array]:

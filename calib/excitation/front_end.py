@@ -1,0 +1,246 @@
+"""The one front end: samples of a sensor and of a reference, with their clocks, become windows.
+
+Files and live streams both call it. The steps: the reference becomes an acceleration at the sensor's sample times;
+stated corners of AC-coupled instruments are undone; where the reference's noise matters both signals are limited to the
+band of the motion; the windows found in them get their verdicts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.excitation import detection
+from calib.excitation.window_verdict import DEFAULT_LIMITS, Limits
+from calib.excitation.windows import Points, motion_windows, rest_window
+from calib.model import Array, Pose, Window, WindowSums
+from calib.signal.band import band_above_noise, lowpass, noise_in_band
+from calib.signal.corner import integral, with_integral, without_corner
+from calib.signal.instrument import Instrument
+from calib.signal.resampling import DIFFERENTIATED_BAND_HZ, HALF, differentiate, differentiator_lost, resample
+from calib.signal.samples import Samples
+
+# Samples beyond a window's ends, the reference's (the sensor's half of it): half the taps of resampling, of
+# differentiating and of the low-pass filter at 100 Hz and above.
+LEAST_MARGIN_S = 1.0
+MOST_MARGIN_S = 5.0  # a differentiator at 10 Hz takes 3.3 s
+# Of many holes pieces of a second are left: too short for the reference's noise, and for type A by segments.
+MOST_MISSING_PCT = 5.0
+NOISE_MATTERS = 1e-5  # of the motion's power: a filter against less of it would cost its ends for nothing
+FILTER_BAND = 1.25  # times its band, where calib.signal.band.lowpass is 6 dB down
+RESAMPLED_BAND = 0.35  # of the reference's rate, to which interpolation itself passes noise
+
+
+class Unusable(ValueError):  # noqa: N818 - said of samples
+    """These samples make no window; the message says which device cannot take part, and why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """How windows are made. Method 3 as printed needs `leave_out` False (every point is kept) and `limit_band` False.
+
+    `limits`: what a window must keep to be used.
+    """
+
+    limits: Limits = DEFAULT_LIMITS
+    leave_out: bool = True
+    limit_band: bool = True
+
+
+DEFAULT_SETTINGS = Settings()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Aligned:
+    """The sensor's samples with the reference at their times, in the band of the motion, and the reference's noise.
+
+    `reference_noise` (2, m) as in calib.model.Window. `clipped_points`: samples at the end of the sensor's range,
+    counted before the filter, which hides them. `independent`: the share of the points that the filter leaves
+    independent. `band_hz`: where the filter ends, None where there is none.
+    """
+
+    points: Points
+    reference_noise: Array
+    clipped_points: int
+    independent: float
+    band_hz: float | None
+
+
+def margin_s(instrument: Instrument, rate_hz: float) -> float:
+    """How many seconds of the reference beyond both ends of a stretch its windows need."""
+    lost = differentiator_lost(rate_hz, instrument.derivatives) + HALF + 1
+    return min(max(LEAST_MARGIN_S, lost / rate_hz), most_margin_s(instrument))
+
+
+def most_margin_s(instrument: Instrument) -> float:
+    """The largest `margin_s` at any rate."""
+    return MOST_MARGIN_S if instrument.derivatives else LEAST_MARGIN_S
+
+
+def windows_of(
+    pose: Pose,
+    sensor: Samples,
+    reference: Samples | None,
+    instrument: Instrument,
+    span_s: tuple[float, float],
+    lag_s: float = 0.0,
+    settings: Settings = DEFAULT_SETTINGS,
+    floor: Array | None = None,
+) -> list[Window]:
+    """The windows between two times in one pose, each with its verdict; empty where sensor and reference do not meet.
+
+    `sensor` and `reference` hold the samples of `span_s` and of a margin around it (`margin_s`; for the sensor half of
+    it is enough). The sensor's indications are taken to come late by `lag_s`. Without a reference the pose must be one
+    at rest; `floor` (3,) is then the sensor's noise at rest elsewhere. Raises Unusable where a device cannot take
+    part: the message says which one and why.
+    """
+    _check(sensor, sensor.device, 3)
+    if reference is None:
+        found = _rest(pose, sensor, span_s, settings, floor)
+    else:
+        name = f"the reference {reference.device}"
+        _check(reference, name, pose.direction.shape[1])
+        if reference.saturated:
+            raise Unusable(f"{name} was at the end of its range")
+        _check_holes(sensor, sensor.device)
+        _check_holes(reference, name)
+        found = _motion(pose, sensor, reference, instrument, span_s, lag_s, settings)
+    if sensor.saturated:
+        reason = "the sensor was at the end of its range"
+        found = [replace(w, used=False, reason=w.reason or reason) for w in found]
+    return found
+
+
+def aligned(
+    sensor: Samples,
+    reference: Samples,
+    instrument: Instrument,
+    span_s: tuple[float, float],
+    lag_s: float = 0.0,
+    *,
+    limit_band: bool = True,
+) -> Aligned | None:
+    """Samples within `span_s` that have a reference, in m/s2; None where there are fewer than two."""
+    rate_hz = reference.clock.rate_hz
+    raw = reference.values / instrument.sensitivity
+    u, lost = differentiate(raw, rate_hz, instrument.derivatives) if instrument.derivatives else (raw, 0)
+    m, V = u.shape[1], sensor.values
+    time_s = sensor.time_s
+    sensor_rate_hz = float((len(time_s) - 1) / (time_s[-1] - time_s[0])) if len(time_s) > 1 else 0.0
+    if instrument.has_corner:
+        u = np.hstack([without_corner(u, rate_hz, instrument.corner_hz), integral(u, rate_hz)])
+        V = without_corner(V, sensor_rate_hz, instrument.sensor_corner_hz)
+    at = resample(u, reference.clock, time_s - lag_s, reference.first_index, lost)
+    columns = np.hstack([V, at.u, at.du])
+    columns[~at.usable] = np.nan
+    band_hz, noise = _band(raw, at.u[at.usable][:, :m], instrument, rate_hz)
+    clipped, independent, k = 0, 1.0, u.shape[1]
+    if band_hz is not None and limit_band:
+        independent = min(1.0, 2.0 * FILTER_BAND * band_hz / sensor_rate_hz)
+        clipped = _clipped(columns[np.isfinite(columns).all(axis=1) & _within(time_s, span_s)])
+        columns = lowpass(columns, sensor_rate_hz, band_hz)
+    usable = np.isfinite(columns).all(axis=1) & _within(time_s, span_s)
+    if usable.sum() < 2:
+        return None
+    kept = columns[usable]
+    points = Points(time_s[usable], kept[:, :3], kept[:, 3 : 3 + k], kept[:, 3 + k :])
+    return Aligned(points, noise, clipped, independent, band_hz if limit_band else None)
+
+
+def nothing_in(pose: Pose, start_s: float, stop_s: float, reason: str) -> Window:
+    """The unused window of a stretch in which there is nothing to judge."""
+    m = pose.direction.shape[1]
+    nothing = WindowSums(m, np.zeros(0), np.zeros((0, 2 * m + 3)), np.zeros((0, 2 * m + 3, 2 * m + 3)))
+    return Window(start_s, stop_s, pose, nothing, False, reason, 0, 0, "motion" if m else "rest")
+
+
+def _check(samples: Samples, device: str, axes: int) -> None:
+    """Raises Unusable where a device cannot take part in a pose that needs this many axes of it."""
+    if samples.axes != axes:
+        has = f"{samples.axes} {'axis' if samples.axes == 1 else 'axes'}"
+        raise Unusable(f"{device} has {has}, this pose needs {axes}")
+    if not samples.in_time:
+        raise Unusable(f"{device}: its sample numbers and arrivals do not make a clock")
+
+
+def _check_holes(samples: Samples, device: str) -> None:
+    """Raises Unusable where so much of a device is missing that what is left tells little."""
+    missing_pct = 100.0 * float(np.mean(np.isnan(samples.values).any(axis=1)))
+    if missing_pct > MOST_MISSING_PCT:
+        raise Unusable(f"{missing_pct:.1f} % of the samples of {device} are missing, {MOST_MISSING_PCT:g} % at most")
+
+
+def _rest(
+    pose: Pose, sensor: Samples, span_s: tuple[float, float], settings: Settings, floor: Array | None
+) -> list[Window]:
+    time_s = sensor.time_s
+    whole = np.isfinite(sensor.values).all(axis=1) & _within(time_s, span_s)
+    if whole.sum() < 2:
+        return []
+    t, V = time_s[whole], sensor.values[whole]
+    return [rest_window(pose, t, V, settings.limits, floor=floor, leave_out=settings.leave_out)]
+
+
+def _motion(
+    pose: Pose,
+    sensor: Samples,
+    reference: Samples,
+    instrument: Instrument,
+    span_s: tuple[float, float],
+    lag_s: float,
+    settings: Settings,
+) -> list[Window]:
+    found = aligned(sensor, reference, instrument, span_s, lag_s, limit_band=settings.limit_band)
+    if found is None:
+        return []
+    if instrument.has_corner:
+        pose = with_integral(pose)
+    windows = motion_windows(pose, found.points, settings.limits, leave_out=settings.leave_out)
+    u_lag_s = float(np.hypot(sensor.clock.u_offset_s, reference.clock.u_offset_s))
+    return [replace(_told(window, found), u_lag_s=u_lag_s) for window in windows]
+
+
+def _told(window: Window, found: Aligned) -> Window:
+    """The window with what was known before the filter, and what the filter left."""
+    window = replace(window, reference_noise=found.reference_noise, independent=found.independent)
+    points, least = found.independent * window.points, float(DEFAULT_LIMITS.least_points)
+    if window.used and points < least:
+        # A regression on hardly more points than it has unknowns leaves no residual to judge it by.
+        count = {"independent_points": points, "independent_points_threshold": least}
+        reason = f"too few points: {points:.0f} are independent in the band of the motion, {least:.0f} needed"
+        return replace(window, used=False, reason=reason, numbers={**window.numbers, **count})
+    if not found.clipped_points:
+        return window
+    count = {"clipped_points": float(found.clipped_points), "clipped_points_threshold": 0.0}
+    reason = window.reason or f"clipped: {found.clipped_points} points at the end of the sensor's range"
+    return replace(window, used=False, reason=reason, numbers={**window.numbers, **count})
+
+
+def _band(raw: Array, u: Array, instrument: Instrument, rate_hz: float) -> tuple[float | None, Array]:
+    """Where to limit both signals, None where that gains nothing, and the reference's noise (2, m) in what is left."""
+    derivatives, m = instrument.derivatives, raw.shape[1]
+    found_hz, density = band_above_noise(raw, rate_hz)
+    density = np.maximum(density, instrument.noise / np.sqrt(0.5 * rate_hz))
+    widest_hz = RESAMPLED_BAND * rate_hz
+    if derivatives:
+        widest_hz = min(DIFFERENTIATED_BAND_HZ, widest_hz)
+    unlimited = noise_in_band(density, widest_hz, derivatives)
+    power = np.var(u, axis=0).max(initial=0.0) if len(u) else 0.0
+    if found_hz is None or np.max(unlimited[0] ** 2, initial=0.0) <= NOISE_MATTERS * power:
+        return None, unlimited.reshape(2, m)
+    return found_hz, noise_in_band(density, min(FILTER_BAND * found_hz, widest_hz), derivatives)
+
+
+def _clipped(columns: Array) -> int:
+    """How many of the samples [V, u, du] (n, 3 + 2 m) are at an end of the sensor's range."""
+    if len(columns) <= columns.shape[1]:
+        return 0
+    V, finest = columns[:, :3], detection.least_step(columns[:, :3])
+    basis = np.column_stack([np.ones(len(columns)), columns[:, 3:]])
+    _, residual = detection.knocked(V, basis, finest)
+    return detection.clipped(V, residual, finest)
+
+
+def _within(time_s: Array, span_s: tuple[float, float]) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    return np.asarray((time_s >= span_s[0]) & (time_s < span_s[1]))

@@ -1,0 +1,27 @@
+"""How a stretch of time in one position is cut into pieces, of each of which windows are made."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+ROUNDING_S = 1e-6  # of ends that were added up
+
+
+def pieces_of(
+    start_s: float, stop_s: float, window_s: float, guard_s: float, every_s: float = 0.0, after_s: float = -float("inf")
+) -> Iterator[tuple[float, float]]:
+    """(start, stop) of the pieces of a stretch, in order; without end where the stretch has none.
+
+    `guard_s` is left out at both ends of the stretch, where the sensor is being turned. A piece is `window_s` long, the
+    last one shorter; one begins each `every_s` (0: one after the other). Pieces that begin before `after_s` are left
+    out: they were made already. All times in s.
+    """
+    first_s, last_s = start_s + guard_s, stop_s - guard_s
+    apart_s = every_s or window_s
+    k = max(0, int((after_s - first_s) // apart_s)) if after_s > first_s else 0
+    end_s = first_s
+    while end_s < last_s:
+        begin_s = first_s + k * apart_s
+        end_s, k = min(begin_s + window_s, last_s), k + 1
+        if begin_s > after_s - ROUNDING_S and begin_s < end_s:
+            yield begin_s, end_s

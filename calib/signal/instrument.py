@@ -1,0 +1,38 @@
+"""What a reference measures, described once: for files and for an agent alike."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+# How many times each quantity must be differentiated to give an acceleration.
+QUANTITIES = {"acceleration": 0, "velocity": 1}
+
+
+@dataclass(frozen=True, slots=True)
+class Instrument:
+    """A reference as its certificate describes it.
+
+    `quantity` is a key of QUANTITIES. `sensitivity`: indication per unit of that quantity in SI units. `noise` is the
+    standard deviation of its own noise over its whole band, in that quantity's SI unit; 0 where nobody stated it: it is
+    then found from the data. `corner_hz`, `u_corner_hz`: corner frequency of an AC-coupled reference (first order) and
+    its standard uncertainty; both 0 where it responds to constants. `sensor_corner_hz`, `u_sensor_corner_hz`: the same
+    of the sensor beside it.
+    """
+
+    quantity: str = "acceleration"
+    sensitivity: float = 1.0
+    noise: float = 0.0
+    corner_hz: float = 0.0
+    u_corner_hz: float = 0.0
+    sensor_corner_hz: float = 0.0
+    u_sensor_corner_hz: float = 0.0
+
+    @property
+    def derivatives(self) -> int:
+        """How many times its indications are differentiated to give an acceleration."""
+        return QUANTITIES[self.quantity]
+
+    @property
+    def has_corner(self) -> bool:
+        """Whether a corner of the reference or of the sensor is stated, or unknown."""
+        return any((self.corner_hz, self.u_corner_hz, self.sensor_corner_hz, self.u_sensor_corner_hz))
