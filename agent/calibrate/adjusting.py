@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from agent.calibrate.frontend import FrontEnd
+from agent.calibrate.files import Files
 from agent.calibrate.outcome import NuisanceValue, Outcome, nothing_used
 from agent.calibrate.priors import priors_of, row_contradictions, u_gravity_mps2
 from agent.calibrate.tables import SensorTable
 from calib.estimate.adjustment import Adjustment, adjust
+from calib.estimate.lag_search import without_lag
 from calib.estimate.norm_fit import norm_fit
 from calib.estimate.nuisances import Applied, Priors
 from calib.excitation.windows import rests_anywhere
@@ -20,34 +21,26 @@ from calib.geometry import STANDARD_GRAVITY_MPS2
 from calib.model import PARAMETERS, Window
 from calib.signal.stamps import clock_from_stamps
 
-PASSES = 4
-# Of a lag that the windows still have: (omega lag)^3 / 6 is what the adjustment's own second order leaves of it.
-PHASE_LEFT = 1e-5
-# Part of the loud power that calm windows must have before it is taken out: it attenuates S by as much.
-QUIET_MATTERS = 1e-4
-LEAST_QUIET_S = 5.0  # of calm a position, else its power is known worse than it matters
 
-
-def adjusted(front: FrontEnd, priors: Priors) -> Outcome:
-    """Solve, take out the lag that was found, repeat until what is left of it is nothing."""
+def adjusted(files: Files, priors: Priors) -> Outcome:
+    """Windows without lag, then their adjustment."""
     applied = Applied(0.0, priors.reference_corner_at_hz, priors.sensor_corner_at_hz)
-    for _ in range(PASSES):
-        windows = front.windows(applied.lag_s)
-        used = [w for w in windows if w.used]
-        if not used:
-            return nothing_used(windows, front.sensor_clock.rate_hz, "3 (adjustment)")
-        calm = _telling([w for w in windows if w.kind == "quiet"], used)
-        if calm and front.band_hz is None and front.limit_band(used, calm):
-            windows = front.windows(applied.lag_s)
-            used = [w for w in windows if w.used]
-            calm = _telling([w for w in windows if w.kind == "quiet"], used)
-        found = adjust(used, priors, applied, calm)
-        left = _lag(found) - applied.lag_s
-        if abs(_omega(used) * left) ** 3 / 6.0 < PHASE_LEFT:
-            break
-        applied = replace(applied, lag_s=_lag(found))
-    outcome = _outcome(found, windows, front.sensor_clock.rate_hz)
-    return replace(outcome, more={**outcome.more, "band_hz": front.band_hz})
+    latest: dict[float, Adjustment] = {}  # by the lag that was taken out
+
+    def at(windows: Sequence[Window], lag_s: float) -> Adjustment:
+        if lag_s not in latest:
+            latest.clear()
+            latest[lag_s] = adjust(_used(windows), priors, replace(applied, lag_s=lag_s))
+        return latest[lag_s]
+
+    windows, lag_s = without_lag(applied.lag_s, files.windows, _used, lambda made, lag_s: _lag(at(made, lag_s)) or 0.0)
+    if not _used(windows):
+        return nothing_used(windows, files.rate_hz, "3 (adjustment)")
+    return _outcome(at(windows, lag_s), windows, files.rate_hz)
+
+
+def _used(windows: Sequence[Window]) -> list[Window]:
+    return [w for w in windows if w.used]
 
 
 def norm_fitted(sensor: SensorTable, options: dict[str, Any]) -> Outcome:
@@ -79,7 +72,7 @@ def _outcome(found: Adjustment, windows: Sequence[Window], rate_hz: float) -> Ou
         coverage_factor=found.coverage_factor,
         uncertainty_kind="combined",
         nuisances=nuisances,
-        lag_s=_lag(found) if any(n.name == "lag" for n in found.nuisances) else None,
+        lag_s=_lag(found),
         rank=found.rank,
         more={
             "frame": "stated",
@@ -98,34 +91,6 @@ def _outcome(found: Adjustment, windows: Sequence[Window], rate_hz: float) -> Ou
     )  # fmt: skip
 
 
-def _lag(found: Adjustment) -> float:
-    return next((n.value for n in found.nuisances if n.name == "lag"), 0.0)
-
-
-def _omega(windows: Sequence[Window]) -> float:
-    """Largest angular frequency (rad/s) that any window's power stands for; 0 at rest."""
-    largest = 0.0
-    for window in windows:
-        m, power = window.sums.reference_channels, np.diag(window.sums.scatter.sum(axis=0))
-        if m and power[:m].sum() > 0.0:
-            largest = max(largest, float(np.sqrt(power[m : 2 * m].sum() / power[:m].sum())))
-    return largest
-
-
-def _telling(quiet: Sequence[Window], loud: Sequence[Window]) -> list[Window]:
-    """The calm windows of positions where the reference's noise matters and calm lasts long enough to know it."""
-    kept: list[Window] = []
-    for position in dict.fromkeys(w.pose.position for w in loud):
-        calm = [w for w in quiet if w.pose.position == position and w.points > 1]
-        if sum(w.stop_s - w.start_s for w in calm) < LEAST_QUIET_S:
-            continue
-        if _power(calm) > QUIET_MATTERS * _power([w for w in loud if w.pose.position == position]):
-            kept += calm
-    return kept
-
-
-def _power(windows: Sequence[Window]) -> float:
-    """Mean square of the reference's channels about their means in each segment, m2/s4."""
-    m = max(w.sums.reference_channels for w in windows)
-    total = sum(float(np.trace(w.sums.scatter.sum(axis=0)[:m, :m])) for w in windows)
-    return total / sum(w.points for w in windows)
+def _lag(found: Adjustment) -> float | None:
+    """The lag that the adjustment estimated; None where it is no unknown."""
+    return next((n.value for n in found.nuisances if n.name == "lag"), None)

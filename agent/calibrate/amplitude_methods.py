@@ -7,7 +7,7 @@ from typing import Any
 import click
 import numpy as np
 
-from agent.calibrate.frontend import FrontEnd
+from agent.calibrate.files import Files
 from agent.calibrate.outcome import Outcome, nothing_used
 from agent.calibrate.priors import contradictions, priors_of
 from calib.estimate.verdict import dead_reasons
@@ -19,7 +19,7 @@ from calib.paper.statistics import rel_s_pct, transverse_excess
 SOLVE = {"1": method1.solve, "2": method2.solve}
 
 
-def by_amplitudes(front: FrontEnd, options: dict[str, Any]) -> Outcome:
+def by_amplitudes(files: Files, options: dict[str, Any]) -> Outcome:
     """Method 1 or 2 on every used window in motion, windows of one position being repetitions.
 
     Raises click.UsageError for --plain, which is Method 3's, and for a tri-axial reference, TableError where --prior
@@ -28,7 +28,7 @@ def by_amplitudes(front: FrontEnd, options: dict[str, Any]) -> Outcome:
     if options["plain"]:
         raise click.UsageError("--plain belongs to Method 3")
     priors = priors_of(options)
-    pairs = list(front.runs())
+    pairs = list(files.runs())
     windows = [window for _, window in pairs]
     # what the front end has made of a velocity is an acceleration already
     method = options["method"]
@@ -36,11 +36,11 @@ def by_amplitudes(front: FrontEnd, options: dict[str, Any]) -> Outcome:
         raise click.UsageError(f"--method {method} needs a uniaxial --reference")
     runs = [Run(p.time_s, p.u[:, 0], p.V, w.pose) for p, w in pairs if w.used]
     if not runs:
-        return nothing_used(windows, front.sensor_clock.rate_hz, method)
+        return nothing_used(windows, files.rate_hz, method)
     try:
         found = SOLVE[method](runs, priors)
     except ValueError as error:
-        return Outcome(None, (str(error),), windows, front.sensor_clock.rate_hz, method)
+        return Outcome(None, (str(error),), windows, files.rate_hz, method)
     reasons = (
         *found.reasons,
         *dead_reasons(found.calibration.sensitivity),
@@ -51,7 +51,7 @@ def by_amplitudes(front: FrontEnd, options: dict[str, Any]) -> Outcome:
         calibration=None if reasons else found.calibration,
         reasons=reasons,
         windows=windows,
-        rate_hz=front.sensor_clock.rate_hz,
+        rate_hz=files.rate_hz,
         method=found.calibration.method,
         coverage_factor=found.coverage_factor,
         uncertainty_kind="GUM, types A and B",

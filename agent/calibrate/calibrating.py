@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from typing import Any
 
 import click
@@ -11,16 +12,17 @@ import numpy as np
 
 from agent.calibrate.adjusting import adjusted, norm_fitted
 from agent.calibrate.amplitude_methods import by_amplitudes
-from agent.calibrate.corners import has_corner, uncoupled
-from agent.calibrate.frontend import FrontEnd, Options
+from agent.calibrate.files import Files, Options
 from agent.calibrate.outcome import Outcome, nothing_used
 from agent.calibrate.poses import PoseInterval, Setting, beside_reference, read_poses
-from agent.calibrate.priors import contradictions, priors_of
+from agent.calibrate.priors import contradictions, instrument_of, priors_of
 from agent.calibrate.tables import ReferenceTable, TableError, read_reference, read_sensor
 from calib.estimate.nuisances import Priors
 from calib.estimate.verdict import dead_reasons
+from calib.excitation.front_end import Settings
 from calib.geometry import STANDARD_GRAVITY_MPS2
 from calib.paper.method3 import PLAIN, fit, refusal
+from calib.signal.instrument import Instrument
 
 BAR_FROM_BYTES = 30_000_000  # shorter files are read before a bar could be of use
 COVERAGE_FACTOR = 2.0  # of plain Method 3: thousands of points, as the paper has it
@@ -35,25 +37,34 @@ def calibrated(options: dict[str, Any]) -> Outcome:
         return by_amplitudes(read_files(options), options)
     if options["plain"]:
         return _plain(read_files(options), priors_of(options))
-    priors = priors_of(options)
-    return adjusted(read_files(options, priors), priors)
+    return adjusted(read_files(options, instrument_of(options)), priors_of(options))
 
 
-def read_files(options: dict[str, Any], priors: Priors | None = None) -> FrontEnd:
-    """Tables, clocks and poses of the files named; corners undone as `priors` state them. Raises TableError."""
+def read_files(options: dict[str, Any], instrument: Instrument | None = None) -> Files:
+    """Tables, clocks and poses of the files named. Raises TableError.
+
+    `instrument` as `instrument_of` gives it; None: without the corners of AC-coupled instruments.
+    """
     paths = [options[name] for name in ("sensor", "reference") if options[name]]
     size = sum(path.stat().st_size for path in paths if path.is_file())
     with _bar("reading", size if size > BAR_FROM_BYTES else 0) as bar:
         sensor = read_sensor(options["sensor"], bar)
         reference = read_reference(options["reference"], bar) if options["reference"] else None
-    stated = options["reference_quantity"]
-    if reference is not None and stated and reference.velocity != (stated == "velocity"):
-        column = "v" if reference.velocity else "a"
-        raise TableError(f"{reference.path}, line 1: column {column} is no {stated}")
+    instrument = instrument or Instrument()
+    if reference is not None:
+        instrument = replace(instrument, quantity=reference.quantity)
+        _check_quantity(reference, instrument, options["reference_quantity"])
     poses = _poses(options, setting_of(options, reference), reference)
-    if priors is not None and reference is not None and has_corner(priors):
-        sensor, reference, poses = uncoupled(sensor, reference, poses, priors)
-    return FrontEnd(sensor, reference, poses, Options(leave_out=not options["plain"], align=not options["plain"]))
+    plain = options["plain"]
+    settings = Settings(leave_out=not plain, limit_band=not plain)
+    return Files(sensor, reference, poses, instrument, Options(settings, align=not plain))
+
+
+def _check_quantity(reference: ReferenceTable, instrument: Instrument, stated: str | None) -> None:
+    if stated and reference.quantity != stated:
+        raise TableError(f"{reference.path}, line 1: column {reference.column} is no {stated}")
+    if instrument.derivatives and instrument.has_corner:
+        raise TableError(f"{reference.path}: a {reference.quantity} reference has no corner frequency to undo")
 
 
 def setting_of(options: dict[str, Any], reference: ReferenceTable | None) -> Setting:
@@ -104,10 +115,10 @@ def _rotation(text: str | None) -> np.ndarray[Any, np.dtype[np.float64]] | None:
         raise click.BadParameter(f"{text!r} is not nine numbers r11,r12,...,r33", param_hint="--rotation") from None
 
 
-def _plain(front: FrontEnd, priors: Priors) -> Outcome:
-    windows = front.windows()
+def _plain(files: Files, priors: Priors) -> Outcome:
+    windows = files.windows()
     if not any(w.used for w in windows):
-        return nothing_used(windows, front.sensor_clock.rate_hz, PLAIN)
+        return nothing_used(windows, files.rate_hz, PLAIN)
     found = fit(windows)
     reasons = (
         *refusal(found, windows),
@@ -118,7 +129,7 @@ def _plain(front: FrontEnd, priors: Priors) -> Outcome:
         None if reasons else found.calibration,
         reasons,
         windows,
-        front.sensor_clock.rate_hz,
+        files.rate_hz,
         PLAIN,
         coverage_factor=COVERAGE_FACTOR,
         uncertainty_kind="type A, white",

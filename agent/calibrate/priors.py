@@ -12,6 +12,7 @@ import numpy as np
 from agent.calibrate.tables import TableError
 from calib.estimate.nuisances import Priors
 from calib.model import PARAMETERS, Array, Calibration
+from calib.signal.instrument import Instrument
 
 # Without a local value gravity is the standard one, which is up to 0.3 % off (poles and equator differ by 0.05 m/s2).
 U_STANDARD_GRAVITY_MPS2 = 0.03
@@ -42,6 +43,16 @@ def priors_of(options: dict[str, Any]) -> Priors:
         sensor_corner_at_hz=options["sensor_corner_hz"],
         parameters=parameters,
         covariance=covariance,
+    )
+
+
+def instrument_of(options: dict[str, Any]) -> Instrument:
+    """What the options say of the reference and of corner frequencies; its file tells the quantity."""
+    return Instrument(
+        corner_hz=options["reference_corner_hz"],
+        u_corner_hz=options["u_reference_corner_hz"],
+        sensor_corner_hz=options["sensor_corner_hz"],
+        u_sensor_corner_hz=options["u_sensor_corner_hz"],
     )
 
 

@@ -23,7 +23,8 @@ CHUNK_BYTES = 1 << 18  # stays in the second-level cache while it is parsed
 LARGEST = 1e15  # no indication or time needs more, and squares and sums of it stay finite
 SENSOR = ("time_s", "vx", "vy", "vz")
 TEMPERATURE = "temperature_degc"
-REFERENCES = (("ax", "ay", "az"), ("a",), ("v",))
+# Columns of a reference, and the quantity that they hold.
+REFERENCES = {("ax", "ay", "az"): "acceleration", ("a",): "acceleration", ("v",): "velocity"}
 # A stamp may be older than the one before: spread back from a late burst, or jittery. Stalls reach some ten ms.
 LATEST_STAMP_S = 0.1
 ROWS_AT_ONCE = 1 << 20
@@ -45,12 +46,16 @@ class SensorTable:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReferenceTable:
-    """reference.csv: stamps (n,) in s, channels (n, 1 or 3) in m/s2, or in m/s where `velocity`."""
+    """reference.csv: stamps (n,) in s, channels (n, 1 or 3) of a quantity of calib.signal.instrument in SI units.
+
+    `column` names the first channel in the header.
+    """
 
     path: Path
     time_s: Array
     x: Array
-    velocity: bool
+    quantity: str
+    column: str
 
 
 def read_sensor(path: Path, progress: Progress | None = None) -> SensorTable:
@@ -75,7 +80,7 @@ def read_reference(path: Path, progress: Progress | None = None) -> ReferenceTab
         require(path, header, ("time_s", *found[0]))
         rows = _columns(path, file, header, ["time_s", *found[0]], progress)
     _check_time(path, rows[:, 0])
-    return ReferenceTable(path, rows[:, 0], rows[:, 1:], found[0] == ("v",))
+    return ReferenceTable(path, rows[:, 0], rows[:, 1:], REFERENCES[found[0]], found[0][0])
 
 
 def open_table(path: Path) -> IO[bytes]:

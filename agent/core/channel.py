@@ -21,6 +21,7 @@ from agent.core.positions import FOUND_WITHIN_S, FoundPositions
 from agent.core.schedule import Piece, ToldTimes
 from agent.core.stream import DeviceStream
 from agent.core.windows import Found, margin_of, refused, windows_in
+from calib.estimate.lag_search import without_lag
 from calib.excitation.front_end import most_margin_s
 from calib.excitation.placing import Placed
 from calib.model import Pose, Window
@@ -28,7 +29,6 @@ from calib.signal.timing import HORIZON_S
 from hw.block import SampleBlock
 
 REFUSED_IN_A_ROW = 3
-LAG_TURNS = 4  # a lag is found, taken out, looked for again: each turn leaves a thousandth
 # A run that begins long after the one before ended: more is a clock that was wrong, and everything has wandered anyway.
 LONGEST_PAUSE_DAYS = 3650.0
 
@@ -287,17 +287,18 @@ class ChannelState:
 
     def _found(self, piece: Piece, first_s: float, day: float) -> tuple[Found, float]:
         """The windows, made again until no lag is left in them that matters."""
-        lag_s = 0.0 if self._estimation is None else self._estimation.lag_s
-        for turn in range(LAG_TURNS):
-            found = windows_in(piece, first_s, self._channel, self._streams, lag_s)
-            used = [w for w in found.windows if w.used]
-            if self._estimation is None or not used or self._channel.reference is None:
-                break
-            better_s = self._estimation.lag_after(used, day, lag_s, found.temperature_degc)
-            if better_s == lag_s or turn == LAG_TURNS - 1:
-                break
-            lag_s = better_s
-        return found, lag_s
+        estimation = self._estimation
+        if estimation is None or self._channel.reference is None:
+            lag_s = 0.0 if estimation is None else estimation.lag_s
+            return windows_in(piece, first_s, self._channel, self._streams, lag_s), lag_s
+        return without_lag(
+            estimation.lag_s,
+            lambda lag_s: windows_in(piece, first_s, self._channel, self._streams, lag_s),
+            lambda found: [w for w in found.windows if w.used],
+            lambda found, lag_s: estimation.lag_after(
+                [w for w in found.windows if w.used], day, lag_s, found.temperature_degc
+            ),
+        )
 
     def _results(self, window: Window, judged: Judged, lag_s: float) -> Iterator[Result]:
         assert self._estimation is not None

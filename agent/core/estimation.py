@@ -20,8 +20,6 @@ from calib.estimate.window_rows import Summary
 from calib.model import PARAMETERS, Array, Calibration, Window, WindowSums
 
 DAY_S = 86400.0
-# Of a lag that a window still has: (omega lag)^3 / 6 is what the equations' own second order leaves of it.
-PHASE_LEFT = 1e-5
 # A jump that is being confirmed may be of any size up to what an operator would hardly accept: 10 % of S, and in the
 # offset two m/s2, which is a mount that leans by 12 deg.
 JUMP_SENSITIVITY = 0.1
@@ -78,13 +76,12 @@ class Estimation:
         return self.recursion.lag_s if "lag" in self.recursion.names else -self._channel.certificate.lag_s
 
     def lag_after(self, windows: Sequence[Window], day: float, lag_s: float, temperature_degc: float) -> float:
-        """The lag once these windows were taken, or `lag_s` where they leave too little of it to matter."""
+        """The lag once these windows, made with `lag_s` taken out, were taken."""
         self._tried = self._try(windows[0], day, lag_s, temperature_degc)
         trial = self._tried.after
         for window in windows[1:]:
             _, trial = trial.with_window(Summary.of(window, day, lag_s, temperature_degc))
-        left = trial.lag_s - lag_s
-        return trial.lag_s if abs(largest_omega(windows) * left) ** 3 / 6.0 > PHASE_LEFT else lag_s
+        return trial.lag_s
 
     def judge(self, window: Window, day: float, lag_s: float, temperature_degc: float) -> Judged:
         """Take, keep aside or refuse one used window."""
@@ -227,13 +224,3 @@ def _most(innovation: Innovation, scale: float) -> str:
     change = innovation.score[p] / np.sqrt(innovation.information[p]) / scale
     told = f"{change:+.3g} m/s2" if p >= 9 else f"{100.0 * change:+.3g} %"
     return f"most of {PARAMETERS[p]}, as if it were off by {told} ({size[p]:.1f} standard deviations)"
-
-
-def largest_omega(windows: Sequence[Window]) -> float:
-    """Largest angular frequency (rad/s) that any window's power stands for; 0 at rest."""
-    largest = 0.0
-    for window in windows:
-        m, power = window.sums.reference_channels, np.diag(window.sums.scatter.sum(axis=0))
-        if m and power[:m].sum() > 0.0:
-            largest = max(largest, float(np.sqrt(power[m : 2 * m].sum() / power[:m].sum())))
-    return largest

@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from agent.calibrate.calibrating import read_files
-from agent.calibrate.frontend import FrontEnd
+from agent.calibrate.files import Files
 from agent.calibrate.origin import SourceFile, source_file
 from agent.calibrate.tables import TableError
 from agent.report.result import CalibrationResult, WindowVerdict
@@ -26,10 +26,10 @@ def retrace(result: CalibrationResult, directory: Path) -> tuple[dict[str, Trace
     if hindrances:
         return {}, [f"{hindrance}: indications and residuals are not shown" for hindrance in hindrances]
     try:
-        front = read_files(options | {name: found.get(options.get(name)) for name in ("sensor", "reference", "poses")})
+        read = read_files(options | {name: found.get(options.get(name)) for name in ("sensor", "reference", "poses")})
     except (TableError, click.UsageError, KeyError, TypeError, ValueError) as error:
         return {}, [f"the files cannot be read with the options that the result names: {error}"]
-    return _traces(front, result), []
+    return _traces(read, result), []
 
 
 def _found(files: tuple[SourceFile, ...], directory: Path) -> tuple[dict[Any, Path], list[str]]:
@@ -47,7 +47,7 @@ def _found(files: tuple[SourceFile, ...], directory: Path) -> tuple[dict[Any, Pa
     return found, hindrances
 
 
-def _traces(front: FrontEnd, result: CalibrationResult) -> dict[str, Trace]:
+def _traces(read: Files, result: CalibrationResult) -> dict[str, Trace]:
     """The newest used window of each position."""
     newest: dict[str, WindowVerdict] = {}
     for window in result.windows:
@@ -57,8 +57,8 @@ def _traces(front: FrontEnd, result: CalibrationResult) -> dict[str, Trace]:
     traces = {}
     for position, window in list(newest.items())[-MOST_TRACES:]:
         middle_s = 0.5 * (window.start_s + window.stop_s)
-        pose = next((p.pose for p in front.poses if p.start_s <= middle_s <= p.stop_s), None)
-        points = front.points(window.start_s, window.stop_s)
-        if pose is not None and len(points.time_s) > 1:
-            traces[position] = Trace(points.time_s, points.V, points.u, points.du, pose)
+        interval = next((p for p in read.poses if p.start_s <= middle_s <= p.stop_s), None)
+        points = None if interval is None else read.points(interval, window.start_s, window.stop_s)
+        if interval is not None and points is not None and len(points.time_s) > 1:
+            traces[position] = Trace(points.time_s, points.V, points.u, points.du, interval.pose)
     return traces

@@ -17,14 +17,15 @@ from calib.estimate.budget import Budget, budget
 from calib.estimate.condense import Condensed, condense
 from calib.estimate.equations import Equations
 from calib.estimate.gauss_newton import Flags, Solution, slope_residuals, solve
-from calib.estimate.jitter import LagScatter, estimated
 from calib.estimate.nuisances import Applied, Nuisances, Priors
+from calib.estimate.slope_scatter import SlopeScatter, estimated
 from calib.estimate.verdict import misfit, nuisance_pull, reasons, turned_windows
+from calib.excitation.excited import excited
 from calib.model import Array, Calibration, Pose, Window
 
 DETERMINED_SHARE = 0.5  # of the prior u, which the data must halve (contract)
-JITTER_TURNS = 3  # the first solution is bent by what it takes for exact; the estimate settles in two
-JITTER_SETTLED = 0.05
+SCATTER_TURNS = 3  # the first solution is bent by what it takes for exact; the estimate settles in two
+SCATTER_SETTLED = 0.05
 DETERMINED_U = 0.1  # of the largest main sensitivity, where there is no prior (contract)
 
 
@@ -78,13 +79,8 @@ class Adjustment:
         return np.asarray(self.calibration.sensitivity @ self.calibration.sensitivity.T)
 
 
-def adjust(
-    windows: Sequence[Window],
-    priors: Priors | None = None,
-    applied: Applied | None = None,
-    quiet: Sequence[Window] = (),
-) -> Adjustment:
-    """Adjust all used windows together; `quiet` ones (see calib.estimate.condense) correct for the reference's noise.
+def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: Applied | None = None) -> Adjustment:
+    """Adjust all used windows together; their reference's noise is corrected for (see calib.excitation.excited).
 
     `applied`: what the front end took out of the data beforehand. Raises ValueError where no window is used.
     """
@@ -92,20 +88,23 @@ def adjust(
     used = [w for w in windows if w.used]
     if not used:
         raise ValueError("no window is used")
-    data = condense(used, quiet)
-    jitter = LagScatter.of(data, priors.lag_window_s)
-    solution = _solution(used, data, priors, applied, jitter)
-    for _ in range(JITTER_TURNS if priors.lag_s > 0.0 else 0):
-        found = estimated(jitter, *slope_residuals(solution), data.type_a.slopes)
-        if found.scatter_s <= (1.0 + JITTER_SETTLED) * jitter.scatter_s:
+    found = [excited(w) for w in used]
+    data = condense([e.window for e in found])
+    u_lag_s = [max(w.u_lag_s, priors.lag_window_s) if priors.lag_s > 0.0 else 0.0 for w in used]
+    scatter = SlopeScatter.of(data, u_lag_s, [e.attenuation for e in found])
+    solution = _solution([e.window for e in found], data, priors, applied, scatter)
+    for _ in range(SCATTER_TURNS if priors.lag_s > 0.0 else 0):
+        larger = estimated(scatter, *slope_residuals(solution), data.type_a.slopes)
+        if larger.lag_s.max() <= (1.0 + SCATTER_SETTLED) * scatter.lag_s.max():
             break
-        jitter = found
-        solution = _solution(used, data, priors, applied, jitter)
+        scatter = larger
+        solution = _solution([e.window for e in found], data, priors, applied, scatter)
     shares = budget(solution, priors.offset_mps2)
     determined = _determined(solution, shares)
 
     def turned(static: int, polarity: int) -> Solution:
-        return _solution(turned_windows(used, static, polarity), data, priors, applied, jitter)
+        reduced = [excited(w).window for w in turned_windows(used, static, polarity)]
+        return _solution(reduced, data, priors, applied, scatter)
 
     return Adjustment(
         calibration=_calibration(solution, shares, determined),
@@ -118,7 +117,7 @@ def adjust(
         chi2_degrees_of_freedom=shares.consistency[1],
         offset_scatter_mps2=shares.offset_scatter_mps2,
         slope_scatter=shares.slope_scatter,
-        lag_scatter_s=jitter.scatter_s,
+        lag_scatter_s=float(scatter.lag_s.max()),
         misfit=misfit(solution),
         nuisance_pull=nuisance_pull(solution, shares.covariance)[0],
         mean=solution.x,
@@ -127,20 +126,21 @@ def adjust(
 
 
 def _solution(
-    windows: Sequence[Window], data: Condensed, priors: Priors, applied: Applied, jitter: LagScatter
+    windows: Sequence[Window], data: Condensed, priors: Priors, applied: Applied, scatter: SlopeScatter
 ) -> Solution:
     poses: list[Pose] = []
-    index: dict[tuple[str, bytes, bytes], int] = {}
+    index: dict[tuple[str, bytes, bytes, bytes], int] = {}
     pose_of = []
     for window in windows:
         pose = window.pose
-        key = (pose.position, pose.direction.tobytes(), pose.gravity_mps2.tobytes())
+        along = b"" if pose.along is None else pose.along.tobytes()
+        key = (pose.position, pose.direction.tobytes(), pose.gravity_mps2.tobytes(), along)
         if key not in index:
             index[key] = len(poses)
             poses.append(pose)
         pose_of.append(index[key])
     nuisances = Nuisances(poses, data.channels, priors, applied)
-    return solve(Equations(data, nuisances, pose_of, priors.offset_mps2, jitter), priors)
+    return solve(Equations(data, nuisances, pose_of, priors.offset_mps2, scatter), priors)
 
 
 def _determined(solution: Solution, shares: Budget) -> Flags:

@@ -37,12 +37,7 @@ def budget(solution: Solution, stated_offset_scatter_mps2: float) -> Budget:
     seen = between_windows(solution)
     noise = _type_a(solution)
     sources = {"type A": (noise, solution.equations.data.type_a.degrees_of_freedom)}
-    jitter = solution.equations.jitter
-    if jitter.scatter_s > 0.0:
-        sources["lag between windows"] = (
-            jitter.scatter_s**2 * jitter.term(slope_residuals(solution)[1]),
-            jitter.degrees_of_freedom,
-        )
+    sources |= solution.equations.scatter.terms(slope_residuals(solution)[1])
     if stated_offset_scatter_mps2 > 0.0:
         larger = max(stated_offset_scatter_mps2, seen.offset.scatter)
         freedom = seen.offset.degrees_of_freedom if larger > stated_offset_scatter_mps2 else np.inf
@@ -80,7 +75,7 @@ def _type_a(solution: Solution) -> Array:
     equations = solution.equations
     _, mean_rows = equations.split(solution.jacobian)
     type_a = equations.data.type_a
-    slope_rows = equations.jitter.whiten(slope_residuals(solution)[1])
+    slope_rows = equations.scatter.whiten(slope_residuals(solution)[1])
     mean_rows = mean_rows * np.sqrt(equations.white_share)[..., None]
     return _quadratic(slope_rows, type_a.slopes) + _quadratic(mean_rows, type_a.means)
 

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.estimate.condense import Condensed
-from calib.estimate.jitter import LagScatter
 from calib.estimate.nuisances import Inputs, Nuisances
+from calib.estimate.slope_scatter import SlopeScatter
 from calib.model import Array
 
 # Below this part of the largest singular value (columns scaled to one) a direction was not excited: positions 0/1/2 deg
@@ -32,7 +32,7 @@ UNSEEN_SHARE = 1e-3  # of an unseen direction that a parameter may have and stil
 class Rows:
     """Whitened residuals (observed less predicted) and Jacobian with respect to [S row by row, Q, nuisances].
 
-    Slopes: `slope` (B, 2M, 3) and `d_slope` (B, 2M, 3, N); means: `mean` (W, 3) and `d_mean` (W, 3, N).
+    Slopes: `slope` (W, 2M, 3) and `d_slope` (W, 2M, 3, N); means: `mean` (W, 3) and `d_mean` (W, 3, N).
     """
 
     slope: Array
@@ -56,14 +56,13 @@ class Equations:
         nuisances: Nuisances,
         pose_of: list[int],
         offset_scatter_mps2: float,
-        jitter: LagScatter,
+        scatter: SlopeScatter,
         output_per_mps2: float | None = None,
     ) -> None:
-        """`pose_of` (W,) the nuisances' pose of a window; `offset_scatter_mps2` and `jitter` between windows;
+        """`pose_of` (W,) the nuisances' pose of a window; `offset_scatter_mps2` and `scatter` between windows;
         `output_per_mps2` the sensor's scale, None: as the data show."""
-        self.data, self.nuisances, self.jitter = data, nuisances, jitter
+        self.data, self.nuisances, self.scatter = data, nuisances, scatter
         self.pose_of_window = np.array(pose_of)
-        self.pose_of_block = self.pose_of_window[data.block_window]
         known = np.isfinite(nuisances.gravity).all(axis=1)[self.pose_of_window]
         self.known = known
         self.output_per_mps2 = self._output_per_mps2() if output_per_mps2 is None else output_per_mps2
@@ -79,7 +78,7 @@ class Equations:
     def _unseen_inputs(self) -> Array:
         """Directions (k, 4) of (a_x, a_y, a_z, 1) square to every input vector, angles as stated; 4 - k is the rank."""
         data, nuisances, m = self.data, self.nuisances, self.data.channels
-        moved = np.einsum("brc,bkc->brk", data.root[:, :m, :m], nuisances.direction[self.pose_of_block])
+        moved = np.einsum("brc,bkc->brk", data.root[:, :m, :m], nuisances.direction[self.pose_of_window])
         held = np.einsum("wkm,wm->wk", nuisances.direction[self.pose_of_window], data.mean_x[:, :m])
         held = np.pad(held + nuisances.gravity[self.pose_of_window], ((0, 0), (0, 1)), constant_values=1.0)
         rows = np.vstack(
@@ -99,7 +98,7 @@ class Equations:
     def _output_per_mps2(self) -> float:
         """The sensor's scale: root mean square of output over input, of all slopes and means."""
         data, m = self.data, self.data.channels
-        moved = np.einsum("brc,bkc->brk", data.root[:, :m, :m], self.nuisances.direction[self.pose_of_block])
+        moved = np.einsum("brc,bkc->brk", data.root[:, :m, :m], self.nuisances.direction[self.pose_of_window])
         gravity, n = self.nuisances.gravity[self.pose_of_window][self.known], data.count[self.known]
         held, level = np.zeros((1, 3)), np.zeros((1, 3))
         if n.size:
@@ -116,7 +115,7 @@ class Equations:
         return Rows(*self._slopes(S, inputs), *self._means(S, Q, z, inputs))
 
     def split(self, rows: Array) -> tuple[Array, Array]:
-        """Stacked rows (rows, ...) back into slopes (B, 2M, 3, ...) and means (W, 3, ...)."""
+        """Stacked rows (rows, ...) back into slopes (W, 2M, 3, ...) and means (W, 3, ...)."""
         slopes = self.data.slopes
         return (
             rows[: slopes.size].reshape(*slopes.shape, *rows.shape[1:]),
@@ -124,30 +123,30 @@ class Equations:
         )
 
     def _slopes(self, S: Array, inputs: Inputs) -> tuple[Array, Array]:
-        data, D = self.data, inputs.direction[self.pose_of_block]
+        data, D = self.data, inputs.direction[self.pose_of_window]
         omega2 = data.omega2[:, None]
-        on_u = 1.0 - 0.5 * inputs.lag_s**2 * omega2  # (B, 3)
+        on_u = 1.0 - 0.5 * inputs.lag_s**2 * omega2  # (W, 3)
         on_du = np.broadcast_to(-inputs.lag_s, on_u.shape)
         ideal = np.einsum("ik,bkm->bim", S, D)
         per_omega = np.divide(1.0, np.sqrt(omega2), out=np.zeros_like(omega2), where=omega2 > 0.0)
-        across = inputs.quadrature[self.pose_of_block] * per_omega  # (B, 3), felt by the first channel's du/dt
+        across = inputs.quadrature[self.pose_of_window] * per_omega  # (W, 3), felt by the first channel's du/dt
         on_rate = ideal * on_du[..., None]
         on_rate[:, :, :1] += (across @ S.T)[..., None]
-        slopes = np.concatenate([ideal * on_u[..., None], on_rate], axis=2)  # (B, 3, 2M)
+        slopes = np.concatenate([ideal * on_u[..., None], on_rate], axis=2)  # (W, 3, 2M)
         residual = data.slopes - np.einsum("brc,bic->bri", data.root, slopes)
 
         nuisances = self.nuisances
-        d_ideal = np.einsum("ik,jbkm->bimj", S, inputs.d_direction[:, self.pose_of_block])
+        d_ideal = np.einsum("ik,jbkm->bimj", S, inputs.d_direction[:, self.pose_of_window])
         d_on_u = -inputs.lag_s[:, None] * omega2[..., None] * nuisances.lag.T
         d_on_du = np.broadcast_to(-nuisances.lag.T, d_on_u.shape)
         d_on_rate = d_ideal * on_du[..., None, None] + ideal[..., None] * d_on_du[:, :, None, :]
-        d_across = inputs.d_quadrature[:, self.pose_of_block] * per_omega
+        d_across = inputs.d_quadrature[:, self.pose_of_window] * per_omega
         d_on_rate[:, :, :1] += np.einsum("ik,jbk->bij", S, d_across)[:, :, None]
         d_z = np.concatenate(
             [d_ideal * on_u[..., None, None] + ideal[..., None] * d_on_u[:, :, None, :], d_on_rate], axis=2
         )
         n = 12 + len(nuisances)
-        jacobian = np.zeros((*data.slopes.shape, n))  # (B, 2M, 3, N)
+        jacobian = np.zeros((*data.slopes.shape, n))  # (W, 2M, 3, N)
         per_row = np.concatenate([D[:, None] * on_u[..., None, None], D[:, None] * on_du[..., None, None]], axis=3)
         per_row[:, :, :, D.shape[2] : D.shape[2] + 1] += across[:, None, :, None]
         for i in range(3):
@@ -157,9 +156,9 @@ class Equations:
         return self._whitened(residual / noise), self._whitened(jacobian / noise[:, None])
 
     def _whitened(self, slopes: Array) -> Array:
-        """Rows (B, 2M, 3, ...) with the scatter of the lag between windows taken into their weight."""
+        """Rows (W, 2M, 3, ...) with the scatter between windows taken into their weight."""
         flat = slopes.reshape(len(slopes), -1, *slopes.shape[3:])
-        return self.jitter.whiten(flat).reshape(slopes.shape)
+        return self.scatter.whiten(flat).reshape(slopes.shape)
 
     def _means(self, S: Array, Q: Array, z: Array, inputs: Inputs) -> tuple[Array, Array]:
         data, nuisances, m = self.data, self.nuisances, self.data.channels
@@ -168,9 +167,7 @@ class Equations:
         rate = np.einsum("wkm,wm->wk", D, data.mean_x[:, m:])
         G = np.nan_to_num(inputs.gravity[self.pose_of_window])
         # A window of no whole number of cycles has a mean of du/dt, which lag and quadrature pass on.
-        per_omega = np.divide(
-            1.0, np.sqrt(data.mean_omega2), out=np.zeros_like(data.count), where=data.mean_omega2 > 0.0
-        )
+        per_omega = np.divide(1.0, np.sqrt(data.omega2), out=np.zeros_like(data.count), where=data.omega2 > 0.0)
         share = (data.mean_x[:, m] if m else 0.0 * data.count) * per_omega
         across = inputs.quadrature[self.pose_of_window] * share[:, None]
         felt = (moved + across + G)[:, None] - inputs.lag_s[:, None] * rate[:, None]  # (W, 3, 3): axis, direction

@@ -7,7 +7,7 @@ Residuals are not white (AR(1) 0.99: the true uncertainty is 11 times the white 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -21,7 +21,8 @@ RHO_COARSEN = 0.35
 @dataclass(frozen=True, slots=True, eq=False)
 class Segments:
     """Sums of K segments about one centre: counts (K,), x x' (K, 2M, 2M), x V' (K, 2M, 3), V V' (K, 3, 3), sums of
-    [x, V] (K, 2M + 3); `mean` (2M + 3,) is that centre."""
+    [x, V] (K, 2M + 3); `mean` (2M + 3,) is that centre. `noise` (2M,): power a sample of the reference's own noise,
+    which is no longer in xx but still in the residuals."""
 
     count: Array
     xx: Array
@@ -29,15 +30,7 @@ class Segments:
     vv: Array
     total: Array
     mean: Array
-
-    def sums(self) -> tuple[Array, Array, Array, Array, Array]:
-        """All that adds up, in the order of the fields."""
-        return self.count, self.xx, self.xv, self.vv, self.total
-
-    def less(self, xx: Array, xv: Array, weight: float = 1.0) -> Segments:
-        """`weight` times the same segments, from each of their points these mean x x' and x V' taken."""
-        n = self.count[:, None, None]
-        return replace(self, xx=weight * (self.xx - n * xx), xv=weight * (self.xv - n * xv))
+    noise: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,23 +45,15 @@ class TypeA:
     degrees_of_freedom: float
 
 
-def pooled(
-    windows: Sequence[Segments],
-    blocks: Sequence[Segments],
-    window_block: Sequence[int],
-    roots: Sequence[Array],
-    whiteners: Sequence[Array],
-) -> TypeA:
-    """Scatter of the whitened scores over all windows (means) and blocks (slopes, whitened by T = `whiteners`)."""
-    slopes = [t.T @ (t @ b.xv.sum(0)) for t, b in zip(whiteners, blocks, strict=True)]
-    own = [(slopes[b], roots[b]) for b in window_block]
-    noise = _noise(windows, own)
+def pooled(windows: Sequence[Segments], roots: Sequence[Array], whiteners: Sequence[Array]) -> TypeA:
+    """Scatter of the whitened scores over all windows; slopes are whitened by T = `whiteners`."""
+    slopes = [t.T @ (t @ w.xv.sum(0)) for t, w in zip(whiteners, windows, strict=True)]
+    noise = _noise(windows, list(zip(slopes, roots, strict=True)))
     size = roots[0].shape[0]
     slope_scores, mean_scores = [], []
-    for block, beta, t in zip(blocks, slopes, whiteners, strict=True):
-        score = np.einsum("rc,kci->kri", t, block.xv - block.xx @ beta) / noise
+    for window, beta, t in zip(windows, slopes, whiteners, strict=True):
+        score = np.einsum("rc,kci->kri", t, window.xv - window.xx @ beta) / noise
         slope_scores.append(score.reshape(len(score), 3 * size))
-    for window, (beta, _) in zip(windows, own, strict=True):
         score = (window.total[:, -3:] - window.total[:, :-3] @ beta) / noise
         mean_scores.append(score / np.sqrt(window.count.sum()))
     live = np.repeat([any(r[j, j] > 0.0 for r in roots) for j in range(size)], 3)
@@ -81,7 +66,8 @@ def _noise(windows: Sequence[Segments], own: Sequence[tuple[Array, Array]]) -> A
     """SD of the residuals within windows, by each window's (slopes, root)."""
     left, freedom, signal, counts = np.zeros(3), 0.0, np.zeros(3), 0.0
     for window, (beta, root) in zip(windows, own, strict=True):
-        xx, xv, vv = window.xx.sum(0), window.xv.sum(0), np.diag(window.vv.sum(0))
+        xx = window.xx.sum(0) + window.count.sum() * np.diag(window.noise)
+        xv, vv = window.xv.sum(0), np.diag(window.vv.sum(0))
         left += vv - 2.0 * np.einsum("ci,ci->i", beta, xv) + np.einsum("ci,cd,di->i", beta, xx, beta)
         signal += vv + window.count.sum() * window.mean[-3:] ** 2
         freedom += window.count.sum() - 1 - np.count_nonzero(np.diag(root))

@@ -10,9 +10,9 @@ import numpy as np
 
 from calib.estimate.condense import Condensed, condense
 from calib.estimate.equations import Equations
-from calib.estimate.jitter import LagScatter
 from calib.estimate.joint_state import JointState
 from calib.estimate.nuisances import Applied, Nuisances, Priors
+from calib.estimate.slope_scatter import SlopeScatter
 from calib.estimate.type_a import TypeA
 from calib.estimate.wander import MAIN_TEMPERATURE, offset_temperature
 from calib.excitation.excited import excited
@@ -134,8 +134,10 @@ class WindowRows:
     ) -> None:
         self.summary, self.data = summary, summary.data
         self.nuisances = Nuisances([summary.moved], self.data.channels, priors, Applied(summary.lag_s))
-        self._jitter = LagScatter.of(self.data, 0.0)
-        self.equations = Equations(self.data, self.nuisances, [0], priors.offset_mps2, self._jitter, scale)
+        u_lag_s = max(priors.lag_window_s, summary.u_lag_s)
+        self._scatter = SlopeScatter.of(self.data, u_lag_s, summary.attenuation)
+        own = SlopeScatter.of(self.data)  # the scatter between windows is in the covariance of the rows, not before it
+        self.equations = Equations(self.data, self.nuisances, [0], priors.offset_mps2, own, scale)
         self._priors, self._held_mps2 = priors, held_mps2
         above = summary.temperature_degc - reference_degc
         self._temperature_k = above if np.isfinite(above) else 0.0
@@ -229,12 +231,8 @@ class WindowRows:
 
         In both are what two clocks differ by from window to window, and what the correction for noise leaves.
         """
-        live, m = self._live, self.data.channels
-        jitter = max(self._priors.lag_window_s, self.summary.u_lag_s) * self._jitter.loading[0][live]
-        signal = np.zeros(6 * m)
-        signal[: 3 * m] = (self.data.slopes[0, :m] / self.data.type_a.noise).ravel()
-        left = self.summary.attenuation * signal[live]
-        both = np.outer(jitter, jitter) + np.outer(left, left)
+        live = self._live
+        both = self._scatter.covariance()[0][np.ix_(live, live)]
         own, white = self._drawn(self.data.type_a.slopes[np.ix_(live, live)], noise.slopes)
         return white + both, own + both
 

@@ -92,7 +92,7 @@ def _reduced(window: Window, live: NDArray[np.bool_], along: Array, noise: Array
     mean = sums.count @ sums.mean[:, :m] / sums.count.sum()
     # The means of silent channels (gravity, where the reference feels it) are still felt.
     gravity = pose.gravity_mps2 + pose.direction[:, :m] @ np.where(live, 0.0, mean - along @ mean)
-    moving: Array = np.kron(np.eye(channels // m), np.diag(live.astype(float)) + along)
+    moving = np.asarray(np.kron(np.eye(channels // m), np.diag(live.astype(float)) + along), dtype=np.float64)
     # What silent channels did from segment to segment must not come back as scatter between them.
     return replace(
         window,

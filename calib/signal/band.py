@@ -26,28 +26,6 @@ WIDEST = 0.35  # of the sampling rate: beyond, a filter has nothing left to take
 STOP_BAND_DB = 66.0
 
 
-def moving_band_hz(loud: Sequence[Array], quiet: Sequence[Array], rate_hz: float) -> float | None:
-    """Upper end in Hz of where loud stretches (n, m) of a reference have more power than quiet ones.
-
-    None where nothing is gained by a filter, or too little is known.
-    """
-    size = int(SEGMENT_S * rate_hz)
-    power_loud, loud_segments = _spectrum(loud, size)
-    power_quiet, quiet_segments = _spectrum(quiet, size)
-    if min(loud_segments, quiet_segments) < LEAST_SEGMENTS:
-        return None
-    smooth = np.ones(SMOOTHED) / SMOOTHED
-    ratio = np.convolve(power_loud / power_quiet, smooth, "same")
-    # Each line of m channels is a chi-squared of 2 m degrees a segment.
-    m = loud[0].shape[1]
-    sd = np.sqrt((1.0 / loud_segments + 1.0 / quiet_segments) / (m * SMOOTHED))
-    moving = np.flatnonzero(ratio[SMOOTHED:-SMOOTHED] > 1.0 + SIGNIFICANT * sd)
-    if not len(moving):
-        return None
-    band_hz = MARGIN * float(moving[-1] + SMOOTHED) / SEGMENT_S
-    return band_hz if band_hz < WIDEST * rate_hz else None
-
-
 def band_above_noise(x: Array, rate_hz: float) -> tuple[float | None, Array]:
     """Upper end in Hz of where x (n, m) has more power than the white noise in it, and that noise (m,) per root Hz.
 

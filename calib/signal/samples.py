@@ -16,9 +16,9 @@ class Samples:
     """Samples of a device one after the other; a missing sample is a row of NaN.
 
     `device` names it in messages. `values` (n, C) in the device's own unit, the first of them has the number
-    `first_index`; `clock` says when each was taken. `in_time`: the times rise and lie where they were asked for (a device whose count jumps at will has no
-    clock). `saturated`: one of the samples was at the end of the device's range. `temperature_degc` is the mean, NaN
-    where the device tells none.
+    `first_index`; `clock` says when each was taken. `in_time`: the times rise and lie where they were asked for (a
+    device whose count jumps at will has no clock). `saturated`: a sample was at the end of the device's range.
+    `temperature_degc` is the mean, NaN where the device tells none.
     """
 
     device: str

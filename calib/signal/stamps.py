@@ -67,6 +67,29 @@ def clock_from_stamps(stamp_s: Array) -> ClockFit:
     )
 
 
+def counted(clock: ClockFit) -> tuple[ClockFit, IntArray, IntArray]:
+    """The clock of samples numbered so that missing ones count too, as a device's own count does.
+
+    `clock` numbers the rows of a file (`clock_from_stamps`). Returns the clock without gaps; the rows (P,) at which
+    runs without a gap begin, and the number (P,) of the first sample of each run.
+    """
+    rows = np.concatenate([[0], clock.gaps]).astype(np.int64)
+    shift = np.zeros(len(rows), dtype=np.int64)
+    for p, row in enumerate(clock.gaps.tolist(), start=1):
+        before_s, after_s = clock.time_of([row - 1, row])
+        at = int(np.searchsorted(clock.knot_index, row - 0.5))
+        periods = float(after_s - before_s) / float(clock.knot_period_s[min(at, len(clock.knot_period_s) - 1)])
+        shift[p] = shift[p - 1] + max(round(periods) - 1, 0)
+    moved = shift[np.searchsorted(rows, clock.knot_index, side="right") - 1]
+    whole = replace(
+        clock,
+        knot_index=clock.knot_index + moved,
+        index=clock.index + int(shift[-1]),
+        gaps=np.empty(0, dtype=np.int64),
+    )
+    return whole, rows, rows + shift
+
+
 def arrivals_from_stamps(stamp_s: Array) -> Arrivals:
     """Bursts out of stamps (n,): equal or close ones are one, so are those spread at a nominal rate; else each is."""
     t = np.asarray(stamp_s, dtype=float)

@@ -9,7 +9,7 @@ constant part of the lateness (a bus transfer, say) shows in no arrival; it is p
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -74,6 +74,17 @@ class ClockFit:
         for _ in range(3):  # periods differ by less than 1e-2 within a piece: each turn gains two digits or more
             index = index + (t - self.time_of(index)) / slope
         return np.asarray(index)
+
+    def stretched(self, rate: float, at_s: float) -> ClockFit:
+        """The clock as it is on a time scale that runs faster by `rate` (s a second) and agrees with this one at
+        `at_s`."""
+        return replace(
+            self,
+            knot_time_s=self.knot_time_s + rate * (self.knot_time_s - at_s),
+            knot_period_s=self.knot_period_s * (1.0 + rate),
+            rate_hz=self.rate_hz / (1.0 + rate),
+            offset_s=self.offset_s + rate * (self.offset_s - at_s),
+        )
 
     @staticmethod
     def _piece(knots: Array, at: Array) -> IntArray | int:

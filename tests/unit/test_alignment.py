@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agent.calibrate.frontend import FrontEnd, Options
+from agent.calibrate.files import Files, Options
 from agent.calibrate.poses import PoseInterval
 from agent.calibrate.tables import ReferenceTable, SensorTable
 from calib.excitation.alignment import drift, segment_lags
@@ -15,6 +15,7 @@ from calib.excitation.windows import Points, motion_windows
 from calib.geometry import beside, clamp
 from calib.model import Pose, Window
 from calib.paper.method3 import fit
+from calib.signal.instrument import Instrument
 
 RATE_HZ = 500.0
 S = np.array([[1.02, 0.01, -0.02], [0.015, 0.98, 0.005], [-0.01, 0.02, 1.01]])
@@ -104,27 +105,27 @@ def tables(ppm: float) -> tuple[SensorTable, ReferenceTable, list[PoseInterval]]
     V = np.concatenate([(motion(part, 1) @ p.direction.T + p.gravity_mps2) @ S.T + 0.1 for part, p in parts])
     V += 0.01 * rng.normal(size=V.shape)
     sensor = SensorTable(Path("sensor.csv"), t, V, None)
-    reference = ReferenceTable(Path("reference.csv"), t * (1 + ppm * 1e-6), motion(t, 1), False)
+    reference = ReferenceTable(Path("reference.csv"), t * (1 + ppm * 1e-6), motion(t, 1), "acceleration", "a")
     return sensor, reference, [PoseInterval(60.0 * k, 60.0 * (k + 1), p) for k, p in enumerate(poses)]
 
 
 def test_free_running_clocks_cost_nothing_once_aligned() -> None:
     sensor, reference, poses = tables(40.0)  # 7 ms apart in the end
-    front = FrontEnd(sensor, reference, poses)
+    front = Files(sensor, reference, poses, Instrument())
     front.windows()
     assert front.drift is not None
     # The reference's stamps run ahead: the sensor's lag behind them less and less.
     assert front.drift.rate == pytest.approx(-40e-6, abs=5e-7)
     lag_s = front.drift.lag_s
     aligned = fit(front.windows(lag_s))
-    as_they_are = fit(FrontEnd(sensor, reference, poses, Options(align=False)).windows(lag_s))
+    as_they_are = fit(Files(sensor, reference, poses, Instrument(), Options(align=False)).windows(lag_s))
     assert aligned.residual_sd.max() < 0.015 < 0.1 < as_they_are.residual_sd.max()
     assert np.abs(aligned.calibration.sensitivity - S).max() < 5e-4
     assert np.abs(as_they_are.calibration.sensitivity - S).max() > 1e-3
 
 
 def test_clocks_in_step_are_left_alone() -> None:
-    front = FrontEnd(*tables(0.0))
+    front = Files(*tables(0.0), Instrument())
     front.windows()
     assert front.drift is not None
     assert not front.drift.significant

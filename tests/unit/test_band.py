@@ -10,7 +10,7 @@ import pytest
 
 from agent.cli.main import run_cli
 from agent.cli.simulate import write_files
-from calib.signal.band import band_above_noise, lowpass, lowpass_lost, moving_band_hz
+from calib.signal.band import band_above_noise, lowpass, lowpass_lost
 from hw.virtual.bench import Bench
 from hw.virtual.motion import ambient
 from hw.virtual.parameters import BenchParameters, ReferenceParameters, SensorParameters
@@ -63,20 +63,6 @@ def test_it_is_a_filter_whatever_the_length(n: int) -> None:
     assert np.isnan(shown[:half]).all()
     assert np.isnan(shown[-half:]).all()
     assert np.isfinite(shown[half:-half]).all()
-
-
-def test_the_band_is_that_of_the_motion() -> None:
-    rng = np.random.default_rng(2)
-    t = np.arange(int(60 * RATE_HZ)) / RATE_HZ
-    lines_hz = np.arange(0.5, 10.0, 0.37)
-    motion = np.sin(2 * np.pi * lines_hz * t[:, None] + rng.uniform(0, 6, len(lines_hz))).sum(axis=1)
-    quiet = [rng.normal(size=(len(t), 1)) for _ in range(2)]
-    loud = [rng.normal(size=(len(t), 1)) + motion[:, None] for _ in range(2)]
-    found = moving_band_hz(loud, quiet, RATE_HZ)
-    assert found is not None
-    assert 10.0 < found < 15.0
-    assert moving_band_hz(quiet, quiet, RATE_HZ) is None
-    assert moving_band_hz(loud, [q[:100] for q in quiet], RATE_HZ) is None
 
 
 def test_a_lag_is_found_under_the_noise_of_the_reference(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

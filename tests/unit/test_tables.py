@@ -119,7 +119,7 @@ def test_references(tmp_path: Path, header: str, channels: int, velocity: bool) 
     fields = header.split(",")
     text = header + "\n" + "".join(",".join(str(k if f == "time_s" else 7) for f in fields) + "\n" for k in range(3))
     table = read_reference(write(tmp_path, text))
-    assert (table.x.shape, table.velocity) == ((3, channels), velocity)
+    assert (table.x.shape, table.quantity == "velocity") == ((3, channels), velocity)
     np.testing.assert_array_equal(table.x, 7)
     np.testing.assert_array_equal(table.time_s, [0, 1, 2])
 

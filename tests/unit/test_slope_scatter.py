@@ -82,7 +82,7 @@ def test_s_and_q_are_as_uncertain_as_said(jitter_s: float) -> None:
 
 
 def test_weighed_as_exact_they_would_not_be(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(adjustment, "JITTER_TURNS", 0)
+    monkeypatch.setattr(adjustment, "SCATTER_TURNS", 0)
     assert mean_square(100e-6).max() > 4.0
 
 

@@ -1,0 +1,175 @@
+"""From files to windows: clocks out of the stamps, the poses cut into pieces, the front end on each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from agent.calibrate.poses import PoseInterval
+from agent.calibrate.streams import FileStream
+from agent.calibrate.tables import ReferenceTable, SensorTable, TableError
+from calib.excitation.alignment import Drift, drift
+from calib.excitation.front_end import (
+    DEFAULT_SETTINGS,
+    Aligned,
+    Settings,
+    Unusable,
+    aligned,
+    margin_s,
+    nothing_in,
+    windows_of,
+)
+from calib.excitation.pieces import pieces_of
+from calib.excitation.windows import Points, motion_windows, rest_sd
+from calib.model import Array, Window
+from calib.signal.instrument import Instrument
+from calib.signal.samples import Samples
+
+GUARD_S = 0.1  # left out at both ends of a pose: hands, and what the clocks do not know
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """How windows are made of files. Method 3 as printed takes both files' clocks as they are: `align` False."""
+
+    settings: Settings = DEFAULT_SETTINGS
+    align: bool = True
+    guard_s: float = GUARD_S
+
+
+class Files:
+    """Windows of a sensor's file, a reference's file and the poses; they can be made again with another lag.
+
+    `instrument` describes the reference. Raises TableError where files do not overlap in time.
+    """
+
+    def __init__(
+        self,
+        sensor: SensorTable,
+        reference: ReferenceTable | None,
+        poses: Sequence[PoseInterval],
+        instrument: Instrument,
+        options: Options | None = None,
+    ) -> None:
+        _check_overlap(sensor, reference, poses)
+        self._options = options or Options()
+        self._sensor = FileStream(str(sensor.path), sensor.time_s, sensor.v)
+        self._reference = None if reference is None else FileStream(str(reference.path), reference.time_s, reference.x)
+        self._instrument = instrument
+        self.drift: Drift | None = None  # of the sensor's clock against the reference's, once windows were made
+        self.poses = poses
+
+    @property
+    def rate_hz(self) -> float:
+        """Of the sensor, as its stamps tell."""
+        return self._sensor.clock.rate_hz
+
+    def windows(self, lag_s: float = 0.0, progress: Callable[[float], Any] | None = None) -> list[Window]:
+        """All windows in order of the poses, used or not. The sensor's indications are taken to lag by `lag_s`.
+
+        Where the two clocks run apart, that is found the first time and taken out. `progress` is called with the
+        seconds of recording just done.
+        """
+        found = self._made(lag_s, progress)
+        if self._options.align and self._reference is not None and self.drift is None:
+            self.drift = drift(found)
+            if self.drift is not None and self.drift.significant:
+                self._reference.stretch(self.drift.rate, self.drift.time_s)
+                found = self._made(lag_s, progress)
+        return found
+
+    def _made(self, lag_s: float, progress: Callable[[float], Any] | None) -> list[Window]:
+        floor = self._rest_floor()
+        windows: list[Window] = []
+        for interval in self.poses:
+            found = [w for piece in self._pieces(interval) for w in self._windows(interval, *piece, lag_s, floor)]
+            windows += found or [_nothing(interval, "no samples of sensor and reference in this pose")]
+            if progress is not None:
+                progress(interval.stop_s - interval.start_s)
+        return windows
+
+    def _pieces(self, interval: PoseInterval) -> Iterator[tuple[float, float]]:
+        longest_s = self._options.settings.limits.longest_s
+        return pieces_of(interval.start_s, interval.stop_s, longest_s, self._options.guard_s)
+
+    def _windows(
+        self, interval: PoseInterval, start_s: float, stop_s: float, lag_s: float, floor: Array | None
+    ) -> list[Window]:
+        sensor, reference = self._cut(interval, start_s, stop_s)
+        if sensor is None or (reference is None and interval.pose.direction.shape[1]):
+            return []
+        span_s, settings = (start_s, stop_s), self._options.settings
+        try:
+            return windows_of(interval.pose, sensor, reference, self._instrument, span_s, lag_s, settings, floor)
+        except Unusable as error:
+            return [nothing_in(interval.pose, start_s, stop_s, str(error))]
+
+    def _cut(self, interval: PoseInterval, start_s: float, stop_s: float) -> tuple[Samples | None, Samples | None]:
+        if self._reference is None or not interval.pose.direction.shape[1]:
+            return self._sensor.cut(start_s, stop_s), None
+        around_s = margin_s(self._instrument, self._reference.clock.rate_hz)
+        sensor = self._sensor.cut(start_s - 0.5 * around_s, stop_s + 0.5 * around_s)
+        return sensor, self._reference.cut(start_s - around_s, stop_s + around_s)
+
+    def runs(self) -> Iterator[tuple[Points, Window]]:
+        """Windows in motion with all their samples, unfiltered, for methods that need more than sums."""
+        settings = self._options.settings
+        for interval in self.poses:
+            for piece in self._pieces(interval):
+                found = self._aligned(interval, *piece, 0.0, limit_band=False)
+                if found is None:
+                    continue
+                for window in motion_windows(
+                    interval.pose, found.points, settings.limits, leave_out=settings.leave_out
+                ):
+                    first = int(np.searchsorted(found.points.time_s, window.start_s, side="left"))
+                    stop = int(np.searchsorted(found.points.time_s, window.stop_s, side="right"))
+                    yield found.points.part(first, stop), window
+
+    def points(self, interval: PoseInterval, start_s: float, stop_s: float, lag_s: float = 0.0) -> Points | None:
+        """Samples of the sensor from `start_s` to `stop_s`; with a reference those that have one, when they felt it."""
+        if interval.pose.direction.shape[1]:
+            found = self._aligned(interval, start_s, stop_s, lag_s, limit_band=self._options.settings.limit_band)
+            return None if found is None else found.points
+        sensor = self._sensor.cut(start_s, stop_s)
+        if sensor is None:
+            return None
+        whole = np.isfinite(sensor.values).all(axis=1)
+        nothing = np.empty((int(whole.sum()), 0))
+        return Points(sensor.time_s[whole], sensor.values[whole], nothing, nothing)
+
+    def _aligned(
+        self, interval: PoseInterval, start_s: float, stop_s: float, lag_s: float, *, limit_band: bool
+    ) -> Aligned | None:
+        sensor, reference = self._cut(interval, start_s, stop_s)
+        if sensor is None or reference is None:
+            return None
+        return aligned(sensor, reference, self._instrument, (start_s, stop_s), lag_s, limit_band=limit_band)
+
+    def _rest_floor(self) -> Array | None:
+        """The sensor's usual noise at rest, over all static poses."""
+        found = []
+        for interval in self.poses:
+            if interval.pose.direction.shape[1] == 0:
+                samples = self._sensor.cut(interval.start_s, interval.stop_s)
+                V = np.empty((0, 3)) if samples is None else samples.values
+                sd = rest_sd(V[np.isfinite(V).all(axis=1)], self.rate_hz)
+                if sd is not None:
+                    found.append(sd)
+        return np.asarray(np.median(found, axis=0)) if found else None
+
+
+def _check_overlap(sensor: SensorTable, reference: ReferenceTable | None, poses: Sequence[PoseInterval]) -> None:
+    spans = [(f"{t.path}", float(t.time_s[0]), float(t.time_s[-1])) for t in (sensor, reference) if t is not None]
+    if poses:
+        spans.append(("the poses", min(p.start_s for p in poses), max(p.stop_s for p in poses)))
+    if max(s for _, s, _ in spans) >= min(e for _, _, e in spans):
+        told = ", ".join(f"{name} from {start:.10g} s to {stop:.10g} s" for name, start, stop in spans)
+        raise TableError(f"no overlap in time: {told}")
+
+
+def _nothing(interval: PoseInterval, reason: str) -> Window:
+    return nothing_in(interval.pose, interval.start_s, interval.stop_s, reason)

@@ -1,0 +1,48 @@
+"""A file's samples as a stream: cut out by time, missing ones counted."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+from calib.model import Array
+from calib.signal.samples import Samples
+from calib.signal.stamps import clock_from_stamps, counted
+from calib.signal.timing import ClockFit
+
+
+class FileStream:
+    """Consecutive samples of a file, timed by the clock behind their stamps.
+
+    `name` is the file's, for messages. `time_s` (n,) stamps, `values` (n, C); both may lie on disk.
+    """
+
+    def __init__(self, name: str, time_s: Array, values: Array) -> None:
+        self._name, self._values = name, values
+        self.clock: ClockFit
+        self.clock, self._rows, self._numbers = counted(clock_from_stamps(time_s))
+
+    @property
+    def axes(self) -> int:
+        """Columns of values."""
+        return int(self._values.shape[1])
+
+    def stretch(self, rate: float, at_s: float) -> None:
+        """From now on the samples' times are on a scale that runs faster by `rate`, see ClockFit.stretched."""
+        self.clock = self.clock.stretched(rate, at_s)
+
+    def cut(self, start_s: float, stop_s: float) -> Samples | None:
+        """The samples taken from `start_s` to before `stop_s`, rows of NaN where one is missing; None for none."""
+        runs = [*self._numbers.tolist(), int(self._numbers[-1]) + len(self._values) - int(self._rows[-1])]
+        edges = np.ceil(self.clock.index_of(np.array([start_s, stop_s])))
+        first, stop = (int(edge) for edge in np.clip(edges, 0, runs[-1]))
+        if stop <= first:
+            return None
+        held = np.full((stop - first, self.axes), np.nan)
+        ends = [*self._rows.tolist(), len(self._values)]
+        for (row, next_row), number in zip(itertools.pairwise(ends), self._numbers.tolist(), strict=True):
+            a, b = max(first, number), min(stop, number + next_row - row)
+            if a < b:
+                held[a - first : b - first] = self._values[row + a - number : row + b - number]
+        return Samples(self._name, first, held, self.clock)
