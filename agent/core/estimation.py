@@ -163,7 +163,7 @@ class Estimation:
     def _jumped(self, held: Sequence[Summary], tilt_rad: float) -> Recursion | None:
         trial = self.recursion.copy()
         # A line that was plugged anew may be late by another time; that is no change of S or Q.
-        trial.loosen(self._jump(held), tilt_rad, lag=True)
+        trial.loosen(self._jump(held), tilt_rad, line=True)
         for k, summary in enumerate(held):
             told = trial.innovation(summary)
             limit = chi2_quantile(1.0 - self._channel.gate.false_holds, told.degrees_of_freedom)

@@ -18,7 +18,7 @@ the uncertainties of S, G and tilt. Were Q in the state, a mean that drifts woul
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -30,18 +30,15 @@ from calib.estimate.fixed_mount import Held, held_at
 from calib.estimate.gauss_newton import Flags
 from calib.estimate.innovation import Innovation, innovation
 from calib.estimate.joint_state import JointState, gain_of
-from calib.estimate.nuisances import Priors
-from calib.estimate.wander import MAIN_TEMPERATURE, RATES, TemperatureModel, Wander, offset_temperature
+from calib.estimate.nuisances import Priors, Term
+from calib.estimate.quantities import MAIN_TEMPERATURE, OFFSET_RATE, RATES, S_AND_Q, Quantity, offset_temperature
+from calib.estimate.wander import TemperatureModel, Wander
 from calib.estimate.window_rows import Noise, Summary, WindowRows
-from calib.model import PARAMETERS, Array, Calibration
+from calib.model import Array, Calibration
 
 DETERMINED_SHARE = 0.5  # of the prior's u, which the data must halve (contract)
 MOST_RECENT = 48  # windows: four times round twelve positions
 ITERATIONS = 6
-# Relative change of S, or rad of an angle, up to which the point need not move: its product with an angle's 0.3 deg is
-# 5e-6 of S.
-STRAIGHT = 1e-3
-STRAIGHT_LAG_S = 5e-5  # (omega lag)^2 / 2 of it at 10 Hz is as much
 MOST_POSITIONS = 48  # whose own nuisances are kept; of the oldest ones nothing but their effect on S and Q remains
 METHOD = "3 (recursive adjustment)"
 
@@ -65,11 +62,11 @@ class Recursion:
     ) -> None:
         self._priors, self._wander, self._temperature, self._fixed = priors, wander, temperature, fixed
         self.scale = float(np.sqrt(np.mean(mean[[0, 4, 8]] ** 2)))
-        self._state = JointState(PARAMETERS, mean, standard_uncertainty)
+        self._state = JointState(S_AND_Q, mean, standard_uncertainty)
         for name in RATES:
-            self._state.append(name, 0.0, wander.offset_rate_mps2 * self.scale)
-        for name, u in temperature.terms(self.scale):
-            self._state.append(name, 0.0, u)
+            self._state.append(Quantity(name, OFFSET_RATE), 0.0, wander.of(OFFSET_RATE.prior) * self.scale)
+        for quantity, u in temperature.terms(self.scale):
+            self._state.append(quantity, 0.0, u)
         self._prior_u = np.array(standard_uncertainty, dtype=np.float64)
         self._bound = self._state.variance.copy()  # what wandering may not exceed
         self._base = self._state.copy()  # before the recent windows
@@ -199,26 +196,26 @@ class Recursion:
         self._keep_positions(summary.pose.position)
         self.windows += 1
 
-    def loosen(self, standard_uncertainty: Array, tilt_rad: float = 0.0, *, lag: bool = False) -> None:
+    def loosen(self, standard_uncertainty: Array, tilt_rad: float = 0.0, *, line: bool = False) -> None:
         """Something changed: S and Q (12,) may be off by as much more from now on, and a fixed mount be tilted.
 
-        `lag`: the lag may be another as well, as after a device or its line began anew.
+        `line`: a device or its line may have begun anew, which makes the lag another.
         """
         self._absorb(len(self._recent))
-        variance = np.zeros(len(self._state))
-        variance[:12] = standard_uncertainty**2
-        for k, name in enumerate(self._state.names):
-            if name.startswith("gravity_") and self._fixed:
-                variance[k] = tilt_rad**2
-            elif name == "lag" and lag:
-                variance[k] = self._priors.lag_s**2
-        self._state.spread(variance)
+        u = np.zeros(len(self._state))
+        u[:12] = standard_uncertainty
+        for k, quantity in enumerate(self._state.quantities):
+            if quantity.kind.loosened_by == "lean" and self._fixed:
+                u[k] = tilt_rad
+            elif quantity.kind.loosened_by == "line" and line:
+                u[k] = self._priors.of(quantity.kind.prior)
+        self._state.spread(u**2)
         self._base = self._state.copy()
 
     def forget_reference(self) -> None:
         """Another reference: what is known of the old one's own sensitivity and lag holds no more."""
         self.put(self.result())
-        self._drop([n for n in self._state.names if n.startswith(("reference", "lag", "rotation_"))])
+        self._keep([not quantity.kind.of_reference for quantity in self._state.quantities])
 
     def put(self, calibration: Calibration) -> None:
         """S and Q as an operator wants them, with their covariance; what the nuisances are in them, they stay."""
@@ -256,7 +253,7 @@ class Recursion:
                 drift[9 + i, state.index(name)] = elapsed
             state.transform(drift)
             tilted = 0.0 if self._held is None else float(np.linalg.norm(self._held.mps2))
-            wanted = self._wander.variance_a_day(state.names, self.scale, tilted) * elapsed
+            wanted = self._wander.variance_a_day(state.quantities, self.scale, tilted) * elapsed
             room = np.maximum(self._bound - state.variance, 0.0)
             state.spread(np.minimum(wanted, room))
         return state
@@ -273,7 +270,7 @@ class Recursion:
         self._point[9:12] = self._state.mean[9:12]
         self._bound[9:12] = u**2
         for term in terms:
-            self._append(term.name, term.expected, term.uncertainty)
+            self._append(term)
         self._held = held
 
     def _mean_output_u(self, held: Held, u_terms: Mapping[str, float]) -> Array:
@@ -283,20 +280,20 @@ class Recursion:
         tilted = sum((S @ moves * u_terms[name]) ** 2 for name, moves in held.by.items())
         return np.sqrt(felt + tilted)
 
-    def _append(self, name: str, mean: float, u: float) -> None:
-        if name not in self._state.names:
-            self._state.append(name, mean, u)
-            self._base.append(name, mean, u)
-            self._point = np.append(self._point, mean)
+    def _append(self, term: Term) -> None:
+        if term.name not in self._state.names:
+            for state in (self._state, self._base):
+                state.append(term.quantity, term.expected, term.uncertainty)
+            self._point = np.append(self._point, term.expected)
             # A mount may come to lean by more than anybody stated of the day it was made.
-            self._bound = np.append(self._bound, (2.0 * u) ** 2)
+            self._bound = np.append(self._bound, (2.0 * term.uncertainty) ** 2)
 
     def _know(self, summary: Summary) -> WindowRows:
         """Nuisances that no window had before come in with their priors; the window's rows."""
         self._mount(summary)
         rows = self._rows(summary)
-        for name, mean, u in rows.unknowns:
-            self._append(name, mean, u)
+        for term in rows.terms:
+            self._append(term)
         return rows
 
     def _taken(self, before: JointState, since: float | None, rows: WindowRows) -> JointState:
@@ -324,17 +321,9 @@ class Recursion:
 
     def _moved(self) -> bool:
         """Whether the products of S and the nuisances, which are all that bends, have left the point."""
-        moved = np.abs(self._state.mean - self._point)
-        limit = np.full(len(moved), STRAIGHT)
-        limit[:9] *= self.scale
-        for k, name in enumerate(self._state.names):
-            if name in PARAMETERS[9:] or name.startswith(("Q", "offset")):
-                limit[k] = np.inf  # these are linear
-            elif name.startswith("lag"):
-                limit[k] = STRAIGHT_LAG_S
-            elif name == "gravity":
-                limit[k] = 10.0 * STRAIGHT
-        return bool(np.any(moved > limit))
+        kinds = [quantity.kind for quantity in self._state.quantities]
+        limit = [kind.straight * (self.scale if kind.in_output_unit else 1.0) for kind in kinds]
+        return bool(np.any(np.abs(self._state.mean - self._point) > limit))
 
     def _absorb(self, count: int) -> None:
         """The oldest recent windows become part of the base, linearised as they are now."""
@@ -348,14 +337,14 @@ class Recursion:
             self._positions.remove(position)
         self._positions.append(position)
         while len(self._positions) > MOST_POSITIONS:
-            end = f"[{self._positions.pop(0)}]"
+            oldest = self._positions.pop(0)
             self._absorb(len(self._recent))
-            self._drop([name for name in self._state.names if name.endswith(end)])
+            self._keep([quantity.position != oldest for quantity in self._state.quantities])
 
-    def _drop(self, names: list[str]) -> None:
-        kept = [name not in names for name in self._state.names]
-        self._bound, self._point = self._bound[kept], self._point[kept]
-        self._state.drop(names)
+    def _keep(self, kept: Sequence[bool]) -> None:
+        """Forget the other quantities."""
+        self._bound, self._point = self._bound[np.array(kept)], self._point[np.array(kept)]
+        self._state.keep(kept)
         self._base = self._state.copy()
 
     # --- state
