@@ -75,7 +75,7 @@ class Estimation:
     @property
     def lag_s(self) -> float:
         """By which the sensor's indications come after the reference's, as far as known."""
-        return self.recursion.lag_s if "lag" in self.recursion.names else -self._channel.certificate.lag_s
+        return self.recursion.lag_s
 
     def lag_after(self, windows: Sequence[Window], day: float, lag_s: float, temperature_degc: float) -> float:
         """The lag once these windows were taken, or `lag_s` where they leave too little of it to matter."""

@@ -25,6 +25,10 @@ def _deg(value: float) -> float:
     return float(np.deg2rad(value))
 
 
+def _minus(value: float) -> float:
+    return -value
+
+
 def _percent(value: float) -> float:
     return value / 100.0
 
@@ -164,8 +168,9 @@ SENSOR_CORNER = Kind(
 LAG = Kind(
     "lag", "s", "lag",
     # A sensor's own low-pass filter and what a clock fit leaves: 0.5 to 15 ms are seen. The sensor's own lag and the
-    # reference's are one unknown: what their stamps differ by.
+    # reference's are one unknown: by how much the sensor's indications come after the reference's.
     prior=Statement("lag_s", 0.02, ("uncertainty.lag_s", "certificate.u_lag_s")),
+    mean=Statement("lag_at_s", 0.0, ("certificate.lag_s",), convert=_minus),
     loosened_by="line", of_reference=True, straight=STRAIGHT_LAG_S, stated=False,
 )  # fmt: skip
 LAG_OF_AXIS = Kind(

@@ -31,7 +31,7 @@ from calib.estimate.gauss_newton import Flags
 from calib.estimate.innovation import Innovation, innovation
 from calib.estimate.joint_state import JointState, gain_of
 from calib.estimate.nuisances import Priors, Term
-from calib.estimate.quantities import MAIN_TEMPERATURE, OFFSET_RATE, RATES, S_AND_Q, Quantity, offset_temperature
+from calib.estimate.quantities import LAG, MAIN_TEMPERATURE, OFFSET_RATE, RATES, S_AND_Q, Quantity, offset_temperature
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.estimate.window_rows import Noise, Summary, WindowRows
 from calib.model import Array, Calibration
@@ -101,8 +101,9 @@ class Recursion:
 
     @property
     def lag_s(self) -> float:
-        """By which the sensor's indications come late; 0 before any window told."""
-        return float(self._state.mean[self._state.index("lag")]) if "lag" in self._state.names else 0.0
+        """By how much the sensor's indications come after the reference's; as stated before any window told."""
+        told = (m for q, m in zip(self._state.quantities, self._state.mean, strict=True) if q.kind is LAG)
+        return float(next(told, self._priors.of(LAG.mean)))
 
     @property
     def determined(self) -> Flags:
