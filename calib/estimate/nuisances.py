@@ -220,6 +220,7 @@ def rotations(vectors: Array) -> Array:
 def _terms(poses: Sequence[Pose], channels: int, priors: Priors, applied: Applied) -> Iterator[Term]:
     yield from _clamp_terms(poses, priors)
     yield from _pose_terms(poses, priors)
+    yield from _lean_terms(poses, priors)
     yield from _slide_terms(poses, priors)
     for name, k in zip(_axes("offset"), np.eye(3), strict=True):
         for p, pose in enumerate(poses):
@@ -278,6 +279,15 @@ def _pose_terms(poses: Sequence[Pose], priors: Priors) -> Iterator[Term]:
         for p in beside:
             if np.any(poses[p].gravity_mps2):
                 quantity = _at(f"gravity_{axis}", kinds.GRAVITY_DIRECTION, poses[p])
+                yield Term(quantity, priors.of(quantity.kind.prior), turn_gravity=_only(poses, p, k))
+
+
+def _lean_terms(poses: Sequence[Pose], priors: Priors) -> Iterator[Term]:
+    """Gravity in other directions than stated, the direction of motion as stated: a mount with all on it leans."""
+    for p, pose in enumerate(poses):
+        if own_channels(pose.direction.shape[1]) < 3 and np.any(pose.gravity_mps2):
+            for axis, k in zip(AXES, np.eye(3), strict=True):
+                quantity = _at(f"lean_{axis}", kinds.LEAN, pose)
                 yield Term(quantity, priors.of(quantity.kind.prior), turn_gravity=_only(poses, p, k))
 
 

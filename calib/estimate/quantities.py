@@ -195,16 +195,26 @@ THETA_BY_POSITION = Kind(
 ALPHA_COMMON = Statement(
     "alpha_common_rad", _deg(0.1), ("uncertainty.alpha_common_deg",), option="u_alpha_common_deg", convert=_deg
 )
-ANGLE = Statement(
-    "angle_rad", _deg(0.2), ("uncertainty.angle_deg",), ("uncertainty.tilt_deg",), option="u_angle_deg", convert=_deg
-)
+ANGLE = Statement("angle_rad", _deg(0.2), ("uncertainty.angle_deg",), option="u_angle_deg", convert=_deg)
 ALPHA = Kind("alpha", "rad", "alpha common", prior=ALPHA_COMMON)
 ALPHA_BY_POSITION = Kind("alpha by position", "rad", "alpha by position", prior=ANGLE)
 DIRECTION = Kind("direction", "rad", "direction common", prior=ALPHA_COMMON)
 DIRECTION_BY_POSITION = Kind("direction by position", "rad", "direction by position", prior=ANGLE)
 GRAVITY_DIRECTION = Kind(
-    "gravity direction by position", "rad", "direction by position", prior=ANGLE, walk=TILT_WALK, loosened_by="lean"
-)
+    # Beside a tri-axial reference, whose mounting turns by itself.
+    "gravity direction by position", "rad", "direction by position",
+    prior=Statement(
+        "gravity_direction_rad", _deg(0.2), ("uncertainty.angle_deg",), ("uncertainty.tilt_deg",),
+        option="u_angle_deg", convert=_deg,
+    ),
+    walk=TILT_WALK, loosened_by="lean",
+)  # fmt: skip
+LEAN = Kind(
+    # Of a mount that does not turn, with the sensor and its reference on it: gravity turns, the direction does not.
+    "lean", "rad", "tilt",
+    prior=Statement("lean_rad", at_fixed_mount=("uncertainty.tilt_deg",), convert=_deg),
+    walk=TILT_WALK, loosened_by="lean",
+)  # fmt: skip
 TILT = Kind(
     "tilt", "rad", "tilt",
     prior=Statement("tilt_rad", option="u_tilt_deg", convert=_deg),

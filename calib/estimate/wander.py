@@ -8,10 +8,12 @@ from typing import ClassVar
 
 import numpy as np
 
+from calib.estimate.joint_state import JointState
 from calib.estimate.quantities import (
     MAIN_TEMPERATURE,
     OFFSET,
     OFFSET_TEMPERATURE,
+    RATES,
     SENSITIVITY_TEMPERATURE,
     TILT_WALK,
     WALKS,
@@ -46,6 +48,21 @@ class Wander(Stated):
             else:
                 found[k] = (self.of(kind.walk) * (scale if kind.in_output_unit else 1.0)) ** 2
         return found
+
+
+def wandered(state: JointState, days: float, variance_a_day: Array, bound: Array) -> JointState:
+    """A copy of the state so many days later: Q has drifted by its rate, and all that wanders is less known.
+
+    `variance_a_day` (N,); no variance grows beyond `bound` (N,).
+    """
+    state = state.copy()
+    if days > 0.0:
+        drift = np.eye(len(state))
+        for i, name in enumerate(RATES):
+            drift[9 + i, state.index(name)] = days
+        state.transform(drift)
+        state.spread(np.minimum(variance_a_day * days, np.maximum(bound - state.variance, 0.0)))
+    return state
 
 
 @dataclass(frozen=True, slots=True)
