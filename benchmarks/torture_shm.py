@@ -73,10 +73,11 @@ def windows(recording: Recording, settings: Settings) -> list[Window]:
     sensor = FileStream("sensor", recording.sensor_stamp_s, recording.v)
     reference = FileStream("reference", recording.reference_stamp_s, recording.reference)
     pose, found = beside(np.eye(3), np.zeros(3)), list[Window]()
-    for span_s in pieces_of(0.0, SECONDS, settings.limits.longest_s, 1.0):
-        parts = sensor.cut(*span_s), reference.cut(span_s[0] - 1.0, span_s[1] + 1.0)
-        assert parts[0] is not None
-        found += windows_of(pose, *parts, Instrument(), span_s, settings=settings)
+    for interval in recording.poses:
+        for span_s in pieces_of(interval.start_s, interval.stop_s, settings.limits.longest_s, 0.0):
+            parts = sensor.cut(*span_s), reference.cut(span_s[0] - 1.0, span_s[1] + 1.0)
+            assert parts[0] is not None
+            found += windows_of(pose, *parts, Instrument(), span_s, settings=settings)
     return found
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from agent.calibrate.tables import TableError
 from calib.estimate.nuisances import Priors
+from calib.estimate.quantities import PRIORS
 from calib.model import PARAMETERS, Array, Calibration
 from calib.signal.instrument import Instrument
 
@@ -25,25 +26,9 @@ NOMINAL_TRANSVERSE = 0.03  # of the nominal sensitivity: data sheets of MEMS say
 def priors_of(options: dict[str, Any]) -> Priors:
     """The options --u-..., --nominal and --prior as priors. Raises TableError where --prior cannot be read."""
     parameters, covariance = _known(options)
-    return Priors(
-        angle_rad=float(np.deg2rad(options["u_angle_deg"])),
-        theta_rad=float(np.deg2rad(options["u_theta_deg"])),
-        theta_position_rad=float(np.deg2rad(options["u_theta_position_deg"])),
-        alpha_common_rad=float(np.deg2rad(options["u_alpha_common_deg"])),
-        offset_mps2=options["u_offset_mps2"],
-        offset_position_mps2=options["u_offset_position_mps2"],
-        reference=options["u_reference_pct"] / 100.0,
-        transverse=options["u_transverse_motion_pct"] / 100.0,
-        tilt_rad=float(np.deg2rad(options["u_tilt_deg"])),
-        rotation_rad=float(np.deg2rad(options["u_rotation_deg"])),
-        gravity_mps2=u_gravity_mps2(options),
-        reference_corner_hz=options["u_reference_corner_hz"],
-        reference_corner_at_hz=options["reference_corner_hz"],
-        sensor_corner_hz=options["u_sensor_corner_hz"],
-        sensor_corner_at_hz=options["sensor_corner_hz"],
-        parameters=parameters,
-        covariance=covariance,
-    )
+    told = options | {"u_gravity_mps2": u_gravity_mps2(options)}
+    stated = {s.name: s.convert(told[s.option]) for s in PRIORS.values() if s.option}
+    return Priors(stated, parameters, covariance)
 
 
 def instrument_of(options: dict[str, Any]) -> Instrument:

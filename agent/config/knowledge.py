@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from functools import reduce
 from typing import Annotated, Literal
 
 import numpy as np
@@ -10,6 +12,7 @@ from pydantic import Field, model_validator
 from agent.config.gate import DriftOptions, GateSettings
 from agent.config.section import Section, Vector
 from calib.estimate.nuisances import Priors
+from calib.estimate.quantities import PRIORS, WALKS, Statement
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import Array
 from calib.signal.instrument import Instrument
@@ -138,35 +141,25 @@ class Knowledge(Section):
 
     def priors(self, *, fixed_mount: bool) -> Priors:
         """The nuisances' priors."""
-        u = self.uncertainty
-        return Priors(
-            angle_rad=float(np.deg2rad(u.tilt_deg if fixed_mount else u.angle_deg)),
-            theta_rad=float(np.deg2rad(u.theta_deg)),
-            theta_position_rad=float(np.deg2rad(u.theta_position_deg)),
-            alpha_common_rad=float(np.deg2rad(u.alpha_common_deg)),
-            offset_mps2=u.offset_mps2,
-            offset_position_mps2=u.offset_position_mps2,
-            reference=self.certificate.u_sensitivity_pct / 100.0,
-            transverse=u.transverse_motion_pct / 100.0,
-            tilt_rad=0.0,
-            rotation_rad=float(np.deg2rad(u.rotation_deg)),
-            gravity_mps2=u.gravity_mps2,
-            # The sensor's own lag and the reference's are one unknown: what their stamps differ by.
-            lag_s=float(np.hypot(u.lag_s, self.certificate.u_lag_s)),
-            lag_window_s=u.lag_window_s,
-        )
+        return Priors(self._stated(PRIORS.values(), fixed_mount=fixed_mount))
 
     def wander(self) -> Wander:
         """How fast things may change."""
-        p = self.process
-        return Wander(
-            sensitivity=p.sensitivity_pct / 100.0,
-            offset_mps2=p.offset_mps2,
-            offset_rate_mps2=p.offset_rate_mps2,
-            offset_rate_walk_mps2=p.offset_rate_walk_mps2,
-            tilt_rad=float(np.deg2rad(p.tilt_deg)),
-            reference=p.reference_pct / 100.0,
-        )
+        return Wander(self._stated(WALKS.values(), fixed_mount=False))
+
+    def _stated(self, statements: Iterable[Statement], *, fixed_mount: bool) -> dict[str, float]:
+        """What the configuration states of them, by name; the places are in the table of unknowns."""
+        found: dict[str, float] = {}
+        for statement in statements:
+            places = statement.at_fixed_mount if fixed_mount else ()
+            values = [statement.convert(self._at(place)) for place in places or statement.configuration]
+            if values:
+                found[statement.name] = float(reduce(np.hypot, values))
+        return found
+
+    def _at(self, place: str) -> float:
+        section, field = place.split(".")
+        return float(getattr(getattr(self, section), field))
 
     def temperature_model(self) -> TemperatureModel:
         """Dependence on temperature."""

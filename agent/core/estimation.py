@@ -73,7 +73,7 @@ class Estimation:
     @property
     def lag_s(self) -> float:
         """By which the sensor's indications come after the reference's, as far as known."""
-        return self.recursion.lag_s if "lag" in self.recursion.names else -self._channel.certificate.lag_s
+        return self.recursion.lag_s
 
     def lag_after(self, windows: Sequence[Window], day: float, lag_s: float, temperature_degc: float) -> float:
         """The lag once these windows, made with `lag_s` taken out, were taken."""
@@ -160,7 +160,7 @@ class Estimation:
     def _jumped(self, held: Sequence[Summary], tilt_rad: float) -> Recursion | None:
         trial = self.recursion.copy()
         # A line that was plugged anew may be late by another time; that is no change of S or Q.
-        trial.loosen(self._jump(held), tilt_rad, lag=True)
+        trial.loosen(self._jump(held), tilt_rad, line=True)
         for k, summary in enumerate(held):
             told = trial.innovation(summary)
             limit = chi2_quantile(1.0 - self._channel.gate.false_holds, told.degrees_of_freedom)

@@ -8,8 +8,8 @@ import numpy as np
 
 from agent.core.events import CalibrationUpdate, DriftReport, Estimate, StatusChange, WindowReport
 from calib.estimate.drift import DriftVerdict
+from calib.estimate.quantities import MAIN_TEMPERATURE, RATES, offset_temperature
 from calib.estimate.recursion import Recursion
-from calib.estimate.wander import MAIN_TEMPERATURE, RATES, offset_temperature
 from calib.model import Array, Calibration, Window
 
 UNCERTAINTY = "combined"

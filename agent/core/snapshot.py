@@ -7,7 +7,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
-VERSION = 1
+from agent.core.migrations import MIGRATIONS
+
+VERSION = 2
 _ARRAY = 1  # msgpack extension code for a numpy array
 
 
@@ -17,14 +19,22 @@ def pack(state: dict[str, Any]) -> bytes:
 
 
 def unpack(data: bytes) -> dict[str, Any]:
-    """The state that `pack` took. Raises ValueError when the bytes are none, or of another version."""
+    """The state that `pack` took, of an older version brought up to date.
+
+    Raises ValueError when the bytes are no snapshot, or of a version that this program does not know.
+    """
     try:
         held = msgspec.msgpack.decode(data, ext_hook=_decode_array)
         version, state = held["version"], held["state"]
     except (msgspec.DecodeError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"not a snapshot: {error}") from None
-    if version != VERSION or not isinstance(state, dict):
-        raise ValueError(f"a snapshot of version {version}; this program reads {VERSION}")
+    if not isinstance(state, dict) or (version != VERSION and version not in MIGRATIONS):
+        raise ValueError(f"a snapshot of version {version}; this program reads {min(MIGRATIONS)} to {VERSION}")
+    try:
+        for older in range(version, VERSION):
+            MIGRATIONS[older](state)
+    except (KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"a snapshot of version {version} that cannot be brought up to date: {error!r}") from None
     return state
 
 

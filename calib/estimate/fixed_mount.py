@@ -32,6 +32,20 @@ class Held:
             factor[9:] -= np.outer(S @ moves, state.factor[state.index(name)])
         return mean, factor
 
+    def mean_output_u(self, state: JointState, u_terms: Mapping[str, float]) -> Array:
+        """(3,) standard uncertainty of the mean output before any data: of Q, S and what moves the input acceleration.
+
+        `state` has Q itself; `u_terms` are standard uncertainties by name.
+        """
+        variance, S = state.variance, state.mean[:9].reshape(3, 3)
+        felt = variance[9:12] + variance[:9].reshape(3, 3) @ self.mps2**2
+        tilted = sum((S @ moves * u_terms[name]) ** 2 for name, moves in self.by.items())
+        return np.sqrt(felt + tilted)
+
+    def moved_by(self, other: Held, names: Sequence[str]) -> Held:
+        """The same acceleration, which nuisances of these names move as `other` says."""
+        return Held(self.mps2, {**self.by, **{name: other.by[name] for name in names if name in other.by}})
+
 
 def held_at(summary: Summary, priors: Priors) -> tuple[Held, Sequence[Term]]:
     """What a window's pose and its reference's mean tell of it; with all nuisances of that pose."""

@@ -6,21 +6,23 @@ of the Kalman filter; Bierman 1977, ch. V).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from calib.estimate.quantities import KINDS, Quantity
 from calib.model import Array
 
 ALIKE = 1e-10  # of unit vectors: directions of the factor closer than this are one
 
 
 class JointState:
-    """Named quantities with their joint covariance. Methods change it in place."""
+    """Quantities with their joint covariance, each under its name. Methods change it in place."""
 
-    def __init__(self, names: Sequence[str], mean: Array, standard_uncertainty: Array) -> None:
-        self.names = list(names)
+    def __init__(self, quantities: Sequence[Quantity], mean: Array, standard_uncertainty: Array) -> None:
+        self.quantities = list(quantities)
+        self.names = [quantity.name for quantity in quantities]
         self.mean = np.array(mean, dtype=np.float64)
         self.factor = np.diag(np.asarray(standard_uncertainty, dtype=np.float64))
 
@@ -41,19 +43,20 @@ class JointState:
         """Where a quantity stands. Raises ValueError where there is none of this name."""
         return self.names.index(name)
 
-    def append(self, name: str, mean: float, standard_uncertainty: float) -> None:
+    def append(self, quantity: Quantity, mean: float, standard_uncertainty: float) -> None:
         """A quantity more, independent of all others."""
         n = len(self.names)
         grown = np.zeros((n + 1, n + 1))
         grown[:n, :n], grown[n, n] = self.factor, standard_uncertainty
-        self.names.append(name)
+        self.quantities.append(quantity)
+        self.names.append(quantity.name)
         self.mean, self.factor = np.append(self.mean, mean), grown
 
-    def drop(self, names: Iterable[str]) -> None:
-        """Forget quantities; what they did to the others' covariance stays (they are marginalised)."""
-        gone = set(names)
-        keep = [k for k, name in enumerate(self.names) if name not in gone]
-        self.names = [self.names[k] for k in keep]
+    def keep(self, kept: Sequence[bool]) -> None:
+        """Forget the others; what they did to the covariance of those kept stays (they are marginalised)."""
+        keep = np.flatnonzero(kept)
+        self.quantities = [self.quantities[k] for k in keep]
+        self.names = [quantity.name for quantity in self.quantities]
         self.mean, self.factor = self.mean[keep], _square(self.factor[keep])
 
     def transform(self, matrix: Array) -> None:
@@ -103,12 +106,14 @@ class JointState:
 
     def snapshot(self) -> dict[str, Any]:
         """All of it, exactly."""
-        return {"names": list(self.names), "mean": self.mean.copy(), "factor": self.factor.copy()}
+        quantities = [[q.name, q.kind.name, q.position] for q in self.quantities]
+        return {"quantities": quantities, "mean": self.mean.copy(), "factor": self.factor.copy()}
 
     @classmethod
     def load(cls, state: Mapping[str, Any]) -> JointState:
-        """The state whose snapshot this is."""
-        loaded = cls(state["names"], np.array(state["mean"]), np.zeros(len(state["names"])))
+        """The state whose snapshot this is. Raises KeyError for a kind that the table of unknowns does not have."""
+        quantities = [Quantity(name, KINDS[kind], position) for name, kind, position in state["quantities"]]
+        loaded = cls(quantities, np.array(state["mean"]), np.zeros(len(quantities)))
         loaded.factor = np.array(state["factor"])
         return loaded
 

@@ -13,57 +13,45 @@ table that rocks does both), and r the reference's relative error.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 
+from calib.estimate import quantities as kinds
+from calib.estimate.quantities import PRIORS, Kind, Quantity, Stated, Statement
 from calib.model import Array, Pose, own_channels
 
 PARALLEL = 1e-3  # rad; motion and gravity closer to one line than this leave the horizontal normal open
 AXES = "xyz"
 
 
-@dataclass(frozen=True, slots=True)
-class Priors:
-    """Standard uncertainties (GUM type B) of the nuisances before the data; 0 fixes one at its stated value.
+@dataclass(frozen=True, init=False)
+class Priors(Stated):
+    """What is known before the data: a standard uncertainty (GUM type B) of each nuisance, and some means.
 
-    `angle` by position (alpha, or a stated direction), `theta` and `alpha_common` of the clamp in all positions,
-    `theta_position` by position, `offset` between windows, `offset_position` between positions, `reference` relative
-    per channel, `transverse` motion relative to the one measured, `tilt` of gravity against the motion, `rotation` of
-    a tri-axial reference about each axis, `lag` common, `lag_axis` between axes and
-    `lag_window` between windows, corner frequencies of an
-    AC-coupled reference or sensor (first order; seen where the windows carry the integral too,
-    see calib.signal.corner).
-    `parameters` (12,) and `covariance` (12, 12): what was known of S, Q in the order of calib.model.PARAMETERS, inf on
-    the diagonal where nothing was.
+    The numbers are attributes, their names and defaults are in calib.estimate.quantities; an uncertainty of 0 fixes the
+    nuisance at its mean. With `Priors.none()` all are fixed, and the adjustment is plain Method 3.
+    `parameters` (12,) and `covariance` (12, 12): what was known of S, Q in the order of
+    calib.model.PARAMETERS, inf on the diagonal where nothing was.
     """
 
-    angle_rad: float = float(np.deg2rad(0.2))
-    theta_rad: float = float(np.deg2rad(0.2))
-    theta_position_rad: float = 0.0
-    alpha_common_rad: float = float(np.deg2rad(0.1))
-    offset_mps2: float = 0.05
-    offset_position_mps2: float = 0.0
-    reference: float = 1e-3
-    transverse: float = 1e-2
-    tilt_rad: float = 0.0
-    rotation_rad: float = float(np.deg2rad(0.2))
-    gravity_mps2: float = 0.03
-    lag_s: float = 0.02  # a sensor's own low-pass filter and what a clock fit leaves: 0.5 to 15 ms are seen
-    lag_axis_s: float = 2e-4  # axes share filter and clock; multiplexed converters differ by 0.1 ms
-    lag_window_s: float = 0.0  # between windows: what clock models leave, if it is more than the data show
-    reference_corner_hz: float = 0.0
-    sensor_corner_hz: float = 0.0
-    reference_corner_at_hz: float = 0.0  # where the corner is expected, 0 for an instrument that feels constants
-    sensor_corner_at_hz: float = 0.0
+    table: ClassVar[Mapping[str, Statement]] = PRIORS
     parameters: Array | None = field(default=None, compare=False)
     covariance: Array | None = field(default=None, compare=False)
 
-    @classmethod
-    def none(cls) -> Priors:
-        """Every nuisance fixed: the adjustment is then plain Method 3."""
-        return cls(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    def __init__(
+        self,
+        values: Mapping[str, float] | None = None,
+        parameters: Array | None = None,
+        covariance: Array | None = None,
+        **stated: float,
+    ) -> None:
+        """`stated` counts before `values`, and these before the defaults. Raises TypeError for an unknown name."""
+        super().__init__(values, **stated)
+        object.__setattr__(self, "parameters", parameters)
+        object.__setattr__(self, "covariance", covariance)
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,16 +65,14 @@ class Applied:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Term:
-    """One nuisance: its name, the source it belongs to in a budget, and per unit of it what it moves.
+    """One nuisance: which quantity it is, its standard uncertainty beforehand, and per unit of it what it moves.
 
     Turns (P, 3) in rad, `transverse` and `quadrature` (P, 3), `reference` (M,), `gravity` in m/s2, `offset` (P, 3) in
     m/s2, `lag` (3,) in s, corners in rad/s. None moves nothing. `expected` is the prior's mean, `applied` what the
     front end took out: the unknown is what is left.
     """
 
-    name: str
-    source: str
-    unit: str
+    quantity: Quantity
     uncertainty: float
     turn_direction: Array | None = None
     turn_gravity: Array | None = None
@@ -100,6 +86,26 @@ class Term:
     sensor_corner: Array | None = None
     expected: float = 0.0
     applied: float = 0.0
+
+    @property
+    def name(self) -> str:
+        """For people."""
+        return self.quantity.name
+
+    @property
+    def kind(self) -> Kind:
+        """Its nature."""
+        return self.quantity.kind
+
+    @property
+    def source(self) -> str:
+        """The line of a budget that it belongs to."""
+        return self.kind.source
+
+    @property
+    def unit(self) -> str:
+        """Of its value."""
+        return self.kind.unit
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -214,28 +220,27 @@ def rotations(vectors: Array) -> Array:
 def _terms(poses: Sequence[Pose], channels: int, priors: Priors, applied: Applied) -> Iterator[Term]:
     yield from _clamp_terms(poses, priors)
     yield from _pose_terms(poses, priors)
+    yield from _lean_terms(poses, priors)
     yield from _slide_terms(poses, priors)
     for name, k in zip(_axes("offset"), np.eye(3), strict=True):
         for p, pose in enumerate(poses):
-            u = priors.offset_position_mps2
-            yield Term(f"{name}[{pose.position}]", "offset by position", "m/s2", u, offset=_only(poses, p, k))
+            quantity = _at(name, kinds.OFFSET_BY_POSITION, pose)
+            yield Term(quantity, priors.of(quantity.kind.prior), offset=_only(poses, p, k))
     if any(np.any(pose.gravity_mps2) for pose in poses):
-        yield Term("gravity", "gravity", "m/s2", priors.gravity_mps2, gravity=np.ones(1))
+        yield _term("gravity", kinds.GRAVITY, priors, gravity=np.ones(1))
     if channels == 0:
         return
     real = own_channels(channels)
     for m in range(real):
         name = "reference" if real == 1 else f"reference_{AXES[m]}"
-        felt = np.eye(real)[m]
-        yield Term(name, "reference sensitivity", "1", priors.reference, reference=np.resize(felt, channels))
-    yield Term("lag", "lag", "s", priors.lag_s, lag=np.ones(3), applied=applied.lag_s)
+        yield _term(name, kinds.REFERENCE, priors, reference=np.resize(np.eye(real)[m], channels))
+    yield _term("lag", kinds.LAG, priors, applied.lag_s, lag=np.ones(3))
     for name, k in zip(_axes("lag"), np.eye(3), strict=True):
-        yield Term(name, "lag", "s", priors.lag_axis_s, lag=k)
-    turn, source = np.full(1, 2.0 * np.pi), "corner frequency"
-    u, expected, taken = priors.reference_corner_hz, priors.reference_corner_at_hz, applied.reference_corner_hz
-    yield Term("reference_corner", source, "Hz", u, reference_corner=turn, expected=expected, applied=taken)
-    u, expected, taken = priors.sensor_corner_hz, priors.sensor_corner_at_hz, applied.sensor_corner_hz
-    yield Term("sensor_corner", source, "Hz", u, sensor_corner=turn, expected=expected, applied=taken)
+        yield _term(name, kinds.LAG_OF_AXIS, priors, lag=k)
+    turn = np.full(1, 2.0 * np.pi)
+    taken = applied.reference_corner_hz
+    yield _term("reference_corner", kinds.REFERENCE_CORNER, priors, taken, reference_corner=turn)
+    yield _term("sensor_corner", kinds.SENSOR_CORNER, priors, applied.sensor_corner_hz, sensor_corner=turn)
 
 
 def _clamp_terms(poses: Sequence[Pose], priors: Priors) -> Iterator[Term]:
@@ -248,13 +253,13 @@ def _clamp_terms(poses: Sequence[Pose], priors: Priors) -> Iterator[Term]:
         motion, gravity = _clamp_frame(poses[p])
         theta[p] = np.cross(gravity, motion)
         alpha[p] = 0.0, 0.0, -1.0
-    for name, axis, common, single in (
-        ("theta", theta, priors.theta_rad, [max(priors.theta_position_rad, poses[p].u_theta_rad) for p in clamped]),
-        ("alpha", alpha, priors.alpha_common_rad, [max(priors.angle_rad, poses[p].u_alpha_rad) for p in clamped]),
+    for name, axis, common, single, found in (
+        ("theta", theta, kinds.THETA, kinds.THETA_BY_POSITION, [poses[p].u_theta_rad for p in clamped]),
+        ("alpha", alpha, kinds.ALPHA, kinds.ALPHA_BY_POSITION, [poses[p].u_alpha_rad for p in clamped]),
     ):
-        yield _turned(name, f"{name} common", common, axis)
-        for p, u in zip(clamped, single, strict=True):
-            yield _turned(f"{name}[{poses[p].position}]", f"{name} by position", u, _only(poses, p, axis[p]))
+        yield _term(name, common, priors, turn_direction=axis, turn_gravity=axis)
+        for p, u in zip(clamped, found, strict=True):
+            yield _turned(_at(name, single, poses[p]), max(priors.of(single.prior), u), _only(poses, p, axis[p]))
 
 
 def _pose_terms(poses: Sequence[Pose], priors: Priors) -> Iterator[Term]:
@@ -263,18 +268,27 @@ def _pose_terms(poses: Sequence[Pose], priors: Priors) -> Iterator[Term]:
     beside = [p for p, pose in enumerate(poses) if own_channels(pose.direction.shape[1]) == 3]
     for axis, k in zip(AXES, np.eye(3), strict=True):
         if stated:
-            yield _turned(f"direction_{axis}", "direction common", priors.alpha_common_rad, _only(poses, stated, k))
+            turn = _only(poses, stated, k)
+            yield _term(f"direction_{axis}", kinds.DIRECTION, priors, turn_direction=turn, turn_gravity=turn)
         if beside:
             turn = _only(poses, beside, k)
-            yield Term(f"rotation_{axis}", "mounting rotation", "rad", priors.rotation_rad, turn_direction=turn)
+            yield _term(f"rotation_{axis}", kinds.ROTATION, priors, turn_direction=turn)
         for p in stated:
-            name = f"direction_{axis}[{poses[p].position}]"
-            yield _turned(name, "direction by position", priors.angle_rad, _only(poses, p, k))
+            quantity = _at(f"direction_{axis}", kinds.DIRECTION_BY_POSITION, poses[p])
+            yield _turned(quantity, priors.of(quantity.kind.prior), _only(poses, p, k))
         for p in beside:
             if np.any(poses[p].gravity_mps2):
-                name = f"gravity_{axis}[{poses[p].position}]"
-                turn = _only(poses, p, k)
-                yield Term(name, "direction by position", "rad", priors.angle_rad, turn_gravity=turn)
+                quantity = _at(f"gravity_{axis}", kinds.GRAVITY_DIRECTION, poses[p])
+                yield Term(quantity, priors.of(quantity.kind.prior), turn_gravity=_only(poses, p, k))
+
+
+def _lean_terms(poses: Sequence[Pose], priors: Priors) -> Iterator[Term]:
+    """Gravity in other directions than stated, the direction of motion as stated: a mount with all on it leans."""
+    for p, pose in enumerate(poses):
+        if own_channels(pose.direction.shape[1]) < 3 and np.any(pose.gravity_mps2):
+            for axis, k in zip(AXES, np.eye(3), strict=True):
+                quantity = _at(f"lean_{axis}", kinds.LEAN, pose)
+                yield Term(quantity, priors.of(quantity.kind.prior), turn_gravity=_only(poses, p, k))
 
 
 def _slide_terms(poses: Sequence[Pose], priors: Priors) -> Iterator[Term]:
@@ -289,18 +303,20 @@ def _slide_terms(poses: Sequence[Pose], priors: Priors) -> Iterator[Term]:
             free.append(p)
     for name, way in (("lateral", lateral), ("vertical", vertical)):
         if way.any():
-            yield from _across(f"transverse_{name}", priors.transverse, way)
+            yield from _across(f"transverse_{name}", "", priors, way)
     for p in free:
+        position = poses[p].position
         for name, k in zip("ab", np.linalg.svd(poses[p].direction[:, :1])[0].T[1:], strict=True):
-            yield from _across(f"transverse_{name}[{poses[p].position}]", priors.transverse, _only(poses, p, k))
+            yield from _across(f"transverse_{name}[{position}]", position, priors, _only(poses, p, k))
     for name, axis in (("pitch", lateral), ("roll", along)):
         if axis.any():
-            yield Term(f"tilt_{name}", "tilt", "rad", priors.tilt_rad, turn_gravity=axis)
+            yield _term(f"tilt_{name}", kinds.TILT, priors, turn_gravity=axis)
 
 
-def _across(name: str, uncertainty: float, way: Array) -> Iterator[Term]:
-    yield Term(name, "transverse motion", "1", uncertainty, transverse=way)
-    yield Term(f"{name}_quadrature", "transverse motion", "1", uncertainty, quadrature=way)
+def _across(name: str, position: str, priors: Priors, way: Array) -> Iterator[Term]:
+    u = priors.of(kinds.TRANSVERSE.prior)
+    yield Term(Quantity(name, kinds.TRANSVERSE, position), u, transverse=way)
+    yield Term(Quantity(f"{name}_quadrature", kinds.TRANSVERSE, position), u, quadrature=way)
 
 
 def _slide_frame(pose: Pose) -> tuple[Array, Array, Array] | None:
@@ -329,8 +345,18 @@ def _clamp_frame(pose: Pose) -> tuple[Array, Array]:
     )
 
 
-def _turned(name: str, source: str, uncertainty: float, axis: Array) -> Term:
-    return Term(name, source, "rad", uncertainty, turn_direction=axis, turn_gravity=axis)
+def _at(name: str, kind: Kind, pose: Pose) -> Quantity:
+    return Quantity(f"{name}[{pose.position}]", kind, pose.position)
+
+
+def _term(name: str, kind: Kind, priors: Priors, applied: float = 0.0, **moves: Array) -> Term:
+    """A nuisance that all positions have in common; `moves` are fields of Term."""
+    u, expected = priors.of(kind.prior), priors.of(kind.mean)
+    return Term(Quantity(name, kind), u, expected=expected, applied=applied, **moves)
+
+
+def _turned(quantity: Quantity, uncertainty: float, axis: Array) -> Term:
+    return Term(quantity, uncertainty, turn_direction=axis, turn_gravity=axis)
 
 
 def _only(poses: Sequence[Pose], where: int | list[int], value: Array) -> Array:

@@ -30,18 +30,16 @@ from calib.estimate.fixed_mount import Held, held_at
 from calib.estimate.gauss_newton import Flags
 from calib.estimate.innovation import Innovation, innovation
 from calib.estimate.joint_state import JointState, gain_of
+from calib.estimate.linearised import Linearised
 from calib.estimate.nuisances import Priors
-from calib.estimate.wander import MAIN_TEMPERATURE, RATES, TemperatureModel, Wander, offset_temperature
+from calib.estimate.quantities import LAG, MAIN_TEMPERATURE, OFFSET_RATE, RATES, S_AND_Q, Quantity, offset_temperature
+from calib.estimate.wander import TemperatureModel, Wander, wandered
 from calib.estimate.window_rows import Noise, Summary, WindowRows
-from calib.model import PARAMETERS, Array, Calibration
+from calib.model import Array, Calibration
 
 DETERMINED_SHARE = 0.5  # of the prior's u, which the data must halve (contract)
 MOST_RECENT = 48  # windows: four times round twelve positions
 ITERATIONS = 6
-# Relative change of S, or rad of an angle, up to which the point need not move: its product with an angle's 0.3 deg is
-# 5e-6 of S.
-STRAIGHT = 1e-3
-STRAIGHT_LAG_S = 5e-5  # (omega lag)^2 / 2 of it at 10 Hz is as much
 MOST_POSITIONS = 48  # whose own nuisances are kept; of the oldest ones nothing but their effect on S and Q remains
 METHOD = "3 (recursive adjustment)"
 
@@ -65,17 +63,13 @@ class Recursion:
     ) -> None:
         self._priors, self._wander, self._temperature, self._fixed = priors, wander, temperature, fixed
         self.scale = float(np.sqrt(np.mean(mean[[0, 4, 8]] ** 2)))
-        self._state = JointState(PARAMETERS, mean, standard_uncertainty)
+        state = JointState(S_AND_Q, mean, standard_uncertainty)
         for name in RATES:
-            self._state.append(name, 0.0, wander.offset_rate_mps2 * self.scale)
-        for name, u in temperature.terms(self.scale):
-            self._state.append(name, 0.0, u)
+            state.append(Quantity(name, OFFSET_RATE), 0.0, wander.of(OFFSET_RATE.prior) * self.scale)
+        for quantity, u in temperature.terms(self.scale):
+            state.append(quantity, 0.0, u)
         self._prior_u = np.array(standard_uncertainty, dtype=np.float64)
-        self._bound = self._state.variance.copy()  # what wandering may not exceed
-        self._base = self._state.copy()  # before the recent windows
-        self._base_day: float | None = None
-        self._recent: list[Summary] = []
-        self._point = self._state.mean.copy()
+        self._joint = Linearised(state)
         self._positions: list[str] = []
         self._noise = Noise()
         self._day: float | None = None
@@ -99,13 +93,14 @@ class Recursion:
     def _against(self, summary: Summary) -> tuple[Innovation, Recursion, WindowRows, JointState]:
         trial = self.copy()
         rows = trial._know(summary)
-        state = trial._wandered(trial._state, trial._day, summary.day)
+        state = trial._wandered(trial._joint.state, trial._day, summary.day)
         return innovation(rows.at(state, state.mean, trial._noise), state), trial, rows, state
 
     @property
     def lag_s(self) -> float:
-        """By which the sensor's indications come late; 0 before any window told."""
-        return float(self._state.mean[self._state.index("lag")]) if "lag" in self._state.names else 0.0
+        """By how much the sensor's indications come after the reference's; as stated before any window told."""
+        told = (m for q, m in zip(self._joint.state.quantities, self._joint.state.mean, strict=True) if q.kind is LAG)
+        return float(next(told, self._priors.of(LAG.mean)))
 
     @property
     def determined(self) -> Flags:
@@ -130,20 +125,23 @@ class Recursion:
 
     def _parameters_factor(self) -> tuple[Array, Array]:
         if self._held is not None:
-            return self._held.parameters(self._state)
-        return self._state.mean[:12].copy(), self._state.factor[:12].copy()
+            return self._held.parameters(self._joint.state)
+        return self._joint.state.mean[:12].copy(), self._joint.state.factor[:12].copy()
 
     def law(self, day: float | None = None) -> Law:
         """S and Q over temperature, with all that their covariance knows of each other; `day`: wandered on until it."""
         if day is not None:
             waited = self.copy()
-            waited._state = self._wandered(self._state, self._day, day)
+            waited._joint.state = self._wandered(self._joint.state, self._day, day)
             return waited.law()
         order, rows = self._temperature.offset_order, self._temperature.sensitivity_order > 0
         names = [n for k in range(1, order + 1) for n in offset_temperature(k)] + list(MAIN_TEMPERATURE if rows else ())
-        more = [self._state.index(name) for name in names]
+        more = [self._joint.state.index(name) for name in names]
         mean, factor = self._parameters_factor()
-        mean, factor = np.append(mean, self._state.mean[more]), np.vstack([factor, self._state.factor[more]])
+        mean, factor = (
+            np.append(mean, self._joint.state.mean[more]),
+            np.vstack([factor, self._joint.state.factor[more]]),
+        )
         low, high = self.temperature_range_degc
         u_beyond = self._temperature.u_offset_mps2[1] * self.scale
         return Law(
@@ -152,8 +150,8 @@ class Recursion:
 
     def quantity(self, name: str) -> tuple[float, float]:
         """(value, standard uncertainty) of anything in the state. Raises ValueError where it is not in it."""
-        k = self._state.index(name)
-        return float(self._state.mean[k]), float(np.sqrt(self._state.variance[k]))
+        k = self._joint.state.index(name)
+        return float(self._joint.state.mean[k]), float(np.sqrt(self._joint.state.variance[k]))
 
     @property
     def residual_sd(self) -> Array:
@@ -168,7 +166,7 @@ class Recursion:
     @property
     def names(self) -> list[str]:
         """Of all quantities in the state."""
-        return list(self._state.names)
+        return list(self._joint.state.names)
 
     @property
     def temperature_range_degc(self) -> tuple[float, float]:
@@ -181,15 +179,15 @@ class Recursion:
     def update(self, summary: Summary) -> None:
         """Take a window: one correction of everything."""
         rows = self._know(summary)
-        self._take(rows, self._wandered(self._state, self._day, summary.day))
+        self._take(rows, self._wandered(self._joint.state, self._day, summary.day))
 
     def _take(self, rows: WindowRows, wandered: JointState) -> None:
         summary = rows.summary
-        self._state = self._corrected(wandered, rows)
+        self._joint.state = self._corrected(wandered, rows)
         self._day = _later(self._day, summary.day)
-        self._recent.append(summary)
+        self._joint.recent.append(summary)
         self._settle()
-        if len(self._recent) > MOST_RECENT:
+        if len(self._joint.recent) > MOST_RECENT:
             self._absorb(1)
         self._noise = self._noise.pooled(rows.noise)
         self._residual_sd = summary.data.type_a.noise.copy()
@@ -199,44 +197,42 @@ class Recursion:
         self._keep_positions(summary.pose.position)
         self.windows += 1
 
-    def loosen(self, standard_uncertainty: Array, tilt_rad: float = 0.0, *, lag: bool = False) -> None:
+    def loosen(self, standard_uncertainty: Array, tilt_rad: float = 0.0, *, line: bool = False) -> None:
         """Something changed: S and Q (12,) may be off by as much more from now on, and a fixed mount be tilted.
 
-        `lag`: the lag may be another as well, as after a device or its line began anew.
+        `line`: a device or its line may have begun anew, which makes the lag another.
         """
-        self._absorb(len(self._recent))
-        variance = np.zeros(len(self._state))
-        variance[:12] = standard_uncertainty**2
-        for k, name in enumerate(self._state.names):
-            if name.startswith("gravity_") and self._fixed:
-                variance[k] = tilt_rad**2
-            elif name == "lag" and lag:
-                variance[k] = self._priors.lag_s**2
-        self._state.spread(variance)
-        self._base = self._state.copy()
+        self._absorb(len(self._joint.recent))
+        u = np.zeros(len(self._joint.state))
+        u[:12] = standard_uncertainty
+        for k, quantity in enumerate(self._joint.state.quantities):
+            if quantity.kind.loosened_by == "lean" and self._fixed:
+                u[k] = tilt_rad
+            elif quantity.kind.loosened_by == "line" and line:
+                u[k] = self._priors.of(quantity.kind.prior)
+        self._joint.state.spread(u**2)
+        self._joint.base = self._joint.state.copy()
 
     def forget_reference(self) -> None:
         """Another reference: what is known of the old one's own sensitivity and lag holds no more."""
         self.put(self.result())
-        self._drop([n for n in self._state.names if n.startswith(("reference", "lag", "rotation_"))])
+        self._joint.keep([not quantity.kind.of_reference for quantity in self._joint.state.quantities])
 
     def put(self, calibration: Calibration) -> None:
         """S and Q as an operator wants them, with their covariance; what the nuisances are in them, they stay."""
-        self._absorb(len(self._recent))
-        self._state.mean[:12], self._state.factor[:12] = self._parameters_factor()
+        self._absorb(len(self._joint.recent))
+        self._joint.state.mean[:12], self._joint.state.factor[:12] = self._parameters_factor()
         values = np.append(calibration.sensitivity.ravel(), calibration.offset)
-        self._state.restate(slice(0, 12), values, calibration.covariance)
+        self._joint.state.restate(slice(0, 12), values, calibration.covariance)
         self._held = None  # Q itself is known again; the next window of a fixed mount makes the mean output of it
-        self._base = self._state.copy()
-        self._point = self._state.mean.copy()
+        self._joint.base = self._joint.state.copy()
+        self._joint.point = self._joint.state.mean.copy()
 
     def copy(self) -> Recursion:
         """An independent copy, to try windows on."""
         other = object.__new__(Recursion)
         other.__dict__.update(self.__dict__)
-        other._state, other._base = self._state.copy(), self._base.copy()
-        other._recent, other._positions = list(self._recent), list(self._positions)
-        other._point, other._bound = self._point.copy(), self._bound.copy()
+        other._joint, other._positions = self._joint.copy(), list(self._positions)
         return other
 
     # --- inside
@@ -248,55 +244,33 @@ class Recursion:
 
     def _wandered(self, state: JointState, since: float | None, day: float) -> JointState:
         """A copy of the state, wandered on to `day`; earlier days are as now."""
-        state = state.copy()
         elapsed = 0.0 if since is None else max(day - since, 0.0)
-        if elapsed > 0.0:
-            drift = np.eye(len(state))
-            for i, name in enumerate(RATES):
-                drift[9 + i, state.index(name)] = elapsed
-            state.transform(drift)
-            tilted = 0.0 if self._held is None else float(np.linalg.norm(self._held.mps2))
-            wanted = self._wander.variance_a_day(state.names, self.scale, tilted) * elapsed
-            room = np.maximum(self._bound - state.variance, 0.0)
-            state.spread(np.minimum(wanted, room))
-        return state
+        tilted = 0.0 if self._held is None else float(np.linalg.norm(self._held.mps2))
+        return wandered(
+            state, elapsed, self._wander.variance_a_day(state.quantities, self.scale, tilted), self._joint.bound
+        )
 
     def _mount(self, summary: Summary) -> None:
         """At the first window of a fixed mount: Q gives its place to the mean output there."""
         if not self._fixed or self._held is not None or not np.isfinite(summary.held_mps2).all():
             return
         held, terms = held_at(summary, self._priors)
-        u = self._mean_output_u(held, {term.name: term.uncertainty for term in terms})
-        for state in (self._state, self._base):
+        u = held.mean_output_u(self._joint.state, {term.name: term.uncertainty for term in terms})
+        for state in (self._joint.state, self._joint.base):
             S = state.mean[:9].reshape(3, 3)
             state.replace(slice(9, 12), state.mean[9:12] + S @ summary.held_mps2, np.diag(u**2))
-        self._point[9:12] = self._state.mean[9:12]
-        self._bound[9:12] = u**2
-        for term in terms:
-            self._append(term.name, term.expected, term.uncertainty)
+        self._joint.point[9:12] = self._joint.state.mean[9:12]
+        self._joint.bound[9:12] = u**2
+        self._joint.append(terms)
         self._held = held
-
-    def _mean_output_u(self, held: Held, u_terms: Mapping[str, float]) -> Array:
-        """(3,) standard uncertainty of the mean output before any data: of Q, S and tilt; never the less for them."""
-        variance, S = self._state.variance, self._state.mean[:9].reshape(3, 3)
-        felt = variance[9:12] + variance[:9].reshape(3, 3) @ held.mps2**2
-        tilted = sum((S @ moves * u_terms[name]) ** 2 for name, moves in held.by.items())
-        return np.sqrt(felt + tilted)
-
-    def _append(self, name: str, mean: float, u: float) -> None:
-        if name not in self._state.names:
-            self._state.append(name, mean, u)
-            self._base.append(name, mean, u)
-            self._point = np.append(self._point, mean)
-            # A mount may come to lean by more than anybody stated of the day it was made.
-            self._bound = np.append(self._bound, (2.0 * u) ** 2)
 
     def _know(self, summary: Summary) -> WindowRows:
         """Nuisances that no window had before come in with their priors; the window's rows."""
         self._mount(summary)
         rows = self._rows(summary)
-        for name, mean, u in rows.unknowns:
-            self._append(name, mean, u)
+        new = self._joint.append(rows.terms)
+        if new and self._held is not None:
+            self._held = self._held.moved_by(held_at(summary, self._priors)[0], new)
         return rows
 
     def _taken(self, before: JointState, since: float | None, rows: WindowRows) -> JointState:
@@ -304,72 +278,46 @@ class Recursion:
 
     def _corrected(self, state: JointState, rows: WindowRows) -> JointState:
         """The state, at its day already, after one window, linearised at the point."""
-        own = rows.at(state, self._point, self._noise)
+        own = rows.at(state, self._joint.point, self._noise)
         gain = gain_of(own.jacobian, state.factor)
-        step = gain @ (own.residual + own.jacobian @ (self._point - state.mean))
+        step = gain @ (own.residual + own.jacobian @ (self._joint.point - state.mean))
         state.correct(step, gain, own.jacobian, own.noise)
         return state
 
     def _settle(self) -> None:
         """Take the recent windows anew, from the base on, until the point is where the estimate is."""
         for _ in range(ITERATIONS):
-            if not self._moved():
+            if not self._joint.moved(self.scale):
                 return
-            self._point = self._state.mean.copy()
-            state, since = self._base, self._base_day
-            for summary in self._recent:
+            self._joint.point = self._joint.state.mean.copy()
+            state, since = self._joint.base, self._joint.base_day
+            for summary in self._joint.recent:
                 state = self._taken(state, since, self._rows(summary))
                 since = _later(since, summary.day)
-            self._state = state
-
-    def _moved(self) -> bool:
-        """Whether the products of S and the nuisances, which are all that bends, have left the point."""
-        moved = np.abs(self._state.mean - self._point)
-        limit = np.full(len(moved), STRAIGHT)
-        limit[:9] *= self.scale
-        for k, name in enumerate(self._state.names):
-            if name in PARAMETERS[9:] or name.startswith(("Q", "offset")):
-                limit[k] = np.inf  # these are linear
-            elif name.startswith("lag"):
-                limit[k] = STRAIGHT_LAG_S
-            elif name == "gravity":
-                limit[k] = 10.0 * STRAIGHT
-        return bool(np.any(moved > limit))
+            self._joint.state = state
 
     def _absorb(self, count: int) -> None:
         """The oldest recent windows become part of the base, linearised as they are now."""
-        for summary in self._recent[:count]:
-            self._base = self._taken(self._base, self._base_day, self._rows(summary))
-            self._base_day = _later(self._base_day, summary.day)
-        del self._recent[:count]
+        for summary in self._joint.recent[:count]:
+            self._joint.base = self._taken(self._joint.base, self._joint.base_day, self._rows(summary))
+            self._joint.base_day = _later(self._joint.base_day, summary.day)
+        del self._joint.recent[:count]
 
     def _keep_positions(self, position: str) -> None:
         if position in self._positions:
             self._positions.remove(position)
         self._positions.append(position)
         while len(self._positions) > MOST_POSITIONS:
-            end = f"[{self._positions.pop(0)}]"
-            self._absorb(len(self._recent))
-            self._drop([name for name in self._state.names if name.endswith(end)])
-
-    def _drop(self, names: list[str]) -> None:
-        kept = [name not in names for name in self._state.names]
-        self._bound, self._point = self._bound[kept], self._point[kept]
-        self._state.drop(names)
-        self._base = self._state.copy()
+            oldest = self._positions.pop(0)
+            self._absorb(len(self._joint.recent))
+            self._joint.keep([quantity.position != oldest for quantity in self._joint.state.quantities])
 
     # --- state
 
     def snapshot(self) -> dict[str, Any]:
         """All that changes, exactly."""
-        return {
-            "state": self._state.snapshot(),
-            "base": self._base.snapshot(),
-            "base_day": self._base_day,
-            "recent": [summary.snapshot() for summary in self._recent],
-            "point": self._point.copy(),
+        return self._joint.snapshot() | {
             "prior_u": self._prior_u.copy(),
-            "bound": self._bound.copy(),
             "positions": list(self._positions),
             "noise": asdict(self._noise),
             "day": self._day,
@@ -381,11 +329,12 @@ class Recursion:
         }
 
     def load(self, state: Mapping[str, Any]) -> None:
-        """Go on from a snapshot of a recursion that was made with the same settings."""
-        self._state, self._base = JointState.load(state["state"]), JointState.load(state["base"])
-        self._base_day, self._point = state["base_day"], np.array(state["point"])
-        self._recent = [Summary.load(s) for s in state["recent"]]
-        self._prior_u, self._bound = np.array(state["prior_u"]), np.array(state["bound"])
+        """Go on from a snapshot of a recursion that was made with the same settings.
+
+        Unknowns that an older version of the program did not have come in with their priors.
+        """
+        self._joint = Linearised.load(state)
+        self._prior_u = np.array(state["prior_u"])
         self._positions = list(state["positions"])
         self._noise = Noise(**state["noise"])
         self._day = state["day"]
@@ -394,6 +343,8 @@ class Recursion:
         self._residual_sd = np.array(state["residual_sd"])
         self._held = None if state["held"] is None else Held(**state["held"])
         self.windows, self.scale = state["windows"], state["scale"]
+        for summary in self._joint.recent[-1:]:
+            self._know(summary)
 
 
 def _later(day: float | None, other: float) -> float:

@@ -10,6 +10,7 @@ import numpy as np
 from calib.distributions import chi2_quantile
 from calib.estimate.budget import Budget
 from calib.estimate.gauss_newton import Flags, Solution
+from calib.estimate.quantities import LAG
 from calib.model import PARAMETERS, Array, Window
 
 CONTRADICTED = 0.999  # probability: one sound calibration in a thousand is refused as contradicting what was known
@@ -71,13 +72,12 @@ def _nothing_determined(solution: Solution, determined: Flags) -> list[str]:
 
 def _lag_reasons(solution: Solution, shares: Budget) -> list[str]:
     terms = solution.equations.nuisances.terms
-    names = [t.name for t in terms]
-    if "lag" not in names:
+    j = next((j for j, t in enumerate(terms) if t.kind is LAG), None)
+    if j is None:
         return []
-    j = names.index("lag")
     after, before = float(np.sqrt(shares.covariance[12 + j, 12 + j])), terms[j].uncertainty
     seen = solution.equations.seen[:9]
-    moved = float(shares.contributions["lag"][:9][seen].max(initial=0.0)) / solution.equations.output_per_mps2
+    moved = float(shares.contributions[LAG.source][:9][seen].max(initial=0.0)) / solution.equations.output_per_mps2
     if after <= 0.5 * before or moved <= CONFOUNDED_LAG:
         return []
     return [
@@ -134,12 +134,12 @@ def _prior_reasons(solution: Solution) -> list[str]:
 
 def nuisance_pull(solution: Solution, covariance: Array) -> tuple[float, float, str]:
     """How far the nuisances moved from what was stated, in the worst direction: in the standard deviations that they
-    have beforehand, the limit, and the one that moved most. The lag is left out: the data alone tell it.
+    have beforehand, the limit, and the one that moved most. A lag is left out: the data alone tell it.
 
     With H the information and C the `covariance` (N, N), an estimate strays from its prior's mean by P^-1 - 2 H^-1 + C.
     """
     terms = solution.equations.nuisances.terms
-    stated = [j for j, t in enumerate(terms) if t.source != "lag"]
+    stated = [j for j, t in enumerate(terms) if t.kind.stated]
     if not stated:
         return 0.0, np.inf, ""
     u, k = np.array([terms[j].uncertainty for j in stated]), 12 + np.array(stated)

@@ -2,53 +2,67 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
-from calib.model import PARAMETERS, Array
+from calib.estimate.joint_state import JointState
+from calib.estimate.quantities import (
+    MAIN_TEMPERATURE,
+    OFFSET,
+    OFFSET_TEMPERATURE,
+    RATES,
+    SENSITIVITY_TEMPERATURE,
+    TILT_WALK,
+    WALKS,
+    Quantity,
+    Stated,
+    Statement,
+    offset_temperature,
+)
+from calib.model import Array
 
-RATES = ("Qx_rate", "Qy_rate", "Qz_rate")  # output unit a day
-MAIN_TEMPERATURE = ("Sx_T1", "Sy_T1", "Sz_T1")  # of a row of S, relative per K
 
-
-def offset_temperature(power: int) -> tuple[str, str, str]:
-    """Names of the coefficients of Q on (T - T0)^power, output unit per K^power."""
-    return f"Qx_T{power}", f"Qy_T{power}", f"Qz_T{power}"
-
-
-@dataclass(frozen=True, slots=True)
-class Wander:
+@dataclass(frozen=True, init=False)
+class Wander(Stated):
     """Standard deviations of random walks after one day (they grow with the square root of time).
 
-    `sensitivity` relative to the scale of S, `offset_mps2`, `tilt_rad` of gravity at a fixed mount, `reference`
-    relative; `offset_rate_mps2` (a day) is the first uncertainty of the steady drift of Q and `offset_rate_walk_mps2`
-    how that rate wanders. Wandering never makes a parameter less known than it was before any data.
+    The numbers are attributes, their names and defaults are in calib.estimate.quantities. `offset_rate_mps2` (a day) is
+    the first uncertainty of the steady drift of Q, `offset_rate_walk_mps2` how that rate wanders. Wandering never makes
+    a parameter less known than it was before any data.
     """
 
-    sensitivity: float = 5e-5
-    offset_mps2: float = 0.002
-    offset_rate_mps2: float = 0.001
-    offset_rate_walk_mps2: float = 2e-5
-    tilt_rad: float = 3.5e-5
-    reference: float = 0.0
+    table: ClassVar[Mapping[str, Statement]] = WALKS
 
-    def variance_a_day(self, names: list[str], scale: float, tilted_mps2: float) -> Array:
-        """(N,) of named quantities; `scale` is the sensor's output unit per m/s2, `tilted_mps2` the gravity of which a
-        tilt of the mount moves the mean output: 0 where Q itself is meant."""
-        found = np.zeros(len(names))
-        for k, name in enumerate(names):
-            if name in PARAMETERS[:9]:
-                found[k] = (self.sensitivity * scale) ** 2
-            elif name in PARAMETERS[9:]:
-                found[k] = (self.offset_mps2**2 + (tilted_mps2 * self.tilt_rad) ** 2) * scale**2
-            elif name in RATES:
-                found[k] = (self.offset_rate_walk_mps2 * scale) ** 2
-            elif name.startswith(("gravity_x", "gravity_y", "gravity_z", "tilt_")):
-                found[k] = self.tilt_rad**2
-            elif name.startswith("reference"):
-                found[k] = self.reference**2
+    def variance_a_day(self, quantities: Sequence[Quantity], scale: float, tilted_mps2: float) -> Array:
+        """(N,) of quantities; `scale` is the sensor's output unit per m/s2, `tilted_mps2` the gravity of which a tilt
+        of the mount moves the mean output: 0 where Q itself is meant."""
+        found = np.zeros(len(quantities))
+        for k, quantity in enumerate(quantities):
+            kind = quantity.kind
+            if kind is OFFSET:
+                tilted = tilted_mps2 * self.of(TILT_WALK)
+                found[k] = (self.of(kind.walk) ** 2 + tilted**2) * scale**2
+            else:
+                found[k] = (self.of(kind.walk) * (scale if kind.in_output_unit else 1.0)) ** 2
         return found
+
+
+def wandered(state: JointState, days: float, variance_a_day: Array, bound: Array) -> JointState:
+    """A copy of the state so many days later: Q has drifted by its rate, and all that wanders is less known.
+
+    `variance_a_day` (N,); no variance grows beyond `bound` (N,).
+    """
+    state = state.copy()
+    if days > 0.0:
+        drift = np.eye(len(state))
+        for i, name in enumerate(RATES):
+            drift[9 + i, state.index(name)] = days
+        state.transform(drift)
+        state.spread(np.minimum(variance_a_day * days, np.maximum(bound - state.variance, 0.0)))
+    return state
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,11 +79,12 @@ class TemperatureModel:
     u_offset_mps2: tuple[float, float] = (0.01, 2e-4)  # per K, per K2
     u_sensitivity: float = 2e-4  # per K
 
-    def terms(self, scale: float) -> list[tuple[str, float]]:
-        """(name, first standard uncertainty) of its coefficients."""
+    def terms(self, scale: float) -> list[tuple[Quantity, float]]:
+        """Its coefficients, each with its first standard uncertainty."""
         found = [
-            (name, u * scale)
+            (Quantity(name, OFFSET_TEMPERATURE), u * scale)
             for power, u in enumerate(self.u_offset_mps2[: self.offset_order], start=1)
             for name in offset_temperature(power)
         ]
-        return found + [(name, self.u_sensitivity) for name in MAIN_TEMPERATURE[: 3 * self.sensitivity_order]]
+        rows = MAIN_TEMPERATURE[: 3 * self.sensitivity_order]
+        return found + [(Quantity(name, SENSITIVITY_TEMPERATURE), self.u_sensitivity) for name in rows]

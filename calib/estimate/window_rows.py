@@ -11,10 +11,10 @@ import numpy as np
 from calib.estimate.condense import Condensed, condense
 from calib.estimate.equations import Equations
 from calib.estimate.joint_state import JointState
-from calib.estimate.nuisances import Applied, Nuisances, Priors
+from calib.estimate.nuisances import Applied, Nuisances, Priors, Term
+from calib.estimate.quantities import MAIN_TEMPERATURE, offset_temperature
 from calib.estimate.slope_scatter import SlopeScatter
 from calib.estimate.type_a import TypeA
-from calib.estimate.wander import MAIN_TEMPERATURE, offset_temperature
 from calib.excitation.excited import excited
 from calib.model import Array, Pose, Window
 
@@ -146,9 +146,9 @@ class WindowRows:
         self._live = np.repeat(np.diag(self.data.root[0]) > 0.0, 3)
 
     @property
-    def unknowns(self) -> list[tuple[str, float, float]]:
-        """(name, mean, standard uncertainty) of its nuisances before any data."""
-        return [(t.name, t.expected, t.uncertainty) for t in self.nuisances.terms]
+    def terms(self) -> list[Term]:
+        """Its nuisances."""
+        return self.nuisances.terms
 
     @property
     def noise(self) -> Noise:

@@ -52,6 +52,7 @@ class Site:
         self.results: list[Result] = []
         self.memories: dict[str, Memory] = {}
         self.spoiled: dict[str, float] = {}  # by device: all that it shows is as many times too large
+        self.late_s: dict[str, float] = {}  # by device: the motion that it shows is as many seconds old
 
     def step(self, event: Any) -> list[Result]:
         outputs = self.pipeline.step(event)
@@ -93,10 +94,10 @@ class Site:
             n = BLOCK_S * RATE_HZ
             index = self.t_s * RATE_HZ + np.arange(n)
             t = index / RATE_HZ
-            a = np.column_stack([sum(0.2 * np.sin(2 * np.pi * f * t + f) for f in tones) for tones in DIRECTIONS])
+            a, u = (_motion(t - self.late_s.get(device, 0.0)) for device in "sr")
             V = (a + GRAVITY) @ S.T + Q_TRUE + 0.005 * self._random.normal(size=a.shape)
             self.t_s += BLOCK_S
-            for device, values in (("s", V), ("r", a)):
+            for device, values in (("s", V), ("r", u)):
                 if device in devices:
                     found += self.step(self._block(device, int(index[0]), values * self.spoiled.get(device, 1.0)))
         return found
@@ -130,6 +131,10 @@ class Site:
             device, "boot", self._epoch_ns + int(arrivals[-1]), first, float(RATE_HZ), arrivals.astype(np.int64),
             np.arange(BURST, len(values) + 1, BURST, dtype=np.int32), np.ascontiguousarray(values), flags=flags,
         )  # fmt: skip
+
+
+def _motion(t: np.ndarray) -> np.ndarray:
+    return np.column_stack([sum(0.2 * np.sin(2 * np.pi * f * t + f) for f in tones) for tones in DIRECTIONS])
 
 
 def _json(calibration: CalibrationUpdate | None) -> str:

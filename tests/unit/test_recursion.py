@@ -19,7 +19,7 @@ from tests.clamp_windows import ALPHAS_DEG, G_MPS2, Q_TRUE, S_TRUE, TRUTH, Fault
 
 MEAN = np.append(np.eye(3).ravel(), np.zeros(3))
 U = np.append(np.where(np.eye(3).ravel() > 0, 0.05, 0.03), np.full(3, 20.0))
-STILL = Wander(0.0, 0.0, 1e-9, 0.0, 0.0, 0.0)
+STILL = replace(Wander.none(), offset_rate_mps2=1e-9)
 DEGREE = np.deg2rad(1.0)
 COLUMN_Y, OTHERS = [1, 4, 7], [0, 2, 3, 5, 6, 8]
 FIXED = Priors(gravity_mps2=0.03, offset_mps2=1e-3, lag_window_s=0.0)
@@ -124,7 +124,10 @@ def test_motion_that_goes_along_is_none_of_the_excited_column() -> None:
 
 
 def test_a_mean_that_drifts_at_a_fixed_mount_moves_the_offset_alone() -> None:
-    random, found = np.random.default_rng(3), mounted(wander=Wander(0.0, 0.01, 1e-3, 1e-5, 0.0, 0.0))
+    random, found = (
+        np.random.default_rng(3),
+        mounted(wander=replace(Wander.none(), offset_mps2=0.01, offset_rate_mps2=1e-3, offset_rate_walk_mps2=1e-5)),
+    )
     for k in range(200):
         Q = Q_TRUE + 0.24 * k / 199
         found.update(Summary.of(building_window(random, Q=Q), k / 24))
@@ -162,7 +165,19 @@ def test_nor_by_motion_askew_to_its_channels() -> None:
 
 
 def test_wandering_never_makes_less_known_than_before_any_data() -> None:
-    random, found = np.random.default_rng(5), mounted(wander=Wander(0.01, 0.1, 1e-3, 1e-3, 0.01, 0.0))
+    random, found = (
+        np.random.default_rng(5),
+        mounted(
+            wander=replace(
+                Wander.none(),
+                sensitivity=0.01,
+                offset_mps2=0.1,
+                offset_rate_mps2=1e-3,
+                offset_rate_walk_mps2=1e-3,
+                tilt_rad=0.01,
+            )
+        ),
+    )
     found.update(Summary.of(building_window(random), 0.0))
     found.update(Summary.of(building_window(random), 1e6))
     u = found.result().standard_uncertainty
@@ -173,7 +188,7 @@ def test_wandering_never_makes_less_known_than_before_any_data() -> None:
 def test_temperature_is_told_from_drift() -> None:
     random = np.random.default_rng(6)
     model = TemperatureModel(offset_order=1, sensitivity_order=1, u_offset_mps2=(0.05, 1e-3), u_sensitivity=1e-3)
-    found = mounted(model=model, wander=Wander(0.0, 1e-3, 1e-3, 0.0, 0.0, 0.0))
+    found = mounted(model=model, wander=replace(Wander.none(), offset_mps2=1e-3, offset_rate_mps2=1e-3))
     per_k, of_main = np.array([0.01, -0.02, 0.005]), np.array([0.0, 5e-4, 0.0])
     for k in range(150):
         day = k / 24
@@ -327,7 +342,7 @@ def test_truth_is_what_the_tests_take_it_for() -> None:
 
 
 def test_the_law_of_a_later_day_has_wandered_on_and_changes_nothing() -> None:
-    found = turned(Priors(), Wander(0.001, 0.01, 0.004, 0.0, 0.0, 0.0))
+    found = turned(Priors(), replace(Wander.none(), sensitivity=0.001, offset_mps2=0.01, offset_rate_mps2=0.004))
     for k, window in enumerate(clamp_points(np.random.default_rng(3)).windows):
         found.update(Summary.of(window, k * 1e-3))
     before = found.snapshot()

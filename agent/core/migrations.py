@@ -1,0 +1,97 @@
+"""States of released versions of the program, brought up to date one version at a time.
+
+A function `from_version_<n>` gets what `unpack` found in a state of version n (of a whole pipeline, or what is kept of
+one device) and changes it to what version n + 1 writes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+from calib.estimate.quantities import (
+    ALPHA,
+    ALPHA_BY_POSITION,
+    DIRECTION,
+    DIRECTION_BY_POSITION,
+    GRAVITY,
+    GRAVITY_DIRECTION,
+    LAG,
+    LAG_OF_AXIS,
+    MAIN_TEMPERATURE,
+    OFFSET,
+    OFFSET_BY_POSITION,
+    OFFSET_RATE,
+    OFFSET_TEMPERATURE,
+    RATES,
+    REFERENCE,
+    ROTATION,
+    SENSITIVITY,
+    SENSITIVITY_TEMPERATURE,
+    THETA,
+    THETA_BY_POSITION,
+    TRANSVERSE,
+    Kind,
+    offset_temperature,
+)
+from calib.model import PARAMETERS
+
+
+def _of_axes(name: str, kind: Kind) -> dict[str, Kind]:
+    return {f"{name}_{axis}": kind for axis in "xyz"}
+
+
+# Version 1 had names alone. Every name that a running agent gave, without the position in brackets behind some.
+_VERSION_1: Mapping[str, Kind] = {
+    **dict.fromkeys(PARAMETERS[:9], SENSITIVITY),
+    **dict.fromkeys(PARAMETERS[9:], OFFSET),
+    **dict.fromkeys(RATES, OFFSET_RATE),
+    **dict.fromkeys(MAIN_TEMPERATURE, SENSITIVITY_TEMPERATURE),
+    **dict.fromkeys((*offset_temperature(1), *offset_temperature(2)), OFFSET_TEMPERATURE),
+    "theta": THETA,
+    "alpha": ALPHA,
+    "gravity": GRAVITY,
+    "lag": LAG,
+    "reference": REFERENCE,
+    **_of_axes("direction", DIRECTION),
+    **_of_axes("rotation", ROTATION),
+    **_of_axes("reference", REFERENCE),
+    **_of_axes("lag", LAG_OF_AXIS),
+    **{f"transverse_{way}": TRANSVERSE for way in ("lateral", "vertical")},
+    **{f"transverse_{way}_quadrature": TRANSVERSE for way in ("lateral", "vertical")},
+}
+_VERSION_1_BY_POSITION: Mapping[str, Kind] = {
+    "theta": THETA_BY_POSITION,
+    "alpha": ALPHA_BY_POSITION,
+    "transverse_a": TRANSVERSE,
+    "transverse_b": TRANSVERSE,
+    **_of_axes("direction", DIRECTION_BY_POSITION),
+    **_of_axes("gravity", GRAVITY_DIRECTION),
+    **_of_axes("offset", OFFSET_BY_POSITION),
+}
+
+
+def from_version_1(state: dict[str, Any]) -> None:
+    """Each unknown gets its kind. Raises KeyError for a name that version 1 did not have."""
+    for estimation in _estimations(state):
+        recursion = estimation["recursion"]
+        for joint in (recursion["state"], recursion["base"]):
+            joint["quantities"] = [_quantity_of_version_1(name) for name in joint.pop("names")]
+
+
+def _estimations(state: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    """Of all channels of a pipeline, or of the device whose state is kept."""
+    for holder in [state, *state.get("channels", {}).values()]:
+        if holder.get("estimation"):
+            yield holder["estimation"]
+
+
+def _quantity_of_version_1(name: str) -> list[str]:
+    """[name, kind, position] of a name such as "lag", "alpha[0]" or "transverse_a[0]_quadrature"."""
+    stem, bracket, rest = name.partition("[")
+    if not bracket:
+        return [name, _VERSION_1[name].name, ""]
+    return [name, _VERSION_1_BY_POSITION[stem].name, rest.rpartition("]")[0]]
+
+
+MIGRATIONS: Mapping[int, Callable[[dict[str, Any]], None]] = {1: from_version_1}
