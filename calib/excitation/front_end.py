@@ -28,7 +28,7 @@ MOST_MARGIN_S = 5.0  # a differentiator at 10 Hz takes 3.3 s
 # Of many holes pieces of a second are left: too short for the reference's noise, and for type A by segments.
 MOST_MISSING_PCT = 5.0
 NOISE_MATTERS = 1e-5  # of the motion's power: a filter against less of it would cost its ends for nothing
-FILTER_BAND = 1.25  # times its band, where calib.signal.band.lowpass is 6 dB down
+FILTER_BAND = 1.197  # times its band: the noise-equivalent bandwidth of calib.signal.band.lowpass
 RESAMPLED_BAND = 0.35  # of the reference's rate, to which interpolation itself passes noise
 
 
@@ -226,7 +226,8 @@ def _band(raw: Array, u: Array, instrument: Instrument, rate_hz: float) -> tuple
     if derivatives:
         widest_hz = min(DIFFERENTIATED_BAND_HZ, widest_hz)
     unlimited = noise_in_band(density, widest_hz, derivatives)
-    power = np.var(u, axis=0).max(initial=0.0) if len(u) else 0.0
+    whole = u[np.isfinite(u).all(axis=1)]  # one missing sample of the reference makes some of them NaN
+    power = np.var(whole, axis=0).max(initial=0.0) if len(whole) else 0.0
     if found_hz is None or np.max(unlimited[0] ** 2, initial=0.0) <= NOISE_MATTERS * power:
         return None, unlimited.reshape(2, m)
     return found_hz, noise_in_band(density, min(FILTER_BAND * found_hz, widest_hz), derivatives)

@@ -43,8 +43,7 @@ def band_above_noise(x: Array, rate_hz: float) -> tuple[float | None, Array]:
         if 2 * segments < LEAST_SEGMENTS and (size := size // 2) < FEWEST_LINES:
             return None, np.zeros(m)
     window = hanning(size)
-    # A line's power is a mean of `segments` exponentials: its median is the mean but for one part in 3 segments.
-    floor = np.median(powers[:, 1:-1], axis=1) / (1.0 - 1.0 / (3.0 * segments))
+    floor = _floor(powers[:, 1:-1], segments)
     ratio = np.convolve(
         np.mean(powers / np.maximum(floor, TINY)[:, None], axis=0), np.ones(SMOOTHED) / SMOOTHED, "same"
     )
@@ -54,7 +53,17 @@ def band_above_noise(x: Array, rate_hz: float) -> tuple[float | None, Array]:
     band_hz = MARGIN * float(moving[-1] + SMOOTHED) * rate_hz / size
     if band_hz >= WIDEST * rate_hz:
         return None, np.zeros(m)
+    # The median over all lines holds those of the motion: in a fifth of them it is 8 % above the noise alone.
+    floor = _floor(powers[:, int(np.ceil(band_hz * size / rate_hz)) : -1], segments)
     return band_hz, np.sqrt(floor / (0.5 * rate_hz * np.sum(window**2)))
+
+
+def _floor(powers: Array, segments: int) -> Array:
+    """(m,) mean power of the noise in lines (m, k), a few of which may hold more than noise.
+
+    A line's power is a mean of `segments` exponentials: its median is the mean but for one part in 3 segments.
+    """
+    return np.asarray(np.median(powers, axis=1) / (1.0 - 1.0 / (3.0 * segments)))
 
 
 def _bridged(x: Array) -> Array:
