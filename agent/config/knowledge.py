@@ -82,12 +82,12 @@ class Certificate(Section):
 class Uncertainty(Section):
     """Standard uncertainties of what moves the data besides S and Q (method: nuisances); 0 fixes one as stated."""
 
-    angle_deg: NotNegative = 0.2
+    angle_deg: NotNegative = 0.2  # how the sensor stands: alpha, or a stated direction, by position
     theta_deg: NotNegative = 0.2
     theta_position_deg: NotNegative = 0.0
     alpha_common_deg: NotNegative = 0.1
     rotation_deg: NotNegative = 0.2
-    tilt_deg: NotNegative = 0.2  # of gravity at a fixed mount
+    tilt_deg: NotNegative = 0.2  # how a fixed mount, with the sensor and its reference, leans against gravity
     transverse_motion_pct: NotNegative = 1.0
     offset_mps2: Positive = 0.05  # between windows
     offset_position_mps2: NotNegative = 0.0

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.estimate.joint_state import JointState
-from calib.estimate.nuisances import Applied, Nuisances, Priors, Term
+from calib.estimate.nuisances import Applied, Nuisances, Priors
+from calib.estimate.terms import Term
 from calib.estimate.window_rows import Summary
 from calib.model import Array
 

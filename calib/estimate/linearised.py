@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from calib.estimate.joint_state import JointState
-from calib.estimate.nuisances import Term
+from calib.estimate.terms import Term
 from calib.estimate.window_rows import Summary
 
 

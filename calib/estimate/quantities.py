@@ -1,6 +1,6 @@
 """The table of unknowns: what each quantity of a joint state is, and all that the estimators need to know of it.
 
-A new unknown is one `Kind` in this file and, in calib.estimate.nuisances, the geometry of what it moves. No other file
+A new unknown is one `Kind` in this file and, in calib.estimate.terms, the geometry of what it moves. No other file
 decides anything by the name of an unknown: a name is for people and for looking up.
 """
 

@@ -32,7 +32,7 @@ from calib.estimate.innovation import Innovation, innovation
 from calib.estimate.joint_state import JointState, gain_of
 from calib.estimate.linearised import Linearised
 from calib.estimate.nuisances import Priors
-from calib.estimate.quantities import LAG, MAIN_TEMPERATURE, OFFSET_RATE, RATES, S_AND_Q, Quantity, offset_temperature
+from calib.estimate.quantities import LAG, OFFSET_RATE, RATES, S_AND_Q, Quantity
 from calib.estimate.wander import TemperatureModel, Wander, wandered
 from calib.estimate.window_rows import Noise, Summary, WindowRows
 from calib.model import Array, Calibration
@@ -135,13 +135,10 @@ class Recursion:
             waited._joint.state = self._wandered(self._joint.state, self._day, day)
             return waited.law()
         order, rows = self._temperature.offset_order, self._temperature.sensitivity_order > 0
-        names = [n for k in range(1, order + 1) for n in offset_temperature(k)] + list(MAIN_TEMPERATURE if rows else ())
-        more = [self._joint.state.index(name) for name in names]
+        state = self._joint.state
+        more = [state.index(quantity.name) for quantity, _ in self._temperature.terms(self.scale)]
         mean, factor = self._parameters_factor()
-        mean, factor = (
-            np.append(mean, self._joint.state.mean[more]),
-            np.vstack([factor, self._joint.state.factor[more]]),
-        )
+        mean, factor = np.append(mean, state.mean[more]), np.vstack([factor, state.factor[more]])
         low, high = self.temperature_range_degc
         u_beyond = self._temperature.u_offset_mps2[1] * self.scale
         return Law(
@@ -246,9 +243,8 @@ class Recursion:
         """A copy of the state, wandered on to `day`; earlier days are as now."""
         elapsed = 0.0 if since is None else max(day - since, 0.0)
         tilted = 0.0 if self._held is None else float(np.linalg.norm(self._held.mps2))
-        return wandered(
-            state, elapsed, self._wander.variance_a_day(state.quantities, self.scale, tilted), self._joint.bound
-        )
+        a_day = self._wander.variance_a_day(state.quantities, self.scale, tilted)
+        return wandered(state, elapsed, a_day, self._joint.bound)
 
     def _mount(self, summary: Summary) -> None:
         """At the first window of a fixed mount: Q gives its place to the mean output there."""

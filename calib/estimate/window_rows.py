@@ -11,9 +11,10 @@ import numpy as np
 from calib.estimate.condense import Condensed, condense
 from calib.estimate.equations import Equations
 from calib.estimate.joint_state import JointState
-from calib.estimate.nuisances import Applied, Nuisances, Priors, Term
+from calib.estimate.nuisances import Applied, Nuisances, Priors
 from calib.estimate.quantities import MAIN_TEMPERATURE, offset_temperature
 from calib.estimate.slope_scatter import SlopeScatter
+from calib.estimate.terms import Term
 from calib.estimate.type_a import TypeA
 from calib.excitation.excited import excited
 from calib.model import Array, Pose, Window
@@ -133,7 +134,7 @@ class WindowRows:
         seen_degc: tuple[float, float],
     ) -> None:
         self.summary, self.data = summary, summary.data
-        self.nuisances = Nuisances([summary.moved], self.data.channels, priors, Applied(summary.lag_s))
+        self.nuisances = Nuisances([summary.moved], self.data.channels, priors, Applied.of(priors, summary.lag_s))
         u_lag_s = max(priors.lag_window_s, summary.u_lag_s)
         self._scatter = SlopeScatter.of(self.data, u_lag_s, summary.attenuation)
         own = SlopeScatter.of(self.data)  # the scatter between windows is in the covariance of the rows, not before it

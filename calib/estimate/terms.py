@@ -1,0 +1,220 @@
+"""The nuisances of some poses, and per unit of each what it moves: the geometry of the unknowns.
+
+An error of a pose is a small rotation of the sensor's whole surroundings: direction of motion and gravity stay a rigid
+pair. Alpha turns it about the sensor's z axis, theta about the horizontal normal of the motion (Eqs. 9-11). A mount
+that leans with all that is on it turns gravity alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.estimate import quantities as kinds
+from calib.estimate.quantities import Kind, Quantity, Stated
+from calib.model import Array, Pose, own_channels
+
+PARALLEL = 1e-3  # rad; motion and gravity closer to one line than this leave the horizontal normal open
+AXES = "xyz"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Term:
+    """One nuisance: which quantity it is, its standard uncertainty beforehand, and per unit of it what it moves.
+
+    Turns (P, 3) in rad, `transverse` and `quadrature` (P, 3), `reference` (M,), `gravity` in m/s2, `offset` (P, 3) in
+    m/s2, `lag` (3,) in s, corners in rad/s. None moves nothing. `expected` is the prior's mean, `applied` what the
+    front end took out: the unknown is what is left.
+    """
+
+    quantity: Quantity
+    uncertainty: float
+    turn_direction: Array | None = None
+    turn_gravity: Array | None = None
+    transverse: Array | None = None
+    quadrature: Array | None = None
+    reference: Array | None = None
+    gravity: Array | None = None
+    offset: Array | None = None
+    lag: Array | None = None
+    reference_corner: Array | None = None
+    sensor_corner: Array | None = None
+    expected: float = 0.0
+    applied: float = 0.0
+
+    @property
+    def name(self) -> str:
+        """For people."""
+        return self.quantity.name
+
+    @property
+    def kind(self) -> Kind:
+        """Its nature."""
+        return self.quantity.kind
+
+    @property
+    def source(self) -> str:
+        """The line of a budget that it belongs to."""
+        return self.kind.source
+
+    @property
+    def unit(self) -> str:
+        """Of its value."""
+        return self.kind.unit
+
+
+def terms(poses: Sequence[Pose], channels: int, priors: Stated, applied: Mapping[Kind, float]) -> Iterator[Term]:
+    """All nuisances of P poses and so many channels of the reference, those of no uncertainty too.
+
+    `applied`: what the front end has already taken out, by kind.
+    """
+    yield from _clamp_terms(poses, priors)
+    yield from _pose_terms(poses, priors)
+    yield from _lean_terms(poses, priors)
+    yield from _slide_terms(poses, priors)
+    for name, k in zip(_axes("offset"), np.eye(3), strict=True):
+        for p, pose in enumerate(poses):
+            quantity = _at(name, kinds.OFFSET_BY_POSITION, pose)
+            yield Term(quantity, priors.of(quantity.kind.prior), offset=_only(poses, p, k))
+    if any(np.any(pose.gravity_mps2) for pose in poses):
+        yield _term("gravity", kinds.GRAVITY, priors, gravity=np.ones(1))
+    if channels == 0:
+        return
+    real = own_channels(channels)
+    for m in range(real):
+        name = "reference" if real == 1 else f"reference_{AXES[m]}"
+        yield _term(name, kinds.REFERENCE, priors, reference=np.resize(np.eye(real)[m], channels))
+    yield _term("lag", kinds.LAG, priors, applied, lag=np.ones(3))
+    for name, k in zip(_axes("lag"), np.eye(3), strict=True):
+        yield _term(name, kinds.LAG_OF_AXIS, priors, lag=k)
+    turn = np.full(1, 2.0 * np.pi)
+    yield _term("reference_corner", kinds.REFERENCE_CORNER, priors, applied, reference_corner=turn)
+    yield _term("sensor_corner", kinds.SENSOR_CORNER, priors, applied, sensor_corner=turn)
+
+
+def _clamp_terms(poses: Sequence[Pose], priors: Stated) -> Iterator[Term]:
+    """Theta and alpha, common and by position."""
+    clamped = [p for p, pose in enumerate(poses) if pose.theta_rad is not None]
+    if not clamped:
+        return
+    theta, alpha = np.zeros((len(poses), 3)), np.zeros((len(poses), 3))
+    for p in clamped:
+        motion, gravity = _clamp_frame(poses[p])
+        theta[p] = np.cross(gravity, motion)
+        alpha[p] = 0.0, 0.0, -1.0
+    for name, axis, common, single, found in (
+        ("theta", theta, kinds.THETA, kinds.THETA_BY_POSITION, [poses[p].u_theta_rad for p in clamped]),
+        ("alpha", alpha, kinds.ALPHA, kinds.ALPHA_BY_POSITION, [poses[p].u_alpha_rad for p in clamped]),
+    ):
+        yield _term(name, common, priors, turn_direction=axis, turn_gravity=axis)
+        for p, u in zip(clamped, found, strict=True):
+            yield _turned(_at(name, single, poses[p]), max(priors.of(single.prior), u), _only(poses, p, axis[p]))
+
+
+def _pose_terms(poses: Sequence[Pose], priors: Stated) -> Iterator[Term]:
+    """Stated directions, common and by position, and the mounting of a tri-axial reference."""
+    stated = [p for p, pose in enumerate(poses) if pose.theta_rad is None and own_channels(pose.direction.shape[1]) < 3]
+    beside = [p for p, pose in enumerate(poses) if own_channels(pose.direction.shape[1]) == 3]
+    for axis, k in zip(AXES, np.eye(3), strict=True):
+        if stated:
+            turn = _only(poses, stated, k)
+            yield _term(f"direction_{axis}", kinds.DIRECTION, priors, turn_direction=turn, turn_gravity=turn)
+        if beside:
+            turn = _only(poses, beside, k)
+            yield _term(f"rotation_{axis}", kinds.ROTATION, priors, turn_direction=turn)
+        for p in stated:
+            quantity = _at(f"direction_{axis}", kinds.DIRECTION_BY_POSITION, poses[p])
+            yield _turned(quantity, priors.of(quantity.kind.prior), _only(poses, p, k))
+        for p in beside:
+            if np.any(poses[p].gravity_mps2):
+                quantity = _at(f"gravity_{axis}", kinds.GRAVITY_DIRECTION, poses[p])
+                yield Term(quantity, priors.of(quantity.kind.prior), turn_gravity=_only(poses, p, k))
+
+
+def _lean_terms(poses: Sequence[Pose], priors: Stated) -> Iterator[Term]:
+    """Gravity in other directions than stated, the direction of motion as stated: a mount with all on it leans."""
+    for p, pose in enumerate(poses):
+        if own_channels(pose.direction.shape[1]) < 3 and np.any(pose.gravity_mps2):
+            for axis, k in zip(AXES, np.eye(3), strict=True):
+                quantity = _at(f"lean_{axis}", kinds.LEAN, pose)
+                yield Term(quantity, priors.of(quantity.kind.prior), turn_gravity=_only(poses, p, k))
+
+
+def _slide_terms(poses: Sequence[Pose], priors: Stated) -> Iterator[Term]:
+    """Motion across a uniaxial reference, and gravity not square to the motion as stated."""
+    lateral, vertical, along = (np.zeros((len(poses), 3)) for _ in range(3))
+    free = []
+    for p, pose in enumerate(poses):
+        frame = _slide_frame(pose)
+        if frame is not None:
+            along[p], vertical[p], lateral[p] = frame
+        elif own_channels(pose.direction.shape[1]) == 1:
+            free.append(p)
+    for name, way in (("lateral", lateral), ("vertical", vertical)):
+        if way.any():
+            yield from _across(f"transverse_{name}", "", priors, way)
+    for p in free:
+        position = poses[p].position
+        for name, k in zip("ab", np.linalg.svd(poses[p].direction[:, :1])[0].T[1:], strict=True):
+            yield from _across(f"transverse_{name}[{position}]", position, priors, _only(poses, p, k))
+    for name, axis in (("pitch", lateral), ("roll", along)):
+        if axis.any():
+            yield _term(f"tilt_{name}", kinds.TILT, priors, turn_gravity=axis)
+
+
+def _across(name: str, position: str, priors: Stated, way: Array) -> Iterator[Term]:
+    u = priors.of(kinds.TRANSVERSE.prior)
+    yield Term(Quantity(name, kinds.TRANSVERSE, position), u, transverse=way)
+    yield Term(Quantity(f"{name}_quadrature", kinds.TRANSVERSE, position), u, quadrature=way)
+
+
+def _slide_frame(pose: Pose) -> tuple[Array, Array, Array] | None:
+    """Unit vectors along the motion, along gravity's part square to it, and across both; None where they are open."""
+    if pose.theta_rad is not None:
+        motion, gravity = _clamp_frame(pose)
+        return motion, gravity, np.cross(gravity, motion)
+    if own_channels(pose.direction.shape[1]) != 1:
+        return None
+    motion = pose.direction[:, 0]
+    gravity = np.nan_to_num(pose.gravity_mps2)
+    across = np.cross(gravity, motion)
+    length = float(np.linalg.norm(across))
+    if length <= PARALLEL * max(float(np.linalg.norm(gravity)), np.finfo(float).tiny):
+        return None
+    return motion, np.cross(motion, across / length), across / length
+
+
+def _clamp_frame(pose: Pose) -> tuple[Array, Array]:
+    """d and e of Eqs. (9)-(11), whichever of them the pose's sensor feels."""
+    theta, alpha = pose.theta_rad or 0.0, pose.alpha_rad or 0.0
+    sin_t, cos_t, sin_a, cos_a = np.sin(theta), np.cos(theta), np.sin(alpha), np.cos(alpha)
+    return (
+        np.array([-sin_a * cos_t, -cos_a * cos_t, sin_t]),
+        np.array([-sin_t * sin_a, -sin_t * cos_a, -cos_t]),
+    )
+
+
+def _at(name: str, kind: Kind, pose: Pose) -> Quantity:
+    return Quantity(f"{name}[{pose.position}]", kind, pose.position)
+
+
+def _term(name: str, kind: Kind, priors: Stated, applied: Mapping[Kind, float] | None = None, **moves: Array) -> Term:
+    """A nuisance that all positions have in common; `moves` are fields of Term."""
+    taken, expected = (applied or {}).get(kind, 0.0), priors.of(kind.mean)
+    return Term(Quantity(name, kind), priors.of(kind.prior), expected=expected, applied=taken, **moves)
+
+
+def _turned(quantity: Quantity, uncertainty: float, axis: Array) -> Term:
+    return Term(quantity, uncertainty, turn_direction=axis, turn_gravity=axis)
+
+
+def _only(poses: Sequence[Pose], where: int | list[int], value: Array) -> Array:
+    one = np.zeros((len(poses), 3))
+    one[where] = value
+    return one
+
+
+def _axes(name: str) -> list[str]:
+    return [f"{name}_{axis}" for axis in AXES]

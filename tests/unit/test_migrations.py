@@ -1,0 +1,102 @@
+"""A state of version 1 is brought up to date: every unknown gets its kind, and the estimation goes on from it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from agent.config import Config
+from agent.core.events import DeviceChange
+from agent.core.kept import take_up
+from agent.core.snapshot import VERSION, pack, unpack
+from agent.delivery.history import History
+from agent.delivery.store import Store
+from agent.recording.reading import RecordingReader
+from calib.estimate.quantities import KINDS
+from tests.replay.golden_files import FORMATS, RECORDING, STATE, config_of
+
+FORMAT_1 = next(path for path in FORMATS if path.name == "format-1")
+
+
+@pytest.fixture
+def kept(tmp_path: Path) -> bytes:
+    """What the released version 1 kept of the golden recording's sensor."""
+    (tmp_path / STATE).write_bytes((FORMAT_1 / STATE).read_bytes())
+    store = Store(tmp_path, 0)
+    with History(store.path) as history:
+        (memory,) = history.memories("mems").values()
+    store.close()
+    return memory.state
+
+
+def raw(state: bytes) -> dict[str, Any]:
+    """As it is stored; arrays are left as they are."""
+    found: dict[str, Any] = msgspec.msgpack.decode(state)
+    return found
+
+
+def test_a_state_of_version_1_goes_on_whole(kept: bytes) -> None:
+    assert raw(kept)["version"] == 1 < VERSION
+    channel = Config.model_validate_json(config_of(FORMAT_1 / RECORDING)).channels[0]
+    nominal = next(
+        msgspec.json.decode(s.event.info_json)
+        for s in RecordingReader(FORMAT_1 / RECORDING).steps()
+        if isinstance(s.event, DeviceChange) and s.event.device == "mems"
+    )
+    taken = take_up(kept, channel, nominal.get("sensitivity"))
+    assert taken.reason == "restored from the run before"
+    state = unpack(kept)["estimation"]["recursion"]["state"]
+    names = raw(kept)["state"]["estimation"]["recursion"]["state"]["names"]
+    assert [name for name, _, _ in state["quantities"]] == names
+    restored = taken.estimation.snapshot()["recursion"]
+    assert np.array_equal(restored["state"]["factor"], state["factor"])
+    assert np.array_equal(restored["state"]["mean"], state["mean"])
+    assert taken.estimation.recursion.windows == unpack(kept)["estimation"]["recursion"]["windows"] > 0
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "position"),
+    [
+        ("Sxy", "sensitivity", ""),
+        ("Qz", "offset", ""),
+        ("Qz_rate", "offset rate", ""),
+        ("Qz_T2", "offset over temperature", ""),
+        ("Sx_T1", "sensitivity over temperature", ""),
+        ("lag", "lag", ""),
+        ("lag_y", "lag of axis", ""),
+        ("reference_y", "reference sensitivity", ""),
+        ("gravity", "gravity", ""),
+        ("gravity_x[beside]", "gravity direction by position", "beside"),
+        ("alpha", "alpha", ""),
+        ("alpha[theta 35 deg, alpha [0] deg]", "alpha by position", "theta 35 deg, alpha [0] deg"),
+        ("transverse_a[direction (0, 0, 1)]_quadrature", "transverse motion", "direction (0, 0, 1)"),
+        ("transverse_lateral_quadrature", "transverse motion", ""),
+        ("offset_x[p]", "offset by position", "p"),
+    ],
+)
+def test_a_name_of_version_1_becomes_a_kind(name: str, kind: str, position: str) -> None:
+    assert brought_up([name])["quantities"] == [[name, kind, position]]
+    assert kind in KINDS
+
+
+def brought_up(names: list[str]) -> dict[str, Any]:
+    joint = {"names": names, "mean": np.zeros(len(names)), "factor": np.eye(len(names))}
+    state = raw(pack({"estimation": {"recursion": {"state": joint, "base": dict(joint)}}}))
+    old = msgspec.msgpack.encode({"version": 1, "state": state["state"]})
+    found: dict[str, Any] = unpack(old)["estimation"]["recursion"]["state"]
+    return found
+
+
+def test_a_name_that_version_1_did_not_have_is_no_state_of_it() -> None:
+    with pytest.raises(ValueError, match=r"version 1 that cannot be brought up to date: .*'gravitas'"):
+        brought_up(["gravitas"])
+
+
+def test_a_version_that_is_not_known_is_named() -> None:
+    newer = msgspec.msgpack.encode({"version": VERSION + 1, "state": {}})
+    with pytest.raises(ValueError, match=f"version {VERSION + 1}; this program reads 1 to {VERSION}"):
+        unpack(newer)
