@@ -25,7 +25,9 @@ from calib.model import Array
 # Below this part of the largest singular value (columns scaled to one) a direction was not excited: positions 0/1/2 deg
 # stand at 3e-6, what rounding leaves of an unseen direction at 1e-15.
 RANK_TOLERANCE = 1e-10
-UNSEEN_SHARE = 1e-3  # of an unseen direction that a parameter may have and still count as seen
+# Of an unseen direction that a parameter may have and still count as seen: what a silent channel shows of another's
+# motion (calib.excitation.excited) is up to 1 % of it; what nobody excited is held at its scale, so u says as much.
+UNSEEN_SHARE = 0.02
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,7 +81,7 @@ class Equations:
         """Directions (k, 4) of (a_x, a_y, a_z, 1) square to every input vector, angles as stated; 4 - k is the rank."""
         data, nuisances, m = self.data, self.nuisances, self.data.channels
         moved = np.einsum("brc,bkc->brk", data.root[:, :m, :m], nuisances.direction[self.pose_of_window])
-        held = np.einsum("wkm,wm->wk", nuisances.direction[self.pose_of_window], data.mean_x[:, :m])
+        held = np.einsum("wkm,wm->wk", nuisances.mean_direction[self.pose_of_window], data.mean_x[:, :m])
         held = np.pad(held + nuisances.gravity[self.pose_of_window], ((0, 0), (0, 1)), constant_values=1.0)
         rows = np.vstack(
             [np.pad(moved.reshape(-1, 3), ((0, 0), (0, 1))), (np.sqrt(data.count)[:, None] * held)[self.known]]
@@ -162,7 +164,7 @@ class Equations:
 
     def _means(self, S: Array, Q: Array, z: Array, inputs: Inputs) -> tuple[Array, Array]:
         data, nuisances, m = self.data, self.nuisances, self.data.channels
-        D = inputs.direction[self.pose_of_window]
+        D = inputs.mean_direction[self.pose_of_window]
         moved = np.einsum("wkm,wm->wk", D, data.mean_x[:, :m])
         rate = np.einsum("wkm,wm->wk", D, data.mean_x[:, m:])
         G = np.nan_to_num(inputs.gravity[self.pose_of_window])
@@ -177,7 +179,7 @@ class Equations:
         for i in range(3):
             jacobian[:, i, 3 * i : 3 * i + 3] = felt[:, i]
             jacobian[:, i, 9 + i] = 1.0
-        d_input = np.einsum("jwkm,wm->jwk", inputs.d_direction[:, self.pose_of_window], data.mean_x[:, :m])
+        d_input = np.einsum("jwkm,wm->jwk", inputs.d_mean_direction[:, self.pose_of_window], data.mean_x[:, :m])
         d_input = d_input + np.nan_to_num(inputs.d_gravity[:, self.pose_of_window])
         d_input = d_input + inputs.d_quadrature[:, self.pose_of_window] * share[:, None]
         jacobian[..., 12:] = np.einsum("ik,jwk->wij", S, d_input)

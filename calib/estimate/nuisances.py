@@ -73,17 +73,20 @@ class Applied:
 class Inputs:
     """Input accelerations at one value of the J nuisances and their derivatives with respect to each.
 
-    `direction` (P, 3, M), `quadrature` (P, 3), `gravity` (P, 3), `lag_s` (3,), `reference_corner` and `sensor_corner`
-    in rad/s; `d_...` the same with J in front.
+    `direction` (P, 3, M) of the motion, `mean_direction` (P, 3, M) of the reference's means: they differ where channels
+    are silent, whose means are felt all the same. `quadrature` (P, 3), `gravity` (P, 3), `lag_s` (3,),
+    `reference_corner` and `sensor_corner` in rad/s; `d_...` the same with J in front.
     """
 
     direction: Array
+    mean_direction: Array
     quadrature: Array
     gravity: Array
     lag_s: Array
     reference_corner: float
     sensor_corner: float
     d_direction: Array
+    d_mean_direction: Array
     d_quadrature: Array
     d_gravity: Array
 
@@ -101,7 +104,7 @@ class Nuisances:
             self._stated[p, :, :m] = pose.direction
             if pose.along is not None:
                 self._along[p, :m, :m] = pose.along
-        self.direction = self._stated @ self._along
+        self.direction, self.mean_direction = self._stated @ self._along, self._stated
         self.gravity = np.array([pose.gravity_mps2 for pose in poses])
         self._real = own_channels(channels)
         self._magnitude = np.maximum(np.linalg.norm(self.gravity, axis=1), np.finfo(float).tiny)
@@ -157,12 +160,14 @@ class Nuisances:
         )
         return Inputs(
             direction @ self._along,
+            direction,
             np.einsum("jpk,j->pk", d_quadrature, z),
             gravity,
             z @ self.lag,
             float(z @ self.reference_corner),
             float(z @ self.sensor_corner),
             d_direction @ self._along,
+            d_direction,
             d_quadrature,
             d_gravity,
         )

@@ -8,7 +8,8 @@ that leans with all that is on it turns gravity alone.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -44,6 +45,15 @@ class Term:
     expected: float = 0.0
     applied: float = 0.0
 
+    def with_(self, other: Term) -> Term:
+        """The same nuisance, moving what `other` moves as well."""
+        moves: dict[str, Any] = {}
+        for f in fields(self):
+            own, more = getattr(self, f.name), getattr(other, f.name)
+            if isinstance(more, np.ndarray):
+                moves[f.name] = more if own is None else own + more
+        return replace(self, uncertainty=max(self.uncertainty, other.uncertainty), **moves)
+
     @property
     def name(self) -> str:
         """For people."""
@@ -65,11 +75,18 @@ class Term:
         return self.kind.unit
 
 
-def terms(poses: Sequence[Pose], channels: int, priors: Stated, applied: Mapping[Kind, float]) -> Iterator[Term]:
+def terms(poses: Sequence[Pose], channels: int, priors: Stated, applied: Mapping[Kind, float]) -> list[Term]:
     """All nuisances of P poses and so many channels of the reference, those of no uncertainty too.
 
-    `applied`: what the front end has already taken out, by kind.
+    `applied`: what the front end has already taken out, by kind. Poses of one position share the nuisances of it.
     """
+    found: dict[str, Term] = {}
+    for term in _terms(poses, channels, priors, applied):
+        found[term.name] = term if term.name not in found else found[term.name].with_(term)
+    return list(found.values())
+
+
+def _terms(poses: Sequence[Pose], channels: int, priors: Stated, applied: Mapping[Kind, float]) -> Iterator[Term]:
     yield from _clamp_terms(poses, priors)
     yield from _pose_terms(poses, priors)
     yield from _lean_terms(poses, priors)

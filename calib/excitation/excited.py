@@ -89,14 +89,13 @@ def _reduced(window: Window, live: NDArray[np.bool_], along: Array, noise: Array
             scatter[:, at + k, at + k] = own - np.minimum(sums.count * power[k], MOST_NOISE * own)
     if live.all():
         return replace(window, sums=replace(sums, scatter=scatter))
-    mean = sums.count @ sums.mean[:, :m] / sums.count.sum()
-    # The means of silent channels (gravity, where the reference feels it) are still felt.
-    gravity = pose.gravity_mps2 + pose.direction[:, :m] @ np.where(live, 0.0, mean - along @ mean)
     moving = np.asarray(np.kron(np.eye(channels // m), np.diag(live.astype(float)) + along), dtype=np.float64)
-    # What silent channels did from segment to segment must not come back as scatter between them.
+    # What silent channels did from segment to segment must not come back as scatter between them; their mean over the
+    # window (gravity, where the reference feels it) is still felt.
+    mean = sums.count @ sums.mean / sums.count.sum()
     return replace(
         window,
         # Stated directions stay: what moved along with a live channel was measured by the silent one, with its error.
-        pose=replace(pose, gravity_mps2=gravity, along=moving),
-        sums=WindowSums(channels, sums.count, np.where(both, sums.mean, 0.0), scatter),
+        pose=replace(pose, along=moving),
+        sums=WindowSums(channels, sums.count, np.where(both, sums.mean, mean), scatter),
     )
