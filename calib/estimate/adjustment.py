@@ -15,18 +15,18 @@ import numpy as np
 from calib.distributions import coverage_factor
 from calib.estimate.budget import Budget, budget
 from calib.estimate.condense import Condensed, condense
+from calib.estimate.determined import Flags, determined
 from calib.estimate.equations import Equations
-from calib.estimate.gauss_newton import Flags, Solution, slope_residuals, solve
+from calib.estimate.fixed_mount import mean_input, never_turned
+from calib.estimate.gauss_newton import Solution, slope_residuals, solve
 from calib.estimate.nuisances import Applied, Nuisances, Priors
 from calib.estimate.slope_scatter import SlopeScatter, estimated
 from calib.estimate.verdict import misfit, nuisance_pull, reasons, turned_windows
 from calib.excitation.excited import excited
 from calib.model import Array, Calibration, Pose, Window
 
-DETERMINED_SHARE = 0.5  # of the prior u, which the data must halve (contract)
 SCATTER_TURNS = 3  # the first solution is bent by what it takes for exact; the estimate settles in two
 SCATTER_SETTLED = 0.05
-DETERMINED_U = 0.1  # of the largest main sensitivity, where there is no prior (contract)
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +88,9 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
     used = [w for w in windows if w.used]
     if not used:
         raise ValueError("no window is used")
+    stated = priors
+    if never_turned(np.array([mean_input(w) for w in used])):
+        priors = _without_offset(priors)
     found = [excited(w) for w in used]
     data = condense([e.window for e in found])
     u_lag_s = [max(w.u_lag_s, priors.lag_window_s) if priors.lag_s > 0.0 else 0.0 for w in used]
@@ -100,18 +103,19 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
         scatter = larger
         solution = _solution([e.window for e in found], data, priors, applied, scatter)
     shares = budget(solution, priors.offset_mps2)
-    determined = _determined(solution, shares)
+    u = np.sqrt(np.diag(shares.covariance)[:12])
+    told = determined(solution.x[:12], u, _prior_u(stated), solution.equations.seen)
 
     def turned(static: int, polarity: int) -> Solution:
         reduced = [excited(w).window for w in turned_windows(used, static, polarity)]
         return _solution(reduced, data, priors, applied, scatter)
 
     return Adjustment(
-        calibration=_calibration(solution, shares, determined),
+        calibration=_calibration(solution, shares, told),
         nuisances=_reported(solution, shares),
         contributions=shares.contributions,
-        coverage_factor=coverage_factor(float(np.min(shares.degrees_of_freedom[determined], initial=np.inf))),
-        reasons=tuple(reasons(used, solution, shares, determined, turned)),
+        coverage_factor=coverage_factor(float(np.min(shares.degrees_of_freedom[told], initial=np.inf))),
+        reasons=tuple(reasons(used, solution, shares, told, turned)),
         rank=solution.equations.rank,
         chi2=shares.consistency[0],
         chi2_degrees_of_freedom=shares.consistency[1],
@@ -143,22 +147,28 @@ def _solution(
     return solve(Equations(data, nuisances, pose_of, priors.offset_mps2, scatter), priors)
 
 
-def _determined(solution: Solution, shares: Budget) -> Flags:
-    """(12,) of S row by row and Q: the data halve the prior's u, or leave less than a tenth of the largest main one."""
-    u = np.sqrt(np.diag(shares.covariance)[:12])
-    before = np.sqrt(1.0 / np.diag(solution.prior_precision)[:12])
-    if solution.bounded.any():
-        known = np.flatnonzero(solution.bounded)
-        before[known] = np.sqrt(np.diag(np.linalg.inv(solution.prior_precision[np.ix_(known, known)])))
-    limit = DETERMINED_U * float(np.abs(solution.x[[0, 4, 8]]).max())
-    return np.asarray(np.where(solution.bounded, u < DETERMINED_SHARE * before, solution.equations.seen & (u <= limit)))
+def _prior_u(priors: Priors) -> Array:
+    """(12,) standard uncertainties of S and Q before any data, inf where nothing was known."""
+    if priors.parameters is None or priors.covariance is None:
+        return np.full(12, np.inf)
+    return np.asarray(np.where(np.isfinite(priors.parameters), np.sqrt(np.diag(priors.covariance)), np.inf))
 
 
-def _calibration(solution: Solution, shares: Budget, determined: Flags) -> Calibration:
-    values = np.where(determined, solution.x[:12], np.nan)
-    covariance = np.where(np.outer(determined, determined), shares.covariance[:12, :12], np.nan)
+def _without_offset(priors: Priors) -> Priors:
+    """What was known of Q left out: under a gravity that never turns it would be told of S, through the mean output."""
+    if priors.parameters is None or priors.covariance is None:
+        return priors
+    covariance = priors.covariance.copy()
+    covariance[9:, :], covariance[:, 9:] = 0.0, 0.0
+    covariance[range(9, 12), range(9, 12)] = np.inf
+    return Priors(priors.values, priors.parameters, covariance)
+
+
+def _calibration(solution: Solution, shares: Budget, told: Flags) -> Calibration:
+    values = np.where(told, solution.x[:12], np.nan)
+    covariance = np.where(np.outer(told, told), shares.covariance[:12, :12], np.nan)
     freedom = solution.equations.data.type_a.degrees_of_freedom
-    return Calibration(values[:9].reshape(3, 3), values[9:], covariance, determined, freedom, "3 (adjustment)")
+    return Calibration(values[:9].reshape(3, 3), values[9:], covariance, told, freedom, "3 (adjustment)")
 
 
 def _reported(solution: Solution, shares: Budget) -> tuple[Nuisance, ...]:
