@@ -72,11 +72,17 @@ _VERSION_1_BY_POSITION: Mapping[str, Kind] = {
 
 
 def from_version_1(state: dict[str, Any]) -> None:
-    """Each unknown gets its kind. Raises KeyError for a name that version 1 did not have."""
+    """Each unknown gets its kind. Raises KeyError for a name that version 1 did not have.
+
+    The summary of a window told which of its blocks is which window: a summary has one.
+    """
     for estimation in _estimations(state):
         recursion = estimation["recursion"]
         for joint in (recursion["state"], recursion["base"]):
             joint["quantities"] = [_quantity_of_version_1(name) for name in joint.pop("names")]
+        for summary in (*recursion["recent"], *estimation["held"]):
+            for gone in ("block_window", "mean_omega2"):
+                del summary["data"][gone]
 
 
 def _estimations(state: Mapping[str, Any]) -> Iterator[dict[str, Any]]:

@@ -55,6 +55,7 @@ def test_a_state_of_version_1_goes_on_whole(kept: bytes) -> None:
     restored = taken.estimation.snapshot()["recursion"]
     assert np.array_equal(restored["state"]["factor"], state["factor"])
     assert np.array_equal(restored["state"]["mean"], state["mean"])
+    assert len(restored["recent"]) == len(raw(kept)["state"]["estimation"]["recursion"]["recent"]) > 0
     assert taken.estimation.recursion.windows == unpack(kept)["estimation"]["recursion"]["windows"] > 0
 
 
@@ -85,7 +86,8 @@ def test_a_name_of_version_1_becomes_a_kind(name: str, kind: str, position: str)
 
 def brought_up(names: list[str]) -> dict[str, Any]:
     joint = {"names": names, "mean": np.zeros(len(names)), "factor": np.eye(len(names))}
-    state = raw(pack({"estimation": {"recursion": {"state": joint, "base": dict(joint)}}}))
+    recursion = {"state": joint, "base": dict(joint), "recent": []}
+    state = raw(pack({"estimation": {"recursion": recursion, "held": []}}))
     old = msgspec.msgpack.encode({"version": 1, "state": state["state"]})
     found: dict[str, Any] = unpack(old)["estimation"]["recursion"]["state"]
     return found

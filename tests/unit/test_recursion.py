@@ -124,10 +124,8 @@ def test_motion_that_goes_along_is_none_of_the_excited_column() -> None:
 
 
 def test_a_mean_that_drifts_at_a_fixed_mount_moves_the_offset_alone() -> None:
-    random, found = (
-        np.random.default_rng(3),
-        mounted(wander=replace(Wander.none(), offset_mps2=0.01, offset_rate_mps2=1e-3, offset_rate_walk_mps2=1e-5)),
-    )
+    wander = replace(Wander.none(), offset_mps2=0.01, offset_rate_mps2=1e-3, offset_rate_walk_mps2=1e-5)
+    random, found = np.random.default_rng(3), mounted(wander=wander)
     for k in range(200):
         Q = Q_TRUE + 0.24 * k / 199
         found.update(Summary.of(building_window(random, Q=Q), k / 24))
@@ -165,19 +163,8 @@ def test_nor_by_motion_askew_to_its_channels() -> None:
 
 
 def test_wandering_never_makes_less_known_than_before_any_data() -> None:
-    random, found = (
-        np.random.default_rng(5),
-        mounted(
-            wander=replace(
-                Wander.none(),
-                sensitivity=0.01,
-                offset_mps2=0.1,
-                offset_rate_mps2=1e-3,
-                offset_rate_walk_mps2=1e-3,
-                tilt_rad=0.01,
-            )
-        ),
-    )
+    walks = {"sensitivity": 0.01, "offset_mps2": 0.1, "offset_rate_mps2": 1e-3, "offset_rate_walk_mps2": 1e-3}
+    random, found = np.random.default_rng(5), mounted(wander=replace(Wander.none(), **walks, tilt_rad=0.01))
     found.update(Summary.of(building_window(random), 0.0))
     found.update(Summary.of(building_window(random), 1e6))
     u = found.result().standard_uncertainty

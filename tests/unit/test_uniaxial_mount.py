@@ -1,7 +1,8 @@
-"""A sensor on a mount that does not turn, beside a uniaxial reference: the mount leans, the direction is off."""
+"""A sensor beside a uniaxial reference: a mount that does not turn leans, the direction is off, positions change."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,10 @@ import pytest
 from agent.config import Channel, parse_config
 from agent.core.estimation import Estimation
 from agent.core.snapshot import pack, unpack
+from calib.estimate.nuisances import Priors
+from calib.estimate.recursion import Recursion
+from calib.estimate.wander import TemperatureModel, Wander
+from calib.estimate.window_rows import Summary
 from calib.model import Pose, Window
 from tests.building_windows import GRAVITY
 from tests.clamp_windows import Q_TRUE, S_TRUE, window_of
@@ -151,3 +156,19 @@ def test_a_state_that_does_not_know_the_lean_learns_it_with_the_next_window() ->
 def _covariance(joint: dict[str, Any], kept: list[bool]) -> np.ndarray:
     rows = joint["factor"][kept]
     return np.asarray(rows @ rows.T)
+
+
+def test_of_positions_left_long_ago_nothing_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Along gravity a position has unknowns of motion across it, in phase and in quadrature."""
+    monkeypatch.setattr("calib.estimate.recursion.MOST_POSITIONS", 3)
+    channel, random = channel_of(MOUNTS["along gravity"]), np.random.default_rng(11)
+    prior, stated = channel.prior, pose_of(channel)
+    u = prior.standard_uncertainty(prior.mean(None))
+    found = Recursion(prior.mean(None), u, Priors(), Wander(), TemperatureModel(), fixed=False)
+    for k in range(5):
+        one = window(random, replace(stated, position=f"p{k}"), stated.direction[:, 0], GRAVITY)
+        found.update(Summary.of(one, k / 24.0))
+    quantities = found.snapshot()["state"]["quantities"]
+    assert {position for _, _, position in quantities} == {"", "p2", "p3", "p4"}
+    assert "transverse_a[p4]_quadrature" in found.names
+    assert [name for name in found.names if "p1" in name] == []
