@@ -6,7 +6,7 @@ All times are the gateway's: `t_monotonic_ns` is CLOCK_MONOTONIC of the boot nam
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import msgspec
 import numpy as np
@@ -96,13 +96,28 @@ class Pruned(msgspec.Struct, frozen=True, kw_only=True):
 Event = RunStart | SampleBlock | DeviceChange | Gap | Command | Pruned | Tick
 
 
-class WindowReport(msgspec.Struct, frozen=True, kw_only=True):
-    """The verdict on one window."""
+class Result(msgspec.Struct, frozen=True, kw_only=True):
+    """What follows from events.
+
+    A subclass here and the protobuf message that is called as its `what`, with a capital letter and fields of the same
+    names, make a new kind: it is recorded, stored, published and shown by that name. `routine` results come by
+    schedule: they are not written to the log.
+    """
+
+    what: ClassVar[str]
+    routine: ClassVar[bool] = False
 
     run_id: str
-    sequence: int
+    sequence: int  # of all results of the gateway
     sensor: str
     t_utc_ns: int
+
+
+class WindowReport(Result, frozen=True, kw_only=True):
+    """The verdict on one window."""
+
+    what: ClassVar[str] = "window"
+
     start_s: float  # since the sensor's first sample
     stop_s: float
     position: str
@@ -113,7 +128,7 @@ class WindowReport(msgspec.Struct, frozen=True, kw_only=True):
     numbers: dict[str, float]  # the statistics behind the verdict, each with its unit in its name
 
 
-class CalibrationUpdate(msgspec.Struct, frozen=True, kw_only=True):
+class CalibrationUpdate(Result, frozen=True, kw_only=True):
     """S and Q in force from now on.
 
     Where a parameter is not determined its value and uncertainty are the prior's. At a temperature T the offset is
@@ -121,10 +136,8 @@ class CalibrationUpdate(msgspec.Struct, frozen=True, kw_only=True):
     multiplied by 1 + sensitivity_temperature[i] (T - T0); both were seen between the two ends of the range only.
     """
 
-    run_id: str
-    sequence: int
-    sensor: str
-    t_utc_ns: int
+    what: ClassVar[str] = "calibration"
+
     sensitivity: list[list[float]]
     offset: list[float]
     standard_uncertainty: list[float]  # 12, S row by row, then Q
@@ -148,25 +161,21 @@ class CalibrationUpdate(msgspec.Struct, frozen=True, kw_only=True):
     u_offset_rate: list[float] = []
 
 
-class Estimate(msgspec.Struct, frozen=True, kw_only=True):
+class Estimate(Result, frozen=True, kw_only=True):
     """S and Q as the data have them, not in force: they wait for an operator's `accept` of this `sequence`."""
 
-    run_id: str
-    sequence: int
-    sensor: str
-    t_utc_ns: int
+    what: ClassVar[str] = "estimate"
+
     reason: str
     calibration: CalibrationUpdate
 
 
-class DriftReport(msgspec.Struct, frozen=True, kw_only=True):
+class DriftReport(Result, frozen=True, kw_only=True):
     """The sequential test's verdict on one parameter, whenever it changes. It is the sensor or the reference: data
     cannot tell."""
 
-    run_id: str
-    sequence: int
-    sensor: str
-    t_utc_ns: int
+    what: ClassVar[str] = "drift"
+
     parameter: str  # of calib.model.PARAMETERS
     verdict: Literal["stable", "drifting", "stepped"]
     change: float  # stepped: by how much, output unit (per m/s2)
@@ -180,13 +189,11 @@ class DriftReport(msgspec.Struct, frozen=True, kw_only=True):
     reason: str
 
 
-class StatusChange(msgspec.Struct, frozen=True, kw_only=True):
+class StatusChange(Result, frozen=True, kw_only=True):
     """CalibrationStatus of a sensor, with the reason."""
 
-    run_id: str
-    sequence: int
-    sensor: str
-    t_utc_ns: int
+    what: ClassVar[str] = "status"
+
     status: Literal["UNCALIBRATED", "COLLECTING", "VALID", "HELD", "RECALIBRATING", "INVALID"]
     before: str
     reason: str
@@ -216,5 +223,5 @@ class Acceleration:
     recorded: bool  # whether it goes into the recording as well
 
 
-Result = WindowReport | CalibrationUpdate | Estimate | DriftReport | StatusChange
+RESULTS: dict[str, type[Result]] = {kind.what: kind for kind in Result.__subclasses__()}
 Output = Result | Acceleration
