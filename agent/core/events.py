@@ -199,6 +199,29 @@ class StatusChange(Result, frozen=True, kw_only=True):
     reason: str
 
 
+class ClockReport(Result, frozen=True, kw_only=True):
+    """How the clock of one device runs against the gateway's, once a minute of the run; NaN is unknown.
+
+    A clock model gives each sample its time. `offset_s`, `jitter_s` and `arrivals` are of the bursts that the model
+    rests on: those of the last minute, of a longer time where `window_s` is longer, 8192 at most.
+    """
+
+    what: ClassVar[str] = "clock"
+    routine: ClassVar[bool] = True
+
+    device: str
+    role: Literal["sensor", "reference"]
+    nominal_rate_hz: float  # as the driver states it
+    rate_hz: float  # at the newest sample
+    u_rate_hz: float
+    offset_s: float  # median of: arrival of a burst, less the model's time of the newest sample in it
+    u_offset_s: float
+    jitter_s: float  # SD of the same, robust: 1.4826 times the median absolute deviation from the median
+    lag_s: float  # role sensor: by which its indications come after the reference's; reference: NaN
+    u_lag_s: float
+    arrivals: int
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Acceleration:
     """A block of the corrected stream, a = S^-1 (V - Q) in m/s2, in the sensor's frame.
