@@ -12,7 +12,7 @@ import click
 import msgspec
 
 from agent import __version__
-from agent.core.events import CalibrationUpdate, StatusChange, WindowReport
+from agent.core.events import RESULTS, CalibrationUpdate, StatusChange, WindowReport
 from agent.delivery.history import FILE_NAME, History, Record, StoreError
 from agent.terminal.quantity import size
 
@@ -54,6 +54,7 @@ class SensorHistory:
     calibrations: list[Record]
     windows: list[Record]
     drift: list[Record]  # empty until drift is watched
+    routine: dict[str, list[Record]]  # results that come by schedule, by kind
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +80,7 @@ def read_overview(data_dir: Path, limit: int) -> Overview:
                 calibrations=history.newest(sensor, "calibration", limit=limit),
                 windows=history.newest(sensor, "window", limit=limit),
                 drift=history.newest(sensor, "drift", limit=limit),
+                routine={w: history.newest(sensor, w, limit=limit) for w, kind in RESULTS.items() if kind.routine},
             )
             for sensor in sorted({sensor for sensor, _ in history.channels() if sensor})
         }
@@ -101,6 +103,7 @@ def as_object(overview: Overview) -> dict[str, Any]:
                 "history": [record.fields for record in held.calibrations],
                 "windows": [record.fields for record in held.windows],
                 "drift": [record.fields for record in held.drift],
+                **{what: [record.fields for record in records] for what, records in held.routine.items()},
             }
             for sensor, held in overview.sensors.items()
         },
@@ -128,7 +131,7 @@ def _print(overview: Overview) -> None:
 def _print_sensor(console: Console, sensor: str, held: SensorHistory) -> None:
     from rich.text import Text
 
-    from agent.terminal.wording import STATUS_STYLES, calibration_cells, verdict, window_span
+    from agent.terminal.wording import STATUS_STYLES, calibration_cells, result_lines, verdict, window_span
 
     name, said = "UNCALIBRATED", "no status yet"
     if held.status and isinstance(status := held.status.result, StatusChange):
@@ -150,6 +153,11 @@ def _print_sensor(console: Console, sensor: str, held: SensorHistory) -> None:
         if isinstance(window := record.result, WindowReport):
             words = f"{window_span(window)}  {window.position}  {verdict(window)}"
             console.print(f"    {_time(window.t_utc_ns)}  {words}", soft_wrap=True)
+    for what, records in held.routine.items():
+        console.print(f"  newest {what} results" if records else f"  no {what} result yet", style="dim")
+        for record in records:
+            words = result_lines(record.result, None)[0]
+            console.print(f"    {_time(record.t_utc_ns)}  {words}", soft_wrap=True)
     console.print()
 
 

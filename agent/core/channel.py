@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 
 from agent.config import Channel
+from agent.core.clocks import Clocks
 from agent.core.corrected import acceleration_block
 from agent.core.estimation import DAY_S, Estimation, Judged
 from agent.core.events import Acceleration, CalibrationUpdate, Command, DeviceChange, Estimate, Output, Result, Tick
@@ -58,6 +59,7 @@ class ChannelState:
         self._finder = FoundPositions(channel) if channel.positions else None
         self._places = self._finder or ToldTimes(channel)
         self._refused = 0  # windows in a row
+        self._clocks = Clocks()
         self._now_ns = 0  # monotonic and UTC of the newest event that carried both
         self._utc_minus_monotonic_ns = 0
 
@@ -85,12 +87,12 @@ class ChannelState:
             if self._finder is not None:
                 self._finder.update(block, self._streams[self.sensor], self._estimation.recursion.scale)
             results += self._corrected(block, self._estimation)
-        return results + list(self._close_windows())
+        return results + list(self._close_windows()) + self._clock_reports()
 
     def on_tick(self, tick: Tick) -> list[Result]:
         """Time passed: late windows are refused, a silent sensor turns the status INVALID."""
         self._clock(tick.t_monotonic_ns, tick.t_utc_ns)
-        return list(self._close_windows()) + self._watch_silence()
+        return list(self._close_windows()) + self._watch_silence() + self._clock_reports()
 
     def on_device(self, change: DeviceChange) -> list[Result]:
         """A device of this channel was opened or lost."""
@@ -187,6 +189,9 @@ class ChannelState:
             self._estimation.forget_reference()
         reason = self._not_certified or f"the reference is now {self._reference}, was {before}"
         return self._say_status(reason) or [self._told(reason)]
+
+    def _clock_reports(self) -> list[Result]:
+        return self._clocks.reports(self._source(), self._now_s(), self._streams, self._estimation)
 
     def _lose(self, reason: str) -> list[Result]:
         if self._estimation is not None:
@@ -381,6 +386,7 @@ class ChannelState:
             "refused": self._refused,
             "now_ns": self._now_ns,
             "utc_minus_monotonic_ns": self._utc_minus_monotonic_ns,
+            **self._clocks.snapshot(),
         }
 
     def load(self, state: Mapping[str, Any]) -> None:
@@ -400,5 +406,6 @@ class ChannelState:
         self._first_day, self._status = state["first_day"], state["status"]
         self._places.load(state["places"])
         self._refused = state["refused"]
+        self._clocks.load(state)
         self._now_ns = state["now_ns"]
         self._utc_minus_monotonic_ns = state["utc_minus_monotonic_ns"]

@@ -6,7 +6,7 @@ All times are the gateway's: `t_monotonic_ns` is CLOCK_MONOTONIC of the boot nam
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import msgspec
 import numpy as np
@@ -96,13 +96,28 @@ class Pruned(msgspec.Struct, frozen=True, kw_only=True):
 Event = RunStart | SampleBlock | DeviceChange | Gap | Command | Pruned | Tick
 
 
-class WindowReport(msgspec.Struct, frozen=True, kw_only=True):
-    """The verdict on one window."""
+class Result(msgspec.Struct, frozen=True, kw_only=True):
+    """What follows from events.
+
+    A subclass here and the protobuf message that is called as its `what`, with a capital letter and fields of the same
+    names, make a new kind: it is recorded, stored, published and shown by that name. `routine` results come by
+    schedule: they are not written to the log.
+    """
+
+    what: ClassVar[str]
+    routine: ClassVar[bool] = False
 
     run_id: str
-    sequence: int
+    sequence: int  # of all results of the gateway
     sensor: str
     t_utc_ns: int
+
+
+class WindowReport(Result, frozen=True, kw_only=True):
+    """The verdict on one window."""
+
+    what: ClassVar[str] = "window"
+
     start_s: float  # since the sensor's first sample
     stop_s: float
     position: str
@@ -113,7 +128,7 @@ class WindowReport(msgspec.Struct, frozen=True, kw_only=True):
     numbers: dict[str, float]  # the statistics behind the verdict, each with its unit in its name
 
 
-class CalibrationUpdate(msgspec.Struct, frozen=True, kw_only=True):
+class CalibrationUpdate(Result, frozen=True, kw_only=True):
     """S and Q in force from now on.
 
     Where a parameter is not determined its value and uncertainty are the prior's. At a temperature T the offset is
@@ -121,10 +136,8 @@ class CalibrationUpdate(msgspec.Struct, frozen=True, kw_only=True):
     multiplied by 1 + sensitivity_temperature[i] (T - T0); both were seen between the two ends of the range only.
     """
 
-    run_id: str
-    sequence: int
-    sensor: str
-    t_utc_ns: int
+    what: ClassVar[str] = "calibration"
+
     sensitivity: list[list[float]]
     offset: list[float]
     standard_uncertainty: list[float]  # 12, S row by row, then Q
@@ -148,25 +161,21 @@ class CalibrationUpdate(msgspec.Struct, frozen=True, kw_only=True):
     u_offset_rate: list[float] = []
 
 
-class Estimate(msgspec.Struct, frozen=True, kw_only=True):
+class Estimate(Result, frozen=True, kw_only=True):
     """S and Q as the data have them, not in force: they wait for an operator's `accept` of this `sequence`."""
 
-    run_id: str
-    sequence: int
-    sensor: str
-    t_utc_ns: int
+    what: ClassVar[str] = "estimate"
+
     reason: str
     calibration: CalibrationUpdate
 
 
-class DriftReport(msgspec.Struct, frozen=True, kw_only=True):
+class DriftReport(Result, frozen=True, kw_only=True):
     """The sequential test's verdict on one parameter, whenever it changes. It is the sensor or the reference: data
     cannot tell."""
 
-    run_id: str
-    sequence: int
-    sensor: str
-    t_utc_ns: int
+    what: ClassVar[str] = "drift"
+
     parameter: str  # of calib.model.PARAMETERS
     verdict: Literal["stable", "drifting", "stepped"]
     change: float  # stepped: by how much, output unit (per m/s2)
@@ -180,16 +189,37 @@ class DriftReport(msgspec.Struct, frozen=True, kw_only=True):
     reason: str
 
 
-class StatusChange(msgspec.Struct, frozen=True, kw_only=True):
+class StatusChange(Result, frozen=True, kw_only=True):
     """CalibrationStatus of a sensor, with the reason."""
 
-    run_id: str
-    sequence: int
-    sensor: str
-    t_utc_ns: int
+    what: ClassVar[str] = "status"
+
     status: Literal["UNCALIBRATED", "COLLECTING", "VALID", "HELD", "RECALIBRATING", "INVALID"]
     before: str
     reason: str
+
+
+class ClockReport(Result, frozen=True, kw_only=True):
+    """How the clock of one device runs against the gateway's, once a minute of the run; NaN is unknown.
+
+    A clock model gives each sample its time. `offset_s`, `jitter_s` and `arrivals` are of the bursts that the model
+    rests on: those of the last minute, of a longer time where `window_s` is longer, 8192 at most.
+    """
+
+    what: ClassVar[str] = "clock"
+    routine: ClassVar[bool] = True
+
+    device: str
+    role: Literal["sensor", "reference"]
+    nominal_rate_hz: float  # as the driver states it
+    rate_hz: float  # at the newest sample
+    u_rate_hz: float
+    offset_s: float  # median of: arrival of a burst, less the model's time of the newest sample in it
+    u_offset_s: float
+    jitter_s: float  # SD of the same, robust: 1.4826 times the median absolute deviation from the median
+    lag_s: float  # role sensor: by which its indications come after the reference's; reference: NaN
+    u_lag_s: float
+    arrivals: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -216,5 +246,5 @@ class Acceleration:
     recorded: bool  # whether it goes into the recording as well
 
 
-Result = WindowReport | CalibrationUpdate | Estimate | DriftReport | StatusChange
+RESULTS: dict[str, type[Result]] = {kind.what: kind for kind in Result.__subclasses__()}
 Output = Result | Acceleration

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from calib.model import Array
 from calib.signal.samples import Samples
 from calib.signal.timing import HORIZON_S, ClockFit, ClockModel
 from hw.block import BlockFlags, SampleBlock
@@ -66,6 +67,12 @@ class DeviceStream:
         """(time in s since the origin, rate in Hz) of a sample, by the clock as it is now."""
         clock = self._fit()
         return float(clock.time_of(index)), clock.rate_hz
+
+    def clock(self) -> tuple[ClockFit, Array]:
+        """The clock as it is now, and how late each burst behind it arrived (B,) in s. There must be a block."""
+        clock = self._fit()
+        assert self._clock is not None
+        return clock, self._clock.lateness_s(clock)
 
     def _fit(self) -> ClockFit:
         if self._fitted is None:

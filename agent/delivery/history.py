@@ -14,7 +14,7 @@ from urllib.parse import quote
 
 import msgspec
 
-from agent.core.events import CalibrationUpdate, DriftReport, Estimate, Result, StatusChange, WindowReport
+from agent.core.events import RESULTS, CalibrationUpdate, Result
 from agent.core.memory import Memory
 from agent.delivery.schema import (
     RESULT_COLUMNS,
@@ -31,14 +31,6 @@ from agent.delivery.schema import (
 __all__ = ["FILE_NAME", "History", "Record", "Removed", "StoreError", "connect_read_only"]
 
 FILE_NAME = "state.sqlite"
-_TYPES: dict[str, type[Result]] = {
-    "calibration": CalibrationUpdate,
-    "window": WindowReport,
-    "estimate": Estimate,
-    "drift": DriftReport,
-    "status": StatusChange,
-}
-_KINDS = {kind: what for what, kind in _TYPES.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +61,7 @@ class Record:
             result.sequence,
             result.run_id,
             result.sensor,
-            _KINDS[type(result)],
+            result.what,
             msgspec.json.encode(fields),
             result.t_utc_ns,
             recorded,
@@ -107,7 +99,7 @@ class Record:
     def result(self) -> Result:
         """The result again; null becomes NaN. Raises StoreError where the payload is not of this version."""
         try:
-            return msgspec.convert(_null_to_nan(self.fields), _TYPES[self.what])
+            return msgspec.convert(_null_to_nan(self.fields), RESULTS[self.what])
         except (KeyError, msgspec.ValidationError) as error:
             raise StoreError(f"result {self.sequence}, a {self.what}, cannot be read: {error}") from None
 
@@ -257,7 +249,7 @@ class History:
 
 def result_of(what: str, fields: dict[str, Any]) -> Result | None:
     """The result whose fields these are; None where this version knows no such kind. Raises msgspec.ValidationError."""
-    return msgspec.convert(_null_to_nan(fields), _TYPES[what]) if what in _TYPES else None
+    return msgspec.convert(_null_to_nan(fields), RESULTS[what]) if what in RESULTS else None
 
 
 def _null_to_nan(value: Any) -> Any:

@@ -435,6 +435,42 @@ class Drift(_message.Message):
     reason: str
     def __init__(self, event_sequence: _Optional[int] = ..., run_id: _Optional[str] = ..., sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., parameter: _Optional[str] = ..., verdict: _Optional[str] = ..., change: _Optional[float] = ..., u_change: _Optional[float] = ..., rate: _Optional[float] = ..., u_rate: _Optional[float] = ..., onset_utc_ns: _Optional[int] = ..., statistic: _Optional[float] = ..., threshold: _Optional[float] = ..., false_alarms_a_year: _Optional[float] = ..., reason: _Optional[str] = ...) -> None: ...
 
+class Clock(_message.Message):
+    __slots__ = ("event_sequence", "run_id", "sequence", "sensor", "t_utc_ns", "device", "role", "nominal_rate_hz", "rate_hz", "u_rate_hz", "offset_s", "u_offset_s", "jitter_s", "lag_s", "u_lag_s", "arrivals")
+    EVENT_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    RUN_ID_FIELD_NUMBER: _ClassVar[int]
+    SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    SENSOR_FIELD_NUMBER: _ClassVar[int]
+    T_UTC_NS_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_FIELD_NUMBER: _ClassVar[int]
+    ROLE_FIELD_NUMBER: _ClassVar[int]
+    NOMINAL_RATE_HZ_FIELD_NUMBER: _ClassVar[int]
+    RATE_HZ_FIELD_NUMBER: _ClassVar[int]
+    U_RATE_HZ_FIELD_NUMBER: _ClassVar[int]
+    OFFSET_S_FIELD_NUMBER: _ClassVar[int]
+    U_OFFSET_S_FIELD_NUMBER: _ClassVar[int]
+    JITTER_S_FIELD_NUMBER: _ClassVar[int]
+    LAG_S_FIELD_NUMBER: _ClassVar[int]
+    U_LAG_S_FIELD_NUMBER: _ClassVar[int]
+    ARRIVALS_FIELD_NUMBER: _ClassVar[int]
+    event_sequence: int
+    run_id: str
+    sequence: int
+    sensor: str
+    t_utc_ns: int
+    device: str
+    role: str
+    nominal_rate_hz: float
+    rate_hz: float
+    u_rate_hz: float
+    offset_s: float
+    u_offset_s: float
+    jitter_s: float
+    lag_s: float
+    u_lag_s: float
+    arrivals: int
+    def __init__(self, event_sequence: _Optional[int] = ..., run_id: _Optional[str] = ..., sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., device: _Optional[str] = ..., role: _Optional[str] = ..., nominal_rate_hz: _Optional[float] = ..., rate_hz: _Optional[float] = ..., u_rate_hz: _Optional[float] = ..., offset_s: _Optional[float] = ..., u_offset_s: _Optional[float] = ..., jitter_s: _Optional[float] = ..., lag_s: _Optional[float] = ..., u_lag_s: _Optional[float] = ..., arrivals: _Optional[int] = ...) -> None: ...
+
 class Acceleration(_message.Message):
     __slots__ = ("event_sequence", "sensor", "t_utc_ns", "first_index", "rate_hz", "x", "y", "z", "covariance", "noise", "determined", "calibration_run_id", "calibration_sequence", "dynamic_only")
     EVENT_SEQUENCE_FIELD_NUMBER: _ClassVar[int]

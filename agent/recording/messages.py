@@ -15,11 +15,11 @@ from google.protobuf import descriptor_pb2
 from google.protobuf.message import DecodeError, Message
 
 from agent.core.events import (
+    RESULTS,
     Acceleration,
     CalibrationUpdate,
     Command,
     DeviceChange,
-    DriftReport,
     Estimate,
     Event,
     Gap,
@@ -27,9 +27,7 @@ from agent.core.events import (
     Pruned,
     Result,
     RunStart,
-    StatusChange,
     Tick,
-    WindowReport,
 )
 from agent.proto import fieldcal_pb2 as pb
 from agent.recording.acceleration import decode_acceleration, encode_acceleration
@@ -39,13 +37,6 @@ from hw.block import SampleBlock
 
 PACKAGE = "fieldcal.v1"
 EVENTS_TOPIC = "/events"
-RESULT_TOPICS: dict[type[Any], str] = {
-    WindowReport: "window",
-    CalibrationUpdate: "calibration",
-    Estimate: "estimate",
-    DriftReport: "drift",
-    StatusChange: "status",
-}
 
 _EVENT_FIELDS: dict[type[Any], str] = {
     RunStart: "run_start",
@@ -74,13 +65,13 @@ def topic_of(item: Event | Output) -> str:
     if isinstance(item, Acceleration):
         return f"/{item.sensor}/acceleration"
     if isinstance(item, Result):
-        return f"/{item.sensor}/{RESULT_TOPICS[type(item)]}"
+        return f"/{item.sensor}/{item.what}"
     return EVENTS_TOPIC
 
 
 def is_result_topic(topic: str) -> bool:
     """Whether results are recorded on a topic."""
-    return topic.rsplit("/", 1)[-1] in RESULT_TOPICS.values()
+    return topic.rsplit("/", 1)[-1] in RESULTS
 
 
 def recorded_ones(outputs: Sequence[Output]) -> list[Output]:
@@ -91,7 +82,7 @@ def recorded_ones(outputs: Sequence[Output]) -> list[Output]:
 def schema_of(topic: str) -> str:
     """Full name of the message that is recorded on a topic of this program."""
     names = {"events": "Event", "raw": "RawBlock", "acceleration": "Acceleration"}
-    names |= {name: name.capitalize() for name in RESULT_TOPICS.values()}
+    names |= {what: what.capitalize() for what in RESULTS}
     return f"{PACKAGE}.{names[topic.rsplit('/', 1)[1]]}"
 
 
@@ -114,16 +105,8 @@ def encode(event_sequence: int, item: Event | Output) -> bytes:
         return encode_block(event_sequence, item)
     if isinstance(item, Acceleration):
         return encode_acceleration(event_sequence, item)
-    if isinstance(item, CalibrationUpdate):
-        message: Message = _calibration_message(event_sequence, item)
-    elif isinstance(item, Estimate):
-        message = _estimate_message(event_sequence, item)
-    elif isinstance(item, DriftReport):
-        message = pb.Drift(event_sequence=event_sequence, **msgspec.structs.asdict(item))
-    elif isinstance(item, WindowReport):
-        message = pb.Window(event_sequence=event_sequence, **msgspec.structs.asdict(item))
-    elif isinstance(item, StatusChange):
-        message = pb.Status(event_sequence=event_sequence, **msgspec.structs.asdict(item))
+    if isinstance(item, Result):
+        message = _MESSAGES.get(type(item), _message)(event_sequence, item)
     else:
         message = pb.Event(event_sequence=event_sequence, **{_EVENT_FIELDS[type(item)]: _event_values(item)})
     return message.SerializeToString(deterministic=True)
@@ -172,9 +155,14 @@ def _values(message: Message) -> dict[str, Any]:
     return values
 
 
-def _result_decoder(
-    message_type: Callable[[], Message], kind: type[WindowReport] | type[DriftReport] | type[StatusChange]
-) -> Callable[[bytes], tuple[int, Event | Output]]:
+def _message(event_sequence: int, result: Result) -> Message:
+    kind: Callable[..., Message] = getattr(pb, result.what.capitalize())
+    return kind(event_sequence=event_sequence, **msgspec.structs.asdict(result))
+
+
+def _decoder(kind: type[Result]) -> Callable[[bytes], tuple[int, Event | Output]]:
+    message_type: Callable[[], Message] = getattr(pb, kind.what.capitalize())
+
     def decode_result(data: bytes) -> tuple[int, Event | Output]:
         message = message_type()
         message.ParseFromString(data)
@@ -222,13 +210,16 @@ def _decode_estimate(data: bytes) -> tuple[int, Result]:
     return values.pop("event_sequence"), msgspec.convert(values, Estimate)
 
 
+# What is not encoded field by field: a calibration is flat in its message, so that a viewer can draw each number.
+_MESSAGES: dict[type[Result], Callable[[int, Any], Message]] = {
+    CalibrationUpdate: _calibration_message,
+    Estimate: _estimate_message,
+}
 _DECODERS: dict[str, Callable[[bytes], tuple[int, Event | Output]]] = {
     f"{PACKAGE}.Event": _decode_event,
     f"{PACKAGE}.RawBlock": decode_block,
     f"{PACKAGE}.Acceleration": decode_acceleration,
-    f"{PACKAGE}.Window": _result_decoder(pb.Window, WindowReport),
+    **{f"{PACKAGE}.{what.capitalize()}": _decoder(kind) for what, kind in RESULTS.items()},
     f"{PACKAGE}.Calibration": _decode_calibration,
     f"{PACKAGE}.Estimate": _decode_estimate,
-    f"{PACKAGE}.Drift": _result_decoder(pb.Drift, DriftReport),
-    f"{PACKAGE}.Status": _result_decoder(pb.Status, StatusChange),
 }

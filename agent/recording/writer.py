@@ -13,9 +13,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol
 
-from agent.core.events import Event, Output, Pruned, RunStart
+from agent.core.events import RESULTS, Event, Output, Pruned, RunStart
 from agent.recording.files import RecordingFile, newest, recordings, sync_directory
-from agent.recording.messages import EVENTS_TOPIC, RESULT_TOPICS, encode, topic_of
+from agent.recording.messages import EVENTS_TOPIC, encode, topic_of
 from agent.recording.pruned_ranges import PRUNED_METADATA, Ranges, from_metadata, merged, to_metadata
 from agent.recording.repair import close_torn
 from agent.recording.retention import FOR_EVER, KeepFiles, delete, due, free_bytes
@@ -65,7 +65,7 @@ class Recorder:
         signer: Signer | None = None,
     ) -> None:
         self._directory = directory
-        results = [f"/{sensor}/{what}" for sensor in sensors for what in RESULT_TOPICS.values()]
+        results = [f"/{sensor}/{what}" for sensor in sensors for what in RESULTS]
         self._topics = [EVENTS_TOPIC, *(f"/{device}/raw" for device in devices), *results]
         self._max_bytes = max_bytes
         self._max_age_ns = int(max_age_s * 1e9)

@@ -137,12 +137,10 @@ class DeviceWatch:
     def _clock_quality(self) -> ClockQuality | None:
         if self._clock is None or self._bursts < CLOCK_FROM_BURSTS:
             return None
-        held = self._clock.snapshot()
         try:
             with np.errstate(all="ignore"):
                 fit = self._clock.result()
-                residual_s = np.asarray(held["arrival_s"]) - fit.time_of(np.asarray(held["index"]))
-                figures = (fit.rate_hz, fit.u_rate_hz, float(residual_s.std()))
+                figures = (fit.rate_hz, fit.u_rate_hz, float(self._clock.lateness_s(fit).std()))
         except np.linalg.LinAlgError:
             return None
         if not np.isfinite(figures).all():

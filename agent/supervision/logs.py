@@ -22,7 +22,6 @@ from typing import Any
 import msgspec
 
 from agent.core.events import Command, DeviceChange, Event, Gap, Pruned, Result
-from agent.recording.messages import RESULT_TOPICS
 from agent.terminal.wording import result_lines
 
 _JOURNAL = logging.getLogger("fieldcal")
@@ -170,7 +169,8 @@ def log_event(event: Event, results: Sequence[Result]) -> None:
         message = f"recordings {event.first_file} to {event.last_file} were deleted to keep to the limits"
         tell("pruned", message, first_file=event.first_file, last_file=event.last_file, bytes=event.bytes)
     for result in results:
-        tell(RESULT_TOPICS[type(result)], result_lines(result, None)[0], **_fields(result))
+        if not result.routine:
+            tell(result.what, result_lines(result, None)[0], **_fields(result))
 
 
 def tell(event: str, message: str, trouble: bool = False, **fields: Any) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import msgspec
 import numpy as np
 
 from agent.core.events import CalibrationUpdate, DriftReport, Estimate, Result, StatusChange, WindowReport
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from agent.delivery.publication import PublicationState
     from agent.terminal.state import RecordingState, Truth
 
+COVERAGE_FACTOR = 2.0  # of U in words, for about 95 % coverage
 STATUS_STYLES = {"VALID": "bold green", "HELD": "yellow", "RECALIBRATING": "yellow", "INVALID": "bold red"}
 
 
@@ -33,6 +35,21 @@ def result_lines(result: Result, truth: Truth | None) -> list[str]:
             lines = [f"{result.sensor}: calibration from {result.windows} windows, {uncertainty_words(result)}"]
             lines += [f"  {row}" for row in calibration_rows(result)]
             return lines + ([f"  {truth_line(result, truth)}"] if truth else [])
+        case _:
+            return [f"{result.sensor}: {', '.join([result.what, *_fields(result)])}"]
+
+
+def _fields(result: Result) -> list[str]:
+    """Name and value of each field of a kind of result that has no words of its own; `u_x` stands behind `x`, as U."""
+    common = Result.__struct_fields__
+    values = {name: value for name, value in msgspec.structs.asdict(result).items() if name not in common}
+    words = []
+    for name, value in values.items():
+        if f"u_{name}" in values:
+            words.append(f"{name} {plus_minus(value, COVERAGE_FACTOR * values[f'u_{name}'])}")
+        elif not (name.startswith("u_") and name[2:] in values):
+            words.append(f"{name} {value:.6g}" if isinstance(value, float) else f"{name} {value}")
+    return words
 
 
 def verdict(window: WindowReport) -> str:

@@ -124,6 +124,11 @@ class ClockModel:
             raise ValueError("no burst yet")
         return parabola(self._index, self._arrival_s, self._nominal_rate_hz).clock(self._index[0], self._index[-1])
 
+    def lateness_s(self, clock: ClockFit) -> Array:
+        """How late each burst of the last minute arrived (B,): its arrival less the time that `clock` gives its newest
+        sample, in s."""
+        return np.asarray(self._arrival_s - clock.time_of(self._index))
+
     def snapshot(self) -> dict[str, float | IntArray | Array]:
         """All of the state, exactly."""
         return {

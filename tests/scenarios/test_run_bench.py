@@ -20,9 +20,12 @@ from tests.scenarios.processes import fieldcal, interrupt, recordings, results, 
 
 ENDPOINT = "tcp/127.0.0.1:7447"
 KEY = "fieldcal/v1/virtual/bench/mems/calibration"
+CLOCK_KEY = "fieldcal/v1/virtual/bench/mems/clock"
+ALL = zenoh.ConsolidationMode.NONE
 SEED = 1
 # Of bench time: S and Q are in force after 39 to 52 s, on a busy machine that lost samples once round later.
 THROUGH_S = 112.0
+CLOCKS_S = 70.0  # from the start at most: clock results come after each minute
 
 
 @dataclass(frozen=True)
@@ -31,6 +34,7 @@ class Run:
     output: str
     live: list[dict[str, Any]]  # calibrations that a plain Zenoh client saw, from before the start on
     late: list[dict[str, Any]]  # what one that came later got from a plain get
+    clocks: list[dict[str, Any]]  # and all clock results
     stopped_in_s: float
     exit_status: int
 
@@ -47,11 +51,12 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
         with started("run", "--seed", str(SEED), "--data-dir", data_dir, output=output) as process:
             # Positions end after 13, 26, 39 and 52 s; three alphas determine all parameters, the fourth improves.
             wait_until(lambda: len(results(data_dir, "calibration")) >= 2, THROUGH_S + 10, "two calibrations")
-            late = late_client()
+            wait_until(lambda: len(results(data_dir, "clock")) >= 2, CLOCKS_S, "the clocks of a minute")
+            late, clocks = late_client(KEY), late_client(CLOCK_KEY + "?after=0")
             stopped_in_s = interrupt(process)
         subscriber.undeclare()
         taker.join(5.0)
-    return Run(data_dir, output.read_text(), live, late, stopped_in_s, process.returncode)
+    return Run(data_dir, output.read_text(), live, late, clocks, stopped_in_s, process.returncode)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -71,9 +76,9 @@ def open_client() -> zenoh.Session:
     return zenoh.open(config)
 
 
-def late_client() -> list[dict[str, Any]]:
+def late_client(selector: str) -> list[dict[str, Any]]:
     with open_client() as session:
-        return [payload(reply.ok) for reply in session.get(KEY) if reply.ok is not None]
+        return [payload(reply.ok) for reply in session.get(selector, consolidation=ALL) if reply.ok is not None]
 
 
 def payload(sample: zenoh.Sample) -> dict[str, Any]:
@@ -103,6 +108,20 @@ def test_every_calibration_reached_a_plain_client(run: Run) -> None:
 
 def test_a_client_that_comes_later_gets_the_one_in_force(run: Run) -> None:
     assert run.late == results(run.data_dir, "calibration")[-1:]
+
+
+def test_the_clocks_of_both_devices_are_told_after_a_minute(run: Run) -> None:
+    stored = results(run.data_dir, "clock")
+    assert run.clocks == stored[: len(run.clocks)]
+    assert [(c["device"], c["role"]) for c in stored[:2]] == [("reference", "reference"), ("mems", "sensor")]
+    for clock in stored:
+        assert clock["nominal_rate_hz"] == 1000.0
+        true_hz = {"mems": 1003.3, "reference": 1000.04}[clock["device"]]
+        assert abs(clock["rate_hz"] - true_hz) < 4.0 * clock["u_rate_hz"] + 0.02  # a wander of 20 ppm
+        assert clock["u_rate_hz"] < 0.1
+        assert 0.0 < clock["jitter_s"] < 0.02
+    assert abs(stored[1]["lag_s"]) < 0.05
+    assert "clock" not in run.output
 
 
 def test_ctrl_c_ends_it_in_two_seconds_with_files_closed(run: Run) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from agent.core.events import CalibrationUpdate, StatusChange, WindowReport
+from agent.core.events import CalibrationUpdate, ClockReport, StatusChange, WindowReport
 
 
 def window(sequence: int, *, used: bool = True, reason: str = "", left_out: int = 0) -> WindowReport:
@@ -61,4 +61,26 @@ def status(sequence: int, value: str = "VALID", reason: str = "8 windows") -> St
         status=value,  # type: ignore[arg-type]
         before="COLLECTING",
         reason=reason,
+    )
+
+
+def clock(sequence: int, *, device: str = "mems") -> ClockReport:
+    """A clock 0.03 % slow, 2.5 ms behind the reference's."""
+    sensor = device == "mems"
+    return ClockReport(
+        run_id="r",
+        sequence=sequence,
+        sensor="mems",
+        t_utc_ns=1_700_000_000_000_000_000 + sequence,
+        device=device,
+        role="sensor" if sensor else "reference",
+        nominal_rate_hz=1000.0,
+        rate_hz=999.7123,
+        u_rate_hz=0.0021,
+        offset_s=3.1e-4,
+        u_offset_s=1.2e-5,
+        jitter_s=2.2e-4,
+        lag_s=2.5e-3 if sensor else math.nan,
+        u_lag_s=1.5e-4 if sensor else math.nan,
+        arrivals=3000,
     )

@@ -21,7 +21,7 @@ import pytest
 from agent.core.events import Command, DeviceChange, Gap, Pruned
 from agent.supervision.logs import WAITING_MAX, JsonFormatter, JsonLog, log_event, under_journal, without_secrets
 from tests.scenarios.processes import fieldcal
-from tests.unit.results import calibration, status, window
+from tests.unit.results import calibration, clock, status, window
 from tests.unit.zenoh_site import wait_for
 
 KEY = "-----BEGIN PRIVATE KEY-----\nMC4CAQAwBQYDK2VwBCIEIB\n-----END PRIVATE KEY-----"
@@ -68,7 +68,7 @@ def test_what_happens_is_an_object_a_line_with_its_fields(piped: Piped) -> None:
     pruned = {"first_file": 3, "last_file": 5, "last_sha256": "0" * 64, "bytes": 7}
     log_event(Pruned(t_monotonic_ns=1, t_utc_ns=1, **pruned), [])
     command = Command(sensor="mems", verb="hold", t_monotonic_ns=1, t_utc_ns=1, key_id="k1", refused="expired")
-    log_event(command, [window(1), calibration(2, qz_known=False), status(3)])
+    log_event(command, [window(1), calibration(2, qz_known=False), status(3), clock(4)])  # a routine result is not told
     entries = piped.entries()
     assert [(e["event"], e["level"]) for e in entries] == [
         ("device", "warning"), ("gap", "warning"), ("pruned", "info"), ("command", "warning"), ("window", "info"),

@@ -18,16 +18,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agent.core.events import (
+    RESULTS,
     CalibrationUpdate,
     Command,
     DeviceChange,
-    DriftReport,
     Estimate,
     Gap,
     RunStart,
-    StatusChange,
     Tick,
-    WindowReport,
 )
 from agent.proto import fieldcal_pb2 as pb
 from agent.recording.messages import MessageError, decode, encode, schema_data, schema_of, topic_of
@@ -41,10 +39,9 @@ STRUCTS = [
     Gap,
     Command,
     Tick,
-    WindowReport,
-    DriftReport,
-    StatusChange,
+    *(kind for what, kind in RESULTS.items() if what not in ("calibration", "estimate")),
 ]
+NAMES = ["Event", "RawBlock", *(what.capitalize() for what in RESULTS)]
 INTEGER = st.integers(-(2**63), 2**63 - 1)
 NUMBER = st.floats(width=64)
 SPECIAL = [float("nan"), -0.0, float("inf"), -float("inf"), 5e-324, math.pi]
@@ -199,7 +196,7 @@ def test_a_block_on_the_wire_is_a_plain_packed_message(device: str) -> None:
     assert list(message.z_counts) == (sent.indications[:, 2].tolist() if device == "acc" else [])
 
 
-@pytest.mark.parametrize("name", ["Event", "RawBlock", "Window", "Calibration", "Status"])
+@pytest.mark.parametrize("name", NAMES)
 def test_a_schema_alone_decodes_its_messages(name: str) -> None:
     pool = descriptor_pool.DescriptorPool()
     for file in descriptor_pb2.FileDescriptorSet.FromString(schema_data(f"fieldcal.v1.{name}")).file:
@@ -210,7 +207,10 @@ def test_a_schema_alone_decodes_its_messages(name: str) -> None:
     assert list(pool.FindFileByName("agent/proto/fieldcal.proto").message_types_by_name) == [name]
 
 
-@given(name=st.sampled_from(["Event", "RawBlock", "Window", "Calibration", "Status"]), data=st.binary(max_size=200))
+@given(
+    name=st.sampled_from(NAMES),
+    data=st.binary(max_size=200),
+)
 def test_any_bytes_decode_or_are_refused(name: str, data: bytes) -> None:
     with contextlib.suppress(MessageError):
         decode(f"fieldcal.v1.{name}", data)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -15,10 +16,11 @@ import pytest
 import zenoh
 from zenoh.ext import AdvancedSubscriber, HistoryConfig, declare_advanced_subscriber
 
-from agent.delivery.history import StoreError
+from agent.delivery.history import Record, StoreError
 from agent.delivery.publication import Publisher
 from agent.delivery.session import EndpointError, session_config
 from agent.delivery.store import Store
+from tests.unit.results import clock
 from tests.unit.zenoh_site import KEY, Site, record, router_process, sequence_of, wait_for
 
 ALL = zenoh.ConsolidationMode.NONE
@@ -94,6 +96,26 @@ def test_what_is_published_arrives_in_order_as_json_with_the_number_before(
     assert {str(s.encoding) for s in samples} == {"application/json"}
     assert numbers_before(samples) == ["0", "1", "2"]
     wait_for(lambda: store.published() == 3)
+
+
+def test_the_clocks_of_both_devices_are_published_as_json_and_a_late_get_brings_the_sensors(
+    site: Site, store: Store, publisher: Publisher
+) -> None:
+    pair = [Record.of(clock(n, device=d), recorded=True, recording="f") for n, d in ((1, "reference"), (2, "mems"))]
+    with site.client() as client:
+        subscriber = client.declare_subscriber(f"{KEY}/mems/clock", zenoh.handlers.RingChannel(10))
+        publisher.start()
+        wait_for(lambda: publisher.state().connected)
+        store.commit(pair)
+        publisher.publish(pair[1])
+        told = [json.loads(sample.payload.to_string()) for sample in samples_up_to(subscriber, 2)]
+        assert get(client, f"{KEY}/mems/clock") == [2]
+        assert get(client, f"{KEY}/mems/clock?after=0") == [1, 2]
+    assert [(fields["device"], fields["lag_s"]) for fields in told] == [("reference", None), ("mems", 2.5e-3)]
+    assert set(told[0]) == {
+        "run_id", "sequence", "sensor", "t_utc_ns", "device", "role", "nominal_rate_hz", "rate_hz", "u_rate_hz",
+        "offset_s", "u_offset_s", "jitter_s", "lag_s", "u_lag_s", "arrivals", "recorded",
+    }  # fmt: skip
 
 
 def test_the_gateway_speaks_for_itself_under_its_own_key(site: Site, store: Store, publisher: Publisher) -> None:

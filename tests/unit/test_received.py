@@ -20,7 +20,7 @@ def payload(**changes: Any) -> bytes:
     return msgspec.json.encode({name: value for name, value in fields.items() if value != "left out"})
 
 
-@pytest.mark.parametrize("what", ["window", "calibration", "status"])
+@pytest.mark.parametrize("what", ["window", "calibration", "status", "clock"])
 def test_a_result_is_taken(what: str) -> None:
     whole = record(7, what)
     received = receive(f"{KEY}/mems/{what}", whole.payload, b"6")

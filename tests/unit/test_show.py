@@ -16,7 +16,7 @@ from agent.cli.show import show
 from agent.core.events import Result as PipelineResult
 from agent.delivery.history import FILE_NAME, Record
 from agent.delivery.store import Store
-from tests.unit.results import calibration, status, window
+from tests.unit.results import calibration, clock, status, window
 
 
 def run_show(*arguments: str | Path) -> Result:
@@ -59,6 +59,20 @@ def test_json_is_one_object_with_the_results_as_published(tmp_path: Path) -> Non
     assert [r["sequence"] for r in mems["windows"]] == [1]
     assert mems["drift"] == []
     assert shown["recordings"] == [{"file": "fieldcal-000001.mcap", "size_bytes": 1500, "finished": True}]
+
+
+def test_the_newest_clock_results_are_shown_by_their_fields(tmp_path: Path) -> None:
+    fill(tmp_path, status(1), *(clock(n, device=d) for n, d in enumerate(("reference", "mems") * 2, start=2))).close()
+    said = run_show("--data-dir", tmp_path, "--limit", "2").stdout
+    assert said.count("mems: clock, device ") == 2
+    assert (
+        "mems: clock, device mems, role sensor, nominal_rate_hz 1000, rate_hz 999.7123 ± 0.0042, offset_s 0.000310 ±"
+        " 0.000024, jitter_s 0.00022, lag_s 0.00250 ± 0.00030, arrivals 3000"
+    ) in said
+    assert "device reference, role reference" in said
+    assert "lag_s –" in said
+    shown = json.loads(run_show("--data-dir", tmp_path, "--json", "-").stdout)
+    assert [r["device"] for r in shown["sensors"]["mems"]["clock"]] == ["mems", "reference"] * 2
 
 
 def test_a_calibration_that_is_not_in_force_is_history(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ import zenoh
 from agent.delivery.history import Record
 from agent.delivery.router import open_router
 from agent.delivery.session import session_config
-from tests.unit.results import calibration, status, window
+from tests.unit.results import calibration, clock, status, window
 
 KEY = "fieldcal/v1/site/gw"
 
@@ -48,7 +48,7 @@ class Site:
 
 def record(sequence: int, what: str = "window", sensor: str = "mems", **fields: Any) -> Record:
     """A result; `fields` are added to its payload."""
-    whole = {"window": window, "calibration": calibration, "status": status}[what](sequence)
+    whole = {"window": window, "calibration": calibration, "status": status, "clock": clock}[what](sequence)
     payload = {**msgspec.structs.asdict(whole), "sensor": sensor, "recorded": True, **fields}
     return Record(sequence, "run-1", sensor, what, msgspec.json.encode(payload), 1000 + sequence, True, "f.mcap")
 
