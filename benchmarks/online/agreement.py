@@ -40,7 +40,7 @@ STILL: dict[str, Any] = {
     "sensitivity_pct": 0.0, "offset_mps2": 0.0, "offset_rate_mps2": 0.0, "offset_rate_walk_mps2": 0.0,
     "tilt_deg": 0.0, "reference_pct": 0.0,
 }  # fmt: skip
-TIMING = Timing(20.0, 0.0, 12)
+TIMING = Timing(20.0, 60.0, 12)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,7 +73,7 @@ def bench_day(seed: int) -> Both:
 
 
 def building(seed: int) -> Both:
-    """A building that moves on all axes, four minutes of it."""
+    """A building that moves on all axes, twelve visits of 20 s."""
     drawn = node(seed, all_axes=True, timing=TIMING)
     return both(drawn.config, list(visits(drawn.building, range(TIMING.windows))))
 
@@ -128,7 +128,11 @@ def _offline(channel: Channel, sensor: tuple[Array, Array, float], reference: tu
     stamps, values, first_s = sensor
     if channel.rotation is not None:
         rows = [channel.rotation[i : i + 3] for i in (0, 3, 6)]
-        poses = [PoseInterval(first_s, float(stamps[-1]) - 2.0, beside(rows, channel.rotation_gravity_mps2))]
+        pose, starts = (
+            beside(rows, channel.rotation_gravity_mps2),
+            first_s + channel.every_s * np.arange(TIMING.windows),
+        )
+        poses = [PoseInterval(s, s + channel.window_s + 2.0 * channel.guard_s, pose) for s in starts.tolist()]
     else:
         poses = [PoseInterval(first_s + p.start_s, first_s + p.stop_s, pose_of(p, channel)) for p in channel.poses]
     mean = channel.prior.mean(1.0)

@@ -11,7 +11,7 @@ from calib.model import Window
 
 TURNS = 4  # each turn leaves a thousandth of the lag
 # Of a lag that windows still have: (omega lag)^3 / 6 is what the equations' own second order leaves of it.
-PHASE_LEFT = 1e-5
+PHASE_LEFT = 1e-8
 Made = TypeVar("Made")
 
 

@@ -26,6 +26,7 @@ import numpy as np
 
 from calib.distributions import coverage_factor
 from calib.estimate.correction import Law
+from calib.estimate.determined import determined
 from calib.estimate.fixed_mount import Held, held_at
 from calib.estimate.gauss_newton import Flags
 from calib.estimate.innovation import Innovation, innovation
@@ -37,7 +38,6 @@ from calib.estimate.wander import TemperatureModel, Wander, wandered
 from calib.estimate.window_rows import Noise, Summary, WindowRows
 from calib.model import Array, Calibration
 
-DETERMINED_SHARE = 0.5  # of the prior's u, which the data must halve (contract)
 MOST_RECENT = 48  # windows: four times round twelve positions
 ITERATIONS = 6
 MOST_POSITIONS = 48  # whose own nuisances are kept; of the oldest ones nothing but their effect on S and Q remains
@@ -104,8 +104,9 @@ class Recursion:
 
     @property
     def determined(self) -> Flags:
-        """(12,) whose standard uncertainty is below half of that before any data."""
-        return np.asarray(np.sqrt(np.diag(self._parameters()[1])) < DETERMINED_SHARE * self._prior_u)
+        """(12,) see calib.estimate.determined."""
+        mean, covariance = self._parameters()
+        return determined(mean, np.sqrt(np.diag(covariance)), self._prior_u, np.ones(12, dtype=bool))
 
     def result(self) -> Calibration:
         """S and Q as they are; where a parameter is not determined, still what was known beforehand of it."""
