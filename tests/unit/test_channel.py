@@ -161,7 +161,7 @@ def test_a_state_made_with_another_configuration_is_not_gone_on_with() -> None:
     assert said(again.results) == [
         (
             "VALID",
-            "begun anew from the calibration in force: the configuration has another temperature, uncertainty",
+            "begun anew from the calibration in force: these settings have changed: temperature, uncertainty",
         )
     ]
     [update] = updates(again.results)
@@ -185,7 +185,7 @@ def test_a_new_prior_is_an_operators_word() -> None:
     site.play(3)
     again = begun(site_config(prior={"sensitivity": 1.01}), kept=site.kept(), day=1.0)
     assert updates(again.results) == []
-    assert said(again.results) == [("UNCALIBRATED", "begun anew from the prior: the configuration has another prior")]
+    assert said(again.results) == [("UNCALIBRATED", "begun anew from the prior: these settings have changed: prior")]
 
 
 @pytest.mark.parametrize(
