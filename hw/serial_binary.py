@@ -10,11 +10,10 @@ import serial
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from hw.block import BlockFlags, DeviceInfo
+from hw.block import LARGEST, BlockFlags, DeviceInfo
 from hw.cutting import Break, Cutter, follow
 from hw.frame_stream import Decoded, FrameStream
 from hw.frames import CHECKSUMS, WIDTH, ByteOrder, ChecksumName, Found, Layout, NumberType, numbers
-from hw.lines import LARGEST
 from hw.serial_sensor import LONGEST_GAP_S, SerialOptions, SerialSensor
 
 BITS_A_BYTE = 10  # with start and stop bit

@@ -111,6 +111,7 @@ class WindowReport(msgspec.Struct, frozen=True, kw_only=True):
     points: int
     left_out: int
     numbers: dict[str, float]  # the statistics behind the verdict, each with its unit in its name
+    fault: str = ""  # where the program itself failed: exception, file and line; "" where it did not
 
 
 class CalibrationUpdate(msgspec.Struct, frozen=True, kw_only=True):

@@ -75,13 +75,13 @@ def drift_report(source: Source, verdict: DriftVerdict, false_alarms_a_year: flo
 
 
 def window_report(
-    source: Source, window: Window, *, used: bool, reason: str, numbers: dict[str, float]
+    source: Source, window: Window, *, used: bool, reason: str, numbers: dict[str, float], fault: str = ""
 ) -> WindowReport:
     """The verdict on a window, the gate's numbers after the excitation's."""
     return WindowReport(
         run_id="", sequence=0, sensor=source.sensor, t_utc_ns=source.t_utc_ns, start_s=window.start_s,
         stop_s=window.stop_s, position=window.pose.position, used=used, reason=reason, points=window.points,
-        left_out=window.left_out, numbers={**window.numbers, **numbers},
+        left_out=window.left_out, numbers={**window.numbers, **numbers}, fault=fault,
     )  # fmt: skip
 
 
