@@ -16,7 +16,7 @@ from agent.core.fault import told
 from agent.core.identity import identity_of, nominal_of, not_certified
 from agent.core.kept import keep, plain, shelved, take_up, update_of
 from agent.core.operators import CommandError, answer, commanded_pose
-from agent.core.outcome import Source, calibration_update, drift_report, estimate, status_change, window_report
+from agent.core.outcome import Source, again, calibration_update, drift_report, estimate, status_change, window_report
 from agent.core.streams import Streams, Verdict
 from agent.core.windows import refused
 from calib.model import Pose, Window
@@ -105,12 +105,12 @@ class ChannelState:
         try:
             if command.verb == "pose":
                 return self._turn(commanded_pose(command, self._channel))
-            said = answer(command, self._estimation, self.identity)
+            said, earlier = answer(command, self._estimation, self.identity)
         except CommandError as error:
             return [self._told(f"{command.verb} refused: {error}")]
         if said.refused:
             return [self._told(f"{command.verb} refused: {said.refused}")]
-        results: list[Result] = [self._put_in_force()] if said.calibration is not None else []
+        results: list[Result] = [self._put_in_force(earlier)] if said.calibration is not None else []
         return [*results, *(self._say_status(said.reason) or [self._told(said.reason)])]
 
     # --- time and identity
@@ -248,9 +248,11 @@ class ChannelState:
             yield self._put_in_force()
         yield from self._say_status(decision.reason)
 
-    def _put_in_force(self) -> CalibrationUpdate:
+    def _put_in_force(self, earlier: CalibrationUpdate | None = None) -> CalibrationUpdate:
+        """What the estimation has in force; `earlier` is the update that made it, where it was made before."""
         assert self._estimation is not None
-        self._in_force = calibration_update(self._source(), self._estimation.in_force, self._estimation.recursion)
+        update = calibration_update(self._source(), self._estimation.in_force, self._estimation.recursion)
+        self._in_force = update if earlier is None else again(update, earlier)
         return self._in_force
 
     def number(self, results: Sequence[Result]) -> None:
@@ -291,7 +293,7 @@ class ChannelState:
         self._first_day = kept.day + pause_days - self._now_s() / DAY_S
         if kept.in_force is None:
             return [], kept.reason
-        self._in_force = msgspec.structs.replace(kept.in_force, t_utc_ns=self._utc_ns())
+        self._in_force = again(msgspec.structs.replace(kept.in_force, t_utc_ns=self._utc_ns()), kept.in_force)
         return [self._in_force], kept.reason
 
     def snapshot(self) -> dict[str, Any]:

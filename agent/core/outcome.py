@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from agent.core.events import CalibrationUpdate, DriftReport, Estimate, StatusChange, WindowReport
@@ -46,6 +47,12 @@ def calibration_update(source: Source, calibration: Calibration, recursion: Recu
         sensitivity_temperature=S_temperature[0], u_sensitivity_temperature=S_temperature[1],
         offset_rate=rate, u_offset_rate=u_rate,
     )  # fmt: skip
+
+
+def again(update: CalibrationUpdate, before: CalibrationUpdate) -> CalibrationUpdate:
+    """An update by which a calibration comes into force that was in force `before`: it is still that one."""
+    run_id, sequence = before.made
+    return msgspec.structs.replace(update, made_run_id=run_id, made_sequence=sequence, made_utc_ns=before.date_utc_ns)
 
 
 def calibration_of(update: CalibrationUpdate) -> Calibration:
