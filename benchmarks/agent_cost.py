@@ -30,7 +30,7 @@ driver = "serial-csv"
 options = {{ port = "{link}-reference", rate_hz = 1000, axes = 1, sequence = true, unit = "m/s2" }}
 [[channels]]
 sensor = "mems"
-prior = {{}}
+prior = {{ sensitivity = 26105 }}
 reference = "reference"
 poses_repeat_s = 52
 poses = [

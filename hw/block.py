@@ -9,6 +9,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+LARGEST = 1e12  # of an indication: no unit needs more, and squares and sums of it stay finite
+
 
 class BlockFlags(enum.IntFlag):
     """What a reader must know about a block before it trusts it."""

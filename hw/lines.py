@@ -9,8 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hw.block import LARGEST
+
 MAX_LINE_BYTES = 256  # with its newline; four decimals of the longest kind have 220; more without a newline is no line
-LARGEST = 1e12  # no unit of indication needs more, and squares and sums of it stay finite
 # What float() takes besides (nan, inf, 1_000) is no indication; the counts bound a line and hold any repr of a double.
 _DECIMAL = rb"[ \t]{0,4}[+-]?(?:\d{1,16}(?:\.\d{0,24})?|\.\d{1,24})(?:[eE][+-]?\d{1,3})?[ \t]{0,4}"
 

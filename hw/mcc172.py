@@ -43,6 +43,15 @@ class Mcc172Options(Options):
             raise ValueError(f"{value:g} Hz is not 51200 Hz over 1 to 256; the nearest is {near:g} Hz")
         return BASE_RATE_HZ / divider
 
+    def check_installed(self) -> None:
+        """Raises ConfigurationError, with what to install, where the vendor's library is not there."""
+        _library()
+
+    @property
+    def tells_sensitivity(self) -> bool:
+        """It tells mV; the sensitivity is that of the sensor behind it."""
+        return False
+
 
 class Mcc172(BufferedSensor):
     """One channel, in mV as calibrated by the board; the sensor's sensitivity is applied elsewhere."""

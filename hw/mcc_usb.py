@@ -36,6 +36,15 @@ class MccUsbOptions(Options):
     iepe: bool = Field(False, description="feed the sensors a constant current, AC-coupled, where the board can")
     serial_number: str = Field("", description="of the sensor, as on its plate")
 
+    def check_installed(self) -> None:
+        """Raises ConfigurationError, with what to install, where the vendor's library is not there."""
+        _library()
+
+    @property
+    def tells_sensitivity(self) -> bool:
+        """It tells mV; the sensitivity is that of the sensor behind it."""
+        return False
+
 
 class MccUsb(BufferedSensor):
     """Calibrated by the board, in mV; the sensor's sensitivity is applied elsewhere."""

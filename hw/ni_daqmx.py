@@ -42,6 +42,15 @@ class NiOptions(Options):
             raise ValueError(f"each is device/input, as in cDAQ1Mod1/ai0, not {', '.join(value)}")
         return value
 
+    def check_installed(self) -> None:
+        """Raises ConfigurationError, with what to install, where the vendor's library is not there."""
+        _library()
+
+    @property
+    def tells_sensitivity(self) -> bool:
+        """It tells mV; the sensitivity is that of the sensor behind it."""
+        return False
+
 
 class Ni(BufferedSensor):
     """In mV, as calibrated by the device; the sensor's sensitivity is applied elsewhere."""

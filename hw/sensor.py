@@ -42,6 +42,14 @@ class Options(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+    def check_installed(self) -> None:
+        """Raises ConfigurationError, with what to install, where a library that the driver needs is not there."""
+
+    @property
+    def tells_sensitivity(self) -> bool:
+        """Whether the opened device may tell its sensitivity: by its data sheet, or since it indicates m/s2."""
+        return True
+
 
 @runtime_checkable
 class Sensor(Protocol):

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import Literal, Self
 
 import numpy as np
 import serial
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from hw.block import BlockFlags, DeviceInfo
+from hw.block import LARGEST, BlockFlags, DeviceInfo
 from hw.cutting import Break, Cutter, follow
 from hw.frame_stream import Decoded, FrameStream
 from hw.frames import CHECKSUMS, WIDTH, ByteOrder, ChecksumName, Found, Layout, NumberType, numbers
-from hw.lines import LARGEST
 from hw.serial_sensor import LONGEST_GAP_S, SerialOptions, SerialSensor
 
 BITS_A_BYTE = 10  # with start and stop bit
@@ -45,7 +45,7 @@ class SerialBinaryOptions(SerialOptions):
     """Options of `serial-binary`."""
 
     rate_hz: float = Field(gt=0, le=100_000, allow_inf_nan=False, description="nominal rate of the samples")
-    start: str = Field(pattern="^([0-9a-fA-F]{2}){1,8}$", description='bytes every frame begins with, e.g. "aa55"')
+    start: str = Field(description='bytes every frame begins with, e.g. "aa55"')
     length: int = Field(ge=3, le=256, description="bytes of a frame, with start and checksum")
     byte_order: ByteOrder = Field("little", description="of all numbers")
     indications: tuple[Number, ...] = Field(description="x, y, z or one alone: [{at = 4, type = 'i16'}, ...]")
@@ -57,6 +57,13 @@ class SerialBinaryOptions(SerialOptions):
     unit: Literal["count", "m/s2", "m/s", "mV"] = Field("count", description="of the indications")
     full_scale: float | None = Field(None, gt=0, description="indications of this size or more are saturated")
     serial_number: str = Field("", description="of the device, as on its plate")
+
+    @field_validator("start")
+    @classmethod
+    def _is_bytes(cls, value: str) -> str:
+        if not re.fullmatch("([0-9a-fA-F]{2}){1,8}", value):
+            raise ValueError("1 to 8 bytes of two hexadecimal digits each, as in aa55")
+        return value
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
@@ -80,6 +87,11 @@ class SerialBinaryOptions(SerialOptions):
                 f"{bits_hz:g} bit/s; baud_rate is {self.baud_rate}"
             )
         return self
+
+    @property
+    def tells_sensitivity(self) -> bool:
+        """Whether it indicates m/s2: nothing else is known of such a device."""
+        return self.unit == "m/s2"
 
     @property
     def layout(self) -> Layout:

@@ -24,6 +24,11 @@ class SerialCsvOptions(SerialOptions):
     full_scale: float | None = Field(None, gt=0, description="indications of this size or more are saturated")
     serial_number: str = Field("", description="of the device, as on its plate")
 
+    @property
+    def tells_sensitivity(self) -> bool:
+        """Whether it indicates m/s2: nothing else is known of such a device."""
+        return self.unit == "m/s2"
+
 
 class SerialCsv(SerialSensor):
     """A bad line is counted and skipped; a jump in the sequence is a gap."""

@@ -1,4 +1,4 @@
-"""Calibrations and evidence as the gate gets them, and max_change computed anew, element by element."""
+"""Gates, calibrations and evidence as a gate gets them, and max_change computed anew, element by element."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ from itertools import product
 
 import numpy as np
 
-from agent.core.gate import Evidence
+from agent.config.gate import GateSettings
+from agent.core.gate import Decision, Evidence, Gate
 from calib.model import Array, Calibration
 
 NOMINAL = np.array([[2.0, 0.01, 0.0], [0.0, 1.9, -0.02], [0.01, 0.0, 2.1]])
 DOF = 9.0
 LIMIT_AT_1E_4 = 33.72  # chi-squared, 9 degrees of freedom (tables: 33.720)
+SETTINGS = GateSettings()
 
 
 def calibration(
@@ -65,3 +67,23 @@ def within_max_change(now: Calibration, anchor: Calibration, main_pct: float, tr
         if not abs(S[i, j] - S0[i, j]) <= limit * (1 + 1e-9):  # 1e-9: the last digits are computed otherwise there
             return False
     return True
+
+
+FAR, NEAR = scaled(1.06), scaled(1.01)
+
+
+def gate(**changes: object) -> Gate:
+    """With a certificate, and nothing in force yet."""
+    return Gate(GateSettings(**changes), calibration())  # type: ignore[arg-type]
+
+
+def valid(**changes: object) -> Gate:
+    """With the certificate in force."""
+    return Gate(GateSettings(**changes), calibration(), calibration())  # type: ignore[arg-type]
+
+
+def held(confirmed: Calibration | None, gate: Gate, windows: int = SETTINGS.confirm_windows) -> Decision:
+    """The last of so many windows that contradict what is in force; `confirmed` by them once there are enough."""
+    for k in range(windows):
+        decision = gate.judge(jumped(), scaled(1.3), confirmed if k + 1 >= SETTINGS.confirm_windows else None)
+    return decision

@@ -60,10 +60,11 @@ def audit(files: tuple[Path, ...], public_key: Path | None, strict: bool, json_t
     A data directory instead of files: all its recordings, none of which may be missing. Exit status 0 when all is as it
     should be, 3 when not, 2 when a file cannot be read.
     """
+    from agent.config.key_file import KeyFileError
     from agent.core.pipeline import Pipeline
     from agent.recording.fingerprint import compute_as
     from agent.recording.reading import first_event
-    from agent.recording.signing import KeyFileError, load_public_key
+    from agent.recording.signing import load_public_key
 
     try:
         key = load_public_key(public_key) if public_key is not None else None

@@ -14,7 +14,7 @@ from agent.config.tls import expiry_warning
 @click.command()
 @click.argument("config", type=click.Path(path_type=Path))
 def check(config: Path) -> int:
-    """Say every fault of CONFIG, each with its path and value. Exit status 2 if there is one."""
+    """Name every fault of CONFIG with its line, its setting and what to do. Exit status 2 if there is one."""
     try:
         loaded = load_config(config)
     except ConfigError as error:

@@ -73,7 +73,7 @@ def run(
 def serve(config: Config, data_dir: Path, watch: Any, duration_s: float | None) -> int:
     """Run the service until a signal or `duration_s`; the exit status."""
     from agent.acquisition.service import Service
-    from agent.recording.signing import KeyFileError
+    from agent.config.key_file import KeyFileError
 
     service = Service(config, data_dir, watch)
     for number in STOP_SIGNALS:

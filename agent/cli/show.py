@@ -13,6 +13,7 @@ import msgspec
 
 from agent import __version__
 from agent.core.events import RESULTS, CalibrationUpdate, StatusChange, WindowReport
+from agent.delivery.calibrations import calibrations
 from agent.delivery.history import FILE_NAME, History, Record, StoreError
 from agent.terminal.quantity import size
 
@@ -47,7 +48,7 @@ def show(data_dir: Path, json_to: str | None, limit: int) -> int:
 
 @dataclass(frozen=True, slots=True)
 class SensorHistory:
-    """What is kept of one sensor; lists are newest first."""
+    """What is kept of one sensor; lists are newest first, each calibration once."""
 
     status: Record | None
     calibration: Record | None  # in force
@@ -77,7 +78,7 @@ def read_overview(data_dir: Path, limit: int) -> Overview:
             sensor: SensorHistory(
                 status=next(iter(history.newest(sensor, "status", limit=1)), None),
                 calibration=in_force.get(sensor),
-                calibrations=history.newest(sensor, "calibration", limit=limit),
+                calibrations=calibrations(history, sensor, limit=limit),
                 windows=history.newest(sensor, "window", limit=limit),
                 drift=history.newest(sensor, "drift", limit=limit),
                 routine={w: history.newest(sensor, w, limit=limit) for w, kind in RESULTS.items() if kind.routine},
@@ -147,7 +148,7 @@ def _print_sensor(console: Console, sensor: str, held: SensorHistory) -> None:
         if isinstance(update := record.result, CalibrationUpdate):
             cells = calibration_cells(update)
             main = "  ".join(f"S{axis}{axis} {cells[i][i]}" for i, axis in enumerate("xyz"))
-            console.print(f"    {_time(update.t_utc_ns)}  {update.windows:3d} windows  {main}", soft_wrap=True)
+            console.print(f"    {_time(update.date_utc_ns)}  {update.windows:3d} windows  {main}", soft_wrap=True)
     console.print("  newest windows" if held.windows else "  no window yet", style="dim")
     for record in held.windows:
         if isinstance(window := record.result, WindowReport):
@@ -176,10 +177,16 @@ def _print_calibration(console: Console, calibration: CalibrationUpdate) -> None
     console.print(table)
     for line in (
         f"S in {unit} per m/s², Q in {unit}, {uncertainty_words(calibration)}",
-        f"{calibration.method}, {calibration.windows} windows, in force since {_time(calibration.t_utc_ns)}",
+        f"{calibration.method}, {calibration.windows} windows, {_since(calibration)}",
         f"of {calibration.identity}",
     ):
         console.print(f"  {line}", soft_wrap=True)
+
+
+def _since(calibration: CalibrationUpdate) -> str:
+    if not calibration.made_sequence:
+        return f"in force since {_time(calibration.t_utc_ns)}"
+    return f"made {_time(calibration.made_utc_ns)}, in force again since {_time(calibration.t_utc_ns)}"
 
 
 def _time(t_utc_ns: int) -> str:

@@ -51,10 +51,6 @@ class Commands(Section):
 
     @model_validator(mode="after")
     def _keys(self) -> Commands:
-        names = [key.id for key in self.keys]
-        for name in names:
-            if names.count(name) > 1:
-                raise ValueError(f"keys: the id {name!r} is used more than once")
         if self.enabled and not self.keys:
             raise ValueError("enabled without keys: nobody could command")
         return self

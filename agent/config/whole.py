@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 from agent.config.channel import Channel
 from agent.config.commands import Commands
 from agent.config.devices import Device, Gateway
+from agent.config.names import name_faults
 from agent.config.section import Section
 from agent.config.sinks import Recording, Results, Zenoh
 from agent.config.supervision import Supervision
@@ -29,22 +30,6 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _names(self) -> Config:
-        names = [d.name for d in self.devices]
-        for name in names:
-            if names.count(name) > 1:
-                raise ValueError(f"devices: the name {name!r} is used more than once")
-        sensors = [c.sensor for c in self.channels]
-        for i, channel in enumerate(self.channels):
-            for role, device in (("sensor", channel.sensor), ("reference", channel.reference)):
-                if device is not None and device not in names:
-                    known = ", ".join(names)
-                    raise ValueError(f"channels.{i}.{role}: no device is called {device!r}; there are {known}")
-            if channel.reference == channel.sensor:
-                raise ValueError(f"channels.{i}: a sensor cannot be its own reference")
-            if sensors.count(channel.sensor) > 1:
-                raise ValueError(f"channels.{i}.sensor: {channel.sensor!r} has more than one channel")
-        for i, key in enumerate(self.commands.keys):
-            for sensor in key.sensors:
-                if sensor != "*" and sensor not in sensors:
-                    raise ValueError(f"commands.keys.{i}.sensors: {sensor!r} has no channel")
+        for path, what in name_faults(self.model_dump()):
+            raise ValueError(f"{'.'.join(map(str, path))}: {what}")
         return self

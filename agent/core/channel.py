@@ -1,10 +1,9 @@
-"""One sensor with its reference: streams -> windows -> estimation -> results."""
+"""One sensor with its reference: what its events change, and the results that follow."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import msgspec
@@ -12,21 +11,16 @@ import msgspec
 from agent.config import Channel
 from agent.core.clocks import Clocks
 from agent.core.corrected import acceleration_block
-from agent.core.estimation import DAY_S, Estimation, Judged
+from agent.core.estimation import DAY_S, Estimation
 from agent.core.events import Acceleration, CalibrationUpdate, Command, DeviceChange, Estimate, Output, Result, Tick
+from agent.core.fault import told
 from agent.core.identity import identity_of, nominal_of, not_certified
 from agent.core.kept import keep, plain, shelved, take_up, update_of
 from agent.core.operators import CommandError, answer, commanded_pose
-from agent.core.outcome import Source, calibration_update, drift_report, estimate, status_change, window_report
-from agent.core.positions import FOUND_WITHIN_S, FoundPositions
-from agent.core.schedule import Piece, ToldTimes
-from agent.core.stream import DeviceStream
-from agent.core.windows import Found, margin_of, refused, windows_in
-from calib.estimate.lag_search import without_lag
-from calib.excitation.front_end import most_margin_s
-from calib.excitation.placing import Placed
+from agent.core.outcome import Source, again, calibration_update, drift_report, estimate, status_change, window_report
+from agent.core.streams import Streams, Verdict
+from agent.core.windows import refused
 from calib.model import Pose, Window
-from calib.signal.timing import HORIZON_S
 from hw.block import SampleBlock
 
 REFUSED_IN_A_ROW = 3
@@ -46,7 +40,7 @@ class ChannelState:
         self.sensor = channel.sensor
         self.identity = ""
         self._origin_ns = 0
-        self._streams: dict[str, DeviceStream] = {}
+        self._streams = Streams(channel)
         self._unit = ""
         self._nominal: float | None = None  # sensitivity by the device's own data sheet
         self._reference = ""  # identity
@@ -56,8 +50,6 @@ class ChannelState:
         self._kept: dict[str, bytes] = {}
         self._first_day = 0.0  # in the estimation's own count, at the run's origin
         self._status = ""  # nothing said yet
-        self._finder = FoundPositions(channel) if channel.positions else None
-        self._places = self._finder or ToldTimes(channel)
         self._refused = 0  # windows in a row
         self._clocks = Clocks()
         self._now_ns = 0  # monotonic and UTC of the newest event that carried both
@@ -68,24 +60,22 @@ class ChannelState:
         self._origin_ns = origin_ns
         self._now_ns = origin_ns
         self._kept = dict(kept)
-        for name in self._devices():
-            self._streams[name] = DeviceStream(name, origin_ns, self._horizon_s)
+        self._streams.begin(origin_ns)
 
     # --- events
 
     def on_block(self, block: SampleBlock) -> list[Output]:
         """A block of the sensor or its reference; others are not this channel's."""
-        if block.device not in self._streams:
+        if block.device not in self._streams.by_device:
             return []
         self._clock(block.t_monotonic_ns, block.t_utc_ns)
-        self._streams[block.device].update(block)
+        self._streams.by_device[block.device].update(block)
         results: list[Output] = []
         if block.device == self.sensor and self._estimation is not None:
             if self._status == "INVALID":
                 self._estimation.gate.regain("")
                 results += self._say_status(f"{self.sensor} speaks again")
-            if self._finder is not None:
-                self._finder.update(block, self._streams[self.sensor], self._estimation.recursion.scale)
+            self._streams.look_where(block, self._estimation)
             results += self._corrected(block, self._estimation)
         return results + list(self._close_windows()) + self._clock_reports()
 
@@ -96,7 +86,7 @@ class ChannelState:
 
     def on_device(self, change: DeviceChange) -> list[Result]:
         """A device of this channel was opened or lost."""
-        if change.device not in self._streams:
+        if change.device not in self._streams.by_device:
             return []
         self._clock(change.t_monotonic_ns, change.t_utc_ns)
         if change.state == "lost":
@@ -117,23 +107,15 @@ class ChannelState:
         try:
             if command.verb == "pose":
                 return self._turn(commanded_pose(command, self._channel))
-            said = answer(command, self._estimation, self.identity)
+            said, earlier = answer(command, self._estimation, self.identity)
         except CommandError as error:
             return [self._told(f"{command.verb} refused: {error}")]
         if said.refused:
             return [self._told(f"{command.verb} refused: {said.refused}")]
-        results: list[Result] = [self._put_in_force()] if said.calibration is not None else []
+        results: list[Result] = [self._put_in_force(earlier)] if said.calibration is not None else []
         return [*results, *(self._say_status(said.reason) or [self._told(said.reason)])]
 
     # --- time and identity
-
-    def _devices(self) -> list[str]:
-        return [self.sensor] + ([self._channel.reference] if self._channel.reference else [])
-
-    @property
-    def _horizon_s(self) -> float:
-        around_s = 2.0 * most_margin_s(self._channel.certificate.instrument)
-        return max(HORIZON_S, self._channel.window_s + around_s + (FOUND_WITHIN_S if self._finder else 0.0))
 
     def _clock(self, t_monotonic_ns: int, t_utc_ns: int) -> None:
         # Blocks of two devices may arrive out of order by a read; time here never goes back.
@@ -157,9 +139,7 @@ class ChannelState:
         if self._estimation is None or identity != self.identity:
             if self._estimation is not None:
                 self._kept = shelved(self._kept, self.identity, self.memory())
-                self._streams[self.sensor].clear()  # samples of the device before are nothing to this one
-                if self._finder is not None:
-                    self._finder.forget()
+                self._streams.forget_sensor()
                 reason = f"{self.sensor} is now {identity}, was {self.identity}"
             elif self._kept and identity not in self._kept:
                 reason = f"the calibration kept belongs to {', '.join(sorted(self._kept))}, this is {identity}"
@@ -184,7 +164,7 @@ class ChannelState:
         if not before or before == self._reference:
             return [self._told(f"nothing is updated: {self._not_certified}")] if self._not_certified else []
         assert self._channel.reference is not None
-        self._streams[self._channel.reference].clear()
+        self._streams.by_device[self._channel.reference].clear()
         if self._estimation is not None:
             self._estimation.forget_reference()
         reason = self._not_certified or f"the reference is now {self._reference}, was {before}"
@@ -199,7 +179,7 @@ class ChannelState:
         return self._change("INVALID", reason)
 
     def _watch_silence(self) -> list[Result]:
-        newest_s = self._streams[self.sensor].newest_arrival_s
+        newest_s = self._streams.by_device[self.sensor].newest_arrival_s
         silent_s = self._now_s() - (newest_s if newest_s is not None else 0.0)
         if silent_s <= self._channel.silence_s:
             return []
@@ -221,7 +201,7 @@ class ChannelState:
         if self._channel.acceleration == "off":
             return []
         found = acceleration_block(
-            block, self._streams[self.sensor], self._origin_ns + self._utc_minus_monotonic_ns,
+            block, self._streams.by_device[self.sensor], self._origin_ns + self._utc_minus_monotonic_ns,
             estimation.law, estimation.residual_sd, self._in_force,
             dynamic_only=self._channel.coupling == "ac", recorded=self._channel.acceleration == "record",
         )  # fmt: skip
@@ -230,90 +210,42 @@ class ChannelState:
     # --- windows
 
     def _turn(self, pose: Pose) -> list[Result]:
-        first_s = self._streams[self.sensor].first_sample_s
-        self._places.turn(0.0 if first_s is None else self._now_s() - first_s, pose)
+        self._streams.turn(self._now_s(), pose)
         return [self._told(f"stands at {pose.position} from now on")]
 
     def _close_windows(self) -> Iterator[Result]:
-        first_s = self._streams[self.sensor].first_sample_s
-        while (piece := self._places.piece) is not None and first_s is not None and self._due(piece, first_s):
-            yield from self._estimate(piece, first_s)
-            self._places.done(piece)
-        around_s = 2.0 * margin_of(self._channel, self._streams)
-        keep_from_s = self._now_s() - around_s
-        if first_s is not None:
-            keep_from_s = min(keep_from_s, first_s + self._places.keep_from_s - around_s)
-        for stream in self._streams.values():
-            stream.forget_before(keep_from_s)
+        """What becomes of all windows that are due. A fault of the program costs its window and is told."""
+        for piece in self._streams.due(self._now_s()):
+            try:
+                for verdict in self._streams.verdicts(piece, self._first_day, self._estimation, self._not_certified):
+                    yield from self._results(verdict)
+            except MemoryError:
+                raise  # says nothing of the data: a replay would not have it
+            except Exception as error:
+                fault = told(error)
+                reason = f"a fault of the program, please report it: {fault}"
+                yield from self._refuse(refused(piece, reason), reason, fault)
 
-    def _due(self, piece: Piece, first_s: float) -> bool:
-        """All samples of the piece are there, or they are later than anybody waits for."""
-        end_s = first_s + piece.stop_s + margin_of(self._channel, self._streams)
-        if self._now_s() > end_s + self._channel.late_horizon_s:
-            return True
-        return all(stream.reaches(end_s) for stream in self._streams.values())
-
-    def _estimate(self, piece: Piece, first_s: float) -> Iterator[Result]:
-        try:
-            yield from self._windows(piece, first_s)
-        except (ArithmeticError, ValueError) as error:  # LinAlgError is one: of samples such as 1e200
-            reason = f"these samples cannot be reckoned with: {error}"
-            yield from self._refuse(refused(piece, reason), reason)
-
-    def _windows(self, piece: Piece, first_s: float) -> Iterator[Result]:
-        day = self._first_day + (first_s + piece.stop_s) / DAY_S
-        placed = self._placed(piece, first_s, day)
-        if placed.pose is None or self._not_certified:
-            found, lag_s = Found([refused(piece, self._not_certified or placed.reason)]), 0.0
-        else:
-            found, lag_s = self._found(replace(piece, pose=placed.pose), first_s, day)
-        found = found.told(placed.numbers)
-        for window in found.windows:
-            if not window.used or self._estimation is None:
-                yield from self._refuse(window, window.reason or f"{self.sensor} was never opened")
-                continue
-            self._refused = 0
-            judged = self._estimation.judge(window, day, lag_s, found.temperature_degc)
-            yield from self._results(window, judged, lag_s)
-
-    def _placed(self, piece: Piece, first_s: float, day: float) -> Placed:
-        """How the sensor stands in the piece, where nobody told."""
-        if self._finder is None or self._estimation is None:
-            return Placed(piece.pose, "", {})
-        cut = self._streams[self.sensor].cut(first_s + piece.start_s, first_s + piece.stop_s)
-        return self._finder.place(piece, cut, self._estimation.recursion, day)
-
-    def _refuse(self, window: Window, reason: str) -> Iterator[Result]:
-        """Of several in a row the status, though it stands, says why nothing is updated."""
-        yield window_report(self._source(), window, used=False, reason=reason, numbers={})
+    def _refuse(self, window: Window, reason: str, fault: str = "") -> Iterator[Result]:
+        """Of a fault of the program, and of several refused in a row, the status, though it stands, says so too."""
+        yield window_report(self._source(), window, used=False, reason=reason, numbers={}, fault=fault)
         self._refused += 1
-        if self._refused == REFUSED_IN_A_ROW:
+        if fault or self._refused == REFUSED_IN_A_ROW:
             yield self._told(f"nothing is updated: {reason}")
 
-    def _found(self, piece: Piece, first_s: float, day: float) -> tuple[Found, float]:
-        """The windows, made again until no lag is left in them that matters."""
-        estimation = self._estimation
-        if estimation is None or self._channel.reference is None:
-            lag_s = 0.0 if estimation is None else estimation.lag_s
-            return windows_in(piece, first_s, self._channel, self._streams, lag_s), lag_s
-        return without_lag(
-            estimation.lag_s,
-            lambda lag_s: windows_in(piece, first_s, self._channel, self._streams, lag_s),
-            lambda found: [w for w in found.windows if w.used],
-            lambda found, lag_s: estimation.lag_after(
-                [w for w in found.windows if w.used], day, lag_s, found.temperature_degc
-            ),
-        )
-
-    def _results(self, window: Window, judged: Judged, lag_s: float) -> Iterator[Result]:
-        assert self._estimation is not None
-        decision, source = judged.decision, self._source()
+    def _results(self, verdict: Verdict) -> Iterator[Result]:
+        window, judged, source = verdict.window, verdict.judged, self._source()
+        if judged is None or self._estimation is None:
+            yield from self._refuse(window, window.reason or f"{self.sensor} was never opened")
+            return
+        self._refused = 0
+        decision = judged.decision
         used = decision.action in ("take", "adopt")
-        numbers = {**decision.numbers, "lag_applied_s": lag_s}
+        numbers = {**decision.numbers, "lag_applied_s": verdict.lag_s}
         yield window_report(source, window, used=used, reason="" if used else decision.reason, numbers=numbers)
         origin_utc_ns = self._utc_ns() - round((self._first_day * DAY_S + self._now_s()) * 1e9)
-        for verdict in judged.drift:
-            yield drift_report(source, verdict, self._channel.drift.false_alarms_a_year, origin_utc_ns)
+        for drift in judged.drift:
+            yield drift_report(source, drift, self._channel.drift.false_alarms_a_year, origin_utc_ns)
         if decision.proposal is not None:
             update = calibration_update(source, decision.proposal, self._estimation.recursion)
             yield estimate(source, decision.reason, update)
@@ -321,9 +253,11 @@ class ChannelState:
             yield self._put_in_force()
         yield from self._say_status(decision.reason)
 
-    def _put_in_force(self) -> CalibrationUpdate:
+    def _put_in_force(self, earlier: CalibrationUpdate | None = None) -> CalibrationUpdate:
+        """What the estimation has in force; `earlier` is the update that made it, where it was made before."""
         assert self._estimation is not None
-        self._in_force = calibration_update(self._source(), self._estimation.in_force, self._estimation.recursion)
+        update = calibration_update(self._source(), self._estimation.in_force, self._estimation.recursion)
+        self._in_force = update if earlier is None else again(update, earlier)
         return self._in_force
 
     def number(self, results: Sequence[Result]) -> None:
@@ -364,14 +298,14 @@ class ChannelState:
         self._first_day = kept.day + pause_days - self._now_s() / DAY_S
         if kept.in_force is None:
             return [], kept.reason
-        self._in_force = msgspec.structs.replace(kept.in_force, t_utc_ns=self._utc_ns())
+        self._in_force = again(msgspec.structs.replace(kept.in_force, t_utc_ns=self._utc_ns()), kept.in_force)
         return [self._in_force], kept.reason
 
     def snapshot(self) -> dict[str, Any]:
         """State for `load`, bit-exact."""
         return {
             "origin_ns": self._origin_ns,
-            "streams": {name: stream.snapshot() for name, stream in self._streams.items()},
+            **self._streams.snapshot(),
             "unit": self._unit,
             "identity": self.identity,
             "reference": self._reference,
@@ -382,7 +316,6 @@ class ChannelState:
             "kept": dict(self._kept),
             "first_day": self._first_day,
             "status": self._status,
-            "places": self._places.snapshot(),
             "refused": self._refused,
             "now_ns": self._now_ns,
             "utc_minus_monotonic_ns": self._utc_minus_monotonic_ns,
@@ -392,9 +325,7 @@ class ChannelState:
     def load(self, state: Mapping[str, Any]) -> None:
         """Take the state that `snapshot` gave."""
         self._origin_ns = state["origin_ns"]
-        self._streams = {
-            n: DeviceStream.restore(n, self._origin_ns, s, self._horizon_s) for n, s in state["streams"].items()
-        }
+        self._streams.load(self._origin_ns, state)
         self._unit, self.identity, self._reference = state["unit"], state["identity"], state["reference"]
         self._not_certified = state["not_certified"]
         self._nominal, self._estimation = state["nominal"], None
@@ -404,7 +335,6 @@ class ChannelState:
         self._in_force = update_of(state["in_force"])
         self._kept = dict(state["kept"])
         self._first_day, self._status = state["first_day"], state["status"]
-        self._places.load(state["places"])
         self._refused = state["refused"]
         self._clocks.load(state)
         self._now_ns = state["now_ns"]

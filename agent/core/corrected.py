@@ -44,8 +44,8 @@ def acceleration_block(
         covariance=found.covariance,
         noise=found.noise,
         determined=law.determined,
-        calibration_run_id="" if in_force is None else in_force.run_id,
-        calibration_sequence=0 if in_force is None else in_force.sequence,
+        calibration_run_id="" if in_force is None else in_force.made[0],
+        calibration_sequence=0 if in_force is None else in_force.made[1],
         dynamic_only=dynamic_only,
         recorded=recorded,
     )

@@ -126,6 +126,7 @@ class WindowReport(Result, frozen=True, kw_only=True):
     points: int
     left_out: int
     numbers: dict[str, float]  # the statistics behind the verdict, each with its unit in its name
+    fault: str = ""  # where the program itself failed: exception, file and line; "" where it did not
 
 
 class CalibrationUpdate(Result, frozen=True, kw_only=True):
@@ -159,6 +160,20 @@ class CalibrationUpdate(Result, frozen=True, kw_only=True):
     u_sensitivity_temperature: list[float] = []
     offset_rate: list[float] = []  # (3,) output unit per day
     u_offset_rate: list[float] = []
+    # Where it comes into force again, after a restart or by a rollback: which result it was when it was made.
+    made_run_id: str = ""
+    made_sequence: int = 0
+    made_utc_ns: int = 0
+
+    @property
+    def made(self) -> tuple[str, int]:
+        """(run, sequence) of the result by which it first came into force: its identity, the same each time."""
+        return (self.made_run_id, self.made_sequence) if self.made_sequence else (self.run_id, self.sequence)
+
+    @property
+    def date_utc_ns(self) -> int:
+        """When it was made; `t_utc_ns` is since when it is in force."""
+        return self.made_utc_ns or self.t_utc_ns
 
 
 class Estimate(Result, frozen=True, kw_only=True):

@@ -2,27 +2,33 @@
 
 A state holds only for what it was made with. Where the configuration states something else since, or another version
 of the program wrote it, the estimation begins anew: from the calibration in force, or from the prior if that is new.
+
+S and Q belong to the sensor and outlive a new mount. The rest of the state does not: at a fixed mount it holds the mean
+output there, on a clamp the errors of its angles, and everywhere the error of one reference.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import msgspec
 
 from agent.config import Channel
+from agent.config.pose import Stop
 from agent.core.estimation import Estimation
 from agent.core.events import CalibrationUpdate
 from agent.core.memory import MOST_MEMORIES
 from agent.core.outcome import calibration_of
+from agent.core.schedule import pose_of
 from agent.core.snapshot import pack, unpack
+from calib.model import Pose
 
 # What the numbers of a state mean; how fast they may wander and when they are believed may change at any time.
 BASIS = frozenset(
-    {"prior", "certificate", "uncertainty", "temperature", "coupling", "gravity_mps2", "static_sign"}
-    | {"rotation", "rotation_gravity_mps2"}
+    {"prior", "certificate", "uncertainty", "temperature", "coupling", "gravity_mps2", "static_sign", "reference"}
+    | {"rotation", "rotation_gravity_mps2", "clamp_theta_deg"}
 )
 MALFORMED = (ValueError, KeyError, TypeError, AttributeError, IndexError)  # a state of other fields or shapes
 
@@ -77,7 +83,7 @@ def take_up(kept: bytes, channel: Channel, nominal: float | None) -> Kept:
         if not changed:
             fresh.load(state["estimation"])
             return Kept(fresh, in_force, reference, day, t_utc_ns, "restored from the run before")
-        why = f"the configuration has another {', '.join(changed)}"
+        why = f"these settings have changed: {', '.join(changed)}"
     except MALFORMED as error:
         changed, reference, why = [], "", f"its state cannot be read: {_said(error)}"
     fresh = Estimation(channel, nominal)
@@ -111,12 +117,33 @@ def update_of(state: dict[str, Any] | None) -> CalibrationUpdate | None:
 
 
 def _basis(channel: Channel) -> dict[str, str]:
-    whole = channel.model_dump(mode="json", include=set(BASIS)) | {"fixed_mount": channel.fixed_mount}
+    whole: dict[str, Any] = channel.model_dump(mode="json", include=set(BASIS)) | {"fixed_mount": channel.fixed_mount}
+    whole["poses"] = _by_position((pose_of(pose, channel), pose) for pose in channel.poses)
+    stops = () if channel.positions == "free" else channel.positions
+    whole["positions"] = _by_position(zip(channel.stops, stops, strict=True))
     return {name: msgspec.json.encode(value, order="deterministic").decode() for name, value in whole.items()}
 
 
+def _by_position(stances: Iterable[tuple[Pose, Stop]]) -> dict[str, list[str]]:
+    """How the sensor is stated to stand, by the name of the position; at what times does not matter."""
+    found: dict[str, set[str]] = {}
+    for pose, stop in stances:
+        found.setdefault(pose.position, set()).add(stop.model_dump_json(exclude={"start_s", "stop_s"}))
+    return {name: sorted(stated) for name, stated in found.items()}
+
+
 def _changed(before: dict[str, str], now: dict[str, str]) -> list[str]:
-    return sorted(name for name in before.keys() | now.keys() if before.get(name) != now.get(name))
+    """Settings that are not as they were. What a state of an earlier version does not name is taken as unchanged."""
+    return sorted(name for name in before if before[name] != now.get(name) and not _same_mount(name, before, now))
+
+
+def _same_mount(name: str, before: dict[str, str], now: dict[str, str]) -> bool:
+    """Whether positions were only added or left out: at least one stayed, and all that stayed are stated as before."""
+    if name not in ("poses", "positions"):
+        return False
+    were, are = msgspec.json.decode(before[name]), msgspec.json.decode(now[name])
+    stayed = were.keys() & are.keys()
+    return bool(stayed) and all(were[position] == are[position] for position in stayed)
 
 
 def _said(error: Exception) -> str:

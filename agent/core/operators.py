@@ -15,35 +15,37 @@ from agent.core.events import CalibrationUpdate, Command
 from agent.core.gate import Answer
 from agent.core.outcome import calibration_of
 from agent.core.schedule import pose_of
-from calib.model import Calibration, Pose
+from calib.model import Pose
 
 
 class CommandError(ValueError):
     """A command that makes no sense; the message says why."""
 
 
-def answer(command: Command, estimation: Estimation, identity: str) -> Answer:
+def answer(command: Command, estimation: Estimation, identity: str) -> tuple[Answer, CalibrationUpdate | None]:
     """The gate's answer to hold, accept or rollback, carried out. Raises CommandError on what no gate understands.
 
-    `identity` is the device's that is there now.
+    `identity` is the device's that is there now. With a rollback, the update whose calibration is in force again.
     """
     arguments, key = _arguments(command), command.key_id
     if command.verb == "hold":
-        return estimation.gate.release(key) if arguments.get("release") else estimation.gate.hold(key)
+        return (estimation.gate.release(key) if arguments.get("release") else estimation.gate.hold(key)), None
+    earlier = None
     if command.verb == "accept":
         sequence = arguments.get("sequence")
         if not isinstance(sequence, int):
             raise CommandError(f"accept needs the sequence of an estimate, not {sequence!r}")
         found = estimation.gate.accept(sequence, key)
     else:
-        found = estimation.gate.rollback(_earlier(command, identity), key)
+        earlier = _earlier(command, identity)
+        found = estimation.gate.rollback(calibration_of(earlier), key)
     if found.calibration is not None:
         estimation.put(found.calibration)
-    return found
+    return found, earlier
 
 
-def _earlier(command: Command, identity: str) -> Calibration:
-    """The calibration that a rollback carries. Raises CommandError where it is none, or another device's."""
+def _earlier(command: Command, identity: str) -> CalibrationUpdate:
+    """The update that a rollback carries. Raises CommandError where it is none, or another device's."""
     try:
         update = msgspec.convert(_numbers(json.loads(command.calibration_json)), CalibrationUpdate)
         calibration = calibration_of(update)
@@ -54,7 +56,7 @@ def _earlier(command: Command, identity: str) -> Calibration:
     shapes = (calibration.sensitivity.shape, calibration.offset.shape, calibration.covariance.shape)
     if shapes != ((3, 3), (3,), (12, 12)) or not np.isfinite(calibration.covariance).all():
         raise CommandError(f"calibration {update.sequence} is not whole: S, Q and a finite covariance of both")
-    return calibration
+    return update
 
 
 def commanded_pose(command: Command, channel: Channel) -> Pose:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from agent.core.events import CalibrationUpdate, DriftReport, Estimate, StatusChange, WindowReport
@@ -48,6 +49,12 @@ def calibration_update(source: Source, calibration: Calibration, recursion: Recu
     )  # fmt: skip
 
 
+def again(update: CalibrationUpdate, before: CalibrationUpdate) -> CalibrationUpdate:
+    """An update by which a calibration comes into force that was in force `before`: it is still that one."""
+    run_id, sequence = before.made
+    return msgspec.structs.replace(update, made_run_id=run_id, made_sequence=sequence, made_utc_ns=before.date_utc_ns)
+
+
 def calibration_of(update: CalibrationUpdate) -> Calibration:
     """What `calibration_update` was made of."""
     return Calibration(
@@ -75,13 +82,13 @@ def drift_report(source: Source, verdict: DriftVerdict, false_alarms_a_year: flo
 
 
 def window_report(
-    source: Source, window: Window, *, used: bool, reason: str, numbers: dict[str, float]
+    source: Source, window: Window, *, used: bool, reason: str, numbers: dict[str, float], fault: str = ""
 ) -> WindowReport:
     """The verdict on a window, the gate's numbers after the excitation's."""
     return WindowReport(
         run_id="", sequence=0, sensor=source.sensor, t_utc_ns=source.t_utc_ns, start_s=window.start_s,
         stop_s=window.stop_s, position=window.pose.position, used=used, reason=reason, points=window.points,
-        left_out=window.left_out, numbers={**window.numbers, **numbers},
+        left_out=window.left_out, numbers={**window.numbers, **numbers}, fault=fault,
     )  # fmt: skip
 
 

@@ -197,9 +197,11 @@ class History:
         rows = self._checked("SELECT name, value, crc FROM marks WHERE name = 'file'")
         return int(rows[0][1]) if rows else 0
 
-    def newest(self, sensor: str, what: str, *, limit: int) -> list[Record]:
-        """The newest `limit` results of one channel, newest first."""
-        return self._records("WHERE sensor = ? AND what = ? ORDER BY sequence DESC LIMIT ?", sensor, what, limit)
+    def newest(self, sensor: str, what: str, *, limit: int, run_id: str = "") -> list[Record]:
+        """The newest `limit` results of one channel, of one run if it is named, newest first."""
+        of_run, named = (" AND run_id = ?", [run_id]) if run_id else ("", [])
+        where = f"WHERE sensor = ? AND what = ?{of_run} ORDER BY sequence DESC LIMIT ?"
+        return self._records(where, sensor, what, *named, limit)
 
     def removed(self) -> list[Removed]:
         """What retention deleted, by channel."""

@@ -15,17 +15,14 @@ from typing import TYPE_CHECKING, BinaryIO
 
 from mcap.opcode import Opcode
 
+from agent.config.key_file import KeyFileError, load_private_key, read_key_file
+
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 
 SIGNATURE_METADATA = "fieldcal.signature"
 _CONTEXT = b"fieldcal recording, version 1\n"  # so that the key's signature of something else is none of a recording
 _HEAD = struct.Struct("<BQ")
-LARGEST_KEY_FILE = 1 << 16  # bytes; a key has 120
-
-
-class KeyFileError(Exception):
-    """A file that holds no usable key. The message names it."""
 
 
 class Signer:
@@ -37,17 +34,8 @@ class Signer:
 
     @staticmethod
     def load(path: Path) -> Signer:
-        """From a PEM file (PKCS #8, not encrypted). Raises KeyFileError."""
-        from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-        from cryptography.hazmat.primitives.serialization import load_pem_private_key
-
-        try:
-            key = load_pem_private_key(_read(path), password=None)
-        except (ValueError, TypeError):  # what cryptography says may quote the file
-            raise KeyFileError(f"{path}: not a private key in PEM without a password") from None
-        if not isinstance(key, Ed25519PrivateKey):
-            raise KeyFileError(f"{path}: a private key, but not of Ed25519")
-        return Signer(key)
+        """With the key in a PEM file (PKCS #8, not encrypted). Raises KeyFileError."""
+        return Signer(load_private_key(path))
 
     def metadata(self, sha256: bytes, length: int) -> dict[str, str]:
         """The metadata record that closes a data section of `length` bytes with this digest."""
@@ -66,7 +54,7 @@ def load_public_key(path: Path) -> Ed25519PublicKey:
     from cryptography.hazmat.primitives.serialization import load_pem_public_key
 
     try:
-        key = load_pem_public_key(_read(path))
+        key = load_pem_public_key(read_key_file(path))
     except ValueError:
         raise KeyFileError(f"{path}: not a public key in PEM") from None
     if not isinstance(key, Ed25519PublicKey):
@@ -115,11 +103,3 @@ def verify_file(file: BinaryIO, size: int, metadata: dict[str, str] | None, key:
     if opcode != Opcode.METADATA or file.read(1) != bytes([Opcode.DATA_END]):
         return "something follows its signature"
     return signature_fault(metadata, digest.digest(), int(length), key)
-
-
-def _read(path: Path) -> bytes:
-    try:
-        with open(path, "rb") as file:
-            return file.read(LARGEST_KEY_FILE)
-    except OSError as error:
-        raise KeyFileError(f"{path}: cannot be read: {error.strerror}") from None

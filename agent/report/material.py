@@ -11,7 +11,8 @@ import msgspec
 
 from agent.calibrate.origin import SourceFile, source_file
 from agent.core.events import CalibrationUpdate, StatusChange, WindowReport
-from agent.delivery.history import FILE_NAME, History, StoreError
+from agent.delivery.calibrations import calibrations, made
+from agent.delivery.history import FILE_NAME, History, Record, StoreError
 from agent.recording.files import recordings
 from agent.report.recorded import Recorded, RecordingError, read_recordings, sensors_of
 from agent.report.result import (
@@ -101,7 +102,7 @@ def _from_recordings(paths: Sequence[Path], sensor: str | None) -> Material:
     chosen = _chosen(sensor, list(dict.fromkeys(name for path in paths for name in sensors_of(path))), str(paths[0]))
     recorded = read_recordings(list(paths), chosen)
     material = _of(recorded, [_verdict(window) for window in recorded.windows], recorded.calibrations)
-    material.history = recorded.calibrations
+    material.history = list({update.made: update for update in recorded.calibrations[::-1]}.values())[::-1]
     material.files = [source_file(path) for path in paths]
     return material
 
@@ -111,13 +112,11 @@ def _from_directory(directory: Path, sensor: str | None) -> Material:
         names = sorted({name for name, what in history.channels() if name and what in ("window", "calibration")})
         chosen = _chosen(sensor, names, str(directory))
         in_force = history.in_force(chosen)
-        kept = history.newest(chosen, "calibration", limit=MOST_HISTORY)[::-1]
-        seen = history.newest(chosen, "window", limit=MOST_HISTORY)[::-1]
+        kept = calibrations(history, chosen, limit=MOST_HISTORY)[::-1]
+        seen = history.newest(chosen, "window", limit=MOST_HISTORY, run_id=_run_of(history, chosen, in_force))[::-1]
         status = next(iter(history.newest(chosen, "status", limit=1)), None)
-    run_id = in_force.run_id if in_force else seen[-1].run_id if seen else ""
-    of_run = [w.result for w in seen if w.run_id == run_id]
-    windows = [_verdict(w) for w in of_run if isinstance(w, WindowReport)]
-    wanted = list(dict.fromkeys(w.recording for w in seen if w.run_id == run_id and w.fields.get("used")))
+    windows = [_verdict(w.result) for w in seen if isinstance(w.result, WindowReport)]
+    wanted = list(dict.fromkeys(w.recording for w in seen if w.fields.get("used")))
     paths, lost = _present(directory, wanted[-MOST_RECORDINGS:])
     recorded = read_recordings(paths, chosen) if paths else Recorded(chosen)
     recorded.status = status.result if status and isinstance(status.result, StatusChange) else recorded.status
@@ -128,6 +127,13 @@ def _from_directory(directory: Path, sensor: str | None) -> Material:
     material.files = [source_file(path) for path in paths]
     material.notices += [f"the recording {name} is not there any more" for name in lost]
     return material
+
+
+def _run_of(history: History, sensor: str, in_force: Record | None) -> str:
+    """The run in which the calibration in force was made; without one, the run of the newest window."""
+    if in_force is not None:
+        return made(in_force)[0]
+    return next((window.run_id for window in history.newest(sensor, "window", limit=1)), "")
 
 
 def _present(directory: Path, names: Sequence[str]) -> tuple[list[Path], list[str]]:

@@ -152,8 +152,8 @@ def from_update(
         "sensor": update.sensor,
         "windows_in_solution": update.windows,
         "residual_sd": update.residual_sd,
-        "run_id": update.run_id,
-        "sequence": update.sequence,
+        "run_id": update.made[0],
+        "sequence": update.made[1],
     }
     return {name: plain(value) for name, value in fields.items()}
 

@@ -63,7 +63,7 @@ def history(updates: Sequence[CalibrationUpdate], unit: str) -> Figure | None:
     """Main sensitivities, in % off their newest value, and offsets over time, with U; None with fewer than two."""
     if len(updates) < 2:
         return None
-    when = [dt.datetime.fromtimestamp(u.t_utc_ns / 1e9, dt.UTC) for u in updates]
+    when = [dt.datetime.fromtimestamp(u.date_utc_ns / 1e9, dt.UTC) for u in updates]
     S = np.array([np.diag(u.sensitivity) for u in updates])
     Q = np.array([u.offset for u in updates])
     U = np.array([u.coverage_factor * np.array(u.standard_uncertainty) for u in updates])

@@ -67,7 +67,7 @@ class Situation(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class SensorHealth(msgspec.Struct, frozen=True, kw_only=True):
-    """Results of one sensor since the run began."""
+    """Results of one sensor since the run began. `calibrations` were made in this run: one restored is none of them."""
 
     status: str
     reason: str
@@ -157,7 +157,7 @@ class Health:
         if isinstance(result, WindowReport):
             used, refused = sensor.windows_used + result.used, sensor.windows_refused + (not result.used)
             sensor = msgspec.structs.replace(sensor, windows_used=used, windows_refused=refused)
-        elif isinstance(result, CalibrationUpdate):
+        elif isinstance(result, CalibrationUpdate) and not result.made_sequence:
             sensor = msgspec.structs.replace(sensor, calibrations=sensor.calibrations + 1)
         elif isinstance(result, StatusChange):
             sensor = msgspec.structs.replace(sensor, status=result.status, reason=result.reason)

@@ -10,7 +10,7 @@ import msgspec
 
 from agent import __version__
 from agent.config import Config
-from agent.core.events import Event, Result, Tick
+from agent.core.events import Event, Result, Tick, WindowReport
 from agent.supervision.health import GatewayStatus, Health, State
 from agent.supervision.logs import log_event, tell
 from agent.supervision.metrics import serve_metrics
@@ -47,6 +47,9 @@ class Supervisor:
         """An event, and what came of it."""
         self._health.update(event, results)
         log_event(event, results)
+        for result in results:
+            if isinstance(result, WindowReport) and result.fault:
+                _log.error("a fault of the program cost %s a window, please report it: %s", result.sensor, result.fault)
         if isinstance(event, SampleBlock):
             self._notifier.feed()
         elif isinstance(event, Tick):

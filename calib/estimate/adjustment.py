@@ -14,7 +14,7 @@ import numpy as np
 
 from calib.distributions import coverage_factor
 from calib.estimate.budget import Budget, budget
-from calib.estimate.condense import Condensed, condense
+from calib.estimate.condense import Condensed, condense, effective
 from calib.estimate.determined import Flags, determined
 from calib.estimate.equations import Equations
 from calib.estimate.fixed_mount import mean_input, never_turned
@@ -92,7 +92,7 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
     if never_turned(np.array([mean_input(w) for w in used])):
         priors = _without_offset(priors)
     found = [excited(w) for w in used]
-    data = condense([e.window for e in found])
+    data = effective(condense([e.window for e in found]), min(w.independent for w in used))
     u_lag_s = [max(w.u_lag_s, priors.lag_window_s) if priors.lag_s > 0.0 else 0.0 for w in used]
     scatter = SlopeScatter.of(data, u_lag_s, [e.attenuation for e in found])
     solution = _solution([e.window for e in found], data, priors, applied, scatter)

@@ -8,11 +8,11 @@ is that of the geometry alone.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.estimate.type_a import Segments, TypeA, pooled
+from calib.estimate.type_a import FEWEST_FREEDOM, LEAST_INFLATION, Segments, TypeA, pooled
 from calib.model import Array, Window, own_channels
 
 PIVOT_FLOOR = 1e-9  # of a channel's own power; what is left after the channels before it is rounding below that
@@ -53,6 +53,26 @@ def condense(windows: Sequence[Window]) -> Condensed:
         mean_v=np.array([s.mean[-3:] for s in segments]),
         count=np.array([s.count.sum() for s in segments]),
         type_a=pooled(segments, roots, whiteners),
+    )
+
+
+def effective(data: Condensed, independent: float) -> Condensed:
+    """The same in units in which slopes and means scatter by one on average, as what segments show.
+
+    Coloured or filtered noise leaves fewer independent points, and so less weight against priors. Where segments tell
+    little, the filter's share of `independent` points stands for them.
+    """
+    type_a, live = data.type_a, np.repeat(np.any(np.diagonal(data.root, axis1=1, axis2=2) > 0.0, axis=0), 3)
+    freedom = type_a.degrees_of_freedom if np.isfinite(type_a.degrees_of_freedom) else 0.0
+    own = min(freedom / FEWEST_FREEDOM, 1.0)
+    seen = [np.diag(type_a.slopes)[live].mean() if live.any() else 1.0, np.diag(type_a.means).mean()]
+    slopes, means = (max(own * float(ratio) + (1.0 - own) / independent, LEAST_INFLATION) for ratio in seen)
+    return replace(
+        data,
+        root=data.root / np.sqrt(slopes),
+        slopes=data.slopes / np.sqrt(slopes),
+        count=data.count / means,
+        type_a=replace(type_a, slopes=type_a.slopes / slopes, means=type_a.means / means),
     )
 
 

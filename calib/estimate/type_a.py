@@ -16,6 +16,8 @@ from calib.model import Array
 
 # Correlation of neighbours above which segments are joined in pairs: they are shorter than 3 correlation times.
 RHO_COARSEN = 0.35
+FEWEST_FREEDOM = 10.0  # degrees of freedom: from fewer, a mean of squares is off by 40 % and more
+LEAST_INFLATION = 0.25  # variance ratios below it are the luck of few segments
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,7 +15,7 @@ from calib.estimate.nuisances import Applied, Nuisances, Priors
 from calib.estimate.quantities import MAIN_TEMPERATURE, offset_temperature
 from calib.estimate.slope_scatter import SlopeScatter
 from calib.estimate.terms import Term
-from calib.estimate.type_a import TypeA
+from calib.estimate.type_a import FEWEST_FREEDOM, LEAST_INFLATION, TypeA
 from calib.excitation.excited import excited
 from calib.model import Array, Pose, Window
 
@@ -44,8 +44,6 @@ class Noise:
 # as it has rows, three times: estimated from fewer it would be too sure of some direction.
 SHRINKAGE = 3.0
 MOST_FREEDOM = 400.0  # degrees of freedom: beyond, the oldest windows' scatter is forgotten
-FEWEST_FREEDOM = 10.0  # degrees of freedom: from fewer, a mean of squares is off by 40 % and more
-LEAST_INFLATION = 0.25  # variance ratios below it are the luck of few segments
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,10 +12,11 @@ from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
 
 from agent.cli.audit import audit, audit_files, recordings_of, run_audit
+from agent.config.key_file import KeyFileError
 from agent.delivery.store import Store
 from agent.recording.files import recordings
 from agent.recording.retention import KeepFiles
-from agent.recording.signing import KeyFileError, Signer, load_public_key
+from agent.recording.signing import Signer, load_public_key
 from agent.recording.writer import Recorder
 from tests.replay.forgery import records, with_sums
 from tests.replay.stand_in import CONFIG, StandIn, happenings, run_start

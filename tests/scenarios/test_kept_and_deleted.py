@@ -117,4 +117,6 @@ def test_a_signing_key_that_is_none_is_bad_input(tmp_path: Path, port: PtyDevice
     config.write_text(CONFIG.format(port=port.path, key=key))
     done = fieldcal("run", config, "--data-dir", tmp_path / "data")
     assert done.returncode == 2
-    assert done.stderr == f"fieldcal run: recording.signing_key: {key}: not a private key in PEM without a password\n"
+    line = config.read_text().splitlines().index(f'signing_key = "{key}"') + 1
+    why = f"{key}: not a private key in PEM without a password; `openssl genpkey -algorithm ed25519` makes one"
+    assert done.stderr == f"{config}: line {line}: recording.signing_key: {why}\n"

@@ -39,14 +39,14 @@ def faults(text: str) -> list[str]:
         (CHANNEL + "gravity_mps2 = 981", ["channels.0.gravity_mps2", "not 981"]),
         (CHANNEL + "late_horizon_s = 600", ["channels.0.late_horizon_s", "not 600"]),
         (CHANNEL + "windows = 100000", ["channels.0.windows", "not 100000"]),
-        (CHANNEL + f"poses = [{{ start_s = 0, stop_s = 1.05, {REST} }}]", ["channels.0", "poses.0", "guard_s 0.5"]),
+        (CHANNEL + f"poses = [{{ start_s = 0, stop_s = 1.05, {REST} }}]", ["channels.0.poses.0: ", "guard_s 0.5"]),
         (CHANNEL + f"poses = [{{ start_s = 2, stop_s = 1, {REST} }}]", ["channels.0.poses.0", "stop_s 1.0"]),
         (CHANNEL + "[recording]\nrotate_s = 1e308", ["recording.rotate_s", "not 1e+308"]),
         (CHANNEL + "[recording]\nrotate_bytes = 1", ["recording.rotate_bytes", "not 1"]),
         (CHANNEL + '[zenoh]\nconnect = ["localhost:7447"]', ["zenoh.connect.0", "not 'localhost:7447'"]),
-        (CHANNEL + '[zenoh]\nconnect = ["tls/h:7447"]', ["zenoh: connect", "zenoh.tls"]),
+        (CHANNEL + '[zenoh]\nconnect = ["tls/h:7447"]', ["zenoh.connect: ", "zenoh.tls"]),
         (CHANNEL + "[commands]\nenabled = true", ["commands: enabled without keys"]),
-        (CHANNEL + KEY + KEY, ["commands: keys", "'anna' is used more than once"]),
+        (CHANNEL + KEY + KEY, ["commands.keys.1.id: ", "'anna' is used more than once"]),
         (CHANNEL + KEY.replace("AAA=", "AA=="), ["commands.keys.0.public_key", "31 bytes"]),
         (CHANNEL + KEY.replace("AAA=", "A*A="), ["commands.keys.0.public_key", "not base64"]),
         (CHANNEL + KEY.replace('"hold"', '"reboot"'), ["commands.keys.0.verbs.0", "not 'reboot'"]),
@@ -68,7 +68,7 @@ def test_a_fault_is_one_line_with_its_path_and_value(text: str, said: list[str])
 @pytest.mark.parametrize("said", ["connect_private_key_base64=S3cr3t", "iface=eth0;password=S3cr3t"])
 def test_an_endpoint_with_a_secret_is_refused_and_not_shown(said: str) -> None:
     (line,) = faults(CHANNEL + f'[zenoh]\nconnect = ["tcp/h:7447#{said}"]')
-    assert "zenoh: connect: tcp/h:7447#... names a key or password" in line
+    assert "zenoh.connect: tcp/h:7447#... names a key or password" in line
     assert "S3cr3t" not in line
     parse_config(tomllib.loads(CHANNEL + '[zenoh]\nconnect = ["tcp/h:7447#iface=eth0"]'), "")
 
@@ -103,7 +103,7 @@ def test_a_file_that_is_none_is_a_fault(tmp_path: Path, content: bytes | None) -
         ("k" * 1_000_000 + " = 1", "kkk"),
         (".".join(["a"] * 1_000_000) + " = 1", "line 1: a key of more than 16 parts"),
         ("\n[" + " . ".join(["'a'"] * 300_000) + "]", "line 2: a key of more than 16 parts"),
-        ('x = "' + "y" * 1_000_000 + '"', "x: Extra inputs"),
+        ('x = "' + "y" * 1_000_000 + '"', "x: there is no such setting"),
         (
             CHANNEL + "poses = [" + "1, " * 100_000 + "]",
             f"channels.0.poses: a list of 100000, more than {LONGEST_LIST}",

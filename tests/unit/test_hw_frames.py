@@ -142,7 +142,7 @@ def options(**changes: object) -> dict[str, object]:
         ({"indications": [{"at": 2, "type": "u8"}] * 2}, "1 or 3 numbers, not 2"),
         ({"sequence": {"at": 2, "type": "i8"}}, "u8, u16 or u32, not i8"),
         ({"rate_hz": 1000.0}, "1000 frames/s of 12 bytes, 10 bits each, are 120000 bit/s; baud_rate is 115200"),
-        ({"start": "aa5"}, "String should match pattern"),
+        ({"start": "aa5"}, "two hexadecimal digits each"),
         ({"temperature": {"at": 9, "type": "i16", "counts_per_degc": 0.0}}, "no thermometer"),
     ],
 )

@@ -192,7 +192,7 @@ def test_an_operators_pose_holds_until_the_next_change() -> None:
         ({"positions": "free"}, "needs a reference"),
         ({"positions": "free", "reference": "r", "clamp_theta_deg": 2}, "tells no alpha"),
         ({"clamp_theta_deg": 35}, 'goes with positions = "free"'),
-        ({"positions": [{"start_s": 0, "gravity_mps2": [0, 0, 9.8]}] * 2}, "positions.stops.0.start_s"),
+        ({"positions": [{"start_s": 0, "gravity_mps2": [0, 0, 9.8]}] * 2}, "positions.0.start_s"),
     ],
 )  # fmt: skip
 def test_a_configuration_that_cannot_be_is_refused(keys: dict[str, Any], words: str) -> None:

@@ -1,0 +1,138 @@
+"""The faults of a configuration, each with its place, in words that say what to do."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path as FilePath
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+
+from agent.config.key_file import KeyFileError, load_private_key
+from agent.config.lines import Path
+from agent.config.names import Told, name_faults
+from agent.config.sinks import Tls
+from agent.config.tls import tls_faults
+from agent.config.whole import Config
+from hw.sensor import DeviceError, Options, load_driver
+
+SHOWN_CHARACTERS = 100  # of a value or a path in a fault
+_IN_WORDS = {
+    "missing": "is missing; add it",
+    "extra_forbidden": "there is no such setting; remove it or correct its name",
+}
+_PATH = re.compile(r"([a-z_]\w*(?:\.\w+)*): ")  # with which a check of several settings begins
+
+
+def faults_of(raw: Mapping[str, Any]) -> tuple[Config | None, list[Told]]:
+    """The configuration, None where it is none, and all faults: what the sections say, names, drivers and files."""
+    config: Config | None = None
+    faults: list[Told] = []
+    named = list(name_faults(raw))
+    try:
+        config = Config.model_validate(raw)
+    except ValidationError as error:
+        # The model looks at its names only when all else is sound; they are named here, and only once.
+        faults += _told(error, raw, but_of_the_whole=bool(named))
+    faults += named
+    options = list(_options(raw, faults))
+    faults += _unknown_sensitivities(raw, dict(options))
+    faults += _file_faults(raw)
+    return config, faults
+
+
+def shown(path: Path) -> str:
+    """A path as faults name it."""
+    return _short(".".join(str(part) for part in path))
+
+
+def _options(raw: Mapping[str, Any], faults: list[Told]) -> Iterator[tuple[str, Options]]:
+    """The options of each device by its name, as its driver takes them; those that it refuses are faults."""
+    for i, device in enumerate(_entries(raw, "devices")):
+        driver, options = device.get("driver"), device.get("options", {})
+        if not isinstance(driver, str) or not isinstance(options, dict):
+            continue  # the section's own check names it
+        try:
+            held = load_driver(driver).options_model.model_validate(options)
+            held.check_installed()
+        except DeviceError as error:
+            faults.append((("devices", i, "driver"), str(error)))
+        except ValidationError as error:
+            faults += [(("devices", i, "options", *path), what) for path, what in _told(error, options)]
+        else:
+            yield str(device.get("name")), held
+
+
+def _unknown_sensitivities(raw: Mapping[str, Any], options: Mapping[str, Options]) -> Iterator[Told]:
+    """Channels whose sensor tells no sensitivity and whose prior states none: nothing could be calibrated."""
+    for i, channel in enumerate(_entries(raw, "channels")):
+        prior, sensor = channel.get("prior"), str(channel.get("sensor"))
+        if not isinstance(prior, Mapping) or prior.get("sensitivity") is not None or sensor not in options:
+            continue
+        if not options[sensor].tells_sensitivity:
+            what = f"is missing: the device {sensor!r} tells none; state it in its unit per m/s2, from its data sheet"
+            yield ("channels", i, "prior", "sensitivity"), what
+
+
+def _file_faults(raw: Mapping[str, Any]) -> Iterator[Told]:
+    """Files that are named and cannot be used."""
+    recording, zenoh = raw.get("recording"), raw.get("zenoh")
+    key = recording.get("signing_key") if isinstance(recording, Mapping) else None
+    if isinstance(key, str):
+        try:
+            load_private_key(FilePath(key))
+        except KeyFileError as error:
+            yield ("recording", "signing_key"), f"{error}; `openssl genpkey -algorithm ed25519` makes one"
+    try:
+        files = Tls.model_validate(zenoh.get("tls") if isinstance(zenoh, Mapping) else None).files
+    except ValidationError:
+        return  # the section's own check names it, if it is there at all
+    for fault in tls_faults(files):
+        field, _, what = fault.partition(": ")
+        yield ("zenoh", "tls", field), what
+
+
+def _entries(raw: Mapping[str, Any], section: str) -> list[Mapping[str, Any]]:
+    held = raw.get(section)
+    return [entry if isinstance(entry, Mapping) else {} for entry in held] if isinstance(held, list) else []
+
+
+def _told(error: ValidationError, raw: Any, *, but_of_the_whole: bool = False) -> Iterator[Told]:
+    faults = [fault for fault in error.errors() if fault["loc"] or not but_of_the_whole]
+    # A list that is too short only because what is in it was refused is no fault of its own.
+    around = {fault["loc"][:n] for fault in faults for n in range(len(fault["loc"]))}
+    for fault in faults:
+        if fault["type"] == "too_short" and fault["loc"] in around:
+            continue
+        path, value = _path(fault["loc"], raw), fault.get("input")
+        what = fault["msg"].removeprefix("Value error, ")
+        if (named := _PATH.match(what)) is not None:
+            path, what = (*path, *named[1].split(".")), what[named.end() :]
+        what = _IN_WORDS.get(fault["type"], what)
+        # A whole section as "the offending value" would bury the message.
+        whole = isinstance(value, dict | BaseModel | list | tuple) or fault["type"] == "missing"
+        yield path, what if whole else f"{what}, not {_value(value)}"
+
+
+def _path(location: tuple[str | int, ...], raw: Any) -> Path:
+    """Where the fault is in the file: without the names of alternatives that pydantic puts between."""
+    path: list[str | int] = []
+    for k, part in enumerate(location):
+        held = isinstance(raw, Mapping) and part in raw
+        if held or (isinstance(raw, list | tuple) and isinstance(part, int) and part < len(raw)):
+            path.append(part)
+            raw = raw[part]
+        elif isinstance(raw, Mapping) and k == len(location) - 1:
+            path.append(part)  # what is missing
+    return tuple(path)
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, int) and value.bit_length() > 64:
+        return f"a number of {value.bit_length()} bits"  # Python refuses to write one of thousands of digits
+    return _short(repr(value))
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= SHOWN_CHARACTERS else f"{text[:SHOWN_CHARACTERS]}..."

@@ -1,0 +1,39 @@
+"""The private key that signs recordings, from its file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:  # only who reads keys pays for it
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+LARGEST_KEY_FILE = 1 << 16  # bytes; a key has 120
+
+
+class KeyFileError(Exception):
+    """A file that holds no usable key. The message names it."""
+
+
+def load_private_key(path: Path) -> Ed25519PrivateKey:
+    """From a PEM file (PKCS #8, not encrypted). Raises KeyFileError."""
+    from cryptography.exceptions import UnsupportedAlgorithm
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+    from cryptography.hazmat.primitives.serialization import load_pem_private_key
+
+    try:
+        key = load_pem_private_key(read_key_file(path), password=None)
+    except (ValueError, TypeError, UnsupportedAlgorithm):  # what cryptography says may quote the file
+        raise KeyFileError(f"{path}: not a private key in PEM without a password") from None
+    if not isinstance(key, Ed25519PrivateKey):
+        raise KeyFileError(f"{path}: a private key, but not of Ed25519")
+    return key
+
+
+def read_key_file(path: Path) -> bytes:
+    """The file, at most LARGEST_KEY_FILE bytes of it. Raises KeyFileError."""
+    try:
+        with open(path, "rb") as file:
+            return file.read(LARGEST_KEY_FILE)
+    except OSError as error:
+        raise KeyFileError(f"{path}: cannot be read: {error.strerror}") from None

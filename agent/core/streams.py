@@ -1,0 +1,175 @@
+"""The samples of a channel: which pieces of them are due, the windows in a piece, and a verdict on each window."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from agent.config import Channel
+from agent.core.estimation import DAY_S, Estimation, Judged
+from agent.core.positions import FOUND_WITHIN_S, FoundPositions
+from agent.core.schedule import Piece, ToldTimes
+from agent.core.stream import DeviceStream
+from agent.core.windows import Found, margin_of, refused, windows_in
+from calib.estimate.lag_search import without_lag
+from calib.excitation.front_end import most_margin_s
+from calib.excitation.placing import Placed
+from calib.model import Pose, Window
+from calib.signal.timing import HORIZON_S
+from hw.block import LARGEST, SampleBlock
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Verdict:
+    """A window and what the estimation made of it; None where it was not asked, for the reason in the window.
+
+    `lag_s` was taken out of the sensor's times.
+    """
+
+    window: Window
+    judged: Judged | None
+    lag_s: float
+
+
+class Streams:
+    """The newest samples of a sensor and of its reference, and when the sensor stood how.
+
+    `by_device` are the streams by the name of the device. Times are seconds since the run's origin.
+    """
+
+    def __init__(self, channel: Channel) -> None:
+        self._channel = channel
+        self.by_device: dict[str, DeviceStream] = {}
+        self._finder = FoundPositions(channel) if channel.positions else None
+        self._places = self._finder or ToldTimes(channel)
+
+    def begin(self, origin_ns: int) -> None:
+        """A new run, nothing is there yet."""
+        names = [self._channel.sensor] + ([self._channel.reference] if self._channel.reference else [])
+        self.by_device = {name: DeviceStream(name, origin_ns, self._horizon_s) for name in names}
+
+    def look_where(self, block: SampleBlock, estimation: Estimation) -> None:
+        """Where nobody told how the sensor stands, gravity in its newest block may."""
+        if self._finder is not None:
+            self._finder.update(block, self._sensor, estimation.recursion.scale)
+
+    def forget_sensor(self) -> None:
+        """Another device takes the sensor's place: samples of the one before are nothing to it."""
+        self._sensor.clear()
+        if self._finder is not None:
+            self._finder.forget()
+
+    def turn(self, now_s: float, pose: Pose) -> None:
+        """An operator says how the sensor stands from now on."""
+        first_s = self._sensor.first_sample_s
+        self._places.turn(0.0 if first_s is None else now_s - first_s, pose)
+
+    def due(self, now_s: float) -> Iterator[Piece]:
+        """The pieces whose samples are all there, or later than anybody waits for; what is old is then forgotten."""
+        first_s = self._sensor.first_sample_s
+        while (piece := self._places.piece) is not None and first_s is not None and self._due(piece, first_s, now_s):
+            yield piece
+            self._places.done(piece)
+        around_s = 2.0 * self._margin_s
+        keep_from_s = now_s - around_s
+        if first_s is not None:
+            keep_from_s = min(keep_from_s, first_s + self._places.keep_from_s - around_s)
+        for stream in self.by_device.values():
+            stream.forget_before(keep_from_s)
+
+    def verdicts(
+        self, piece: Piece, first_day: float, estimation: Estimation | None, unusable: str
+    ) -> Iterator[Verdict]:
+        """A verdict on each window of a piece. `first_day` is the run's origin in the estimation's own count.
+
+        `unusable` says why the reference may not be used, "" where it may.
+        """
+        first_s = self._sensor.first_sample_s
+        assert first_s is not None  # a piece was due
+        day = first_day + (first_s + piece.stop_s) / DAY_S
+        placed, lag_s = Placed(piece.pose, "", {}), 0.0
+        if unsound := self._unsound(first_s + piece.start_s, first_s + piece.stop_s):
+            found = Found([refused(piece, unsound)])
+        else:
+            placed = self._placed(piece, first_s, day, estimation)
+            if placed.pose is None or unusable:
+                found = Found([refused(piece, unusable or placed.reason)])
+            else:
+                found, lag_s = self._found(replace(piece, pose=placed.pose), first_s, day, estimation)
+        found = found.told(placed.numbers)
+        for window in found.windows:
+            judged = None
+            if window.used and estimation is not None:
+                judged = estimation.judge(window, day, lag_s, found.temperature_degc)
+            yield Verdict(window, judged, lag_s)
+
+    def snapshot(self) -> dict[str, Any]:
+        """State for `load`, bit-exact."""
+        return {
+            "streams": {name: stream.snapshot() for name, stream in self.by_device.items()},
+            "places": self._places.snapshot(),
+        }
+
+    def load(self, origin_ns: int, state: Mapping[str, Any]) -> None:
+        """Take the state that `snapshot` gave."""
+        self.by_device = {
+            n: DeviceStream.restore(n, origin_ns, s, self._horizon_s) for n, s in state["streams"].items()
+        }
+        self._places.load(state["places"])
+
+    @property
+    def _sensor(self) -> DeviceStream:
+        return self.by_device[self._channel.sensor]
+
+    @property
+    def _horizon_s(self) -> float:
+        around_s = 2.0 * most_margin_s(self._channel.certificate.instrument)
+        return max(HORIZON_S, self._channel.window_s + around_s + (FOUND_WITHIN_S if self._finder else 0.0))
+
+    @property
+    def _margin_s(self) -> float:
+        return margin_of(self._channel, self.by_device)
+
+    def _due(self, piece: Piece, first_s: float, now_s: float) -> bool:
+        end_s = first_s + piece.stop_s + self._margin_s
+        return now_s > end_s + self._channel.late_horizon_s or all(s.reaches(end_s) for s in self.by_device.values())
+
+    def _unsound(self, start_s: float, stop_s: float) -> str:
+        """Which device shows a number that nothing can be computed from, and which; "" where none does."""
+        for name, stream in self.by_device.items():
+            cut = stream.cut(start_s - self._margin_s, stop_s + self._margin_s)
+            if cut is None:
+                continue
+            shown = {
+                "an indication": cut.values.ravel(),
+                "its temperature in degC": np.array([cut.temperature_degc]),
+            }
+            for what, values in shown.items():
+                beyond = values[np.abs(values) > LARGEST]  # NaN is a sample that is missing
+                if len(beyond):
+                    return f"{name}: {what} is {beyond[0]:.6g}, too large to compute with ({LARGEST:g} at most)"
+        return ""
+
+    def _placed(self, piece: Piece, first_s: float, day: float, estimation: Estimation | None) -> Placed:
+        """How the sensor stands in the piece, where nobody told."""
+        if self._finder is None or estimation is None:
+            return Placed(piece.pose, "", {})
+        cut = self._sensor.cut(first_s + piece.start_s, first_s + piece.stop_s)
+        return self._finder.place(piece, cut, estimation.recursion, day)
+
+    def _found(self, piece: Piece, first_s: float, day: float, estimation: Estimation | None) -> tuple[Found, float]:
+        """The windows, made again until no lag is left in them that matters."""
+        if estimation is None or self._channel.reference is None:
+            lag_s = 0.0 if estimation is None else estimation.lag_s
+            return windows_in(piece, first_s, self._channel, self.by_device, lag_s), lag_s
+        return without_lag(
+            estimation.lag_s,
+            lambda lag_s: windows_in(piece, first_s, self._channel, self.by_device, lag_s),
+            lambda found: [w for w in found.windows if w.used],
+            lambda found, lag_s: estimation.lag_after(
+                [w for w in found.windows if w.used], day, lag_s, found.temperature_degc
+            ),
+        )

@@ -1,0 +1,42 @@
+"""The calibrations of a sensor, each once, however often it came into force."""
+
+from __future__ import annotations
+
+from agent.delivery.history import History, Record
+
+
+def made(record: Record) -> tuple[str, int]:
+    """(run, sequence) of the result by which the calibration of this record first came into force."""
+    fields = record.fields
+    sequence = fields.get("made_sequence")
+    return (str(fields.get("made_run_id")), int(sequence)) if sequence else (record.run_id, record.sequence)
+
+
+def date_utc_ns(record: Record) -> int:
+    """When the calibration of this record was made."""
+    return int(record.fields.get("made_utc_ns") or record.t_utc_ns)
+
+
+def calibrations(history: History, sensor: str, *, limit: int) -> list[Record]:
+    """The newest `limit` calibrations of a sensor, newest first by when they were made.
+
+    Each is the record of when it was made; of one that retention deleted, the record by which it came into force last.
+    """
+    asked = limit
+    while True:
+        records = history.newest(sensor, "calibration", limit=asked)
+        once: dict[tuple[str, int], Record] = {}
+        for record in records:
+            once.setdefault(made(record), record)
+        if len(once) >= limit or len(records) < asked:
+            break
+        asked *= 2
+    newest = sorted(once.values(), key=date_utc_ns, reverse=True)[:limit]
+    return [_first(history, record) for record in newest]
+
+
+def _first(history: History, record: Record) -> Record:
+    run_id, sequence = made(record)
+    found = history.after(sequence - 1, [(record.sensor, "calibration")], limit=1)
+    there = bool(found) and (found[0].run_id, found[0].sequence) == (run_id, sequence)
+    return found[0] if there else record

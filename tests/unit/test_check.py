@@ -1,0 +1,214 @@
+"""`fieldcal check` and the start of `fieldcal run`: the same faults of a configuration, each with its line."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from cryptography.hazmat.primitives.asymmetric import ec, ed25519
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
+
+from agent.cli.main import run_cli
+from agent.cli.run import STOP_SIGNALS
+
+GOOD = """[gateway]
+site = "bridge"
+[[devices]]
+name = "imu"
+driver = "serial-csv"
+options = { port = "/dev/ttyUSB0", rate_hz = 100, unit = "count" }
+[[devices]]
+name = "laser"
+driver = "serial-csv"
+[devices.options]
+port = "/dev/ttyUSB1"
+rate_hz = 100
+axes = 1
+[[channels]]
+sensor = "imu"
+reference = "laser"
+[channels.prior]
+sensitivity = 26000
+[recording]
+keep_days = 30
+"""
+
+
+@pytest.fixture(autouse=True)
+def _signals() -> Iterator[None]:
+    """`run` takes them over before it reads its configuration."""
+    before = {number: signal.getsignal(number) for number in STOP_SIGNALS}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+def checked(path: Path, text: str, capsys: pytest.CaptureFixture[str]) -> list[str]:
+    """What `check` says of a text, each line without the name of the file; `run` must say the same."""
+    path.write_text(text)
+    told = []
+    for command in (
+        ["check", str(path)],
+        ["run", str(path), "--log", "plain", "--data-dir", str(path.parent / "data")],
+    ):
+        assert run_cli(command) == 2
+        shown = capsys.readouterr()
+        assert shown.out == ""
+        told.append(shown.err.splitlines())
+    assert told[0] == told[1]
+    assert not (path.parent / "data").exists()
+    assert all(line.startswith(f"{path}: line ") for line in told[0])
+    return [line.removeprefix(f"{path}: ") for line in told[0]]
+
+
+def test_a_sound_configuration_is_good(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "gateway.toml"
+    path.write_text(GOOD)
+    assert run_cli(["check", str(path)]) == 0
+    assert capsys.readouterr().out == f"{path}: good; 2 devices, 1 channels, 0 poses\n"
+
+
+@pytest.mark.parametrize(
+    ("said", "instead", "told"),
+    [
+        (
+            "sensitivity = 26000",
+            "u_main_pct = 1",
+            "line 17: channels.0.prior.sensitivity: is missing: the device 'imu' tells none; state it in its unit per "
+            "m/s2, from its data sheet",
+        ),
+        (
+            'sensor = "imu"',
+            'sensor = "imo"',
+            "line 15: channels.0.sensor: no device is called 'imo'; there is imu, laser",
+        ),
+        (
+            'reference = "laser"',
+            'reference = "imu"',
+            "line 16: channels.0.reference: a sensor cannot be its own reference; name another device, or leave it out",
+        ),
+        (
+            'name = "laser"',
+            'name = "the laser"',
+            "line 8: devices.1.name: a name has 1 to 63 letters (A-Z, a-z), digits, '_', '.' or '-', the first a "
+            "letter or a digit, not 'the laser'",
+        ),
+        (
+            "keep_days = 30",
+            "keep_day = 30",
+            "line 20: recording.keep_day: there is no such setting; remove it or correct its name, not 30",
+        ),
+        ("port = \"/dev/ttyUSB1\"\n", "", "line 10: devices.1.options.port: is missing; add it"),
+        ("keep_days = 30", "keep_days = ", "line 20: not TOML: Invalid value (at line 20, column 13)"),
+    ],
+)  # fmt: skip
+def test_a_fault_names_line_path_and_remedy(
+    said: str, instead: str, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lines = checked(tmp_path / "f.toml", GOOD.replace(said, instead, 1), capsys)
+    assert lines[0] == told
+    assert not [line for line in lines if re.search(r"[\[^]\^|\\\$|\{0,", line)], "a regular expression is no help"
+
+
+def test_a_device_that_tells_m_per_s2_needs_no_sensitivity(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "f.toml"
+    path.write_text(GOOD.replace('unit = "count"', 'unit = "m/s2"').replace("sensitivity = 26000", ""))
+    assert run_cli(["check", str(path)]) == 0, capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("driver", "options", "module", "extra"),
+    [
+        ("sound-card", "{}", "sounddevice", "sound"),
+        ("ni", '{ channels = ["cDAQ1Mod1/ai0"] }', "nidaqmx", "ni"),
+        ("mcc-usb", "{}", "uldaq", "mcc"),
+        ("mcc172", "{}", "daqhats", "mcc"),
+    ],
+)
+def test_a_driver_whose_library_is_missing_is_a_fault(
+    driver: str,
+    options: str,
+    module: str,
+    extra: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, module, None)  # an import of it fails, as where it is not installed
+    text = GOOD.replace(
+        'name = "laser"\ndriver = "serial-csv"\n[devices.options]', f'name = "laser"\ndriver = "{driver}"'
+    )
+    text = text.replace('port = "/dev/ttyUSB1"\nrate_hz = 100\naxes = 1\n', f"options = {options}\n")
+    [line] = checked(tmp_path / "f.toml", text, capsys)
+    assert line.startswith(
+        f"line 9: devices.1.driver: driver {driver} needs {module} (pip install 'fieldcal[{extra}]')"
+    )
+
+
+def key_of(kind: str, path: Path) -> None:
+    """A file that shall hold a signing key."""
+    private = (Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+    if kind == "sound":
+        path.write_bytes(ed25519.Ed25519PrivateKey.generate().private_bytes(*private))
+    elif kind == "public":
+        path.write_bytes(
+            ed25519.Ed25519PrivateKey.generate()
+            .public_key()
+            .public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo)
+        )
+    elif kind == "of another kind":
+        path.write_bytes(ec.generate_private_key(ec.SECP256R1()).private_bytes(*private))
+    elif kind == "no PEM":
+        path.write_bytes(os.urandom(64))
+    elif kind == "a directory":
+        path.mkdir()
+
+
+@pytest.mark.parametrize(
+    ("kind", "why"),
+    [
+        ("missing", "cannot be read: No such file or directory"),
+        ("a directory", "cannot be read: Is a directory"),
+        ("no PEM", "not a private key in PEM without a password"),
+        ("public", "not a private key in PEM without a password"),
+        ("of another kind", "a private key, but not of Ed25519"),
+    ],
+)
+def test_a_signing_key_that_cannot_sign_is_a_fault(
+    kind: str, why: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    key = tmp_path / "recording.key"
+    key_of(kind, key)
+    [line] = checked(tmp_path / "f.toml", f'{GOOD}signing_key = "{key}"\n', capsys)
+    assert line.startswith(f"line 21: recording.signing_key: {key}: {why}; ")
+
+
+def test_a_signing_key_that_can_sign_is_good(tmp_path: Path) -> None:
+    key_of("sound", tmp_path / "recording.key")
+    (tmp_path / "f.toml").write_text(f'{GOOD}signing_key = "{tmp_path}/recording.key"\n')
+    assert run_cli(["check", str(tmp_path / "f.toml")]) == 0
+
+
+def test_names_come_with_all_other_faults(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = GOOD.replace('sensor = "imu"', 'sensor = "imo"').replace('reference = "laser"', 'reference = "lasre"')
+    text = text.replace("rate_hz = 100,", "rate_hz = -1,").replace(
+        "keep_days = 30", 'keep_days = "x"\nsigning_key = "/no"'
+    )
+    text += '[[commands.keys]]\nid = "a"\npublic_key = "x"\nverbs = ["hold"]\nsensors = ["other"]\n'
+    lines = checked(tmp_path / "f.toml", text, capsys)
+    assert sorted(": ".join(line.split(": ")[:2]) for line in lines) == sorted(
+        [
+            "line 6: devices.0.options.rate_hz",
+            "line 15: channels.0.sensor",
+            "line 16: channels.0.reference",
+            "line 20: recording.keep_days",
+            "line 21: recording.signing_key",
+            "line 24: commands.keys.0.public_key",
+            "line 26: commands.keys.0.sensors.0",
+        ]
+    )

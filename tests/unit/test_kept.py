@@ -1,0 +1,79 @@
+"""What a later run makes of a state that was made with another geometry."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from agent.config import Channel, parse_config
+from agent.core.estimation import Estimation
+from agent.core.kept import Kept, keep, take_up
+from agent.core.outcome import Source, calibration_update
+from agent.core.snapshot import pack, unpack
+
+G = 9.80665
+UP = {"direction": [1.0, 0.0, 0.0], "gravity_mps2": [0.0, 0.0, G]}
+UPSIDE_DOWN = {"direction": [1.0, 0.0, 0.0], "gravity_mps2": [0.0, 0.0, -G]}
+SIDEWAYS = {"direction": [0.0, 1.0, 0.0], "gravity_mps2": [0.0, 0.0, G]}
+RESTORED = "restored from the run before"
+
+
+def channel(*stances: dict[str, Any], **more: Any) -> Channel:
+    """A sensor that stands 10 s each in these poses."""
+    devices = [{"name": n, "driver": "serial-csv", "options": {"port": n, "rate_hz": 50}} for n in ("s", "r", "other")]
+    poses = [{"start_s": 10 * k, "stop_s": 10 * k + 10, **stance} for k, stance in enumerate(stances)]
+    held = {"sensor": "s", "reference": "r", "prior": {"sensitivity": 1.0}, "poses": poses}
+    return parse_config({"devices": devices, "channels": [held | more]}, "").channels[0]
+
+
+def state_of(made_with: Channel) -> bytes:
+    """A state with a calibration in force."""
+    estimation = Estimation(made_with, None)
+    in_force = calibration_update(Source("s", "A", "m/s2", 5), estimation.in_force, estimation.recursion)
+    return keep(made_with, estimation, in_force, "", 0.0, 5)
+
+
+def after(before: Channel, now: Channel) -> Kept:
+    return take_up(state_of(before), now, None)
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "named"),
+    [
+        (channel(UP), channel(UPSIDE_DOWN), "poses"),  # the position's name tells the direction alone
+        (channel(UP), channel(SIDEWAYS), "poses"),
+        (channel(UP, SIDEWAYS), channel(UPSIDE_DOWN, SIDEWAYS), "poses"),
+        (channel(UP), channel(UP, reference="other"), "reference"),
+        (
+            channel(positions="free", clamp_theta_deg=30.0),
+            channel(positions="free", clamp_theta_deg=40.0),
+            "clamp_theta_deg",
+        ),
+        (channel(positions=[UP, UPSIDE_DOWN | {"direction": [0, 0, 1]}]), channel(positions="free"), "positions"),
+    ],
+)
+def test_a_state_made_at_another_mount_is_not_gone_on_with(before: Channel, now: Channel, named: str) -> None:
+    found = after(before, now)
+    assert found.reason == f"begun anew from the calibration in force: these settings have changed: {named}"
+    assert found.in_force is not None
+    assert found.estimation.recursion.windows == 0
+
+
+@pytest.mark.parametrize(
+    ("before", "now"),
+    [
+        (channel(UP, SIDEWAYS), channel(SIDEWAYS, UP)),  # at other times
+        (channel(UP, SIDEWAYS), channel(UP, SIDEWAYS, {"direction": [0.0, 0.0, 1.0], "gravity_mps2": [0, 0, G]})),
+        (channel(positions="free", clamp_theta_deg=30.0), channel(positions="free", clamp_theta_deg=30.0)),
+    ],
+)
+def test_what_stands_as_before_is_the_same_mount(before: Channel, now: Channel) -> None:
+    assert after(before, now).reason == RESTORED
+
+
+def test_a_state_of_an_earlier_version_says_nothing_of_its_mount() -> None:
+    state = unpack(state_of(channel(UP)))
+    for name in ("poses", "positions", "clamp_theta_deg", "reference"):
+        del state["basis"][name]
+    assert take_up(pack(state), channel(UP), None).reason == RESTORED
