@@ -171,7 +171,7 @@ class ChannelState:
         return self._say_status(reason) or [self._told(reason)]
 
     def _clock_reports(self) -> list[Result]:
-        return self._clocks.reports(self._source(), self._now_s(), self._streams, self._estimation)
+        return self._clocks.reports(self._source(), self._now_s(), self._streams.by_device, self._estimation)
 
     def _lose(self, reason: str) -> list[Result]:
         if self._estimation is not None:
