@@ -1,6 +1,6 @@
-"""What i2c-dev answers: the same questions to the kernel in the machine and to its stand-in, `hw.virtual.kernel`.
+"""Answers of i2c-dev: the same questions go to the kernel in the machine and to its twin, `hw.virtual.kernel`.
 
-Run as a script in the machine, it prints its answers as JSON.
+As a script in the machine it prints its answers as JSON.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ GONE_S = 10.0
 
 
 def answers(path: str) -> dict[str, str]:
-    """By question. An ADXL355 must be at 0x1D, nobody at 0x55."""
+    """Answers by question. An ADXL355 must be at 0x1D and no device at 0x55."""
     with SMBus(path) as bus:
         funcs = bus.funcs
 
@@ -55,7 +55,7 @@ def _written(bus: SMBus) -> list[int]:
 
 
 def held(path: str, address: int) -> dict[str, str]:
-    """At an address that a kernel driver holds: reads of i2c-dev, and what it lets through all the same."""
+    """Answers at an address that a kernel driver holds: reads through i2c-dev, and transfers that it still allows."""
     with SMBus(path) as bus:
         return {
             "held by a kernel driver, byte": outcome(lambda: bus.read_byte_data(address, 0x75)),
@@ -64,8 +64,10 @@ def held(path: str, address: int) -> dict[str, str]:
 
 
 def gone(path: str, say_open: Callable[[], object]) -> dict[str, str]:
-    """The node is open while the adapter goes: what reads say then (of an ADXL345: no kernel driver takes it), and the
-    next opening."""
+    """Remove the adapter while its node is open: the answers of a read and of the next opening.
+
+    The read is of the ADXL345, which no kernel driver uses.
+    """
     end_s = time.monotonic() + GONE_S
     with SMBus(path) as bus:
         bus.read_byte_data(ADXL345, 0)
@@ -78,7 +80,7 @@ def gone(path: str, say_open: Callable[[], object]) -> dict[str, str]:
 
 
 def outcome(question: Callable[[], object]) -> str:
-    """What came, or the errno's name."""
+    """The result, or the name of the errno."""
     try:
         return str(question())
     except OSError as error:
@@ -86,7 +88,7 @@ def outcome(question: Callable[[], object]) -> str:
 
 
 def main() -> None:
-    """`answers NODE`, `held NODE ADDRESS` or `gone NODE MARK`: MARK is a file made once the node is open."""
+    """Arguments: `answers NODE`, `held NODE ADDRESS` or `gone NODE MARK`; MARK is a file made once the node is open."""
     what, path, *rest = sys.argv[1:]
     match what:
         case "answers":

@@ -1,4 +1,4 @@
-"""Driver `iio` where the kernel refuses, as JSON. Run in the machine, with the trigger `lsm6dso` there."""
+"""Requests of driver `iio` that the kernel refuses, as JSON. Run in the machine, with the trigger `lsm6dso` present."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ RATE_HZ = 26.0
 
 
 def opened(options: dict[str, Any]) -> str:
-    """What opening with these options says."""
+    """Message when the driver is opened with these options."""
     sensor = Iio("sensor", IioOptions.model_validate(options))
     try:
         sensor.open()
@@ -24,7 +24,7 @@ def opened(options: dict[str, Any]) -> str:
 
 
 def refusals() -> dict[str, str]:
-    """By question."""
+    """Messages by question."""
     found = {
         "a rate that is rounded": opened(LSM6DSO | {"rate_hz": 100}),
         "a rate that is refused": opened(LSM6DSO | {"rate_hz": 5000}),
