@@ -183,13 +183,13 @@ def told(reads: list[Late], stood: list[Late]) -> str:
         for t_s, apart_s in late
     ]
     excused = sum(apart_s - max(by_s, default=0.0) <= FIFO_S for apart_s, by_s in within)
-    return f"{longest}; {len(late)} too long, {excused} of them only because the machine itself stood still"
+    return f"{longest}; {len(late)} too long, {excused} of them only because the machine itself paused"
 
 
 def circumstances(before: bool, stood: list[Late]) -> str:
     """Text: load and pauses of the machine, and whether its other processes had lower priority."""
     kept = ", all under SCHED_FIFO" if before else ""
-    still = f"the machine itself stood still {len(stood)} times for more than {1e3 * STILL_S:g} ms"
+    still = f"the machine itself paused {len(stood)} times for more than {1e3 * STILL_S:g} ms"
     if stood:
         still += f", {1e3 * max(late_s for _, late_s in stood):.0f} ms at most"
     return f"load of the machine {os.getloadavg()[2]:.0f}{kept};\n{still}"

@@ -63,7 +63,7 @@ class Adxl345(FifoSensor):
     def _identify(self) -> dict[str, int]:
         (found,) = self._device.read(chip.DEVID, 1)
         if found != chip.IDENTITY:
-            raise IdentityError(f"{self._device.name}: expected 0x{chip.IDENTITY:02X}, found 0x{found:02X}")
+            raise IdentityError(f"{self._device.name}: expected the ID 0x{chip.IDENTITY:02X}, found 0x{found:02X}")
         return {"DEVID": found}
 
     def _set_up(self, identity: Mapping[str, int]) -> DeviceInfo:

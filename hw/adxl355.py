@@ -87,7 +87,8 @@ class Adxl355(FifoSensor):
             if after == before:
                 return
         raise DeviceLost(
-            f"{self._device.name}: after a reset the shadow registers read {after.hex(' ')}, not {before.hex(' ')}"
+            f"{self._device.name}: after a reset the shadow registers read {after.hex(' ')}, "
+            f"not {before.hex(' ')}; check supply and wiring"
         )
 
     def _temperature(self) -> tuple[int, float]:

@@ -74,7 +74,7 @@ class BufferedSensor(ABC):
         After a loss the measurement must run again when this method returns. Raises DeviceLost.
         """
 
-    def _ends(self, info: DeviceInfo) -> tuple[float, float]:  # noqa: ARG002 - not every device says
+    def _ends(self, info: DeviceInfo) -> tuple[float, float]:  # noqa: ARG002 - not every device needs it
         """Lowest and highest indication of the range, in the unit of the indications."""
         return -np.inf, np.inf
 

@@ -175,7 +175,7 @@ class Iio:
             if self._options.device in (path.name, name):
                 return path
         known = ", ".join(f"{name} ({path.name})" for path, name in names.items()) or "none"
-        raise DeviceLost(f"{SYSFS}: no IIO device {self._options.device!r}; there are {known}")
+        raise DeviceLost(f"{SYSFS}: no IIO device {self._options.device!r}; available: {known}")
 
     def _configure(self) -> dict[str, str]:
         """Write all settings and start the buffer; returns the settings as read back, by file name."""

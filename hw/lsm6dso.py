@@ -64,7 +64,7 @@ class Lsm6dso(FifoSensor):
     def _identify(self) -> dict[str, int]:
         (found,) = self._device.read(chip.WHO_AM_I, 1)
         if found != chip.IDENTITY:
-            raise IdentityError(f"{self._device.name}: expected 0x{chip.IDENTITY:02X}, found 0x{found:02X}")
+            raise IdentityError(f"{self._device.name}: expected the ID 0x{chip.IDENTITY:02X}, found 0x{found:02X}")
         return {"WHO_AM_I": found}
 
     def _set_up(self, identity: Mapping[str, int]) -> DeviceInfo:

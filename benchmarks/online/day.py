@@ -116,5 +116,5 @@ def table() -> str:
     return (
         f"A day of the bench, sensor 1 kHz x 3 and reference 1 kHz ({blocks} blocks, {windows} windows used, {updates} "
         f"calibrations) takes the pipeline **{cpu_s:.0f} s** of one core. {CYCLES} cycles of four minutes are "
-        "generated and played again and again; that is not in the figure."
+        "generated once and then repeated; the time to generate them is not included."
     )

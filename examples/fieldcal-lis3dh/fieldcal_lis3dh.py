@@ -79,7 +79,7 @@ class Lis3dh(FifoSensor):
     def _identify(self) -> dict[str, int]:
         (found,) = self._device.read(WHO_AM_I, 1)
         if found != IDENTITY:
-            raise IdentityError(f"{self._device.name}: expected 0x{IDENTITY:02X}, found 0x{found:02X}")
+            raise IdentityError(f"{self._device.name}: expected the ID 0x{IDENTITY:02X}, found 0x{found:02X}")
         return {"WHO_AM_I": found}
 
     def _set_up(self, identity: Mapping[str, int]) -> DeviceInfo:

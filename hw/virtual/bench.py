@@ -64,7 +64,7 @@ class Bench:
         self.seed = seed
         sensor, reference = parameters.sensor, parameters.reference
         if reference.channels == 3 and reference.quantity != "acceleration":
-            raise ValueError("a tri-axial reference measures acceleration")
+            raise ValueError("a tri-axial reference must measure acceleration")
         self._scene = Scene(parameters, seed)
         self._coloured = ColouredNoise(seed, sensor.coloured_phi) if sensor.coloured_noise_mps2 else None
         self._sensor_response = _sensor_response(sensor, parameters.motion.frequency_hz)

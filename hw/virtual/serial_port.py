@@ -77,7 +77,7 @@ class PtyDevice:
                 self.path.unlink(missing_ok=True)
 
     def has_reader(self) -> bool:
-        """Whether somebody has the port open."""
+        """Whether a reader has the port open."""
         with self._lock:
             return self._open_for_reading()
 

@@ -153,7 +153,7 @@ class TestIio(SensorContract):
         assert enable.read_text() == "1"
 
     def test_absent_says_what_there_is(self, rig: IioRig) -> None:
-        with pytest.raises(DeviceLost, match=r"no IIO device 'other'; there are twin345 \(iio:device0\)"):
+        with pytest.raises(DeviceLost, match=r"no IIO device 'other'; available: twin345 \(iio:device0\)"):
             rig.build_elsewhere().open()
 
     def test_what_the_full_buffer_dropped_is_a_gap_of_known_length_or_a_restart(self, rig: IioRig) -> None:

@@ -37,8 +37,8 @@ def answers(path: str) -> dict[str, str]:
             "block of 32 registers": outcome(lambda: bytes(bus.read_i2c_block_data(ADXL355, 0, 32)).hex()),
             "byte written and read back": outcome(lambda: _written(bus)),
             "4 registers in one transfer": outcome(lambda: read(4).hex()),
-            "nobody there, byte": outcome(lambda: bus.read_byte_data(ABSENT, 0)),
-            "nobody there, transfer": outcome(lambda: bus.i2c_rdwr(i2c_msg.read(ABSENT, 1))),
+            "no device, byte": outcome(lambda: bus.read_byte_data(ABSENT, 0)),
+            "no device, transfer": outcome(lambda: bus.i2c_rdwr(i2c_msg.read(ABSENT, 1))),
             "42 messages": outcome(lambda: bus.i2c_rdwr(*[write(0)] * 42)),
             "43 messages": outcome(lambda: bus.i2c_rdwr(*[write(0)] * 43)),
             "4096 bytes": outcome(lambda: len(read(4096))),
@@ -76,7 +76,7 @@ def gone(path: str, say_open: Callable[[], object]) -> dict[str, str]:
             time.sleep(0.01)
     while (after := outcome(lambda: SMBus(path).close())) != "ENOENT" and time.monotonic() < end_s:
         time.sleep(0.01)
-    return {"adapter gone, open node": first, "adapter gone, opened anew": after}
+    return {"adapter gone, open node": first, "adapter gone, opened again": after}
 
 
 def outcome(question: Callable[[], object]) -> str:

@@ -91,7 +91,7 @@ def unplugging(machine: Machine) -> Iterator[Row]:
     machine.adapter.unplug()
     there = json.loads(machine.guest.sh("until [ -s /host/run/gone ]; do sleep 0.1; done; cat /host/run/gone"))
     yield same("i2c-dev", "adapter gone, open node", there["adapter gone, open node"], "EIO")
-    yield same("i2c-dev", "adapter gone, opened anew", there["adapter gone, opened anew"], "ENOENT")
+    yield same("i2c-dev", "adapter gone, opened again", there["adapter gone, opened again"], "ENOENT")
 
 
 def probe(machine: Machine) -> Iterator[Row]:

@@ -33,10 +33,10 @@ def refusals() -> dict[str, str]:
     first = Iio("first", IioOptions.model_validate(LSM6DSO | {"rate_hz": RATE_HZ}))
     first.open()
     before = first.read_block()
-    found["somebody else reads it"] = opened(LSM6DSO | {"rate_hz": RATE_HZ})
+    found["another process reads the device"] = opened(LSM6DSO | {"rate_hz": RATE_HZ})
     after = first.read_block()
     first.close()
-    found["the first reader goes on"] = "samples come" if before and after else "it fell silent"
+    found["the first reader continues"] = "samples arrive" if before and after else "no samples"
     return found
 
 

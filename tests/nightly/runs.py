@@ -80,14 +80,14 @@ def iio_refusals(machine: Machine) -> Iterator[Row]:
         "a rate that is rounded": "wrote 100, the kernel driver set 104.000000",
         "a rate that is refused": f"5000 is refused; accepted values: {rates}",
         "no buffer": "no buffer",
-        "somebody else reads it": "Device or resource busy",
+        "another process reads the device": "Device or resource busy",
     }
     for question, words in wanted.items():
         found = said[question]
         kind, _, message = found.partition(": ")
         agree = kind == "ConfigurationError" and words in message
         yield Row("driver iio", question, words if agree else found, kind, agree)
-    yield same("driver iio", "the first reader goes on", said["the first reader goes on"], "samples come")
+    yield same("driver iio", "the first reader continues", said["the first reader continues"], "samples arrive")
 
 
 def agent_run(machine: Machine, name: str, devices: dict[str, tuple[str, str]]) -> dict[str, Any]:

@@ -290,5 +290,5 @@ def test_contradicting_parameters_are_refused() -> None:
         Bench(one_position(sensor=SensorParameters(noise_mps2=0.1)), -1).sensor_values(0, 1)
     with pytest.raises(ValueError, match="positions on the clamp"):
         Bench(replace(one_position(clamp=ClampErrors(0.1)), schedule=Schedule((resting(np.ones(3), 1.0),))), 1)
-    with pytest.raises(ValueError, match="measures acceleration"):
+    with pytest.raises(ValueError, match="must measure acceleration"):
         Bench(one_position(reference=ReferenceParameters(rotation=np.eye(3), quantity="velocity")), 1)
