@@ -1,6 +1,6 @@
-"""What the live agent costs: CPU against the bare loop that only reads and records, start, memory.
+"""Cost of the live agent: CPU relative to a bare loop that only reads and records, start time, memory.
 
-Sensor (1 kHz, three axes) and reference (1 kHz) are served on pseudo-terminals by another process; agent and bare loop
+Another process serves the sensor (1 kHz, three axes) and the reference (1 kHz) on pseudo-terminals. Agent and bare loop
 run one after the other on the same ports, twice.
 """
 
@@ -45,19 +45,19 @@ connect = ["tcp/127.0.0.1:7449"]
 
 
 def cpu_s(pid: int) -> float:
-    """CPU time of a process so far, user and system."""
+    """CPU time of a process until now, user and system, s."""
     fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def peak_mb(pid: int) -> float:
-    """Peak resident memory."""
+    """Peak resident memory, MB."""
     line = next(x for x in Path(f"/proc/{pid}/status").read_text().splitlines() if x.startswith("VmHWM"))
     return int(line.split()[1]) / 1024
 
 
 def measure(command: list[str]) -> tuple[float, float]:
-    """CPU share (s per s) after the warm-up, and peak memory in MB."""
+    """CPU time per s after the warm-up, and peak memory in MB."""
     process = subprocess.Popen([sys.executable, *command], stdout=subprocess.DEVNULL)
     try:
         time.sleep(WARM_UP_S)
@@ -71,7 +71,7 @@ def measure(command: list[str]) -> tuple[float, float]:
 
 
 def first_block_s(config: Path, data_dir: Path) -> float:
-    """From starting the process to the arrival of the first block that is in the recording."""
+    """Time in s from the start of the process to the arrival of the first block that is in the recording."""
     began_ns = time.monotonic_ns()
     command = [sys.executable, "-m", "agent", "run", str(config), "--data-dir", str(data_dir), "--duration", "3"]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)

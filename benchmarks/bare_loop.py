@@ -1,4 +1,4 @@
-"""The alternative to the agent: a loop that only reads two devices and records them. Same drivers, same recorder.
+"""The loop with which the agent is compared: it reads two devices and records them. Same drivers, same recorder.
 
 python -m benchmarks.bare_loop CONFIG DATA_DIR SECONDS
 """
@@ -21,7 +21,7 @@ from hw.sensor import boot_id, load_driver
 
 
 def main() -> None:
-    """Read and record until the time is over."""
+    """Read and record for SECONDS."""
     config = load_config(Path(sys.argv[1]))
     data_dir = Path(sys.argv[2])
     data_dir.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""The least uncertainty that white noise allows: S, Q and a common lag from all points, straight from Eqs. (8)-(11)."""
+"""Cramér-Rao bound for white noise: least u of S, Q and a common lag from all points, directly from Eqs. (8)-(11)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from hw.virtual.parameters import BenchParameters
 
 
 def cramer_rao(parameters: BenchParameters) -> np.ndarray:
-    """(12,) standard uncertainties of S row by row and Q; nothing but noise is unknown on this bench."""
+    """Standard uncertainties (12,) of S row by row and Q, on a bench whose only fault is noise."""
     rate_hz, omega = 1000.0, 2.0 * np.pi * float(parameters.motion.frequency_hz[0])
     size = float(np.abs(parameters.motion.amplitude_mps2[0, 0]))
     information = np.zeros((13, 13))

@@ -1,4 +1,4 @@
-"""The drift test: how often it is wrong, and how soon it speaks beside a CUSUM of the same false-alarm rate.
+"""The drift test: its false-alarm rate, and its delay compared with a CUSUM of the same false-alarm rate.
 
 `python -m benchmarks.drift_test [MILLIONS]` prints the tables of docs/online.md; 60 takes most of an hour.
 """
@@ -17,9 +17,9 @@ from calib.estimate.onsets import CLIP, FEWEST, SPAN, Onsets
 from calib.model import PARAMETERS, Array
 
 WINDOWS_A_YEAR = 8766.0
-RATE = DriftSettings().false_alarms_a_year / (len(PARAMETERS) * WINDOWS_A_YEAR)  # a window, one parameter
+RATE = DriftSettings().false_alarms_a_year / (len(PARAMETERS) * WINDOWS_A_YEAR)  # false alarms per window and parameter
 HOUR_S = 3600.0
-QUIET, LONGEST = 300, 2500  # windows before the change, and after it at most
+QUIET, LONGEST = 300, 2500  # number of windows before the change, and largest number of windows after it
 SERIES = 400
 CHANGES: dict[str, Callable[[int], float]] = {
     "step of 30 sigma": lambda _: 30.0,
@@ -32,7 +32,7 @@ CHANGES: dict[str, Callable[[int], float]] = {
 
 
 def false_alarms(threshold: float, windows: int, series: int = 1000) -> int:
-    """Alarms in so many windows of white scores; a parameter begins anew after each."""
+    """Alarms in `windows` windows of white scores; after an alarm the test of that parameter starts again."""
     onsets, random, alarms = Onsets(series), np.random.default_rng(1), 0
     for k in range(windows // series):
         onsets.update(k * HOUR_S, random.normal(size=series), np.ones(series))
@@ -43,21 +43,21 @@ def false_alarms(threshold: float, windows: int, series: int = 1000) -> int:
 
 
 class Glr:
-    """The test of calib.estimate.onsets at the product's threshold."""
+    """The test of calib.estimate.onsets with the threshold of the product."""
 
     def __init__(self) -> None:
         self._onsets, self._k = Onsets(SERIES), 0
         self._threshold = false_alarm_threshold(RATE, FEWEST, SPAN)
 
     def alarms(self, score: Array) -> Array:
-        """(SERIES,) flags after one more window."""
+        """Alarms (SERIES,) after one more window with scores `score` (SERIES,)."""
         self._onsets.update(self._k * HOUR_S, score, np.ones(SERIES))
         self._k += 1
         return self._onsets.strongest() > self._threshold
 
 
 class Cusum:
-    """Page's two-sided CUSUM made for one size of step, threshold by Siegmund (1985), equation 2.57."""
+    """Page's two-sided CUSUM, designed for one size of step; threshold from Siegmund (1985), equation 2.57."""
 
     def __init__(self, size: float) -> None:
         self._allowance = size / 2
@@ -66,14 +66,17 @@ class Cusum:
         self._sums = np.zeros((2, SERIES))
 
     def alarms(self, score: Array) -> Array:
-        """(SERIES,) flags after one more window."""
+        """Alarms (SERIES,) after one more window with scores `score` (SERIES,)."""
         cut = np.clip(score, -CLIP, CLIP)
         self._sums = np.maximum(self._sums + np.array([cut, -cut]) - self._allowance, 0.0)
         return np.asarray(self._sums.max(axis=0) > self._threshold)
 
 
 def delays(test: Glr | Cusum, change: Callable[[int], float]) -> Array:
-    """(SERIES,) windows from the change to the alarm, the one that alarms counted; LONGEST + 1 where it never came."""
+    """Number of windows (SERIES,) from the change to the alarm, the window of the alarm included.
+
+    LONGEST + 1 where there was no alarm.
+    """
     random, first = np.random.default_rng(2), np.full(SERIES, LONGEST + 1.0)
     for k in range(-QUIET, LONGEST):
         alarms = test.alarms(random.normal(size=SERIES) + (change(k) if k >= 0 else 0.0))

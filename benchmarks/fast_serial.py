@@ -1,7 +1,7 @@
-"""Driver `serial-csv-fast`: `serial-csv` with a clock that runs FIELDCAL_FAST times as fast as the machine's.
+"""Driver `serial-csv-fast`: `serial-csv` with a clock that runs FIELDCAL_FAST times as fast as the machine's clock.
 
-A device that sends as much faster then makes hours of stamps, windows and rotations in minutes. The agent finds the
-driver as it finds any other of a third party.
+With a device that sends faster by the same factor, hours of stamps, windows and file rotations take minutes. The agent
+finds the driver through its entry point, like every third-party driver.
 """
 
 from __future__ import annotations
@@ -16,11 +16,12 @@ from hw.sensor import Clock, system_clock
 from hw.serial_stream import SerialCsv
 
 SPEED = int(os.environ.get("FIELDCAL_FAST", "1"))
-_ORIGIN_NS, _ = system_clock()  # the driver is imported before the run's origin: its stamps are never before that
+# The driver is imported before the run's origin is set, so its stamps are never earlier than the origin
+_ORIGIN_NS, _ = system_clock()
 
 
 class FastSerialCsv(SerialCsv):
-    """A block holds half a second of the fast clock, and pauses are as much shorter."""
+    """A block holds half a second of the fast clock; the pauses are shorter by the same factor."""
 
     def __init__(
         self,
@@ -34,13 +35,13 @@ class FastSerialCsv(SerialCsv):
 
 
 def _ahead(now: tuple[int, int]) -> tuple[int, int]:
-    """UTC runs ahead by as much as the monotonic clock: a step of it stays what it is."""
+    """Times of the fast clock. UTC is ahead by as much as the monotonic clock, so a step of UTC keeps its size."""
     ahead_ns = (SPEED - 1) * (now[0] - _ORIGIN_NS)
     return now[0] + ahead_ns, now[1] + ahead_ns
 
 
 def environment(speed: int, site: Path) -> dict[str, str]:
-    """What a process needs to find the driver; `site` is a directory in which its entry point is written."""
+    """Environment variables with which a process finds the driver; its entry point is written into `site`."""
     plug_in = site / "fieldcal_fast-0.dist-info"
     plug_in.mkdir(parents=True, exist_ok=True)
     (plug_in / "METADATA").write_text("Metadata-Version: 2.1\nName: fieldcal-fast\nVersion: 0\n")

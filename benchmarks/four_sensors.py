@@ -1,9 +1,9 @@
-"""Four sensors at 1 kHz and two references for ten minutes: does the agent lose a sample, and what does it cost?
+"""Four sensors at 1 kHz and two references for ten minutes: does the agent lose samples, and what does it cost?
 
-The twins run in another process than the agent: four ADXL355 at register level, each on an I2C bus of its own whose
-transfers go over a socket (the agent's smbus2 is the real one, only the kernel is replaced), and two references that
-write lines on pseudo-terminals. `python -m benchmarks four_sensors`; RUN_SECONDS in the environment for another
-length.
+The twins run in another process than the agent: four ADXL355 at register level, each on its own I2C bus, whose
+transfers go over a socket (the agent uses the real smbus2; only the kernel is replaced), and two references that write
+lines on pseudo-terminals. `python -m benchmarks four_sensors`; the environment variable RUN_SECONDS sets another
+duration.
 """
 
 from __future__ import annotations
@@ -40,19 +40,19 @@ from hw.virtual.timebase import BenchTime
 
 SECONDS = float(os.environ.get("RUN_SECONDS", "600"))
 WARM_UP_S = 6.0  # imports and the first fits are not part of the running cost
-BENCHES, SENSORS = (1, 2), range(4)  # seeds; each bench carries two sensors and a reference
+BENCHES, SENSORS = (1, 2), range(4)  # seeds of the benches; each bench has two sensors and a reference
 ADDRESS = 0x1D
-FIFO_S = 0.032  # what the FIFO holds at 1 kHz
-STILL_S = 0.005  # of a machine: what a read, every 8 ms, does not mind
+FIFO_S = 0.032  # time in which the FIFO fills at 1 kHz
+STILL_S = 0.005  # pause of the machine that does not disturb a read every 8 ms
 
 
 def bench_of(sensor: int) -> int:
-    """Which of the benches carries a sensor."""
+    """The bench to which a sensor belongs."""
     return sensor // 2
 
 
 def configuration(directory: Path) -> str:
-    """The agent's, as TOML."""
+    """Configuration of the agent, as TOML."""
     lines = ["[zenoh]", "enabled = false"]
     for i in SENSORS:
         options = f"{{ bus = {i}, address = {ADDRESS}, rate_hz = 1000, serial_number = '{i}' }}"
@@ -72,7 +72,7 @@ def configuration(directory: Path) -> str:
 
 
 def run_twins(directory: Path) -> None:
-    """Serve all devices until told to stop."""
+    """Serve all devices until a request to stop."""
     stopped = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stopped.set())
     ports = []
@@ -93,7 +93,7 @@ def run_twins(directory: Path) -> None:
 
 def _begun(bench: Bench, clock: BenchTime) -> Any:
     def due(t_s: float) -> int:
-        if not clock.begun:  # a twin asks for the first time when it is set to measure
+        if not clock.begun:  # the first request of a twin comes when it is set to measure
             clock.begin(t_s)
         return bench.sensor_samples_due(clock(t_s))
 
@@ -101,7 +101,7 @@ def _begun(bench: Bench, clock: BenchTime) -> Any:
 
 
 def run_agent(directory: Path, seconds: float) -> int:
-    """`fieldcal run` with the kernel replaced; how full its queue was goes into a file."""
+    """Run `fieldcal run` with the kernel replaced; write the largest queue length into a file."""
     from agent.acquisition import service
     from agent.cli.main import run_cli
 
@@ -122,7 +122,7 @@ def run_agent(directory: Path, seconds: float) -> int:
 
 
 def measure(directory: Path) -> dict[str, float]:
-    """Run both; CPU shares after the warm-up (s per s), peak memory, longest queue."""
+    """Run twins and agent; returns CPU time per s after the warm-up, peak memory, longest queue."""
     (directory / "config.toml").write_text(configuration(directory))
     command = [sys.executable, "-m", "benchmarks.four_sensors"]
     twins = subprocess.Popen([*command, "twins", str(directory)])
@@ -147,7 +147,7 @@ def measure(directory: Path) -> dict[str, float]:
 
 
 def recorded(directory: Path) -> tuple[Counter[str], dict[str, list[SampleBlock]], int]:
-    """Gaps told by reason, blocks by device (without their samples' sake kept), calibrations."""
+    """Number of gaps by reason, blocks by device (the indications are not used), number of calibrations."""
     gaps: Counter[str] = Counter()
     blocks: dict[str, list[SampleBlock]] = {}
     calibrations = 0
@@ -162,7 +162,7 @@ def recorded(directory: Path) -> tuple[Counter[str], dict[str, list[SampleBlock]
 
 
 def reads_late(blocks: dict[str, list[SampleBlock]]) -> list[Late]:
-    """When each FIFO was read too long after it was read before, and how long after, s; the longest if none was."""
+    """Reads of each FIFO that came too late after the read before: time and delay, s; if none, the latest read."""
     found: list[Late] = []
     for device in (f"mems-{i}" for i in SENSORS):
         read_s = np.concatenate([block.burst_t_monotonic_ns for block in blocks[device]]) * 1e-9
@@ -173,7 +173,7 @@ def reads_late(blocks: dict[str, list[SampleBlock]]) -> list[Late]:
 
 
 def told(reads: list[Late], stood: list[Late]) -> str:
-    """The longest time between two reads, and how many of those too long the machine made so by standing still."""
+    """Text: the longest time between two reads, and how many of the late reads were caused by pauses of the machine."""
     longest = f"{1e3 * max(apart_s for _, apart_s in reads):.1f} ms"
     late = [(t_s, apart_s) for t_s, apart_s in reads if apart_s > FIFO_S]
     if not late:
@@ -183,13 +183,13 @@ def told(reads: list[Late], stood: list[Late]) -> str:
         for t_s, apart_s in late
     ]
     excused = sum(apart_s - max(by_s, default=0.0) <= FIFO_S for apart_s, by_s in within)
-    return f"{longest}; {len(late)} too long, {excused} of them only because the machine itself stood still"
+    return f"{longest}; {len(late)} too long, {excused} of them only because the machine itself paused"
 
 
 def circumstances(before: bool, stood: list[Late]) -> str:
-    """What else the machine did, and whether that was kept away."""
+    """Text: load and pauses of the machine, and whether its other processes had lower priority."""
     kept = ", all under SCHED_FIFO" if before else ""
-    still = f"the machine itself stood still {len(stood)} times for more than {1e3 * STILL_S:g} ms"
+    still = f"the machine itself paused {len(stood)} times for more than {1e3 * STILL_S:g} ms"
     if stood:
         still += f", {1e3 * max(late_s for _, late_s in stood):.0f} ms at most"
     return f"load of the machine {os.getloadavg()[2]:.0f}{kept};\n{still}"
@@ -216,15 +216,15 @@ own) and two references at 1 kHz (serial) in another process, recorded, windows 
 
 | figure | measured | goal |
 | --- | --- | --- |
-| blocks that tell of a loss (overrun, restart, gap) | {lost} | none |
+| blocks flagged with a loss (overrun, restart, gap) | {lost} | none |
 | samples missing, of {samples} | {missing} | 0 |
 | dropped between driver and pipeline | {json.dumps(dict(gaps)) if gaps else "nothing"} | nothing |
-| longest between two reads of a FIFO | {told(reads_late(blocks), stood)} | 32 ms |
-| most events that waited in the queue | {found["queue"]:.0f} of {60 * len(blocks)} | |
+| longest time between two reads of a FIFO | {told(reads_late(blocks), stood)} | 32 ms |
+| largest number of events in the queue | {found["queue"]:.0f} of {60 * len(blocks)} | |
 | CPU of the agent, of one core | {found["agent"]:.1%} | |
 | CPU of the twins, of one core | {found["twins"]:.1%} | |
 | peak memory of the agent (VmHWM) | {found["peak_mb"]:.0f} MB | |
-| calibrations that it found | {calibrations} | |
+| calibrations made by the agent | {calibrations} | |
 """,
     )
 

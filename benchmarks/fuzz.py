@@ -1,7 +1,4 @@
-"""10^5 mutated and random command bodies and as many payloads: what is taken, what is raised, what it costs.
-
-Run: python -m benchmarks.fuzz [COUNT]. The tests do the same with 2000 (tests/unit/test_commands.py, test_received.py).
-"""
+"""10^5 mutated and random command bodies and as many payloads: how many are accepted, errors, cost."""
 
 from __future__ import annotations
 
@@ -20,7 +17,7 @@ from tests.unit.test_commands import mutated
 from tests.unit.zenoh_site import KEY, record
 
 SEED = 6
-RANDOM_SHARE = 0.2  # bytes that are near nothing
+RANDOM_SHARE = 0.2  # share of bodies that are random bytes instead of a mutation
 
 
 def body(good: bytes, random_: random.Random) -> bytes:
@@ -31,14 +28,14 @@ def body(good: bytes, random_: random.Random) -> bytes:
 
 
 def fuzz_commands(count: int, random_: random.Random) -> str:
-    """All of them at a desk, signed ones with broken insides among them; a good command is taken afterwards."""
+    """Give all bodies to a desk, some signed with invalid content; then a good command must be accepted."""
     with tempfile.TemporaryDirectory() as directory:
         site = DeskSite(Path(directory))
         began_s = time.perf_counter()
         good = sealed({"theta_deg": 10, "alpha_deg": 20}, verb="pose")
         inside = good.split(b"\n", 1)[1]
         for i in range(count):
-            # Half of them by somebody who has a key: what is signed reaches the parsers.
+            # Half of the bodies are signed with a valid key, so that they reach the parsers.
             data = body(good, random_) if i % 2 else signed(body(inside, random_)[:3000])
             taken = site.send(data, verb="pose").taken
             assert i % 2 == 0 or not taken, data
@@ -52,7 +49,7 @@ def fuzz_commands(count: int, random_: random.Random) -> str:
 
 
 def fuzz_payloads(count: int, random_: random.Random) -> str:
-    """All of them as a consumer gets them; those that are taken are whole results."""
+    """Give all payloads to a consumer; every accepted payload must be a complete result."""
     taken: Counter[str] = Counter()
     began_s = time.perf_counter()
     for i in range(count):
@@ -65,7 +62,7 @@ def fuzz_payloads(count: int, random_: random.Random) -> str:
 
 
 def main(count: int) -> None:
-    """Prints a line each."""
+    """Print one line each for commands and payloads."""
     os.nice(10)
     random_ = random.Random(SEED)
     for fuzz in (fuzz_commands, fuzz_payloads):

@@ -1,6 +1,6 @@
-"""Random and mutated byte streams through every parser of the drivers: no exception comes out, no memory grows.
+"""Random and mutated byte streams through every parser of the drivers: no exception may occur, no memory may grow.
 
-`python -m benchmarks.fuzz_drivers [STREAMS [SEED]]`, 10^6 of them by default, shared out evenly.
+`python -m benchmarks.fuzz_drivers [STREAMS [SEED]]`: 10^6 streams by default, divided equally among the parsers.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import tracemalloc
 from collections.abc import Callable
 from dataclasses import dataclass
 
-os.environ["OPENBLAS_NUM_THREADS"] = "1"  # as every entry point of the product, before numpy loads
+os.environ["OPENBLAS_NUM_THREADS"] = "1"  # as in every entry point of the product; must be set before numpy is loaded
 
 import numpy as np
 
@@ -35,17 +35,17 @@ from hw.witmotion import WitStream
 
 STREAMS = 1_000_000
 LONGEST = 120  # bytes of a random stream
-REOPEN = 50  # streams between two openings of a port
-WARM_UP = 2_000  # caches fill, then memory is counted
+REOPEN = 50  # a port is opened again after this many streams
+WARM_UP = 2_000  # streams after which the caches are full and memory is measured
 COUNTS = np.arange(30, dtype=np.int32).reshape(10, 3)
 
 Parse = Callable[[bytes, int], object]
-"""Bytes, and which of the streams it is."""
+"""Takes the bytes and the number of the stream."""
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """What one parser did: `grown_bytes` are those still allocated at the end that were not after the warm-up."""
+    """Result of one parser. `grown_bytes`: memory allocated at the end and not at the end of the warm-up."""
 
     parser: str
     streams: int
@@ -54,7 +54,7 @@ class Row:
 
 
 def parsers() -> dict[str, tuple[bytes, Parse]]:
-    """By name: a good stream to mutate, and what takes it."""
+    """By name: a good stream to mutate, and the function that parses a stream."""
     binary = SerialBinaryOptions.model_validate(
         {
             "port": "p", "rate_hz": 100.0, "start": "aa55", "length": 12, "checksum": "sum8",
@@ -85,7 +85,7 @@ def parsers() -> dict[str, tuple[bytes, Parse]]:
 
 
 def fuzz(streams: int, seed: int) -> list[Row]:
-    """Run `streams` through each parser; what is not allowed comes out as it is."""
+    """Run `streams` streams through each parser; an exception that a parser may not raise is passed on."""
     rows = []
     for name, (good, parse) in parsers().items():
         draw = random.Random(f"{seed} {name}")
@@ -104,7 +104,7 @@ def fuzz(streams: int, seed: int) -> list[Row]:
 
 
 def _mutated(good: bytes, draw: random.Random) -> bytes:
-    """Up to three bits turned, bytes lost, bytes put in or bytes changed."""
+    """Change `good`: up to three bits, or bytes removed, inserted or changed."""
     data = bytearray(good)
     for _ in range(draw.randrange(4)):
         at = draw.randrange(len(data) + 1)
@@ -132,7 +132,7 @@ def _fed(stream: Stream) -> Parse:
     return parse
 
 
-def _adxl355(data: bytes, i: int) -> None:  # noqa: ARG001 - every stream alike
+def _adxl355(data: bytes, i: int) -> None:  # noqa: ARG001 - all streams are treated alike
     adxl355_registers.triples(adxl355_registers.without_empty(_whole(data, 3)))
 
 
@@ -140,15 +140,15 @@ def _lsm6dso(data: bytes, i: int) -> None:
     lsm6dso_registers.tagged_samples(_whole(data, lsm6dso_registers.WORD_BYTES), None if i % 5 == 0 else i % 4)
 
 
-def _iio(data: bytes, i: int) -> None:  # noqa: ARG001 - every stream alike
-    with contextlib.suppress(ConfigurationError):  # so a file that the kernel cannot have written is told
+def _iio(data: bytes, i: int) -> None:  # noqa: ARG001 - all streams are treated alike
+    with contextlib.suppress(ConfigurationError):  # the error for a file that the kernel cannot have written
         element = iio_scan.Element.parse(0, _text(data))
         scan = iio_scan.layout({"timestamp": element})
         element.value(np.frombuffer(_whole(data, scan.itemsize), scan)["timestamp"])
 
 
-def _replay(data: bytes, i: int) -> None:  # noqa: ARG001 - every stream alike
-    with contextlib.suppress(MessageError):  # so a damaged recording is told
+def _replay(data: bytes, i: int) -> None:  # noqa: ARG001 - all streams are treated alike
+    with contextlib.suppress(MessageError):  # the error for a damaged recording
         decode("fieldcal.v1.RawBlock", data)
 
 
@@ -165,7 +165,7 @@ def _text(data: bytes) -> str:
 
 
 def main() -> None:
-    """Print a row for each parser, and the sum."""
+    """Print one row per parser, and the sum."""
     total = int(sys.argv[1]) if len(sys.argv) > 1 else STREAMS
     rows = fuzz(-(-total // len(parsers())), int(sys.argv[2]) if len(sys.argv) > 2 else 1)
     for row in rows:

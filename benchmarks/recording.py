@@ -1,4 +1,4 @@
-"""What recording and replaying cost: CPU a block, and replay against plain decompressing and CRC of the same file."""
+"""Cost of recording and replaying: CPU time per block; replay compared with decompression and CRC of the file."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SECOND = 1_000_000_000
 
 
 def blocks(seed: int) -> Iterator[SampleBlock]:
-    """A tri-axial device of counts (ADXL355: 256000 a g, noise 100 rms) and a uniaxial one of decimals, 1 kHz each."""
+    """A tri-axial device with counts (ADXL355: 256000 per g, noise 100 rms) and a uniaxial one with decimals, 1 kHz."""
     rng = np.random.default_rng(seed)
     n = int(RATE_HZ * BLOCK_S)
     for number in range(int(DURATION_S / BLOCK_S)):
@@ -46,7 +46,7 @@ def blocks(seed: int) -> Iterator[SampleBlock]:
 
 
 def configuration() -> Config:
-    """A channel whose sensor stands for ten seconds each at three angles, again and again."""
+    """A channel whose sensor stands for ten seconds at each of three angles, repeatedly."""
     poses = [
         {"start_s": start_s, "stop_s": start_s + 10, "theta_deg": 35, "alpha_deg": alpha_deg}
         for start_s, alpha_deg in ((3, 0), (16, 30), (29, 120))
@@ -58,7 +58,7 @@ def configuration() -> Config:
 
 
 def record(directory: Path, events: list[Event]) -> Path:
-    """Record the events and what the pipeline makes of them, flushed and synced as a live agent does."""
+    """Record the events and the results of the pipeline, flushed and synced like a live agent's."""
     config = configuration()
     pipeline = Pipeline.begin(config, "r", 0, 0, {})
     recorder = Recorder(directory, ["mems", "reference"], ["mems"], max_bytes=1 << 40)
@@ -78,7 +78,7 @@ def record(directory: Path, events: list[Event]) -> Path:
 
 
 def decompress_and_check(path: Path) -> None:
-    """The least that any reader must do: every chunk unpacked, its CRC computed."""
+    """The minimum work of any reader: decompress every chunk and compute its CRC."""
     with open(path, "rb") as file:
         for record in walk(file, path.stat().st_size):
             if record.name == "Chunk":
@@ -86,7 +86,7 @@ def decompress_and_check(path: Path) -> None:
 
 
 def read(path: Path) -> None:
-    """All events, as replay gets them."""
+    """Read all events like replay does."""
     for _ in RecordingReader(path).steps():
         pass
 
@@ -106,13 +106,13 @@ def replay(path: Path) -> None:
 
 
 def check(path: Path) -> None:
-    """The audit's pass over the bytes."""
+    """The audit's check of all bytes."""
     with open(path, "rb") as file:
         assert not check_integrity(file, path.stat().st_size).faults
 
 
 def cpu_s(work: Callable[[Path], object], path: Path) -> float:
-    """Least CPU time of three runs, in s."""
+    """Smallest CPU time of three runs, s."""
     times = []
     for _ in range(3):
         start = time.process_time()

@@ -1,7 +1,7 @@
-"""`make soak`: hours of the real agent on serial ports, its memory, threads and file descriptors.
+"""`make soak`: hours of the real agent on serial ports; watches its memory, threads and file descriptors.
 
-`--speed 20` makes 24 h out of 72 min: the ports send 20 times as fast, and a plug-in driver's clock runs 20 times as
-fast (benchmarks.fast_serial), so that every stamp, window and rotation is as in real time.
+With `--speed 20`, 24 h take 72 min: the ports send 20 times as fast, and the clock of a plug-in driver runs 20 times as
+fast (benchmarks.fast_serial), so that stamps, windows and file rotation are the same as in real time.
 """
 
 from __future__ import annotations
@@ -38,19 +38,20 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "reliability.md"
 SEED = 1
 SAMPLE_S = 5.0
-SETTLE_S = 0.5  # a reader throws away what came before its port was set up
-# Median of the last quarter over that of the second: what grows by a hundredth in half a day grows for ever. The first
-# quarter is left out, in which caches, windows and clock models fill.
+SETTLE_S = 0.5  # a reader discards what arrives before its port is set up
+# Limit of the median of the last quarter over that of the second. A value that grows by 1 % in half a day has no limit.
+# The first quarter is left out because caches, windows and clock models fill then.
 FLAT = 1.02
 ENDPOINT = "tcp/127.0.0.1:{port}"
-# By size alone: a file begins by the agent's clock and ages by the drivers', which is ahead of it.
+# Files are rotated by size alone, because a file starts by the agent's clock and its age follows the drivers' clock,
+# which is ahead.
 ROTATION = "[recording]\nrotate_s = 86400\nrotate_bytes = 2097152"
 ROLES: tuple[Role, ...] = ("sensor", "reference")
 
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """What a process holds at one moment."""
+    """Resources of a process at one moment."""
 
     elapsed_s: float
     memory_mb: float
@@ -60,7 +61,7 @@ class Sample:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Soaked:
-    """What came of a soak; `hours` of the drivers' clocks."""
+    """Results of a soak; `hours` are of the drivers' clocks."""
 
     speed: int
     rate_hz: int
@@ -74,7 +75,7 @@ class Soaked:
 
 
 def soak(hours: float, speed: int, rate_hz: int, port: int) -> Soaked:
-    """Run the agent for `hours` of its drivers' clock and watch it."""
+    """Run the agent for `hours` of its drivers' clock and observe it."""
     parameters = plain(SEED)
     sensor, reference = (replace(p.clock, nominal_rate_hz=rate_hz) for p in (parameters.sensor, parameters.reference))
     parameters = replace(
@@ -105,7 +106,7 @@ def soak(hours: float, speed: int, rate_hz: int, port: int) -> Soaked:
         bench_time.begin(speed * time.monotonic())
         samples = list(_watched(agent, hours * 3600 / speed))
         lasted_h = samples[-1].elapsed_s * speed / 3600
-        lost = sum(device.lost_bytes for device in devices)  # before nobody reads any more
+        lost = sum(device.lost_bytes for device in devices)  # before the agent stops reading
         agent.terminate()
         agent.wait(20)
         with History(directory / "data" / FILE_NAME) as history:
@@ -129,7 +130,7 @@ def _config(bench: Bench, directory: Path, speed: int, port: int) -> str:
     lines.append(
         f'[[channels]]\nsensor = "sensor"\nreference = "reference"\nposes = [{poses}]\n'
         f"prior = {{ sensitivity = {bench.parameters.sensor.nominal_sensitivity} }}\n"
-        # A pause of the machine is 20 times as long on the fast clock.
+        # On the fast clock a pause of the machine is 20 times as long.
         f"silence_s = {30 * speed}\nlate_horizon_s = 60\n"
         f"poses_repeat_s = {bench.parameters.schedule.period_s}"
     )
@@ -152,7 +153,7 @@ def _process(arguments: list[str], directory: Path, speed: int) -> Iterator[subp
 
 @contextmanager
 def _received(endpoint: str) -> Iterator[list[int]]:
-    """The numbers of all results that a consumer got, in the order they came."""
+    """Numbers of all results that a consumer received, in order of arrival."""
     numbers: list[int] = []
     while True:
         with contextlib.suppress(ConnectionError):
@@ -185,7 +186,7 @@ def _watched(process: subprocess.Popen[bytes], duration_s: float) -> Iterator[Sa
 
 
 def _worst_error(bench: Bench, kept: list[Record]) -> float:
-    """The greatest error of any main sensitivity in any calibration, in percent."""
+    """Largest error of any main sensitivity in any calibration, %."""
     truth = np.diag(bench.truth.sensitivity)
     updates = [r.result for r in kept if r.what == "calibration"]
     found = np.array([np.diag(np.array(u.sensitivity)) for u in updates if isinstance(u, CalibrationUpdate)])
@@ -199,7 +200,7 @@ def _row(name: str, values: NDArray[np.float64], unit: str) -> str:
 
 
 def table(soaked: Soaked) -> str:
-    """The part of the page."""
+    """Text of the page."""
     numbers = [record.sequence for record in soaked.kept]
     calibrations = sum(record.what == "calibration" for record in soaked.kept)
     used = sum(record.what == "window" and bool(record.fields["used"]) for record in soaked.kept)
@@ -213,14 +214,14 @@ def table(soaked: Soaked) -> str:
     return f"""
 {time.strftime("%Y-%m-%d", time.gmtime())}, {machine()}: {soaked.hours:.2f} h of the drivers' clock in
 {soaked.samples[-1].elapsed_s / 60:.0f} min, {soaked.speed} times real time; sensor {soaked.rate_hz} Hz x 3 and
-reference {soaked.rate_hz} Hz, seed {SEED}; {len(soaked.samples)} looks; exit status {soaked.exit_status}.
+reference {soaked.rate_hz} Hz, seed {SEED}; {len(soaked.samples)} observations; exit status {soaked.exit_status}.
 
 | median of a quarter of the time | first | second | third | last | last over second at most {FLAT} |
 | --- | --- | --- | --- | --- | --- |
 {chr(10).join(rows)}
 
 {len(numbers)} results, {calibrations} of them calibrations, {used} of {windows} windows used; lost on the way to a
-consumer: {lost}, out of order: {sum(np.diff(soaked.received) <= 0) if len(soaked.received) > 1 else 0}. Greatest error
+consumer: {lost}, out of order: {sum(np.diff(soaked.received) <= 0) if len(soaked.received) > 1 else 0}. Largest error
 of a main sensitivity in any calibration: {soaked.worst_error_pct:.3f} %. Bytes that the ports lost because the machine
 was late: {soaked.lost_bytes}.
 """

@@ -1,6 +1,6 @@
-"""Speed of what the estimator is made of: window sums against recursive estimators, an adjustment, calibrate on a file.
+"""Speed of the estimator's parts: window sums compared with recursive estimators, an adjustment, `calibrate` on a file.
 
-The recursive ones get the same work: 3 outputs, regressors (a_x, a_y, a_z, 1), one sample at a time.
+The recursive estimators get the same work: 3 outputs, regressors (a_x, a_y, a_z, 1), one sample at a time.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from calib.model import Array, Window
 
 RATE_HZ = 1000.0
 SAMPLES = 2_000_000  # for the sums
-FEW = 20_000  # for the recursive ones, which take 30 us a sample
+FEW = 20_000  # for the recursive estimators, which take 30 us per sample
 HOUR = 3_600_000
 WINDOWS = 100
 
 
 def signals(n: int, rng: np.random.Generator) -> tuple[Array, Array, Array]:
-    """A uniaxial reference (n, 1), its derivative, and a sensor's indications (n, 3) on the clamp."""
+    """A uniaxial reference (n, 1), its derivative, and the indications (n, 3) of a sensor on the clamp."""
     t = np.arange(n) / RATE_HZ
     omega = 2 * np.pi * 3.0
     u, du = 5.0 * np.sin(omega * t)[:, None], 5.0 * omega * np.cos(omega * t)[:, None]
@@ -39,7 +39,7 @@ def signals(n: int, rng: np.random.Generator) -> tuple[Array, Array, Array]:
 
 
 def rate(work: Callable[[], object], samples: int) -> float:
-    """Samples a CPU second, best of three."""
+    """Samples per second of CPU time, the best of three runs."""
     best = np.inf
     for _ in range(3):
         start = time.process_time()
@@ -49,7 +49,7 @@ def rate(work: Callable[[], object], samples: int) -> float:
 
 
 def recursive_rates(rng: np.random.Generator) -> dict[str, float]:
-    """filterpy, padasip and river on the same 12 parameters."""
+    """Samples per second of filterpy, padasip and river for the same 12 parameters."""
     import padasip
     from filterpy.kalman import KalmanFilter
     from river import linear_model
@@ -79,7 +79,7 @@ def recursive_rates(rng: np.random.Generator) -> dict[str, float]:
 
 
 def adjustment_ms(rng: np.random.Generator) -> float:
-    """CPU time of an adjustment over 100 windows in 12 positions, ms, best of five."""
+    """CPU time in ms of an adjustment over 100 windows in 12 positions, the best of five runs."""
     windows = []
     for k in range(WINDOWS):
         pose = clamp(np.deg2rad(35.0), np.deg2rad(30.0 * (k % 12)))
@@ -96,7 +96,7 @@ def adjustment_ms(rng: np.random.Generator) -> float:
 
 
 def calibrate_hour(directory: Path, rng: np.random.Generator) -> dict[str, float]:
-    """Wall seconds to calibrate an hour of 1 kHz, and to read the same two files."""
+    """Wall time in s of a calibration of one hour at 1 kHz, and of reading the same two files."""
     t = np.arange(HOUR) / RATE_HZ
     alphas = (0.0, 30.0, 120.0, 210.0)
     quarter = HOUR // len(alphas)
@@ -122,7 +122,7 @@ def calibrate_hour(directory: Path, rng: np.random.Generator) -> dict[str, float
 
 
 def wall_s(command: list[str]) -> float:
-    """Seconds of a whole process."""
+    """Wall time in s of a whole process."""
     start = time.monotonic()
     subprocess.run([sys.executable, *command], check=True, stdout=subprocess.DEVNULL)
     return time.monotonic() - start

@@ -1,10 +1,10 @@
-"""Plain Method 3 against the adjustment on recordings with known truth: root mean square, bounds, coverage.
+"""Plain Method 3 and the adjustment on recordings with known truth: root mean square error, bounds, coverage.
 
     python -m benchmarks.torture [--quick] [--recordings 300] [--together 1000] [--row NAME] [--write]
 
-Every recording is drawn anew: faults from the priors that the adjustment is told. Per row and each of the 12
-parameters: RMS over the bound (the posterior u; Cramér-Rao where there is nothing but noise) inside the 99.9 %
-chi-squared band for its count, coverage inside the 99.9 % binomial band, both Bonferroni over the table.
+For every recording faults are drawn from the priors that the adjustment gets. Checked for each row and each of the 12
+parameters: RMS over the bound (the posterior u; Cramér-Rao where noise is the only fault) is inside the 99.9 %
+chi-squared band for its count; coverage is inside the 99.9 % binomial band. Both bands are Bonferroni over the table.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ from hw.virtual.bench import Bench
 
 TRUTH = np.concatenate([S_TRUE.ravel(), Q_TRUE])
 MAIN, TRANSVERSE, OFFSET = [0, 4, 8], [1, 2, 3, 5, 6, 7], [9, 10, 11]
-LEVEL = 1e-3  # of a false alarm anywhere in the table
+LEVEL = 1e-3  # probability of a false alarm anywhere in the table
 SEED = 20180101
-POOLED = 0.94, 0.97  # coverage of all parameters in all rows
+POOLED = 0.94, 0.97  # limits of the coverage of all parameters in all rows
 COVERED = stats.norm.cdf(2.0) - stats.norm.cdf(-2.0)
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Errors (N, 12) of plain Method 3 and of the adjustment, its standard uncertainties, and k (N,)."""
+    """Errors (N, 12) of plain Method 3 and of the adjustment, u (N, 12) of the adjustment, and k (N,)."""
 
     plain: np.ndarray
     errors: np.ndarray
@@ -48,12 +48,12 @@ class Outcome:
     refused: list[str]
 
     def inside(self) -> np.ndarray:
-        """(N, 12) which errors lie within their expanded uncertainty."""
+        """Which errors (N, 12) lie within their expanded uncertainty."""
         return np.abs(self.errors) <= self.k[:, None] * self.uncertainties
 
 
 def one(task: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray, float, str]:
-    """One recording of a row: errors of both, u, k and the reasons of a refusal."""
+    """One recording of a row: errors of both methods, u, k, and the reasons of a refusal."""
     number, index = task
     row = ROWS[number]
     random = np.random.default_rng([SEED, number, index])
@@ -75,7 +75,7 @@ def outcome(pool: multiprocessing.pool.Pool, number: int, recordings: int) -> Ou
 
 
 def line(name: str, result: Outcome, tests: int) -> tuple[str, list[str]]:
-    """Markdown line of a row and what fails in it."""
+    """Markdown line of a row, and its violations of the bands."""
     n = len(result.errors)
     rms, bound = _rms(result.errors), _rms(result.uncertainties)
     if name == ROWS[0].name:
@@ -112,7 +112,7 @@ def _mm(values: np.ndarray) -> str:
 
 HOW = (
     "Theta 35°, alpha 0, 30, 120, 210°, three repetitions of six cycles at 3 Hz and "
-    "10 m/s²; faults drawn anew for every recording from the priors that the adjustment is told. Root mean square "
+    "10 m/s²; for every recording faults are drawn from the priors that the adjustment gets. Root mean square "
     "error, worst axis: main / transverse sensitivity in % of 1, Q in mm/s². In brackets the 99.9 % band, Bonferroni "
     "over the table. The bound of the clean row is Cramér-Rao's."
 )
@@ -123,7 +123,7 @@ HEADER = (
 
 
 def main(arguments: Sequence[str] = ("--write",)) -> int:
-    """Run the table; 0 where every band holds."""
+    """Run the table; returns 0 if all bands hold."""
     options = _options(arguments)
     numbers = [i for i, row in enumerate(ROWS) if options.row in row.name]
     tests = 2 * 12 * len(numbers)
@@ -152,7 +152,7 @@ def main(arguments: Sequence[str] = ("--write",)) -> int:
 
 
 def _as_good_as_clean(results: dict[str, Outcome]) -> list[str]:
-    """Faults that have a mend: main and transverse within 0.02 % of the clean row."""
+    """Check rows with a completely correctable fault: main and transverse within 0.02 % of the row without faults."""
     clean = results.get(ROWS[0].name)
     if clean is None:
         return []
@@ -166,12 +166,16 @@ def _as_good_as_clean(results: dict[str, Outcome]) -> list[str]:
 
 def _options(arguments: Sequence[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="12 recordings a row: does it run, is nothing far off")
+    parser.add_argument(
+        "--quick",
+        action="store_true",
+        help="12 recordings per row, as a quick check that the benchmark runs and no result is far off",
+    )
     parser.add_argument("--recordings", type=int, default=300)
-    parser.add_argument("--together", type=int, default=1000, help="recordings of the last row")
+    parser.add_argument("--together", type=int, default=1000, help="number of recordings of the last row")
     parser.add_argument("--row", default="", help="only rows whose name contains this")
     parser.add_argument("--processes", type=int, default=os.cpu_count())
-    parser.add_argument("--write", action="store_true", help="put the table into docs/performance.md")
+    parser.add_argument("--write", action="store_true", help="write the table into docs/performance.md")
     options = parser.parse_args(arguments)
     if options.quick:
         options.recordings = options.together = 12

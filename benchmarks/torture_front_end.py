@@ -1,4 +1,4 @@
-"""From a recording to S and Q: the adjustment's way (clock, windows, solve, shift, repeat) and the naive one."""
+"""From a recording to S and Q, with the adjustment's steps (clock, windows, solve, shift, repeat) and without."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from calib.signal.stamps import clock_from_stamps
 from hw.virtual.bench import Recording
 from hw.virtual.schedule import PoseInterval
 
-LAG_LEFT_S = 2e-5  # a lag below costs (omega tau)^2 / 2 = 3e-7 at 6 Hz
-CORNER_LEFT_HZ = 1e-3  # costs (c / omega)^2 / 2 = 2e-6 at 0.5 Hz
+LAG_LEFT_S = 2e-5  # a smaller lag changes S by less than (omega tau)^2 / 2 = 3e-7 at 6 Hz
+CORNER_LEFT_HZ = 1e-3  # a smaller corner changes S by less than (c / omega)^2 / 2 = 2e-6 at 0.5 Hz
 PASSES = 4
 
 
 def adjusted(recording: Recording, priors: Priors, velocity: bool) -> Adjustment:
-    """Solve, take out the lag and the corner that were found, repeat until they are gone."""
+    """Solve, correct for the lag and the corner that were found, and repeat until they are negligible."""
     sensor = clock_from_stamps(recording.sensor_stamp_s)
     reference = clock_from_stamps(recording.reference_stamp_s)
     times = np.asarray(sensor.time_of(np.arange(len(recording.v))))
@@ -54,7 +54,7 @@ def adjusted(recording: Recording, priors: Priors, velocity: bool) -> Adjustment
 
 
 def plain(recording: Recording, velocity: bool) -> np.ndarray:
-    """Method 3 as printed on what the stamps say: no clock model, no lag, all points."""
+    """Method 3 as printed, with the stamps as they are: no clock model, no lag, all points."""
     reference = recording.reference
     if velocity:
         reference = np.gradient(reference, recording.reference_stamp_s, axis=0)

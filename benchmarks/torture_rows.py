@@ -1,4 +1,4 @@
-"""The faults of a field recording, each alone and all together: what the bench does, and what an estimator is told."""
+"""The faults of a field recording, each alone and all together: the true bench, and the priors of an estimator."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ NOISE_MPS2 = 0.02
 S_TRUE = np.array([[1.02, 0.01, -0.02], [0.015, 0.98, 0.005], [-0.01, 0.02, 1.01]])
 Q_TRUE = np.array([0.36, -0.06, 0.165])
 ANGLE_DEG, OFFSET_MPS2, LAG_S, CORNER_HZ = 0.2, 0.05, 0.005, 0.16
-# What is told where nothing else is: the lag is always free, since no clock of the field is known to be in step.
+# Priors where a row has no others: the lag is always unknown, because no clock in the field is known to be synchronous.
 FIXED = replace(Priors.none(), lag_s=0.02)
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One line of the table: how to draw a bench, the priors that are true of it, and whether a mend undoes it all."""
+    """One row of the table: how to draw a bench, its true priors, and whether the fault can be corrected completely."""
 
     name: str
     bench: Callable[[np.random.Generator], BenchParameters]
@@ -47,7 +47,7 @@ def _sensor(bench: BenchParameters, **changes: object) -> BenchParameters:
 
 
 def _bursts(bench: BenchParameters) -> BenchParameters:
-    """Rate 1.3 % off nominal, a FIFO of 32 read when it is full, stamped when it arrives."""
+    """Rate 1.3 % off nominal; a FIFO of 32 samples that is read when it is full; samples stamped at their arrival."""
     clock = Clock(1000.0, rate_error=0.013, offset_s=0.4e-3)
     reference = replace(bench.reference, clock=Clock(1000.0, offset_s=0.7e-3), bursts=Bursts(poll_s=0.01))
     return replace(_sensor(bench, clock=clock, bursts=Bursts(poll_s=0.032)), reference=reference)
@@ -72,7 +72,8 @@ def _corner(random: np.random.Generator) -> BenchParameters:
     bench = replace(_bench(hold_s=10.0), motion=multisine(random, 0.5, 8.0, lines=12, peak_mps2=10.0))
     corner = abs(CORNER_HZ * (1.0 + 0.2 * random.normal()))
     bench = replace(bench, reference=replace(bench.reference, highpass_hz=corner))
-    return drawn(bench, Spread(offset_mps2=OFFSET_MPS2), random)  # the filter keeps no mean to know better
+    # The filter has removes the mean, so the mean gives no information about the offset
+    return drawn(bench, Spread(offset_mps2=OFFSET_MPS2), random)
 
 
 def _across(random: np.random.Generator) -> BenchParameters:

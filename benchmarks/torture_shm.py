@@ -1,9 +1,9 @@
-"""A structure that hardly moves: tri-axial reference with noise, half of the time calm; the adjustment and plain.
+"""A structure with small motion, calm half of the time, and a noisy tri-axial reference: adjustment, plain Method 3.
 
     python -m benchmarks.torture_shm [--recordings 160] [--write]
 
-Motion of rms 0.02 m/s2 from 0.5 to 10 Hz, ten seconds in turn at full level and at 0.15 of it, 600 s; both devices at
-100 Hz, noise of the reference 0.006, of the sensor 0.002 m/s2.
+Motion of 0.02 m/s2 rms from 0.5 to 10 Hz, alternately ten seconds at full level and ten seconds at 0.15 of it, 600 s;
+both devices at 100 Hz; noise of the reference 0.006 m/s2, of the sensor 0.002 m/s2.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ SECONDS, STRETCH_S, CALM = 600.0, 10.0, 0.15
 TURN_S = 0.0  # the level changes, nobody turns anything
 UP = np.array([0.0, 0.0, 9.80665])
 ALONG = np.array([1.0, 0.0, 0.0])
-LIMIT_PCT = 0.25  # root mean square of an element
+LIMIT_PCT = 0.25  # of the root mean square error of an element
 HOW = (
     "Rms 0.02 m/s², 0.5 to 10 Hz, 600 s, ten seconds in turn at full level and at "
     "0.15 of it; noise of the reference 0.006 m/s²; both devices at 100 Hz."
@@ -60,7 +60,7 @@ def one(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
         seed,
     )
     recording = bench.recording(SECONDS)
-    # As fieldcal calibrate does; as printed all points count, none is filtered, and nothing is known of the noise.
+    # As in fieldcal calibrate. Plain Method 3 uses all points without a filter and without the noise.
     plain = windows(recording, Settings(limit_band=False))
     loud = {(w.start_s, w.stop_s) for w in plain if w.kind == "motion"}
     naive = fit([replace(w, used=(w.start_s, w.stop_s) in loud, reason="") for w in plain]).calibration.sensitivity
@@ -82,10 +82,10 @@ def windows(recording: Recording, settings: Settings) -> list[Window]:
 
 
 def main(arguments: Sequence[str] = ("--write",)) -> int:
-    """Run the recordings; 0 where the limits hold."""
+    """Run the recordings; returns 0 if the limits hold."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--recordings", type=int, default=160)
-    parser.add_argument("--write", action="store_true", help="put the table into docs/performance.md")
+    parser.add_argument("--write", action="store_true", help="write the table into docs/performance.md")
     options = parser.parse_args(arguments)
     with multiprocessing.Pool() as pool:
         results = pool.map(one, range(options.recordings), chunksize=1)

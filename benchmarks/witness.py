@@ -1,7 +1,7 @@
-"""How long the machine itself stood still while something was measured: a process a CPU that only sleeps.
+"""Pauses of the machine during a measurement: one process per CPU that only sleeps.
 
-What is late beside an idle witness was held up by the machine (its host, its kernel, real-time neighbours), not by
-what is measured.
+If the idle witness was late at the same time, the machine (its host, its kernel, real-time processes) caused the delay
+and not the measured process.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ import threading
 import time
 
 SLEEP_S = 0.001
-PRIORITY = 10  # of what is measured; the witness's is one more
+PRIORITY = 10  # of the measured process; the witness has one more
 Late = tuple[float, float]
-"""When it should have woken (CLOCK_MONOTONIC) and by how much it was late, s."""
+"""Time at which the witness should have woken (CLOCK_MONOTONIC) and its delay, s."""
 
 
 def before_others() -> bool:
-    """Take this process, and all that it starts, before the rest of the machine; False where that is not allowed."""
+    """Give this process and its children priority over the rest of the machine; False if this is not permitted."""
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     except PermissionError:
@@ -29,7 +29,7 @@ def before_others() -> bool:
 
 
 class Witness:
-    """Watches all CPUs from its making until `result`."""
+    """Watches all CPUs from its construction until `result`."""
 
     def __init__(self) -> None:
         command = [sys.executable, "-m", "benchmarks.witness"]
@@ -37,7 +37,7 @@ class Witness:
         self._watching = [subprocess.Popen([*command, str(cpu)], stdout=subprocess.PIPE, text=True) for cpu in cpus]
 
     def result(self, least_s: float) -> list[Late]:
-        """Stop, and tell of all that was late by more than `least_s`, in order of time."""
+        """Stop and return all delays of more than `least_s`, in order of time."""
         found: list[Late] = []
         for process in self._watching:
             process.terminate()
@@ -48,7 +48,7 @@ class Witness:
 
 
 def watch(cpu: int) -> None:
-    """Sleep on this CPU until told to stop; then print a line for each time it was late by more than `SLEEP_S`."""
+    """Sleep on this CPU until a request to stop; then print one line per delay of more than `SLEEP_S`."""
     stopped = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stopped.set())
     os.sched_setaffinity(0, {cpu})

@@ -1,8 +1,8 @@
 """The paper's experiment on the virtual bench: its three methods, Tables 3 and 4, Figures 2 and 7-18.
 
-    python examples/paper.py [DOCS] [--benches N]        writes DOCS/paper.md and DOCS/paper/*.svg, docs/ by default
+    python examples/paper.py [DOCS] [--benches N]        writes DOCS/paper.md and DOCS/paper/*.svg; default DOCS: docs/
 
-Everything is drawn from fixed seeds: the same machine gives the same files.
+All seeds are fixed: the same machine writes the same files.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ ONE_PERIOD = 333  # samples of 1 kHz, as in Figure 2
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("docs", type=Path, nargs="?", default=Path(__file__).parents[1] / "docs")
-    parser.add_argument("--benches", type=int, default=100, help="of the Monte Carlo, for each sensor")
+    parser.add_argument("--benches", type=int, default=100, help="number of benches of the Monte Carlo, per sensor")
     options = parser.parse_args()
     docs: Path = options.docs
     started = time.perf_counter()
@@ -57,7 +57,7 @@ def main() -> None:
 
 
 def draw(folder: Path, found: list[Comparison], at: dict[str, dict[int, Comparison]], runs: list[Run]) -> None:
-    """All figures as SVG."""
+    """Write all figures as SVG into `folder`."""
     run = next(r for r in runs if r.pose.position == "method 3, 30 deg")
     period = slice(0, ONE_PERIOD)
     a_ref = four_parameter(run.time_s, run.reference).derivative(run.time_s)[period, 0]

@@ -1,1 +1,1 @@
-"""Devices: the sample block every driver yields, the sensor protocol, the drivers and the virtual bench."""
+"""Devices: the sample block that every driver returns, the sensor protocol, the drivers and the virtual bench."""

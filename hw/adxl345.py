@@ -17,7 +17,7 @@ from hw.i2c import READS_MAX
 from hw.self_test import SelfTest
 from hw.sensor import IdentityError
 
-LOST = "FIFO ran over, or a read of it broke off"
+LOST = "FIFO overrun or interrupted FIFO read"
 
 
 class Adxl345Options(FifoOptions):
@@ -25,20 +25,21 @@ class Adxl345Options(FifoOptions):
 
     rates_hz = tuple(chip.RATE_CODES)
     fifo_samples = chip.FIFO_SAMPLES
-    bytes_a_sample = 11  # address, register, address, INT_SOURCE, DATA_FORMAT, six of data: one read a sample
+    bytes_a_sample = 11  # one read per sample: address, register, address, INT_SOURCE, DATA_FORMAT, six data bytes
     bytes_a_poll = 4  # address, register, address, FIFO_STATUS
 
     address: Literal[0x53, 0x1D] = Field(0x53, description="83 (0x53), or 29 (0x1D) with ALT ADDRESS high")
     rate_hz: float = Field(800.0, description=f"one of {', '.join(f'{rate:g}' for rate in chip.RATE_CODES)}")
-    range_g: Literal[2, 4, 8, 16] = Field(16, description="range, plus and minus; the resolution is the same in all")
+    range_g: Literal[2, 4, 8, 16] = Field(16, description="range, plus and minus; all ranges have the same resolution")
 
 
 class Adxl345(FifoSensor):
-    """The entry count in one transfer, then a read for each sample, which takes it from the FIFO, up to 21 a transfer.
+    """Reads the number of FIFO entries, then the samples, one register read per sample, up to 21 reads per transfer.
 
-    Each begins at INT_SOURCE, two registers before the data, since reading data clears its overrun bit: an adapter may
-    stall between two reads of one transfer. A sample that is read has no mark: once some are lost, all that this poll
-    found goes with them, and the next one starts anew.
+    Each register read starts at INT_SOURCE, two registers before the data, because reading the data clears the overrun
+    bit in INT_SOURCE, and the adapter may stall between two reads of one transfer. The samples of this part carry no
+    counter. If samples were lost during a poll, the driver discards all samples of that poll and flags the next block
+    RESTART.
     """
 
     options_model = Adxl345Options
@@ -62,13 +63,13 @@ class Adxl345(FifoSensor):
     def _identify(self) -> dict[str, int]:
         (found,) = self._device.read(chip.DEVID, 1)
         if found != chip.IDENTITY:
-            raise IdentityError(f"{self._device.name}: expected 0x{chip.IDENTITY:02X}, found 0x{found:02X}")
+            raise IdentityError(f"{self._device.name}: expected the ID 0x{chip.IDENTITY:02X}, found 0x{found:02X}")
         return {"DEVID": found}
 
     def _set_up(self, identity: Mapping[str, int]) -> DeviceInfo:
         self._device.write(chip.POWER_CTL, chip.STANDBY)
-        self._device.write(chip.FIFO_CTL, chip.BYPASS)  # empties the FIFO
-        self._device.read(chip.DATA, 6)  # clears what INT_SOURCE says of an earlier run
+        self._device.write(chip.FIFO_CTL, chip.BYPASS)  # This empties the FIFO.
+        self._device.read(chip.DATA, 6)  # This clears the flags that an earlier run left in INT_SOURCE.
         self._write_settings(last=chip.POWER_CTL)
         return self._info("adxl345", self._options.rate_hz, identity)
 

@@ -1,5 +1,7 @@
-"""Registers of the ADXL345 and what its bytes mean. Source: data sheet ADXL345; names and bits also in Linux,
-drivers/iio/accel/adxl345.h and adxl345_core.c."""
+"""Registers of the ADXL345 and the meaning of their contents.
+
+Source: data sheet ADXL345. Linux has the same names and bits (drivers/iio/accel/adxl345.h and adxl345_core.c).
+"""
 
 from __future__ import annotations
 
@@ -11,15 +13,16 @@ IDENTITY = 0xE5
 DEVID, BW_RATE, POWER_CTL, INT_SOURCE, DATA_FORMAT, DATA, FIFO_CTL, FIFO_STATUS = (
     *(0x00, 0x2C, 0x2D, 0x30, 0x31, 0x32, 0x38, 0x39),
 )
-OVERRUN = 0x01  # in INT_SOURCE; reading data clears it
+OVERRUN = 0x01  # in INT_SOURCE; reading the data clears it
 SAMPLE_BYTES = 8  # INT_SOURCE, DATA_FORMAT, three numbers
 ENTRIES_MASK = 0x3F  # in FIFO_STATUS
 FIFO_SAMPLES = 32
 STANDBY, MEASURE = 0x00, 0x08
 BYPASS, STREAM = 0x00, 0x80
-COUNTS_PER_G = 256  # full resolution, any range; data sheet: 230 to 282
+COUNTS_PER_G = 256  # in full resolution, at any range; the data sheet allows 230 to 282
 RANGE_CODES: Mapping[int, int] = {2: 0, 4: 1, 8: 2, 16: 3}
-# 3200 and 1600 Hz lose their lowest bit and do not fit a 400 kHz bus; the data sheet names 800 Hz as the most for it.
+# At 3200 and 1600 Hz the lowest bit is lost, and the samples do not fit a 400 kHz bus: the data sheet gives 800 Hz as
+# the highest rate for it.
 RATE_CODES: Mapping[float, int] = {800.0 / 2.0**step: 0x0D - step for step in range(10)}
 SETTING_NAMES: Mapping[int, str] = {
     **dict(enumerate(("THRESH_TAP", "OFSX", "OFSY", "OFSZ", "DUR", "LATENT", "WINDOW", "THRESH_ACT"), 0x1D)),
@@ -35,14 +38,14 @@ _FULL_RESOLUTION, _SELF_TEST = 0x08, 0x80
 
 
 def limits(range_g: int) -> tuple[int, int]:
-    """Lowest and highest count: 10 bits at 2 g, one more for each doubling of the range."""
+    """Lowest and highest count at `range_g`: 10 bits at 2 g, one bit more for each doubling of the range."""
     return -COUNTS_PER_G * range_g, COUNTS_PER_G * range_g - 1
 
 
 def settings(rate_hz: float, range_g: int) -> dict[int, tuple[str, int]]:
-    """Name and value by register while measuring: offsets zero, no event detection, no self-test, FIFO in stream mode.
+    """Register -> (name, value) while measuring: offsets zero, no event detection, no self-test, FIFO in stream mode.
 
-    The part has no reset, so all that can be set is.
+    The part has no reset command, so this sets every register that can be written.
     """
     values = dict.fromkeys(SETTING_NAMES, 0)
     values[BW_RATE] = RATE_CODES[rate_hz]
@@ -53,9 +56,13 @@ def settings(rate_hz: float, range_g: int) -> dict[int, tuple[str, int]]:
 
 
 def self_test(range_g: int) -> SelfTest:
-    """The SELF_TEST bit. Data sheet: 0.20 to 2.10 g in x, as much the other way in y, 0.30 to 3.40 g in z at 2.5 V;
-    at 3.3 V 1.77 and 1.47 times as much (tables 1 and 14). The supply is not known, so both are accepted; the limits
-    hold at 100 to 800 Hz (page 22). Noise in counts, any rate."""
+    """Self-test with the SELF_TEST bit.
+
+    Limits from the data sheet, tables 1 and 14: at 2.5 V supply 0.20 to 2.10 g in x, the same with opposite sign in y,
+    0.30 to 3.40 g in z; at 3.3 V these values are multiplied by 1.77 (x, y) and 1.47 (z). The supply voltage is not
+    known here, so the limits include both. They hold at 100 to 800 Hz (page 22). The noise is given in counts, at any
+    rate.
+    """
     return SelfTest(
         writes=((DATA_FORMAT, _SELF_TEST | _FULL_RESOLUTION | RANGE_CODES[range_g]),),
         settle_s=0.1,

@@ -1,4 +1,4 @@
-"""Drivers `adxl355`, `adxl357` and `adxl359`: one family on I2C, read through its FIFO."""
+"""Drivers `adxl355`, `adxl357` and `adxl359`: one family of parts on I2C, read through their FIFO."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ class Adxl357Options(Adxl355Options):
 
 
 class Adxl355(FifoSensor):
-    """STATUS and the entry count in one transfer, then as many entries as make whole samples.
+    """Reads STATUS and the number of FIFO entries in one transfer, then as many entries as make whole samples.
 
-    A poll that came too late finds OVERRUN set; a read that broke off may have taken entries with it; entries out of
-    step are dropped up to the next X marker.
+    If a poll comes too late, OVERRUN is set. If a read is interrupted, it may have removed entries from the FIFO.
+    Entries that do not form x, y, z are dropped up to the next entry with the X marker.
     """
 
     options_model: ClassVar[type[Options]] = Adxl355Options
@@ -69,16 +69,16 @@ class Adxl355(FifoSensor):
         found = self._device.read(chip.DEVID, 4)
         if found[:3] != self.part.identity:
             wanted = self.part.identity.hex(" ")
-            raise IdentityError(f"{self._device.name}: expected {wanted}, found {found[:3].hex(' ')}")
+            raise IdentityError(f"{self._device.name}: expected the IDs {wanted}, found {found[:3].hex(' ')}")
         return {"REVID": found[chip.REVISION]}
 
     def _set_up(self, identity: Mapping[str, int]) -> DeviceInfo:
         self._reset()
-        self._write_settings(last=chip.POWER_CTL)  # settings take in standby only
+        self._write_settings(last=chip.POWER_CTL)  # settings are accepted in standby only
         return self._info(self.part.kind.lower(), self._options.rate_hz, identity)
 
     def _reset(self) -> None:
-        """Reset until the part's trim is back as it was before."""
+        """Reset until the shadow registers, which hold the factory trim, read the same as before. Raises DeviceLost."""
         for _ in range(RESET_ATTEMPTS):
             before = self._device.read(chip.SHADOW, chip.SHADOW_BYTES)
             self._device.write(chip.RESET, chip.RESET_CODE)
@@ -87,7 +87,8 @@ class Adxl355(FifoSensor):
             if after == before:
                 return
         raise DeviceLost(
-            f"{self._device.name}: after a reset the shadow registers read {after.hex(' ')}, not {before.hex(' ')}"
+            f"{self._device.name}: after a reset the shadow registers read {after.hex(' ')}, "
+            f"not {before.hex(' ')}; check supply and wiring"
         )
 
     def _temperature(self) -> tuple[int, float]:
@@ -96,13 +97,14 @@ class Adxl355(FifoSensor):
     def _poll(self) -> Burst:
         retries = self._device.retries
         arrival_ns, utc_ns, (status, entries) = self._device.read_stamped([(chip.STATUS, 2)], self._clock)
-        # a STATUS read that failed may have cleared the flag
+        # A STATUS read that failed may have cleared the overrun flag.
         lost = bool(status & chip.OVERRUN) or (self._device.retries > retries and entries >= chip.FIFO_ENTRIES_MAX)
         whole = min(entries, chip.FIFO_ENTRIES_MAX) // 3 * 3
         if not whole:
             return Burst(arrival_ns, utc_ns, b"", lost)
         retries = self._device.retries
-        # STATUS behind the data: between count and data the FIFO may have run over, however few it held.
+        # STATUS is read again after the data: the FIFO may have overrun between the count and the data, even if the
+        # count was low.
         answer = self._device.read_each([(chip.FIFO_DATA, 3 * whole), (chip.STATUS, 1)])
         lost |= bool(answer[-1] & chip.OVERRUN) or self._device.retries > retries
         data = chip.without_empty(answer[:-1])
@@ -113,13 +115,13 @@ class Adxl355(FifoSensor):
 
 
 class Adxl357(Adxl355):
-    """As the ADXL355, with five times its range."""
+    """Like the ADXL355, with five times its range."""
 
     options_model = Adxl357Options
     part = chip.ADXL357
 
 
 class Adxl359(Adxl357):
-    """As the ADXL357, with a part ID of its own."""
+    """Like the ADXL357, with a different part ID."""
 
     part = chip.ADXL359

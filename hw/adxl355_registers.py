@@ -1,10 +1,14 @@
-"""Registers of the ADXL355, ADXL357 and ADXL359 and what their bytes mean: pure functions, no bus.
+"""Registers of the ADXL355, ADXL357 and ADXL359 and the meaning of their contents: pure functions, no bus.
 
-Sources: data sheets ADXL354/ADXL355 and ADXL356/ADXL357 (tables of specifications and registers); ADXL359 as in Linux,
-drivers/iio/accel/adxl355_core.c (part ID, 19.5 ug/LSB at 10 g, temperature intercept). The ADXL357's part ID is also
-the ADXL355's (0xED: data sheets, and the public drivers that check it): which one it is only the configuration knows.
-LSB/g also in Zephyr, adxl355_decoder.c; Linux and no-OS round them to 3.9 and 19.5 ug/LSB, 0.16 % smaller. Temperature
-also in Zephyr and no-OS; of the ADXL357 public drivers have 1852 as the data sheet, no-OS has 1885: 3.6 K apart.
+Sources: data sheets ADXL354/ADXL355 and ADXL356/ADXL357 (specification and register tables). For the ADXL359: Linux,
+drivers/iio/accel/adxl355_core.c (part ID, 19.5 ug/LSB at 10 g, temperature intercept).
+
+The ADXL357 has the same part ID as the ADXL355 (0xED, in the data sheets and in the public drivers that check the ID).
+Only the configuration tells which of the two parts is connected.
+
+LSB/g: Zephyr (adxl355_decoder.c) has the values of the data sheet; Linux and no-OS round to 3.9 and 19.5 ug/LSB, which
+is 0.16 % less. Temperature: the ADXL355's values are also in Zephyr and no-OS. The ADXL357's intercept is 1852 in the
+data sheet and in other public drivers, but 1885 in no-OS, which is a difference of 3.6 K.
 """
 
 from __future__ import annotations
@@ -29,21 +33,25 @@ SETTING_NAMES = (
     *("ACT_EN", "ACT_THRESH_H", "ACT_THRESH_L", "ACT_COUNT", "FILTER", "FIFO_SAMPLES"),
     *("INT_MAP", "SYNC", "RANGE", "POWER_CTL", "SELF_TEST"),
 )
-RATES_HZ = tuple(4000.0 / 2.0**code for code in range(11))  # by the code in FILTER
+RATES_HZ = tuple(4000.0 / 2.0**code for code in range(11))  # index: the code in FILTER
 COUNTS_MIN, COUNTS_MAX = -(2**19), 2**19 - 1
-_RANGE_RESET_BITS = 0x80  # I2C high-speed mode, set after a reset and left so
-_X_MARK, _EMPTY = 0x01, 0x02  # in an entry's last byte
+_RANGE_RESET_BITS = 0x80  # I2C high-speed bits, set by a reset and kept
+_X_MARK, _EMPTY = 0x01, 0x02  # in the last byte of a FIFO entry
 
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """What differs within the family. `counts_per_g` by range in g, lowest range first, its code 1, 2, 3."""
+    """Properties in which the parts of the family differ.
+
+    `counts_per_g` maps the range in g to its counts per g, lowest range first; the register codes are 1, 2, 3 in this
+    order.
+    """
 
     kind: str
-    identity: bytes  # Analog Devices, MEMS, part
+    identity: bytes  # the three ID registers: Analog Devices, MEMS, part
     counts_per_g: Mapping[int, int]
-    temperature_intercept: int  # LSB at 25 degC; the slope is -9.05 LSB a degree in all of them
-    noise_g: float  # per root Hz, at the lowest range
+    temperature_intercept: int  # LSB at 25 degC; the slope is -9.05 LSB per degC in all parts
+    noise_g: float  # g per square root of Hz, at the lowest range
     self_test_low_g: Axes
     self_test_high_g: Axes
 
@@ -56,9 +64,10 @@ ADXL359 = Part("ADXL359", bytes([0xAD, 0x1D, 0xE9]), {10: 51200, 20: 25600, 40: 
 
 
 def settings(part: Part, rate_hz: float, range_g: int) -> bytes:
-    """Values of the registers FIRST_SETTING .. SELF_TEST while measuring.
+    """Values of the registers FIRST_SETTING to SELF_TEST while measuring, for `rate_hz` and `range_g`.
 
-    Offsets zero and high-pass filter off: S and Q are of untouched counts. No interrupts, internal clock, no self-test.
+    The offset registers are zero and the high-pass filter is off, so that S and Q belong to unmodified counts.
+    Interrupts and self-test are off, the clock is the internal one.
     """
     values = dict.fromkeys(SETTING_NAMES, 0)
     values["FILTER"] = RATES_HZ.index(rate_hz)
@@ -70,9 +79,13 @@ def settings(part: Part, rate_hz: float, range_g: int) -> bytes:
 
 
 def self_test(part: Part, rate_hz: float) -> SelfTest:
-    """ST1 and ST2, set in standby. ADXL355 data sheet: 0.1 to 0.6 g in x and y, 0.5 to 3.0 g in z (typically 0.3, 0.3,
-    1.5 g); ADXL357: 0.5 to 3.0 g in z (typically 1.25 g), none stated for x and y: there anything but nothing. The
-    limits also in the public drivers of plasmapper for both. Noise over a bandwidth of a quarter of the rate."""
+    """Self-test with the bits ST1 and ST2, which are set in standby.
+
+    ADXL355 data sheet: 0.1 to 0.6 g in x and y, 0.5 to 3.0 g in z (typically 0.3, 0.3 and 1.5 g). ADXL357 data sheet:
+    0.5 to 3.0 g in z (typically 1.25 g) and no limits for x and y; there any change from 0.01 to 3.0 g passes. The
+    public drivers of plasmapper use the same limits for both parts. The noise is that of a bandwidth of a quarter of
+    the rate.
+    """
     noise_g = part.noise_g * (rate_hz / 4) ** 0.5
     return SelfTest(
         writes=((POWER_CTL, _STANDBY), (SELF_TEST, 0x03), (POWER_CTL, MEASURE)),
@@ -85,15 +98,19 @@ def self_test(part: Part, rate_hz: float) -> SelfTest:
 
 
 def temperature(part: Part, data: bytes) -> tuple[int, float]:
-    """Raw 12 bits and degC from TEMP2, TEMP1. Nominal line; part to part its intercept differs by degrees."""
+    """Raw value (12 bits) and temperature in degC from the registers TEMP2 and TEMP1.
+
+    The data sheet's nominal line is used; the intercept differs by some degC from part to part.
+    """
     raw = (data[0] & 0x0F) << 8 | data[1]
     return raw, 25.0 + (raw - part.temperature_intercept) / -9.05
 
 
 def triples(data: bytes) -> FifoSamples:
-    """Find the triples in FIFO entries (3 bytes each) by the X marker: X, two others (Y, Z), then X or the end.
+    """Find the samples (x, y, z) in FIFO entries of 3 bytes each by the X marker.
 
-    Entries that the device marks as empty must not be in `data` (see `without_empty`).
+    A sample is an entry with the X marker, two entries without it (Y, Z), and then the next X marker or the end of
+    `data`. `data` must not hold entries that the device marks as empty (see `without_empty`).
     """
     entries = np.frombuffer(data, np.uint8).reshape(-1, 3)
     n = len(entries)
@@ -115,6 +132,6 @@ def triples(data: bytes) -> FifoSamples:
 
 
 def without_empty(data: bytes) -> bytes:
-    """Leave out the entries that the device marks as read from an empty FIFO."""
+    """Remove the entries that the device marks as read from an empty FIFO."""
     entries = np.frombuffer(data, np.uint8).reshape(-1, 3)
     return bytes(entries[(entries[:, 2] & _EMPTY) == 0].tobytes())

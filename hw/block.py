@@ -1,4 +1,4 @@
-"""What a device yields: blocks of indications as they came, with the arrival of every burst in them."""
+"""What a device returns: blocks of indications as they were read, with the arrival time of every burst in them."""
 
 from __future__ import annotations
 
@@ -13,29 +13,33 @@ LARGEST = 1e12  # of an indication: no unit needs more, and squares and sums of 
 
 
 class BlockFlags(enum.IntFlag):
-    """What a reader must know about a block before it trusts it."""
+    """What a reader must know about a block before it uses it."""
 
     NONE = 0
-    SATURATED = 1  # at least one indication at the end of the range
-    OVERRUN = 2  # the device lost samples before this block, how many is not known
-    GAP = 4  # samples before this block are missing, first_index says how many
-    RESTART = 8  # the index does not go on in time from the block before: the clock model starts anew
+    SATURATED = 1  # at least one indication is at the end of the range
+    OVERRUN = 2  # the device lost an unknown number of samples before this block
+    GAP = 4  # samples before this block are missing; first_index tells how many
+    RESTART = 8  # the time of this block cannot be counted on from the block before: the clock model starts again
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SampleBlock:
     """Consecutive samples of one device, about half a second, read in one or more bursts.
 
-    A burst is what one read of a FIFO or a port returned; its arrival is all that is known of time (the clock model
-    makes sample times of it). `burst_t_monotonic_ns[b]` is the arrival (CLOCK_MONOTONIC, ns) of the burst after which
-    `burst_count[b]` samples of this block had been read (cumulative, the last one equals N).
-    `indications` is (N, 3) for a tri-axial device, (N, 1) for a uniaxial one: int32 counts or float64 decimals, never
-    scaled. Sample i of the block has index `first_index + i` in the device's own count, which never repeats in a run.
+    A burst is the result of one read of a FIFO or a port. Only the arrival time of a burst is known; the clock model
+    computes the sample times from the arrival times.
+
+    - `burst_t_monotonic_ns` (B,): arrival of each burst, CLOCK_MONOTONIC, ns.
+    - `burst_count` (B,): how many samples of this block had been read with burst b; cumulative, the last element is N.
+    - `indications`: (N, 3) for a tri-axial device, (N, 1) for a uniaxial one; int32 counts or float64 decimals, not
+      scaled.
+    - `first_index`: sample i of the block has index `first_index + i` in the device's own count. An index never repeats
+      in a run.
     """
 
     device: str
     boot_id: str
-    t_utc_ns: int  # UTC at the last burst's arrival
+    t_utc_ns: int  # UTC at the arrival of the last burst
     first_index: int
     nominal_rate_hz: float
     burst_t_monotonic_ns: NDArray[np.int64]
@@ -58,7 +62,7 @@ class SampleBlock:
 
 @dataclass(frozen=True, slots=True)
 class Drop:
-    """What a driver read and could not use, for the record of the run."""
+    """Data that a driver read and could not use, for the record of the run."""
 
     count: int
     unit: Literal["samples", "lines", "bytes"]
@@ -67,7 +71,7 @@ class Drop:
 
 @dataclass(frozen=True, slots=True)
 class DeviceInfo:
-    """Who a device is, as read from it, and how it was set."""
+    """Identity of a device, as read from the device, and its settings."""
 
     driver: str
     kind: str  # part or protocol, e.g. "ADXL355"
@@ -77,4 +81,4 @@ class DeviceInfo:
     nominal_rate_hz: float
     range_mps2: float | None = None
     nominal_sensitivity: float | None = None  # indications per m/s2, from the data sheet
-    settings: dict[str, str] = field(default_factory=dict)  # register dump or port settings, as read back
+    settings: dict[str, str] = field(default_factory=dict)  # register contents or port settings, as read back

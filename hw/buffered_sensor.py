@@ -1,4 +1,4 @@
-"""What all drivers have in common whose samples wait in a library's buffer: polls, bursts, losses."""
+"""Common part of all drivers whose samples wait in the buffer of a library: polls, bursts, losses."""
 
 from __future__ import annotations
 
@@ -16,19 +16,20 @@ from hw.cutting import Cutter, Stretch
 from hw.sensor import GOLDEN, Clock, DeviceLost, Options, system_clock
 
 BLOCK_S, POLL_S = 0.5, 0.02
-BUFFER_S = 1.0  # what a driver asks its library to keep: fifty polls
+BUFFER_S = 1.0  # length of the buffer that a driver asks its library for: fifty polls
 OVERFLOW = "input overflow"
 
 Indications = NDArray[np.int32] | NDArray[np.float64]
 Read = tuple[int, int, Indications]
-"""Arrival and UTC in ns, and the samples."""
+"""Arrival (CLOCK_MONOTONIC) and UTC, both in ns, and the samples."""
 
 
 class BufferedSensor(ABC):
-    """Takes what waits every POLL_S, stamped with the time just before it is asked for.
+    """Reads all waiting samples every POLL_S. Their arrival is the time just before the read.
 
-    What an overflow lost lies somewhere in what was waiting: all of that is thrown away, and the next sample starts
-    anew. A subclass finds, starts and reads its device; `options` must have `rate_hz`.
+    If the buffer overflows, it is not known where among the waiting samples the lost ones were. All waiting samples are
+    then discarded and the next block carries RESTART and OVERRUN. A subclass finds, starts and reads its device;
+    `options` must have `rate_hz`.
     """
 
     options_model: ClassVar[type[Options]]
@@ -44,7 +45,7 @@ class BufferedSensor(ABC):
         self._options = options
         self._clock = clock
         self._sleep = sleep
-        self._cutter = Cutter(name, np.nan)  # the rate is known once it is open
+        self._cutter = Cutter(name, np.nan)  # the rate is known after `open`
         self._opened = False
         self._ready: deque[SampleBlock] = deque()
         self._loss: DeviceLost | None = None
@@ -53,33 +54,36 @@ class BufferedSensor(ABC):
 
     @abstractmethod
     def _where(self) -> str:
-        """The way to the device, for messages."""
+        """Name of the device and its port, for messages."""
 
     @abstractmethod
     def _start(self) -> DeviceInfo:
-        """Find the device, set it, let it measure. Raises DeviceLost, ConfigurationError or IdentityError."""
+        """Find the device, set it up and start the measurement.
+
+        Raises DeviceLost, ConfigurationError or IdentityError.
+        """
 
     @abstractmethod
     def _stop(self) -> None:
-        """Release the device, also one that `_start` found but could not start; never raises."""
+        """Release the device, also if `_start` found it but could not start it. Never raises."""
 
     @abstractmethod
     def _take(self) -> tuple[Indications, bool]:
-        """What waits (n, axes), and whether samples were lost since the last call; it measures on then.
+        """Return the waiting samples (n, axes), and whether samples were lost since the last call.
 
-        Raises DeviceLost.
+        After a loss the measurement must run again when this method returns. Raises DeviceLost.
         """
 
-    def _ends(self, info: DeviceInfo) -> tuple[float, float]:  # noqa: ARG002 - not every device says
-        """Ends of the range, in the indications' unit."""
+    def _ends(self, info: DeviceInfo) -> tuple[float, float]:  # noqa: ARG002 - not every device needs it
+        """Lowest and highest indication of the range, in the unit of the indications."""
         return -np.inf, np.inf
 
     def _temperature(self) -> tuple[int | None, float | None]:
-        """Raw and degC at the end of a block."""
+        """Raw value and degC at the end of a block; None where the device has no thermometer."""
         return None, None
 
     def open(self) -> DeviceInfo:
-        """Find it, set it, start it. Raises DeviceLost, ConfigurationError or IdentityError."""
+        """Find the device, set it up and start it. Raises DeviceLost, ConfigurationError or IdentityError."""
         self.close()
         try:
             info = self._start()
@@ -100,12 +104,12 @@ class BufferedSensor(ABC):
             self._stop()
 
     def take_drops(self) -> list[Drop]:
-        """What waited when the buffer ran over."""
+        """The samples that were discarded because the buffer overflowed, since the last call."""
         dropped, self._dropped = self._dropped, 0
         return [Drop(dropped, "samples", OVERFLOW)] if dropped else []
 
     def read_block(self) -> SampleBlock | None:
-        """The next block, or None. Raises DeviceLost."""
+        """The next block, or None if no sample came. Raises DeviceLost."""
         if not self._ready and self._loss is None:
             if not self._opened:
                 raise DeviceLost(f"{self._where()} is not open")
@@ -117,12 +121,12 @@ class BufferedSensor(ABC):
         return None
 
     def _gather(self) -> None:
-        """Take for BLOCK_S; a loss, of samples or of the device, ends it earlier."""
+        """Read samples for BLOCK_S, or until samples or the device are lost."""
         reads: list[Read] = []
         end_ns = self._clock()[0] + round(BLOCK_S * 1e9)
         try:
             while self._clock()[0] < end_ns and not self._ready:
-                self._phase = (self._phase + GOLDEN) % 1.0  # so that poll and sample clock do not beat
+                self._phase = (self._phase + GOLDEN) % 1.0  # avoids a beat between polls and sample clock
                 self._sleep(POLL_S + self._phase / self._cutter.nominal_rate_hz)
                 now_ns, utc_ns = self._clock()
                 samples, overflowed = self._take()
@@ -135,11 +139,11 @@ class BufferedSensor(ABC):
                 elif len(samples):
                     reads.append((now_ns, utc_ns, samples))
         except DeviceLost as error:
-            self._loss = error  # raised once all before it is returned
+            self._loss = error  # raised after all earlier samples have been returned
         self._finish(reads)
 
     def _finish(self, reads: list[Read]) -> None:
-        """Make blocks of what was read."""
+        """Make blocks of the samples in `reads`."""
         if not reads:
             return
         arrivals_ns, utc_ns, samples = zip(*reads, strict=True)

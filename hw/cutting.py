@@ -1,4 +1,4 @@
-"""Makes sample blocks of what a driver read: cuts where samples are not consecutive, keeps the index and the flags."""
+"""Makes sample blocks of what a driver read: starts a block at each gap, counts the sample index, sets the flags."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from hw.sensor import boot_id
 
 @dataclass(frozen=True, slots=True)
 class Break:
-    """Sample `at` of a stretch is not the next one after sample `at - 1`; `missing` samples lie between, if known."""
+    """Sample `at` of a stretch does not follow sample `at - 1`; `missing` samples lie between, if the number is
+    known."""
 
     at: int
     flags: BlockFlags
@@ -23,22 +24,22 @@ class Break:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stretch:
-    """What came in about half a second. `burst_count[b]` samples had been read when burst b arrived (cumulative)."""
+    """The samples of about half a second. `burst_count[b]` samples had been read when burst b arrived (cumulative)."""
 
     indications: NDArray[np.int32] | NDArray[np.float64]
     burst_t_monotonic_ns: NDArray[np.int64]
     burst_count: NDArray[np.int64]
-    t_utc_ns: int  # UTC at the last burst's arrival
+    t_utc_ns: int  # UTC at the arrival of the last burst
     temperature_raw: int | None = None
     temperature_degc: float | None = None
 
 
 class Cutter:
-    """Numbers a device's samples through its life and cuts stretches into blocks.
+    """Numbers a device's samples over the whole run and cuts stretches into blocks.
 
-    `lowest` and `highest` are the ends of the range, in the indications' unit: an indication there is SATURATED.
-    Flags that no sample could carry yet wait for the next one. Rate and ends may
-    change when a device is opened.
+    A block with an indication at or beyond `lowest` or `highest` (ends of the range, in the unit of the indications) is
+    flagged SATURATED. A flag that is set while there is no sample goes to the next block. Rate and range may change
+    when the device is opened again.
     """
 
     def __init__(self, device: str, nominal_rate_hz: float, lowest: float = -np.inf, highest: float = np.inf) -> None:
@@ -50,12 +51,15 @@ class Cutter:
         self._flags = BlockFlags.NONE
 
     def flag(self, flags: BlockFlags, missing: int = 0) -> None:
-        """What the next sample's block must carry, and how far its index jumps."""
+        """Set flags of the next sample's block; the sample index jumps by `missing`."""
         self._flags |= flags
         self._index += missing
 
     def cut(self, stretch: Stretch, breaks: Sequence[Break] = ()) -> list[SampleBlock]:
-        """Blocks of consecutive samples; `breaks` in rising order of `at`, 0 <= at <= number of samples."""
+        """Cut a stretch into blocks of consecutive samples.
+
+        `breaks` in ascending order of `at`, 0 <= at <= number of samples.
+        """
         blocks = []
         start = 0
         for point in breaks:
@@ -68,7 +72,7 @@ class Cutter:
         if start == stop:
             return []
         count = np.clip(stretch.burst_count, start, stop) - start
-        bringing = np.diff(count, prepend=0) > 0  # the others say nothing of this block's times
+        bringing = np.diff(count, prepend=0) > 0  # Bursts without a sample of this block tell nothing about its times.
         arrivals = stretch.burst_t_monotonic_ns[bringing]
         indications = stretch.indications[start:stop]
         if indications.max() >= self.highest or indications.min() <= self.lowest:
@@ -92,8 +96,11 @@ class Cutter:
 
 
 def follow(steps: NDArray[np.int64] | NDArray[np.float64], longest_gap: float) -> list[Break]:
-    """Breaks of a count by its steps (n,) from sample to sample: a longer step than one is a GAP of known length, none,
-    one backwards or one beyond `longest_gap` a RESTART."""
+    """Breaks of a sample counter, from its steps (n,) between samples.
+
+    A step of 1 is no break. A step of 2 to `longest_gap` is a GAP of known length. A step of 0, a negative step or a
+    step above `longest_gap` is a RESTART.
+    """
     breaks = []
     for at in np.flatnonzero(steps != 1).tolist():
         missing = int(steps[at]) - 1

@@ -1,4 +1,4 @@
-"""What the reads of a chip's FIFO become: samples, and what of the bytes was none. Pure functions, no bus."""
+"""Results of reading the FIFO of a chip: samples, and the words that belong to no sample. Pure functions, no bus."""
 
 from __future__ import annotations
 
@@ -10,11 +10,16 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FifoSamples:
-    """Whole samples of a run of FIFO words (what the chip stores at a time: an axis, a sample, a tagged sample).
+    """Complete samples in a sequence of FIFO words.
 
-    `counts` (N, 3) int32; `last` (N,) place of the word that ended each sample; `breaks` samples before which words
-    were out of step (rising, may hold N); `dropped` words that belong to no sample; `rest` bytes of a sample that has
-    only begun.
+    A word is what the chip stores at a time: an axis, a sample, a tagged sample.
+
+    - `counts` (N, 3): int32.
+    - `last` (N,): position of the word that completed each sample.
+    - `breaks`: samples that do not follow the sample before, because words between them were not usable (ascending, may
+      hold N).
+    - `dropped`: number of words that belong to no sample.
+    - `rest`: bytes of an incomplete sample at the end.
     """
 
     counts: NDArray[np.int32]
@@ -25,14 +30,17 @@ class FifoSamples:
 
 
 def plain_samples(data: bytes, byte_order: str) -> FifoSamples:
-    """Samples of three 16 bit numbers without any mark, `byte_order` "<" or ">"; their step is the reader's care."""
+    """Samples of three 16-bit numbers without any marker, `byte_order` "<" or ">".
+
+    `data` must begin with the first byte of a sample; this function cannot check it.
+    """
     counts = np.frombuffer(data, f"{byte_order}i2").astype(np.int32).reshape(-1, 3)
     return FifoSamples(counts, np.arange(len(counts)), [], 0, b"")
 
 
 @dataclass(frozen=True, slots=True)
 class Burst:
-    """One read of a FIFO. `lost` tells that samples before it, how many is not known, are gone."""
+    """Data of one FIFO read. `lost`: an unknown number of samples before these data is lost."""
 
     arrival_ns: int
     utc_ns: int

@@ -1,4 +1,7 @@
-"""What all drivers that poll a FIFO over I2C have in common: polls, blocks, losses. A chip adds its registers."""
+"""Common part of all drivers that poll a FIFO over I2C: polls, blocks, losses.
+
+A subclass adds the registers of its chip.
+"""
 
 from __future__ import annotations
 
@@ -20,21 +23,22 @@ from hw.sensor import GOLDEN, Clock, ConfigurationError, DeviceError, DeviceLost
 
 STANDARD_GRAVITY_MPS2 = 9.80665
 BLOCK_S = 0.5
-OUT_OF_STEP = "FIFO entries out of step"
+OUT_OF_STEP = "incomplete samples in the FIFO"
 
 Registers = Mapping[int, tuple[str, int]]
-"""What is set, by register: its name and value."""
+"""Settings: register -> (name, value)."""
 
 
 class FifoSensor(ABC):
-    """Polls a FIFO for half a second and makes blocks of what came.
+    """Polls a FIFO for half a second and makes blocks of the samples.
 
-    How many samples are lost is unknown when the FIFO ran over, when a read broke off and when its entries were out of
-    step: RESTART each time. A subclass gives the abstract methods; `options` must be FifoOptions with an `address`.
+    The number of lost samples is unknown if the FIFO overran, if a read was interrupted, or if FIFO entries did not
+    form complete samples. The next block then carries RESTART. A subclass implements the abstract methods; `options`
+    must be FifoOptions with an `address`.
     """
 
     options_model: ClassVar[type[Options]]
-    word_bytes: ClassVar[int]  # what the FIFO stores at a time
+    word_bytes: ClassVar[int]  # bytes that the FIFO stores at a time
 
     def __init__(
         self,
@@ -51,14 +55,14 @@ class FifoSensor(ABC):
         self._cutter = Cutter(name, options.rate_hz, *self._limits())
         self._ready: deque[SampleBlock] = deque()
         self._loss: DeviceLost | None = None
-        self._dropped: Counter[str] = Counter()  # words, by reason
+        self._dropped: Counter[str] = Counter()  # number of words by reason
         self._rest = b""
         self._next_poll_ns = 0
         self._phase = 0.0
 
     @abstractmethod
     def _kind(self) -> str:
-        """The part's name, for messages."""
+        """Name of the part, for messages."""
 
     @abstractmethod
     def _limits(self) -> tuple[int, int]:
@@ -66,7 +70,7 @@ class FifoSensor(ABC):
 
     @abstractmethod
     def _identify(self) -> Mapping[str, int]:
-        """What says who it is, by register; reads only. Raises IdentityError."""
+        """Read the identity registers and return them by name; write nothing. Raises IdentityError."""
 
     @abstractmethod
     def _set_up(self, identity: Mapping[str, int]) -> DeviceInfo:
@@ -74,38 +78,38 @@ class FifoSensor(ABC):
 
     @abstractmethod
     def _counts_per_g(self) -> float:
-        """Nominal, at the range that is set."""
+        """Nominal counts per g at the range that is set."""
 
     @abstractmethod
     def _self_test(self) -> SelfTest:
-        """How the device tests itself as it is set."""
+        """The self-test of the device at its present settings."""
 
     @abstractmethod
     def _settings(self) -> Registers:
-        """What is set while measuring, in rising order."""
+        """The settings while measuring, in ascending order of register."""
 
     @abstractmethod
     def _poll(self) -> Burst:
-        """What the FIFO holds now."""
+        """Read what the FIFO holds now."""
 
     @abstractmethod
     def _decode(self, data: bytes) -> FifoSamples:
-        """Samples in the words of half a second, the rest of the last one included."""
+        """Samples in the words of half a second; `data` begins with the rest of the words before."""
 
     def _temperature(self) -> tuple[int | None, float | None]:
-        """Raw and degC; called before the first poll of each block."""
+        """Raw value and degC; called before the first poll of each block."""
         return None, None
 
     def _forget(self) -> None:
-        """The next word does not follow the last one."""
+        """Discard the incomplete sample, because the next word does not follow the last one."""
         self._drop(OUT_OF_STEP, len(self._rest) // self.word_bytes)
         self._rest = b""
 
     def open(self) -> DeviceInfo:
-        """Identify, reset, configure, read back.
+        """Identify the device, reset it, write the settings and read them back.
 
-        Raises ConfigurationError (address held by a kernel driver, settings not taken), IdentityError or DeviceLost
-        (no bus, nothing answers).
+        Raises ConfigurationError (a kernel driver holds the address, or a setting was not accepted), IdentityError, or
+        DeviceLost (no bus, or no device answers).
         """
         self._device.open()
         try:
@@ -122,9 +126,9 @@ class FifoSensor(ABC):
         return info
 
     def identify(self) -> str:
-        """Who answers at the address. Reads identity alone, so that a device in use is not disturbed.
+        """Name the device at the address. Reads only the identity registers, so a device in use is not disturbed.
 
-        Raises as `open`.
+        Raises the same errors as `open`.
         """
         self._device.open()
         try:
@@ -135,7 +139,10 @@ class FifoSensor(ABC):
         return f"{self._kind()} ({', '.join(f'{name} 0x{value:02X}' for name, value in identity.items())})"
 
     def self_test(self) -> SelfTestReport:
-        """Let the open device test itself, about 3 s. It has to be opened anew afterwards. Raises as `read_block`."""
+        """Run the self-test of the open device; takes about 3 s. Open the device again afterwards.
+
+        Raises the same errors as `read_block`.
+        """
         test = self._self_test()
         g = self._counts_per_g()
         still = self._settled(0.0)
@@ -147,12 +154,12 @@ class FifoSensor(ABC):
         return SelfTestReport(test, tuple(change.tolist()), tuple(noise.tolist()))
 
     def _settled(self, settle_s: float) -> NDArray[np.generic]:
-        """Indications of a block, with what came before and within `settle_s` thrown away."""
+        """Indications of one block, after the samples of the first `settle_s` and of the block before are discarded."""
         self._sleep(settle_s)
         self.read_block()
         block = self.read_block()
         if block is None:
-            raise DeviceLost(f"{self._device.name}: it fell silent")
+            raise DeviceLost(f"{self._device.name}: sent no samples during the self-test")
         return block.indications
 
     def close(self) -> None:
@@ -160,13 +167,13 @@ class FifoSensor(ABC):
         self._device.close()
 
     def take_drops(self) -> list[Drop]:
-        """FIFO entries that became no sample since the last call, in bytes."""
+        """Bytes of FIFO entries that became no sample since the last call, by reason."""
         drops = [Drop(self.word_bytes * words, "bytes", reason) for reason, words in self._dropped.items() if words]
         self._dropped.clear()
         return drops
 
     def read_block(self) -> SampleBlock | None:
-        """The next block, or None. Raises DeviceLost."""
+        """The next block, or None if no sample came. Raises DeviceLost."""
         if not self._ready and self._loss is None:
             self._gather()
         if self._ready:
@@ -176,7 +183,7 @@ class FifoSensor(ABC):
         return None
 
     def _gather(self) -> None:
-        """Poll for BLOCK_S; a loss, of samples or of the device, ends it earlier."""
+        """Poll for BLOCK_S, or until samples or the device are lost."""
         bursts: list[Burst] = []
         raw_degc: tuple[int | None, float | None] = None, None
         end_ns = self._next_poll_ns + round(BLOCK_S * 1e9)
@@ -195,12 +202,15 @@ class FifoSensor(ABC):
             if not any(burst.data for burst in bursts):
                 self._check_settings(DeviceLost)
         except DeviceLost as loss:
-            self._loss = loss  # raised once all that came before it has been returned
+            self._loss = loss  # raised after all earlier samples have been returned
         self._finish(bursts, raw_degc)
 
     def _wait(self) -> None:
-        """Sleep to the next poll; spread over a sample period by the golden ratio, so that poll and sample clock do
-        not beat and each second's arrivals sample all of the period."""
+        """Sleep until the next poll.
+
+        The polls are spread over a sample period by the golden ratio, so that polls and sample clock do not beat and
+        the arrivals of each second cover the whole sample period.
+        """
         now_ns, _ = self._clock()
         self._next_poll_ns += round(self._options.interval_s * 1e9)
         self._phase = (self._phase + GOLDEN) % 1.0
@@ -211,7 +221,7 @@ class FifoSensor(ABC):
             self._next_poll_ns = now_ns
 
     def _finish(self, bursts: list[Burst], raw_degc: tuple[int | None, float | None]) -> None:
-        """Decode what was read and make blocks of it."""
+        """Decode the bursts and make blocks of the samples."""
         if not bursts:
             return
         lengths = [len(burst.data) // self.word_bytes for burst in bursts]
@@ -233,7 +243,7 @@ class FifoSensor(ABC):
         self._dropped[reason] += words
 
     def _check_settings(self, error: type[DeviceError] = ConfigurationError) -> None:
-        """Read every setting back, neighbours in one read."""
+        """Read every setting back (neighbouring registers in one read) and raise `error` if one differs."""
         settings = self._settings()
         runs: list[list[int]] = []
         for register in settings:
@@ -248,10 +258,10 @@ class FifoSensor(ABC):
             if value != wanted
         ]
         if wrong:
-            raise error(f"{self._device.name} is not set as it should be (did it lose power?): {', '.join(wrong)}")
+            raise error(f"{self._device.name} does not hold its settings (did it lose power?): {', '.join(wrong)}")
 
     def _write_settings(self, *, last: int) -> None:
-        """Write all settings, register `last` behind the others, and read them back."""
+        """Write all settings, register `last` after the others, and read them back."""
         settings = self._settings()
         for register, (_, value) in settings.items():
             if register != last:
@@ -260,7 +270,7 @@ class FifoSensor(ABC):
         self._check_settings()
 
     def _info(self, driver: str, rate_hz: float, found: Mapping[str, int]) -> DeviceInfo:
-        """What `open` returns; `found` are read registers that were not set."""
+        """Build the result of `open`; `found` are registers that were read but not set, by name."""
         counts_per_g = self._counts_per_g()
         registers = dict(found) | dict(self._settings().values())
         return DeviceInfo(

@@ -1,4 +1,4 @@
-"""From bursts of bytes to sample blocks by frames of fixed length, without a port."""
+"""Makes sample blocks of bursts of bytes that hold frames of fixed length; needs no port."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ NO_FRAME = "no frame"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Decoded:
-    """Samples of a run of frames: `indications` (n, axes), `frame` (n,) which of the frames ended each sample."""
+    """Samples of a sequence of frames.
+
+    `indications` (n, axes); `frame` (n,) is the index of the frame that completed each sample.
+    """
 
     indications: NDArray[np.int32] | NDArray[np.float64]
     frame: NDArray[np.int64]
@@ -27,7 +30,10 @@ class Decoded:
 
 
 class FrameStream(ABC):
-    """Gathers bursts with `feed`, decodes all of them at once in `blocks`. Holds at most a frame begun besides."""
+    """Collects bursts with `feed` and decodes all of them in `blocks`.
+
+    Between calls it keeps at most one incomplete frame.
+    """
 
     def __init__(self, cutter: Cutter, layout: Layout) -> None:
         self._cutter = cutter
@@ -37,10 +43,13 @@ class FrameStream(ABC):
 
     @abstractmethod
     def _decode(self, found: Found) -> Decoded:
-        """Samples of these frames."""
+        """Return the samples of these frames."""
 
     def begin(self) -> None:
-        """A port was opened: up to the first frame there is only the rest of one."""
+        """Start after a port was opened.
+
+        The bytes up to the first frame are the rest of a frame and are not counted as dropped.
+        """
         self._listening = False
         self._slipped = False
         self._rest = b""
@@ -51,14 +60,14 @@ class FrameStream(ABC):
         self._cutter.flag(BlockFlags.RESTART)
 
     def feed(self, data: bytes, arrival_ns: int, utc_ns: int) -> None:
-        """One burst and its arrival."""
+        """Add one burst (`data`) and its arrival time, ns."""
         self._bursts.append(data)
         self._arrivals_ns.append(arrival_ns)
         self._utc_ns = utc_ns
         self.size += len(data)
 
     def blocks(self) -> list[SampleBlock]:
-        """Blocks of all that was fed since the last call."""
+        """Decode everything fed since the last call and return its blocks."""
         if not self._bursts:
             return []
         read = len(self._rest) + np.cumsum([len(burst) for burst in self._bursts])
@@ -88,6 +97,6 @@ class FrameStream(ABC):
         )
 
     def take_drops(self) -> list[Drop]:
-        """Bytes that belong to no frame since the last call."""
+        """Bytes since the last call that belong to no frame."""
         dropped, self._dropped = self._dropped, 0
         return [Drop(dropped, "bytes", NO_FRAME)] if dropped else []

@@ -1,4 +1,4 @@
-"""Frames of fixed length in a stream of bytes: found by their first bytes and their checksum. Pure functions."""
+"""Finds frames of fixed length in a stream of bytes by their first bytes and their checksum. Pure functions."""
 
 from __future__ import annotations
 
@@ -35,13 +35,15 @@ CHECKSUMS: Mapping[ChecksumName, tuple[int, Callable[[bytes], int]]] = {
     "crc16-ccitt": (2, lambda data: binascii.crc_hqx(data, 0xFFFF)),
     "crc16-modbus": (2, _crc16_modbus),
 }
-"""Bytes of a checksum, and its value."""
+"""Checksum name -> (number of bytes, function of the covered bytes)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Frames of `length` bytes begin with `start`; the checksum are their last bytes, of all before from
-    `checksum_from` on."""
+    """Frames of `length` bytes that begin with `start`.
+
+    The checksum is in the last bytes of the frame and covers the bytes before it, from byte `checksum_from` on.
+    """
 
     start: bytes
     length: int
@@ -52,8 +54,14 @@ class Layout:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """`frames` (N, length) bytes; `end` (N,) place behind each in the data; `slipped` (N + 1,) whether bytes before
-    it, and behind the last, were no frame; `dropped` how many were none; `rest` what may be the beginning of one."""
+    """Result of `find`.
+
+    - `frames` (N, length): the bytes of the frames.
+    - `end` (N,): position in the data after each frame.
+    - `slipped` (N + 1,): whether there were bytes outside a frame before each frame, and after the last one.
+    - `dropped`: number of bytes outside frames.
+    - `rest`: bytes at the end that may be the beginning of a frame.
+    """
 
     frames: NDArray[np.uint8]
     end: NDArray[np.int64]
@@ -63,8 +71,11 @@ class Found:
 
 
 def find(data: bytes, layout: Layout) -> Found:
-    """All frames in `data`. Where the checksum fails the search goes on one byte further, since the first bytes of a
-    frame may also occur within one."""
+    """Find all frames in `data`.
+
+    If the checksum is wrong, the search continues one byte later, because the first bytes of a frame may also occur
+    inside a frame.
+    """
     width, checksum = CHECKSUMS[layout.checksum]
     covered = layout.length - width
     starts: list[int] = []
@@ -87,7 +98,7 @@ def find(data: bytes, layout: Layout) -> Found:
 
 
 def _beginning(data: bytes, start: bytes, free: int) -> int:
-    """Where a frame's first bytes begin at the very end of `data`; its length if they do not."""
+    """Position where `data` ends with the first bytes of a frame; the length of `data` if it does not."""
     for at in range(max(free, len(data) - len(start) + 1), len(data)):
         if start.startswith(data[at:]):
             return at
@@ -95,7 +106,7 @@ def _beginning(data: bytes, start: bytes, free: int) -> int:
 
 
 def numbers(frames: NDArray[np.uint8], at: int, kind: NumberType, order: ByteOrder) -> NDArray[np.generic]:
-    """The number at byte `at` of each frame, (N,)."""
+    """The number at byte `at` of each frame (N, length), as (N,)."""
     raw = np.ascontiguousarray(frames[:, at : at + WIDTH[kind]])
     if kind == "i24":
         most = raw if order == "big" else raw[:, ::-1]

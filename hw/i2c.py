@@ -1,4 +1,4 @@
-"""One device on an I2C bus, over smbus2: register reads and writes, retried where the failure may pass."""
+"""One device on an I2C bus, over smbus2: register reads and writes, with retries after transient errors."""
 
 from __future__ import annotations
 
@@ -16,17 +16,18 @@ T = TypeVar("T")
 Read = tuple[int, int]
 """First register and number of bytes."""
 
-READS_MAX = 21  # each is two messages, and Linux takes 42 a transfer
+READS_MAX = 21  # a read needs two messages, and Linux accepts 42 messages per transfer
 RETRIES = 3
-RETRY_WAIT_S = 0.0005  # lets another master's transfer or a stuck clock end; three of them fill no FIFO
+# Time for another master's transfer or clock stretching to end; three waits are too short to fill a FIFO
+RETRY_WAIT_S = 0.0005
 TRANSIENT = frozenset((errno.ENXIO, errno.EREMOTEIO, errno.EIO, errno.ETIMEDOUT, errno.EAGAIN))
 
 
 class I2CDevice:
-    """`name` says in messages who it is. `retries` counts the transfers that had to be repeated so far.
+    """A device at `address` of /dev/i2c-`bus`; `kind` names it in messages. `retries` counts the repeated transfers.
 
-    All methods but `close` raise DeviceLost (bus gone, nothing answers after the retries) or ConfigurationError
-    (a kernel driver holds the address: never forced).
+    All methods but `close` raise DeviceLost (the bus is gone, or the device does not answer after the retries) or
+    ConfigurationError (a kernel driver holds the address; this class never takes it over).
     """
 
     def __init__(self, kind: str, bus: int, address: int, sleep: Callable[[float], None]) -> None:
@@ -38,7 +39,7 @@ class I2CDevice:
         self._bus: SMBus | None = None
 
     def open(self) -> None:
-        """Open the bus. ConfigurationError if it does SMBus transfers only."""
+        """Open the bus. Raises ConfigurationError if the adapter only supports SMBus transfers."""
         self.close()
         try:
             self._bus = SMBus(self.path)
@@ -46,7 +47,7 @@ class I2CDevice:
             raise DeviceLost(f"{self.path}: {error.strerror}") from error
         if not self._bus.funcs & I2cFunc.I2C:
             self.close()
-            raise ConfigurationError(f"{self.path} does SMBus transfers only, {self.name} needs plain I2C")
+            raise ConfigurationError(f"{self.path} only supports SMBus transfers, {self.name} needs plain I2C")
 
     def close(self) -> None:
         """Release the bus; never raises."""
@@ -56,15 +57,15 @@ class I2CDevice:
                 bus.close()
 
     def read(self, register: int, count: int) -> bytes:
-        """`count` bytes from `register` on, in one transfer."""
+        """Read `count` bytes, starting at `register`, in one transfer."""
         return self.read_each([(register, count)])
 
     def read_each(self, reads: Sequence[Read]) -> bytes:
-        """All of `reads` (at most READS_MAX) in one transfer, their bytes one behind the other."""
+        """Do all `reads` (at most READS_MAX) in one transfer; returns their bytes concatenated."""
         return self._retry(lambda bus: self._transfer(bus, reads))
 
     def read_stamped(self, reads: Sequence[Read], clock: Clock) -> tuple[int, int, bytes]:
-        """As `read_each`, with the middle of the transfer that succeeded: CLOCK_MONOTONIC and UTC, ns."""
+        """As `read_each`; also returns the middle of the successful transfer, CLOCK_MONOTONIC and UTC, ns."""
 
         def stamped(bus: SMBus) -> tuple[int, int, bytes]:
             before_ns, _ = clock()
@@ -76,12 +77,14 @@ class I2CDevice:
         return self._retry(stamped)
 
     def check_free(self) -> None:
-        """Raises ConfigurationError if a kernel driver holds the address, DeviceLost if nobody answers at it."""
+        """Raise ConfigurationError if a kernel driver holds the address, DeviceLost if no device answers there."""
         self._retry(lambda bus: bus.read_byte_data(self._address, 0))
 
     def write(self, register: int, value: int) -> None:
-        """One byte to a register, as an SMBus call: the kernel refuses these, and only these, while a driver of its own
-        holds the address."""
+        """Write one byte to a register, as an SMBus call.
+
+        While a kernel driver holds the address, the kernel refuses SMBus calls, but not plain I2C transfers.
+        """
         self._retry(lambda bus: bus.write_byte_data(self._address, register, value))
 
     def _transfer(self, bus: SMBus, reads: Sequence[Read]) -> bytes:
@@ -101,7 +104,10 @@ class I2CDevice:
                 return transfer(self._bus)
             except OSError as error:
                 if error.errno == errno.EBUSY:
-                    raise ConfigurationError(f"{self.name}: a kernel driver holds the address; unbind it") from error
+                    raise ConfigurationError(
+                        f"{self.name}: a kernel driver holds the address; unbind the kernel driver "
+                        "or use the driver iio"
+                    ) from error
                 if error.errno not in TRANSIENT or attempts > RETRIES:
                     raise DeviceLost(f"{self.name}: {error.strerror}") from error
             attempts += 1

@@ -1,4 +1,4 @@
-"""Driver `iio`: an accelerometer that a kernel driver reads (Linux industrial I/O), through its buffer."""
+"""Driver `iio`: an accelerometer that a Linux kernel driver (industrial I/O) reads, through the kernel's buffer."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from hw.sensor import Clock, ConfigurationError, DeviceLost, Options, system_clo
 SYSFS, DEV = Path("/sys/bus/iio/devices"), Path("/dev")
 BLOCK_S, POLL_S, BUFFER_S = 0.5, 0.05, 4.0
 READ_BYTES = 1 << 20
-LONGEST_GAP = 100  # samples: with a rate 1 % off, how many a longer one held is not known
+LONGEST_GAP = 100  # samples; the length of a longer gap is uncertain if the rate is 1 % off
 AXES = ("accel_x", "accel_y", "accel_z")
 OFF = ("in_accel_x_calibbias", "in_accel_y_calibbias", "in_accel_z_calibbias")
 HIGH_PASS = "in_accel_filter_high_pass_3db_frequency"
@@ -31,16 +31,16 @@ HIGH_PASS = "in_accel_filter_high_pass_3db_frequency"
 class IioOptions(Options):
     """Options of `iio`."""
 
-    device: str = Field(min_length=1, description="its name, e.g. adxl355, or its node, e.g. iio:device0")
-    rate_hz: float = Field(gt=0, le=100_000, description="sampling frequency, one that the kernel driver has")
-    trigger: str | None = Field(None, description="name of the trigger, where the driver sets none itself")
+    device: str = Field(min_length=1, description="name of the device, e.g. adxl355, or its node, e.g. iio:device0")
+    rate_hz: float = Field(gt=0, le=100_000, description="sampling frequency; the kernel driver must offer it")
+    trigger: str | None = Field(None, description="name of the trigger; needed if the kernel driver sets none itself")
 
 
 class Iio:
-    """Files of sysfs and the device's node alone: no library is needed.
+    """Reads the files in sysfs and the device's node; needs no library.
 
-    The kernel stamps every sample at its interrupt (CLOCK_MONOTONIC): each sample is a burst with that arrival. A step
-    between stamps tells how many samples the buffer dropped.
+    The kernel stamps every sample at its interrupt (CLOCK_MONOTONIC), so each sample is a burst with this arrival time.
+    A larger step between two stamps tells how many samples the buffer dropped.
     """
 
     options_model: ClassVar[type[Options]] = IioOptions
@@ -65,15 +65,19 @@ class Iio:
         self._last_ns: int | None = None
 
     def open(self) -> DeviceInfo:
-        """Find it, set it, read it back, start its buffer. Raises DeviceLost or ConfigurationError."""
+        """Find the device, write its settings, read them back, start its buffer.
+
+        Raises DeviceLost or ConfigurationError.
+        """
         self.close()
         self._directory = self._find()
         if not (self._directory / "buffer").is_dir():
             raise ConfigurationError(
-                f"{self._directory}: no buffer; most kernel drivers need an interrupt line for one"
+                f"{self._directory}: the device has no buffer; most kernel drivers need its interrupt line for one"
             )
         try:
-            # Before anything is set: whoever else has it open keeps it as it is.
+            # The node is opened before any setting is written: if another process has it open, the settings stay as
+            # they are.
             self._file = os.open(DEV / self._directory.name, os.O_RDONLY | os.O_NONBLOCK)
             settings = self._configure()
             scale = _number(self._directory / "in_accel_scale") if "in_accel_scale" in settings else 0.0
@@ -102,7 +106,7 @@ class Iio:
         )
 
     def close(self) -> None:
-        """Release the node and stop the buffer."""
+        """Close the node and stop the buffer."""
         file, self._file = self._file, None
         if file is not None:
             with contextlib.suppress(OSError):
@@ -111,11 +115,11 @@ class Iio:
                 (self._directory / "buffer" / "enable").write_text("0")
 
     def take_drops(self) -> list[Drop]:
-        """Nothing is read in vain: what the kernel dropped shows as gaps."""
+        """Always empty: samples that the kernel dropped appear as gaps."""
         return []
 
     def read_block(self) -> SampleBlock | None:
-        """The next block, or None. Raises DeviceLost."""
+        """The next block, or None if no sample came. Raises DeviceLost."""
         if not self._ready and self._loss is None:
             if self._file is None:
                 raise DeviceLost(f"IIO device {self._options.device} (/dev/{self._directory.name}) is not open")
@@ -161,20 +165,20 @@ class Iio:
             self._loss = DeviceLost(f"/dev/{self._directory.name}: {error.strerror}")
             return b""
         if not data:
-            self._loss = DeviceLost(f"/dev/{self._directory.name}: it ended")
+            self._loss = DeviceLost(f"/dev/{self._directory.name}: the device returned end of file")
         return data
 
     def _find(self) -> Path:
-        """The device's directory."""
+        """Directory of the device in sysfs. Raises DeviceLost."""
         names = {path: _text(path / "name") for path in sorted(SYSFS.glob("iio:device*"))}
         for path, name in names.items():
             if self._options.device in (path.name, name):
                 return path
         known = ", ".join(f"{name} ({path.name})" for path, name in names.items()) or "none"
-        raise DeviceLost(f"{SYSFS}: no IIO device {self._options.device!r}; there are {known}")
+        raise DeviceLost(f"{SYSFS}: no IIO device {self._options.device!r}; available: {known}")
 
     def _configure(self) -> dict[str, str]:
-        """Set all, start the buffer; what stands in the files then."""
+        """Write all settings and start the buffer; returns the settings as read back, by file name."""
         here = self._directory
         _write(here / "buffer" / "enable", "0")
         rate = next(
@@ -190,7 +194,7 @@ class Iio:
             _write(path, value)
             found = _text(path)
             if found != value and not _same_number(found, value):
-                raise ConfigurationError(f"{path}: wrote {value}, it says {found}")
+                raise ConfigurationError(f"{path}: wrote {value}, the kernel driver set {found}")
         self._elements = self._choose(here / "scan_elements")
         self._scan = iio_scan.layout(self._elements)
         bits = self._elements["accel_x"].bits
@@ -201,7 +205,7 @@ class Iio:
         return {path.name: _text(path) for path in kept if path.exists()}
 
     def _choose(self, directory: Path) -> dict[str, iio_scan.Element]:
-        """Acceleration and time stamp are stored, nothing else."""
+        """Store the acceleration and the time stamp in the buffer and nothing else; returns the stored elements."""
         elements = {}
         for path in sorted(directory.glob("in_*_en")):
             name = path.name.removeprefix("in_").removesuffix("_en")
@@ -212,7 +216,7 @@ class Iio:
                 elements[name] = iio_scan.Element.parse(index, _text(directory / f"in_{name}_type"))
         absent = [name for name in (*AXES, "timestamp") if name not in elements]
         if absent:
-            raise ConfigurationError(f"{directory}: no element {', '.join(absent)}")
+            raise ConfigurationError(f"{directory}: the device does not have {', '.join(absent)}")
         return elements
 
 
@@ -221,7 +225,10 @@ def _text(path: Path) -> str:
 
 
 def _write(path: Path, value: str) -> None:
-    """Set a file of sysfs. ConfigurationError for a value that the kernel driver refuses, else OSError naming it."""
+    """Write a file of sysfs.
+
+    Raises ConfigurationError if the kernel driver refuses the value, otherwise OSError with the path.
+    """
     try:
         path.write_text(value)
     except OSError as error:
@@ -230,23 +237,23 @@ def _write(path: Path, value: str) -> None:
         known = path.with_name(f"{path.name}_available")
         if path.name == "enable":
             triggers = ", ".join(_text(name) for name in sorted(SYSFS.glob("trigger*/name"))) or "none"
-            hint = f"; has it a trigger (option trigger, there are: {triggers})?"
+            hint = f"; set the option trigger if the device needs one (triggers here: {triggers})"
         else:
-            hint = f", it takes {_text(known)}" if known.exists() else ""
+            hint = f"; accepted values: {_text(known)}" if known.exists() else ""
         raise ConfigurationError(f"{path}: {value} is refused{hint}") from error
 
 
 def _number(path: Path) -> float:
-    """Raises ConfigurationError for a file that holds none."""
+    """The number in a file. Raises ConfigurationError if the text is not a number."""
     text = _text(path)
     try:
         return float(text)
     except ValueError:
-        raise ConfigurationError(f"{path}: {text!r} is no number") from None
+        raise ConfigurationError(f"{path}: {text!r} is not a number") from None
 
 
 def _same_number(found: str, wanted: str) -> bool:
-    """1000.000000 is 1000; what a driver made of a rate that it does not have is not."""
+    """Whether two texts are the same number: 1000.000000 and 1000 are, a rate that the kernel driver rounded is not."""
     try:
         return abs(float(found) - float(wanted)) <= 1e-3 * abs(float(wanted))
     except ValueError:

@@ -1,7 +1,8 @@
-"""Scans of Linux's industrial I/O buffers: how one is laid out, what its bytes mean. Pure functions, no files.
+"""Scans in the buffers of Linux industrial I/O: their layout and the meaning of their bytes. Pure functions, no files.
 
-Source: Linux, Documentation/ABI/testing/sysfs-bus-iio (scan_elements: `[be|le]:[s|u]bits/storagebitsXrepeat>>shift`);
-elements stand in the order of their index, each aligned to its own size, the whole to its largest.
+Source: Linux, Documentation/ABI/testing/sysfs-bus-iio (scan_elements: `[be|le]:[s|u]bits/storagebitsXrepeat>>shift`).
+The elements stand in ascending order of their index. Each element is aligned to its own size, the scan to the size of
+its largest element.
 """
 
 from __future__ import annotations
@@ -31,20 +32,23 @@ class Element:
 
     @classmethod
     def parse(cls, index: int, text: str) -> Element:
-        """Of the files `*_index` and `*_type`. Raises ConfigurationError for a type that is none, or of several."""
+        """Read the contents of the files `*_index` and `*_type`.
+
+        Raises ConfigurationError if `text` is not a type, or is a type of several numbers.
+        """
         found = _TYPE.fullmatch(text)
         bits, storage_bits, shift = map(int, found.groups()[2:]) if found else (0, 0, 0)
         if found is None or not 0 < bits <= storage_bits - shift:
-            raise ConfigurationError(f"{text!r} is no type of a scan element that holds one number")
+            raise ConfigurationError(f"{text!r} is not the type of a scan element with one number")
         return cls(index, found[1], found[2] == "s", bits, storage_bits, shift)
 
     @property
     def dtype(self) -> str:
-        """As it is stored."""
+        """Type of the element in memory."""
         return f"{'<' if self.order == 'le' else '>'}{'i' if self.signed else 'u'}{self.storage_bits // 8}"
 
     def value(self, stored: NDArray[np.generic]) -> NDArray[np.int64]:
-        """Numbers out of what is stored: shifted, cut to their bits, with their sign."""
+        """The numbers (n,) from the stored words (n,): shifted, reduced to their bits, with sign."""
         numbers = stored.astype(np.int64) >> self.shift
         if self.bits >= 64:
             return numbers
@@ -53,7 +57,7 @@ class Element:
 
 
 def layout(elements: Mapping[str, Element]) -> np.dtype[np.void]:
-    """How a scan of these elements lies in memory."""
+    """Layout of a scan of these elements in memory."""
     names = sorted(elements, key=lambda name: elements[name].index)
     offsets, end = [], 0
     for name in names:
@@ -66,7 +70,10 @@ def layout(elements: Mapping[str, Element]) -> np.dtype[np.void]:
 
 
 def missing(stamps_ns: NDArray[np.int64], before_ns: int | None, rate_hz: float) -> NDArray[np.int64]:
-    """How many samples lie between each stamp (n,) and the one before it; a step up to 1.7 periods is one sample."""
+    """Number of samples missing before each stamp (n,); `before_ns` is the stamp before the first one, or None.
+
+    A step of up to 1.7 sample periods counts as one period.
+    """
     first = stamps_ns[:1] - round(1e9 / rate_hz) if before_ns is None else np.array([before_ns])
     steps = np.diff(np.concatenate([first, stamps_ns])) * 1e-9 * rate_hz
     return np.where(steps > 1.7, np.round(steps) - 1, 0).astype(np.int64)

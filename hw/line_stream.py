@@ -1,4 +1,4 @@
-"""From bursts of bytes to sample blocks: the serial text protocol `[seq,]x,y,z` or `[seq,]a`, without a port."""
+"""Makes sample blocks of bursts of bytes in the serial text protocol `[seq,]x,y,z` or `[seq,]a`; needs no port."""
 
 from __future__ import annotations
 
@@ -12,15 +12,18 @@ from hw.block import BlockFlags, Drop, SampleBlock
 from hw.cutting import Break, Cutter, Stretch, follow
 from hw.lines import MAX_LINE_BYTES, decode
 
-UNREADABLE = "not the expected decimals"
+UNREADABLE = "line without the expected decimal numbers"
 OVERLONG = f"no newline within {MAX_LINE_BYTES} bytes"
 
 
 class LineStream:
-    """Gathers bursts with `feed`, decodes all of them at once in `blocks`. Holds at most an unfinished line besides.
+    """Collects bursts with `feed` and decodes all of them in `blocks`.
 
-    With a sequence, missing samples are a GAP of known length; a count that repeats, goes back, or leaps by more than
-    `longest_gap` samples is a RESTART. Without one, a bad line may stand for any number of samples: RESTART.
+    Between calls it keeps at most one incomplete line.
+
+    With a sequence number, missing samples are a GAP of known length; a number that repeats, goes back or jumps by more
+    than `longest_gap` samples is a RESTART. Without a sequence number, a bad line may have been any number of samples:
+    RESTART.
     """
 
     def __init__(self, cutter: Cutter, axes: int, *, sequence: bool, longest_gap: float) -> None:
@@ -32,7 +35,10 @@ class LineStream:
         self.begin()
 
     def begin(self) -> None:
-        """A port was opened: up to the first newline there is only the rest of a line."""
+        """Start after a port was opened.
+
+        The bytes up to the first newline are the rest of a line and are not counted.
+        """
         self._listening = False
         self._tail = b""
         self._last_sequence: float | None = None
@@ -40,11 +46,11 @@ class LineStream:
         self._lines: list[int] = []
         self._arrivals_ns: list[int] = []
         self._utc_ns = 0
-        self.size = 0  # bytes gathered
+        self.size = 0  # number of collected bytes
         self._cutter.flag(BlockFlags.RESTART)
 
     def feed(self, data: bytes, arrival_ns: int, utc_ns: int) -> None:
-        """One burst and its arrival. Of an overlong line only the beginning is kept."""
+        """Add one burst and its arrival time, ns. Of an overlong line only the beginning is kept."""
         if not self._listening:
             _, newline, data = data.partition(b"\n")
             self._listening = bool(newline)
@@ -63,7 +69,7 @@ class LineStream:
             self._tail = self._tail[:MAX_LINE_BYTES]
 
     def blocks(self) -> list[SampleBlock]:
-        """Blocks of all that was fed since the last call."""
+        """Decode everything fed since the last call and return its blocks."""
         if not self._text:
             return []
         decoded = decode(b"".join(self._text), self._columns)
@@ -85,13 +91,13 @@ class LineStream:
         return self._cutter.cut(Stretch(values, arrivals_ns, np.searchsorted(line, burst_lines), self._utc_ns), breaks)
 
     def take_drops(self) -> list[Drop]:
-        """Bad lines and bytes of overlong ones since the last call."""
+        """Bad lines and bytes of overlong lines since the last call."""
         drops = [Drop(count, unit, reason) for (unit, reason), count in self._drops.items() if count]
         self._drops.clear()
         return drops
 
     def _follow(self, sequence: NDArray[np.float64]) -> list[Break]:
-        """Where the sequence does not go on by one, and what that means."""
+        """Breaks where the sequence number does not increase by one."""
         if not len(sequence):
             return []
         before = sequence[0] - 1 if self._last_sequence is None else self._last_sequence

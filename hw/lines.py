@@ -1,4 +1,4 @@
-"""Decodes lines of comma-separated decimals, and is exact about which are none."""
+"""Decodes lines of comma-separated decimal numbers and reports every line that is not one."""
 
 from __future__ import annotations
 
@@ -11,20 +11,21 @@ from numpy.typing import NDArray
 
 from hw.block import LARGEST
 
-MAX_LINE_BYTES = 256  # with its newline; four decimals of the longest kind have 220; more without a newline is no line
-# What float() takes besides (nan, inf, 1_000) is no indication; the counts bound a line and hold any repr of a double.
+MAX_LINE_BYTES = 256  # bytes with the newline; the four longest decimals of a line have 220 bytes
+# float() also accepts nan, inf and 1_000, which are not indications. The repeat counts limit the length of a line and
+# still accept the repr() of any double.
 _DECIMAL = rb"[ \t]{0,4}[+-]?(?:\d{1,16}(?:\.\d{0,24})?|\.\d{1,24})(?:[eE][+-]?\d{1,3})?[ \t]{0,4}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Decoded:
-    """Good lines of a text: `line` (N,) their numbers counted from 0, `values` (N, columns). The rest, counted."""
+    """Result of `decode`: `line` (N,) numbers of the good lines, counted from 0; `values` (N, columns)."""
 
     line: NDArray[np.int64]
     values: NDArray[np.float64]
-    bad_at: list[int]  # numbers of the bad lines, overlong ones included, in rising order
-    bad_lines: int  # that are not overlong
-    bad_bytes: int  # of overlong lines
+    bad_at: list[int]  # numbers of the bad lines, overlong lines included, in ascending order
+    bad_lines: int  # number of bad lines without the overlong ones
+    bad_bytes: int  # number of bytes in overlong lines
 
 
 @functools.cache
@@ -33,10 +34,10 @@ def _pattern(columns: int) -> re.Pattern[bytes]:
 
 
 def decode(text: bytes, columns: int) -> Decoded:
-    """Decode whole lines, each ended by LF or CRLF, of `columns` decimals.
+    """Decode complete lines, each ended by LF or CRLF, with `columns` decimal numbers each.
 
-    Blank lines and comments (#) count as nothing; bad are another number of fields, what is no decimal, and what is
-    beyond LARGEST. Takes about 1.5 us a line, good or bad, on a desktop core.
+    Blank lines and comments (#) are skipped. A line is bad if it has another number of fields, a field that is not a
+    decimal number, or a value beyond LARGEST. Takes about 1.5 us per line, good or bad, on a desktop core.
     """
     lines = text.split(b"\n")[:-1]
     is_good = _pattern(columns).fullmatch

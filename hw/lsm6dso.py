@@ -17,7 +17,7 @@ from hw.sensor import DeviceLost, IdentityError
 
 RESET_WAIT_S = 0.01
 RESET_ATTEMPTS = 5
-SETTLE_SAMPLES = 5  # AN5192: the first one to four samples after a start are to be thrown away
+SETTLE_SAMPLES = 5  # AN5192: discard the first one to four samples after a start
 
 
 class Lsm6dsoOptions(FifoOptions):
@@ -26,7 +26,7 @@ class Lsm6dsoOptions(FifoOptions):
     rates_hz = chip.RATES_HZ
     fifo_samples = chip.FIFO_WORDS
     bytes_a_sample = chip.WORD_BYTES
-    bytes_a_poll = 13  # count, data and FIFO_STATUS, each behind address, register, address; 2 + 2 bytes of status
+    bytes_a_poll = 13  # address, register, address each for count, data and FIFO_STATUS; 2 + 2 bytes of FIFO_STATUS
 
     address: Literal[0x6A, 0x6B] = Field(0x6A, description="106 (0x6A), or 107 (0x6B) with SA0 high")
     rate_hz: float = Field(833.0, description=f"one of {', '.join(f'{rate:g}' for rate in chip.RATES_HZ)}")
@@ -34,11 +34,12 @@ class Lsm6dsoOptions(FifoOptions):
 
 
 class Lsm6dso(FifoSensor):
-    """FIFO_STATUS in one transfer, then as many words as it counts.
+    """Reads FIFO_STATUS in one transfer, then the number of words that it states.
 
-    Each word says of which sensor it is and counts from 0 to 3, so that a lost one shows. The nominal rate is the one
-    that the part states of itself (INTERNAL_FREQ_FINE). Its own time stamps are not stored: they would double the
-    traffic on the bus, and a sample's time follows from the arrivals to some 40 us within a minute, near their 25 us.
+    Each word names its sensor and has a counter from 0 to 3, so a lost word is noticed. The nominal rate is the one
+    that the part states of itself (INTERNAL_FREQ_FINE). The part's own time stamps are not stored: they would double
+    the traffic on the bus. Sample times from the arrivals reach about 40 us within a minute; the part's stamps have a
+    step of 25 us.
     """
 
     options_model = Lsm6dsoOptions
@@ -63,7 +64,7 @@ class Lsm6dso(FifoSensor):
     def _identify(self) -> dict[str, int]:
         (found,) = self._device.read(chip.WHO_AM_I, 1)
         if found != chip.IDENTITY:
-            raise IdentityError(f"{self._device.name}: expected 0x{chip.IDENTITY:02X}, found 0x{found:02X}")
+            raise IdentityError(f"{self._device.name}: expected the ID 0x{chip.IDENTITY:02X}, found 0x{found:02X}")
         return {"WHO_AM_I": found}
 
     def _set_up(self, identity: Mapping[str, int]) -> DeviceInfo:
@@ -82,7 +83,7 @@ class Lsm6dso(FifoSensor):
             self._sleep(RESET_WAIT_S)
             if not self._device.read(chip.CTRL3_C, 1)[0] & chip.SOFTWARE_RESET:
                 return
-        raise DeviceLost(f"{self._device.name}: the reset does not end")
+        raise DeviceLost(f"{self._device.name}: the device does not finish its reset; check its supply and wiring")
 
     def _temperature(self) -> tuple[int, float]:
         return chip.temperature(self._device.read(chip.TEMPERATURE, 2))
@@ -98,7 +99,8 @@ class Lsm6dso(FifoSensor):
         lost = bool(status[1] & chip.OVERRUN)
         data = b""
         if words:
-            # FIFO_STATUS behind the data: between count and data the FIFO may have run over, however few it held.
+            # FIFO_STATUS is read again after the data: the FIFO may have overrun between the count and the data, even
+            # if the count was low.
             answer = self._device.read_each([(chip.FIFO_DATA, chip.WORD_BYTES * words), (chip.FIFO_STATUS, 2)])
             data = answer[:-2]
             lost |= bool(answer[-1] & chip.OVERRUN)

@@ -1,7 +1,7 @@
-"""Registers of the LSM6DSO and LSM6DSOX (the same for what is used here) and what their bytes mean.
+"""Registers of the LSM6DSO and LSM6DSOX (the registers used here are the same) and the meaning of their contents.
 
-Sources: data sheets LSM6DSO and LSM6DSOX, application notes AN5192 and AN5272 (actual output data rate); names and
-bits also in ST's lsm6dsox-pid (lsm6dsox_reg.h) and in Linux, drivers/iio/imu/st_lsm6dsx.
+Sources: data sheets LSM6DSO and LSM6DSOX, application notes AN5192 and AN5272 (actual output data rate); names and bits
+also in ST's lsm6dsox-pid (lsm6dsox_reg.h) and in Linux, drivers/iio/imu/st_lsm6dsx.
 """
 
 from __future__ import annotations
@@ -18,29 +18,34 @@ FIRST_FIFO_SETTING, FIFO_CTRL3, FIFO_CTRL4, FIFO_STATUS, FIFO_DATA = 0x07, 0x09,
 CTRL1_XL, CTRL3_C, CTRL5_C, TEMPERATURE, FREQ_FINE, USER_OFFSET = 0x10, 0x12, 0x14, 0x20, 0x63, 0x73
 SOFTWARE_RESET = 0x01  # in CTRL3_C, clears itself
 BYPASS, CONTINUOUS = 0x00, 0x06  # FIFO_CTRL4
-OVERRUN = 0x48  # in the second byte of FIFO_STATUS: now, and latched until it is read
+OVERRUN = 0x48  # in the second byte of FIFO_STATUS: overrun now, and overrun latched until FIFO_STATUS is read
 COUNT_MASK = 0x3FF
 FIFO_WORDS = 512
 WORD_BYTES = 7
 LIMITS = -(2**15), 2**15 - 1
-# Data sheet, mg/LSB by range in g, in the order of the range's code.
+# Data sheet, mg/LSB by range in g, in the order of the range codes.
 MG_PER_COUNT: Mapping[int, float] = {2: 0.061, 16: 0.488, 4: 0.122, 8: 0.244}
-RATES_HZ = (12.5, 26.0, 52.0, 104.0, 208.0, 416.0, 833.0, 1667.0, 3333.0, 6667.0)  # by code, from 1
+RATES_HZ = (12.5, 26.0, 52.0, 104.0, 208.0, 416.0, 833.0, 1667.0, 3333.0, 6667.0)  # index + 1 is the code
 _INTERNAL_HZ, _FINE_STEP = 6667.0, 0.0015
 _BLOCK_DATA_UPDATE, _AUTO_INCREMENT, _RESET_CTRL9, _DEVICE_CONF = 0x40, 0x04, 0xE0, 0x02
-_ACCELEROMETER = 2  # tag
+_ACCELEROMETER = 2  # tag of the accelerometer
 
 
 def actual_rate_hz(rate_hz: float, freq_fine: int) -> float:
-    """What the part says its rate is: 6667 Hz (1 + 0.0015 FREQ_FINE) over a power of two (AN5272, ODR actual)."""
+    """Rate that the part states, Hz, from its register INTERNAL_FREQ_FINE (`freq_fine`).
+
+    6667 Hz (1 + 0.0015 FREQ_FINE), divided by a power of two (AN5272, ODR actual).
+    """
     signed = freq_fine - 256 if freq_fine > 127 else freq_fine
     divider = 2 ** (len(RATES_HZ) - 1 - RATES_HZ.index(rate_hz))
     return float(_INTERNAL_HZ * (1 + _FINE_STEP * signed) / divider)
 
 
 def self_test(rate_hz: float) -> SelfTest:
-    """Positive self-test. Data sheet (DS12140, table 2): 50 to 1700 mg at any range; noise 70 ug per root Hz at 2 g,
-    over half the rate."""
+    """Positive self-test. Data sheet DS12140, table 2: 50 to 1700 mg at any range.
+
+    The noise is 70 ug per square root of Hz (at 2 g) over half the rate.
+    """
     noise_g = 70e-6 * (rate_hz / 2) ** 0.5
     return SelfTest(
         writes=((CTRL5_C, 0x01),),
@@ -53,14 +58,17 @@ def self_test(rate_hz: float) -> SelfTest:
 
 
 def temperature(data: bytes) -> tuple[int, float]:
-    """Raw and degC: 256 LSB a degree, 0 at 25 degC."""
+    """Raw value and degC: 256 LSB per degC, 0 at 25 degC."""
     raw = int.from_bytes(data, "little", signed=True)
     return raw, 25.0 + raw / 256.0
 
 
 def settings(rate_hz: float, range_g: int) -> dict[int, tuple[str, int]]:
-    """Name and value by register while measuring: accelerometer alone, high performance, no second filter, no user
-    offset, no self-test, FIFO in continuous mode."""
+    """Register -> (name, value) while measuring.
+
+    The accelerometer alone is on, in high-performance mode; no second filter, no user offset, no self-test, FIFO in
+    continuous mode.
+    """
     code = RATES_HZ.index(rate_hz) + 1
     names = ("FIFO_CTRL1", "FIFO_CTRL2", "FIFO_CTRL3", "FIFO_CTRL4")
     values = dict.fromkeys(enumerate(names, FIRST_FIFO_SETTING), 0)
@@ -76,11 +84,11 @@ def settings(rate_hz: float, range_g: int) -> dict[int, tuple[str, int]]:
 
 
 def tagged_samples(data: bytes, last_counter: int | None) -> tuple[FifoSamples, int | None]:
-    """Accelerometer words of a run of FIFO words, and the last one's counter.
+    """Accelerometer samples in a sequence of FIFO words, and the counter of the last word.
 
-    A word is a tag (bits 7:3 kind, 2:1 counter, 0 makes the parity even) and three 16 bit numbers. Words of another
-    kind or parity are dropped; where the counter does not go on by one (from `last_counter`, None: from anywhere)
-    there is a break.
+    A word is a tag byte and three 16-bit numbers. Tag: bits 7:3 sensor, 2:1 counter, bit 0 makes the parity even. Words
+    of another sensor or with wrong parity are dropped. Where the counter does not increase by one there is a break;
+    `last_counter` is the counter before `data`, or None if any first counter is accepted.
     """
     words = np.frombuffer(data, np.uint8).reshape(-1, WORD_BYTES)
     tag = words[:, 0]

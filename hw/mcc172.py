@@ -1,8 +1,9 @@
-"""Driver `mcc172`: an analog sensor on an MCC 172 (24 bit, IEPE, on a Raspberry Pi's header), through daqhats.
+"""Driver `mcc172`: an analog sensor on an MCC 172 (24 bit, IEPE, on the header of a Raspberry Pi), through daqhats.
 
-Names and meanings as in daqhats 1.4.1 (daqhats/mcc172.py, hats.py): volts unless asked for counts, +-5 V, a rate of
-51.2 kHz over 1 to 256, a scan that stops when its buffer runs over. The inputs are AC-coupled (MCC 172 data sheet), and
-its filter delays by 39 samples (a_in_clock, trigger_config): a part of the reference's lag.
+Names and meanings as in daqhats 1.4.1 (daqhats/mcc172.py, hats.py): it returns volts unless counts are requested, the
+range is +-5 V, the rate is 51.2 kHz divided by 1 to 256, a scan stops when its buffer overflows. The inputs are
+AC-coupled (MCC 172 data sheet). The board's filter delays by 39 samples (a_in_clock, trigger_config), which is a part
+of the reference's lag.
 """
 
 from __future__ import annotations
@@ -19,20 +20,22 @@ from hw.vendor_library import vendor_library
 
 BASE_RATE_HZ, DIVIDERS = 51_200.0, range(1, 257)
 RATE_TOLERANCE = 1e-3
-SYNC_POLL_S, SYNC_POLLS = 0.01, 200  # 128 periods of the slowest rate are 0.64 s
+SYNC_POLL_S, SYNC_POLLS = 0.01, 200  # the converters need 128 periods to synchronise: 0.64 s at the slowest rate
 MV_PER_V = 1e3
-UNSCALED = 1000.0  # mV per unit: what comes is volts
+UNSCALED = 1000.0  # mV per unit: the library then returns volts
 INVALID_BOARD = "Invalid board type"
 
 
 class Mcc172Options(Options):
     """Options of `mcc172`."""
 
-    address: int = Field(0, ge=0, le=7, description="of the board, as its jumpers are set")
+    address: int = Field(0, ge=0, le=7, description="address of the board, as set by its jumpers")
     channel: Literal[0, 1] = Field(0, description="input of the board")
-    rate_hz: float = Field(3200.0, gt=0, description="51200 over a whole number from 1 to 256, e.g. 1600, 3200, 6400")
-    iepe: bool = Field(True, description="feed the sensor a constant current; not for a voltage source")
-    serial_number: str = Field("", description="of the sensor, as on its plate")
+    rate_hz: float = Field(
+        3200.0, gt=0, description="51200 divided by a whole number from 1 to 256, e.g. 1600, 3200, 6400"
+    )
+    iepe: bool = Field(True, description="supply the sensor with constant current (IEPE); false for a voltage source")
+    serial_number: str = Field("", description="of the sensor, as on its label")
 
     @field_validator("rate_hz")
     @classmethod
@@ -40,7 +43,7 @@ class Mcc172Options(Options):
         divider = round(BASE_RATE_HZ / value)
         if divider not in DIVIDERS or abs(BASE_RATE_HZ / divider - value) > RATE_TOLERANCE * value:
             near = BASE_RATE_HZ / min(max(divider, 1), 256)
-            raise ValueError(f"{value:g} Hz is not 51200 Hz over 1 to 256; the nearest is {near:g} Hz")
+            raise ValueError(f"{value:g} Hz is not 51200 Hz divided by 1 to 256; the nearest rate is {near:g} Hz")
         return BASE_RATE_HZ / divider
 
     def check_installed(self) -> None:
@@ -54,7 +57,10 @@ class Mcc172Options(Options):
 
 
 class Mcc172(BufferedSensor):
-    """One channel, in mV as calibrated by the board; the sensor's sensitivity is applied elsewhere."""
+    """One channel in mV, with the calibration of the board applied.
+
+    The sensitivity of the sensor is applied elsewhere.
+    """
 
     options_model: ClassVar[type[Options]] = Mcc172Options
 
@@ -73,7 +79,7 @@ class Mcc172(BufferedSensor):
         except library.HatError as error:
             raise (IdentityError if INVALID_BOARD in str(error) else DeviceLost)(f"{self._where()}: {error}") from error
         except Exception as error:
-            if type(error) is not Exception:  # daqhats says so, and only so, that its library in C is missing
+            if type(error) is not Exception:  # daqhats raises a plain Exception only if its C library is missing
                 raise
             raise ConfigurationError(f"driver mcc172: {error}") from error
         return DeviceInfo(
@@ -87,7 +93,7 @@ class Mcc172(BufferedSensor):
         )
 
     def _configure(self, library: Any) -> dict[str, str]:
-        """Set input and clock, read them back."""
+        """Write the settings of input and clock and read them back."""
         board, options = self._board, self._options
         board.iepe_config_write(options.channel, int(options.iepe))
         board.a_in_sensitivity_write(options.channel, UNSCALED)
@@ -98,7 +104,7 @@ class Mcc172(BufferedSensor):
                 break
             self._sleep(SYNC_POLL_S)
         else:
-            raise DeviceLost(f"{self._where()}: its converters did not synchronise within {SYNC_POLL_S * SYNC_POLLS} s")
+            raise DeviceLost(f"{self._where()}: the converters did not synchronise within {SYNC_POLL_S * SYNC_POLLS} s")
         found = {
             "iepe": (board.iepe_config_read(options.channel), int(options.iepe)),
             "mV per unit": (board.a_in_sensitivity_read(options.channel), UNSCALED),
@@ -106,7 +112,7 @@ class Mcc172(BufferedSensor):
         }
         wrong = [f"{name} is {is_:g}, not {wanted:g}" for name, (is_, wanted) in found.items() if is_ != wanted]
         if wrong:
-            raise ConfigurationError(f"{self._where()} is not set as it should be: {', '.join(wrong)}")
+            raise ConfigurationError(f"{self._where()} does not hold its settings: {', '.join(wrong)}")
         return {name: f"{is_:g}" for name, (is_, _) in found.items()} | {
             "channel": str(options.channel),
             "board": board.serial(),
@@ -137,7 +143,7 @@ class Mcc172(BufferedSensor):
                 _end_scan(board)
                 self._scan()
             elif not read.running:
-                raise DeviceLost(f"{self._where()}: its scan ended")
+                raise DeviceLost(f"{self._where()}: the scan stopped")
         except _library().HatError as error:
             raise DeviceLost(f"{self._where()}: {error}") from error
         return MV_PER_V * np.asarray(read.data, np.float64)[:, None], overrun
@@ -148,7 +154,7 @@ def _end_scan(board: Any) -> None:
         board.a_in_scan_stop()
         board.a_in_scan_cleanup()
     except _library().HatError:
-        pass  # there was none
+        pass  # there was no scan
 
 
 def _library() -> Any:

@@ -1,7 +1,7 @@
 """Driver `mcc-usb`: analog sensors on a USB or Ethernet board of MCC, through uldaq (MCC's library for Linux).
 
-Names and meanings as in uldaq 1.2.3 (ai_device.py, ul_structs.py, ul_enums.py): a continuous scan fills a ring in
-memory, the transfer status counts the scans that went into it, and that count alone tells that it ran over its reader.
+Names and meanings as in uldaq 1.2.3 (ai_device.py, ul_structs.py, ul_enums.py): a continuous scan writes into a ring
+buffer, and the transfer status counts the scans written so far. This count is the only sign of an overrun.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from hw.sensor import ConfigurationError, DeviceLost, Options
 from hw.vendor_library import vendor_library
 
 MV_PER_V = 1e3
-RATE_TOLERANCE = 0.01  # a board makes the nearest rate its clock divides into; further off is another one
+RATE_TOLERANCE = 0.01  # relative; a board uses the nearest rate its clock can make, a larger difference is refused
 OVERRUNS = ("OVERRUN", "ADC_OVERRUN", "PACER_OVERRUN", "NET_BUFFER_OVERRUN")
 LOST = ("DEV_NOT_FOUND", "DEV_NOT_CONNECTED", "DEAD_DEV", "DEV_UNAVAILABLE", "NO_CONNECTION_ESTABLISHED", "TIMEDOUT")
 
@@ -27,14 +27,20 @@ LOST = ("DEV_NOT_FOUND", "DEV_NOT_CONNECTED", "DEAD_DEV", "DEV_UNAVAILABLE", "NO
 class MccUsbOptions(Options):
     """Options of `mcc-usb`."""
 
-    device: str = Field("", description="part of the board's product name or unique id; by default the only one")
+    device: str = Field(
+        "", description="part of the board's product name or unique id; empty if there is only one board"
+    )
     first_channel: int = Field(0, ge=0, description="first input")
-    axes: Literal[1, 3] = Field(1, description="1: that input, 3: it and the next two as x, y, z")
+    axes: Literal[1, 3] = Field(
+        1, description="1: first_channel only; 3: first_channel and the next two inputs as x, y, z"
+    )
     differential: bool = Field(True, description="else single-ended")
-    range_v: Literal[1, 2, 5, 10] = Field(10, description="range, plus and minus V, one that the board has")
+    range_v: Literal[1, 2, 5, 10] = Field(10, description="range, plus and minus; the board must have it")
     rate_hz: float = Field(1000.0, gt=0, le=100_000, description="scans a second")
-    iepe: bool = Field(False, description="feed the sensors a constant current, AC-coupled, where the board can")
-    serial_number: str = Field("", description="of the sensor, as on its plate")
+    iepe: bool = Field(
+        False, description="supply the sensors with constant current (IEPE), AC-coupled; the board must be able to"
+    )
+    serial_number: str = Field("", description="of the sensor, as on its label")
 
     def check_installed(self) -> None:
         """Raises ConfigurationError, with what to install, where the vendor's library is not there."""
@@ -47,7 +53,7 @@ class MccUsbOptions(Options):
 
 
 class MccUsb(BufferedSensor):
-    """Calibrated by the board, in mV; the sensor's sensitivity is applied elsewhere."""
+    """In mV, with the calibration of the board applied. The sensitivity of the sensor is applied elsewhere."""
 
     options_model: ClassVar[type[Options]] = MccUsbOptions
 
@@ -73,7 +79,9 @@ class MccUsb(BufferedSensor):
             lost = error.error_code.name in LOST
             raise (DeviceLost if lost else ConfigurationError)(f"{self._where()}: {error}") from error
         if abs(rate_hz - options.rate_hz) > RATE_TOLERANCE * options.rate_hz:
-            raise ConfigurationError(f"{self._where()}: {rate_hz:g} Hz is the nearest it has to {options.rate_hz:g} Hz")
+            raise ConfigurationError(
+                f"{self._where()}: rate_hz {options.rate_hz:g} is not available, the nearest rate is {rate_hz:g} Hz"
+            )
         return DeviceInfo(
             driver="mcc-usb",
             kind=descriptor.product_name,
@@ -96,22 +104,29 @@ class MccUsb(BufferedSensor):
         found = [board for board in boards if wanted in board.product_name or wanted in board.unique_id]
         if len(found) != 1:
             known = ", ".join(f"{board.product_name} {board.unique_id}" for board in boards) or "none"
-            raise DeviceLost(f"{self._where()}: {len(found)} boards have that in their name; there are {known}")
+            raise DeviceLost(
+                f"{self._where()}: {len(found)} boards have this in their name, one is needed; connected: {known}"
+            )
         return found[0]
 
     def _configure(self, library: Any) -> None:
-        """What the board must be able to do, and the current for the sensors."""
+        """Check that the board can do what the options ask for; switch the sensors' current on or off."""
         info, options = self._ai.get_info(), self._options
         channels = range(options.first_channel, options.first_channel + options.axes)
         there = info.get_num_chans_by_mode(self._mode(library))
         if channels.stop > there:
-            raise ConfigurationError(f"{self._where()}: no input {channels.stop - 1}, it has {there} in this mode")
+            raise ConfigurationError(
+                f"{self._where()}: there is no input {channels.stop - 1}; in this mode the board has "
+                f"{there} inputs, counted from 0"
+            )
         known = [found.name for found in info.get_ranges(self._mode(library))]
         if self._range(library).name not in known:
-            raise ConfigurationError(f"{self._where()}: no range_v {options.range_v}: it has {', '.join(known)}")
+            raise ConfigurationError(
+                f"{self._where()}: the board has no range_v {options.range_v}; it has {', '.join(known)}"
+            )
         if not info.supports_iepe():
             if options.iepe:
-                raise ConfigurationError(f"{self._where()}: iepe = true, and it has no current for such sensors")
+                raise ConfigurationError(f"{self._where()}: iepe = true, but the board has no IEPE current")
             return
         config = self._ai.get_config()
         mode = library.IepeMode.ENABLED if options.iepe else library.IepeMode.DISABLED
@@ -120,7 +135,9 @@ class MccUsb(BufferedSensor):
             config.set_chan_iepe_mode(channel, mode)
             config.set_chan_coupling_mode(channel, coupling)
             if (config.get_chan_iepe_mode(channel), config.get_chan_coupling_mode(channel)) != (mode, coupling):
-                raise ConfigurationError(f"{self._where()}: input {channel} does not take {mode.name}, {coupling.name}")
+                raise ConfigurationError(
+                    f"{self._where()}: input {channel} does not accept {mode.name}, {coupling.name}"
+                )
 
     def _mode(self, library: Any) -> Any:
         return library.AiInputMode.DIFFERENTIAL if self._options.differential else library.AiInputMode.SINGLE_ENDED
@@ -129,7 +146,7 @@ class MccUsb(BufferedSensor):
         return library.Range[f"BIP{self._options.range_v}VOLTS"]
 
     def _scan(self) -> float:
-        """Start it; the rate it really has, Hz."""
+        """Start the scan; returns the actual rate, Hz."""
         library, options = _library(), self._options
         length = 2 * round(BUFFER_S * options.rate_hz)
         self._ring = library.create_float_buffer(options.axes, length)
@@ -141,9 +158,9 @@ class MccUsb(BufferedSensor):
         )  # fmt: skip
         return float(rate_hz)
 
-    def _ends(self, info: DeviceInfo) -> tuple[float, float]:  # noqa: ARG002 - what was asked for is what it has
+    def _ends(self, info: DeviceInfo) -> tuple[float, float]:  # noqa: ARG002 - the range is the one that was set
         full_mv = MV_PER_V * self._options.range_v
-        return -full_mv, full_mv * (1 - 2.0**-15)  # the last step of the coarsest converter, 16 bit
+        return -full_mv, full_mv * (1 - 2.0**-15)  # one step of 16 bit, the coarsest converter, below full scale
 
     def _stop(self) -> None:
         device, self._device, self._ai = self._device, None, None
@@ -171,16 +188,16 @@ class MccUsb(BufferedSensor):
         if overrun:
             self._again(library)
         elif status == library.ScanStatus.IDLE:
-            raise DeviceLost(f"{self._where()}: its scan ended")
+            raise DeviceLost(f"{self._where()}: the scan stopped")
         return MV_PER_V * samples, overrun
 
     @property
     def _kept(self) -> int:
-        """Scans that may wait: half the ring, since the library may be writing in the other half."""
+        """Scans that may wait: half the ring, because the library may be writing into the other half."""
         return int(len(self._ring) // self._options.axes // 2)
 
     def _copied(self, first: int, stop: int) -> NDArray[np.float64]:
-        """Scans first .. stop - 1, the newest ones where there are too many."""
+        """Copy scans first .. stop - 1; only the newest ones if there are more than `_kept`."""
         ring = np.ctypeslib.as_array(self._ring).reshape(-1, self._options.axes)
         return np.asarray(ring[np.arange(max(first, stop - self._kept), stop) % len(ring)])
 

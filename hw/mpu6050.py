@@ -15,32 +15,32 @@ from hw.fifo_sensor import FifoSensor, Registers
 from hw.self_test import SelfTest, SelfTestReport
 from hw.sensor import IdentityError
 
-RESET_WAIT_S = 0.1  # register map: 100 ms; Linux waits as long
-START_WAIT_S = 0.1  # gyroscope and its clock run by then (Linux: 60 to 70 ms)
-FREE_SAMPLES_MIN = 3  # with less room Linux resets the FIFO too: it may run over while it is read
-LOST = "FIFO ran over, or out of step: reset"
+RESET_WAIT_S = 0.1  # register map: 100 ms; Linux uses the same time
+START_WAIT_S = 0.1  # the gyroscope and its clock have started by then (Linux: 60 to 70 ms)
+FREE_SAMPLES_MIN = 3  # with less room the FIFO may overrun while it is read; Linux resets it then, too
+LOST = "FIFO overrun or incomplete samples; FIFO was reset"
 
 
 class Mpu6050Options(FifoOptions):
     """Options of `mpu6050`."""
 
     rates_hz = chip.RATES_HZ
-    fifo_samples = 512 // chip.SAMPLE_BYTES  # of the later parts; the MPU-6050's holds twice as much
+    fifo_samples = 512 // chip.SAMPLE_BYTES  # of the MPU-6500 and later; the FIFO of the MPU-6050 holds twice as much
     bytes_a_sample = 6
-    bytes_a_poll = 12  # INT_STATUS, FIFO_COUNT, and the beginning of the read
+    bytes_a_poll = 12  # INT_STATUS, FIFO_COUNT, and the start of the read
 
     address: Literal[0x68, 0x69] = Field(0x68, description="104 (0x68), or 105 (0x69) with AD0 high")
     rate_hz: float = Field(1000.0, description=f"one of {', '.join(f'{rate:g}' for rate in chip.RATES_HZ)}")
     range_g: Literal[2, 4, 8, 16] = Field(2, description="range, plus and minus")
-    clone: bool = Field(False, description="take a part with an unknown WHO_AM_I for an MPU-6500")
+    clone: bool = Field(False, description="treat a part with an unknown WHO_AM_I as an MPU-6500")
 
 
 class Mpu6050(FifoSensor):
-    """Overflow flag and byte count in one transfer, then as many bytes as make whole samples.
+    """Reads the overflow flag and the byte count in one transfer, then the bytes of all complete samples.
 
-    Samples have no mark, and the FIFO's size is no multiple of theirs: once it ran over, all behind is out of step.
-    So it is reset when it ran over or nearly did, when a read broke off, and when its count is no multiple of a sample
-    twice in a row (once may be a sample that is just being written).
+    The samples carry no marker, and the size of the FIFO is not a multiple of a sample. After an overrun it is unknown
+    where a sample starts. The driver therefore resets the FIFO if it overran or almost did, if a read was interrupted,
+    and if the byte count is not a multiple of a sample twice in a row (once is normal while a sample is being written).
     """
 
     options_model = Mpu6050Options
@@ -64,7 +64,7 @@ class Mpu6050(FifoSensor):
         return chip.self_test(self._part, self._device.read(chip.SELF_TEST, 4), options.rate_hz, options.range_g)
 
     def self_test(self) -> SelfTestReport:
-        """As every driver's; an MPU-6050 at 8 g, as its register map asks for."""
+        """Self-test as in every driver; an MPU-6050 is set to 8 g for it, as its register map requires."""
         options = self._options
         if not self._part.accel_config_2 and options.range_g != chip.SELF_TEST_RANGE_G:
             self._options = options.model_copy(update={"range_g": chip.SELF_TEST_RANGE_G})
@@ -79,7 +79,8 @@ class Mpu6050(FifoSensor):
         if found not in chip.PARTS and not self._options.clone:
             known = ", ".join(f"0x{identity:02X}" for identity in chip.PARTS)
             raise IdentityError(
-                f"{self._device.name}: WHO_AM_I is 0x{found:02X}, expected one of {known} (option clone accepts others)"
+                f"{self._device.name}: WHO_AM_I is 0x{found:02X}, expected one of {known} "
+                "(for a compatible part set the option clone)"
             )
         self._part = chip.PARTS.get(found) or chip.clone(found)
         return {"WHO_AM_I": found}
@@ -87,7 +88,7 @@ class Mpu6050(FifoSensor):
     def _set_up(self, identity: Mapping[str, int]) -> DeviceInfo:
         self._device.write(chip.POWER_1, chip.DEVICE_RESET)
         self._sleep(RESET_WAIT_S)
-        self._device.write(chip.POWER_1, chip.CLOCK_FROM_GYRO)  # it is asleep after a reset
+        self._device.write(chip.POWER_1, chip.CLOCK_FROM_GYRO)  # the part sleeps after a reset
         self._sleep(START_WAIT_S)
         self._write_settings(last=chip.USER_CTRL)
         self._reset_fifo()
@@ -107,7 +108,8 @@ class Mpu6050(FifoSensor):
         retries = self._device.retries
         arrival_ns, utc_ns, found = self._device.read_stamped([(chip.INT_STATUS, 1), (chip.FIFO_COUNT, 2)], self._clock)
         count = int.from_bytes(found[1:], "big")
-        lost = bool(found[0] & chip.OVERFLOW) or self._device.retries > retries  # a status read in vain is cleared
+        # A failed read of INT_STATUS has cleared the flag
+        lost = bool(found[0] & chip.OVERFLOW) or self._device.retries > retries
         lost |= count > self._part.fifo_bytes - FREE_SAMPLES_MIN * self.word_bytes
         if count % self.word_bytes:
             again = int.from_bytes(self._device.read(chip.FIFO_COUNT, 2), "big")

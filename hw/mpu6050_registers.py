@@ -1,8 +1,8 @@
-"""Registers of the MPU-6050, MPU-6500 and MPU-9250 and what their bytes mean.
+"""Registers of the MPU-6050, MPU-6500 and MPU-9250 and the meaning of their contents.
 
-Sources: register maps RM-MPU-6000A, RM-MPU-6500A and RM-MPU-9250A, specification PS-MPU-6000A; identities, FIFO sizes
-and temperature lines also in Linux, drivers/iio/imu/inv_mpu6050 (inv_mpu_iio.h, inv_mpu_core.c: offsets 12420 and 7011
-LSB, 2.941176 and 2.995178 mK/LSB). LSB/g, noise and tolerance of the MPU-9250: PS-MPU-9250A-01, table 2.
+Sources: register maps RM-MPU-6000A, RM-MPU-6500A and RM-MPU-9250A, specification PS-MPU-6000A. Identities, FIFO sizes
+and temperature lines are also in Linux, drivers/iio/imu/inv_mpu6050 (inv_mpu_iio.h, inv_mpu_core.c: offsets 12420 and
+7011 LSB, 2.941176 and 2.995178 mK/LSB). LSB/g, noise and tolerance of the MPU-9250: PS-MPU-9250A-01, table 2.
 """
 
 from __future__ import annotations
@@ -20,27 +20,29 @@ FIFO_RESET, FIFO_ON = 0x04, 0x40
 OVERFLOW = 0x10  # in INT_STATUS and INT_ENABLE
 SAMPLE_BYTES = 6
 COUNTS_PER_G: Mapping[int, int] = {2: 16384, 4: 8192, 8: 4096, 16: 2048}
-SELF_TEST_RANGE_G = 8  # of an MPU-6050: at 2 g its answer and gravity together reach the end (RM-MPU-6000A, 4.1)
+# Of an MPU-6050: at 2 g the self-test and gravity together reach the end of the range (RM-MPU-6000A, 4.1)
+SELF_TEST_RANGE_G = 8
 LIMITS = -(2**15), 2**15 - 1
 RATES_HZ = tuple(1000.0 / (divider + 1) for divider in (0, 1, 3, 4, 7, 9, 19, 39, 99, 249))
 _ACCEL_INTO_FIFO = 0x08
-# Bandwidth of the digital low-pass filter by its code; code 0 of the MPU-6050 would run the divider from 8 kHz.
+# Bandwidth of the digital low-pass filter by its code. Code 0 is not used: with it the MPU-6050 divides 8 kHz, not 1
+# kHz, to make the sample rate.
 _BANDWIDTH_HZ: Mapping[int, float] = {1: 184, 2: 94, 3: 44, 4: 21, 5: 10, 6: 5}
 
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """What differs within the family."""
+    """Properties in which the parts of the family differ."""
 
     kind: str
     fifo_bytes: int
-    accel_offset: range  # the accelerometer's offset registers, which hold the maker's trim
+    accel_offset: range  # offset registers of the accelerometer, which hold the factory trim
     accel_config_2: bool
     counts_per_degc: float
     zero_count_degc: float
 
     def temperature(self, data: bytes) -> tuple[int, float]:
-        """Raw and degC from the two bytes of the temperature."""
+        """Raw value and degC from the two bytes of the temperature registers."""
         raw = int.from_bytes(data, "big", signed=True)
         return raw, raw / self.counts_per_degc + self.zero_count_degc
 
@@ -58,20 +60,21 @@ PARTS: Mapping[int, Part] = {
 
 
 def clone(who_am_i: int) -> Part:
-    """What is taken for granted of a part with another WHO_AM_I: the smaller FIFO of the later parts."""
+    """Properties assumed for a part with another WHO_AM_I; its FIFO size is that of the later parts, the smaller
+    one."""
     return Part(f"MPU clone 0x{who_am_i:02X}", 512, range(0x77, 0x7F), True, 333.87, 21.0)
 
 
 def low_pass_code(rate_hz: float) -> int:
-    """The widest filter that ends below half the rate, as Linux chooses it."""
+    """Code of the widest filter with a bandwidth of at most half the rate, as Linux chooses it."""
     return min((code for code, hz in _BANDWIDTH_HZ.items() if hz <= rate_hz / 2), default=6)
 
 
 def settings(part: Part, rate_hz: float, range_g: int) -> dict[int, tuple[str, int]]:
-    """Name and value by register while measuring: accelerometer alone in the FIFO, no self-test.
+    """Register -> (name, value) while measuring: only the accelerometer in the FIFO, no self-test.
 
-    The clock is the gyroscope's, steadier than the internal one; so the gyroscope is on. The overflow interrupt is
-    enabled (its pin may stay open) for its status bit.
+    The clock is that of the gyroscope, which is more stable than the internal one; therefore the gyroscope is on. The
+    overflow interrupt is enabled because its status bit is read; its pin may be left unconnected.
     """
     low_pass = low_pass_code(rate_hz)
     values = {
@@ -91,10 +94,12 @@ def settings(part: Part, rate_hz: float, range_g: int) -> dict[int, tuple[str, i
 
 
 def factory_trim_g(part: Part, codes: bytes) -> list[float]:
-    """Change by self-test that the maker measured, in g by axis, from the registers SELF_TEST on (4 bytes).
+    """Change of the indication by the self-test as measured in the factory, in g, by axis.
 
-    MPU-6050 (RM-MPU-6000A, 4.1): 0.34 (0.92 / 0.34)^((code - 1) / 30). MPU-6500 and later (AN-MPU-9250A-03):
-    2620 * 1.01^(code - 1) counts at 2 g. 0 where the code is 0.
+    `codes` are the four bytes from the register SELF_TEST on. A code of 0 gives 0.
+
+    MPU-6050 (RM-MPU-6000A, 4.1): 0.34 (0.92 / 0.34)^((code - 1) / 30) g. MPU-6500 and later (AN-MPU-9250A-03): 2620 *
+    1.01^(code - 1) counts at 2 g.
     """
     if part.accel_config_2:
         return [2620 * 1.01 ** (code - 1) / COUNTS_PER_G[2] if code else 0.0 for code in codes[:3]]
@@ -103,8 +108,11 @@ def factory_trim_g(part: Part, codes: bytes) -> list[float]:
 
 
 def self_test(part: Part, codes: bytes, rate_hz: float, range_g: int) -> SelfTest:
-    """All three axes. MPU-6050: within 14 % of the maker's (PS-MPU-6000A); later parts: half to one and a half of it
-    (AN-MPU-9250A-03). Noise 400 and 300 ug per root Hz over the filter's bandwidth."""
+    """Self-test of all three axes, with limits around the factory values in `codes`.
+
+    MPU-6050: within 14 % of the factory value (PS-MPU-6000A). Later parts: 0.5 to 1.5 times the factory value
+    (AN-MPU-9250A-03). The noise is 400 ug (MPU-6050) or 300 ug per square root of Hz over the bandwidth of the filter.
+    """
     spread = 0.5 if part.accel_config_2 else 0.14
     x, y, z = factory_trim_g(part, codes)
     noise_g = (300e-6 if part.accel_config_2 else 400e-6) * _BANDWIDTH_HZ[low_pass_code(rate_hz)] ** 0.5
@@ -114,5 +122,5 @@ def self_test(part: Part, codes: bytes, rate_hz: float, range_g: int) -> SelfTes
         low_g=(x * (1 - spread), y * (1 - spread), z * (1 - spread)),
         high_g=(x * (1 + spread), y * (1 + spread), z * (1 + spread)),
         noise_g=(noise_g, noise_g, noise_g),
-        source=f"the maker's own figures in the {part.kind}, within {spread:.0%}",
+        source=f"factory values stored in the {part.kind}, within {spread:.0%}",
     )

@@ -17,10 +17,10 @@ from hw.sensor import ConfigurationError, DeviceLost, Options
 from hw.vendor_library import vendor_library
 
 MV_PER_V = 1e3
-RATE_TOLERANCE = 0.01  # a device makes the nearest rate its clock divides into; further off is another one
-# Samples were lost: buffer overwritten or full, on-board FIFO run over (three codes of them).
+RATE_TOLERANCE = 0.01  # relative; a device uses the nearest rate its clock can make, a larger difference is refused
+# Samples were lost: buffer overwritten or full, on-board FIFO overrun (three codes).
 OVERRUNS = (-200279, -200222, -200361, -200010, -209829)
-# Device unknown, not accessible, removed, transfer aborted, no such device or resource behind the name.
+# Device unknown, not accessible or removed, transfer aborted, no device or resource of this name.
 LOST = (-200220, -201003, -200045, -50405, -88705, -88708)
 
 
@@ -30,16 +30,18 @@ class NiOptions(Options):
     channels: tuple[str, ...] = Field(description='physical channels, one or three for x, y, z: ["cDAQ1Mod1/ai0"]')
     rate_hz: float = Field(2048.0, gt=0, le=200_000, description="samples a second")
     range_v: float = Field(5.0, gt=0, le=100, description="largest voltage expected, plus and minus")
-    iepe_ma: float | None = Field(None, gt=0, le=20, description="current to feed the sensors, AC-coupled; mA, e.g. 2")
-    serial_number: str = Field("", description="of the sensor, as on its plate")
+    iepe_ma: float | None = Field(
+        None, gt=0, le=20, description="supply current of the sensors in mA (IEPE), AC-coupled"
+    )
+    serial_number: str = Field("", description="of the sensor, as on its label")
 
     @field_validator("channels")
     @classmethod
     def _one_or_three(cls, value: tuple[str, ...]) -> tuple[str, ...]:
         if len(value) not in (1, 3):
-            raise ValueError(f"1 or 3 channels, not {len(value)}")
+            raise ValueError(f"1 or 3 channels are needed, not {len(value)}")
         if not all(channel.partition("/")[2] for channel in value):
-            raise ValueError(f"each is device/input, as in cDAQ1Mod1/ai0, not {', '.join(value)}")
+            raise ValueError(f"each channel must be device/input, as in cDAQ1Mod1/ai0, not {', '.join(value)}")
         return value
 
     def check_installed(self) -> None:
@@ -53,7 +55,7 @@ class NiOptions(Options):
 
 
 class Ni(BufferedSensor):
-    """In mV, as calibrated by the device; the sensor's sensitivity is applied elsewhere."""
+    """In mV, with the calibration of the device applied. The sensitivity of the sensor is applied elsewhere."""
 
     options_model: ClassVar[type[Options]] = NiOptions
 
@@ -86,7 +88,9 @@ class Ni(BufferedSensor):
         except _library("errors").DaqNotFoundError as error:
             raise ConfigurationError(f"driver ni needs NI-DAQmx, which is not installed: {_line(error)}") from error
         if abs(rate_hz - options.rate_hz) > RATE_TOLERANCE * options.rate_hz:
-            raise ConfigurationError(f"{self._where()}: {rate_hz:g} Hz is the nearest it has to {options.rate_hz:g} Hz")
+            raise ConfigurationError(
+                f"{self._where()}: rate_hz {options.rate_hz:g} is not available, the nearest rate is {rate_hz:g} Hz"
+            )
         return DeviceInfo(
             driver="ni",
             kind=kind,
@@ -103,7 +107,7 @@ class Ni(BufferedSensor):
         )
 
     def _input(self, channel: str) -> Any:
-        """Add a channel, and the current for its sensor."""
+        """Add a channel, and the supply current for its sensor if `iepe_ma` is set."""
         options, constants = self._options, _library("constants")
         added = self._task.ai_channels.add_ai_voltage_chan(channel, min_val=-options.range_v, max_val=options.range_v)
         if options.iepe_ma is not None:
@@ -113,8 +117,9 @@ class Ni(BufferedSensor):
             added.ai_excit_val = options.iepe_ma * 1e-3
         return added
 
-    def _ends(self, info: DeviceInfo) -> tuple[float, float]:  # noqa: ARG002 - read when it was set
-        return -self._full_mv, self._full_mv * (1 - 2.0**-15)  # the last step of the coarsest converter, 16 bit
+    def _ends(self, info: DeviceInfo) -> tuple[float, float]:  # noqa: ARG002 - read when the channels were set up
+        # One step of 16 bit, the coarsest converter, below full scale
+        return -self._full_mv, self._full_mv * (1 - 2.0**-15)
 
     def _stop(self) -> None:
         task, self._task, self._reader = self._task, None, None
@@ -137,7 +142,7 @@ class Ni(BufferedSensor):
         return MV_PER_V * volts.T, False
 
     def _again(self) -> None:
-        with contextlib.suppress(_library().DaqError):  # it may say once more what happened
+        with contextlib.suppress(_library().DaqError):  # stop() may report the same error once more
             self._task.stop()
         try:
             self._task.start()
@@ -146,7 +151,7 @@ class Ni(BufferedSensor):
 
 
 def _line(error: Exception) -> str:
-    """Its message, which has several lines and empty ones between them."""
+    """The error's message on one line; NI-DAQmx writes several lines with empty lines between them."""
     return " ".join(str(error).split())
 
 

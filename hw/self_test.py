@@ -1,4 +1,4 @@
-"""What a chip's self-test must show, and what it did show."""
+"""What the self-test of a chip must show, and what it showed."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ Axes = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class SelfTest:
-    """`writes` (register, value) turn it on; the indications then change by `low_g` to `high_g` after `settle_s`.
+    """Definition of a self-test.
 
-    `noise_g` is the data sheet's noise (rms) at this rate and range. `source` says where the figures stand.
+    Writing `writes` (register, value) switches the self-test on. After `settle_s` the indications must have changed by
+    `low_g` to `high_g` (by axis, g). `noise_g` is the noise in the data sheet (rms, g) at the present rate and range.
+    `source` names the document of these values.
     """
 
     writes: Sequence[tuple[int, int]]
@@ -25,9 +27,10 @@ class SelfTest:
 
 @dataclass(frozen=True, slots=True)
 class SelfTestReport:
-    """What was measured, in g by axis: the change by the self-test, and the noise (rms) without it.
+    """Result of a self-test, in g by axis: the change by the self-test, and the noise (rms) without it.
 
-    The noise holds what shakes the device too: more than the data sheet's is no fault of it, none at all is.
+    The noise includes vibration of the device. Noise above the data sheet is therefore no fault; no noise at all is
+    one.
     """
 
     test: SelfTest
@@ -36,12 +39,12 @@ class SelfTestReport:
 
     @property
     def faults(self) -> list[str]:
-        """What is not as it should be, one line each; empty: passed."""
+        """The faults, one line each; empty if the device passed."""
         faults = []
         for i, axis in enumerate("xyz"):
             low, high = self.test.low_g[i], self.test.high_g[i]
             if not low <= self.change_g[i] <= high:
-                faults.append(f"{axis} changes by {self.change_g[i]:.3f} g, not by {low:g} to {high:g} g")
+                faults.append(f"{axis} changes by {self.change_g[i]:.3f} g, the limits are {low:g} to {high:g} g")
             if self.noise_g[i] == 0:
-                faults.append(f"{axis} has no noise at all: is it dead?")
+                faults.append(f"{axis} has no noise at all: the axis may be dead")
         return faults

@@ -1,4 +1,4 @@
-"""What every driver is: the protocol, the tree of errors, and the registry of drivers (built in and entry points)."""
+"""The protocol that every driver implements, the errors, and the registry of drivers (built in and entry points)."""
 
 from __future__ import annotations
 
@@ -15,30 +15,34 @@ from pydantic import BaseModel, ConfigDict
 from hw.block import DeviceInfo, Drop, SampleBlock
 
 ENTRY_POINT_GROUP = "fieldcal.sensors"
-GOLDEN = (5**0.5 - 1) / 2  # of a sample period, by which each poll is later than the one before: the two never beat
+# Golden ratio: each poll is later by this part of a sample period, so that polls and samples never beat
+GOLDEN = (5**0.5 - 1) / 2
 
 Clock = Callable[[], tuple[int, int]]
-"""Returns (CLOCK_MONOTONIC, UTC), both in ns, read one right after the other."""
+"""Returns (CLOCK_MONOTONIC, UTC), both in ns, read directly one after the other."""
 
 
 class DeviceError(Exception):
-    """Anything a device or its port does wrong. The message names port, address and value."""
+    """A fault of a device or its port. The message names port, address and value."""
 
 
 class ConfigurationError(DeviceError):
-    """The settings cannot work with this device: retrying does not help until somebody changes something."""
+    """The settings cannot work with this device.
+
+    A retry does not help until the configuration or the machine is changed.
+    """
 
 
 class IdentityError(ConfigurationError):
-    """Something answers, but it is not the device that was named."""
+    """A device answers, but it is not the configured one."""
 
 
 class DeviceLost(DeviceError):  # noqa: N818 - the state has this name in events and texts
-    """The device or its port is gone; the reader closes it and tries again with back-off."""
+    """The device or its port is gone. The reader closes it and tries again with increasing delay."""
 
 
 class Options(BaseModel):
-    """Base of every driver's options: unknown keys are refused, values are not changed after loading."""
+    """Base class of every driver's options: unknown keys are refused, values do not change after loading."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -53,33 +57,37 @@ class Options(BaseModel):
 
 @runtime_checkable
 class Sensor(Protocol):
-    """A device that yields sample blocks. All methods are called from one reader thread.
+    """A device that returns sample blocks. All methods are called from one reader thread.
 
-    Drivers are built as `Driver(name, options, clock=..., sleep=...)` and do no I/O before `open`. All their waiting
-    goes through `sleep` (seconds) or a read that data end, so that a simulated clock drives them faster than real time.
-    The first block after `open` carries RESTART; indices go on over `close` and `open` and never repeat.
+    Drivers are built as `Driver(name, options, clock=..., sleep=...)` and do no I/O before `open`. They wait only in
+    `sleep` (seconds) or in a read that ends when data arrive, so that a simulated clock can drive them faster than real
+    time. The first block after `open` carries RESTART. The sample index continues over `close` and `open` and never
+    repeats.
     """
 
     options_model: ClassVar[type[Options]]
 
     def open(self) -> DeviceInfo:
-        """Identify, reset, configure, read back. Raises ConfigurationError, IdentityError or DeviceLost."""
+        """Identify the device, reset it, write the settings, read them back.
+
+        Raises ConfigurationError, IdentityError or DeviceLost.
+        """
 
     def read_block(self) -> SampleBlock | None:
-        """The next block (about 0.5 s of bursts, never empty); None when nothing came in that time.
+        """The next block (about 0.5 s of bursts, never empty); None if no sample came in that time.
 
-        Raises DeviceLost, but only after all that was read before the loss has been returned.
+        Raises DeviceLost, after all samples that were read before the loss have been returned.
         """
 
     def take_drops(self) -> list[Drop]:
-        """What was read and could not be used since the last call, one entry a reason; mostly empty. Never raises."""
+        """Data that could not be used since the last call, one entry per reason; usually empty. Never raises."""
 
     def close(self) -> None:
-        """Release the port; never raises, may be called twice, a closed sensor can be opened again."""
+        """Release the port. Never raises, may be called twice; a closed sensor can be opened again."""
 
 
 class DriverFactory(Protocol):
-    """What a registry entry must be: a Sensor class."""
+    """What a registry entry must be: a class that implements Sensor."""
 
     options_model: ClassVar[type[Options]]
 
@@ -108,14 +116,14 @@ BUILT_IN: Mapping[str, str] = {
 
 
 def driver_names() -> list[str]:
-    """Names of all drivers, built in and installed as plug-ins, sorted. Imports none of them."""
+    """Names of all drivers, built in and installed as plug-ins, sorted. Imports no driver."""
     return sorted({*BUILT_IN, *(entry.name for entry in entry_points(group=ENTRY_POINT_GROUP))})
 
 
 def load_driver(name: str) -> DriverFactory:
-    """The driver of this name, imported now. A built-in name cannot be taken over by a plug-in.
+    """Import the driver of this name. A plug-in cannot replace a built-in driver.
 
-    Raises ConfigurationError for a name that nobody has, and for a plug-in that cannot be imported or is no driver.
+    Raises ConfigurationError if no driver has this name, or if a plug-in cannot be imported or is not a sensor class.
     """
     if name in BUILT_IN:
         entry = EntryPoint(name, BUILT_IN[name], ENTRY_POINT_GROUP)
@@ -126,11 +134,11 @@ def load_driver(name: str) -> DriverFactory:
         entry = found[0]
     try:
         driver = entry.load()
-    except Exception as error:  # a plug-in's module may raise anything while it is imported
+    except Exception as error:  # a plug-in may raise any error while it is imported
         raise ConfigurationError(f"driver {name!r} ({entry.value}) cannot be loaded: {error!r}") from error
     model = getattr(driver, "options_model", None)
     if not (callable(driver) and isinstance(model, type) and issubclass(model, Options)):
-        raise ConfigurationError(f"driver {name!r} ({entry.value}) is no sensor class with an options_model")
+        raise ConfigurationError(f"driver {name!r} ({entry.value}) is not a sensor class with an options_model")
     return cast(DriverFactory, driver)
 
 
@@ -138,7 +146,7 @@ def _unknown(name: str) -> str:
     names = driver_names()
     near = difflib.get_close_matches(name, names, n=1)
     hint = f"did you mean {near[0]!r}? " if near else ""
-    return f"no driver {name!r}: {hint}there are {', '.join(names)}"
+    return f"no driver {name!r}: {hint}available drivers: {', '.join(names)}"
 
 
 def system_clock() -> tuple[int, int]:
@@ -148,5 +156,5 @@ def system_clock() -> tuple[int, int]:
 
 @functools.cache
 def boot_id() -> str:
-    """The kernel's name of this boot, which says what CLOCK_MONOTONIC counts from."""
+    """Identifier of this boot from the kernel; CLOCK_MONOTONIC counts from this boot."""
     return Path("/proc/sys/kernel/random/boot_id").read_text("ascii").strip()

@@ -1,4 +1,4 @@
-"""Driver `serial-binary`: a device that sends one sample a frame of fixed length, described in the configuration."""
+"""Driver `serial-binary`: a device that sends one sample per frame; the configuration describes the frame."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ class Number(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    at: int = Field(ge=0, description="its first byte, counted from 0")
+    at: int = Field(ge=0, description="position of its first byte in the frame, counted from 0")
     type: NumberType
 
     @property
     def end(self) -> int:
-        """The byte behind it."""
+        """Position after the last byte of the number."""
         return self.at + WIDTH[self.type]
 
 
 class Thermometer(Number):
     """The device's temperature: degC = zero_degc + number / counts_per_degc."""
 
-    counts_per_degc: float = Field(1.0, description="counts a degree; below 0 where they fall")
+    counts_per_degc: float = Field(1.0, description="counts per degree; negative if the counts fall with temperature")
     zero_degc: float = Field(0.0, description="degC at 0 counts")
 
 
@@ -45,18 +45,18 @@ class SerialBinaryOptions(SerialOptions):
     """Options of `serial-binary`."""
 
     rate_hz: float = Field(gt=0, le=100_000, allow_inf_nan=False, description="nominal rate of the samples")
-    start: str = Field(description='bytes every frame begins with, e.g. "aa55"')
-    length: int = Field(ge=3, le=256, description="bytes of a frame, with start and checksum")
+    start: str = Field(description='first bytes of every frame, hexadecimal, e.g. "aa55"')
+    length: int = Field(ge=3, le=256, description="bytes of a frame, start and checksum included")
     byte_order: ByteOrder = Field("little", description="of all numbers")
-    indications: tuple[Number, ...] = Field(description="x, y, z or one alone: [{at = 4, type = 'i16'}, ...]")
-    sequence: Number | None = Field(None, description="a sample count; without it lost frames go unseen")
-    temperature: Thermometer | None = Field(None, description="of the device")
-    checksum: ChecksumName = Field("none", description="the frame's last bytes")
-    checksum_from: int = Field(0, ge=0, description="first byte that it covers")
-    checksum_order: ByteOrder = Field("little", description="of a checksum of two bytes")
+    indications: tuple[Number, ...] = Field(description="x, y, z, or a single one: [{at = 4, type = 'i16'}, ...]")
+    sequence: Number | None = Field(None, description="a sample counter; without it lost frames are not noticed")
+    temperature: Thermometer | None = Field(None, description="temperature of the device")
+    checksum: ChecksumName = Field("none", description="kind of checksum in the last bytes of the frame")
+    checksum_from: int = Field(0, ge=0, description="first byte that the checksum covers")
+    checksum_order: ByteOrder = Field("little", description="byte order of a checksum of two bytes")
     unit: Literal["count", "m/s2", "m/s", "mV"] = Field("count", description="of the indications")
     full_scale: float | None = Field(None, gt=0, description="indications of this size or more are saturated")
-    serial_number: str = Field("", description="of the device, as on its plate")
+    serial_number: str = Field("", description="of the device, as on its label")
 
     @field_validator("start")
     @classmethod
@@ -68,23 +68,23 @@ class SerialBinaryOptions(SerialOptions):
     @model_validator(mode="after")
     def _fits(self) -> Self:
         if self.temperature is not None and self.temperature.counts_per_degc == 0:
-            raise ValueError("temperature.counts_per_degc: 0 counts a degree is no thermometer")
+            raise ValueError("temperature.counts_per_degc: 0 counts per degree is not possible")
         if len(self.indications) not in (1, 3):
-            raise ValueError(f"indications: 1 or 3 numbers, not {len(self.indications)}")
+            raise ValueError(f"indications: 1 or 3 numbers are needed, not {len(self.indications)}")
         covered = self.length - CHECKSUMS[self.checksum][0]
         for number in (*self.indications, self.sequence, self.temperature):
             if number is not None and number.end > covered:
                 raise ValueError(
                     f"the {number.type} at {number.at} ends at byte {number.end}; "
-                    f"a frame of {self.length} bytes has room up to {covered}"
+                    f"in a frame of {self.length} bytes numbers must end at {covered} or before"
                 )
         if self.sequence is not None and self.sequence.type not in ("u8", "u16", "u32"):
-            raise ValueError(f"sequence: u8, u16 or u32, not {self.sequence.type}")
+            raise ValueError(f"sequence: type must be u8, u16 or u32, not {self.sequence.type}")
         bits_hz = BITS_A_BYTE * self.length * self.rate_hz
         if bits_hz > self.baud_rate:
             raise ValueError(
                 f"port too slow: {self.rate_hz:g} frames/s of {self.length} bytes, {BITS_A_BYTE} bits each, are "
-                f"{bits_hz:g} bit/s; baud_rate is {self.baud_rate}"
+                f"{bits_hz:g} bit/s; baud_rate is only {self.baud_rate}"
             )
         return self
 
@@ -95,21 +95,24 @@ class SerialBinaryOptions(SerialOptions):
 
     @property
     def layout(self) -> Layout:
-        """How frames are found."""
+        """Layout for `hw.frames.find`."""
         start = bytes.fromhex(self.start)
         return Layout(start, self.length, self.checksum, self.checksum_from, self.checksum_order)
 
 
 class BinaryStream(FrameStream):
-    """One sample a frame. With a sequence a missing frame is a GAP; without one, bytes that are no frame may stand for
-    any number of them: RESTART. Frames with a number that is none, or beyond LARGEST, are no samples."""
+    """One sample per frame.
+
+    With a sequence number, missing frames are a GAP. Without one, bytes outside a frame may have been any number of
+    frames: RESTART. A frame with a number that is not finite, or beyond LARGEST, is not a sample.
+    """
 
     def __init__(self, cutter: Cutter, options: SerialBinaryOptions) -> None:
         self._options = options
         super().__init__(cutter, options.layout)
 
     def begin(self) -> None:
-        """A port was opened."""
+        """Start after a port was opened."""
         super().begin()
         self._last: int | None = None
 
@@ -117,7 +120,7 @@ class BinaryStream(FrameStream):
         options = self._options
         columns = [numbers(found.frames, n.at, n.type, options.byte_order) for n in options.indications]
         counted = all(n.type not in ("f32", "u32") for n in options.indications)
-        with np.errstate(invalid="ignore"):  # a float may hold any bits
+        with np.errstate(invalid="ignore"):  # the four bytes of an f32 may hold any bits
             values = np.column_stack(columns).astype(np.int32 if counted else np.float64)
         sound = (np.abs(values) <= LARGEST).all(axis=1)
         return Decoded(
@@ -128,13 +131,13 @@ class BinaryStream(FrameStream):
         )
 
     def _unseen(self, found: Found, sound: NDArray[np.bool_]) -> list[Break]:
-        """Where bytes or frames that are no samples lie between two."""
+        """Breaks where there are bytes or frames between two samples that are not samples."""
         broken = found.slipped[:-1].copy()
         broken[1:] |= ~sound[:-1]
         return [Break(at, BlockFlags.RESTART) for at in np.flatnonzero(broken[sound]).tolist()]
 
     def _follow(self, frames: NDArray[np.uint8]) -> list[Break]:
-        """Where the sequence, which wraps, does not go on by one."""
+        """Breaks where the sequence number, which wraps around, does not increase by one."""
         kind = self._options.sequence
         if kind is None or not len(frames):
             return []
@@ -145,7 +148,7 @@ class BinaryStream(FrameStream):
         return follow(steps, LONGEST_GAP_S * self._options.rate_hz)
 
     def _temperature(self, frames: NDArray[np.uint8]) -> tuple[int | None, float | None]:
-        """Of the last frame."""
+        """Raw value and degC in the last frame; None without one."""
         kind = self._options.temperature
         if kind is None or not len(frames):
             return None, None
@@ -157,7 +160,7 @@ class BinaryStream(FrameStream):
 
 
 class SerialBinary(SerialSensor):
-    """Frames are found by their first bytes and their checksum; what is none is counted and skipped."""
+    """Finds frames by their first bytes and their checksum; other bytes are counted and skipped."""
 
     options_model = SerialBinaryOptions
 
@@ -165,7 +168,7 @@ class SerialBinary(SerialSensor):
         limit = self._options.full_scale or math.inf
         return BinaryStream(Cutter(name, self._options.rate_hz, -limit, limit), self._options)
 
-    def _set_up(self, port: serial.Serial) -> DeviceInfo:  # noqa: ARG002 - nothing is set in such a device
+    def _set_up(self, port: serial.Serial) -> DeviceInfo:  # noqa: ARG002 - such a device has no settings
         options = self._options
         return self._info(
             "serial-binary",

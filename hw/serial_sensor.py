@@ -1,4 +1,4 @@
-"""What all drivers on a serial port have in common: the port, bursts and losses. A subclass says what bytes mean."""
+"""Common part of all drivers on a serial port: the port, bursts and losses. A subclass decodes the bytes."""
 
 from __future__ import annotations
 
@@ -17,42 +17,45 @@ from hw.block import DeviceInfo, Drop, SampleBlock
 from hw.sensor import GOLDEN, Clock, ConfigurationError, DeviceLost, Options, system_clock
 
 BLOCK_S = 0.5
-GATHER_S = 0.010  # a wake-up for ten samples at 1 kHz, not for each; 115 B of the kernel's 4 kB at 115200 baud
-SLOW_RATE_HZ = 100.0  # below, a sample is read as it comes: the port wakes the reader, and GATHER_SLOW_S lets it end
+GATHER_S = 0.010  # at 1 kHz one wake-up serves ten samples; 115 bytes of the kernel's 4 kB at 115200 baud
+# Below this rate each sample is read as it arrives: the port wakes the reader, GATHER_SLOW_S lets the sample finish
+SLOW_RATE_HZ = 100.0
 GATHER_SLOW_S = 0.002
-READ_BYTES = 65536  # bounds a single read
-BLOCK_BYTES = 262144  # bounds a block's memory: 0.5 s at 4 Mbaud is 200 kB
-LONGEST_GAP_S = 10.0  # a longer jump in the sequence is a counter that began anew, or a damaged number
-LOST = (serial.SerialException, OSError, termios.error)  # termios.error is no OSError; all three come at an unplug
+READ_BYTES = 65536  # upper limit of a single read
+BLOCK_BYTES = 262144  # upper limit of the bytes of a block; 0.5 s at 4 Mbaud is 200 kB
+LONGEST_GAP_S = 10.0  # a longer jump of the sequence number means that the counter restarted or the number was damaged
+# Pyserial raises any of these when the port is unplugged; termios.error is not an OSError
+LOST = (serial.SerialException, OSError, termios.error)
 
 
 class SerialOptions(Options):
     """Options of every driver on a serial port."""
 
     port: str = Field(min_length=1, description="path of the port, best one of /dev/serial/by-id")
-    baud_rate: int = Field(115200, gt=0, le=4_000_000, description="as the device was set")
+    baud_rate: int = Field(115200, gt=0, le=4_000_000, description="as set in the device")
 
 
 class Stream(Protocol):
-    """Makes sample blocks of bursts of bytes; `size` counts the bytes that wait to be decoded."""
+    """Makes sample blocks of bursts of bytes; `size` is the number of bytes that wait to be decoded."""
 
     size: int
 
     def begin(self) -> None:
-        """A port was opened."""
+        """Start after a port was opened."""
 
     def feed(self, data: bytes, arrival_ns: int, utc_ns: int) -> None:
-        """One burst and its arrival."""
+        """Add one burst and its arrival time, ns."""
 
     def blocks(self) -> list[SampleBlock]:
-        """Blocks of all that was fed since the last call."""
+        """Decode everything fed since the last call and return its blocks."""
 
     def take_drops(self) -> list[Drop]:
-        """What was no sample since the last call."""
+        """Data since the last call that became no sample."""
 
 
 class SerialSensor(ABC):
-    """Lets bursts gather, stamps each with the time at which its read returned, decodes them block by block."""
+    """Lets bytes collect, stamps each burst with the time at which its read returned, decodes the bursts into
+    blocks."""
 
     options_model: ClassVar[type[Options]]
 
@@ -75,14 +78,18 @@ class SerialSensor(ABC):
 
     @abstractmethod
     def _build_stream(self, name: str) -> Stream:
-        """What makes blocks of the bytes."""
+        """The stream that makes blocks of the bytes; `name` is the device."""
 
     @abstractmethod
     def _set_up(self, port: serial.Serial) -> DeviceInfo:
-        """Whatever the device needs once its port is open."""
+        """Identify and set up the device once its port is open."""
 
     def open(self) -> DeviceInfo:
-        """Open the port. Raises DeviceLost (absent, in use, no right), ConfigurationError (settings it cannot do)."""
+        """Open the port and set up the device.
+
+        Raises DeviceLost (the port does not exist, is in use or may not be opened) or ConfigurationError (the port does
+        not support the settings).
+        """
         self.close()
         options = self._options
         try:
@@ -112,11 +119,11 @@ class SerialSensor(ABC):
                 port.close()
 
     def take_drops(self) -> list[Drop]:
-        """What was no sample since the last call."""
+        """Data since the last call that became no sample."""
         return self._stream.take_drops()
 
     def read_block(self) -> SampleBlock | None:
-        """The next block, or None. Raises DeviceLost."""
+        """The next block, or None if no sample came. Raises DeviceLost."""
         if not self._ready and self._loss is None:
             if self._port is None:
                 raise DeviceLost(f"port {self._options.port} is not open")
@@ -128,7 +135,7 @@ class SerialSensor(ABC):
         return None
 
     def _gather(self, port: serial.Serial) -> None:
-        """Read bursts for BLOCK_S and decode them; silence or a loss ends it earlier."""
+        """Read bursts for BLOCK_S, or until the device is silent or lost, and decode them."""
         now_ns, _ = self._clock()
         end_ns = now_ns + round(BLOCK_S * 1e9)
         while now_ns < end_ns and self._stream.size < BLOCK_BYTES:
@@ -136,7 +143,8 @@ class SerialSensor(ABC):
             try:
                 data = port.read(min(max(1, port.in_waiting), READ_BYTES))
             except LOST as error:
-                self._loss = DeviceLost(f"port {self._options.port}: {error}")  # raised once all before it is returned
+                # Raised after all earlier samples have been returned
+                self._loss = DeviceLost(f"port {self._options.port}: {error}")
                 break
             now_ns, utc_ns = self._clock()
             if not data:
@@ -145,15 +153,18 @@ class SerialSensor(ABC):
         self._ready.extend(self._stream.blocks())
 
     def _pause_s(self) -> float:
-        """Time to let a burst gather; spread over a sample period by the golden ratio, so that poll and sample clock
-        do not beat and each second's arrivals sample all of the period."""
+        """Time in s in which a burst collects.
+
+        The reads are spread over a sample period by the golden ratio, so that reads and sample clock do not beat and
+        the arrivals of each second cover the whole sample period.
+        """
         if self._options.rate_hz < SLOW_RATE_HZ:
             return GATHER_SLOW_S
         self._phase = (self._phase + GOLDEN) % 1.0
         return GATHER_S + self._phase / float(self._options.rate_hz)
 
     def _info(self, driver: str, settings: dict[str, str], **known: Any) -> DeviceInfo:
-        """What `open` returns: `known` besides the driver, the rate and the port's settings."""
+        """Build the result of `open`; `known` are its fields except driver, rate and the settings of the port."""
         options = self._options
         port = {"port": options.port, "baud_rate": str(options.baud_rate)}
         return DeviceInfo(driver=driver, nominal_rate_hz=options.rate_hz, settings=port | settings, **known)

@@ -1,4 +1,4 @@
-"""Driver `serial-csv`: a device that writes one sample a line, `[seq,]x,y,z` or `[seq,]a`, on a serial port."""
+"""Driver `serial-csv`: a device that writes one sample per line, `[seq,]x,y,z` or `[seq,]a`, on a serial port."""
 
 from __future__ import annotations
 
@@ -17,12 +17,14 @@ from hw.serial_sensor import LONGEST_GAP_S, SerialOptions, SerialSensor
 class SerialCsvOptions(SerialOptions):
     """Options of `serial-csv`."""
 
-    axes: Literal[1, 3] = Field(3, description="1: a uniaxial device, 3: x,y,z")
+    axes: Literal[1, 3] = Field(3, description="1: uniaxial device, 3: x,y,z")
     rate_hz: float = Field(gt=0, le=100_000, allow_inf_nan=False, description="nominal rate of the samples")
-    sequence: bool = Field(False, description="each line begins with a sample count; without it lost lines go unseen")
+    sequence: bool = Field(
+        False, description="each line begins with a sample counter; without it lost lines are not noticed"
+    )
     unit: Literal["count", "m/s2", "m/s", "mV"] = Field("m/s2", description="of the indications")
     full_scale: float | None = Field(None, gt=0, description="indications of this size or more are saturated")
-    serial_number: str = Field("", description="of the device, as on its plate")
+    serial_number: str = Field("", description="of the device, as on its label")
 
     @property
     def tells_sensitivity(self) -> bool:
@@ -31,7 +33,7 @@ class SerialCsvOptions(SerialOptions):
 
 
 class SerialCsv(SerialSensor):
-    """A bad line is counted and skipped; a jump in the sequence is a gap."""
+    """Bad lines are counted and skipped; a jump in the sequence number is a gap."""
 
     options_model = SerialCsvOptions
 
@@ -45,7 +47,7 @@ class SerialCsv(SerialSensor):
             longest_gap=LONGEST_GAP_S * options.rate_hz,
         )
 
-    def _set_up(self, port: serial.Serial) -> DeviceInfo:  # noqa: ARG002 - nothing is set in such a device
+    def _set_up(self, port: serial.Serial) -> DeviceInfo:  # noqa: ARG002 - such a device has no settings
         options = self._options
         return self._info(
             "serial-csv",

@@ -1,4 +1,4 @@
-"""Driver `sound-card`: a digital accelerometer that is a USB sound card (Digiducer 333D01 and alike)."""
+"""Driver `sound-card`: a digital accelerometer that is a USB sound card (Digiducer 333D01 and similar)."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ from hw.buffered_sensor import BufferedSensor
 from hw.sensor import DeviceLost, Options
 from hw.vendor_library import vendor_library
 
-FULL_SCALE = 2**23  # counts; the interface hands on 24 bits
+FULL_SCALE = 2**23  # counts; the device sends 24 bits
 CHANNELS = 2
-# Model, format, serial number, a sensitivity a channel, calibration date: The Modal Shop, MAN-0343; the same digits in
-# their Python example. Format 1: counts per m/s2, five digits; 2 and 3: counts per volt, seven digits, by 1 and 20.
+# Name of a card: model, format, serial number, sensitivity of each channel, calibration date (The Modal Shop, MAN-0343;
+# the same digits are in their Python example). Format 1: counts per m/s2, five digits. Formats 2 and 3: counts per
+# volt, seven digits, divided by 1 and 20.
 _ACCELERATION = re.compile(r"(333D\w\w|633A\w\w|SDC0\w\w).1(\w{6})(\d{5})(\d{5})(\d{6})")
 _VOLTAGE = re.compile(r"(485B\w\w|SDC0\w\w).([23])(\w{6})(\d{7})(\d{7})(\d{6})")
 
@@ -26,8 +27,8 @@ _VOLTAGE = re.compile(r"(485B\w\w|SDC0\w\w).([23])(\w{6})(\d{7})(\d{7})(\d{6})")
 class SoundCardOptions(Options):
     """Options of `sound-card`."""
 
-    device: str = Field("333D", min_length=1, description="part of the sound card's name")
-    channel: Literal[1, 2] = Field(1, description="A or B; of a 333D01 the first is the sensitive one")
+    device: str = Field("333D", min_length=1, description="part of the name of the sound card")
+    channel: Literal[1, 2] = Field(1, description="1 is A, 2 is B; A is the more sensitive one in a 333D01")
     rate_hz: float = Field(
         8000.0, description="one of 8000, 11025, 16000, 22050, 32000, 44100, 48000", gt=0, le=192_000
     )
@@ -39,7 +40,7 @@ class SoundCardOptions(Options):
 
 @dataclass(frozen=True, slots=True)
 class Plate:
-    """What a card says of itself by its name. `counts_per_mps2` is None for one that measures a voltage."""
+    """Data of a card that are encoded in its name. `counts_per_mps2` is None for a card that measures a voltage."""
 
     model: str
     serial_number: str
@@ -48,7 +49,7 @@ class Plate:
 
 
 def read_plate(name: str, channel: int) -> Plate | None:
-    """The plate in a sound card's name; None if it has none."""
+    """Decode the name of a sound card; None if the name has another form."""
     if found := _ACCELERATION.search(name):
         model, serial, *sensitivities, date = found.groups()
         return Plate(model, serial, float(sensitivities[channel - 1]), date)
@@ -58,7 +59,7 @@ def read_plate(name: str, channel: int) -> Plate | None:
 
 
 class SoundCard(BufferedSensor):
-    """Blocking reads (callbacks need memory that is written and executed, which a hardened service is denied)."""
+    """Uses blocking reads: callbacks need writable and executable memory, which a hardened service may not have."""
 
     options_model: ClassVar[type[Options]] = SoundCardOptions
 
@@ -75,7 +76,7 @@ class SoundCard(BufferedSensor):
             index = next((card["index"] for card in cards if options.device in card["name"]), None)
             if index is None:
                 known = ", ".join(repr(card["name"]) for card in cards) or "none"
-                raise DeviceLost(f"no sound card/input with {options.device!r} in its name; there are {known}")
+                raise DeviceLost(f"no sound card/input with {options.device!r} in its name; available: {known}")
             name = library.query_devices(index)["name"]
             self._stream = library.InputStream(
                 device=index, channels=CHANNELS, samplerate=options.rate_hz, dtype="int32", blocksize=0
@@ -97,7 +98,7 @@ class SoundCard(BufferedSensor):
             settings={"name": name, "channel": str(options.channel), "calibrated": plate.calibrated},
         )
 
-    def _ends(self, info: DeviceInfo) -> tuple[float, float]:  # noqa: ARG002 - the same for every card
+    def _ends(self, info: DeviceInfo) -> tuple[float, float]:  # noqa: ARG002 - the range is the same for every card
         return -FULL_SCALE, FULL_SCALE - 1
 
     def _stop(self) -> None:

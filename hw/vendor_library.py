@@ -1,4 +1,4 @@
-"""A vendor's library, imported only by those who name its driver."""
+"""Import of a vendor's library, only when its driver is used."""
 
 from __future__ import annotations
 
@@ -9,10 +9,13 @@ from hw.sensor import ConfigurationError
 
 
 def vendor_library(module: str, driver: str, extra: str, besides: str) -> Any:
-    """The module. Raises ConfigurationError with what to install: the extra, and what it needs besides."""
+    """Import and return `module`.
+
+    Raises ConfigurationError that tells what to install: the `extra` of fieldcal, and `besides`.
+    """
     try:
         return importlib.import_module(module)
-    except (ImportError, OSError) as error:  # OSError: the package is there, the library in C is not
+    except (ImportError, OSError) as error:  # OSError: the Python package is installed, its C library is not
         package = module.partition(".")[0]
         raise ConfigurationError(
             f"driver {driver} needs {package} (pip install 'fieldcal[{extra}]') and {besides}: {error}"

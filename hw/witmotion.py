@@ -1,4 +1,4 @@
-"""Driver `witmotion`: WitMotion inertial sensors (WT901, JY901 and alike) on a serial port."""
+"""Driver `witmotion`: WitMotion inertial sensors (WT901, JY901 and similar) on a serial port."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from hw.serial_sensor import LONGEST_GAP_S, SerialOptions, SerialSensor
 BITS_A_BYTE = 10  # with start and stop bit
 FRAMES_A_SAMPLE = 2  # time and acceleration
 STANDARD_GRAVITY_MPS2 = 9.80665
-COMMAND_WAIT_S = 0.02  # as WitMotion's own code waits between commands
+COMMAND_WAIT_S = 0.02  # WitMotion's own code waits this long between commands
 ANSWER_WAIT_S = 0.05
 ANSWER_ATTEMPTS = 5
 ANSWER_TIMEOUT_S = 0.1
@@ -30,29 +30,29 @@ class WitMotionOptions(SerialOptions):
 
     rate_hz: float = Field(100.0, description=f"one of {', '.join(f'{rate:g}' for rate in wit.RATE_CODES)}")
     baud_rate: Literal[9600, 115200, 230400, 921600] = Field(
-        115200, description="as the device was set; new ones: 9600"
+        115200, description="as set in the device; factory setting: 9600"
     )
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
         if self.rate_hz not in wit.RATE_CODES:
             known = ", ".join(f"{rate:g}" for rate in wit.RATE_CODES)
-            raise ValueError(f"rate_hz: {self.rate_hz:g} Hz is not a rate of this device: {known}")
+            raise ValueError(f"rate_hz: {self.rate_hz:g} Hz is not a rate of this device; use one of {known}")
         frame_bytes = FRAMES_A_SAMPLE * wit.LAYOUT.length
         bits_hz = BITS_A_BYTE * frame_bytes * self.rate_hz
         if bits_hz > self.baud_rate:
             raise ValueError(
                 f"port too slow: {self.rate_hz:g} samples/s of {frame_bytes} bytes, {BITS_A_BYTE} bits each, are "
-                f"{bits_hz:g} bit/s; baud_rate is {self.baud_rate}"
+                f"{bits_hz:g} bit/s; baud_rate is only {self.baud_rate}"
             )
         return self
 
 
 class WitStream(FrameStream):
-    """A sample is an acceleration frame behind its time frame: the times tell how many samples are missing.
+    """A sample is a time frame followed by an acceleration frame; the times tell how many samples are missing.
 
-    An acceleration frame without a time frame before it is no sample. `restarted` says that the device's clock began
-    anew: what it sent from then on is thrown away, since its settings did too.
+    An acceleration frame that does not follow a time frame is no sample. `restarted`: the device's clock started again.
+    The samples after that are discarded, because the device has lost its settings, too.
     """
 
     def __init__(self, cutter: Cutter, rate_hz: float) -> None:
@@ -60,7 +60,7 @@ class WitStream(FrameStream):
         super().__init__(cutter, wit.LAYOUT)
 
     def begin(self) -> None:
-        """A port was opened."""
+        """Start after a port was opened."""
         super().begin()
         self._time_frame: np.ndarray | None = None
         self._last_ms: int | None = None
@@ -94,8 +94,10 @@ class WitStream(FrameStream):
 
 
 class WitMotion(SerialSensor):
-    """Sets rate, filter, what is sent, and zero offsets, and reads them back. Nothing is saved in the device: after a
-    loss of its power it is as its owner left it, until this driver opens it again."""
+    """Sets rate, filter, output content and zero offsets, and reads them back.
+
+    Nothing is saved in the device. After a loss of power it has its saved settings until this driver opens it again.
+    """
 
     options_model = WitMotionOptions
     _stream: WitStream
@@ -117,7 +119,7 @@ class WitMotion(SerialSensor):
             if found[register] != value
         ]
         if wrong:
-            raise ConfigurationError(f"port {port.port}: WitMotion is not set as it should be: {', '.join(wrong)}")
+            raise ConfigurationError(f"port {port.port}: WitMotion does not hold its settings: {', '.join(wrong)}")
         settings = {wit.NAMES[register]: f"0x{found[register]:04X}" for register in wanted}
         (version, *_) = self._registers(port, wit.VERSION).values()
         number = self._registers(port, wit.NUMBER) | self._registers(port, wit.NUMBER + 2)
@@ -136,10 +138,10 @@ class WitMotion(SerialSensor):
     def _gather(self, port: serial.Serial) -> None:
         super()._gather(port)
         if self._stream.restarted and self._loss is None:
-            self._loss = DeviceLost(f"port {port.port}: the clock of the WitMotion does not go on: did it lose power?")
+            self._loss = DeviceLost(f"port {port.port}: the clock of the WitMotion jumped (did it lose power?)")
 
     def _registers(self, port: serial.Serial, first: int) -> dict[int, int]:
-        """Four registers from `first` on, by number. What the device sends of its own accord meanwhile is skipped."""
+        """Read the four registers from `first` on, by number. Frames that the device sends on its own are skipped."""
         port.reset_input_buffer()
         port.write(wit.ask(first))
         heard = b""
@@ -149,11 +151,13 @@ class WitMotion(SerialSensor):
             for frame in find(heard, wit.LAYOUT).frames:
                 if frame[1] == wit.REGISTERS:
                     return dict(enumerate(wit.words(frame), first))
-        said = "nothing" if not heard else f"{len(heard)} bytes without an answer in them"
-        raise IdentityError(f"port {port.port}: no WitMotion at {port.baudrate} baud: it sent {said}")
+        said = "nothing" if not heard else f"{len(heard)} bytes without an answer"
+        raise IdentityError(
+            f"port {port.port}: no WitMotion at {port.baudrate} baud (received: {said}); check baud_rate"
+        )
 
 
 def _text(registers: dict[int, int]) -> str:
-    """Characters, two a register; nothing where they are none."""
+    """Decode two characters per register; "" if they are not letters and digits."""
     text = b"".join(value.to_bytes(2, "little") for value in registers.values()).rstrip(b"\0 \xff")
     return text.decode("ascii") if text.isalnum() else ""

@@ -1,4 +1,4 @@
-"""`fieldcal probe`: what answers on this machine's I2C buses and serial ports, who it is, and whether it is sound."""
+"""`fieldcal probe`: devices that answer on this machine's I2C buses and serial ports, and their self-tests."""
 
 from __future__ import annotations
 
@@ -21,8 +21,11 @@ MICRO = 1e6
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """Something at an address. `drivers` are those that know it (several where the part does not say which one it is);
-    `note` what the others, or the kernel, say of it."""
+    """Answer at an address.
+
+    `drivers` are those that recognise the device (several if the part does not tell which of them it is); `note` is
+    what the other drivers or the kernel report.
+    """
 
     address: int
     drivers: list[str] = field(default_factory=list)
@@ -33,7 +36,7 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class Bus:
-    """/dev/i2c-N; `fault` says why nothing can be asked there."""
+    """The bus /dev/i2c-N; `fault` tells why it cannot be probed."""
 
     number: int
     fault: str
@@ -42,12 +45,14 @@ class Bus:
 
 @click.command()
 @click.option("--bus", "buses", type=click.IntRange(0), multiple=True, metavar="N", help="Only /dev/i2c-N.")
-@click.option("--self-test", is_flag=True, help="Let each device test itself: it is reset, so no agent may use it.")
+@click.option(
+    "--self-test", is_flag=True, help="Run the self-test of each device. It resets the device: stop the agent first."
+)
 @click.option("--json", "json_to", type=click.Choice(["-"]), help="One JSON object on standard output.")
 def probe(buses: tuple[int, ...], self_test: bool, json_to: str | None) -> int:
-    """I2C buses and serial ports of this machine. Reads identities alone, unless asked for a self-test.
+    """Probe the I2C buses and serial ports of this machine. Reads only identity registers, unless --self-test is given.
 
-    Exit status 3 if a self-test failed, 1 if a bus that was named cannot be asked.
+    Exit status 3 if a self-test failed, 1 if a named bus cannot be probed.
     """
     drivers = i2c_drivers()
     found = [on_bus(number, drivers, self_test) for number in buses or i2c_buses()]
@@ -63,13 +68,13 @@ def probe(buses: tuple[int, ...], self_test: bool, json_to: str | None) -> int:
 
 
 def i2c_buses() -> list[int]:
-    """Numbers of the I2C adapters of this machine."""
+    """Numbers N of the I2C adapters /dev/i2c-N of this machine."""
     nodes = (path.name.removeprefix("i2c-") for path in Path("/dev").glob("i2c-*"))
     return sorted(int(number) for number in nodes if number.isdigit())
 
 
 def serial_ports() -> list[dict[str, str]]:
-    """Serial ports with what the system knows of them. None is opened: that would reset some boards."""
+    """Serial ports and the system's information about them. No port is opened: opening resets some boards."""
     from serial.tools.list_ports import comports
 
     by_id = {str(path.resolve()): str(path) for path in Path("/dev/serial/by-id").glob("*")}
@@ -85,20 +90,20 @@ def serial_ports() -> list[dict[str, str]]:
 
 
 def i2c_drivers() -> dict[str, type[FifoSensor]]:
-    """Drivers that can say who answers at an address, by name."""
+    """Drivers that can identify a device at an address, by name."""
     found = {}
     for name in driver_names():
         try:
             driver = load_driver(name)
         except ConfigurationError:
-            continue  # `fieldcal sensors` tells why
+            continue  # `fieldcal sensors` reports the reason
         if isinstance(driver, type) and issubclass(driver, FifoSensor):
             found[name] = driver
     return found
 
 
 def on_bus(number: int, drivers: dict[str, type[FifoSensor]], self_test: bool) -> Bus:
-    """What answers at the addresses that the drivers know, in their order."""
+    """Probe the addresses that the drivers know, in ascending order of the addresses."""
     adapter = I2CDevice("adapter", number, 0, time.sleep)
     try:
         adapter.open()
@@ -136,7 +141,7 @@ def _at(bus: int, address: int, drivers: dict[str, type[FifoSensor]], self_test:
 
 
 def tested(sensor: FifoSensor) -> dict[str, Any]:
-    """The self-test's result, for JSON and for the lines."""
+    """Result of the self-test, for JSON and for the printed lines."""
     try:
         sensor.open()
         return as_object(sensor.self_test())
@@ -147,7 +152,7 @@ def tested(sensor: FifoSensor) -> dict[str, Any]:
 
 
 def as_object(report: SelfTestReport) -> dict[str, Any]:
-    """Figures in g by axis."""
+    """Values of a self-test by axis, in g."""
     return {
         "change_g": report.change_g,
         "low_g": report.test.low_g,
@@ -161,12 +166,12 @@ def as_object(report: SelfTestReport) -> dict[str, Any]:
 
 def _print(buses: list[Bus], ports: list[dict[str, str]]) -> None:
     if not buses:
-        click.echo("no I2C bus (no /dev/i2c-N): is the adapter enabled, and i2c-dev loaded?")
+        click.echo("no I2C bus (no /dev/i2c-N): enable the adapter and load the kernel module i2c-dev")
     for bus in buses:
         if bus.fault:
             click.echo(bus.fault)
             continue
-        click.echo(f"/dev/i2c-{bus.number}: " + ("" if bus.answers else "no device that a driver knows"))
+        click.echo(f"/dev/i2c-{bus.number}: " + ("" if bus.answers else "no device that a driver recognises"))
         for answer in bus.answers:
             click.echo(f"  0x{answer.address:02X}  {answer.identity or answer.note}")
             if answer.drivers:

@@ -11,13 +11,13 @@ import click
 
 from hw.sensor import BUILT_IN, ConfigurationError, DriverFactory, driver_names, load_driver
 
-# by the end of a name
+# unit by the ending of the option's name
 UNITS = {"_hz": "Hz", "_khz": "kHz", "_s": "s", "_g": "g", "_mps2": "m/s2", "_degc": "degC", "baud_rate": "bit/s"}
 
 
 @dataclass(frozen=True, slots=True)
 class Driver:
-    """One driver. `options` is the JSON schema of its options; `fault` says why it cannot be loaded."""
+    """One driver. `options` is the JSON schema of its options; `fault` tells why the driver cannot be loaded."""
 
     name: str
     built_in: bool
@@ -30,11 +30,11 @@ class Driver:
 @click.argument("names", nargs=-1, metavar="[DRIVER]...")
 @click.option("--json", "json_to", type=click.Choice(["-"]), help="One JSON object on standard output.")
 def sensors(names: tuple[str, ...], json_to: str | None) -> int:
-    """Drivers with their options; without DRIVER all of them. Exit status 2 for a driver that nobody has."""
+    """List drivers with their options; without DRIVER all of them. Exit status 2 if a DRIVER does not exist."""
     known = driver_names()
     strangers = [name for name in names if name not in known]
     for name in strangers:
-        click.echo(f"fieldcal sensors: no driver {name!r}: there are {', '.join(known)}", err=True)
+        click.echo(f"fieldcal sensors: no driver {name!r}; available drivers: {', '.join(known)}", err=True)
     if strangers:
         return 2
     drivers = [describe(name) for name in names or known]
@@ -50,7 +50,7 @@ def sensors(names: tuple[str, ...], json_to: str | None) -> int:
 
 
 def describe(name: str) -> Driver:
-    """What is known of a driver; one that cannot be loaded says why."""
+    """Description of a driver. If the driver cannot be loaded, the description holds the reason."""
     try:
         factory = load_driver(name)
     except ConfigurationError as error:
@@ -59,14 +59,14 @@ def describe(name: str) -> Driver:
 
 
 def _first_line(factory: DriverFactory) -> str:
-    """Of the module's docstring, without the driver's name: `Driver `x`: what it is`."""
+    """First line of the module's docstring without the prefix "Driver `x`: "."""
     module = sys.modules[getattr(factory, "__module__", "")]
     line = (module.__doc__ or "").strip().partition("\n")[0]
     return line.partition(": ")[2] or line
 
 
 def as_object(driver: Driver) -> dict[str, Any]:
-    """For JSON; `units` by option."""
+    """Description for JSON; `units` is by option."""
     units = {option: unit_of(option) for option in driver.options.get("properties", {}) if unit_of(option)}
     found: dict[str, Any] = {"name": driver.name, "built_in": driver.built_in, "description": driver.description}
     if driver.fault:
@@ -75,12 +75,15 @@ def as_object(driver: Driver) -> dict[str, Any]:
 
 
 def unit_of(option: str) -> str:
-    """An option's unit, by its name."""
+    """Unit of an option, from its name; "" if the name has none."""
     return next((unit for end, unit in UNITS.items() if option.endswith(end)), "")
 
 
 def as_lines(driver: Driver) -> list[str]:
-    """Name and description, then a row for each option: name, unit, default or `required`, values, description."""
+    """Lines for people: name and description, then one row per option.
+
+    A row has name, unit, default or `required`, values, description.
+    """
     head = f"{driver.name}: {driver.fault or driver.description}" + ("" if driver.built_in else " (plug-in)")
     required = driver.options.get("required", [])
     rows = [
@@ -106,7 +109,7 @@ def _shown(value: Any) -> str:
 
 
 def _values(schema: dict[str, Any], definitions: dict[str, Any]) -> str:
-    """Which values an option takes: a list of them, or its type; of a table its keys."""
+    """Values that an option accepts: a list of values, or a type; for a table its keys."""
     if "$ref" in schema:
         return "{" + ", ".join(definitions[schema["$ref"].rpartition("/")[2]]["properties"]) + "}"
     if "enum" in schema:

@@ -24,21 +24,27 @@ from hw.virtual.timebase import BenchTime
 
 ROLES: tuple[Role, ...] = ("sensor", "reference")
 POLL_S = 0.05
-# A reader opens a port, sets it up and throws away what came until then: pyserial needs a few ms for it.
+# A reader opens a port, sets it up and discards what was received until then; pyserial needs a few ms for this.
 SETTLE_S = 0.25
-LINGER_S = 1.0  # after the last sample, so that a reader gets it before the port hangs up
+LINGER_S = 1.0  # s; the port stays open this long after the last sample, so that a reader gets the last sample
 
 
 @click.command()
-@click.option("--preset", type=click.Choice(list(PRESETS)), help="A virtual bench: sensor and reference.")
-@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=1, show_default=True, help="Of the bench.")
-@click.option("--csv", "directory", type=click.Path(path_type=Path, file_okay=False), help="Write files there.")
-@click.option("--duration", "duration_s", type=click.FloatRange(1, 1e6), help="Seconds; else three repetitions.")
-@click.option("--play", type=click.Path(path_type=Path), help="Serve this sensor.csv or reference.csv.")
-@click.option("--rate-hz", type=click.FloatRange(1e-3, 1e5), help="Play at this rate instead of by column time_s.")
-@click.option("--axes", help="Columns to play, as vx,vy,vz; by default those of sensor.csv or reference.csv.")
-@click.option("--sequence", is_flag=True, help="Begin each played line with its number.")
-@click.option("--loop", is_flag=True, help="Play for ever.")
+@click.option("--preset", type=click.Choice(list(PRESETS)), help="Virtual bench with sensor and reference.")
+@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=1, show_default=True, help="Seed of the bench.")
+@click.option(
+    "--csv", "directory", type=click.Path(path_type=Path, file_okay=False), help="Write files into this directory."
+)
+@click.option(
+    "--duration", "duration_s", type=click.FloatRange(1, 1e6), help="Length in s; default: three repetitions."
+)
+@click.option("--play", type=click.Path(path_type=Path), help="Play this sensor.csv or reference.csv.")
+@click.option(
+    "--rate-hz", type=click.FloatRange(1e-3, 1e5), help="Play at this rate instead of the times in column time_s."
+)
+@click.option("--axes", help="Columns to play, e.g. vx,vy,vz; default: the signals of sensor.csv or reference.csv.")
+@click.option("--sequence", is_flag=True, help="Start each played line with its sequence number.")
+@click.option("--loop", is_flag=True, help="Repeat until Ctrl-C.")
 @click.option(
     "--link", type=click.Path(path_type=Path), help="Path of the port; a bench appends -sensor and -reference."
 )
@@ -58,19 +64,19 @@ def simulate(
 
     \b
     --preset plain --csv DIR   sensor.csv, reference.csv, poses.csv and truth.json for `fieldcal calibrate`
-    --preset plain             sensor and reference, each on a port, until Ctrl-C
-    --play FILE                a recording on a port, at its own pace, to its end
+    --preset plain             sensor and reference, each on its own port, until Ctrl-C
+    --play FILE                a recording on a port, at its own speed, to its end
 
-    Nothing is sent until somebody reads; then time begins with the first sample.
+    Nothing is sent until a reader opens the port; the first sample is sent then.
     """
     if (preset is None) == (play is None):
-        raise click.UsageError("give one of --preset and --play")
+        raise click.UsageError("give either --preset or --play")
     if preset is not None and (rate_hz or axes or sequence or loop):
-        raise click.UsageError("--rate-hz, --axes, --sequence and --loop go with --play")
+        raise click.UsageError("--rate-hz, --axes, --sequence and --loop need --play")
     if play is not None and directory is not None:
-        raise click.UsageError("--csv goes with --preset")
+        raise click.UsageError("--csv needs --preset")
     if duration_s is not None and directory is None:
-        raise click.UsageError("--duration goes with --csv")
+        raise click.UsageError("--duration needs --csv")
     try:
         if play is not None:
             track = read_track(play, tuple(axes.split(",")) if axes else None, rate_hz)
@@ -96,8 +102,8 @@ def simulate(
 def write_files(bench: Bench, directory: Path, duration_s: float | None, origin: dict[str, Any]) -> None:
     """Write sensor.csv, reference.csv, poses.csv (formats of `fieldcal calibrate`) and truth.json.
 
-    `duration_s` of the bench's clock, by default three repetitions of its schedule, which is one on the clamp. `origin`
-    goes into truth.json.
+    `duration_s` is in seconds of the bench's clock; default: three repetitions of its schedule, which is one on the
+    clamp. `origin` is written into truth.json.
     """
     p = bench.parameters
     recording = bench.recording(p.schedule.duration_s(3) if duration_s is None else duration_s)
@@ -164,7 +170,7 @@ def _serve_bench(bench: Bench, link: Path | None) -> int:
 
 
 class _Serving:
-    """Serves ports until told to stop; SIGINT and SIGTERM end it in order, so that links do not stay behind."""
+    """Serves ports until it is told to stop. SIGINT and SIGTERM end it in order, so that no links are left."""
 
     def __init__(self) -> None:
         self._stopped = threading.Event()
@@ -179,24 +185,24 @@ class _Serving:
         self._undo.close()
 
     def start(self, device: PtyDevice) -> PtyDevice:
-        """Serve this port until the end."""
+        """Serve this port until `_Serving` ends."""
         self._undo.callback(device.stop)
         device.start()
         return device
 
     def goes_on(self) -> bool:
-        """Wait a moment; False once told to stop."""
+        """Wait a moment; False after a request to stop."""
         return not self._stopped.wait(POLL_S)
 
     def wait_for_reader(self, device: PtyDevice) -> bool:
-        """Wait until somebody has opened and set up the port; False once told to stop."""
+        """Wait until a reader has opened and set up the port; False after a request to stop."""
         while self.goes_on():
             if device.has_reader():
                 return not self._stopped.wait(SETTLE_S)
         return False
 
     def linger(self, device: PtyDevice) -> None:
-        """Leave the reader time to take the rest."""
+        """Wait until the reader has had time to read the rest."""
         end = time.monotonic() + LINGER_S
         while time.monotonic() < end and device.has_reader() and self.goes_on():
             pass

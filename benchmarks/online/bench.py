@@ -1,8 +1,11 @@
-"""A bench day: the sensor is turned by hand from stop to stop, nobody tells when; beside it `fieldcal calibrate`.
+"""A bench day: a person turns the sensor from stop to stop at unknown times.
 
-The stops are on a clamp at two inclinations, all visited twice. What an operator knows to 0.2 deg or 0.05 m/s2 is off
-by as much, drawn once a run. The agent gets the samples, the list of stops and a data sheet's S and Q; `fieldcal
-calibrate` gets the same samples as files, the same data sheet, and the time and position of every stop.
+`fieldcal calibrate` is run for comparison.
+
+The stops are on a clamp at two inclinations; each stop is visited twice. Quantities that an operator knows to 0.2 deg
+or 0.05 m/s2 have errors of this size, drawn once per run. The agent gets the samples, the list of stops, and S and Q of
+a data sheet. `fieldcal calibrate` gets the same samples as files, the same data sheet, and the time and position of
+every stop.
 """
 
 from __future__ import annotations
@@ -34,10 +37,10 @@ SEED, RUNS = 1, 20
 RATES_HZ = (1000.0, 200.0)
 STOPS = tuple((theta_deg, alpha_deg) for theta_deg in (35.0, 55.0) for alpha_deg in (0.0, 120.0, 240.0))
 HOLD_S, TURN_S, ROUNDS = 25.0, 4.0, 2
-AFTER_S = 12.0  # into the next turning, by which the last stop ends
-# A data sheet's: main sensitivities to 5 %, transverse 3 %, zero-g offset 50 mg.
+AFTER_S = 12.0  # time into the next turn, by which the last stop has ended
+# As in a data sheet: main sensitivities to 5 %, transverse 3 %, zero-g offset 50 mg.
 U_MAIN_PCT, U_TRANSVERSE_PCT, U_OFFSET_MPS2 = 5.0, 3.0, 0.5
-FREE_GATE = {"least_determined": 3}  # S_xy and S_yx no free angle tells
+FREE_GATE = {"least_determined": 3}  # without stated angles S_xy and S_yx cannot be determined
 MAIN = [0, 4, 8]
 KINDS = (
     ("main sensitivity", "%", MAIN),
@@ -57,8 +60,7 @@ KNOWN = Spread(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Day:
-    """What agent and `fieldcal calibrate` found of one day, (12,) in m/s2 and 1, and the latter's u. `positions` that
-    the agent found for its windows, "" where it took none; `windows` that both took."""
+    """Results of one day: of the agent and of `fieldcal calibrate`, (12,) in m/s2 and 1, and the u of the latter."""
 
     online: Array
     offline: Array
@@ -69,12 +71,12 @@ class Day:
 
     @property
     def apart(self) -> Array:
-        """(12,) differences over u."""
+        """Differences (12,) between the results, divided by u."""
         return np.abs(self.online - self.offline) / self.u
 
 
 def world(seed: int, rate_hz: float = RATES_HZ[0]) -> Bench:
-    """The day's bench; sensor and reference at `rate_hz`, read as the drivers here read."""
+    """The bench of the day. Sensor and reference sample at `rate_hz` and are read like the drivers of hw read."""
     p = plain(seed)
     stands = tuple(clamped(theta_deg, alpha_deg, HOLD_S) for theta_deg, alpha_deg in STOPS)
     turned = replace(
@@ -95,7 +97,7 @@ def world(seed: int, rate_hz: float = RATES_HZ[0]) -> Bench:
 
 
 def config(bench: Bench, **keys: Any) -> Config:
-    """Stops, no times. `keys` are further ones of the channel."""
+    """Configuration with stops but without times. `keys` are further keys of the channel."""
     sensor = bench.parameters.sensor
     devices = [
         {
@@ -111,14 +113,14 @@ def config(bench: Bench, **keys: Any) -> Config:
         "reference": "reference",
         "prior": prior | {"u_transverse_pct": U_TRANSVERSE_PCT},
         "uncertainty": {"theta_position_deg": KNOWN.theta_position_deg},
-        "temperature": {"offset_order": 0},  # `fieldcal calibrate` knows none
+        "temperature": {"offset_order": 0},  # `fieldcal calibrate` has no temperature model
         "positions": [{"theta_deg": theta_deg, "alpha_deg": alpha_deg} for theta_deg, alpha_deg in STOPS],
     }
     return parse_config({"devices": devices, "channels": [channel | keys], "zenoh": {"enabled": False}}, "bench day")
 
 
 def day(seed: int, rate_hz: float = RATES_HZ[0]) -> Day:
-    """One day both ways."""
+    """Simulate one day and calibrate it in both ways."""
     bench = world(seed, rate_hz)
     duration_s = bench.parameters.schedule.duration_s(ROUNDS) + AFTER_S
     update, reports = online(bench, duration_s)
@@ -136,7 +138,7 @@ def day(seed: int, rate_hz: float = RATES_HZ[0]) -> Day:
 
 
 def online(bench: Bench, duration_s: float, **keys: Any) -> tuple[CalibrationUpdate, list[WindowReport]]:
-    """The agent's last calibration, and its windows. Raises ValueError where it came to none."""
+    """The agent's last calibration, and its windows. Raises ValueError if there is no calibration."""
     run = Run(config(bench, **keys))
     updates, reports, said = [], [], ""
     for event in bench_events(bench, bench.recording(duration_s)):
@@ -154,7 +156,7 @@ def online(bench: Bench, duration_s: float, **keys: Any) -> tuple[CalibrationUpd
 
 
 def offline(bench: Bench, duration_s: float) -> dict[str, Any]:
-    """What `fieldcal calibrate --json -` prints. Raises ValueError where it refuses."""
+    """Output of `fieldcal calibrate --json -`. Raises ValueError if the data are refused."""
     with TemporaryDirectory() as name:
         directory = Path(name)
         write_files(bench, directory, duration_s, {})
@@ -180,7 +182,7 @@ def _data_sheet(nominal: float) -> dict[str, Any]:
 
 
 def table(days: Sequence[Day], rate_hz: float) -> str:
-    """The worst of all days at a rate, by kind of parameter."""
+    """The largest values of all days at one rate, by kind of parameter."""
     apart = np.array([day.apart for day in days])
     off = np.array([np.abs(day.online - day.truth) / day.u for day in days])
     u = np.array([day.u for day in days])
@@ -189,7 +191,7 @@ def table(days: Sequence[Day], rate_hz: float) -> str:
         f"{len(days)} days at {rate_hz:g} Hz of {len(STOPS)} stops visited {ROUNDS} times, {HOLD_S:g} s each. Windows "
         f"taken on-line {windows[:, 0].sum()}, by `fieldcal calibrate` {windows[:, 1].sum()}.",
         "",
-        "| | u of calibrate, mean | on-line less calibrate, worst / u | rms / u | on-line less truth, rms / u |",
+        "| | u of calibrate, mean | on-line minus calibrate, worst / u | rms / u | on-line minus truth, rms / u |",
         "| --- | --- | --- | --- | --- |",
     ]
     for name, unit, k in KINDS:
@@ -200,7 +202,7 @@ def table(days: Sequence[Day], rate_hz: float) -> str:
 
 
 def free_day(seed: int) -> tuple[Array, Array]:
-    """One day on a clamp whose angles nobody states: errors over u (12,), and u (12,) in m/s2 and 1."""
+    """One day on a clamp with unknown angles: errors over u (12,), and u (12,) in m/s2 and 1."""
     bench = world(seed)
     scale = bench.parameters.sensor.nominal_sensitivity
     update, _ = online(bench, bench.parameters.schedule.duration_s(ROUNDS) + AFTER_S, positions="free", gate=FREE_GATE)

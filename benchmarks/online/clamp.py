@@ -1,4 +1,4 @@
-"""A bench as events: what a gateway would have got of hw.virtual.bench, bursts as they arrived."""
+"""A bench as events: blocks of hw.virtual.bench as a gateway would receive them, with the arrival of each burst."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 
 def bench_events(bench: Bench, recording: Recording) -> Iterator[Event]:
-    """Openings and all blocks of a recording of this bench, devices "sensor" and "reference", in order of arrival."""
+    """Openings and blocks of a recording of this bench, in order of arrival; devices "sensor" and "reference"."""
     p = bench.parameters
     sensor_hz, reference_hz = p.sensor.clock.nominal_rate_hz, p.reference.clock.nominal_rate_hz
     unit = "m/s2" if p.reference.quantity == "acceleration" else "m/s"
@@ -39,7 +39,7 @@ def bench_events(bench: Bench, recording: Recording) -> Iterator[Event]:
 def blocks(
     device: str, stamp_s: Array, values: Array, rate_hz: float, temperature_degc: Array | None = None
 ) -> Iterator[SampleBlock]:
-    """Blocks of about `BLOCK_S` from stamps (n,), equal within a burst, and values (n, m)."""
+    """Blocks of about `BLOCK_S` from stamps (n,), which are equal within a burst, and values (n, m)."""
     last = np.append(np.flatnonzero(np.diff(stamp_s) > 0), len(stamp_s) - 1)  # the newest sample of each burst
     arrivals_ns = np.round(stamp_s[last] * 1e9).astype(np.int64)
     edges = np.flatnonzero(np.diff(stamp_s[last] // BLOCK_S, append=np.inf)) + 1

@@ -1,4 +1,4 @@
-"""Configurations of the scenarios: what an operator would have written down, with what he knows and does not know."""
+"""Configurations of the scenarios: what an operator would have written, with nominal values and their uncertainties."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ LONGEST_SILENCE_S = 3600.0
 
 
 def building_config(building: Building, **keys: Any) -> Config:
-    """Sensor and reference of a building, the mount's rotation and gravity as nominal (identity, z up).
+    """Sensor and reference of a building; rotation of the mount and gravity are nominal (identity, z up).
 
-    `keys` are further ones of the channel, the section `prior` among them.
+    `keys` are further keys of the channel, for example the section `prior`.
     """
     p = building.parameters
     devices = [

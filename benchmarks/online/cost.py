@@ -1,4 +1,4 @@
-"""What a window costs as a run grows long: time of the pipeline and the size of its state, window 10 to 10,000."""
+"""Cost of a window in a long run: CPU time of the pipeline and size of its state, from window 10 to 10,000."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from benchmarks.online.runner import Run, visits
 
 TIMING = Timing(10.0, 3600.0, 10_000)
 AT = (10, 100, 1000, 10_000)
-NEAR = 200  # windows around each, at most; the median of them is told
+NEAR = 200  # largest number of windows around each stated window; their median is reported
 
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """Around one window: CPU time of all events of a window (ms, median), snapshot, memory of the process."""
+    """Cost around one window: median CPU time of all events of a window (ms), size of the snapshot, process memory."""
 
     window: int
     cpu_ms: float
@@ -29,7 +29,7 @@ class Cost:
 
 
 def measure(windows: int = TIMING.windows) -> list[Cost]:
-    """One run of so many windows, an hour apart, at 100 Hz."""
+    """Simulate one run of `windows` windows, an hour apart, at 100 Hz."""
     drawn = node(1, all_axes=True, timing=TIMING)
     run = Run(drawn.config)
     spent: list[float] = []
@@ -49,13 +49,13 @@ def measure(windows: int = TIMING.windows) -> list[Cost]:
 
 
 def resident_mb() -> float:
-    """Memory of this process that is in RAM."""
+    """Memory of this process in RAM, MB."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
 def table(costs: list[Cost]) -> str:
-    """A row a window number."""
+    """One row per stated window."""
     lines = ["| window | CPU a window, ms | state, kB | memory of the process, MB |", "| --- | --- | --- | --- |"]
     lines += [f"| {c.window} | {c.cpu_ms:.2f} | {c.snapshot_bytes / 1024:.1f} | {c.resident_mb:.1f} |" for c in costs]
     return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""Coverage of the on-line U: persistent faults drawn once a run, each parameter in force held against the truth."""
+"""Coverage of the on-line U: constant faults are drawn per run, parameters in force are compared with the truth."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from calib.model import PARAMETERS
 SEED = 50_000
 RUNS = 300
 TIMING = Timing(30.0, 120.0, 16)
-# Of a data sheet rather than a certificate, so that the data halve all of it.
+# As in a data sheet rather than a certificate, so that the data halve the u of every parameter.
 STATED = Stated(main_pct=3.0, transverse_pct=1.5, offset_mps2=0.5)
 LEVEL = 0.999  # of the band over all parameters together (Bonferroni)
 
 
 def one(seed: int) -> NDArray[np.float64]:
-    """(12,) error over U of what is in force after a run's last window; NaN where it is not determined."""
+    """Error over U (12,) of the calibration in force after the last window; NaN where a parameter is not determined."""
     drawn = node(seed, all_axes=True, timing=TIMING, stated=STATED)
     run = Run(drawn.config)
     results = [r for event in visits(drawn.building, range(TIMING.windows)) for r in run.feed(event)]
@@ -35,7 +35,7 @@ def one(seed: int) -> NDArray[np.float64]:
 
 
 def band(runs: int, parameters: int, share: float = 0.95, level: float = LEVEL) -> tuple[int, int]:
-    """Least and greatest count of covered runs that a right U gives, all `parameters` together, at this level."""
+    """Lowest and highest number of covered runs for a correct U, for all `parameters` together, at this level."""
     tail = (1 - level) / parameters / 2
     logs = [
         math.lgamma(runs + 1) - math.lgamma(k + 1) - math.lgamma(runs - k + 1)
@@ -47,7 +47,7 @@ def band(runs: int, parameters: int, share: float = 0.95, level: float = LEVEL) 
 
 
 def table(ratios: Sequence[NDArray[np.float64]]) -> str:
-    """A row a parameter: in how many runs it is determined, in how many the truth lies within U, and the band."""
+    """One row per parameter: number of runs in which it is determined, number with the truth within U, band."""
     values = np.array(ratios)
     lines = ["| parameter | determined | within U | % | band |", "| --- | --- | --- | --- | --- |"]
     for p, name in enumerate(PARAMETERS):

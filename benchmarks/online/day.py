@@ -1,8 +1,8 @@
-"""A day of 1 kHz from the paper's bench: what of it is the pipeline's own time.
+"""A day of 1 kHz from the paper's bench: the CPU time of the pipeline alone.
 
-The sensor stands for 57 s in each of four positions, then it is turned: a window a minute, all day. `CYCLES` of that
-are generated once and then played again and again, sample numbers and arrivals going on; the pipeline sees a day of
-data like any other.
+The sensor stands for 57 s in each of four positions, then it is turned: one window per minute, all day. `CYCLES` cycles
+are generated once and then played repeatedly with increasing sample numbers and arrival times, so that the pipeline
+receives a normal day of data.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ RATE_HZ = 1000.0
 HOLD_S, TURN_S = 57.0, 3.0
 BLOCK_S = 5.0
 BURST = 25
-CYCLES = 2  # of the schedule of four minutes
+CYCLES = 2  # of the schedule, which takes four minutes
 DAY_S = 86_400.0
 
 
 def config(bench: Bench) -> Config:
-    """The bench's four positions, again and again."""
+    """The bench's four positions, repeated."""
     poses = [
         {"start_s": p.start_s, "stop_s": p.stop_s, "theta_deg": p.theta_deg, "alpha_deg": p.alpha_deg}
         for p in bench.poses
@@ -57,7 +57,7 @@ def config(bench: Bench) -> Config:
 
 
 def bench() -> Bench:
-    """The plain preset, its clocks exact so that what was generated can be played again."""
+    """The preset `plain` with exact clocks, so that the generated data can be repeated."""
     p = plain(1)
     exact = Clock(RATE_HZ)
     stands = tuple(replace(stand, hold_s=HOLD_S) for stand in p.schedule.stands)
@@ -73,7 +73,7 @@ def bench() -> Bench:
 
 
 def events(bench: Bench, duration_s: float) -> Iterator[Event]:
-    """Openings, then blocks and a tick a block for `duration_s`."""
+    """Openings, then blocks for `duration_s`, each followed by a tick."""
     n = round(BLOCK_S * RATE_HZ)
     blocks = round(CYCLES * bench.parameters.schedule.period_s / BLOCK_S)
     held = [(bench.sensor_counts(k * n, n), bench.reference_values(k * n, n)) for k in range(blocks)]
@@ -95,11 +95,11 @@ def events(bench: Bench, duration_s: float) -> Iterator[Event]:
 
 
 def measure(duration_s: float) -> tuple[float, int, int]:
-    """CPU seconds, windows used and calibrations of a run."""
+    """CPU time in s, number of used windows and number of calibrations of a run."""
     world = bench()
     run = Run(config(world))
     feed = events(world, duration_s)
-    first = next(feed)  # by then all is generated
+    first = next(feed)  # the data are generated before the first event
     begin = time.process_time()
     windows = updates = 0
     for event in itertools.chain([first], feed):
@@ -110,11 +110,11 @@ def measure(duration_s: float) -> tuple[float, int, int]:
 
 
 def table() -> str:
-    """The figure in words."""
+    """The result as text."""
     cpu_s, windows, updates = measure(DAY_S)
     blocks = 2 * int(DAY_S / BLOCK_S)
     return (
         f"A day of the bench, sensor 1 kHz x 3 and reference 1 kHz ({blocks} blocks, {windows} windows used, {updates} "
         f"calibrations) takes the pipeline **{cpu_s:.0f} s** of one core. {CYCLES} cycles of four minutes are "
-        "generated and played again and again; that is not in the figure."
+        "generated once and then repeated; the time to generate them is not included."
     )

@@ -1,4 +1,4 @@
-"""Harm: what befalls sensor or reference must not get into the calibration in force; harmless windows must."""
+"""Faults of sensor or reference (harm): none may change the calibration in force; other windows must be used."""
 
 from __future__ import annotations
 
@@ -17,15 +17,16 @@ from hw.virtual.harm import HARMLESS, KINDS
 
 SEED = 20_000
 TIMING = Timing(20.0, 60.0, 12)
-KNOWN_WINDOWS = 4  # before the harm, in every other run
-FACTOR_U = 4.0  # off the truth by more standard uncertainties is wrong (at k = 2, in proportion at any other)
-UNSUPPORTED = ("the reference is calm here",)  # reasons of windows that nobody expects to be taken
+KNOWN_WINDOWS = 4  # windows before the fault, in every other run
+# A parameter is wrong if it differs from the truth by more standard uncertainties (for k = 2; else in proportion)
+FACTOR_U = 4.0
+UNSUPPORTED = ("the reference is calm here",)  # reasons of windows that are not expected to be used
 MAIN = np.eye(3, dtype=bool)
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What became of a run. `wrong`: the first wrong acceptance, "" where there was none; counts are since the harm."""
+    """Result of a run. `wrong`: the first wrong calibration that was accepted, or ""; the counts start at the fault."""
 
     kind: str
     name: str
@@ -41,7 +42,7 @@ class Outcome:
 
 
 def harmed(kind: str, seed: int) -> Outcome:
-    """One run with a harm of this kind ("" for none), everything drawn by the seed."""
+    """Simulate one run with a fault of this kind ("" for none); everything is drawn from the seed."""
     random = np.random.default_rng([seed, 7])
     harm = KINDS[kind](random) if kind else HARMLESS
     since = KNOWN_WINDOWS * int(random.integers(2)) if kind else 0
@@ -71,7 +72,10 @@ def _outcome(kind: str, name: str, seed: int, drawn: Node, since: int, results: 
 
 
 def wrong(update: CalibrationUpdate, drawn: Node, harmed: bool) -> str:
-    """Why a calibration in force is wrong: a determined parameter off the truth, or further than max_change."""
+    """Why a calibration in force is wrong, or "".
+
+    It is wrong if a determined parameter is off the truth, or if S is further from its nominal value than max_change.
+    """
     building = drawn.building
     output = building.harm.output if harmed else np.eye(3)
     true = building.truth((update.t_utc_ns - EPOCH_NS) * 1e-9)
@@ -97,7 +101,7 @@ def plain(reason: str) -> str:
 
 
 def table(outcomes: Iterable[Outcome]) -> str:
-    """A row a kind: runs, wrong acceptances, statuses at the end, the commonest reasons."""
+    """One row per kind: runs, wrong acceptances, final statuses, most frequent reasons."""
     by_kind: dict[str, list[Outcome]] = {}
     for outcome in outcomes:
         by_kind.setdefault(outcome.kind, []).append(outcome)

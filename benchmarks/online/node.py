@@ -1,4 +1,4 @@
-"""A node with its faults drawn once: what an operator states of it, and a building in which that is just so true."""
+"""A node whose faults are drawn once: a building, and a configuration whose stated uncertainties are true for it."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ RATE_HZ = 100.0
 
 @dataclass(frozen=True, slots=True)
 class Stated:
-    """Standard uncertainties that the operator writes down; the faults are drawn from them.
+    """Standard uncertainties that the operator states; the faults are drawn from them.
 
-    So small that four or five of them are within max_change: a sensor that differs by more from its certificate is held
-    by rule, and no matter of statistics.
+    They are so small that four or five of them are within max_change. A sensor that differs from its certificate by
+    more is held because of that rule, which is not a statistical question.
     """
 
     main_pct: float = 1.0
@@ -32,12 +32,12 @@ class Stated:
     rotation_deg: float = 0.2
     reference_pct: float = 0.1
     lag_s: float = 0.002
-    gravity_deg: float = 0.1  # of the mount against plumb
+    gravity_deg: float = 0.1  # of the mount against the vertical
     gravity_mps2: float = 0.03
     offset_window_mps2: float = 0.002
 
     def keys(self) -> dict[str, Any]:
-        """The channel's sections: nothing wanders, since nothing does in the building."""
+        """Sections of the channel. All walks are zero, because nothing wanders in the building."""
         return {
             "prior": {
                 "sensitivity": 1.0, "u_main_pct": self.main_pct, "u_transverse_pct": self.transverse_pct,
@@ -54,9 +54,9 @@ class Stated:
             },
             "temperature": {"offset_order": 0},
             "gate": {
-                # What moves in one direction alone never tells Q better than the transverse sensitivities are known.
+                # With motion in one direction alone, Q is never known better than the transverse sensitivities.
                 "least_determined": 1,
-                # The defaults, or five standard uncertainties of what is not known as well as that.
+                # The defaults, or five standard uncertainties where a quantity is known less well than the default.
                 "max_change_main_pct": max(5.0, 5 * self.main_pct),
                 "max_change_transverse_pct": max(3.0, 5 * self.transverse_pct),
                 "max_change_rotation_deg": max(3.0, 5 * self.transverse_pct),
@@ -67,7 +67,7 @@ class Stated:
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """Windows of a run."""
+    """Number and timing of the windows of a run."""
 
     window_s: float = 20.0
     every_s: float = 60.0
@@ -76,7 +76,7 @@ class Timing:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Node:
-    """A building with the configuration that belongs to it."""
+    """A building and its configuration."""
 
     building: Building
     config: Config
@@ -92,7 +92,7 @@ def node(
     stated: Stated | None = None,
     timing: Timing | None = None,
 ) -> Node:
-    """One draw of everything, at 100 Hz."""
+    """Draw everything from `seed`, at 100 Hz."""
     stated, timing = stated or Stated(), timing or Timing()
     random = np.random.default_rng([seed, 5])
     main, across = stated.main_pct / 100, stated.transverse_pct / 100
@@ -117,7 +117,7 @@ def node(
 
 
 def _turned(random: np.random.Generator, u_deg: float) -> np.ndarray:
-    """A small rotation, `u_deg` about each axis."""
+    """A small rotation with standard deviation `u_deg` about each axis."""
     vector = np.deg2rad(u_deg) * random.standard_normal(3)
     angle = float(np.linalg.norm(vector))
     return rotation(vector / angle, angle) if angle else np.eye(3)

@@ -1,4 +1,4 @@
-"""Runs the scenarios and writes what they show into docs/online.md (the cost into docs/performance.md)."""
+"""Runs the scenarios and writes their results into docs/online.md (the cost into docs/performance.md)."""
 
 from __future__ import annotations
 
@@ -19,12 +19,16 @@ ONLINE = PAGE.with_name("online.md")
 
 
 def main() -> int:
-    """The command line."""
+    """Parse the command line and run."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.online", description=__doc__)
-    parser.add_argument("names", nargs="*", choices=[*PARTS, []], help="all without any")
-    parser.add_argument("--write", action="store_true", help="put the tables into the pages")
+    parser.add_argument("names", nargs="*", choices=[*PARTS, []], help="default: all")
+    parser.add_argument("--write", action="store_true", help="write the tables into the pages")
     parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--runs", type=int, help="of harm (and as many harmless) or coverage; windows of year or cost")
+    parser.add_argument(
+        "--runs",
+        type=int,
+        help="number of runs of harm (and as many without harm) or of coverage; number of windows of year or cost",
+    )
     options = parser.parse_args()
     for name in options.names or PARTS:
         begin = time.monotonic()
@@ -39,7 +43,7 @@ def main() -> int:
 
 
 def spread(work: Callable[[Any], Any], items: Sequence[Any], workers: int) -> list[Any]:
-    """All results in order, by so many processes."""
+    """All results in order, computed by `workers` processes."""
     if workers == 1:
         return [work(item) for item in items]
     with ProcessPoolExecutor(workers) as pool:

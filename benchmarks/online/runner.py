@@ -1,4 +1,4 @@
-"""Events of a virtual world into the pipeline, as fast as it takes them, recorded if asked for."""
+"""Feeds the events of a virtual world into the pipeline as fast as possible; records them on request."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from agent.recording.fingerprint import fingerprint, versions
 from agent.recording.writer import Recorder
 from hw.block import DeviceInfo, SampleBlock
 
-EPOCH_NS = 1_790_000_000_000_000_000  # UTC at the world's zero
+EPOCH_NS = 1_790_000_000_000_000_000  # UTC at time 0 of the world
 TICK_NS = 1_000_000_000
-# A tick each second between visits of an hour would be most of the events; a few are enough for time to pass.
-LATE_S = 8.0  # after a visit: what is late by more is refused by then
+# With visits an hour apart, one tick per second would be most of the events; a few are enough to advance the time.
+LATE_S = 8.0  # time after a visit after which late samples are refused
 
 
 class Visited(Protocol):
-    """A world that is visited now and then: hw.virtual.building."""
+    """A world with data at visits only, such as hw.virtual.building."""
 
     def infos(self) -> dict[str, DeviceInfo]: ...
     def span(self, visit: int) -> tuple[float, float]: ...
@@ -30,7 +30,7 @@ class Visited(Protocol):
 
 
 class Run:
-    """One run of the pipeline. `directory` (existing) takes the recording."""
+    """One run of the pipeline. The recording is written into `directory`, which must exist, unless it is None."""
 
     def __init__(self, config: Config, directory: Path | None = None) -> None:
         self.pipeline = Pipeline.begin(config, "run-1", 0, 0, {})
@@ -55,7 +55,7 @@ class Run:
         return self.now_ns * 1e-9
 
     def feed(self, event: Event) -> list[Result]:
-        """Step the pipeline; what follows from the event. The corrected stream, where it is on, is left out."""
+        """Step the pipeline and return the results of `event`, without the corrected stream."""
         results = [result for result in self.pipeline.step(event) if not isinstance(result, Acceleration)]
         self.now_ns = max(self.now_ns, event.t_monotonic_ns)
         self.events += 1
@@ -73,7 +73,7 @@ class Run:
 
 
 def opened(infos: dict[str, DeviceInfo], t_ns: int = 0) -> Iterator[DeviceChange]:
-    """The devices' openings."""
+    """Events that open the devices."""
     for device, info in infos.items():
         yield DeviceChange(
             device=device,
@@ -85,7 +85,7 @@ def opened(infos: dict[str, DeviceInfo], t_ns: int = 0) -> Iterator[DeviceChange
 
 
 def visits(world: Visited, numbers: Iterable[int]) -> Iterator[Event]:
-    """Openings, then visit by visit its blocks with a tick a second, and one when all that is late has come."""
+    """Openings; then for each visit its blocks with a tick per second, and one tick after all late blocks."""
     yield from opened(world.infos())
     for visit in numbers:
         yield from ticked(world.visit(visit))
@@ -93,7 +93,7 @@ def visits(world: Visited, numbers: Iterable[int]) -> Iterator[Event]:
 
 
 def ticked(blocks: Iterable[SampleBlock]) -> Iterator[Event]:
-    """Blocks in order of arrival, with a tick before each that comes in a new second."""
+    """Blocks in order of arrival, with a tick before the first block of each second."""
     now_s: int | None = None
     for block in blocks:
         arrival_s = block.t_monotonic_ns // TICK_NS
@@ -104,6 +104,6 @@ def ticked(blocks: Iterable[SampleBlock]) -> Iterator[Event]:
 
 
 def tick(time_s: float) -> Tick:
-    """A tick at a time of the world's clock."""
+    """A tick at `time_s` of the world's clock."""
     now_ns = round(time_s * TICK_NS)
     return Tick(t_monotonic_ns=now_ns, t_utc_ns=EPOCH_NS + now_ns)

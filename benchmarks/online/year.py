@@ -1,4 +1,4 @@
-"""A year in a building: what is in force is held against the truth at every window."""
+"""A year in a building: at every window the calibration in force is compared with the truth."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from hw.virtual.building import DAY_S, Building, BuildingParameters
 Array = NDArray[np.float64]
 MONTH_DAYS = 30.4
 STEP_DAY = 150.0  # in month 5
-STEP = 0.01  # of S_yy
+STEP = 0.01  # change of S_yy
 LOUD_MPS2 = 0.1
-LOUD_WINDOWS = 10  # in which the step is to be found
+LOUD_WINDOWS = 10  # windows in which the step must be found
 SYY, QZ = 4, 11
-GRAVITY = np.array([0.0, 0.0, 9.80665])  # as stated
+GRAVITY = np.array([0.0, 0.0, 9.80665])  # as stated in the configuration
 
 
 def parameters(seed: int, elsewhere: float = 0.0) -> BuildingParameters:
-    """The issue's building; what is not exactly known is drawn."""
+    """The building of docs/online.md; quantities that are not known exactly are drawn."""
     random = np.random.default_rng([seed, 3])
     sensitivity = np.eye(3) + np.where(np.eye(3), 0.01, 0.005) * random.standard_normal((3, 3))
     step = np.zeros((3, 3))
@@ -45,7 +45,7 @@ def parameters(seed: int, elsewhere: float = 0.0) -> BuildingParameters:
 
 
 def config(building: Building, **keys: Any) -> Config:
-    """What an operator states of it. `keys` are further ones of the channel, or sections in the place of these."""
+    """The operator's configuration. `keys` are further keys of the channel, or replace its sections."""
     stated = {
         "prior": {"sensitivity": 1.0, "u_main_pct": 2.0, "u_transverse_pct": 1.0, "u_offset_mps2": 0.5},
         "certificate": {"u_sensitivity_pct": 0.1, "noise_mps2": 0.001},
@@ -57,7 +57,7 @@ def config(building: Building, **keys: Any) -> Config:
 
 @dataclass(slots=True)
 class Year:
-    """What was seen, window by window. Errors are in force less true; `u` standard uncertainties."""
+    """Observations by window. Errors are value in force minus true value; `u` are standard uncertainties."""
 
     time_s: list[float] = field(default_factory=list)
     syy_error: list[float] = field(default_factory=list)
@@ -72,7 +72,7 @@ class Year:
     used: int = 0
 
     def step_found_after(self, building: Building) -> int | None:
-        """Windows of level 0.1 or more from the step of S_yy to its report; None where it was never found."""
+        """Number of windows of level 0.1 or more from the step of S_yy to its report; None if it was not reported."""
         p = building.parameters
         at_s = STEP_DAY * DAY_S
         found = [d for d in self.drifts if d.parameter == "Syy" and d.verdict == "stepped"]
@@ -83,7 +83,7 @@ class Year:
         return sum(building.level_mps2(visit) >= LOUD_MPS2 for visit in visits_since)
 
     def alarms_before(self) -> list[DriftReport]:
-        """Verdicts "stepped", or "drifting" of S, before anything of the kind was true."""
+        """Verdicts "stepped", or "drifting" of S, before the true step."""
         return [
             d
             for d in self.drifts
@@ -94,12 +94,12 @@ class Year:
 
 
 def seconds(t_utc_ns: int) -> float:
-    """Of the building's clock."""
+    """Seconds of the building's clock."""
     return (t_utc_ns - EPOCH_NS) * 1e-9
 
 
 def at_temperature(update: CalibrationUpdate, degc: float) -> Array:
-    """Q (3,) at a temperature."""
+    """Q (3,) at the temperature `degc`."""
     offset = np.array(update.offset)
     for power, coefficients in enumerate(update.offset_temperature, start=1):
         offset = offset + np.array(coefficients) * (degc - update.reference_temperature_degc) ** power
@@ -107,7 +107,7 @@ def at_temperature(update: CalibrationUpdate, degc: float) -> Array:
 
 
 def whole(building: Building, numbers: range) -> Year:
-    """The agent over these visits."""
+    """Run the agent over these visits."""
     run, year = Run(config(building)), Year()
     for event in visits(building, numbers):
         for result in run.feed(event):
@@ -124,7 +124,7 @@ def whole(building: Building, numbers: range) -> Year:
 
 
 def settled_s(building: Building) -> float:
-    """When the windows are over in which the step is to be found."""
+    """End of the windows in which the step must be found, s."""
     every_s = building.parameters.every_s
     visit, loud = int(np.ceil(STEP_DAY * DAY_S / every_s)), 0
     while loud < LOUD_WINDOWS:
@@ -134,7 +134,7 @@ def settled_s(building: Building) -> float:
 
 
 def facts(building: Building, year: Year) -> dict[str, str]:
-    """What the issue asks, in words and numbers."""
+    """Results as texts with numbers."""
     time_s = np.array(year.time_s)
     syy, u_syy = np.abs(year.syy_error), np.array(year.u_syy)
     mean = np.abs(year.mean_error_mps2).max(axis=1)
@@ -142,27 +142,27 @@ def facts(building: Building, year: Year) -> dict[str, str]:
     after = time_s > settled_s(building)
     found = year.step_found_after(building)
     return {
-        "windows, of them used": f"{year.windows}, {year.used}",
+        "windows, number of used ones": f"{year.windows}, {year.used}",
         f"step of {100 * STEP:g} % in S_yy on day {STEP_DAY:g} found after": (
             "never" if found is None else f"{found} windows of level {LOUD_MPS2:g} or more"
         ),
-        "verdicts before it": "; ".join(d.reason for d in year.alarms_before()) or "none",
-        f"S_yy off the truth from {LOUD_WINDOWS} such windows after it on, at most": (
+        "verdicts before the step": "; ".join(d.reason for d in year.alarms_before()) or "none",
+        f"largest error of S_yy, from {LOUD_WINDOWS} such windows after the step on": (
             f"{100 * syy[after].max():.3f} %" if after.any() else ""
         ),
         "u(S_yy) at the end": f"{100 * u_syy[-1]:.3f} %",
-        "mean output off the truth, at most (99 % of the windows)": (
+        "largest error of the mean output (of 99 % of the windows)": (
             f"{1e3 * mean.max():.2f} ({1e3 * np.quantile(mean, 0.99):.2f}) mm/s2"
         ),
-        "Q off the truth in parts of its U, at most": f"{offset.max():.2f}",
+        "largest error of Q over its U": f"{offset.max():.2f}",
         "U(Q) at the end": ", ".join(f"{2e3 * u:.0f}" for u in year.u_offset[-1]) + " mm/s2",
-        "columns x and z of S moved by": f"{np.abs(np.array(year.columns) - year.columns[0]).max():.1e}",
+        "largest change of columns x and z of S": f"{np.abs(np.array(year.columns) - year.columns[0]).max():.1e}",
         "status": ", ".join(f"{s.status} ({seconds(s.t_utc_ns) / DAY_S:.1f} d)" for s in year.statuses[-6:]),
     }
 
 
 def table(found: dict[str, dict[str, str]]) -> str:
-    """A column a run."""
+    """One column per run."""
     lines = ["| | " + " | ".join(found) + " |", "| --- |" + " --- |" * len(found)]
     first = next(iter(found.values()))
     lines += [f"| {name} | " + " | ".join(column[name] for column in found.values()) + " |" for name in first]

@@ -19,11 +19,11 @@ WHO_AM_I, IDENTITY = 0x0F, 0x33
 CTRL_REG1, CTRL_REG2, CTRL_REG3, CTRL_REG4, CTRL_REG5, FIFO_CTRL, FIFO_SRC, OUT_X = (
     *(0x20, 0x21, 0x22, 0x23, 0x24, 0x2E, 0x2F, 0x28),
 )
-AUTO_INCREMENT = 0x80  # in a register's number
+AUTO_INCREMENT = 0x80  # added to a register's number for a read of several registers
 STREAM, OVERRUN, LEVEL_MASK = 0x80, 0x40, 0x1F
 RATE_CODES: Mapping[float, int] = {400.0: 7, 200.0: 6, 100.0: 5, 50.0: 4, 25.0: 3, 10.0: 2}
 MG_PER_COUNT: Mapping[int, int] = {2: 1, 4: 2, 8: 4, 16: 12}  # high resolution, 12 bits
-NEARLY_FULL = 28  # of 32; a FIFO that may run over between count and read counts as run over
+NEARLY_FULL = 28  # of 32 samples; if the FIFO may be full before the data are read, the driver treats it as overrun
 
 
 class Lis3dhOptions(FifoOptions):
@@ -40,7 +40,7 @@ class Lis3dhOptions(FifoOptions):
 
 
 class Lis3dh(FifoSensor):
-    """The level in one transfer, then as many samples as it says."""
+    """Reads the number of stored samples in one transfer, then these samples."""
 
     options_model = Lis3dhOptions
     word_bytes = 6
@@ -66,7 +66,7 @@ class Lis3dh(FifoSensor):
         }
 
     def _self_test(self) -> SelfTest:
-        """Self-test 0. Data sheet: 17 to 360 counts of 4 mg at 2 g in normal mode; typical noise 3 mg rms at 100 Hz."""
+        """Self-test 0. Data sheet: 17 to 360 counts of 4 mg, at 2 g, normal mode; noise typically 3 mg rms, 100 Hz."""
         return SelfTest(
             writes=((CTRL_REG4, self._settings()[CTRL_REG4][1] | 0x02),),
             settle_s=0.1,
@@ -79,12 +79,12 @@ class Lis3dh(FifoSensor):
     def _identify(self) -> dict[str, int]:
         (found,) = self._device.read(WHO_AM_I, 1)
         if found != IDENTITY:
-            raise IdentityError(f"{self._device.name}: expected 0x{IDENTITY:02X}, found 0x{found:02X}")
+            raise IdentityError(f"{self._device.name}: expected the ID 0x{IDENTITY:02X}, found 0x{found:02X}")
         return {"WHO_AM_I": found}
 
     def _set_up(self, identity: Mapping[str, int]) -> DeviceInfo:
         self._device.write(CTRL_REG1, 0x00)
-        self._device.write(FIFO_CTRL, 0x00)  # bypass empties the FIFO
+        self._device.write(FIFO_CTRL, 0x00)  # bypass mode empties the FIFO
         self._write_settings(last=CTRL_REG1)
         return self._info("lis3dh", self._options.rate_hz, identity)
 
@@ -93,10 +93,11 @@ class Lis3dh(FifoSensor):
         arrival_ns, utc_ns, (source,) = self._device.read_stamped([(FIFO_SRC, 1)], self._clock)
         level = 32 if source & OVERRUN else source & LEVEL_MASK
         data = self._device.read(OUT_X | AUTO_INCREMENT, 6 * level) if level else b""
-        made_since = (self._clock()[0] - arrival_ns) * 1e-9 * self._options.rate_hz  # it may have run over meanwhile
+        # Samples made since the count was read, with which the FIFO may have overrun
+        made_since = (self._clock()[0] - arrival_ns) * 1e-9 * self._options.rate_hz
         lost = level + made_since > NEARLY_FULL or self._device.retries > retries
-        if lost:  # what a read that broke off left is fewer than the level, and nothing tells how many
-            self._drop("FIFO ran over, or a read of it broke off", level)
+        if lost:  # after an interrupted read an unknown number of samples is missing, at most `level`
+            self._drop("FIFO overrun or interrupted FIFO read", level)
             data = b""
         return Burst(arrival_ns, utc_ns, data, lost)
 

@@ -1,4 +1,4 @@
-"""A LIS3DH at register level with its live FIFO."""
+"""A LIS3DH at register level with its FIFO."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ SETTINGS = frozenset((*range(CTRL_REG1, 0x28), FIFO_CTRL))
 
 
 class Lis3dhTwin(FifoTwin):
-    """See FifoTwin. Reads from OUT_X on with auto-increment go on through the FIFO."""
+    """See FifoTwin. A read from OUT_X on with auto-increment continues with the next sample of the FIFO."""
 
     fifo_bytes = 32 * 6
     sample_bytes = 6
@@ -30,7 +30,7 @@ class Lis3dhTwin(FifoTwin):
         on = self.registers[CTRL_REG1] >> 4 and self.registers[CTRL_REG5] & 0x40
         return bool(on) and self.registers[FIFO_CTRL] & 0xC0 == 0x80
 
-    def _encode(self, first: int, counts: Counts) -> bytes:  # noqa: ARG002 - these samples bear no number
+    def _encode(self, first: int, counts: Counts) -> bytes:  # noqa: ARG002 - the samples of this part carry no number
         return (counts << 4).astype("<i2").tobytes()
 
     def _deflection(self) -> Counts:

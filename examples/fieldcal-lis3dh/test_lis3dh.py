@@ -1,4 +1,4 @@
-"""fieldcal's own contract on the driver, and byte pairs from the data sheet."""
+"""The contract of fieldcal applied to this driver, and byte pairs from the data sheet."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Lis3dhRig(I2cRig):
     rate_hz = 400.0
 
     def lose(self) -> None:
-        # Nothing of a sample says which one it is: they vanish without a trace only where a read breaks off.
+        # The samples carry no number, so the driver can notice a loss only as an interrupted read: simulate one.
         self.twin.break_off(errno.EIO, 3)
 
 
@@ -37,7 +37,7 @@ class TestLis3dh(I2cContract):
 
     def test_says_how_it_is_set(self, rig: Lis3dhRig) -> None:
         info = rig.sensor.open()
-        # Data sheet: 1 mg a digit at 2 g in high resolution; 400 Hz is 7.
+        # Data sheet: 1 mg per count at 2 g in high resolution; the code of 400 Hz is 7.
         assert info.nominal_sensitivity == pytest.approx(1000 / 9.80665, rel=1e-12)
         assert info.settings["CTRL_REG1"] == "0x77"
         assert info.settings["CTRL_REG4"] == "0x88"

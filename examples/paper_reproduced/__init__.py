@@ -1,1 +1,1 @@
-"""The experiment of the paper on the virtual bench: what examples/paper.py is made of."""
+"""The paper's experiment on the virtual bench: the parts of examples/paper.py."""

@@ -1,4 +1,4 @@
-"""The paper's bench: slide, clamp, mountings and two accelerometers, with the faults that a real one has."""
+"""The paper's bench: slide, clamp, mountings and two accelerometers, with the faults of a real bench."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ METHOD_2_ALPHA_DEG = 135.0
 CYCLES = 6
 TURN_S = 0.8  # the slide's motion fades out and in
 LDV_NOISE_MPS = 2e-5
-# Sensor on the table, z into it; for z along the motion it stands on its side.
+# The sensor lies on the table with z into it. For z along the motion it stands on its side.
 TABLE_GRAVITY = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Device:
-    """An accelerometer of section 2.5 with an S and Q of the kind that the paper found. S in `unit` per m/s2."""
+    """An accelerometer of section 2.5, with S and Q similar to those in the paper. S in `unit` per m/s2."""
 
     key: str
     name: str
@@ -40,24 +40,25 @@ class Device:
     offset: Array
     noise_mps2: float
     dc: bool
-    alphas_deg: tuple[float, ...]  # four of 0, 30, 90, 120, 135, 210; which ones for which sensor the text leaves open
-    transverse_limit_pct: float  # section 3.1.5, 3.2.5: what Method 1 had verified
+    # Four of 0, 30, 90, 120, 135, 210; the paper does not say which four it used for which sensor
+    alphas_deg: tuple[float, ...]
+    transverse_limit_pct: float  # section 3.1.5, 3.2.5: the limit that Method 1 had verified
 
 
 def _rows(main: tuple[float, ...], relative_pct: list[list[float]]) -> Array:
     return np.array(main)[:, None] * (np.eye(3) + np.array(relative_pct) / 100)
 
 
-# White noise such that s_rel of Method 1 is 0.03 % at 10 m/s2 (3.1.1, 3.2.1); Q as at 3 Hz (3.1.3, 3.2.3). Transverse
-# sensitivities inside the paper's bounds (3.1.5, 3.2.5) such that Method 2, which does not see them, differs from
-# Method 1 as in Tables 3 and 4.
+# The white noise gives s_rel of 0.03 % in Method 1 at 10 m/s2 (3.1.1, 3.2.1). Q is that at 3 Hz (3.1.3, 3.2.3). The
+# transverse sensitivities are within the paper's limits (3.1.5, 3.2.5). Method 2 neglects them, and they are chosen so
+# that Method 2 differs from Method 1 as in Tables 3 and 4.
 PIEZO = Device(
     key="piezo",
     name="piezo-electric PCB 356A15",
     unit="mV",
     nominal=10.0,
     sensitivity=_rows((10.12, 9.95, 10.31), [[0, -0.92, 0.4], [-0.5, 0, 0.76], [-0.95, 1.0, 0]]),
-    offset=np.array([0.3113, 0.5427, 0.06098]),  # of the data acquisition: the sensor is AC-coupled
+    offset=np.array([0.3113, 0.5427, 0.06098]),  # offset of the data acquisition, because the sensor is AC-coupled
     noise_mps2=0.015,
     dc=False,
     alphas_deg=(0.0, 90.0, 135.0, 210.0),
@@ -80,16 +81,17 @@ DEVICES = (PIEZO, MEMS)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Faults:
-    """What is true on a bench and nobody knows. Angles are true minus nominal.
+    """True deviations of a bench, which are unknown to the methods. Angles are true minus nominal.
 
-    Lists by position have Method 2's position of the clamp first, then Method 3's four.
+    Lists by position have the position of Method 2 on the clamp first, then the four positions of Method 3.
     """
 
     theta_rad: float = 0.0
     alpha_rad: float = 0.0
     alpha_by_position_rad: Array = field(default_factory=lambda: np.zeros(5))
-    mounting_rad: Array = field(default_factory=lambda: np.zeros((3, 3)))  # Method 1: rotation vector by axis
-    offset_mps2: Array = field(default_factory=lambda: np.zeros((5, 3)))  # of the clamp's positions
+    # Method 1: rotation vector of the sensor for each axis
+    mounting_rad: Array = field(default_factory=lambda: np.zeros((3, 3)))
+    offset_mps2: Array = field(default_factory=lambda: np.zeros((5, 3)))  # one offset per position of the clamp
     reference: float = 0.0
     lateral: float = 0.0
     vertical: float = 0.0
@@ -99,7 +101,7 @@ class Faults:
 
 
 def drawn(priors: Priors, random: np.random.Generator) -> Faults:
-    """One bench out of those that `priors` speak of."""
+    """Draw one bench from the distributions that `priors` states."""
     return Faults(
         theta_rad=priors.theta_rad * random.normal(),
         alpha_rad=priors.alpha_common_rad * random.normal(),
@@ -116,7 +118,7 @@ def drawn(priors: Priors, random: np.random.Generator) -> Faults:
 
 
 def poses(device: Device) -> dict[str, Pose]:
-    """Nominal poses by name: x, y, z of Method 1, then the clamp's: Method 2's, and Method 3's four."""
+    """Nominal poses by name: x, y, z of Method 1, then those on the clamp: one of Method 2, four of Method 3."""
     g = STANDARD_GRAVITY_MPS2
     found = [on_axis(axis, g * down, f"axis {axis}") for axis, down in zip("xyz", TABLE_GRAVITY, strict=True)]
     felt = g if device.dc else 0.0
@@ -135,7 +137,7 @@ def record(
     repetitions: int = 3,
     rate_hz: float = 1000.0,
 ) -> list[Run]:
-    """All runs, position after position, `repetitions` times over: six cycles each, an LDV as the reference."""
+    """Record all runs: the positions in order, `repetitions` times, six cycles each, with an LDV as the reference."""
     hold_s = CYCLES / frequency_hz + 2 / rate_hz
     stands = _stands(device, faults, hold_s)
     none = np.zeros(3)
@@ -188,6 +190,6 @@ def _sensor(device: Device, faults: Faults, rate_hz: float) -> SensorParameters:
         highpass_hz=faults.corner_hz or None,
     )
     if not device.dc and not faults.corner_hz:
-        # AC-coupled without a corner worth the name: gravity is gone, the motion is not touched
+        # AC-coupled with a very low corner frequency: removes gravity and does not change the motion
         return replace(sensor, highpass_hz=1e-9)
     return sensor

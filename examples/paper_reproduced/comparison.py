@@ -1,4 +1,4 @@
-"""The three methods on one recording of the bench, and Appendix A of them."""
+"""The three methods applied to one recording of the bench, with Appendix A for each."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ METHODS = (1, 2, 3)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Comparison:
-    """Results of the three methods, {method: ...}. S (3, 3) with NaN where a method has none; U with its own k."""
+    """Results of the three methods, {method: ...}. S (3, 3) has NaN where a method gives no value; U has its own k."""
 
     device: Device
     frequency_hz: float
@@ -32,11 +32,11 @@ class Comparison:
     one: AmplitudeCalibration
     two: AmplitudeCalibration
     three: method3.Fit
-    windows: Sequence[Window]  # of Method 3, its segments being cycles
+    windows: Sequence[Window]  # of Method 3; each cycle is a segment
     statements: dict[int, Statement]
     sensitivity: dict[int, Array]
     offset: Array  # of Method 3
-    s_rel_pct: dict[int, Array]  # (3,) of the main sensitivities, the largest of the repetitions
+    s_rel_pct: dict[int, Array]  # (3,) of the main sensitivities, the largest value of the repetitions
 
     @property
     def main(self) -> dict[int, Array]:
@@ -45,12 +45,12 @@ class Comparison:
 
     @property
     def differences_pct(self) -> dict[tuple[int, int], Array]:
-        """A row of Table 3 or 4 for each pair."""
+        """Differences in % for each pair of methods, like a row of Table 3 or 4."""
         return differences_pct(self.main)
 
     @property
     def expanded_pct(self) -> dict[int, Array]:
-        """{method: (3,) U of the main sensitivities in % of them, k = 2}."""
+        """{method: (3,) U of the main sensitivities in % of their values, k = 2}."""
         return {
             m: 2 * np.sqrt(np.diag(s.covariance)[MAIN]) / np.abs(self.main[m]) * 100 for m, s in self.statements.items()
         }
@@ -62,7 +62,7 @@ class Comparison:
 
 
 def compare(device: Device, runs: Sequence[Run], priors: Priors) -> Comparison:
-    """Methods 1 and 2 on amplitudes, Method 3 as printed, each with its budget."""
+    """Apply Methods 1 and 2 to amplitudes and Method 3 as printed, each with its uncertainty budget."""
     by_method = {m: [r for r in runs if _method(r) == m] for m in METHODS}
     one = method1.solve(by_method[1], priors)
     two = method2.solve(by_method[2], priors, device.transverse_limit_pct)
@@ -88,7 +88,7 @@ def compare(device: Device, runs: Sequence[Run], priors: Priors) -> Comparison:
 
 
 def window(run: Run) -> Window:
-    """A run as Method 3 takes it, segments being cycles: the LDV's velocity as a_ref(t) by its sine (Eq. 12)."""
+    """A run as a window of Method 3, each cycle a segment; a_ref(t) is the sine fit of the LDV's velocity (Eq. 12)."""
     fit = four_parameter(run.time_s, run.reference)
     u, du = fit.derivative(run.time_s, 1), fit.derivative(run.time_s, 2)
     edges = cycle_edges(run.time_s, fit.frequency_hz)
@@ -106,7 +106,7 @@ def _worst(result: AmplitudeCalibration) -> Array:
 
 
 def _worst_by_cycle(windows: Sequence[Window], positions: int) -> Array:
-    """Method 3 once for each cycle of the positions of a repetition; s_rel over the cycles."""
+    """s_rel of Method 3 over the cycles of a repetition: Method 3 is solved once for each cycle."""
     worst = np.zeros(3)
     for first in range(0, len(windows), positions):
         repetition = windows[first : first + positions]
@@ -123,7 +123,10 @@ def _cycle(w: Window, k: int) -> Window:
 
 
 def joint_difference(comparison: Comparison, joint: NDArray[np.float64]) -> tuple[Array, Array]:
-    """d (12,) = S_2 - S_1 (main), S_3 - S_1 (all nine), and its covariance from the methods' joint one (36, 36)."""
+    """d (12,): S_2 - S_1 (main sensitivities), then S_3 - S_1 (all nine); and its covariance (12, 12).
+
+    `joint` (36, 36) is the joint covariance of the three methods.
+    """
     S = comparison.sensitivity
     rows = np.zeros((12, 36))
     for row, parameter in enumerate(MAIN):

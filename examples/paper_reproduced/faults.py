@@ -1,4 +1,4 @@
-"""Which faults of the bench explain a spread like the paper's: each alone, and the smallest that give its tables."""
+"""Which faults of the bench explain differences like the paper's: each fault alone, and the smallest set of faults."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from paper_reproduced.published import OFFSET, corrected_pct
 FREQUENCIES_HZ = (3, 6)
 AMPLITUDE_MPS2 = 10.0
 
-# What the methods' authors may have known of their bench. It gives U of 0.5, 5.5 and 2.7 %; section 3.3 says 0.5, 5, 3.
+# Uncertainties that the authors may have known of their bench. They give U of 0.5, 5.5 and 2.7 %; section 3.3 has 0.5,
+# 5 and 3 %.
 STATED = Priors(
     angle_rad=float(np.deg2rad(0.5)),
     theta_rad=float(np.deg2rad(0.5)),
@@ -47,8 +48,8 @@ ALONE: Mapping[str, Faults] = {
     "g 0.03 m/s² larger than 9.80665": Faults(gravity_mps2=0.03),
     "reference 0.5 % too high": Faults(reference=0.005),
 }
-SQUARED_LAG = "lag, second order"  # its pull is (lag / u)2: a lag acts by its square
-# A corner takes gravity from a DC sensor; offsets and gravity do nothing to an AC sensor.
+SQUARED_LAG = "lag, second order"  # its pull is (lag / u)^2, because the effect of a lag is proportional to its square
+# An AC corner removes gravity from the output of a DC sensor. Offsets and gravity have no effect on an AC sensor.
 SENSELESS = {"mems": {"AC corner"}, "piezo": {"offset", "g 0.03"}}
 
 
@@ -61,7 +62,7 @@ class Alone:
 
 
 def alone(device: Device, seed: int) -> list[Alone]:
-    """Each fault by itself on a quiet sensor."""
+    """Simulate each fault alone, on a sensor without noise."""
     quiet = replace(device, noise_mps2=0.0)
     found = []
     for name, faults in ALONE.items():
@@ -74,8 +75,9 @@ def alone(device: Device, seed: int) -> list[Alone]:
 class Explanation:
     """The smallest faults, in units of their stated u, that give the paper's numbers at one frequency.
 
-    `pulls` {name: size in u}, largest first; `found` what a bench with these faults then gives; `chi2` of the paper's
-    numbers, `numbers` of them, against the stated budget.
+    - `pulls` {name: size in u}, largest first.
+    - `found`: the results of a bench with these faults.
+    - `chi2`: chi-squared of the paper's numbers against the stated budget; `numbers` is their count.
     """
 
     device: Device
@@ -87,9 +89,10 @@ class Explanation:
 
 
 def explain(device: Device, frequency_hz: int, seed: int) -> Explanation:
-    """Least squares weighted by the stated budget, z = A' (A A' + rounding)^-1 d, then tried on the bench.
+    """Least squares weighted by the stated budget, z = A' (A A' + rounding)^-1 d; the result is then simulated.
 
-    d are d_21 and d_31, for a DC sensor also Q less the mean of both frequencies (its own Q nobody knows).
+    d has d_21 and d_31; for a DC sensor also Q minus the mean of Q over both frequencies, because its true Q is
+    unknown.
     """
     straight = np.diag(np.diag(device.sensitivity))
     offset = np.mean([OFFSET[device.key, f] for f in FREQUENCIES_HZ], axis=0) if device.dc else device.offset
@@ -99,7 +102,7 @@ def explain(device: Device, frequency_hz: int, seed: int) -> Explanation:
     wanted = _numbers(device, printed, np.array(OFFSET[device.key, frequency_hz]) - offset)
     columns = _columns(base)
     pulls, chi2 = _smallest(columns, wanted, _rounding(device))
-    if pulls.get(SQUARED_LAG, 0.0) < 0.0:  # no lag makes Method 3 larger
+    if pulls.get(SQUARED_LAG, 0.0) < 0.0:  # no lag can increase the result of Method 3
         del columns[SQUARED_LAG]
         pulls, chi2 = _smallest(columns, wanted, _rounding(device))
     return Explanation(
@@ -118,17 +121,17 @@ def _measured(device: Device, faults: Faults, frequency_hz: int, seed: int) -> C
 
 
 def _numbers(device: Device, differences_pct: Mapping[tuple[int, int], Array], offset: Array) -> Array:
-    """What is to be explained as one vector: d_21, d_31 in %, Q in output unit where there is one."""
+    """The numbers to be explained as one vector: d_21, d_31 in %, and Q in output unit for a DC sensor."""
     return np.concatenate([differences_pct[2, 1], differences_pct[3, 1], *([offset] if device.dc else [])])
 
 
 def _rounding(device: Device) -> Array:
-    """u of the printed numbers: half a unit of the last of two digits, rectangular; Q has four."""
+    """u of the printed numbers: rectangular, half a unit of the last digit (two digits; four for Q)."""
     return np.append(np.full(6, 0.05 / np.sqrt(3)), np.full(3 if device.dc else 0, 1e-4))
 
 
 def _columns(base: Comparison) -> dict[str, Array]:
-    """{nuisance: what one u of it does to the numbers}, to the first order."""
+    """{nuisance: change of the numbers by one u of it}, first order."""
     none = np.zeros(12)
     columns = {}
     for name in dict.fromkeys(name for s in base.statements.values() for name in s.contributions):
@@ -146,14 +149,14 @@ def _columns(base: Comparison) -> dict[str, Array]:
 
 
 def _smallest(columns: Mapping[str, Array], wanted: Array, rounding: Array) -> tuple[dict[str, float], float]:
-    """The smallest pulls that give `wanted` to the rounding, and chi-squared of `wanted`."""
+    """The smallest pulls that give `wanted` within the rounding, and chi-squared of `wanted`."""
     A = np.array(list(columns.values())).T
     weights = np.linalg.solve(A @ A.T + np.diag(rounding**2), wanted)
     return dict(zip(columns, (A.T @ weights).tolist(), strict=True)), float(wanted @ weights)
 
 
 def _faults(device: Device, pulls: Mapping[str, float]) -> Faults:
-    """The bench of these pulls."""
+    """The faults of a bench with these pulls."""
 
     def size(name: str, u: float) -> float:
         return u * pulls.get(name, 0.0)
@@ -177,7 +180,7 @@ def _faults(device: Device, pulls: Mapping[str, float]) -> Faults:
 
 
 def _crossed(device: Device, pulls: Mapping[str, float]) -> Array:
-    """The device's S with the transverse sensitivities that Method 2 is to have met."""
+    """S of the device with the transverse sensitivities that these pulls assume in Method 2."""
     S = device.sensitivity.copy()
     u = device.transverse_limit_pct / 100 / np.sqrt(3)
     for i, row in enumerate("xyz"):

@@ -1,4 +1,4 @@
-"""Figures 2 and 7-18 of the paper, from the virtual bench, and two that it does not have: s_rel and the budgets."""
+"""Figures 2 and 7-18 of the paper, from the virtual bench, and two more: s_rel and the uncertainty budgets."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from paper_reproduced.bench import Device
 from paper_reproduced.comparison import MAIN, METHODS, Comparison
 from paper_reproduced.published import REPEATABILITY_PCT, corrected_pct
 
-# Okabe and Ito's colours, told apart by everybody and in grey
+# Colours of Okabe and Ito: distinct for colour-blind readers and in grey.
 BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#555555"
 COLOUR = {1: BLUE, 2: ORANGE, 3: GREEN}
 AXIS_COLOUR = dict(zip("xyz", (BLUE, ORANGE, GREEN), strict=True))
@@ -32,16 +32,16 @@ STYLE: dict[Any, Any] = {
     "grid.color": "#dddddd",
     "grid.linewidth": 0.6,
     "legend.frameon": False,
-    "svg.hashsalt": "fieldcal",  # the same figure gives the same file
+    "svg.hashsalt": "fieldcal",  # fixed, so that the same figure gives the same file
     "path.simplify": True,
 }
-MAGNIFIED = 10  # transverse parts in the 3-D diagrams
+MAGNIFIED = 10  # factor of the transverse parts in the 3-D diagrams
 OBLIQUE = np.array([[-0.72, -0.40], [0.88, -0.28], [0.0, 1.0]])  # x, y, z on paper
 LABEL = {"x": (-0.95, -0.05), "y": (0.95, 0.12), "z": (0.62, 0.95)}
 
 
 def save(figure: Figure, path: Path) -> None:
-    """As the ending of `path` says; an SVG is the same file every time."""
+    """Write the figure in the format of the suffix of `path`; an SVG has the same bytes every time."""
     with mpl.rc_context(STYLE):
         figure.savefig(path, metadata={"Date": None} if path.suffix == ".svg" else None, dpi=110)
 
@@ -62,7 +62,7 @@ def figure_2(run: Run, a_ref_mps2: Array, unit: str) -> Figure:
 
 
 def rows_of_s(device: Device, at: Mapping[int, Comparison]) -> Figure:
-    """Rows of S as points in space (Figure 6's notation): a column for each method, 3 Hz above 6 Hz."""
+    """Rows of S as points in space (notation of Figure 6): one column per method, 3 Hz above 6 Hz."""
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(8.4, 5.6), layout="constrained")
         panels = figure.subplots(2, 3)
@@ -89,7 +89,7 @@ def _diagram(axes: Any, nominal: float, S: Array) -> None:
         axes.text(*(1.37 * tip), axis, color=GREY, ha="center", va="center")
         seen = np.isfinite(S[i]).all()
         row = np.where(unit > 0, S[i], MAGNIFIED * S[i] if seen else 0.0) / nominal
-        # dotted: along the other two axes from the ideal point to the row's
+        # dotted: from the ideal point to the row's point, along the other two axes
         steps = [row[i] * unit, *(np.diag(row)[j] for j in range(3) if j != i)]
         corners = np.cumsum(steps, axis=0) @ OBLIQUE
         axes.plot(*corners.T, color=colour, lw=1.0, ls=":")
@@ -100,7 +100,7 @@ def _diagram(axes: Any, nominal: float, S: Array) -> None:
 
 
 def bars(device: Device, at: Mapping[int, Comparison]) -> Figure:
-    """Main sensitivity per method with k = 2 bars, and where the paper's differences would put Methods 2 and 3."""
+    """Main sensitivities by method with U (k = 2), and Methods 2 and 3 as they follow from the paper's differences."""
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(8.4, 3.6), layout="constrained")
         panels = figure.subplots(1, 3, sharey=False)

@@ -1,4 +1,4 @@
-"""Monte Carlo (JCGM 101) on the virtual bench: benches and sensors drawn from what the budgets state."""
+"""Monte Carlo (JCGM 101) on the virtual bench: benches and sensors are drawn as the budgets state."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ ADJUSTED = "3, adjusted"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drawn:
-    """Of one device and method: U (k = 2) of the main sensitivities (3,) in %, by GUM and as twice the errors' rms.
+    """Result for one device and one method.
 
-    `within` of the `errors` lie within U.
+    U (k = 2) of the main sensitivities (3,) in %: by the GUM budget, and as twice the rms of the errors. `within` of
+    the `errors` lie within U.
     """
 
     device: Device
@@ -31,7 +32,7 @@ class Drawn:
 
 
 def monte_carlo(device: Device, priors: Priors, benches: int, seed: int) -> list[Drawn]:
-    """`benches` recordings at 3 Hz, 10 m/s2, 200 samples a second, one repetition each, three methods on each."""
+    """Apply the three methods to `benches` recordings (3 Hz, 10 m/s2, 200 samples/s, one repetition)."""
     random = np.random.default_rng(seed)
     off = {m: np.empty((benches, 3)) for m in (*map(str, METHODS), ADJUSTED)}
     U = {m: np.empty((benches, 3)) for m in off}
@@ -60,7 +61,7 @@ def monte_carlo(device: Device, priors: Priors, benches: int, seed: int) -> list
 
 
 def _sensor(device: Device, random: np.random.Generator) -> Device:
-    """The device with transverse sensitivities anywhere within the limit that Method 2 was told."""
+    """The device with transverse sensitivities drawn evenly within the limit that Method 2 assumes."""
     limit = device.transverse_limit_pct / 100
     main = np.diag(device.sensitivity)
     S = main[:, None] * random.uniform(-limit, limit, (3, 3))

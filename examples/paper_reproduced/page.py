@@ -1,4 +1,4 @@
-"""docs/paper.md: the paper's numbers beside those of the virtual bench."""
+"""Writes docs/paper.md: the paper's numbers beside those of the virtual bench."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ FIGURES = {PIEZO.key: ("7-9", "10-12"), MEMS.key: ("13-15", "16-18")}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Findings:
-    """All that the page shows. `at` {device: {frequency: comparison at 10 m/s2}}."""
+    """Everything that the page shows. `at` {device: {frequency: comparison at 10 m/s2}}."""
 
     at: Mapping[str, Mapping[int, Comparison]]
     alone: Mapping[str, Sequence[Alone]]
@@ -67,12 +67,12 @@ The bench is the paper's: a horizontal slide moved by a sine of 3 or 6 Hz and 2 
 reference (Eq. 12), 1000 samples a second, six cycles a run, three repetitions. Method 1 has one axis along the motion
 (Eqs. 1-4), Method 2 the clamp at θ = 35°, α = 135° (Eqs. 5-7), Method 3 four α on the same clamp (Eqs. 8-11), solved
 by least squares over all points as printed. Sensors: {PIEZO.name} (10 mV per m/s², AC-coupled)
-and {MEMS.name} (DC, output in m/s²). Which four α each had is not said in the text; taken here:
-{_list(PIEZO.alphas_deg)}° and {_list(MEMS.alphas_deg)}°. The sensors' S is made up inside the paper's
+and {MEMS.name} (DC, output in m/s²). The paper does not say which four α each sensor had; taken here:
+{_list(PIEZO.alphas_deg)}° and {_list(MEMS.alphas_deg)}°. The sensors' S is invented within the paper's
 bounds (transverse below {TRANSVERSE_PCT["piezo"]:g} and {TRANSVERSE_PCT["mems"]:g} %); Q is that of sections 3.1.3 and
 3.2.3 at 3 Hz.
 
-What the bench is *stated* to be known to, as standard uncertainties; the paper leaves its own to Part 2.
+The table states the standard uncertainties that are assumed for the bench. The paper leaves its own to Part 2.
 
 {stated}
 
@@ -110,9 +110,9 @@ their rounding (`tests/unit/test_paper_tables.py`)."""
 
 {table}{note}
 
-Without faults Methods 1 and 3 agree to {_worst(at, (3, 1)):.3f} %. Method 2 differs by what it cannot see: transverse
-sensitivities of at most {transverse:.1f} % (paper: all under {TRANSVERSE_PCT[device.key]:g} %) are enough for the
-paper's differences between Methods 2 and 1.
+Without faults Methods 1 and 3 agree to {_worst(at, (3, 1)):.3f} %. Method 2 differs because it neglects transverse
+sensitivities: values of at most {transverse:.1f} % (paper: all under {TRANSVERSE_PCT[device.key]:g} %) are enough to
+explain the paper's differences between Methods 2 and 1.
 
 {_offsets(device, found)}
 
@@ -123,7 +123,7 @@ paper's differences between Methods 2 and 1.
 ![Main sensitivities by method](paper/methods-{device.key}.svg)
 
 **Figures {bars}.** Main sensitivities with expanded uncertainty (k = 2).
-Crosses: where the printed d_rel would put them."""
+Crosses: Method 1 of the bench plus the printed d_rel."""
 
 
 def _offsets(device: Device, found: Findings) -> str:
@@ -146,8 +146,8 @@ def _repeatability(found: Findings) -> str:
     return f"""## Repeatability
 
 s_rel over the six cycles (Appendix A) at 10 m/s², in %: the largest of three repetitions, three axes and both
-frequencies. White noise of {MEMS.noise_mps2:g} m/s² on the sensor is of the order that the paper found; s_rel
-falls as one over the amplitude.
+frequencies. White noise of {MEMS.noise_mps2:g} m/s² on the sensor gives s_rel of the size that the paper found; s_rel
+is inversely proportional to the amplitude.
 
 {_table(("sensor", "method", "paper", "bench"), lines)}
 
@@ -169,34 +169,34 @@ def _uncertainty(found: Findings) -> str:
     head = ("sensor", "method", "paper", "GUM", "Monte Carlo", "errors within U")
     return f"""## Uncertainty
 
-Expanded uncertainty (k = 2) of S_xx · S_yy · S_zz in %, 3 Hz. The Monte Carlo is that many virtual benches and sensors
-drawn from the stated uncertainties, transverse sensitivities anywhere below the verified limit; it shares no code with
-the budgets.
+Expanded uncertainty (k = 2) of S_xx · S_yy · S_zz in %, 3 Hz. The Monte Carlo simulates that many virtual benches and
+sensors, drawn from the stated uncertainties; transverse sensitivities are drawn evenly below the verified limit. It
+shares no code with the budgets.
 
 {_table(head, lines)}
 
 ![Budget by source](paper/budgets.svg)
 
-Half a degree in θ is what makes Method 3 a method of 3 %; transverse sensitivities that are only known to be small make
-Method 2 one of 5 %. The adjustment (`calib/estimate/`, "3, adjusted") takes the recordings of Method 3 and the same
-stated uncertainties; it sees θ in the data of the DC-coupled sensor."""
+The uncertainty of half a degree in θ gives Method 3 its U of about 3 %. Transverse sensitivities, of which only an
+upper limit is known, give Method 2 its U of about 5 %. The adjustment (`calib/estimate/`, "3, adjusted") uses the
+recordings of Method 3 and the same stated uncertainties; it estimates θ from the data of the DC-coupled sensor."""
 
 
 def _alone(found: Findings) -> str:
     tables = "\n\n".join(_alone_table(device, found.alone[device.key]) for device in DEVICES)
     tilted = next(row for row in found.alone[MEMS.key] if row.name.startswith("θ")).at[3]
     residual = float(tilted.three.residual_sd.max())
-    return f"""## Which fault explains a spread like theirs
+    return f"""## Which fault explains differences like the paper's
 
-Each fault alone, no noise. What the first row shows of d₂₁ are the transverse sensitivities that Method 2 does not see;
-d₂₁ is the same at both frequencies.
+Each fault alone, no noise. In the first row d₂₁ comes from the transverse sensitivities, which Method 2 neglects. d₂₁
+is the same at both frequencies.
 
 {tables}
 
-The methods differ because each takes the same fault differently. Half a degree of θ moves S_zz of the MEMS by
-{tilted.differences_pct[3, 1][2]:.1f} % in Method 3 and leaves a residual of {residual:.2f} m/s²: the fit looks fine.
-Only two kinds of fault make Method 3 at 6 Hz another one than at 3 Hz: what turns the phase (a lag, an AC corner), and
-whatever changes from run to run (angles set anew, offsets)."""
+The methods differ because the same fault has a different effect in each. Half a degree of θ changes S_zz of the MEMS by
+{tilted.differences_pct[3, 1][2]:.1f} % in Method 3 but leaves a residual of only {residual:.2f} m/s², so the fit does
+not show the fault. Only two kinds of fault make the results of Method 3 at 6 Hz differ from those at 3 Hz: faults that
+turn the phase (a lag, an AC corner), and faults that change from run to run (angles set again, offsets)."""
 
 
 def _alone_table(device: Device, rows: Sequence[Alone]) -> str:
@@ -219,18 +219,18 @@ def _explained(found: Findings) -> str:
     moved = abs(OFFSET[MEMS.key, 3][0] - OFFSET[MEMS.key, 6][0])
     return f"""## The smallest faults that give the paper's numbers
 
-Each frequency is taken as a bench of its own. Looked for are the faults, together as small as possible in units of
-their stated standard uncertainties, that give the printed d₂₁ and d₃₁ and, for the MEMS, the printed Q (its own Q being
-the mean of both). The last column of the tables above is the virtual bench with exactly these faults. χ² is that of the
-paper's numbers against the stated uncertainties: about as large as their count where these explain them.
+Each frequency is treated as a separate bench. The table has the smallest set of faults, in units of their stated
+standard uncertainties, that gives the printed d₂₁ and d₃₁ and, for the MEMS, the printed Q (its true Q is taken as the
+mean of both frequencies). The last column of the tables above is the virtual bench with exactly these faults. χ²
+compares the paper's numbers with the stated uncertainties: if these explain the numbers, χ² is about their count.
 
 {_table(("sensor", "", "χ²", "largest faults, in units of their u"), lines)}
 
-The piezo-electric sensor at 3 Hz is an ordinary draw from the stated bench. At 6 Hz it takes a lag between sensor and
-vibrometer. The MEMS's numbers, with its Q, ask for {" and ".join(factors)} times the stated uncertainties, spread over
-many faults: its data came over USB with a clock of its own, and q_x moved by {moved:.2f} m/s² between two fits of one
-sensor. That is geometry, offset and time in the fit, not the sensor; the adjustment has them as unknowns. Which of them
-it was on that bench the printed numbers cannot tell: there are more faults than numbers."""
+The stated uncertainties explain the piezo-electric sensor at 3 Hz. At 6 Hz a lag between sensor and vibrometer is
+needed as well. The MEMS's numbers, with its Q, need {" and ".join(factors)} times the stated uncertainties, spread over
+many faults: its data came over USB with a clock of its own, and q_x changed by {moved:.2f} m/s² between two fits of one
+sensor. The cause is geometry, offset and time in the fit, not the sensor; the adjustment has them as unknowns. The
+printed numbers cannot tell which of these faults the bench had, because there are more faults than numbers."""
 
 
 def _pull(name: str, size: float) -> str:

@@ -1,4 +1,4 @@
-"""What the paper printed: D'Emilia, Gaspari, Mazzoleni, Natale, Schiavi, Part 1, J. Sens. Sens. Syst. 7, 2018."""
+"""Numbers printed in the paper: D'Emilia, Gaspari, Mazzoleni, Natale, Schiavi, Part 1, J. Sens. Sens. Syst. 7, 2018."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ def _rows(d_21: str, d_31: str, d_32: str) -> dict[Pair, Printed]:
     return {pair: (x, y, z) for pair, (x, y, z) in zip(((2, 1), (3, 1), (3, 2)), rows, strict=True)}
 
 
-# Tables 3 and 4, d_rel (S_xx, S_yy, S_zz) in %, as printed: digits tell the rounding.
+# Tables 3 and 4, d_rel (S_xx, S_yy, S_zz) in %, as printed; the number of digits gives the rounding.
 DIFFERENCES_PCT: dict[tuple[str, int], dict[Pair, Printed]] = {
     ("piezo", 3): _rows("0.51 1.3 2.0", "-0.18 -0.24 0.91", "-0.69 -1.5 -1.1"),
     ("piezo", 6): _rows("0.54 1.2 1.9", "-0.20 -1.1 -1.3", "-0.74 -2.3 -3.2"),
     ("mems", 3): _rows("0.73 -0.12 -0.19", "2.8 -0.49 1.1", "2.1 -0.37 -0.93"),
     ("mems", 6): _rows("0.68 -0.25 0.11", "1.8 1.5 1.4", "1.1 1.7 1.3"),
 }
-# Of this entry d_31 does not fit the other two: it is -1.1.
+# In this entry the printed d_31 of 1.1 contradicts the other two differences; it must be -1.1.
 MISPRINT = ("mems", 3, 2)
 
 # Sections 3.1.3 and 3.2.3, Q of Method 3 in output unit (mV, m/s2).
@@ -46,7 +46,7 @@ def decimals(text: str) -> int:
 
 
 def corrected_pct(device: str, frequency_hz: int, pair: Pair) -> tuple[float, float, float]:
-    """A row of Table 3 or 4 as numbers, the misprint put right."""
+    """A row of Table 3 or 4 as numbers, with the misprint corrected."""
     x, y, z = (float(text) for text in DIFFERENCES_PCT[device, frequency_hz][pair])
     if (device, frequency_hz) == MISPRINT[:2] and pair == (3, 1):
         z = -z

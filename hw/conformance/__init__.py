@@ -1,4 +1,4 @@
-"""What every driver must do, as test classes to subclass, here and in plug-ins. Needs pytest."""
+"""Tests that every driver must pass, as test classes to subclass, in this repository and in plug-ins. Needs pytest."""
 
 import pytest
 

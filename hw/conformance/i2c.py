@@ -1,4 +1,4 @@
-"""What every driver that polls a FIFO over I2C must do: the contract on a register-level twin under the real smbus2."""
+"""Tests that every driver which polls a FIFO over I2C must pass, on a register-level twin under the real smbus2."""
 
 from __future__ import annotations
 
@@ -22,13 +22,19 @@ LAP = 1000
 
 @functools.cache
 def numbered_counts() -> NDArray[np.int32]:
-    """x and y count samples in laps and laps, z is their negative sum; enough for the longest test."""
+    """Counts (n, 3) that number the samples: x + 500 is the place within a lap, y + 550 the lap, z = -(x + y).
+
+    There are enough samples for the longest test.
+    """
     lap, place = np.divmod(np.arange(1_100_000, dtype=np.int32), LAP)
     return np.column_stack([place - 500, lap - 550, 1050 - place - lap])
 
 
 class I2cRig(Rig):
-    """A subclass names driver, twin, options and what its range ends with."""
+    """Rig for a driver on I2C.
+
+    A subclass names the driver, the twin, the options and the highest count of the range.
+    """
 
     driver: ClassVar[type[FifoSensor]]
     twin_class: ClassVar[type[FifoTwin]]
@@ -40,7 +46,7 @@ class I2cRig(Rig):
 
     @property
     def fifo_register(self) -> int:
-        """Where a read that takes samples begins."""
+        """Register at which a read that takes samples starts."""
         return self.twin_class.data_register
 
     def __init__(self) -> None:
@@ -67,7 +73,7 @@ class I2cRig(Rig):
         return self.build(bus=7)
 
     def put(self, twin: FifoTwin) -> None:
-        """Another device at the address."""
+        """Put another device at the address."""
         self.twin = self.bus.targets[self.address] = twin
 
     def counts(self, first: int, n: int) -> NDArray[np.int32]:
@@ -106,11 +112,12 @@ class I2cRig(Rig):
 
 
 class I2cContract(SensorContract):
-    filter_register: ClassVar[tuple[int, str]]  # a setting, and its name in messages
-    trimmed: ClassVar[dict[int, int]]  # offsets, high-pass filter, self-test: what somebody may have left on
-    late_s: ClassVar[float]  # longer than the FIFO holds
-    temperature: ClassVar[tuple[int, float] | None]  # a raw number and its degC
-    self_test_range: ClassVar[float] = 1.0  # times the range that is set
+    filter_register: ClassVar[tuple[int, str]]  # a settings register, and its name in messages
+    # Registers (offsets, high-pass filter, self-test) with values that somebody may have left in them
+    trimmed: ClassVar[dict[int, int]]
+    late_s: ClassVar[float]  # longer than the time in which the FIFO fills
+    temperature: ClassVar[tuple[int, float] | None]  # a raw value and its degC
+    self_test_range: ClassVar[float] = 1.0  # range during the self-test as a multiple of the range that is set
 
     @pytest.mark.parametrize("number", [errno.ENXIO, errno.EREMOTEIO])
     def test_nobody_at_the_address(self, rig: I2cRig, number: int) -> None:
@@ -186,7 +193,8 @@ class I2cContract(SensorContract):
 
     @pytest.mark.parametrize("words", [1, 9, 12, 48])
     def test_a_read_that_broke_off_restarts(self, rig: I2cRig, words: int) -> None:
-        # 12 and 48 words are whole samples and whole rounds of a counter: no mark is missing, and still they are gone.
+        # 12 and 48 words are whole samples and whole cycles of the word counter: the counter shows no gap, but samples
+        # are lost.
         rig.sensor.open()
         _, before = rig.read()
         rig.twin.break_off(errno.EIO, words)
@@ -204,7 +212,7 @@ class I2cContract(SensorContract):
         assert after[0] > before[-1] + 1
 
     def test_fifo_that_runs_over_between_count_and_read(self, rig: I2cRig) -> None:
-        # The process waits for a processor between the two: what is read does not follow what was read before.
+        # The process does not get the processor between the two reads: the data do not follow the data read before.
         class Stalling(rig.twin_class):  # type: ignore[name-defined,misc]
             stall_s = 0.0
 
@@ -261,9 +269,9 @@ class I2cContract(SensorContract):
         assert report.faults == []
         assert info.nominal_sensitivity is not None
         counts_per_g = info.nominal_sensitivity * 9.80665 / self.self_test_range
-        # of 0 and 1 in turn, of 0 to 3, of 0 to 7
+        # The noise is that of the indications 0, 1, 0, 1 in x, 0 to 3 in y, 0 to 7 in z.
         assert [g * counts_per_g for g in report.noise_g] == pytest.approx([0.5, 1.118, 2.291], rel=0.01)
-        rig.sensor.open()  # and it is off again
+        rig.sensor.open()  # this switches the self-test off
         block = rig.sensor.read_block()
         assert block is not None
         assert block.indications.max() == 7
@@ -276,5 +284,5 @@ class I2cContract(SensorContract):
         rig.sensor.open()
         faults = rig.sensor.self_test().faults
         assert len(faults) == 6
-        assert "x changes by 0.000 g, not by" in faults[0]
-        assert "is it dead?" in faults[1]
+        assert "x changes by 0.000 g, the limits are" in faults[0]
+        assert "may be dead" in faults[1]

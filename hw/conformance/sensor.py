@@ -1,4 +1,4 @@
-"""What every driver must do, on a device that numbers its samples. Subclass `SensorContract` and give it a rig."""
+"""Tests that every driver must pass, on a device that numbers its samples. Subclass `SensorContract` with a rig."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ EPOCH_NS = 1_700_000_000_000_000_000
 
 
 class Rig(ABC):
-    """A driver on a simulated device at `rate_hz`, both on one simulated clock that only `sleep` moves.
+    """A driver on a simulated device at `rate_hz`. Both use one simulated clock, which only `sleep` moves.
 
-    Sample k of the device says k in its indications (`number`), and exists from time k / rate_hz on.
+    The indications of sample k contain the number k (see `number`). Sample k exists from time k / rate_hz on.
     """
 
     sensor: Sensor
@@ -35,29 +35,29 @@ class Rig(ABC):
         self.t_s += seconds
 
     def due(self, t_s: float) -> int:
-        """How many samples the device has made."""
+        """Number of samples that the device has made until `t_s`."""
         due = int(np.floor(t_s * self.rate_hz + 1e-6)) + 1
         return due if self.silent_from is None else min(due, self.silent_from)
 
     def silence(self) -> None:
-        """From now on the device makes no more samples."""
+        """The device makes no more samples from now on."""
         self.silent_from = self.due(self.t_s)
 
     @abstractmethod
     def build_elsewhere(self) -> Sensor:
-        """A driver whose port is not there."""
+        """A driver whose port does not exist."""
 
     @abstractmethod
     def number(self, indications: NDArray[np.generic]) -> NDArray[np.int64]:
-        """The device's numbers of these samples; fails when the axes of a row do not belong together."""
+        """Sample numbers (n,) of the indications (n, axes); fails if the axes of a row belong to different samples."""
 
     @abstractmethod
     def saturate(self, first: int, last: int) -> None:
-        """Samples first .. last are at the end of the range."""
+        """Put samples `first` to `last` at the end of the range."""
 
     @abstractmethod
     def lose(self) -> None:
-        """Some samples vanish between device and driver, in the middle of those that wait to be read."""
+        """Remove some of the samples that wait to be read, in the middle of them."""
 
     @abstractmethod
     def unplug(self) -> None: ...
@@ -73,7 +73,7 @@ class Rig(ABC):
         return self.sensor.open()
 
     def blocks(self, seconds: float) -> Iterator[SampleBlock]:
-        """Blocks until there is so much of them."""
+        """Read blocks until they hold at least `seconds` of samples."""
         samples = seconds * self.rate_hz
         while samples > 0:
             block = self.sensor.read_block()
@@ -83,7 +83,7 @@ class Rig(ABC):
 
 
 def check_shape(block: SampleBlock, axes: int) -> None:
-    """What a block promises by itself."""
+    """Check what a block promises by itself: shapes, types, order."""
     assert block.n > 0
     assert block.indications.shape == (block.n, axes)
     assert block.indications.dtype in (np.int32, np.float64)
@@ -142,7 +142,7 @@ class SensorContract(ABC):
         assert rig.sensor.take_drops() == []
 
     def test_arrivals_are_late_by_less_than_a_sample(self, rig: Rig) -> None:
-        # The simulated reads take no time: what had been made when the burst was read must be all that was counted.
+        # The simulated reads take no time: the burst must hold exactly the samples that existed at its arrival.
         rig.open()
         for block in rig.blocks(2.0):
             numbers = rig.number(block.indications)
@@ -150,7 +150,8 @@ class SensorContract(ABC):
             assert numbers[block.burst_count - 1].tolist() == last_made
 
     def test_polls_do_not_beat_with_the_sample_clock(self, rig: Rig) -> None:
-        # Lateness within a sample period must be spread evenly in any second, though the clocks' ratio is rational.
+        # The delay from sample to arrival must be spread evenly over a sample period in any second, although the ratio
+        # of the two clocks is rational.
         rig.open()
         arrivals_ns = np.concatenate([block.burst_t_monotonic_ns for block in rig.blocks(1.0)])
         lateness = arrivals_ns * 1e-9 * rig.rate_hz % 1.0
@@ -208,7 +209,7 @@ class SensorContract(ABC):
         assert there in rig.number(marked[0].indications)
 
     def test_a_loss_is_marked_where_it_is(self, rig: Rig) -> None:
-        # Wherever two neighbours in a block are not neighbours in the device, a reader is told a wrong time.
+        # Neighbours in a block must be neighbours in the device; otherwise a reader computes wrong times.
         rig.open()
         *_, before = rig.blocks(0.6)
         rig.sleep(0.02)
@@ -225,7 +226,8 @@ class SensorContract(ABC):
 
     @pytest.mark.parametrize("seconds", [0.1, 3.0])
     def test_a_late_reader_is_told(self, rig: Rig, seconds: float) -> None:
-        # What overflows meanwhile differs (FIFO of the device, buffer of the kernel), that it is told does not.
+        # Devices lose samples in different places (FIFO of the device, buffer of the kernel), but every driver must
+        # report it.
         rig.open()
         *_, before = rig.blocks(0.6)
         rig.sleep(seconds)

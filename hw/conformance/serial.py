@@ -1,4 +1,4 @@
-"""What every driver on a serial port must do: the contract on a pseudo-terminal under the real pyserial."""
+"""Tests that every driver on a serial port must pass, on a pseudo-terminal under the real pyserial."""
 
 from __future__ import annotations
 
@@ -19,11 +19,14 @@ from hw.sensor import DeviceLost
 from hw.serial_sensor import SerialSensor
 from hw.virtual.serial_port import PtyDevice
 
-KERNEL_BUFFER = 4095  # bytes a terminal holds for its reader
+KERNEL_BUFFER = 4095  # bytes that a terminal keeps for its reader
 
 
 class SerialRig(Rig):
-    """A subclass names the driver, its options, and what the device writes."""
+    """Rig for a driver on a serial port.
+
+    A subclass names the driver, its options, and the bytes that the device writes.
+    """
 
     driver: ClassVar[type[SerialSensor]]
     known: ClassVar[dict[str, Any]]
@@ -32,7 +35,7 @@ class SerialRig(Rig):
         self.saturated = range(0)
         self.next = 0
         self.text = b""
-        self.noise = b""  # what the device says instead
+        self.noise = b""  # bytes that the device writes instead of its samples
         self.noise_bytes = 0
         self.port = PtyDevice(self.text_due, lambda: self.t_s, link, self.received)
         self.listener: int | None = None
@@ -40,10 +43,10 @@ class SerialRig(Rig):
 
     @abstractmethod
     def write(self, first: int, n: int) -> bytes:
-        """What the device writes of these samples."""
+        """Bytes that the device writes for samples first .. first + n - 1."""
 
     def received(self, data: bytes) -> None:
-        """What the driver sent."""
+        """Handle bytes that the driver sent to the device."""
 
     def build(self, **changes: Any) -> SerialSensor:
         options = {"port": str(self.port.path), "rate_hz": self.rate_hz} | self.known | changes
@@ -64,7 +67,7 @@ class SerialRig(Rig):
         return self.text
 
     def sleep(self, seconds: float) -> None:
-        """Time passes; the device writes what it made, as far as the terminal holds it, and it reaches the reader."""
+        """Move the clock; the device writes its new samples, as far as the terminal has room, to the reader."""
         super().sleep(seconds)
         lost = self.port.lost_bytes
         waiting = self.waiting()
@@ -74,19 +77,19 @@ class SerialRig(Rig):
         wanted = min(waiting + len(self.text) - (self.port.lost_bytes - lost), KERNEL_BUFFER)
         deadline = time.monotonic() + 5.0
         while self.waiting() < wanted and time.monotonic() < deadline:
-            pass  # the kernel hands the bytes on from a worker of its own, within microseconds
+            pass  # the kernel passes the bytes on from its own worker thread, within microseconds
 
     def waiting(self) -> int:
-        """Bytes that wait for the reader, asked by a second file that never reads."""
+        """Number of bytes that wait for the reader, asked through a second file that never reads."""
         if self.listener is None:
             return 0
         try:
             return int(struct.unpack("I", fcntl.ioctl(self.listener, termios.FIONREAD, b"\0\0\0\0"))[0])
-        except OSError:  # hung up
+        except OSError:  # the port is unplugged
             return 0
 
     def open(self) -> DeviceInfo:
-        """As a driver does it, and the device then goes on where it is."""
+        """Open the port like the driver does; the device goes on from its present sample."""
         if self.listener is not None:
             os.close(self.listener)
             self.listener = None

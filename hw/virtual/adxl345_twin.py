@@ -1,6 +1,6 @@
-"""An ADXL345 at register level with its live FIFO: 32 samples and one more in the output registers.
+"""An ADXL345 at register level with its FIFO of 32 samples; one more sample is in the output registers.
 
-Without the FIFO (bypass) these hold the sample made last.
+Without the FIFO (bypass mode) the output registers hold the newest sample.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ READ_ONLY = frozenset((0x2B, INT_SOURCE, *range(DATA, DATA + 6), FIFO_STATUS))
 
 
 class Adxl345Twin(FifoTwin):
-    """See FifoTwin. Reading from DATA on takes one sample from the FIFO and clears the overrun bit."""
+    """See FifoTwin. A read that starts at DATA takes one sample from the FIFO and clears the overrun bit."""
 
     fifo_bytes = 33 * 6
     sample_bytes = 6
@@ -34,7 +34,7 @@ class Adxl345Twin(FifoTwin):
     def _filling(self) -> bool:
         return bool(self.registers[POWER_CTL] & 0x08) and self.registers[FIFO_CTL] & 0xC0 == 0x80
 
-    def _encode(self, first: int, counts: Counts) -> bytes:  # noqa: ARG002 - these samples bear no number
+    def _encode(self, first: int, counts: Counts) -> bytes:  # noqa: ARG002 - the samples of this part carry no number
         return counts.astype("<i2").tobytes()
 
     def _read_fifo(self, count: int) -> bytes:

@@ -1,4 +1,4 @@
-"""An ADXL355, ADXL357 or ADXL359 at register level with its live FIFO."""
+"""An ADXL355, ADXL357 or ADXL359 at register level with its FIFO."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ from hw.virtual.fifo_twin import Counts, FifoTwin
 
 IDENTITY = bytes([0xAD, 0x1D, 0xED, 0x01])
 EMPTY_ENTRY = b"\x00\x00\x02"
-RESET_S = 0.005  # so long after a reset the shadow registers are not loaded and settings do not take
-SHADOW = bytes([0x4C, 0x21, 0x9A, 0x05, 0x33])  # trim of this part, any constant does
+RESET_S = 0.005  # for this time after a reset the shadow registers are not loaded and settings are not accepted
+SHADOW = bytes([0x4C, 0x21, 0x9A, 0x05, 0x33])  # factory trim of this twin; any constant will do
 STATUS, FIFO_ENTRIES, TEMPERATURE, DATA, FIFO_DATA = 0x04, 0x05, 0x06, 0x08, 0x11
 FIRST_SETTING, LAST_SETTING, POWER_CTL, RESET, RESET_CODE, SHADOW_1 = 0x1E, 0x2E, 0x2D, 0x2F, 0x52, 0x50
 RESET_VALUES = {0x27: 0x01, 0x29: 0x60, 0x2C: 0x81, POWER_CTL: 0x01}
 
 
 def encode(counts: NDArray[np.int32]) -> bytes:
-    """FIFO entries of (n, 3) counts: 20 bits each, left-justified in 3 bytes, bit 0 marks X."""
+    """FIFO entries of (n, 3) counts: 20 bits each, left-justified in 3 bytes; bit 0 marks X."""
     words = (counts.astype(np.uint32) & 0xFFFFF) << 4
     words[:, 0] |= 1
     return words.astype(">u4").view(np.uint8).reshape(-1, 4)[:, 1:].tobytes()
 
 
 class Adxl355Twin(FifoTwin):
-    """See FifoTwin. `identity` are the four ID registers, by default the part's own."""
+    """See FifoTwin. `identity` are the four ID registers, by default those of the real part."""
 
     own_identity = IDENTITY
-    self_test_counts = (76800, 76800, 384000)  # at the lowest range; typical by the data sheet: 0.3, 0.3, 1.5 g
+    self_test_counts = (76800, 76800, 384000)  # at the lowest range; typical values of the data sheet: 0.3, 0.3, 1.5 g
 
     fifo_bytes = 96 * 3
     sample_bytes = 9
@@ -48,10 +48,10 @@ class Adxl355Twin(FifoTwin):
     ) -> None:
         self._identity = identity or self.own_identity
         super().__init__(source, samples_due, clock, temperature_raw=temperature_raw)
-        self._ready_s = clock()  # it was powered long before
+        self._ready_s = clock()  # the device has had power for a long time
 
     def power_cycle(self) -> None:
-        """Power fails and comes back: registers as after a reset, standby."""
+        """Power fails and comes back: registers as after a reset, device in standby."""
         super().power_cycle()
         self._ready_s = self._clock() + RESET_S
 
@@ -66,7 +66,7 @@ class Adxl355Twin(FifoTwin):
     def _filling(self) -> bool:
         return not self.registers[POWER_CTL] & 1
 
-    def _encode(self, first: int, counts: Counts) -> bytes:  # noqa: ARG002 - these entries bear no number
+    def _encode(self, first: int, counts: Counts) -> bytes:  # noqa: ARG002 - these entries carry no number
         return encode(counts)
 
     def _nothing(self, count: int) -> bytes:
@@ -108,13 +108,13 @@ class Adxl355Twin(FifoTwin):
 
 
 class Adxl357Twin(Adxl355Twin):
-    """Five times the range, another temperature line."""
+    """Like the ADXL355, with five times the range and another temperature line."""
 
-    self_test_counts = (15360, 15360, 64000)  # typical by the data sheet in z: 1.25 g
+    self_test_counts = (15360, 15360, 64000)  # z: typical value of the data sheet, 1.25 g
     temperature_at_25_degc = 1852
 
 
 class Adxl359Twin(Adxl357Twin):
-    """As the ADXL357, with a part ID of its own."""
+    """Like the ADXL357, with a different part ID."""
 
     own_identity = bytes([0xAD, 0x1D, 0xE9, 0x01])

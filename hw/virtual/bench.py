@@ -1,4 +1,4 @@
-"""The paper's bench as a simulation with known truth: sensor and reference, sample by sample, at any index."""
+"""Simulation of the paper's bench with known truth: samples of sensor and reference at any index."""
 
 from __future__ import annotations
 
@@ -21,26 +21,29 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """What an estimator should find. S in output unit per m/s2, Q and the offsets by position in output unit."""
+    """True values that an estimator should find.
+
+    S in output unit per m/s2, Q and the offsets by position in output unit.
+    """
 
     sensitivity: Array  # (3, 3)
     offset: Array  # (3,)
-    lag_s: Array  # (3,) sensor's lag behind the reference; without the part of a low-pass filter
+    lag_s: Array  # (3,) lag of the sensor behind the reference, without the delay of a low-pass filter
     rate_hz: float
     reference_rate_hz: float
     reference_sensitivity: float
     gravity_mps2: float
-    theta_error_deg: Array  # (positions,) true minus nominal
+    theta_error_deg: Array  # (positions,) true minus nominal angle
     alpha_error_deg: Array
-    offset_by_position: Array  # (positions, 3), to be added to `offset`
+    offset_by_position: Array  # (positions, 3), added to `offset`
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recording:
-    """What a gateway would have written down, and the truth behind it. Stamps and times in s of the bench's clock."""
+    """What a gateway would have recorded, and the truth. Stamps and times in s of the bench's clock."""
 
-    sensor_stamp_s: Array  # (N,) when the gateway got the sample
-    sensor_time_s: Array  # (N,) when it was taken
+    sensor_stamp_s: Array  # (N,) when the gateway received the sample
+    sensor_time_s: Array  # (N,) when the sensor took the sample
     v: Array  # (N, 3) indications, output unit
     temperature_degc: Array  # (N,)
     reference_stamp_s: Array  # (M,)
@@ -51,9 +54,9 @@ class Recording:
 
 
 class Bench:
-    """One bench, deterministic by `parameters` and `seed`: any index gives the same bits however it is asked for.
+    """One bench, determined by `parameters` and `seed`: samples do not depend on the order in which they are asked for.
 
-    Raises ValueError where the parameters contradict each other.
+    Raises ValueError if the parameters contradict each other.
     """
 
     def __init__(self, parameters: BenchParameters, seed: int) -> None:
@@ -61,18 +64,18 @@ class Bench:
         self.seed = seed
         sensor, reference = parameters.sensor, parameters.reference
         if reference.channels == 3 and reference.quantity != "acceleration":
-            raise ValueError("a tri-axial reference measures acceleration")
+            raise ValueError("a tri-axial reference must measure acceleration")
         self._scene = Scene(parameters, seed)
         self._coloured = ColouredNoise(seed, sensor.coloured_phi) if sensor.coloured_noise_mps2 else None
         self._sensor_response = _sensor_response(sensor, parameters.motion.frequency_hz)
         self._reference_response = _highpass(reference.highpass_hz, parameters.motion.frequency_hz)
-        # a live twin and its port ask for neighbouring samples again and again
+        # a live twin and its port ask for neighbouring samples many times
         self._sensor_block = lru_cache(maxsize=4)(self._make_sensor_block)
         self._reference_block = lru_cache(maxsize=4)(self._make_reference_block)
 
     @property
     def truth(self) -> Truth:
-        """What is true on this bench."""
+        """True values of this bench."""
         p = self.parameters
         sensor, positions = p.sensor, len(p.schedule.stands)
         by_position = sensor.offset_by_position_mps2
@@ -94,15 +97,15 @@ class Bench:
 
     @property
     def poses(self) -> list[PoseInterval]:
-        """Nominal positions of the first repetition; the schedule repeats with `parameters.schedule.period_s`."""
+        """Nominal positions of the first repetition; the schedule repeats every `parameters.schedule.period_s`."""
         return self.parameters.schedule.poses(self.parameters.schedule.duration_s(1))
 
     def sensor_times(self, first: int, n: int) -> Array:
-        """True times (n,) of samples first .. first + n - 1."""
+        """True times (n,) of samples first .. first + n - 1, s."""
         return self.parameters.sensor.clock.times(first, n)
 
     def sensor_samples_due(self, t_s: float) -> int:
-        """How many samples the sensor has taken by `t_s`."""
+        """Number of samples that the sensor has taken by `t_s`."""
         return int(self.parameters.sensor.clock.due(t_s))
 
     def sensor_values(self, first: int, n: int) -> Array:
@@ -110,18 +113,18 @@ class Bench:
         return _cut(self._sensor_block, first, n)
 
     def sensor_counts(self, first: int, n: int) -> NDArray[np.int32]:
-        """Indications (n, 3) as whole numbers of the resolution. Raises ValueError for a sensor without one."""
+        """Indications (n, 3) as multiples of the resolution. Raises ValueError for a sensor without a resolution."""
         resolution = self.parameters.sensor.resolution
         if resolution <= 0:
-            raise ValueError("this sensor is not quantised: it has no counts")
+            raise ValueError("this sensor has no counts: its resolution is 0 (not quantised)")
         return np.rint(self.sensor_values(first, n) / resolution).astype(np.int32)
 
     def reference_times(self, first: int, n: int) -> Array:
-        """True times (n,) of the reference's samples."""
+        """True times (n,) of the reference's samples first .. first + n - 1, s."""
         return self.parameters.reference.clock.times(first, n)
 
     def reference_samples_due(self, t_s: float) -> int:
-        """How many samples the reference has taken by `t_s`."""
+        """Number of samples that the reference has taken by `t_s`."""
         return int(self.parameters.reference.clock.due(t_s))
 
     def reference_values(self, first: int, n: int) -> Array:
@@ -129,7 +132,7 @@ class Bench:
         return _cut(self._reference_block, first, n)
 
     def recording(self, duration_s: float) -> Recording:
-        """All that a gateway gets from time 0 to `duration_s`. The poses are those whose hold ends by then."""
+        """Everything that a gateway receives from time 0 to `duration_s`. Poses: those whose hold ends by then."""
         p = self.parameters
         sensor_stamp = self._stamps(p.sensor.clock, p.sensor.bursts, Stream.SENSOR_ARRIVAL, duration_s)
         reference_stamp = self._stamps(p.reference.clock, p.reference.bursts, Stream.REFERENCE_ARRIVAL, duration_s)
@@ -153,7 +156,7 @@ class Bench:
         return bursts.stamps(clock, bursts.arrivals(self.seed, stream, until_s))
 
     def _make_sensor_block(self, block: int) -> Array:
-        """V = S(T) a(t - lag) + Q(T, position, window) + noise, then quantised and held within the range."""
+        """V = S(T) a(t - lag) + Q(T, position, window) + noise; then quantised and limited to the range."""
         p, sensor = self.parameters, self.parameters.sensor
         t = self.sensor_times(block * BLOCK, BLOCK)
         warmer = p.temperature.at(t)[:, None] - p.temperature.mean_degc
@@ -192,7 +195,7 @@ class Bench:
         return _quantised(values, reference.resolution)
 
     def _reference_input(self, reference: ReferenceParameters, t_s: Array) -> Array:
-        """What the reference measures (n, m): the slide's channel, or all three beside the sensor."""
+        """Quantity at the reference (n, m): along the slide if uniaxial, all three axes if it is beside the sensor."""
         if reference.rotation is None:
             velocity, acceleration = self._scene.slide(t_s, self._reference_response)
             return (velocity if reference.quantity == "velocity" else acceleration)[:, :1]
@@ -201,7 +204,7 @@ class Bench:
 
 
 def _cut(block_of: Callable[[int], Array], first: int, n: int) -> Array:
-    """Rows first .. first + n - 1 out of blocks, as a copy."""
+    """Rows first .. first + n - 1 of the blocks that `block_of` returns, as a copy."""
     last = first + n
     blocks = range(first // BLOCK, max(first, last - 1) // BLOCK + 1)
     return np.concatenate([block_of(b)[max(first - b * BLOCK, 0) : max(last - b * BLOCK, 0)] for b in blocks])
@@ -212,7 +215,7 @@ def _quantised(values: Array, resolution: float) -> Array:
 
 
 def _highpass(corner_hz: float | None, frequency_hz: Array) -> ComplexArray | None:
-    """First-order high-pass filter at the motion's lines."""
+    """Response of a first-order high-pass filter at the frequencies of the motion; None without a corner."""
     if corner_hz is None:
         return None
     s = 1j * frequency_hz / corner_hz
@@ -220,7 +223,10 @@ def _highpass(corner_hz: float | None, frequency_hz: Array) -> ComplexArray | No
 
 
 def _sensor_response(sensor: SensorParameters, frequency_hz: Array) -> ComplexArray | None:
-    """The sensor's filters at the motion's lines, None without any. The second order one is Butterworth's."""
+    """Response of the sensor's filters at the frequencies of the motion; None without a filter.
+
+    The second-order filter is a Butterworth filter.
+    """
     highpass = _highpass(sensor.highpass_hz, frequency_hz)
     if sensor.lowpass_hz is None:
         return highpass

@@ -1,7 +1,8 @@
-"""A sensor fixed in a building beside a tri-axial reference: blocks as a gateway gets them, for years, with the truth.
+"""A sensor fixed in a building beside a tri-axial reference: blocks as a gateway receives them, and the truth.
 
-Time goes by visits: in each the building moves for one window, at a level and in a direction drawn for it. Between two
-visits nothing is generated, while the devices' clocks, their sample numbers, temperature, tilt and drift go on.
+Data are generated in visits, for years. In each visit the building moves for one window, with a level and a direction
+drawn for this visit. Between two visits nothing is generated, but clocks, sample numbers, temperature, tilt and drift
+continue.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ from hw.virtual.timebase import Bursts, Clock
 Array = NDArray[np.float64]
 DAY_S = 86_400.0
 YEAR_S = 365.0 * DAY_S
-EPOCH_NS = 1_790_000_000_000_000_000  # UTC at the building's zero
-TEMPERATURE_STEP_K = 1 / 16  # resolution of a usual chip's thermometer
+EPOCH_NS = 1_790_000_000_000_000_000  # UTC at time 0 of the building
+TEMPERATURE_STEP_K = 1 / 16  # resolution of the thermometer in a common chip
 STREAMS: dict[Role, tuple[Stream, Stream]] = {
     "sensor": (Stream.SENSOR, Stream.SENSOR_ARRIVAL),
     "reference": (Stream.REFERENCE, Stream.REFERENCE_ARRIVAL),
@@ -31,9 +32,9 @@ STREAMS: dict[Role, tuple[Stream, Stream]] = {
 
 @dataclass(frozen=True, slots=True)
 class Instrument:
-    """One of the two devices: when it samples, and its white noise.
+    """One of the two devices: its clock and its white noise.
 
-    It sends `burst` samples each time so many are there; `late` says how much later than the newest of them they come.
+    It sends its samples in bursts of `burst`. `late` gives the delay of a burst after its newest sample.
     """
 
     noise_mps2: float
@@ -42,7 +43,7 @@ class Instrument:
     late: Bursts = field(default_factory=Bursts)
 
     def bursts(self, time_s: float) -> int:
-        """How many bursts are complete at a time."""
+        """Number of complete bursts at `time_s`."""
         return int(self.clock.due(time_s)) // self.burst
 
 
@@ -55,22 +56,24 @@ class Weather:
     day_k: float = 4.0
 
     def at(self, time_s: float) -> float:
-        """Temperature at a time."""
+        """Temperature at `time_s`, degC."""
         turn = 2 * np.pi * time_s
         return float(self.mean_degc + self.season_k * np.sin(turn / YEAR_S) + self.day_k * np.sin(turn / DAY_S))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BuildingParameters:
-    """What is true in the building. Faults are off by default; the output is in m/s2, so S is near 1.
+    """True values of the building. Faults are off by default; the output is in m/s2, so S is near 1.
 
-    `rotation` is R in a = R a_ref, `gravity_mps2` (3,) what an ideal sensor reads at rest at the beginning;
-    `tilt_rad_a_day` (3,) turns it. `steps`: (time in s, (3, 3) added to S from then on). The building moves along the
-    reference's y; in a part `elsewhere` of the visits along a direction drawn at random; with `all_axes` in all three.
+    - `rotation` (3, 3): R in a = R a_ref.
+    - `gravity_mps2` (3,): what an ideal sensor reads at rest at time 0; `tilt_rad_a_day` (3,) turns this vector.
+    - `steps`: (time in s, (3, 3) added to S from then on).
+    - Direction of the motion: y of the reference; in the fraction `elsewhere` of the visits a random direction; with
+      `all_axes` all three axes.
     """
 
     window_s: float = 120.0
-    every_s: float = 3600.0  # from the beginning of one visit to the next; 0: one after the other
+    every_s: float = 3600.0  # from the start of one visit to the start of the next; 0: visits without a pause
     level_mps2: tuple[float, float] = (0.02, 0.3)  # rms, drawn log-uniformly for each visit
     band: Band = field(default_factory=Band)
     elsewhere: float = 0.0
@@ -85,7 +88,7 @@ class BuildingParameters:
     gravity_mps2: Array = field(default_factory=lambda: np.array([0.0, 0.0, STANDARD_GRAVITY_MPS2]))
     tilt_rad_a_day: Array = field(default_factory=lambda: np.zeros(3))
     weather: Weather = field(default_factory=Weather)
-    reference_sensitivity: Array = field(default_factory=lambda: np.eye(3))  # (3, 3) what it shows of a_ref
+    reference_sensitivity: Array = field(default_factory=lambda: np.eye(3))  # (3, 3) applied to a_ref
     sensor: Instrument = field(
         default_factory=lambda: Instrument(0.005, Clock(200.0, rate_error=1e-4, offset_s=0.0013, wander=20e-6))
     )
@@ -100,9 +103,10 @@ class BuildingParameters:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BuildingTruth:
-    """What is true at one time. `offset` (3,) is Q at the present temperature, `offset_at_mean` at the mean one.
+    """True values at one time.
 
-    `mean_output` (3,) = S g + Q: what the sensor shows, on average.
+    `offset` (3,) is Q at the present temperature, `offset_at_mean` (3,) Q at the mean temperature. `mean_output` (3,) =
+    S g + Q is the mean indication.
     """
 
     sensitivity: Array
@@ -114,9 +118,10 @@ class BuildingTruth:
 
 
 class Building:
-    """Deterministic by `parameters` and `seed`: any visit gives the same bits in whatever order they are asked for.
+    """One building, determined by `parameters` and `seed`: visits do not depend on the order in which they are asked
+    for.
 
-    `harm` befalls the devices from visit `harmed_from` on.
+    From visit `harmed_from` on, `harm` disturbs the devices.
     """
 
     def __init__(self, parameters: BuildingParameters, seed: int, harm: Harm = HARMLESS, harmed_from: int = 0) -> None:
@@ -134,7 +139,7 @@ class Building:
         }
 
     def span(self, visit: int) -> tuple[float, float]:
-        """First and last moment, in s, of which there are data in a visit."""
+        """Start and end of the data of a visit, s."""
         p = self.parameters
         if not p.every_s:
             return visit * p.window_s, (visit + 1) * p.window_s
@@ -142,7 +147,7 @@ class Building:
         return start_s, start_s + p.lead_s + p.window_s + p.lead_s
 
     def truth(self, time_s: float) -> BuildingTruth:
-        """What is true at a time."""
+        """True values at `time_s`."""
         p = self.parameters
         days = time_s / DAY_S
         sensitivity = p.sensitivity + sum(
@@ -155,12 +160,12 @@ class Building:
         return BuildingTruth(sensitivity, offset, at_mean, gravity, degc, sensitivity @ gravity + offset)
 
     def level_mps2(self, visit: int) -> float:
-        """Rms of the motion in a visit."""
+        """Level of the motion in a visit, rms."""
         low, high = np.log(self.parameters.level_mps2)
         return float(np.exp(generator(self.seed, Stream.BUILDING_MOTION, visit).uniform(low, high)))
 
     def visit(self, visit: int) -> list[SampleBlock]:
-        """All blocks of a visit, both devices, in order of their arrival."""
+        """All blocks of a visit, of both devices, in order of arrival."""
         harm = self.harm if visit >= self.harmed_from else HARMLESS
         motion = self._motion(visit, Stream.BUILDING_MOTION)
         elsewhere = self._motion(visit, Stream.BUILDING_HARM)
@@ -205,7 +210,7 @@ class Building:
         return harm.arrived(seen, blocks)
 
     def _arrivals(self, role: Role, visit: int, newest_s: Array) -> Array:
-        """When the bursts with these newest samples (B,) arrive, never running backwards."""
+        """Arrival times (B,) of bursts with these newest samples (B,); they never decrease."""
         late = (self.parameters.sensor if role == "sensor" else self.parameters.reference).late
         random, n = generator(self.seed, STREAMS[role][1], visit), len(newest_s)
         by = late.least_late_s + random.exponential(late.mean_late_s, n)
@@ -213,7 +218,7 @@ class Building:
         return np.maximum.accumulate(newest_s + by)
 
     def _shown(self, role: Role, time_s: float, moved: Array) -> Array:
-        """Indications (n, 3) without noise: V = S (R a_ref + g) + Q, or what the reference makes of a_ref."""
+        """Indications (n, 3) without noise: V = S (R a_ref + g) + Q for the sensor, S_ref a_ref for the reference."""
         p = self.parameters
         if role == "reference":
             return moved @ p.reference_sensitivity.T

@@ -1,4 +1,4 @@
-"""Random motion of a building for some minutes: modes over a broad band, at one level, in one direction or in all."""
+"""Random motion of a building for some minutes: modes in a broad band, one level, along one or all directions."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-# Points of the grid a period of the band's upper end: cubic pieces between them are right to 3e-6 of the motion there.
+# Grid points per period of the upper end of the band: interpolation by cubic pieces is then accurate to 3e-6.
 POINTS_A_PERIOD = 32
 
 
 @dataclass(frozen=True, slots=True)
 class Band:
-    """Where a building moves: modes (natural frequency and damping ratio) above a flat part of the spectrum."""
+    """Spectrum of a building's motion: modes (natural frequency and damping ratio) above a flat part."""
 
     low_hz: float = 0.5
     high_hz: float = 15.0
     modes: tuple[tuple[float, float], ...] = ((1.3, 0.02), (3.9, 0.02), (8.4, 0.03))
-    flat: float = 0.3  # part of the power that is spread over the band
+    flat: float = 0.3  # fraction of the power that is spread evenly over the band
 
     def density(self, frequency_hz: Array) -> Array:
-        """Power of the acceleration over frequency, up to a factor; the modes have equal power."""
+        """Power density of the acceleration at `frequency_hz`, up to a factor; all modes have equal power."""
         inside = (frequency_hz >= self.low_hz) & (frequency_hz <= self.high_hz)
         width = self.high_hz - self.low_hz
         density = np.full_like(frequency_hz, self.flat / width)
@@ -34,7 +34,7 @@ class Band:
 
 
 class BuildingMotion:
-    """Acceleration (m/s2) from `start_s` to `stop_s`, fading in and out within `ramp_s`, zero beyond.
+    """Acceleration (m/s2) from `start_s` to `stop_s`; it fades in and out within `ramp_s` and is zero outside.
 
     `shape` (C, 3): each of the C rows is a direction with its own random motion of `level_mps2` rms.
     """
@@ -63,11 +63,11 @@ class BuildingMotion:
         self._slope = np.fft.irfft(lines * (2j * np.pi * frequency_hz[:, None] / self._rate_hz), points, axis=0)
 
     def at(self, time_s: Array) -> Array:
-        """(n, 3) at times (n,)."""
+        """Acceleration (n, 3) at times (n,)."""
         place = np.clip((time_s - self._start_s) * self._rate_hz, 0.0, len(self._value) - 2.0)
         cell = place.astype(np.int64)
         x = place - cell
-        # Cubic Hermite pieces: value and slope are exact on the grid.
+        # Cubic Hermite pieces: value and slope are exact at the grid points.
         fade = _step((time_s - self._start_s) / self._ramp_s) * _step((self._stop_s - time_s) / self._ramp_s)
         a, b = (1 + 2 * x) * (1 - x) ** 2 * fade, x * (1 - x) ** 2 * fade
         c, d = x**2 * (3 - 2 * x) * fade, x**2 * (x - 1) * fade
@@ -86,6 +86,6 @@ def _step(progress: Array) -> Array:
 
 
 def _fast_length(least: int) -> int:
-    """The smallest 2^a 3^b 5^c that is not below `least`."""
+    """The smallest 2^a 3^b 5^c of at least `least`."""
     candidates = ((1 << a) * (1, 3, 9)[b] * (1, 5, 25)[c] for a in range(1, 30) for b in range(3) for c in range(3))
     return min(n for n in candidates if n >= least)

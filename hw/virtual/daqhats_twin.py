@@ -1,4 +1,4 @@
-"""Stands in for the library daqhats with one MCC 172 behind it, as daqhats 1.4.1 documents it."""
+"""Replaces the library daqhats, with one MCC 172 connected, as daqhats 1.4.1 documents it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-SYNC_READS = 3  # how often the clock is asked before the converters run together
+SYNC_READS = 3  # number of clock reads before the converters are synchronised
 
 Info = namedtuple("Info", ["AI_MIN_VOLTAGE", "AI_MAX_VOLTAGE"])
 Clock = namedtuple("Clock", ["clock_source", "sample_rate_per_channel", "synchronized"])
@@ -19,7 +19,7 @@ ScanRead = namedtuple("ScanRead", ["running", "hardware_overrun", "buffer_overru
 
 
 class HatError(Exception):
-    """As the library's."""
+    """Like the error of the library."""
 
     def __init__(self, address: int, value: str) -> None:
         super().__init__(value)
@@ -37,16 +37,16 @@ class SourceType(IntEnum):
 
 
 class OptionFlags(IntEnum):
-    """Of a scan."""
+    """Options of a scan."""
 
     DEFAULT = 0x0000
     CONTINUOUS = 0x0010
 
 
 class DaqhatsTwin:
-    """The module. `source(first, n)` returns (n,) volts; `samples_due()` how many exist now.
+    """Replaces the module. `source(first, n)` returns (n,) volts; `samples_due()` the number of samples that exist now.
 
-    As the board's, a scan that runs over its buffer stops, and the next read says so.
+    A scan whose buffer overflows stops and the next read reports the overrun, like with the board.
     """
 
     HatError, SourceType, OptionFlags = HatError, SourceType, OptionFlags
@@ -54,9 +54,9 @@ class DaqhatsTwin:
     def __init__(self, source: Callable[[int, int], NDArray[np.float64]], samples_due: Callable[[], int]) -> None:
         self.source = source
         self.samples_due = samples_due
-        self.present = {0: "MCC 172"}  # boards by address
-        self.stuck: dict[str, Any] = {}  # fault: what is read back instead of what was set
-        self.hardware_overrun = False  # fault: of the next read
+        self.present = {0: "MCC 172"}  # kind of board by address
+        self.stuck: dict[str, Any] = {}  # fault: value that is read back instead of the written one, by setting
+        self.hardware_overrun = False  # fault: the next read reports an overrun
         self.next = 0
 
     def mcc172(self, address: int = 0) -> Board:
@@ -70,7 +70,7 @@ class DaqhatsTwin:
 
 
 class Board:
-    """What `mcc172(address)` returns."""
+    """Replaces the object that `mcc172(address)` returns."""
 
     def __init__(self, twin: DaqhatsTwin, address: int) -> None:
         self._twin = twin
@@ -82,52 +82,52 @@ class Board:
         self._capacity = 0
 
     def info(self) -> Info:
-        """Ends of the range, V."""
+        """Lowest and highest voltage."""
         return Info(-5.0, 5.0 - 10.0 / 16_777_216)
 
     def serial(self) -> str:
-        """Of the board."""
+        """Serial number of the board."""
         return "01ABCDEF"
 
     def calibration_date(self) -> str:
-        """Of the board."""
+        """Calibration date of the board."""
         return "2026-02-03"
 
     def firmware_version(self) -> Version:
-        """Of the board."""
+        """Firmware version of the board."""
         return Version("1.03")
 
     def iepe_config_write(self, channel: int, mode: int) -> None:
-        """Turn the current on or off."""
+        """Switch the IEPE current on or off."""
         self._iepe[channel] = mode
 
     def iepe_config_read(self, channel: int) -> int:
-        """Whether it is on."""
+        """Whether the IEPE current is on."""
         return int(self._twin.stuck.get("iepe", self._iepe[channel]))
 
     def a_in_sensitivity_write(self, channel: int, value: float) -> None:
-        """MV per unit."""
+        """Set mV per unit."""
         self._mv_per_unit[channel] = value
 
     def a_in_sensitivity_read(self, channel: int) -> float:
-        """MV per unit."""
+        """Return mV per unit."""
         return self._mv_per_unit[channel]
 
     def a_in_clock_config_write(self, clock_source: SourceType, sample_rate_per_channel: float) -> None:
-        """The nearest rate there is."""
+        """Set the nearest possible rate."""
         assert clock_source == SourceType.LOCAL
         divider = int(51_200.0 / sample_rate_per_channel + 0.5)
         self._rate_hz = 51_200.0 / min(max(divider, 1), 256)
         self._reads = 0
 
     def a_in_clock_config_read(self) -> Clock:
-        """Rate, and whether the converters run together."""
+        """Clock source, rate, and whether the converters are synchronised."""
         self._reads += 1
         synchronized = self._reads >= self._twin.stuck.get("sync", SYNC_READS)
         return Clock(SourceType.LOCAL, self._rate_hz, synchronized)
 
     def a_in_scan_start(self, channel_mask: int, samples_per_channel: int, options: int) -> None:
-        """From now on samples are kept."""
+        """Start to keep samples."""
         if self._capacity:
             raise HatError(self._address, "A scan is already active.")
         assert channel_mask in (1, 2)
@@ -137,7 +137,7 @@ class Board:
         self._twin.next = self._twin.samples_due()
 
     def a_in_scan_read_numpy(self, samples_per_channel: int, timeout: float) -> ScanRead:
-        """All that is there."""
+        """All samples that exist and were not read yet."""
         assert (samples_per_channel, timeout) == (-1, 0)
         twin = self._twin
         if self._address not in twin.present:
@@ -152,8 +152,8 @@ class Board:
         return ScanRead(not (over or hardware), hardware, over, True, False, twin.source(first, kept))
 
     def a_in_scan_stop(self) -> None:
-        """As the library's."""
+        """Stop the scan."""
 
     def a_in_scan_cleanup(self) -> None:
-        """Give the buffer back."""
+        """Release the buffer."""
         self._capacity = 0

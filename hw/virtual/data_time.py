@@ -1,4 +1,4 @@
-"""The clock of data that are played: as the machine's, or faster, and the same for all devices that play together."""
+"""Clock for played data: at real time or faster, and common to all devices that play together."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ T = TypeVar("T")
 
 
 class DataClock:
-    """CLOCK_MONOTONIC and UTC in ns, both passing `speed` times as fast as those of `clock` from now on."""
+    """CLOCK_MONOTONIC and UTC in ns; from now on both run `speed` times as fast as `clock`."""
 
     def __init__(self, clock: Clock, speed: float) -> None:
         self._clock = clock
@@ -25,7 +25,7 @@ class DataClock:
         return self._zero_ns + passed_ns, self._utc_zero_ns + passed_ns
 
     def slowed(self, sleep: Callable[[float], None]) -> Callable[[float], None]:
-        """A `sleep` whose seconds are those of this clock."""
+        """Turn a `sleep` in real seconds into one in seconds of this clock."""
         return lambda seconds: sleep(seconds / self._speed)
 
 
@@ -34,7 +34,7 @@ _lock = threading.Lock()
 
 
 def together(key: Hashable, build: Callable[[], T]) -> T:
-    """The one object of this process with this key, as long as anybody holds it; built if there is none."""
+    """Return the object of this process with this key; build it if nobody holds one."""
     with _lock:
         found = _together.get(key)
         if found is None:

@@ -1,4 +1,4 @@
-"""Driver `virtual`: the virtual bench, sensor and reference, without a port; in real time or faster."""
+"""Driver `virtual`: the sensor or the reference of the virtual bench, without a port; at real time or faster."""
 
 from __future__ import annotations
 
@@ -22,43 +22,46 @@ from hw.virtual.timebase import BenchTime
 ReferenceKind = Literal["preset", "vibrometer", "tri-axial"]
 # A quarter turn about z: a = R a_ref.
 ROTATION = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-VIBROMETER_NOISE_MPS, VIBROMETER_RESOLUTION_MPS = 10e-6, 1e-6  # of a usual one at 1 kHz and 1 m/s full scale
+VIBROMETER_NOISE_MPS, VIBROMETER_RESOLUTION_MPS = 10e-6, 1e-6  # of a common vibrometer at 1 kHz and 1 m/s full scale
 
 
 class VirtualOptions(Options):
-    """Options of `virtual`. Sensor and reference are of one bench where preset, seed and speed are the same."""
+    """Options of `virtual`. Sensor and reference belong to one bench if preset, seed and speed are the same."""
 
     role: Literal["sensor", "reference"] = Field(description="which device of the bench")
     preset: str = Field("plain", description=f"which bench: {', '.join(PRESETS)}")
-    seed: int = Field(1, ge=0, lt=2**32, description="of the bench's parameters and noise")
-    speed: float = Field(1.0, gt=0, le=100, description="times as fast as real time, stamps included")
+    seed: int = Field(1, ge=0, lt=2**32, description="seed of the bench's parameters and noise")
+    speed: float = Field(
+        1.0, gt=0, le=100, description="factor by which time runs faster than real time, stamps included"
+    )
     reference: ReferenceKind = Field(
-        "preset", description="the preset's own; vibrometer: velocity; tri-axial: beside the sensor, x along its y"
+        "preset",
+        description="preset: as in the preset; vibrometer: velocity; tri-axial: its x along the sensor's y",
     )
 
     @field_validator("preset")
     @classmethod
     def _known(cls, value: str) -> str:
         if value not in PRESETS:
-            raise ValueError(f"no preset {value!r}: there are {', '.join(PRESETS)}")
+            raise ValueError(f"no preset {value!r}; available: {', '.join(PRESETS)}")
         return value
 
 
 class BenchClock:
-    """The time of one bench: that of its data, and how long it has run; it begins when its first device is opened."""
+    """Time of one bench: the clock of its data, and the time since its first device was opened."""
 
     def __init__(self, clock: Clock, speed: float) -> None:
         self.data = DataClock(clock, speed)
         self._time = BenchTime()
 
     def begin(self) -> None:
-        """From now on the bench moves; nothing if it does."""
+        """Start the motion of the bench; no effect if it has started."""
         if not self._time.begun:
             self._time.begin(self._now_s())
 
     @property
     def passed_s(self) -> float:
-        """Since it began."""
+        """Time since `begin`, s."""
         return self._time(self._now_s())
 
     def _now_s(self) -> float:
@@ -66,7 +69,10 @@ class BenchClock:
 
 
 class Virtual(BufferedSensor):
-    """Keeps a second of samples for its reader, as a library does. `plugged` takes the fault of that name."""
+    """Keeps one second of samples for its reader, like the buffer of a library.
+
+    `plugged = False` simulates a lost device.
+    """
 
     options_model: ClassVar[type[Options]] = VirtualOptions
 
@@ -93,7 +99,7 @@ class Virtual(BufferedSensor):
     def _start(self) -> DeviceInfo:
         if not self.plugged:
             raise DeviceLost(f"{self._where()}: unplugged")
-        self._values(0, 1)  # the first numbers cost some ms of loading
+        self._values(0, 1)  # the first values take some ms to load
         self._bench_clock.begin()
         self._next = self._due()
         return self._sensor_info() if self._options.role == "sensor" else self._reference_info()
@@ -123,12 +129,12 @@ class Virtual(BufferedSensor):
             nominal_rate_hz=reference.clock.nominal_rate_hz,
         )
 
-    def _ends(self, info: DeviceInfo) -> tuple[float, float]:  # noqa: ARG002 - the bench knows
+    def _ends(self, info: DeviceInfo) -> tuple[float, float]:  # noqa: ARG002 - the bench has the range
         limit = self._bench.parameters.sensor.limit if self._options.role == "sensor" else np.inf
         return -limit, limit
 
     def _stop(self) -> None:
-        """Nothing is held."""
+        """There is nothing to release."""
 
     def _take(self) -> tuple[Indications, bool]:
         if not self.plugged:
@@ -139,7 +145,7 @@ class Virtual(BufferedSensor):
         return self._values(first, kept), first + kept < due
 
     def _due(self) -> int:
-        """How many samples exist now."""
+        """Number of samples that exist now."""
         passed_s = self._bench_clock.passed_s
         if self._options.role == "sensor":
             return self._bench.sensor_samples_due(passed_s)
@@ -158,7 +164,7 @@ class Virtual(BufferedSensor):
 
 
 def parameters_of(options: VirtualOptions) -> BenchParameters:
-    """The preset's bench with the reference that was asked for."""
+    """The bench of the preset with the chosen reference."""
     parameters = PRESETS[options.preset](options.seed)
     return replace(parameters, reference=_reference(parameters.reference, options.reference))
 

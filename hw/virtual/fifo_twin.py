@@ -1,4 +1,4 @@
-"""What all register-level twins with a live FIFO have in common, for `hw.virtual.kernel`."""
+"""Common part of all register-level twins with a FIFO, for `hw.virtual.kernel`."""
 
 from __future__ import annotations
 
@@ -14,11 +14,14 @@ Counts = NDArray[np.int32]
 
 
 class FifoTwin(ABC):
-    """`source(first, n)` returns (n, 3) int32 counts of samples first .. first + n - 1, at the set range;
-    `samples_due(t_s)` how many samples exist at `t_s` in all; `clock()` is that time, in seconds.
-    `temperature_raw(t_s)` is the chip's temperature number. All physics comes from outside.
+    """A chip on the I2C bus. Motion, noise, time and temperature come from the arguments.
 
-    Samples go on being counted while the FIFO is off, but only those made while it is on reach it.
+    - `source(first, n)` returns (n, 3) int32 counts of samples first .. first + n - 1 at the set range.
+    - `samples_due(t_s)`: number of samples that exist at `t_s`.
+    - `clock()`: the present time t_s, s.
+    - `temperature_raw(t_s)`: raw temperature value of the chip.
+
+    Samples are counted while the FIFO is off, too, but only samples made while it is on go into it.
     """
 
     fifo_bytes: ClassVar[int]
@@ -55,29 +58,29 @@ class FifoTwin(ABC):
 
     @abstractmethod
     def _encode(self, first: int, counts: Counts) -> bytes:
-        """Words of samples first .. first + n - 1."""
+        """FIFO words of samples first .. first + n - 1."""
 
     @abstractmethod
     def _get(self, register: int) -> int:
-        """One register read."""
+        """Value of one register that is read."""
 
     @abstractmethod
     def _set(self, register: int, value: int) -> None:
-        """One register written."""
+        """Write one register."""
 
     def _deflection(self) -> Counts:
-        """What self-test adds (3,)."""
+        """Change (3,) of the counts by the self-test."""
         return np.zeros(3, np.int32)
 
     def _newest(self) -> Counts:
-        """What the output registers hold (3,): the sample made last, one and the same throughout a message."""
+        """Contents (3,) of the output registers: the newest sample; it does not change within one I2C message."""
         if self._latched is None:
             due = self._samples_due(self._clock())
             self._latched = self._source(due - 1, 1)[0] + self._deflection() if due else np.zeros(3, np.int32)
         return self._latched
 
     def power_cycle(self) -> None:
-        """Power fails and comes back, or a reset: registers as after it, FIFO empty."""
+        """Power fails and comes back, or the device is reset: registers have their reset values, the FIFO is empty."""
         self.registers = self._reset_registers()
         self._pointer = 0
         self._latched = None
@@ -85,16 +88,16 @@ class FifoTwin(ABC):
         self._overrun = False
 
     def steal(self, word: int = 0, count: int = 1) -> None:
-        """Fault: words vanish from the FIFO, the first of them at place `word`."""
+        """Fault: remove `count` words from the FIFO, from position `word` on."""
         self._fill()
         del self._fifo[self.word_bytes * word : self.word_bytes * (word + count)]
 
     def fail(self, number: int, times: int = 1) -> None:
-        """Fault: the next messages end in this errno."""
+        """Fault: the next `times` messages fail with errno `number`."""
         self._failures += [number] * times
 
     def break_off(self, number: int, words: int) -> None:
-        """Fault: the next FIFO read ends in this errno after so many words went out in vain."""
+        """Fault: the next FIFO read removes `words` words and then fails with errno `number`."""
         self._broken_off = number, words
 
     def write(self, data: bytes) -> None:
@@ -106,7 +109,7 @@ class FifoTwin(ABC):
             self._pointer = (self._pointer + 1) & 0xFF
 
     def read(self, count: int) -> bytes:
-        """One I2C read message, from the register written last on."""
+        """One I2C read message; it starts at the register that was written last."""
         self._fail()
         self._latched = None
         self._fill()
@@ -128,7 +131,7 @@ class FifoTwin(ABC):
             raise error(number)
 
     def _read_fifo(self, count: int) -> bytes:
-        """What a read of so many bytes from the data register returns."""
+        """Bytes that a read of `count` bytes from the data register returns."""
         return self._take(count)
 
     def _take(self, count: int) -> bytes:
@@ -137,11 +140,11 @@ class FifoTwin(ABC):
         return taken + self._nothing(count - len(taken))
 
     def _nothing(self, count: int) -> bytes:
-        """What is read from an empty FIFO."""
+        """Bytes that a read from an empty FIFO returns."""
         return bytes(count)
 
     def _empty(self) -> None:
-        """Empty the FIFO; what is made from now on may go into it."""
+        """Empty the FIFO; samples made from now on may go into it."""
         self._fifo = bytearray()
         self._next = self._samples_due(self._clock()) if self._filling else 0
 
@@ -151,7 +154,7 @@ class FifoTwin(ABC):
         due = self._samples_due(self._clock())
         if due <= self._next:
             return
-        room = self.fifo_bytes // self.sample_bytes + 1  # one more than it holds, so that an overflow shows
+        room = self.fifo_bytes // self.sample_bytes + 1  # one sample more than the FIFO holds, to detect an overflow
         first = max(self._next, due - room)
         self._fifo += self._encode(first, self._source(first, due - first) + self._deflection())
         self._next = due
@@ -165,5 +168,5 @@ class FifoTwin(ABC):
 
 
 def error(number: int) -> OSError:
-    """The errno as the kernel's answer."""
+    """The OSError that the kernel returns for this errno."""
     return OSError(number, os.strerror(number))

@@ -1,4 +1,4 @@
-"""What can befall the two devices in a building so that what they show says nothing, or something wrong, of S and Q."""
+"""Faults of the two devices in a building, after which their data tell nothing, or nothing true, about S and Q."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ Role = Literal["sensor", "reference"]
 
 
 class Motion(Protocol):
-    """Acceleration over time."""
+    """Acceleration as a function of time."""
 
     def at(self, time_s: Array) -> Array: ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Visit:
-    """One device in one visit: when it samples (n,), how the building moves (rms), and the `first` since the harm.
+    """One device in one visit: its sample times (n,), the level of the building's motion (rms), its random generator.
 
-    `elsewhere` is motion that has nothing to do with the device.
+    `first`: this is the first visit with the fault. `elsewhere`: motion that has nothing to do with the device.
     """
 
     role: Role
@@ -39,27 +39,27 @@ class Visit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Harm:
-    """Nothing wrong; each kind overrides what it changes. `name` is for tables."""
+    """No fault. Each subclass overrides what its fault changes. `name` is for tables."""
 
     name: str = "none"
 
     @property
     def output(self) -> Array:
-        """(3, 3) M: the sensor's S is M S and its Q is M Q as long as this lasts."""
+        """Matrix M (3, 3) of the sensor's output: while the fault lasts the true values are M S and M Q."""
         return np.eye(3)
 
     def moved(self, visit: Visit, felt: Array) -> Array:
-        """Acceleration (n, 3) that a device feels."""
+        """Acceleration (n, 3) at the device, from the acceleration `felt` (n, 3) without the fault."""
         del visit
         return felt
 
     def shown(self, visit: Visit, values: Array) -> Array:
-        """Indications (n, 3)."""
+        """Indications (n, 3), from the indications `values` (n, 3) without the fault."""
         del visit
         return values
 
     def arrived(self, visit: Visit, blocks: list[SampleBlock]) -> list[SampleBlock]:
-        """Blocks, as the gateway gets them."""
+        """Blocks as the gateway receives them."""
         del visit
         return blocks
 
@@ -69,7 +69,7 @@ HARMLESS = Harm()
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Unplugged(Harm):
-    """The reference's cable is off: no blocks, a constant, or noise and hum at 50 Hz."""
+    """The cable of the reference is disconnected: no blocks, a constant value, or noise and 50 Hz hum."""
 
     how: Literal["lost", "constant", "hum"] = "lost"
 
@@ -89,7 +89,7 @@ class Unplugged(Harm):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DeadChannel(Harm):
-    """One channel of a device holds one value, or shows noise alone."""
+    """One channel of a device has a constant value, or noise only."""
 
     role: Role = "sensor"
     axis: int = 1
@@ -110,7 +110,7 @@ class DeadChannel(Harm):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Transformed(Harm):
-    """All that a device shows is multiplied by a matrix (3, 3): wrong sensitivity, sign, or axes."""
+    """The indications of a device are multiplied by a matrix (3, 3): wrong sensitivity, sign or order of the axes."""
 
     role: Role = "reference"
     matrix: Array = field(default_factory=lambda: np.eye(3))
@@ -125,7 +125,10 @@ class Transformed(Harm):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KnockedOff(Harm):
-    """The sensor fell off its mount and lies there turned; it still moves with the building, or hangs by its cable."""
+    """The sensor has fallen off its mount and is turned.
+
+    It follows the building (`follows`), or it hangs by its cable.
+    """
 
     turn: Array = field(default_factory=lambda: np.eye(3))
     follows: bool = True
@@ -134,13 +137,13 @@ class KnockedOff(Harm):
         return felt if visit.role == "reference" or self.follows else visit.elsewhere.at(visit.time_s)
 
     def shown(self, visit: Visit, values: Array) -> Array:
-        # S is near 1: turning what it shows is turning it, gravity and all.
+        # S is near 1, so turning the indications is the same as turning the sensor, gravity included.
         return values @ self.turn.T if visit.role == "sensor" else values
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FarAway(Harm):
-    """The reference stands 100 m away: `common` of the amplitude there is the sensor's motion, the rest is not."""
+    """The reference stands 100 m away and shares only the fraction `common` of its amplitude with the sensor."""
 
     common: float = 0.3
 
@@ -152,7 +155,7 @@ class FarAway(Harm):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Clipped(Harm):
-    """The sensor holds its indications within `peak` times the rms of the motion, about their mean."""
+    """The sensor limits its indications to `peak` times the rms of the motion, about their mean."""
 
     peak: float = 1.0
 
@@ -165,7 +168,10 @@ class Clipped(Harm):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lossy(Harm):
-    """A part of the samples is lost, `run` in a row; the sample numbers say so (`told`), or count what came."""
+    """A fraction `share` of the samples is lost, `run` in a row.
+
+    `told`: the sample numbers show the loss; otherwise the device numbers only the samples that are left.
+    """
 
     role: Role = "sensor"
     share: float = 0.1
@@ -189,11 +195,11 @@ class Lossy(Harm):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ClockStep(Harm):
-    """All of a device comes later from one moment on, or its sample numbers jump, or the gateway's UTC does."""
+    """From one moment on, all data of a device arrive later, or its sample numbers jump, or the gateway's UTC jumps."""
 
     role: Role = "sensor"
     what: Literal["arrival", "number", "utc"] = "arrival"
-    step: float = 0.1  # s, of whichever clock
+    step: float = 0.1  # s of the clock that jumps
 
     def arrived(self, visit: Visit, blocks: list[SampleBlock]) -> list[SampleBlock]:
         since = len(blocks) // 2 if visit.first else 0
@@ -212,7 +218,7 @@ class ClockStep(Harm):
 
 
 def _pieces(block: SampleBlock, kept: NDArray[np.bool_]) -> list[SampleBlock]:
-    """What is left of a block, cut where samples are missing; each piece arrives with the burst that brought it."""
+    """The samples `kept` of a block, as one block per stretch without a gap; arrivals as before."""
     edges = np.flatnonzero(np.diff(kept.astype(np.int8), prepend=0, append=0)).tolist()
     pieces = []
     for first, stop in zip(edges[::2], edges[1::2], strict=True):
@@ -232,7 +238,7 @@ def _pieces(block: SampleBlock, kept: NDArray[np.bool_]) -> list[SampleBlock]:
 
 
 def _shortened(block: SampleBlock, kept: NDArray[np.bool_], number: int) -> SampleBlock:
-    """A block with the samples `kept` alone, the first of them `number`; bursts that brought none are left out."""
+    """A block with only the samples `kept`, the first one with `number`; bursts without these samples are removed."""
     count = np.cumsum(kept)[block.burst_count - 1]
     some = np.diff(count, prepend=0) > 0
     return replace(

@@ -1,4 +1,4 @@
-"""An accelerometer as the kernel's industrial I/O shows it: files in a directory, and a pipe for the node."""
+"""An accelerometer as the kernel's industrial I/O presents it: files in a directory, and a pipe as its node."""
 
 from __future__ import annotations
 
@@ -37,9 +37,13 @@ for _i, _axis in enumerate("xyz"):
 
 
 class IioTwin:
-    """`source(first, n)` returns (n, 3) counts, `stamps_ns(first, n)` their stamps, `samples_due(t_s)` how many exist.
+    """Files in `root`/sys and the node in `root`/dev.
 
-    Lives in `root`/sys and `root`/dev. As the kernel's, its buffer drops the newest samples once it is full.
+    - `source(first, n)` returns (n, 3) counts.
+    - `stamps_ns(first, n)` returns their stamps.
+    - `samples_due(t_s)`: number of samples that exist at `t_s`.
+
+    A full buffer drops the newest samples, like the kernel's.
     """
 
     def __init__(
@@ -59,7 +63,7 @@ class IioTwin:
         self.plug()
 
     def plug(self) -> None:
-        """Bind the driver: files and node are there."""
+        """Bind the kernel driver: files and node exist."""
         for name, text in FILES.items():
             path = self.sysfs / NODE / name
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -69,7 +73,7 @@ class IioTwin:
         self._pipe = os.open(self.dev / NODE, os.O_RDWR | os.O_NONBLOCK)
 
     def unplug(self) -> None:
-        """Take all of it away."""
+        """Remove files and node."""
         if self._pipe is not None:
             os.close(self._pipe)
             self._pipe = None
@@ -77,7 +81,7 @@ class IioTwin:
             shutil.rmtree(self.sysfs / NODE)
 
     def serve(self, t_s: float) -> None:
-        """Store what was made up to `t_s`, hand on what the reader has room for."""
+        """Store the samples made up to `t_s`, and pass on as many as the reader has room for."""
         due = self._samples_due(t_s)
         first, self.next = self.next, max(self.next, due)
         if self._pipe is None:

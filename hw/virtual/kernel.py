@@ -1,8 +1,8 @@
-"""Stands in for the kernel's i2c-dev under the real smbus2: only its open, close and ioctl are replaced.
+"""Replaces the kernel's i2c-dev under the real smbus2; only the calls open, close and ioctl are replaced.
 
-errno values and limits are those of Linux 6.1: at most 42 messages a transfer and 8192 bytes a message (EINVAL), an
-absent address ENXIO or EREMOTEIO by adapter, an address that a kernel driver holds EBUSY, an adapter that went away
-EIO while it is open and ENOENT afterwards.
+errno values and limits are those of Linux 6.1: at most 42 messages per transfer and 8192 bytes per message (EINVAL);
+ENXIO or EREMOTEIO, depending on the adapter, for an address without a device; EBUSY for an address that a kernel driver
+holds; EIO for an adapter that was removed while it was open, ENOENT afterwards.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ import smbus2.smbus2 as s2
 MAX_MESSAGES = 42
 MAX_MESSAGE_BYTES = 8192
 READ = 1  # I2C_M_RD
-FUNCTIONS = 0x0EFF0009  # I2C and what the kernel makes of it for SMBus
+FUNCTIONS = 0x0EFF0009  # I2C, and the SMBus calls that the kernel implements with it
 
 
 class I2CTarget(Protocol):
-    """A device on the bus. Both methods may raise OSError, as a device that does not acknowledge."""
+    """A device on the bus. Both methods may raise OSError, for example if the device does not acknowledge."""
 
     def write(self, data: bytes) -> None:
         """One write message."""
@@ -35,7 +35,7 @@ class I2CTarget(Protocol):
 
 
 class I2CBus:
-    """An adapter with its targets by address; `claimed` addresses belong to a kernel driver."""
+    """An adapter with its targets by address. A kernel driver holds the addresses in `claimed`."""
 
     def __init__(
         self,
@@ -48,22 +48,22 @@ class I2CBus:
         self.claimed: set[int] = set()
         self.functions = functions
         self.plugged = True
-        self.generation = 0  # rises with each unplug: files opened before are dead
+        self.generation = 0  # increases with each unplug: files opened before are invalid
         self.transfers = 0
         self._absent_errno = absent_errno
         self._lock = threading.Lock()
 
     def unplug(self) -> None:
-        """Take the adapter away."""
+        """Remove the adapter."""
         self.plugged = False
         self.generation += 1
 
     def replug(self) -> None:
-        """Bring it back."""
+        """Connect the adapter again."""
         self.plugged = True
 
     def transfer(self, messages: list[tuple[int, int | bytes]]) -> list[bytes | None]:
-        """Messages (address, bytes to write or number of bytes to read) in one go; what was read, by message."""
+        """Do all messages (address, bytes to write or number of bytes to read); return the bytes read, by message."""
         with self._lock:
             self.transfers += 1
             return [self._message(address, content) for address, content in messages]
@@ -79,9 +79,9 @@ class I2CBus:
 
 
 class Kernel:
-    """Files and ioctls of i2c-dev, on the argument structures of smbus2. All methods raise OSError as the kernel would.
+    """Files and ioctls of i2c-dev, on the argument structures of smbus2. All methods raise OSError like the kernel.
 
-    `installed` puts it under smbus2; whatever else carries system calls out of another process may ask it too.
+    `installed` puts this object under smbus2. Code that forwards the system calls of another process may use it, too.
     """
 
     def __init__(self, nodes: Mapping[str, I2CBus]) -> None:
@@ -90,7 +90,7 @@ class Kernel:
         self._address: dict[int, int] = {}
 
     def open(self, path: str, flags: int) -> int:
-        """A file descriptor for the node of an adapter."""
+        """Open the node of an adapter; returns a file descriptor."""
         bus = self._nodes.get(path)
         if bus is None or not bus.plugged:
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), path)
@@ -99,13 +99,13 @@ class Kernel:
         return file
 
     def close(self, file: int) -> None:
-        """Give it back."""
+        """Close a file descriptor."""
         self._files.pop(file)
         self._address.pop(file, None)
         os.close(file)
 
     def ioctl(self, file: int, request: int, argument: Any) -> int:
-        """One request; what it returns is written into `argument`."""
+        """One request; results are written into `argument`."""
         bus, generation = self._files[file]
         if generation != bus.generation:
             raise _error(errno.EIO)
@@ -139,7 +139,7 @@ def _rdwr(bus: I2CBus, argument: Any) -> int:
 
 
 def _smbus(bus: I2CBus, address: int, argument: Any) -> None:
-    """Byte data and I2C block data, which is what drivers use; the adapter makes them of plain messages."""
+    """Byte data and I2C block data, the calls that drivers use; the adapter turns them into plain messages."""
     block = argument.data.contents.block
     command = bytes([argument.command])
     reading = argument.read_write == s2.I2C_SMBUS_READ
@@ -164,7 +164,7 @@ def _error(number: int) -> OSError:
 
 @contextlib.contextmanager
 def installed(nodes: Mapping[str, I2CBus]) -> Iterator[None]:
-    """Within, smbus2 finds these adapters (by path, e.g. /dev/i2c-1) and no others."""
+    """While this context is active, smbus2 finds these adapters (by path, e.g. /dev/i2c-1) and no others."""
     kernel = Kernel(nodes)
     module = vars(s2)
     before = module["ioctl"], module["os"]

@@ -1,4 +1,4 @@
-"""A bench preset in real time: the sensor an ADXL355 under the real smbus2, the reference on a pseudo-terminal."""
+"""A bench preset in real time: an ADXL355 under the real smbus2, and a reference on a pseudo-terminal."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ ADDRESS = 0x1D
 
 
 class LiveBench:
-    """Context manager: within it `adxl355` and `serial-csv` find the bench's devices with the options given here.
+    """Context in which `adxl355` and `serial-csv` find the bench's devices, with the options given here.
 
-    The bench's zero is the moment at which the sensor is first set to measure, so that poses in seconds since the
-    sensor's first sample are poses of the bench's clock. `bus` and `port` take faults (unplug). Only for a bench whose
-    sensor counts as an ADXL355 does; raises ValueError for any other.
+    Time 0 of the bench is the moment when the sensor starts to measure. Poses in seconds since the sensor's first
+    sample are therefore poses of the bench's clock. `bus` and `port` accept faults (unplug). Raises ValueError if the
+    sensor of the bench does not have the counts of an ADXL355.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class LiveBench:
         self._open = ExitStack()
 
     def __enter__(self) -> LiveBench:
-        # The first numbers cost 20 ms of loading, and the FIFO holds 32: pay before anybody reads.
+        # The first values take 20 ms to load, but the FIFO holds only 32 samples: load them before the first read.
         self.bench.sensor_counts(0, 1)
         self.bench.reference_values(0, 1)
         self.port = PtyDevice(self._lines, self._clock)
@@ -71,7 +71,7 @@ class LiveBench:
         return serial_options(self.bench, "reference") | {"port": str(self.port.path)}
 
     def _sensor_samples_due(self, t_s: float) -> int:
-        # The twin asks for the first time when it is set to measure.
+        # The twin first asks for samples when it is set to measure: that moment is time 0 of the bench.
         if not self.time.begun:
             self.time.begin(t_s)
         return self.bench.sensor_samples_due(self.time(t_s))
@@ -85,4 +85,4 @@ def _range_g(nominal_sensitivity: float) -> int:
     for range_g, counts in ADXL355.counts_per_g.items():
         if abs(nominal_sensitivity * STANDARD_GRAVITY_MPS2 - counts) < 1e-6 * counts:
             return range_g
-    raise ValueError(f"no range of an ADXL355 has {nominal_sensitivity:g} counts per m/s2")
+    raise ValueError(f"the ADXL355 has no range with {nominal_sensitivity:g} counts per m/s2")

@@ -1,4 +1,4 @@
-"""An LSM6DSO or LSM6DSOX at register level with its live tagged FIFO."""
+"""An LSM6DSO or LSM6DSOX at register level with its tagged FIFO."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ SETTINGS = frozenset((*range(FIFO_CTRL1, FIFO_CTRL4 + 1), *range(CTRL1_XL, CTRL1
 
 
 def words(tag: int, first: int, numbers: Counts) -> bytes:
-    """FIFO words: the tag's kind, the slot's counter, even parity, three 16 bit numbers."""
+    """FIFO words: tag with sensor, counter of the slot and even parity; then three 16-bit numbers."""
     tags = (tag << 3 | (np.arange(first, first + len(numbers)) & 3) << 1).astype(np.uint8)
     tags |= np.bitwise_count(tags) & 1
     return np.column_stack([tags, numbers.astype("<i2").view(np.uint8).reshape(-1, 6)]).tobytes()
 
 
 class Lsm6dsoTwin(FifoTwin):
-    """See FifoTwin. `freq_fine` is what the part says of its own rate."""
+    """See FifoTwin. `freq_fine` is the register with which the part states its own rate."""
 
     fifo_bytes = 512 * 7
     sample_bytes = 7

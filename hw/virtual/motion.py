@@ -1,4 +1,4 @@
-"""Motion of the bench as a sum of sines: exact at any time, and exact through any linear filter."""
+"""Motion of the bench as a sum of sines: exact at any time, also after any linear filter."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Motion:
     def evaluate(self, t_s: Array, response: ComplexArray | None = None) -> tuple[Array, Array, Array]:
         """Displacement (m), velocity (m/s) and acceleration (m/s2), each (n, 3), at times `t_s` (n,).
 
-        `response` (C,) is the complex frequency response of what the motion passes through, 1 where None.
+        `response` (C,) is the complex frequency response of a filter that the motion passes through; None: no filter.
         """
         omega = 2 * np.pi * self.frequency_hz
         phase = np.multiply.outer(t_s, omega)
@@ -37,14 +37,14 @@ class Motion:
         return signals[:, :3], signals[:, 3:6], signals[:, 6:]
 
     def with_transverse(self, lateral: float, vertical: float = 0.0) -> Motion:
-        """The same motion with coherent motion beside it: fractions of the motion along the slide."""
+        """The same motion with coherent transverse motion, given as fractions of the motion along the slide."""
         along = self.amplitude_mps2[:, 0]
         added = np.stack([np.zeros_like(along), lateral * along, vertical * along], axis=1)
         return replace(self, amplitude_mps2=self.amplitude_mps2 + added)
 
 
 def sine(frequency_hz: float, amplitude_mps2: float, phase_rad: float = 0.0) -> Motion:
-    """The paper's motion: one sine along the slide, acceleration amplitude * sin(2 pi f t + phase)."""
+    """The motion of the paper: one sine along the slide, acceleration amplitude * sin(2 pi f t + phase)."""
     amplitude = np.zeros((1, 3), dtype=complex)
     amplitude[0, 0] = -1j * amplitude_mps2 * np.exp(1j * phase_rad)
     return Motion(np.array([frequency_hz]), amplitude)
@@ -53,16 +53,16 @@ def sine(frequency_hz: float, amplitude_mps2: float, phase_rad: float = 0.0) -> 
 def multisine(
     generator: np.random.Generator, low_hz: float = 1.0, high_hz: float = 8.0, lines: int = 8, peak_mps2: float = 5.0
 ) -> Motion:
-    """Equal sines along the slide with random phases, their sum peaking at `peak_mps2`.
+    """Sum of sines of equal amplitude along the slide, with random phases; the peak of the sum is `peak_mps2`.
 
-    Each line stands at a random place in its own part of the band, so that no two are harmonics and every stretch of
-    some seconds is different.
+    Each line has a random frequency in its own part of the band. So no two lines are harmonics, and the motion does not
+    repeat within some seconds.
     """
     frequency = low_hz + (high_hz - low_hz) * (np.arange(lines) + generator.uniform(0.2, 0.8, lines)) / lines
     amplitude = np.zeros((lines, 3), dtype=complex)
     amplitude[:, 0] = np.exp(2j * np.pi * generator.random(lines))
     motion = Motion(frequency, amplitude)
-    # 60 s at 16 points a period of the highest line: misses the peak of the sum by less than 2 %
+    # 60 s with 16 points per period of the highest line: the peak found is less than 2 % too low.
     grid = np.arange(0.0, 60.0, 1 / (16 * high_hz))
     peak = np.abs(motion.evaluate(grid)[2][:, 0]).max()
     return replace(motion, amplitude_mps2=amplitude * (peak_mps2 / peak))
@@ -81,7 +81,7 @@ def ambient(
     lines: int = 64,
     rms_mps2: float = 0.02,
 ) -> Motion:
-    """Random tri-axial motion of a structure: independent lines in all three channels, `rms_mps2` in each."""
+    """Random tri-axial motion of a structure: independent lines in each of the three channels, of `rms_mps2` each."""
     frequency = low_hz + (high_hz - low_hz) * (np.arange(lines) + generator.uniform(0.2, 0.8, lines)) / lines
     weight = generator.normal(size=(lines, 3)) + 1j * generator.normal(size=(lines, 3))
     rms = np.sqrt((np.abs(weight) ** 2).sum(axis=0) / 2)

@@ -1,4 +1,4 @@
-"""An MPU-6050 or one of its successors at register level with its live FIFO, which runs over byte by byte."""
+"""An MPU-6050 or one of its successors at register level with its FIFO, which overruns byte by byte."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from hw.virtual.fifo_twin import Counts, FifoTwin
 
 SMPLRT_DIV, FIFO_EN, INT_ENABLE, INT_STATUS, DATA, TEMPERATURE = 0x19, 0x23, 0x38, 0x3A, 0x3B, 0x41
 USER_CTRL, POWER_1, POWER_2, FIFO_COUNT, FIFO_DATA, WHO_AM_I = 0x6A, 0x6B, 0x6C, 0x72, 0x74, 0x75
-TRIM = bytes([0x12, 0x34, 0x56, 0x78, 0x9A, 0xBC])  # the maker's, any constant does
+TRIM = bytes([0x12, 0x34, 0x56, 0x78, 0x9A, 0xBC])  # factory trim; any constant will do
 
 
 class Mpu6050Twin(FifoTwin):
@@ -20,7 +20,7 @@ class Mpu6050Twin(FifoTwin):
     data_register = FIFO_DATA
     identity = 0x68
     trim_register = 0x06
-    # 0.488 g as the maker measured it: code 12 of the MPU-6050's five bits, 113 of the later parts
+    # factory value 0.488 g: code 12 in the five bits of the MPU-6050, 113 in later parts
     self_test_codes = bytes([3 << 5, 3 << 5, 3 << 5, 0])
     temperature_at_25_degc = round((25 - 36.53) * 340)
 
@@ -28,7 +28,7 @@ class Mpu6050Twin(FifoTwin):
         registers = bytearray(256)
         registers[WHO_AM_I] = self.identity
         registers[0x0D:0x11] = self.self_test_codes
-        registers[POWER_1] = 0x40  # asleep
+        registers[POWER_1] = 0x40  # sleep mode
         registers[self.trim_register : self.trim_register + len(TRIM)] = TRIM
         return registers
 
@@ -37,11 +37,11 @@ class Mpu6050Twin(FifoTwin):
         awake = not self.registers[POWER_1] & 0x40
         return awake and bool(self.registers[USER_CTRL] & 0x40) and bool(self.registers[FIFO_EN] & 0x08)
 
-    def _encode(self, first: int, counts: Counts) -> bytes:  # noqa: ARG002 - these samples bear no number
+    def _encode(self, first: int, counts: Counts) -> bytes:  # noqa: ARG002 - these samples carry no number
         return counts.astype(">i2").tobytes()
 
     def _deflection(self) -> Counts:
-        change = 8000 >> (self.registers[0x1C] >> 3 & 3)  # the same in g at any range
+        change = 8000 >> (self.registers[0x1C] >> 3 & 3)  # the same in g at every range
         return np.full(3, change if self.registers[0x1C] & 0xE0 == 0xE0 else 0, np.int32)
 
     def _get(self, register: int) -> int:

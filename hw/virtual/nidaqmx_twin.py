@@ -1,4 +1,4 @@
-"""Stands in for the library nidaqmx with one device behind it, as nidaqmx 1.7.0 documents it."""
+"""Replaces the library nidaqmx, with one device connected, as nidaqmx 1.7.0 documents it."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ NO_LONGER_AVAILABLE, INVALID_DEVICE_ID, NO_SUCH_CHANNEL, BAD_VALUE = -200279, -2
 
 
 class DaqNotFoundError(Exception):
-    """As the library's."""
+    """Like the error of the library."""
 
 
 class DaqError(Exception):
-    """As the library's: its message has several lines."""
+    """Like the error of the library, whose message has several lines."""
 
     def __init__(self, message: str, error_code: int) -> None:
         super().__init__(f"{message}\n\nStatus Code: {error_code}")
@@ -26,37 +26,37 @@ class DaqError(Exception):
 
 
 class AcquisitionType(Enum):
-    """How long a task samples."""
+    """Whether a task samples a fixed number of times or continuously."""
 
     FINITE = 10178
     CONTINUOUS = 10123
 
 
 class Coupling(Enum):
-    """Of an input."""
+    """Coupling of an input."""
 
     AC = 10045
     DC = 10050
 
 
 class ExcitationSource(Enum):
-    """Of a sensor's current."""
+    """Source of the supply current of a sensor."""
 
     INTERNAL = 10200
     NONE = 10230
 
 
 class ExcitationVoltageOrCurrent(Enum):
-    """What a sensor is fed with."""
+    """Whether a sensor is supplied with a voltage or a current."""
 
     USE_VOLTAGE = 10322
     USE_CURRENT = 10134
 
 
 class NidaqmxTwin:
-    """The modules. `source(first, n)` returns (n, channels) volts; `samples_due()` how many exist now.
+    """Replaces the modules. `source(first, n)` returns (n, channels) volts; `samples_due()` how many samples exist.
 
-    As the library's, a buffer that runs over its reader is told by the next read, and the task must be started anew.
+    If the buffer overruns, the next read reports it and the task must be started again, like with the library.
     """
 
     DaqError = DaqError
@@ -65,9 +65,9 @@ class NidaqmxTwin:
         self.source = source
         self.samples_due = samples_due
         self.plugged = True
-        self.installed = True  # NI-DAQmx itself
+        self.installed = True  # whether NI-DAQmx itself is installed
         self.rate_error = 0.0
-        self.task: Task | None = None  # the newest
+        self.task: Task | None = None  # the newest task
         self.modules: dict[str, Any] = {
             "nidaqmx": self,
             "nidaqmx.constants": SimpleNamespace(
@@ -82,24 +82,24 @@ class NidaqmxTwin:
         }
 
     def Task(self) -> Task:  # noqa: N802 - the library's name
-        """A task."""
+        """Make a task."""
         if not self.installed:
             raise DaqNotFoundError("Could not find an installation of NI-DAQmx.")
         self.task = Task(self)
         return self.task
 
-    def device(self, name: str) -> Any:  # noqa: ARG002 - there is one
-        """What a device says of itself."""
+    def device(self, name: str) -> Any:  # noqa: ARG002 - there is only one device
+        """Properties of a device."""
         return SimpleNamespace(product_type="NI 9234", serial_num=0x1A2B3C)
 
     def check(self) -> None:
-        """Whether the device is there."""
+        """Raise DaqError if the device is not connected."""
         if not self.plugged:
             raise DaqError("Device identifier is invalid.", INVALID_DEVICE_ID)
 
 
 class Task:
-    """A task; it is its own collection of channels, timing and stream, which the library keeps apart."""
+    """A task. It is also its own collection of channels, timing and stream, which are separate in the library."""
 
     def __init__(self, twin: NidaqmxTwin) -> None:
         self.twin = twin
@@ -111,7 +111,7 @@ class Task:
         self.next = 0
 
     def add_ai_voltage_chan(self, physical_channel: str, *, min_val: float, max_val: float) -> Any:
-        """Add an input; its range is the smallest that holds what is expected."""
+        """Add an input; its range is the smallest one that includes `min_val` and `max_val`."""
         self.twin.check()
         if not physical_channel.startswith("cDAQ1Mod1/ai"):
             raise DaqError("Physical channel specified does not exist.", NO_SUCH_CHANNEL)
@@ -120,32 +120,32 @@ class Task:
         return self.inputs[-1]
 
     def cfg_samp_clk_timing(self, rate: float, *, sample_mode: AcquisitionType, samps_per_chan: int) -> None:
-        """Set rate and buffer."""
+        """Set rate and size of the buffer."""
         assert sample_mode is AcquisitionType.CONTINUOUS
         if rate > 51_200:
             raise DaqError("Requested value is not a supported value for this property.", BAD_VALUE)
         self.samp_clk_rate = rate * (1 + self.twin.rate_error)
-        self.capacity = max(samps_per_chan, 10_000)  # the library's own least for a rate of 100 to 10 000 Hz
+        self.capacity = max(samps_per_chan, 10_000)  # the library's minimum for a rate of 100 to 10 000 Hz
 
     def start(self) -> None:
-        """From now on samples are kept."""
+        """Start to keep samples."""
         self.twin.check()
         assert not self.running
         self.running = True
         self.next = self.twin.samples_due()
 
     def stop(self) -> None:
-        """Sample no more."""
+        """Stop sampling."""
         self.twin.check()
         self.running = False
 
     def close(self) -> None:
-        """Forget it."""
+        """Delete the task."""
         self.closed = True
 
     @property
     def avail_samp_per_chan(self) -> int:
-        """How many can be read."""
+        """Number of samples per channel that can be read."""
         self.twin.check()
         return min(self.twin.samples_due() - self.next, self.capacity) if self.running else 0
 

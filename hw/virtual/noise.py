@@ -1,4 +1,4 @@
-"""Random numbers that depend on seed, stream and block alone, so that nobody's way of asking changes them."""
+"""Random numbers that depend only on seed, stream and block, so that they do not depend on the order of the calls."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-BLOCK = 2048  # samples a block: 2 s at 1 kHz, long enough that a block's fixed cost is small
+BLOCK = 2048  # samples per block: 2 s at 1 kHz, long enough to make the fixed cost of a block small
 
 
 class Stream(IntEnum):
-    """What a random number is for."""
+    """Purpose of a random number."""
 
     SENSOR = 1
     SENSOR_COLOURED = 2
@@ -28,27 +28,27 @@ class Stream(IntEnum):
 
 
 def generator(seed: int, stream: Stream, block: int = 0) -> np.random.Generator:
-    """The generator of one block: Philox, keyed by seed and stream, its counter's high word being the block.
+    """The generator of one block: Philox with seed and stream as its key and the block in the high word of its counter.
 
-    Raises ValueError for a seed that is no unsigned 64-bit number.
+    Raises ValueError if the seed is not an unsigned 64-bit number.
     """
     if not 0 <= seed < 2**64:
-        raise ValueError(f"a seed is a whole number from 0 to 2^64 - 1, got {seed}")
+        raise ValueError(f"the seed must be a whole number from 0 to 2^64 - 1, got {seed}")
     return np.random.Generator(np.random.Philox(key=[seed, int(stream)], counter=[0, 0, 0, block]))
 
 
 class ColouredNoise:
-    """Stationary AR(1) noise of SD 1, x_k = phi x_(k-1) + sqrt(1 - phi^2) w_k, three axes, block by block.
+    """Stationary AR(1) noise with standard deviation 1, x_k = phi x_(k-1) + sqrt(1 - phi^2) w_k, three axes, by blocks.
 
-    The state at a block's beginning follows from all blocks before it; going on from the last one asked for is cheap,
-    going back starts again at the first.
+    The state at the start of a block depends on all blocks before it. Asking for the next block is fast; asking for an
+    earlier block starts again at the first one.
     """
 
     def __init__(self, seed: int, phi: float) -> None:
         if not 0 < phi < 1:
-            raise ValueError(f"AR(1) coefficient must lie between 0 and 1, got {phi}")
+            raise ValueError(f"the AR(1) coefficient must lie between 0 and 1, got {phi}")
         self._seed, self._phi = seed, phi
-        # 32 steps at a time by a triangular matrix instead of one at a time
+        # a triangular matrix makes 32 steps at a time
         step = np.arange(32)
         self._kernel = np.tril(phi ** np.abs(step[:, None] - step[None, :])) * np.sqrt(1 - phi**2)
         self._decay = phi ** (step[:, None] + 1.0)
@@ -56,7 +56,7 @@ class ColouredNoise:
         self._state = self._start()
 
     def block(self, block: int) -> Array:
-        """(BLOCK, 3) values of one block."""
+        """The values (BLOCK, 3) of one block."""
         if block < self._next:
             self._next, self._state = 0, self._start()
         while self._next < block:

@@ -1,4 +1,4 @@
-"""All that can be set on the virtual bench. Every fault is off by default; the values are what is true, not priors."""
+"""All parameters of the virtual bench. Faults are off by default. The values are true values, not priors."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorParameters:
-    """The accelerometer under calibration: V = S a + Q (Eq. 8), and how it falls short of that.
+    """The accelerometer under calibration: V = S a + Q (Eq. 8), and its deviations from this model.
 
-    `sensitivity` (3, 3) in output unit per m/s2, `offset` (3,) in output unit. What is said in m/s2 acts on the output
-    through `nominal_sensitivity`. The filters act on all axes alike; `lag_s` is a pure delay an axis.
+    `sensitivity` (3, 3) in output unit per m/s2, `offset` (3,) in output unit. Values in m/s2 are converted to the
+    output unit by `nominal_sensitivity`. The filters act on all axes alike; `lag_s` is a pure delay, one value per
+    axis.
     """
 
     sensitivity: Array = field(default_factory=lambda: np.eye(3))
@@ -28,7 +29,7 @@ class SensorParameters:
     unit: str = "m/s2"
     nominal_sensitivity: float = 1.0
     resolution: float = 0.0  # output unit; 0: not quantised
-    limit: float = np.inf  # output unit; indications are held within +- limit
+    limit: float = np.inf  # output unit; indications are limited to +- limit
     clock: Clock = field(default_factory=Clock)
     bursts: Bursts | None = None  # None: every sample is stamped with its true time
     noise_mps2: float = 0.0  # SD of white noise
@@ -37,24 +38,24 @@ class SensorParameters:
     lag_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
     lowpass_hz: float | None = None
     lowpass_order: Literal[1, 2] = 1
-    highpass_hz: float | None = None  # AC-coupled, first order: gravity is not felt
+    highpass_hz: float | None = None  # corner of a first-order AC coupling; the sensor then does not indicate gravity
     offset_by_position_mps2: Array | None = None  # (positions, 3)
-    offset_by_window_mps2: float = 0.0  # SD of a new offset in every window, each axis
+    offset_by_window_mps2: float = 0.0  # standard deviation of an offset that changes with every window, per axis
     offset_per_k_mps2: tuple[float, float, float] = (0.0, 0.0, 0.0)
     sensitivity_per_k: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReferenceParameters:
-    """The reference: uniaxial on the slide, or tri-axial beside the sensor where `rotation` is given.
+    """The reference: uniaxial on the slide, or tri-axial beside the sensor if `rotation` is given.
 
-    `rotation` (3, 3) is R in a = R a_ref. `sensitivity` multiplies what it measures: 1.001 is 0.1 % too high, -1 has
-    the polarity turned. Noise and resolution are in its own unit, m/s2 or m/s.
+    `rotation` (3, 3) is R in a = R a_ref. `sensitivity` multiplies the indication: with 1.001 it is 0.1 % too high,
+    with -1 the polarity is wrong. Noise and resolution are in the reference's unit, m/s2 or m/s.
     """
 
     rotation: Array | None = None
     quantity: Literal["acceleration", "velocity"] = "acceleration"
-    feels_gravity: bool = True  # a tri-axial one; a uniaxial one on a level slide has none to feel
+    feels_gravity: bool = True  # for a tri-axial reference; gravity has no component along a level slide
     sensitivity: float = 1.0
     noise: float = 0.0
     resolution: float = 0.0
@@ -71,7 +72,7 @@ class ReferenceParameters:
 
 @dataclass(frozen=True, slots=True)
 class ClampErrors:
-    """True angle minus nominal angle of the clamp, in degrees; the lists have one entry a position."""
+    """True minus nominal angle of the clamp, in degrees. The lists have one entry per position."""
 
     theta_deg: float = 0.0
     alpha_deg: float = 0.0
@@ -79,7 +80,7 @@ class ClampErrors:
     alpha_by_position_deg: tuple[float, ...] = ()
 
     def of_positions(self, n: int) -> tuple[Array, Array]:
-        """Errors of theta and alpha, in degrees, each (n,). Raises ValueError where a list has not n entries."""
+        """Errors of theta and alpha, in degrees, each (n,). Raises ValueError if a list does not have n entries."""
         theta = np.array(self.theta_by_position_deg or (0.0,) * n)
         alpha = np.array(self.alpha_by_position_deg or (0.0,) * n)
         if theta.shape != (n,) or alpha.shape != (n,):
@@ -89,16 +90,16 @@ class ClampErrors:
 
 @dataclass(frozen=True, slots=True)
 class Knocks:
-    """Blows on the sensor that the reference does not see: half-sines at random times, in random directions."""
+    """Shocks at the sensor that the reference does not measure: half-sines at random times in random directions."""
 
-    rate_hz: float = 0.0  # mean number a second
-    peak_mps2: float = 8.0  # the highest; each is 0.3 to 1 of it
+    rate_hz: float = 0.0  # mean number per second
+    peak_mps2: float = 8.0  # largest peak; each shock has 0.3 to 1 of it
     duration_s: float = 0.02
 
 
 @dataclass(frozen=True, slots=True)
 class Temperature:
-    """Slow temperature of the sensor, mean + swing * sin; the sensor's S and Q are stated at `mean_degc`."""
+    """Slow change of the sensor's temperature, mean + swing * sin; the sensor's S and Q hold at `mean_degc`."""
 
     mean_degc: float = 25.0
     swing_k: float = 0.0
@@ -111,7 +112,10 @@ class Temperature:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BenchParameters:
-    """The whole bench. By default the paper's: 3 Hz sine of 10 m/s2, theta 35 deg, six cycles a position, no fault."""
+    """Parameters of the whole bench.
+
+    Default: that of the paper, 3 Hz sine of 10 m/s2, theta 35 deg, six cycles a position, no fault.
+    """
 
     schedule: Schedule = field(
         default_factory=lambda: Schedule(
@@ -122,8 +126,8 @@ class BenchParameters:
     sensor: SensorParameters = field(default_factory=SensorParameters)
     reference: ReferenceParameters = field(default_factory=ReferenceParameters)
     gravity_mps2: float = STANDARD_GRAVITY_MPS2
-    static_sign: Literal[-1, 1] = 1  # -1: the sensor's z points out of the clamp, at rest it reads -e
+    static_sign: Literal[-1, 1] = 1  # -1: z of the sensor points out of the clamp; at rest the sensor indicates -e
     clamp: ClampErrors = field(default_factory=ClampErrors)
     knocks: Knocks = field(default_factory=Knocks)
     temperature: Temperature = field(default_factory=Temperature)
-    handling_mps2: float = 0.5  # amplitude of the shaking while a person turns the clamp
+    handling_mps2: float = 0.5  # amplitude of the vibration while a person turns the clamp

@@ -1,4 +1,4 @@
-"""A CSV recording as a device that speaks the serial text protocol, at the recording's own pace."""
+"""Plays a CSV recording as a device that sends the serial text protocol, at the speed of the recording."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-SIGNALS = (("vx", "vy", "vz"), ("ax", "ay", "az"), ("a",), ("v",))  # of sensor.csv and reference.csv
+SIGNALS = (("vx", "vy", "vz"), ("ax", "ay", "az"), ("a",), ("v",))  # column names of sensor.csv and reference.csv
 
 
 class PlaybackError(Exception):
@@ -18,16 +18,16 @@ class PlaybackError(Exception):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
-    """What is to be sent: when, in s since the first sample (N,), and the values as the file writes them (N)."""
+    """Data to be sent: the times (N,) in s since the first sample, and the values (N) as written in the file."""
 
     time_s: NDArray[np.float64]
     values: list[str]
 
 
 def read_track(path: Path, columns: tuple[str, ...] | None = None, rate_hz: float | None = None) -> Track:
-    """Read the columns to be sent, by default those of the contract's sensor.csv or reference.csv.
+    """Read the columns to be sent, by default those of sensor.csv or reference.csv as `fieldcal calibrate` reads them.
 
-    The pace is the column `time_s`, or `rate_hz` where it is given. Raises PlaybackError.
+    The times come from the column `time_s`, or from `rate_hz` if it is given. Raises PlaybackError.
     """
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
@@ -55,17 +55,19 @@ def read_track(path: Path, columns: tuple[str, ...] | None = None, rate_hz: floa
     backwards = np.flatnonzero(np.diff(time_s) < 0)
     if len(backwards):
         at = int(backwards[0]) + 1
-        raise PlaybackError(f"{path}, sample {at + 1}, column time_s: {time_s[at]} after {time_s[at - 1]}")
+        raise PlaybackError(
+            f"{path}, sample {at + 1}, column time_s: {time_s[at]} is earlier than {time_s[at - 1]} before it"
+        )
     return Track(time_s - time_s[0], values)
 
 
 def _wanted(path: Path, header: list[str], columns: tuple[str, ...] | None, rate_hz: float | None) -> list[str]:
-    """The columns to read, time first where it sets the pace."""
+    """Names of the columns to read; time_s is the first if the times come from it."""
     if columns is None:
         columns = next((names for names in SIGNALS if set(names) <= set(header)), None)
         if columns is None:
             signals = " or ".join(",".join(names) for names in SIGNALS)
-            raise PlaybackError(f"{path}, line 1: no columns {signals} in the header {','.join(header)!r}")
+            raise PlaybackError(f"{path}, line 1: none of the columns {signals} in the header {','.join(header)!r}")
     wanted = [*columns] if rate_hz else ["time_s", *columns]
     for name in wanted:
         if name not in header:
@@ -84,9 +86,9 @@ def _number(path: Path, line: int, column: str, text: str) -> float:
 
 
 class Player:
-    """Text due of a track for `hw.virtual.serial_port.PtyDevice`: silent until `begin`.
+    """Text of a track that is due, for `hw.virtual.serial_port.PtyDevice`; no text before `begin`.
 
-    With `loop` the track begins again one mean sample interval after its end, for ever.
+    With `loop` the track starts again one mean sample interval after its end, without limit.
     """
 
     def __init__(self, track: Track, *, sequence: bool = False, loop: bool = False) -> None:
@@ -104,7 +106,7 @@ class Player:
 
     @property
     def finished(self) -> bool:
-        """Whether all has been sent."""
+        """Whether the whole track has been sent."""
         return not self._loop and self._sent == len(self._track.values)
 
     def __call__(self, t_s: float) -> bytes:
@@ -112,7 +114,7 @@ class Player:
             return b""
         due = self._due(t_s - self._zero_s)
         lines = [self._line(k) for k in range(self._sent, due)]
-        # a reader gives up the line within which it opened the port: let that be a comment
+        # A reader discards the line during which it opened the port: this comment is sent to be that line.
         greeting = "# playing\n" if lines and not self._sent else ""
         self._sent = max(due, self._sent)
         return (greeting + "".join(lines)).encode("ascii", "replace")

@@ -1,4 +1,4 @@
-"""The two benches `fieldcal run` shows without a configuration: an ADXL355 on the paper's clamp, plain and faulty."""
+"""The two benches of `fieldcal run` without a configuration: an ADXL355 on the paper's clamp, plain and faulty."""
 
 from __future__ import annotations
 
@@ -21,23 +21,24 @@ from hw.virtual.spread import Spread, drawn
 from hw.virtual.timebase import Bursts, Clock
 
 COUNTS_PER_MPS2 = 256_000 / STANDARD_GRAVITY_MPS2  # ADXL355 at 2 g
-# 20 bit: 20.08 m/s2. Gravity (8.0 on z, 5.6 across), 6 m/s2 of motion and an 8 m/s2 knock stay below 18.
+# Range with 20 bit: 20.08 m/s2. Gravity (8.0 on z, 5.6 on x and y), 6 m/s2 of motion and a shock of 8 m/s2 stay below
+# 18.
 LARGEST_COUNT = 2**19 - 1
 THETA_DEG = 35.0
 ALPHAS_DEG = (0.0, 30.0, 120.0, 210.0)
 HOLD_S = 10.0
 TURN_S = 3.0
-START_S = 3.0  # a gateway has its devices open by then: four positions are through after 52 s
+START_S = 3.0  # the gateway has opened its devices by then; four positions are complete after 52 s
 # 22.5 ug/sqrt(Hz) over a quarter of 1 kHz (ADXL355 data sheet: bandwidth ODR / 4)
 ADXL355_NOISE_MPS2 = 22.5e-6 * STANDARD_GRAVITY_MPS2 * 250**0.5
 
 
 def plain(seed: int) -> BenchParameters:
-    """The sensor's own clock, bursts and noise; no lag, true angles, constant Q.
+    """The bench without faults: the sensor's own clock, bursts and noise; no lag, true angles, constant Q.
 
-    S is some per cent off nominal with transverse terms, Q some tenths of a m/s2 (data sheet: up to 75 mg); they and
-    the phases of the motion follow from `seed`. The ADXL355's rate is 0.33 % off (measured on such parts: 12 s an
-    hour). Reference: uniaxial accelerometer on the slide, 1 kHz, in m/s2, its clock 40 ppm off.
+    S differs from nominal by some per cent and has transverse terms, Q is some tenths of a m/s2 (data sheet: up to 75
+    mg). Both, and the phases of the motion, follow from `seed`. The rate of the ADXL355 is off by 0.33 % (measured on
+    such parts: 12 s per hour). Reference: uniaxial accelerometer on the slide, 1 kHz, in m/s2, its clock off by 40 ppm.
     """
     random = generator(seed, Stream.PRESET)
     main = np.diag(1 + random.uniform(-0.04, 0.04, 3))
@@ -67,11 +68,13 @@ def plain(seed: int) -> BenchParameters:
 
 
 def faulty(seed: int) -> BenchParameters:
-    """All faults of an ordinary field recording on top of `plain`, drawn by `seed` where they are uncertain.
+    """The bench `plain` with all faults of an ordinary field recording; uncertain values are drawn with `seed`.
 
-    The sensor lags by 5 ms, its rate is 1.3 % off, the clamp's angles are known to 0.2 deg (0.1 deg in common), the
-    offset differs by 0.05 m/s2 between positions, moves with 5 K of temperature, knocks hit the sensor alone, the
-    reference is known to 0.1 %, its slide moves 1 % sideways.
+    - The sensor lags by 5 ms and its rate is off by 1.3 %.
+    - The clamp's angles are known to 0.2 deg (0.1 deg common to all positions).
+    - The offset differs by 0.05 m/s2 between positions and changes with 5 K of temperature.
+    - Shocks act on the sensor but not on the reference.
+    - The reference is known to 0.1 %, and its slide moves 1 % sideways.
     """
     bench = plain(seed)
     spread = Spread(

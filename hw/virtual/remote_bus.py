@@ -1,7 +1,8 @@
-"""Targets of an I2C bus in another process: the adapter on one side of a socket, its twins on the other.
+"""Targets of an I2C bus in another process: the adapter is on one side of a socket, its twins on the other.
 
-A transfer is one packet each way: the messages (an address, 1 for a read, a length, what is to be written), and errno
-(0 when all went well) with what was read. One call each, as an ioctl is one: each is a wait for the interpreter.
+A transfer is one packet in each direction. Request: the messages (address, 1 for a read, length, bytes to write).
+Answer: errno (0 for success) and the bytes read. There is one packet per transfer, like one ioctl, because each packet
+costs a wait for the interpreter.
 """
 
 from __future__ import annotations
@@ -17,11 +18,11 @@ from pathlib import Path
 from hw.virtual.kernel import MAX_MESSAGE_BYTES, I2CBus
 
 _MESSAGE, _RESULT = struct.Struct("<BBH"), struct.Struct("<i")
-_PACKET_BYTES = 4 * MAX_MESSAGE_BYTES  # more than any driver asks for at once
+_PACKET_BYTES = 4 * MAX_MESSAGE_BYTES  # larger than any request of a driver
 
 
 class RemoteBus(I2CBus):
-    """For `installed`: an adapter whose targets `serve` answers for, at `path`."""
+    """An adapter for `installed`; the function `serve` answers for its targets at `path`."""
 
     def __init__(self, path: Path) -> None:
         super().__init__({})
@@ -30,11 +31,11 @@ class RemoteBus(I2CBus):
         self._turn = threading.Lock()
 
     def close(self) -> None:
-        """Let go of the other side."""
+        """Close the connection."""
         self._socket.close()
 
     def transfer(self, messages: list[tuple[int, int | bytes]]) -> list[bytes | None]:
-        """As every bus does it."""
+        """Do all messages, like every bus."""
         request = b""
         for address, content in messages:
             if isinstance(content, int):
@@ -44,7 +45,8 @@ class RemoteBus(I2CBus):
         with self._turn:
             self._socket.sendall(request)
             answer = self._socket.recv(_PACKET_BYTES)
-        (number,) = _RESULT.unpack_from(answer) if answer else (errno.ENODEV,)  # nothing: the other side is gone
+        # An empty answer: the other side is gone
+        (number,) = _RESULT.unpack_from(answer) if answer else (errno.ENODEV,)
         if number:
             raise OSError(number, os.strerror(number))
         read: list[bytes | None] = []
@@ -59,7 +61,7 @@ class RemoteBus(I2CBus):
 
 
 def serve(bus: I2CBus, path: Path) -> None:
-    """Answer for the bus's targets, from a thread, as long as the process lives."""
+    """Answer requests for the bus's targets from a thread, until the process ends."""
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     listener.bind(str(path))
     listener.listen()

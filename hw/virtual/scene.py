@@ -1,4 +1,4 @@
-"""The mechanics of the bench: what accelerations act in the sensor's axes at any time, without any instrument."""
+"""Mechanics of the bench: the acceleration in the sensor's axes at any time, without any instrument."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from hw.virtual.schedule import Schedule, Span, Stand, clamp_frame, rotation
 
 Array = NDArray[np.float64]
 RAMP_S = 0.4  # the motion fades in and out within this time, inside the turning
-KNOCK_CELL_S = 1.0  # knocks are drawn anew for each cell of this length
+KNOCK_CELL_S = 1.0  # shocks are drawn separately for each cell of this length, s
 
 
 class Scene:
-    """Motion, clamp, gravity, hands and knocks of one bench. Times are sorted arrays in s of the bench's clock."""
+    """Motion, clamp, gravity, handling and shocks of one bench. Times are sorted arrays in s of the bench's clock."""
 
     def __init__(self, parameters: BenchParameters, seed: int) -> None:
         self._p = parameters
@@ -28,7 +28,7 @@ class Scene:
         return max(window, 0) % len(self._true.stands)
 
     def spans(self, t_s: Array) -> list[Span]:
-        """Holds and turnings at `t_s`."""
+        """Holds and turns at `t_s`."""
         return list(self._true.spans(t_s))
 
     def slide(self, t_s: Array, response: ComplexArray | None = None) -> tuple[Array, Array]:
@@ -42,7 +42,7 @@ class Scene:
     ) -> Array:
         """Acceleration (n, 3) in the sensor's true axes, Eqs. (9)-(11).
 
-        The motion passes through `response`; gravity, the shaking by hands and the knocks do not.
+        The motion passes through `response`; gravity, the vibration by handling and the shocks do not.
         """
         _, motion = self.slide(t_s, response)
         g = self._p.static_sign * self._p.gravity_mps2 if gravity else 0.0
@@ -58,7 +58,7 @@ class Scene:
         return felt
 
     def _level(self, t_s: Array) -> Array:
-        """Level of the motion and its first and second derivative, (3, n)."""
+        """Level of the motion with its first and second derivative, (3, n)."""
         level = np.zeros((3, len(t_s)))
         for span in self._true.spans(t_s):
             after = self._true.stand(span.window).level
@@ -73,14 +73,14 @@ class Scene:
         return level
 
     def _turn(self, window: int) -> tuple[float, float, float]:
-        """Start and stop of the way into `window`, and the level before it; before the first window all is at rest."""
+        """Start and stop of the turn into `window`, and the level before it; before the first window all is at rest."""
         stop = self._true.start_of(window)
         if window == 0:
             return stop - max(self._p.schedule.turn_s, RAMP_S), stop, 0.0
         return stop - self._true.turn_s, stop, self._true.stand(window - 1).level
 
     def _turning(self, t_s: Array, window: int, motion: Array, g: float) -> Array:
-        """Felt while the clamp is turned by hand from the position before `window` into it."""
+        """Acceleration while a person turns the clamp from the position before `window` into that of `window`."""
         start, stop, _ = self._turn(window)
         progress = (t_s - start) / (stop - start)
         before, after = self._true.stand(window - 1), self._true.stand(window)
@@ -107,9 +107,9 @@ class Scene:
 
 
 def true_schedule(parameters: BenchParameters) -> Schedule:
-    """The schedule as the sensor really stands: the nominal one with the errors of the clamp's angles.
+    """The schedule with the true positions: the nominal one plus the errors of the clamp's angles.
 
-    Raises ValueError where an angle error is given for a position that no clamp made, or their number is wrong.
+    Raises ValueError if an angle error is given for a position without a clamp, or if the number of errors is wrong.
     """
     nominal = parameters.schedule
     theta_deg, alpha_deg = parameters.clamp.of_positions(len(nominal.stands))
@@ -121,13 +121,13 @@ def _displaced(stand: Stand, theta_error_deg: float, alpha_error_deg: float) -> 
     if theta_error_deg == 0 and alpha_error_deg == 0:
         return stand
     if stand.theta_deg is None or stand.alpha_deg is None:
-        raise ValueError("angle errors need positions on the clamp")
+        raise ValueError("angle errors are only possible for positions on the clamp")
     theta, alpha = np.deg2rad([stand.theta_deg + theta_error_deg, stand.alpha_deg + alpha_error_deg])
     return Stand(stand.hold_s, clamp_frame(theta, alpha), stand.slide, stand.level)
 
 
 def _fade(progress: Array, duration: float) -> Array:
-    """Smooth step from 0 to 1 over `progress` 0..1, and its first two time derivatives, (3, n)."""
+    """Smooth step from 0 to 1 for `progress` 0..1 within `duration`, with its first two time derivatives, (3, n)."""
     p = np.clip(progress, 0.0, 1.0)
     step = p**3 * (10 - 15 * p + 6 * p**2)
     rate = 30 * p**2 * (1 - p) ** 2 / duration
@@ -136,15 +136,15 @@ def _fade(progress: Array, duration: float) -> Array:
 
 
 def _turned(before: Stand, after: Stand, progress: Array) -> Array:
-    """Frames (n, 3, 3) on the shortest way from one stand's to the other's."""
+    """Frames (n, 3, 3) on the shortest rotation from the frame of `before` to that of `after`."""
     way = after.frame @ before.frame.T
     angle = np.arccos(np.clip((np.trace(way) - 1) / 2, -1.0, 1.0))
     if angle < 1e-12:
         return np.broadcast_to(before.frame, (len(progress), 3, 3))
-    # (way + way') / 2 = cos I + (1 - cos) k k': its largest column gives the axis even at 180 deg
+    # (way + way') / 2 = cos I + (1 - cos) k k': its largest column gives the axis k, also at 180 deg.
     outer = (way + way.T) / 2 - np.cos(angle) * np.eye(3)
     axis = outer[:, np.argmax(np.diag(outer))]
     axis = axis / np.linalg.norm(axis)
-    if np.sum(np.cross(np.eye(3), axis) * (way - way.T)) < 0:  # the axis came without its sign
+    if np.sum(np.cross(np.eye(3), axis) * (way - way.T)) < 0:  # the column gives k without its sign
         axis = -axis
     return np.asarray(rotation(axis, progress * angle) @ before.frame)

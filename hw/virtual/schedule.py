@@ -1,4 +1,4 @@
-"""How the sensor stands on the bench, for how long, and how it is turned from one position to the next."""
+"""Positions of the sensor on the bench, how long each is held, and how the sensor is turned between them."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ STANDARD_GRAVITY_MPS2 = 9.80665
 
 
 def clamp_frame(theta_rad: float, alpha_rad: float) -> Array:
-    """Bench directions in the sensor's axes on the clamp, (3, 3): columns along the slide, lateral, gravity.
+    """Directions of the bench in the sensor's axes on the clamp, (3, 3); columns: along the slide, lateral, gravity.
 
-    The first column multiplies a_ref, the third g in Eqs. (9)-(11), printed signs; the second completes a right-handed
-    frame. The paper's clamp has its slide horizontal.
+    The first column multiplies a_ref and the third g in Eqs. (9)-(11), with the printed signs. The second column
+    completes a right-handed frame. The slide of the paper's clamp is horizontal.
     """
     st, ct = np.sin(theta_rad), np.cos(theta_rad)
     sa, ca = np.sin(alpha_rad), np.cos(alpha_rad)
@@ -33,10 +33,11 @@ def rotation(axis: Array, angle_rad: Array | float) -> Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stand:
-    """One position of the sensor, held for `hold_s`, the bench moving at `level` times its motion.
+    """One position of the sensor, held for `hold_s`; the bench moves with `level` times its motion.
 
-    `frame` (3, 3) turns bench axes (horizontal, lateral, gravity) into the sensor's; `slide` (3,) is the unit vector
-    of the slide in bench axes, horizontal unless the slide is inclined. Angles are kept where a clamp gave the frame.
+    `frame` (3, 3) turns bench axes (horizontal, lateral, gravity) into the sensor's. `slide` (3,) is the unit vector of
+    the slide in bench axes; it is horizontal unless the slide is inclined. The angles are kept if a clamp defined the
+    frame.
     """
 
     hold_s: float
@@ -48,7 +49,7 @@ class Stand:
 
     @property
     def carrier(self) -> Array:
-        """(3, 3), columns: the three channels of the motion in the sensor's axes."""
+        """The three channels of the motion in the sensor's axes, (3, 3), as columns."""
         return np.column_stack([self.frame @ self.slide, self.frame[:, 1:]])
 
 
@@ -59,10 +60,10 @@ def clamped(theta_deg: float, alpha_deg: float, hold_s: float, level: float = 1.
 
 
 def directed(direction: Array, gravity: Array, hold_s: float, level: float = 1.0) -> Stand:
-    """A field node: motion along the unit vector `direction`, an ideal sensor at rest reading along `gravity`."""
+    """A position of a field node: motion along the unit vector `direction`, gravity along `gravity` at rest."""
     d, e = (np.asarray(v, dtype=float) / np.linalg.norm(v) for v in (direction, gravity))
     lateral = np.cross(e, d)
-    if np.linalg.norm(lateral) < 1e-9:  # a vertical slide leaves the horizontal free
+    if np.linalg.norm(lateral) < 1e-9:  # the slide is vertical: any horizontal direction will do
         lateral = np.cross(e, np.eye(3)[np.argmin(np.abs(e))])
     lateral /= np.linalg.norm(lateral)
     frame = np.column_stack([np.cross(lateral, e), lateral, e])
@@ -70,12 +71,12 @@ def directed(direction: Array, gravity: Array, hold_s: float, level: float = 1.0
 
 
 def resting(gravity: Array, hold_s: float) -> Stand:
-    """A static position: an ideal sensor reads along `gravity`, nothing moves."""
+    """A static position: nothing moves, an ideal sensor indicates along `gravity`."""
     return directed(np.eye(3)[np.argmin(np.abs(gravity))], gravity, hold_s, level=0.0)
 
 
 class PoseInterval(NamedTuple):
-    """The nominal position between two times of the bench's clock, as an operator would write it down."""
+    """The nominal position between two times of the bench's clock, as an operator would write it into poses.csv."""
 
     start_s: float
     stop_s: float
@@ -88,7 +89,7 @@ class PoseInterval(NamedTuple):
 
 
 class Span(NamedTuple):
-    """A part of a sorted array of times: at rest in window `window`, or on the way into it."""
+    """Part of a sorted array of times: the hold of window `window`, or the turn into it."""
 
     part: slice
     window: int
@@ -97,10 +98,12 @@ class Span(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Schedule:
-    """Stands one after the other for ever; between two the motion fades out, the sensor is turned, it fades in.
+    """Stands one after the other, repeated without end.
 
-    Window w is stand `w % len(stands)` in its repetition `w // len(stands)`. Before `start_s` the sensor waits in the
-    first position, the slide at rest.
+    Between two stands the motion fades out, the sensor is turned, and the motion fades in.
+
+    Window w is stand `w % len(stands)` in repetition `w // len(stands)`. Before `start_s` the sensor is in the first
+    position and the slide is at rest.
     """
 
     stands: tuple[Stand, ...]
@@ -109,7 +112,7 @@ class Schedule:
 
     @property
     def period_s(self) -> float:
-        """Time after which everything repeats."""
+        """Duration of one repetition, s."""
         return sum(stand.hold_s + self.turn_s for stand in self.stands)
 
     def duration_s(self, repetitions: int) -> float:
@@ -117,17 +120,17 @@ class Schedule:
         return self.start_s + repetitions * self.period_s - self.turn_s
 
     def start_of(self, window: int) -> float:
-        """When window `window` begins."""
+        """Time at which window `window` starts, s."""
         repetition, index = divmod(window, len(self.stands))
         before = sum(stand.hold_s + self.turn_s for stand in self.stands[:index])
         return self.start_s + repetition * self.period_s + before
 
     def stand(self, window: int) -> Stand:
-        """The stand of window `window`; the first one before the beginning."""
+        """The stand of window `window`; the first stand for a negative window."""
         return self.stands[max(window, 0) % len(self.stands)]
 
     def window_at(self, t_s: float) -> int:
-        """The window that holds at `t_s`, or that the turning at `t_s` leads to."""
+        """The window whose hold, or whose turn before the hold, includes `t_s`."""
         repetition = max(0, int((t_s - self.start_s) // self.period_s))
         window = repetition * len(self.stands)
         while t_s >= self.start_of(window) + self.stand(window).hold_s:
@@ -135,7 +138,7 @@ class Schedule:
         return window
 
     def spans(self, t_s: Array) -> Iterator[Span]:
-        """Sorted times `t_s` cut into holds and turnings."""
+        """Divide sorted times `t_s` into holds and turns."""
         first, n = 0, len(t_s)
         window = self.window_at(float(t_s[0]))
         while first < n:
@@ -148,7 +151,7 @@ class Schedule:
             window += 1
 
     def poses(self, until_s: float) -> list[PoseInterval]:
-        """The nominal positions whose hold ends by `until_s` (to a microsecond)."""
+        """Nominal positions whose hold ends by `until_s` (to 1 us)."""
         found: list[PoseInterval] = []
         window = 0
         while (stop := self.start_of(window) + self.stand(window).hold_s) <= until_s + 1e-6:

@@ -1,4 +1,4 @@
-"""The devices of a bench as `serial-csv` sees them."""
+"""The devices of a bench as devices of the driver `serial-csv`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Role = Literal["sensor", "reference"]
 
 
 def serial_lines(bench: Bench, role: Role, time: BenchTime) -> SampleLines:
-    """The text one of the bench's devices writes, for a `PtyDevice`."""
+    """The text that one device of the bench sends, for a `PtyDevice`."""
     if role == "sensor":
         values, due, resolution = bench.sensor_values, bench.sensor_samples_due, bench.parameters.sensor.resolution
     else:
@@ -24,7 +24,7 @@ def serial_lines(bench: Bench, role: Role, time: BenchTime) -> SampleLines:
 
 
 def serial_options(bench: Bench, role: Role) -> dict[str, Any]:
-    """Options of `serial-csv` for one of the bench's devices, all but the port."""
+    """Options of `serial-csv` for one device of the bench, without the port."""
     p = bench.parameters
     if role == "sensor":
         return {"axes": 3, "rate_hz": p.sensor.clock.nominal_rate_hz, "sequence": True, "unit": p.sensor.unit}
@@ -34,5 +34,5 @@ def serial_options(bench: Bench, role: Role) -> dict[str, Any]:
 
 
 def decimals_of(resolution: float) -> int:
-    """Decimals that tell all multiples of `resolution` apart; 6 for an unquantised signal."""
+    """Number of decimals that is enough to tell all multiples of `resolution` apart; 6 for an unquantised signal."""
     return max(0, -int(np.floor(np.log10(resolution) + 1e-9))) if resolution else 6

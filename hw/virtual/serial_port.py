@@ -1,4 +1,4 @@
-"""A device on a pseudo-terminal: what a USB serial sensor is to pyserial, unplugging included."""
+"""A device on a pseudo-terminal, which pyserial treats like a USB serial sensor; it can be unplugged."""
 
 from __future__ import annotations
 
@@ -15,16 +15,20 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-BURST_S = 0.008  # USB adapters hand bytes on every 1 to 16 ms
+BURST_S = 0.008  # USB adapters deliver bytes every 1 to 16 ms
 
 
 class PtyDevice:
-    """Writes the text that is due to whoever has the port open, and never waits for a reader.
+    """Sends the text that is due to the reader that has the port open, and never waits for the reader.
 
-    `text_due(t_s)` returns the text that became due since its last call, as bytes; `clock()` is the device's time in
-    seconds; `received(data)` takes what is sent to it. `path` is a symbolic link that stays the same over `unplug` and
-    `replug`. Either `start` a thread that serves in bursts, or call `serve` yourself. As on a wire, what nobody reads
-    is lost: without a reader all of it, with a slow one what the kernel's buffer does not hold (`lost_bytes`).
+    - `text_due(t_s)` returns the text that became due since its last call, as bytes.
+    - `clock()`: time of the device, s.
+    - `received(data)` gets the bytes that are sent to the device.
+    - `path`: a symbolic link that stays the same over `unplug` and `replug`.
+
+    Either `start` a thread that serves in bursts, or call `serve` yourself. As on a real line, bytes that nobody reads
+    are lost: all of them without a reader, and with a slow reader those that do not fit into the kernel's buffer
+    (`lost_bytes`).
     """
 
     def __init__(
@@ -42,30 +46,30 @@ class PtyDevice:
         self.lost_bytes = 0
         self._garbage = b""
         self._master: int | None = None
-        self._lock = threading.Lock()  # serve against unplug and replug
+        self._lock = threading.Lock()  # serve() and unplug() or replug() must not run at the same time
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
         self.replug()
 
     def replug(self) -> None:
-        """Make the port (again): a new terminal under the same path. Raises FileExistsError if the path is taken."""
+        """Make the port again: a new terminal under the same path. Raises FileExistsError if the path exists."""
         with self._lock:
             if self._master is not None:
                 return
             master, slave = os.openpty()
             try:
-                tty.setraw(slave)  # otherwise the terminal echoes what the device wrote before the port was opened
+                tty.setraw(slave)  # otherwise the terminal echoes what the device sent before the port was opened
                 os.set_blocking(master, False)
                 self.path.symlink_to(os.ttyname(slave))
             except BaseException:
                 os.close(master)
                 raise
             finally:
-                os.close(slave)  # only so does the master hear whether anybody reads
+                os.close(slave)  # only then the master is told whether a reader has the port open
             self._master = master
 
     def unplug(self) -> None:
-        """Hang up: a reader's next call fails, and the path is gone."""
+        """Unplug: the next call of a reader fails, and the path is removed."""
         with self._lock:
             if self._master is not None:
                 os.close(self._master)
@@ -73,16 +77,16 @@ class PtyDevice:
                 self.path.unlink(missing_ok=True)
 
     def has_reader(self) -> bool:
-        """Whether somebody has the port open."""
+        """Whether a reader has the port open."""
         with self._lock:
             return self._open_for_reading()
 
     def inject(self, garbage: bytes) -> None:
-        """Write this before the next text."""
+        """Send these bytes before the next text."""
         self._garbage += garbage
 
     def serve(self) -> None:
-        """Take what was sent to the device, write what is due now."""
+        """Receive the bytes that were sent to the device, then send what is due."""
         self._listen()
         text = self._garbage + self._text_due(self._clock())
         self._garbage = b""
@@ -134,8 +138,8 @@ class PtyDevice:
 class SampleLines:
     """Text of a sampled signal in the serial text protocol, for `PtyDevice`.
 
-    `values(first, n)` returns (n, axes) indications; `samples_due(t_s)` how many samples exist at `t_s` in all. Starts
-    with a comment, since a reader gives up the line within which it opened the port.
+    `values(first, n)` returns (n, axes) indications; `samples_due(t_s)` the number of samples that exist at `t_s`. The
+    text starts with a comment, because a reader discards the line during which it opened the port.
     """
 
     def __init__(
@@ -166,7 +170,7 @@ class SampleLines:
 
 
 def format_lines(values: NDArray[np.float64], number: str = "%.6f", first_sequence: int | None = None) -> bytes:
-    """Lines of the serial text protocol for (n, axes) values; with their sequence, if its first number is given."""
+    """Lines of the serial text protocol for (n, axes) values, with sequence numbers if the first one is given."""
     fields: Sequence[str] = [number] * values.shape[1]
     if first_sequence is not None:
         fields = ["%d", *fields]

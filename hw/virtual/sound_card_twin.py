@@ -1,4 +1,4 @@
-"""Stands in for the library sounddevice with one sound card behind it."""
+"""Replaces the library sounddevice, with one sound card connected."""
 
 from __future__ import annotations
 
@@ -12,12 +12,14 @@ BUFFER_S = 1.0
 
 
 class PortAudioError(Exception):
-    """As the library's."""
+    """Like the error of the library."""
 
 
 class SoundCardTwin:
-    """`source(first, n)` returns (n, 2) 24 bit counts, `samples_due()` how many exist now. As PortAudio's, the buffer
-    drops the newest samples once it is full, and the next read says that it overflowed."""
+    """Replaces the module. `source(first, n)` returns (n, 2) 24-bit counts, `samples_due()` how many samples exist.
+
+    A full buffer drops the newest samples, and the next read reports an overflow, like with PortAudio.
+    """
 
     PortAudioError = PortAudioError
 
@@ -39,31 +41,31 @@ class SoundCardTwin:
         return cards if index is None else cards[index]
 
     def InputStream(self, **settings: Any) -> Stream:  # noqa: N802 - the library's name
-        """A stream from the card."""
+        """Open a stream from the card."""
         if settings["samplerate"] > 48000:
             raise PortAudioError("Invalid sample rate [PaErrorCode -9997]")
         return Stream(self, settings["samplerate"])
 
     def take(self, n: int) -> NDArray[np.int32]:
-        """The next n frames, left-justified as the library hands them on."""
+        """The next n frames, left-justified like those of the library."""
         frames = self._source(self.next, n) << 8
         self.next += n
         return frames
 
 
 class Stream:
-    """What `InputStream` returns."""
+    """Replaces the object that `InputStream` returns."""
 
     def __init__(self, card: SoundCardTwin, rate_hz: float) -> None:
         self._card = card
         self._capacity = int(BUFFER_S * rate_hz)
 
     def start(self) -> None:
-        """From now on samples are kept."""
+        """Start to keep samples."""
         self._card.next = self._card.samples_due()
 
     def close(self, ignore_errors: bool = True) -> None:
-        """As the library's."""
+        """Close the stream."""
 
     @property
     def read_available(self) -> int:
@@ -73,7 +75,7 @@ class Stream:
         return min(self._card.samples_due() - self._card.next, self._capacity)
 
     def read(self, n: int) -> tuple[NDArray[np.int32], bool]:
-        """Frames (n, 2), and whether some were lost."""
+        """Frames (n, 2), and whether frames were lost."""
         frames = self._card.take(n)
         over = self._card.samples_due() - self._card.next
         lost, self._card.lost = self._card.lost or over, 0

@@ -1,4 +1,4 @@
-"""Faults drawn from their priors: the standard uncertainties of method and configuration, made into one true bench."""
+"""Faults drawn from their priors: standard uncertainties of the method and the configuration become one true bench."""
 
 from __future__ import annotations
 
@@ -12,24 +12,28 @@ from hw.virtual.schedule import rotation as about
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """Standard deviations of what is not exactly known, 0 where it is. Names as `fieldcal calibrate --u-...`."""
+    """Standard deviations of quantities that are not known exactly; 0: exact.
 
-    angle_deg: float = 0.0  # alpha by position
-    theta_deg: float = 0.0  # theta common to all positions
+    Names as in `fieldcal calibrate --u-...`.
+    """
+
+    angle_deg: float = 0.0  # alpha, one error per position
+    theta_deg: float = 0.0  # theta, one error common to all positions
     alpha_common_deg: float = 0.0
     theta_position_deg: float = 0.0
-    offset_mps2: float = 0.0  # by window, each axis
-    offset_position_mps2: float = 0.0  # by position, each axis
+    offset_mps2: float = 0.0  # one offset per window, each axis
+    offset_position_mps2: float = 0.0  # one offset per position, each axis
     reference_pct: float = 0.0
-    transverse_motion_pct: float = 0.0  # lateral and vertical each, of the motion along the slide
+    transverse_motion_pct: float = 0.0  # lateral and vertical motion each, relative to the motion along the slide
     gravity_mps2: float = 0.0
     rotation_deg: float = 0.0  # mounting of a tri-axial reference, each axis
 
 
 def drawn(parameters: BenchParameters, spread: Spread, random: np.random.Generator) -> BenchParameters:
-    """`parameters` with one draw of every fault in `spread` added to what they hold.
+    """`parameters` plus one draw of every fault in `spread`.
 
-    The offset by window is drawn by the bench itself (it has no end), here it is set to its SD.
+    The offset by window is drawn by the bench itself, because the number of windows is not limited; here only its
+    standard deviation is set.
     """
     n = len(parameters.schedule.stands)
     sensor, reference, clamp = parameters.sensor, parameters.reference, parameters.clamp

@@ -1,4 +1,4 @@
-"""When a virtual device takes its samples, and when a gateway gets to read them."""
+"""Times at which a virtual device takes its samples, and at which a gateway reads them."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ IntArray = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """A device's own clock: sample k is taken at offset_s + k T + (wander T_w / 2 pi) sin(2 pi k T / T_w).
+    """A device's clock: sample k is taken at offset_s + k T + (wander T_w / 2 pi) sin(2 pi k T / T_w).
 
-    T = 1 / (nominal_rate_hz * (1 + rate_error)), T_w = wander_period_s; `wander` is the greatest fractional change of
-    the period in a thermal cycle (250e-6: +-250 ppm).
+    T = 1 / (nominal_rate_hz * (1 + rate_error)), T_w = wander_period_s. `wander` is the largest relative change of the
+    period in a thermal cycle (250e-6: +-250 ppm).
     """
 
     nominal_rate_hz: float = 1000.0
@@ -39,10 +39,11 @@ class Clock:
         return self._time(np.arange(first, first + n))
 
     def due(self, t_s: Array | float) -> IntArray:
-        """How many samples exist at `t_s`: those taken at or before it."""
+        """Number of samples that exist at `t_s`: those taken at or before `t_s`."""
         t = np.asarray(t_s, dtype=float)
         nominal = t - self.offset_s
-        for _ in range(3 if self.wander else 0):  # each turn gains a factor of the wander, 1e-3 at most
+        # Each iteration improves the result by the factor `wander`, 1e-3 at most
+        for _ in range(3 if self.wander else 0):
             nominal = t - self.offset_s - self._wander_s(nominal)
         count = np.floor(nominal * self.rate_hz).astype(np.int64) + 1
         # rounding in the inverse must not contradict times()
@@ -63,10 +64,11 @@ class Clock:
 
 @dataclass(frozen=True, slots=True)
 class Bursts:
-    """When a gateway reads a device: every `poll_s`, late by `least_late_s` + an exponential, rarely by a stall.
+    """Times at which a gateway reads a device: every `poll_s`, plus a delay, rarely plus a stall.
 
-    `apart_s`: each read is set later by a share of it that the golden ratio gives, as the drivers of hw do with the
-    sample period so that reads and samples do not beat; 0 for a gateway that does not.
+    The delay is `least_late_s` + an exponential of mean `mean_late_s`. `apart_s`: range over which the reads are spread
+    by the golden ratio, as the drivers in hw spread them over a sample period so that reads and samples do not beat; 0
+    for a gateway that does not spread its reads.
     """
 
     poll_s: float = 0.016
@@ -75,10 +77,11 @@ class Bursts:
     stall_probability: float = 0.01
     longest_stall_s: float = 0.015
     apart_s: float = 0.0
-    spread: bool = False  # stamps go back from a burst's arrival at the nominal rate instead of being all alike
+    # Stamps count back from a burst's arrival at the nominal rate; otherwise all samples of a burst have one stamp
+    spread: bool = False
 
     def arrivals(self, seed: int, stream: Stream, until_s: float) -> Array:
-        """Arrival times (B,) of the reads up to `until_s`, never running backwards."""
+        """Arrival times (B,) of the reads up to `until_s`; they never decrease."""
         reads = int(until_s / self.poll_s)
         late = np.concatenate([self._lateness(seed, stream, block) for block in range(reads // BLOCK + 1)])
         number = np.arange(1, reads + 1)
@@ -87,7 +90,7 @@ class Bursts:
         return np.asarray(times[times <= until_s])
 
     def stamps(self, clock: Clock, arrivals: Array) -> Array:
-        """The stamp (N,) a gateway writes to each sample that `arrivals` brought."""
+        """The stamps (N,) that a gateway writes for the samples of `arrivals`."""
         due = clock.due(arrivals)
         count = np.diff(due, prepend=0)
         stamps = np.repeat(arrivals, count)
@@ -103,7 +106,7 @@ class Bursts:
 
 
 class BenchTime:
-    """Seconds of the bench's clock out of those of the machine's; until `begin` -1, when nothing is sampled yet."""
+    """Converts seconds of the machine's clock to seconds of the bench's clock; -1 before `begin` (no samples)."""
 
     def __init__(self) -> None:
         self._zero_s: float | None = None
@@ -114,12 +117,12 @@ class BenchTime:
         return self._zero_s is not None
 
     def begin(self, t_s: float) -> None:
-        """The machine's `t_s` is the bench's zero."""
+        """`t_s` of the machine's clock is time 0 of the bench."""
         self._zero_s = t_s
 
     def __call__(self, t_s: float) -> float:
         return -1.0 if self._zero_s is None else t_s - self._zero_s
 
     def gated(self, samples_due: Callable[[float], int]) -> Callable[[float], int]:
-        """`samples_due` of the bench's clock as a function of the machine's."""
+        """`samples_due` as a function of the machine's time instead of the bench's."""
         return lambda t_s: samples_due(self(t_s))

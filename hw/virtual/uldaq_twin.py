@@ -1,4 +1,4 @@
-"""Stands in for the library uldaq with one board behind it, as uldaq 1.2.3 documents it."""
+"""Replaces the library uldaq, with one board connected, as uldaq 1.2.3 documents it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 
 class ULError(IntEnum):
-    """Some of the library's."""
+    """Some error codes of the library."""
 
     DEV_NOT_CONNECTED = 7
     OVERRUN = 18
@@ -21,7 +21,7 @@ class ULError(IntEnum):
 
 
 class ULException(Exception):  # noqa: N818 - the library's name
-    """As the library's."""
+    """Like the error of the library."""
 
     def __init__(self, error_code: ULError) -> None:
         super().__init__(error_code)
@@ -32,20 +32,20 @@ class ULException(Exception):  # noqa: N818 - the library's name
 
 
 class InterfaceType(IntEnum):
-    """How boards are connected."""
+    """Connection of a board."""
 
     ANY = 7
 
 
 class AiInputMode(IntEnum):
-    """Of an input."""
+    """Mode of an input."""
 
     DIFFERENTIAL = 1
     SINGLE_ENDED = 2
 
 
 class Range(IntEnum):
-    """Of an input."""
+    """Range of an input."""
 
     BIP10VOLTS = 5
     BIP5VOLTS = 6
@@ -54,40 +54,40 @@ class Range(IntEnum):
 
 
 class ScanOption(IntEnum):
-    """Of a scan."""
+    """Options of a scan."""
 
     CONTINUOUS = 8
 
 
 class AInScanFlag(IntEnum):
-    """Of a scan."""
+    """Flags of a scan."""
 
     DEFAULT = 0
 
 
 class ScanStatus(IntEnum):
-    """Of a scan."""
+    """Status of a scan."""
 
     IDLE = 0
     RUNNING = 1
 
 
 class IepeMode(IntEnum):
-    """Of an input."""
+    """IEPE mode of an input."""
 
     DISABLED = 1
     ENABLED = 2
 
 
 class CouplingMode(IntEnum):
-    """Of an input."""
+    """Coupling of an input."""
 
     DC = 1
     AC = 2
 
 
 class UldaqTwin:
-    """The module. `source(first, n)` returns (n, axes) volts; `samples_due()` how many exist now."""
+    """Replaces the module. `source(first, n)` returns (n, axes) volts; `samples_due()` how many samples exist now."""
 
     ULError, ULException, InterfaceType, AiInputMode, Range = ULError, ULException, InterfaceType, AiInputMode, Range
     ScanOption, AInScanFlag, ScanStatus, IepeMode = ScanOption, AInScanFlag, ScanStatus, IepeMode
@@ -97,23 +97,23 @@ class UldaqTwin:
         self.source = source
         self.samples_due = samples_due
         self.plugged = True
-        self.iepe = True  # whether the board has the current
+        self.iepe = True  # whether the board has an IEPE current
         self.ranges = [Range.BIP10VOLTS, Range.BIP1VOLTS]
         self.rate_error = 0.0
-        self.fault: ULError | None = None  # of the next status
+        self.fault: ULError | None = None  # fault: the next status request fails with it
         self.ended = False  # fault: the scan stops by itself
 
     def get_daq_device_inventory(self, interface_type: int) -> list[Any]:
-        """Boards that are there."""
+        """Connected boards."""
         assert interface_type == InterfaceType.ANY
         return [SimpleNamespace(product_name="USB-1808X", unique_id="01F2A3B4")] if self.plugged else []
 
     def DaqDevice(self, descriptor: Any) -> Device:  # noqa: N802, ARG002 - the library's name; there is one board
-        """The board."""
+        """Make the object of the board."""
         return Device(self)
 
     def create_float_buffer(self, number_of_channels: int, samples_per_channel: int) -> Any:
-        """A ring."""
+        """Make a ring buffer."""
         return (ctypes.c_double * (number_of_channels * samples_per_channel))()
 
 
@@ -127,61 +127,61 @@ class Device:
         self._begun = self._written = 0
 
     def connect(self) -> None:
-        """As the library's."""
+        """Connect to the board."""
         self._check()
 
     def disconnect(self) -> None:
-        """As the library's."""
+        """Disconnect from the board."""
         self._check()
 
     def release(self) -> None:
-        """As the library's."""
+        """Release the board."""
 
     def get_ai_device(self) -> Device:
         """The analog inputs."""
         return self
 
     def get_info(self) -> Device:
-        """What they can do."""
+        """Properties of the analog inputs."""
         return self
 
     def get_config(self) -> Device:
-        """How they are set."""
+        """Configuration of the analog inputs."""
         return self
 
     def get_num_chans_by_mode(self, input_mode: AiInputMode) -> int:
-        """Inputs."""
+        """Number of inputs."""
         return 8 if input_mode == AiInputMode.DIFFERENTIAL else 16
 
     def get_ranges(self, input_mode: AiInputMode) -> list[Range]:  # noqa: ARG002 - the same in both modes
-        """Ranges."""
+        """Ranges that the board has."""
         return self._twin.ranges
 
     def supports_iepe(self) -> bool:
-        """Whether there is a current for sensors."""
+        """Whether the board has an IEPE current."""
         return self._twin.iepe
 
     def set_chan_iepe_mode(self, channel: int, mode: IepeMode) -> None:
-        """Turn the current on or off."""
+        """Switch the IEPE current on or off."""
         self._modes["iepe", channel] = mode
 
     def get_chan_iepe_mode(self, channel: int) -> IepeMode:
-        """Whether it is on."""
+        """Whether the IEPE current is on."""
         return IepeMode(self._modes["iepe", channel])
 
     def set_chan_coupling_mode(self, channel: int, mode: CouplingMode) -> None:
-        """AC or DC."""
+        """Set AC or DC coupling."""
         self._modes["coupling", channel] = mode
 
     def get_chan_coupling_mode(self, channel: int) -> CouplingMode:
-        """AC or DC."""
+        """Return AC or DC coupling."""
         return CouplingMode(self._modes["coupling", channel])
 
     def a_in_scan(
         self, low_channel: int, high_channel: int, input_mode: AiInputMode, analog_range: Range,
         samples_per_channel: int, rate: float, options: ScanOption, flags: AInScanFlag, data: Any,
     ) -> float:  # fmt: skip
-        """Fill `data`, round and round; the rate."""
+        """Fill the ring buffer `data` continuously; returns the actual rate, Hz."""
         self._check()
         assert len(data) == samples_per_channel * (high_channel - low_channel + 1)
         assert (options, flags) == (ScanOption.CONTINUOUS, AInScanFlag.DEFAULT)
@@ -194,7 +194,7 @@ class Device:
         return rate * (1 + self._twin.rate_error)
 
     def get_scan_status(self) -> tuple[ScanStatus, Any]:
-        """Whether it runs, and how many scans went into the ring."""
+        """Whether the scan runs, and how many scans were written into the ring buffer."""
         self._check()
         if self._twin.fault is not None:
             fault, self._twin.fault = self._twin.fault, None
@@ -204,7 +204,7 @@ class Device:
         return status, SimpleNamespace(current_scan_count=self._written)
 
     def scan_stop(self) -> None:
-        """As the library's."""
+        """Stop the scan."""
         self._check()
         self._ring = None
 

@@ -1,4 +1,4 @@
-"""A WitMotion sensor, byte by byte, for `PtyDevice`."""
+"""A WitMotion sensor at the level of its bytes, for `PtyDevice`."""
 
 from __future__ import annotations
 
@@ -20,8 +20,10 @@ def frame(kind: int, *words: int) -> bytes:
 
 
 class WitMotionTwin:
-    """`source(first, n)` returns (n, 3) counts, `samples_due(t_s)` how many exist at `t_s` in all, one each
-    1 / `rate_hz`. `text_due` and `received` are what `PtyDevice` takes."""
+    """A sensor that takes one sample every 1 / `rate_hz`; `text_due` and `received` are arguments of `PtyDevice`.
+
+    `source(first, n)` returns (n, 3) counts, `samples_due(t_s)` the number of samples that exist at `t_s`.
+    """
 
     def __init__(
         self, source: Callable[[int, int], NDArray[np.int32]], samples_due: Callable[[float], int], rate_hz: float
@@ -33,7 +35,7 @@ class WitMotionTwin:
         self.power_cycle()
 
     def power_cycle(self) -> None:
-        """Power fails and comes back: registers as they were saved, the clock begins anew."""
+        """Power fails and comes back: registers have their saved values, the clock starts again."""
         self.registers = dict.fromkeys(range(256), 0)
         self.registers |= {OUTPUT: 0x1E, RATE: 6, OFFSET_X: 12, BANDWIDTH: 4, VERSION: 0x2710}
         self.registers |= dict(enumerate(struct.unpack("<6H", b"WT4200001234"), NUMBER))
@@ -43,7 +45,7 @@ class WitMotionTwin:
         self._zero = self.next
 
     def received(self, data: bytes) -> None:
-        """Commands, as they come."""
+        """Handle the commands in `data`, which may be split anywhere."""
         self._commands += data
         while len(self._commands) >= COMMAND_BYTES:
             head, register, value = struct.unpack("<HBH", self._commands[:COMMAND_BYTES])
@@ -59,7 +61,7 @@ class WitMotionTwin:
                 self.registers[register] = value
 
     def text_due(self, t_s: float) -> bytes:
-        """Frames that became due, by what the registers ask for."""
+        """Frames that became due, with the contents that the registers select."""
         due = self._samples_due(t_s)
         first, self.next = self.next, max(self.next, due)
         text, self._answers = self._answers, b""
@@ -79,5 +81,5 @@ class WitMotionTwin:
         if asked & 0x02:
             text += frame(0x51, *counts, 2503)
         if asked & 0x04:
-            text += frame(0x52, 0x5555, 0x5155, 0x5555, 0x5055)  # bytes that look like the beginning of frames
+            text += frame(0x52, 0x5555, 0x5155, 0x5555, 0x5055)  # bytes that look like the start of frames
         return text

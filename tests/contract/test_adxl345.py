@@ -1,4 +1,4 @@
-"""The contract on the ADXL345's twin, and what only this part can do wrong."""
+"""The driver contract on the ADXL345's twin, and the faults that only this part has."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from hw.virtual.adxl345_twin import Adxl345Twin
 class Adxl345Rig(I2cRig):
     driver, twin_class, address, full = Adxl345, Adxl345Twin, 0x53, 4095
     rate_hz = 800.0
-    fifo_register = 0x30  # INT_SOURCE goes before the data
+    fifo_register = 0x30  # reads start at INT_SOURCE, before the data
 
     def lose(self) -> None:
-        # Nothing of a sample says which one it is: entries vanish without a trace only where a read breaks off.
+        # The samples carry no number, so the driver can notice a loss only as an interrupted read: simulate one.
         self.twin.break_off(errno.EIO, 3)
 
 
@@ -55,7 +55,7 @@ class TestAdxl345(I2cContract):
         rig.read()
         rig.sleep(0.2)
         rig.read()
-        assert rig.sensor.take_drops() == [Drop(33 * 6, "bytes", "FIFO ran over, or a read of it broke off")]
+        assert rig.sensor.take_drops() == [Drop(33 * 6, "bytes", "FIFO overrun or interrupted FIFO read")]
 
     def test_overrun_between_count_and_read(self, rig: Adxl345Rig) -> None:
         class Stalling(Adxl345Twin):
@@ -77,7 +77,7 @@ class TestAdxl345(I2cContract):
         assert after[0] > before[-1] + 30
 
     def test_overrun_within_a_transfer(self, rig: Adxl345Rig) -> None:
-        # An adapter stalls between two messages of one transfer, as one on USB does.
+        # An adapter may stall between two messages of one transfer, for example an adapter on USB.
         class Stalling(Adxl345Twin):
             stall_s = 0.0
 

@@ -1,4 +1,4 @@
-"""The contract on the twins of the ADXL355, ADXL357 and ADXL359, and the faults only this family has."""
+"""The driver contract on the twins of the ADXL355, ADXL357 and ADXL359, and the faults that only this family has."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ class Adxl355Rig(I2cRig):
 class TestAdxl355(I2cContract):
     kind, counts_per_g = "ADXL355", 256000  # data sheet, at 2 g
     filter_register = 0x28, "FILTER"
-    # offsets somebody trimmed, a high-pass filter somebody turned on, self-test
+    # registers that another user may have written: offsets, high-pass filter, self-test
     trimmed = {0x1E: 0x11, 0x23: 0x11, 0x2E: 0x03}  # noqa: RUF012
     late_s = 0.2
-    # Data sheet: 1885 at 25 degC, -9.05 LSB a degree: 181 LSB less are 20 degrees more.
+    # Data sheet: 1885 at 25 degC, -9.05 LSB per degC: 181 LSB less are 20 degC more.
     temperature = 1704, 45.0
 
     @pytest.fixture
@@ -50,11 +50,11 @@ class TestAdxl355(I2cContract):
     def test_wrong_identity(self, rig: Adxl355Rig) -> None:
         adxl359 = Adxl355Twin(rig.counts, rig.due, lambda: rig.t_s, identity=b"\xad\x1d\xe9\x01")
         rig.put(adxl359)
-        with pytest.raises(IdentityError, match=r"0x1D on /dev/i2c-1: expected ad 1d ed, found ad 1d e9"):
+        with pytest.raises(IdentityError, match=r"0x1D on /dev/i2c-1: expected the IDs ad 1d ed, found ad 1d e9"):
             rig.sensor.open()
 
     def test_reset_is_repeated_until_the_trim_is_back(self, rig: Adxl355Rig) -> None:
-        rig.twin.power_cycle()  # just now: the trim that is compared is not loaded yet
+        rig.twin.power_cycle()  # the trim, which the driver compares, is not loaded directly after a power cycle
         rig.sensor.open()
         flags, _ = rig.read()
         assert flags == BlockFlags.RESTART
@@ -75,7 +75,8 @@ class TestAdxl355(I2cContract):
             rig.sensor.open()
 
     def test_out_of_step_at_the_front(self, rig: Adxl355Rig) -> None:
-        # The X of the oldest sample is gone: its Y and Z are dropped, and each later poll leaves two entries behind.
+        # The X of the oldest sample is lost: its Y and Z are dropped, and each later poll leaves two entries in the
+        # FIFO.
         rig.sensor.open()
         _, before = rig.read()
         rig.sleep(0.005)
@@ -83,7 +84,7 @@ class TestAdxl355(I2cContract):
         flags, after = rig.read()
         assert flags == BlockFlags.RESTART
         assert after[0] == before[-1] + 2
-        assert rig.sensor.take_drops() == [Drop(6, "bytes", "FIFO entries out of step")]
+        assert rig.sensor.take_drops() == [Drop(6, "bytes", "incomplete samples in the FIFO")]
         number = after[-1]
         for _ in range(4):
             flags, numbers = rig.read()
@@ -101,13 +102,14 @@ class TestAdxl355(I2cContract):
         _, before = rig.read()
         flags, after = rig.read()
         assert flags == BlockFlags.RESTART
-        assert len(before) in (1, 2)  # without its X a sample's Y and Z could belong to the one before
+        # Without its X, the Y and Z of a sample could be taken for those of the sample before
+        assert len(before) in (1, 2)
         assert after[0] == before[-1] + 4 - len(before)
         (drop,) = rig.sensor.take_drops()
         assert drop.count == 3 * (3 * (3 - len(before)) - 1)
 
     def test_overrun_between_count_and_read(self, rig: Adxl355Rig) -> None:
-        # 31 samples are counted, then the process stalls and the oldest go before they are read.
+        # 31 samples are counted, then the process stalls, and the oldest samples are overwritten before they are read.
         class Stalling(rig.twin_class):  # type: ignore[name-defined,misc]
             stall_s = 0.0
 
@@ -120,14 +122,14 @@ class TestAdxl355(I2cContract):
         rig.put(Stalling(rig.counts, rig.due, lambda: rig.t_s))
         rig.sensor.open()
         _, before = rig.read()
-        rig.sleep(0.0305)  # the poll that was due meanwhile comes at once
+        rig.sleep(0.0305)  # the poll that became due meanwhile follows at once
         Stalling.stall_s = 0.01
         flags, after = rig.read()
         assert after[0] != before[-1] + 1
         assert flags == BlockFlags.RESTART | BlockFlags.OVERRUN
 
     def test_overrun_told_by_a_status_that_got_lost(self, rig: Adxl355Rig) -> None:
-        # STATUS clears by being read, also when the transfer then fails: the full FIFO must tell.
+        # A read clears STATUS even if the transfer then fails: the driver must recognise the loss by the full FIFO.
         class Garbling(rig.twin_class):  # type: ignore[name-defined,misc]
             garble = False
 
@@ -142,7 +144,8 @@ class TestAdxl355(I2cContract):
         rig.put(twin)
         rig.sensor.open()
         _, before = rig.read()
-        rig.sleep(0.0501 + (-rig.t_s) % 0.001)  # no sample is made between the two attempts, which would run over anew
+        # No sample is made between the two attempts; it would overrun the FIFO again
+        rig.sleep(0.0501 + (-rig.t_s) % 0.001)
         twin.garble = True
         flags, after = rig.read()
         assert after[0] != before[-1] + 1
@@ -163,7 +166,7 @@ class Adxl357Rig(Adxl355Rig):
 
 class TestAdxl357(TestAdxl355):
     kind, counts_per_g = "ADXL357", 51200  # data sheet, at 10 g
-    temperature = 1671, 45.0  # data sheet: 1852 at 25 degC, -9.05 LSB a degree
+    temperature = 1671, 45.0  # data sheet: 1852 at 25 degC, -9.05 LSB per degC
 
     @pytest.fixture
     def rig(self) -> Iterator[Adxl355Rig]:
@@ -187,7 +190,7 @@ class TestAdxl359(TestAdxl357):
 
     def test_wrong_identity(self, rig: Adxl355Rig) -> None:
         rig.put(Adxl357Twin(rig.counts, rig.due, lambda: rig.t_s))
-        with pytest.raises(IdentityError, match=r"0x1D on /dev/i2c-1: expected ad 1d e9, found ad 1d ed"):
+        with pytest.raises(IdentityError, match=r"0x1D on /dev/i2c-1: expected the IDs ad 1d e9, found ad 1d ed"):
             rig.sensor.open()
 
 

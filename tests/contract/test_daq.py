@@ -1,4 +1,4 @@
-"""The contract on `mcc172`, `mcc-usb` and `ni`, each with a stand-in for its vendor's library."""
+"""The driver contract on `mcc172`, `mcc-usb` and `ni`, each with a twin of its vendor's library."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from hw.virtual.daqhats_twin import DaqhatsTwin
 from hw.virtual.nidaqmx_twin import NidaqmxTwin
 from hw.virtual.uldaq_twin import UldaqTwin, ULError
 
-STEP_V = 8e-6  # a sample's number, about the middle of a run: 10^6 of them stay within 5 V
+STEP_V = 8e-6  # V per sample number, from the middle of a run: 10^6 numbers stay within 5 V
 
 
 class DaqRig(Rig):
@@ -119,7 +119,7 @@ class TestMcc172(SensorContract):
     def test_the_buffer_runs_over(self, rig: Mcc172Rig) -> None:
         rig.open()
         *_, before = rig.blocks(0.6)
-        rig.sleep(4.0)  # the library keeps 10 000 samples at this rate, 3.1 s
+        rig.sleep(4.0)  # at this rate the library keeps 10 000 samples, 3.1 s
         after = next(rig.blocks(0.1))
         assert after.flags == BlockFlags.RESTART | BlockFlags.OVERRUN
         assert after.first_index == before.first_index + before.n
@@ -127,8 +127,9 @@ class TestMcc172(SensorContract):
         assert (drop.count, drop.reason) == (10_000, "input overflow")
 
     def test_the_library_in_c_is_missing(self, rig: Mcc172Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-        def absent(address: int) -> None:  # noqa: ARG001 - as the library's
-            raise Exception("daqhats shared library is not installed.")  # in these words and no other class
+        def absent(address: int) -> None:  # noqa: ARG001 - signature of the library
+            # The library raises plain Exception with this text
+            raise Exception("daqhats shared library is not installed.")
 
         monkeypatch.setattr(rig.twin, "mcc172", absent)
         with pytest.raises(ConfigurationError, match="daqhats shared library is not installed"):
@@ -181,8 +182,8 @@ class TestMccUsb(SensorContract):
     @pytest.mark.parametrize(
         ("options", "message"),
         [
-            ({"range_v": 5}, "no range_v 5: it has BIP10VOLTS, BIP1VOLTS"),
-            ({"first_channel": 8}, r"no input (8|10), it has 8 in this mode"),
+            ({"range_v": 5}, "no range_v 5; it has BIP10VOLTS, BIP1VOLTS"),
+            ({"first_channel": 8}, r"no input (8|10); in this mode the board has 8 inputs"),
             ({"rate_hz": 60_000}, "BAD_RATE"),
         ],
     )
@@ -193,24 +194,26 @@ class TestMccUsb(SensorContract):
     def test_a_current_that_the_board_has_not(self, rig: MccUsbRig) -> None:
         rig.twin.iepe = False
         rig.build(iepe=False).open()
-        with pytest.raises(ConfigurationError, match="iepe = true, and it has no current"):
+        with pytest.raises(ConfigurationError, match="iepe = true, but the board has no IEPE current"):
             rig.build(iepe=True).open()
 
     def test_a_rate_that_is_another(self, rig: MccUsbRig) -> None:
         rig.twin.rate_error = 0.02
-        with pytest.raises(ConfigurationError, match="1020 Hz is the nearest it has to 1000 Hz"):
+        with pytest.raises(ConfigurationError, match="rate_hz 1000 is not available, the nearest rate is 1020 Hz"):
             rig.open()
 
     def test_a_scan_that_ends(self, rig: MccUsbRig) -> None:
         rig.open()
         list(rig.blocks(0.6))
         rig.twin.ended = True
-        with pytest.raises(DeviceLost, match="its scan ended"):
+        with pytest.raises(DeviceLost, match="the scan stopped"):
             list(rig.blocks(2.0))
 
     def test_which_board(self, rig: MccUsbRig) -> None:
         assert rig.build(device="1808").open().kind == "USB-1808X"
-        with pytest.raises(DeviceLost, match="0 boards have that in their name; there are USB-1808X 01F2A3B4"):
+        with pytest.raises(
+            DeviceLost, match="0 boards have this in their name, one is needed; connected: USB-1808X 01F2A3B4"
+        ):
             rig.build(device="USB-2404").open()
 
 
@@ -226,7 +229,7 @@ class NiRig(DaqRig):
         return self.build()
 
     def lose(self) -> None:
-        self.sleep(5.0)  # longer than the library's buffer holds
+        self.sleep(5.0)  # longer than the buffer of the library
 
     def unplug(self) -> None:
         self.twin.plugged = False
@@ -300,10 +303,10 @@ def test_without_the_library_it_says_what_to_install(
 @pytest.mark.parametrize(
     ("driver", "options", "message"),
     [
-        (Mcc172, {"rate_hz": 1000.0}, "1000 Hz is not 51200 Hz over 1 to 256; the nearest is 1003.92 Hz"),
-        (Mcc172, {"rate_hz": 100.0}, "the nearest is 200 Hz"),
-        (Ni, {"channels": ["Dev1/ai0", "Dev1/ai1"]}, "1 or 3 channels, not 2"),
-        (Ni, {"channels": ["ai0"]}, "each is device/input"),
+        (Mcc172, {"rate_hz": 1000.0}, "1000 Hz is not 51200 Hz divided by 1 to 256; the nearest rate is 1003.92 Hz"),
+        (Mcc172, {"rate_hz": 100.0}, "the nearest rate is 200 Hz"),
+        (Ni, {"channels": ["Dev1/ai0", "Dev1/ai1"]}, "1 or 3 channels are needed, not 2"),
+        (Ni, {"channels": ["ai0"]}, "each channel must be device/input"),
     ],
 )
 def test_options_that_cannot_work(driver: type[BufferedSensor], options: dict[str, Any], message: str) -> None:

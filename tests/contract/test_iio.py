@@ -1,4 +1,4 @@
-"""The contract on `iio`, over files and a pipe as the kernel lays them out."""
+"""The driver contract on `iio`, with files and a pipe in the layout of the kernel."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class TestIio(SensorContract):
         rig.close()
 
     def test_polls_do_not_beat_with_the_sample_clock(self, rig: IioRig) -> None:
-        """Here the kernel stamps every sample: nothing is left to beat."""
+        """Replaced, because the kernel stamps every sample and no poll can beat with the sample clock."""
         rig.open()
         for block in rig.blocks(1.0):
             assert block.burst_count.tolist() == list(range(1, block.n + 1))
@@ -101,7 +101,9 @@ class TestIio(SensorContract):
         self, rig: IioRig, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(iio, "_text", lambda path: "800.000000" if "frequency" in path.name else path.read_text())
-        with pytest.raises(ConfigurationError, match=r"in_accel_sampling_frequency: wrote 1000, it says 800"):
+        with pytest.raises(
+            ConfigurationError, match=r"in_accel_sampling_frequency: wrote 1000, the kernel driver set 800"
+        ):
             rig.sensor.open()
 
     @pytest.mark.parametrize(
@@ -110,9 +112,9 @@ class TestIio(SensorContract):
             (
                 "in_accel_sampling_frequency",
                 ("iio:device0/in_accel_sampling_frequency_available", "12.5 26\n"),
-                r"in_accel_sampling_frequency: 1000 is refused, it takes 12\.5 26$",
+                r"in_accel_sampling_frequency: 1000 is refused; accepted values: 12\.5 26$",
             ),
-            ("enable", ("trigger0/name", "pace\n"), r"buffer/enable: 1 is refused; .*there are: pace\)\?$"),
+            ("enable", ("trigger0/name", "pace\n"), r"buffer/enable: 1 is refused; .*triggers here: pace\)$"),
         ],
     )
     def test_a_value_that_the_kernel_driver_refuses_is_said_with_what_it_takes(
@@ -120,7 +122,7 @@ class TestIio(SensorContract):
     ) -> None:
         def write(path: Path, text: str) -> int:
             if path.name == refused and text != "0":
-                raise OSError(errno.EINVAL, "Invalid argument")  # as write(2) says it: without a name
+                raise OSError(errno.EINVAL, "Invalid argument")  # write(2) reports an error without the file name
             return plain(path, text)
 
         path = rig.twin.sysfs / known[0]
@@ -133,7 +135,7 @@ class TestIio(SensorContract):
 
     def test_a_device_without_a_buffer_is_refused(self, rig: IioRig) -> None:
         shutil.rmtree(rig.twin.sysfs / "iio:device0/buffer")
-        with pytest.raises(ConfigurationError, match="iio:device0: no buffer"):
+        with pytest.raises(ConfigurationError, match="iio:device0: the device has no buffer"):
             rig.sensor.open()
 
     def test_a_device_that_somebody_else_reads_is_left_as_it_is(
@@ -151,7 +153,7 @@ class TestIio(SensorContract):
         assert enable.read_text() == "1"
 
     def test_absent_says_what_there_is(self, rig: IioRig) -> None:
-        with pytest.raises(DeviceLost, match=r"no IIO device 'other'; there are twin345 \(iio:device0\)"):
+        with pytest.raises(DeviceLost, match=r"no IIO device 'other'; available: twin345 \(iio:device0\)"):
             rig.build_elsewhere().open()
 
     def test_what_the_full_buffer_dropped_is_a_gap_of_known_length_or_a_restart(self, rig: IioRig) -> None:
@@ -171,7 +173,7 @@ def test_elements_as_the_kernel_states_them() -> None:
     assert Element.parse(0, "be:u10/16>>6").value(np.array([0xFFC0], np.uint16)).tolist() == [1023]
     assert Element.parse(0, "le:s20/32>>12").value(np.array([-(2**31)], np.int32)).tolist() == [-(2**19)]
     for several_or_none in ("le:s12/16X2>>4", "le:s0/16>>0", "le:s12/16>>5", "le:s12/16>>4\n", "le:s١/8>>0"):
-        with pytest.raises(ConfigurationError, match="is no type of a scan element"):
+        with pytest.raises(ConfigurationError, match="is not the type of a scan element"):
             Element.parse(0, several_or_none)
     scan = layout({"b": Element.parse(1, "le:s64/64>>0"), "a": Element.parse(0, "be:s16/16>>0")})
     assert (scan.names, scan.itemsize, scan.fields["b"][1]) == (("a", "b"), 16, 8)  # type: ignore[index]

@@ -1,4 +1,4 @@
-"""The contract on the LSM6DSO's twin, and what only its tagged FIFO can do wrong."""
+"""The driver contract on the LSM6DSO's twin, and the faults that only its tagged FIFO has."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class TestLsm6dso(I2cContract):
     filter_register = 0x17, "CTRL8_XL"
     trimmed = {0x73: 0x11, 0x75: 0xF0, 0x14: 0x01, 0x17: 0xF4}  # noqa: RUF012 - offsets, self-test, high-pass filter
     late_s = 0.9
-    # Data sheet: 256 LSB a degree, 0 at 25 degC.
+    # Data sheet: 256 LSB per degC, 0 at 25 degC.
     temperature = -2560, 15.0
 
     @pytest.fixture
@@ -80,7 +80,7 @@ class TestLsm6dso(I2cContract):
         flags, numbers = rig.read()
         assert flags == BlockFlags.NONE
         assert (np.diff(numbers) == 1).all()
-        assert rig.sensor.take_drops() == [Drop(7, "bytes", "FIFO entries out of step")]
+        assert rig.sensor.take_drops() == [Drop(7, "bytes", "incomplete samples in the FIFO")]
 
     def test_a_tag_of_odd_parity_is_no_sample(self, rig: Lsm6dsoRig) -> None:
         rig.sensor.open()
@@ -92,4 +92,4 @@ class TestLsm6dso(I2cContract):
         flags, after = rig.read()
         assert flags == BlockFlags.RESTART
         assert after[0] == before[-1] + 2
-        assert rig.sensor.take_drops() == [Drop(7, "bytes", "FIFO entries out of step")]
+        assert rig.sensor.take_drops() == [Drop(7, "bytes", "incomplete samples in the FIFO")]

@@ -1,4 +1,4 @@
-"""The contract on the twins of the MPU-6050 and MPU-6500, and what only their FIFO can do wrong."""
+"""The driver contract on the twins of the MPU-6050 and MPU-6500, and the faults that only their FIFO has."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class TestMpu6050(I2cContract):
         assert info.settings["SMPLRT_DIV"] == "0x00"
         assert info.settings["CONFIG"] == "0x01"
         assert info.settings["PWR_MGMT_1"] == "0x01"
-        # The maker's trim is no setting of ours: recorded, not touched.
+        # The factory trim is not a setting of the driver: it is recorded and not changed.
         assert [info.settings[f"ACCEL_OFFSET_{i}"] for i in range(6)] == [f"0x{value:02X}" for value in TRIM]
         assert bytes(rig.twin.registers[6:12]) == TRIM
 
@@ -58,7 +58,7 @@ class TestMpu6050(I2cContract):
         assert flags == BlockFlags.RESTART | BlockFlags.OVERRUN
         assert after[0] > before[-1] + 20
         (drop,) = rig.sensor.take_drops()
-        assert drop.reason == "FIFO ran over, or out of step: reset"
+        assert drop.reason == "FIFO overrun or incomplete samples; FIFO was reset"
 
     def test_a_sample_that_is_just_being_written_is_no_fault(self, rig: Mpu6050Rig) -> None:
         class Writing(Mpu6050Twin):
@@ -111,7 +111,7 @@ class TestMpu6500(TestMpu6050):
         assert bytes(rig.twin.registers[0x77:0x7D]) == TRIM
 
     def test_a_million_samples_none_lost_doubled_or_shifted(self, rig: Mpu6050Rig) -> None:
-        """Once for the family is enough: only identity, FIFO size and temperature differ."""
+        """Done for one part only, because the parts differ only in identity, FIFO size and temperature."""
         rig.open()
         assert sum(block.n for block in rig.blocks(5.0)) >= 5000
         assert rig.sensor.take_drops() == []

@@ -1,4 +1,4 @@
-"""The contract on `replay`, and what its recordings may be."""
+"""The driver contract on `replay`, and which recordings the driver accepts."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ INFO = DeviceInfo("adxl355", "ADXL355", "17", "count", 3, 1000.0)
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Six seconds of the bench, devices `mems` and `reference`."""
+    """A recording of six seconds of the bench, with the devices `mems` and `reference`."""
     directory = tmp_path_factory.mktemp("recorded")
     record(directory, 6.0)
     return next(directory.glob("*.mcap"))
 
 
 class ReplayRig(Rig):
-    """The recording is made while it is played: what the device does next is in the events that come next."""
+    """The recording is generated while it is played; each event is made when the driver asks for it."""
 
     def __init__(self, recording: Path) -> None:
         self.saturated = range(0)
@@ -58,7 +58,7 @@ class ReplayRig(Rig):
         return self.build(recordings=["/no/such/file.mcap"])
 
     def events(self) -> Iterator[Event]:
-        """What an agent would have recorded of the device: its blocks, its comings and goings, and ticks."""
+        """Events that an agent would have recorded of the device: its blocks, its losses and openings, and ticks."""
         t_s, phase, made, there, lost, flags = 0.0, 0.0, 0, False, 0, BlockFlags.NONE
         while True:
             if self.plugged != there:
@@ -128,7 +128,7 @@ class TestReplay(SensorContract):
         rig.close()
 
     def test_what_came_before_the_loss_is_returned_first(self, rig: Rig) -> None:
-        # Here a block is whole, as it was recorded: the one that was recorded before the loss.
+        # Blocks are played as they were recorded: the last one is that before the loss.
         rig.open()
         *_, before = rig.blocks(0.6)
         block = rig.sensor.read_block()
@@ -175,7 +175,7 @@ def test_every_recorded_sample_comes_again_at_its_place(recording: Path, device:
         played = sensor.read_block()
         assert played is not None
         check_stamps(played, block)
-        assert machine.t_s == pytest.approx(played.t_monotonic_ns * 1e-9, abs=1e-6)  # no sooner than it was there
+        assert machine.t_s == pytest.approx(played.t_monotonic_ns * 1e-9, abs=1e-6)  # not before the block had arrived
         assert played.flags == block.flags | (BlockFlags.RESTART if first else BlockFlags.NONE)
         assert np.array_equal(played.indications, block.indications)
         assert played.indications.dtype == block.indications.dtype
@@ -185,7 +185,7 @@ def test_every_recorded_sample_comes_again_at_its_place(recording: Path, device:
 
 
 def check_stamps(played: SampleBlock, block: SampleBlock) -> None:
-    """Moved to this machine's clock, which was at 500 s when the recording's was at 0, and not otherwise."""
+    """Check that only the times changed: this machine's clock was at 500 s when the recording's clock was at 0."""
     assert np.array_equal(played.burst_t_monotonic_ns, block.burst_t_monotonic_ns + 500 * 10**9)
     assert played.t_utc_ns == 10**18 + played.t_monotonic_ns
     assert np.array_equal(played.burst_count, block.burst_count)
@@ -201,7 +201,7 @@ def test_devices_play_together(recording: Path) -> None:
     reference.open()
     late = reference.read_block()
     assert late is not None
-    # blocks of half a second: the one from 2.0 to 2.5 s is the first that was not over
+    # Blocks of half a second: the one from 2.0 to 2.5 s is the first one that ends after the start.
     assert late.t_monotonic_ns == pytest.approx(502.5e9, abs=0.01e9)
     assert (late.device, late.first_index) == ("ref", 0)
 

@@ -1,4 +1,4 @@
-"""The contract on `serial-binary`, and what only frames can do wrong."""
+"""The driver contract on `serial-binary`, and the faults that only frames have."""
 
 from __future__ import annotations
 

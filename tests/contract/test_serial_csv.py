@@ -1,4 +1,4 @@
-"""The contract on `serial-csv`, and what only lines of text can do wrong."""
+"""The driver contract on `serial-csv`, and the faults that only lines of text have."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from hw.virtual.serial_port import format_lines
 class CsvRig(SerialRig):
     driver = SerialCsv
     known = {"sequence": True, "full_scale": 1e9}  # noqa: RUF012
-    rate_hz = 5000.0  # 50 lines a burst, so that the long test is not of system calls
+    rate_hz = 5000.0  # 50 lines per burst, so that system calls do not dominate the long test
 
     def write(self, first: int, n: int) -> bytes:
         return format_lines(self.values(first, n), "%.1f", first if self.known["sequence"] else None)
@@ -36,7 +36,7 @@ class CsvRig(SerialRig):
         return x.astype(np.int64)
 
     def open(self) -> DeviceInfo:
-        """The device ends the line within which the port was opened."""
+        """Open the port; the device then finishes the line during which the port was opened."""
         info = super().open()
         self.port.inject(b"\n")
         return info
@@ -63,7 +63,7 @@ class TestSerialCsv(SerialContract):
         block = next(rig.blocks(0.1))
         assert block.flags == BlockFlags.NONE
         assert rig.number(block.indications)[0] == rig.number(before.indications)[-1] + 1
-        bad = [] if garbage.startswith(b"#") else [Drop(3, "lines", "not the expected decimals")]
+        bad = [] if garbage.startswith(b"#") else [Drop(3, "lines", "line without the expected decimal numbers")]
         assert rig.sensor.take_drops() == bad
         assert rig.sensor.take_drops() == []
 

@@ -1,4 +1,4 @@
-"""The contract on `sound-card`, with a stand-in for the library."""
+"""The driver contract on `sound-card`, with a twin of the library."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The package that docs/add-a-sensor.md shows: installed as an installer leaves it, its own tests pass."""
+"""The package of docs/add-a-sensor.md: installed like an installer does it, it passes its own tests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The contract on `virtual`, and that its two devices are of one bench."""
+"""The driver contract on `virtual`, and that sensor and reference belong to one bench."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from hw.virtual.bench import Bench
 from hw.virtual.device import Virtual, VirtualOptions
 from hw.virtual.presets import PRESETS
 
-FULL = 2**19 - 1  # of the preset's sensor
+FULL = 2**19 - 1  # highest count of the preset's sensor
 
 
 class VirtualRig(Rig):
-    """The bench's samples are replaced by their numbers; all else is the driver's own."""
+    """The bench's samples are replaced by their numbers; everything else is the real driver."""
 
     def __init__(self) -> None:
         self.saturated = range(0)
@@ -59,7 +59,7 @@ class VirtualRig(Rig):
         self.saturated = range(first, last + 1)
 
     def lose(self) -> None:
-        # Longer ago than it keeps: what waits has a hole, as after any overflow.
+        # Longer than the buffer: samples are missing among those that wait, as after any overflow.
         self.sleep(1.1)
 
     def unplug(self) -> None:
@@ -142,7 +142,7 @@ def test_speed_is_that_of_time_not_of_samples_a_second_of_it(speed: float) -> No
     assert machine.t_s - began_s == pytest.approx(20 * 0.5 / speed, rel=0.06)
     stamps_s = (blocks[-1].t_monotonic_ns - blocks[0].t_monotonic_ns) * 1e-9
     samples = sum(block.n for block in blocks[1:])
-    # 0.33 % is the preset's clock; half a sample at each end
+    # the clock of the preset is off by 0.33 %; half a sample of tolerance at each end
     assert samples / stamps_s == pytest.approx(1.0033 * info.nominal_rate_hz, abs=1.5 / stamps_s)
     assert blocks[-1].t_utc_ns - blocks[-1].t_monotonic_ns == 10**18
     assert {block.flags for block in blocks[1:]} == {BlockFlags.NONE}
@@ -164,10 +164,10 @@ def test_the_temperature_is_the_bench_s() -> None:
     machine = Machine()
     sensor = machine.build(role="sensor", preset="faulty")
     sensor.open()
-    machine.sleep(450.0 - 0.5)  # a quarter of its thermal cycle: 5 K above 25 degC
+    machine.sleep(450.0 - 0.5)  # a quarter of the thermal cycle: 5 K above 25 degC
     assert read(sensor).temperature_degc == pytest.approx(30.0, abs=0.01)
 
 
 def test_an_unknown_preset_is_named() -> None:
-    with pytest.raises(ValidationError, match="no preset 'plane': there are plain, faulty"):
+    with pytest.raises(ValidationError, match="no preset 'plane'; available: plain, faulty"):
         VirtualOptions.model_validate({"role": "sensor", "preset": "plane"})

@@ -1,4 +1,4 @@
-"""The contract on the WitMotion's twin, and what only this device can do wrong."""
+"""The driver contract on the WitMotion's twin, and the faults that only this device has."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class WitMotionRig(SerialRig):
 
 
 class TestWitMotion(SerialContract):
-    million = 100_000  # it sends two frames a sample and shares the way of serial-binary, which reads a million
+    million = 100_000  # two frames per sample; it shares code with serial-binary, whose test reads a million
 
     @pytest.fixture
     def rig(self, tmp_path: Path) -> Iterator[WitMotionRig]:
@@ -68,7 +68,7 @@ class TestWitMotion(SerialContract):
     def test_says_who_it_is_and_how_it_is_set(self, rig: WitMotionRig) -> None:
         info = rig.open()
         assert info.serial_number == "WT4200001234"
-        # Protocol: 16 g are 32768.
+        # Protocol: 32768 counts are 16 g.
         assert info.nominal_sensitivity == pytest.approx(2048 / 9.80665, rel=1e-12)
         assert {name: info.settings[name] for name in ("RSW", "RRATE", "AXOFFSET", "BANDWIDTH")} == {
             "RSW": "0x0003",
@@ -93,7 +93,7 @@ class TestWitMotion(SerialContract):
         rig.noise = noise
         rig.twin = WitMotionTwin(rig.counts, lambda _: 0, rig.rate_hz)
         rig.twin.received = lambda data: None  # type: ignore[method-assign]  # noqa: ARG005
-        with pytest.raises(IdentityError, match=f"no WitMotion at 115200 baud: it sent .*{said}"):
+        with pytest.raises(IdentityError, match=rf"no WitMotion at 115200 baud \(received: .*{said}"):
             rig.sensor.open()
 
     def test_missing_samples_are_counted_by_the_clock(self, rig: WitMotionRig) -> None:
@@ -114,7 +114,7 @@ class TestWitMotion(SerialContract):
         assert (np.diff(rig.number(block.indications)) == 1).all()
 
     def test_power_lost_underway(self, rig: WitMotionRig) -> None:
-        # Its offsets are back then: nothing of what it sends may be taken.
+        # After a restart the device has its saved offsets again: none of its samples may be used.
         rig.open()
         list(rig.blocks(11.0))
         rig.twin.power_cycle()

@@ -1,5 +1,5 @@
-"""The twins against Debian's own kernel: a virtual machine whose kernel drives an I2C adapter with the twins on it.
+"""The twins compared with Debian's own kernel: a virtual machine whose kernel uses an I2C adapter with the twins on it.
 
-`python -m tests.nightly` (or `make nightly`) prints a table of what the kernel says and what fieldcal says, and ends
-with 1 if they differ. docs/twins.md describes it.
+`python -m tests.nightly` (or `make nightly`) prints a table with the values of the kernel and those of fieldcal. The
+exit status is 1 if they differ. docs/twins.md describes it.
 """

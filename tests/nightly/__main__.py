@@ -1,4 +1,4 @@
-"""`python -m tests.nightly`: start the machine, compare, print the table. Ends with 1 where anything differs."""
+"""`python -m tests.nightly`: start the machine, compare, print the table. Exit status 1 if any row differs."""
 
 from __future__ import annotations
 
@@ -25,12 +25,15 @@ MODULES = [
     *("virtio_pci", "9pnet_virtio", "9p", "xhci_pci", "i2c_tiny_usb", "i2c_dev", "kfifo_buf", "iio_trig_hrtimer"),
     *("st_lsm6dsx_i2c", "inv_mpu6050_i2c"),
 ]
-ADXL355 = "adxl355_i2c"  # Debian's kernel lacks it
+ADXL355 = "adxl355_i2c"  # not in Debian's kernel
 Step = Callable[[Machine], Iterator[Row]]
 
 
 def steps(kernel: DebianKernel) -> list[Step]:
-    """In this order: once the kernel's drivers hold their devices nobody else may, and unplugging ends it all."""
+    """The comparisons in order.
+
+    After the kernel's drivers hold their devices no other may, and unplugging ends everything.
+    """
     before: list[Step] = [checks.i2c_dev, checks.probe, runs.own_drivers]
     bound: list[Step] = [checks.mpu6050, checks.held_address, checks.lsm6dso]
     if kernel.has(ADXL355):
@@ -39,7 +42,7 @@ def steps(kernel: DebianKernel) -> list[Step]:
 
 
 def compared() -> Iterator[Row]:
-    """All rows, as they come."""
+    """All rows, as they are produced."""
     kernel = fetched()
     without = "" if kernel.has(ADXL355) else "; no module adxl355_i2c, so the ADXL355 is read by fieldcal alone"
     print(f"Linux {kernel.release} under QEMU{without}", flush=True)
@@ -58,7 +61,7 @@ def compared() -> Iterator[Row]:
 
 
 def main() -> int:
-    """Print a line a row; the exit status, 2 where there is no machine to compare with."""
+    """Print one line per row; returns the exit status, 2 if no machine could be started."""
     began_s = time.monotonic()
     differing = rows = 0
     try:
@@ -68,7 +71,7 @@ def main() -> int:
             mark = "  " if row.agree else "! "
             print(f"{mark}{row.subject:13} {row.what:34} {row.kernel:44} {row.fieldcal}", flush=True)
     except (FileNotFoundError, subprocess.CalledProcessError, GuestError) as error:
-        print(f"not compared to the end: {error}", file=sys.stderr)
+        print(f"the comparison stopped before its end: {error}", file=sys.stderr)
         return 2
     print(f"{rows} rows, {differing} differ, {time.monotonic() - began_s:.0f} s")
     return 1 if differing else 0

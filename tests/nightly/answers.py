@@ -1,6 +1,6 @@
-"""What i2c-dev answers: the same questions to the kernel in the machine and to its stand-in, `hw.virtual.kernel`.
+"""Answers of i2c-dev: the same questions go to the kernel in the machine and to its twin, `hw.virtual.kernel`.
 
-Run as a script in the machine, it prints its answers as JSON.
+As a script in the machine it prints its answers as JSON.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ GONE_S = 10.0
 
 
 def answers(path: str) -> dict[str, str]:
-    """By question. An ADXL355 must be at 0x1D, nobody at 0x55."""
+    """Answers by question. An ADXL355 must be at 0x1D and no device at 0x55."""
     with SMBus(path) as bus:
         funcs = bus.funcs
 
@@ -37,8 +37,8 @@ def answers(path: str) -> dict[str, str]:
             "block of 32 registers": outcome(lambda: bytes(bus.read_i2c_block_data(ADXL355, 0, 32)).hex()),
             "byte written and read back": outcome(lambda: _written(bus)),
             "4 registers in one transfer": outcome(lambda: read(4).hex()),
-            "nobody there, byte": outcome(lambda: bus.read_byte_data(ABSENT, 0)),
-            "nobody there, transfer": outcome(lambda: bus.i2c_rdwr(i2c_msg.read(ABSENT, 1))),
+            "no device, byte": outcome(lambda: bus.read_byte_data(ABSENT, 0)),
+            "no device, transfer": outcome(lambda: bus.i2c_rdwr(i2c_msg.read(ABSENT, 1))),
             "42 messages": outcome(lambda: bus.i2c_rdwr(*[write(0)] * 42)),
             "43 messages": outcome(lambda: bus.i2c_rdwr(*[write(0)] * 43)),
             "4096 bytes": outcome(lambda: len(read(4096))),
@@ -55,7 +55,7 @@ def _written(bus: SMBus) -> list[int]:
 
 
 def held(path: str, address: int) -> dict[str, str]:
-    """At an address that a kernel driver holds: reads of i2c-dev, and what it lets through all the same."""
+    """Answers at an address that a kernel driver holds: reads through i2c-dev, and transfers that it still allows."""
     with SMBus(path) as bus:
         return {
             "held by a kernel driver, byte": outcome(lambda: bus.read_byte_data(address, 0x75)),
@@ -64,8 +64,10 @@ def held(path: str, address: int) -> dict[str, str]:
 
 
 def gone(path: str, say_open: Callable[[], object]) -> dict[str, str]:
-    """The node is open while the adapter goes: what reads say then (of an ADXL345: no kernel driver takes it), and the
-    next opening."""
+    """Remove the adapter while its node is open: the answers of a read and of the next opening.
+
+    The read is of the ADXL345, which no kernel driver uses.
+    """
     end_s = time.monotonic() + GONE_S
     with SMBus(path) as bus:
         bus.read_byte_data(ADXL345, 0)
@@ -74,11 +76,11 @@ def gone(path: str, say_open: Callable[[], object]) -> dict[str, str]:
             time.sleep(0.01)
     while (after := outcome(lambda: SMBus(path).close())) != "ENOENT" and time.monotonic() < end_s:
         time.sleep(0.01)
-    return {"adapter gone, open node": first, "adapter gone, opened anew": after}
+    return {"adapter gone, open node": first, "adapter gone, opened again": after}
 
 
 def outcome(question: Callable[[], object]) -> str:
-    """What came, or the errno's name."""
+    """The result, or the name of the errno."""
     try:
         return str(question())
     except OSError as error:
@@ -86,7 +88,7 @@ def outcome(question: Callable[[], object]) -> str:
 
 
 def main() -> None:
-    """`answers NODE`, `held NODE ADDRESS` or `gone NODE MARK`: MARK is a file made once the node is open."""
+    """Arguments: `answers NODE`, `held NODE ADDRESS` or `gone NODE MARK`; MARK is a file made once the node is open."""
     what, path, *rest = sys.argv[1:]
     match what:
         case "answers":

@@ -1,4 +1,4 @@
-"""What is compared: the kernel's words beside fieldcal's, row by row."""
+"""The comparisons: values of the kernel and values of fieldcal, row by row."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ IIO = "/sys/bus/iio/devices"
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One comparison. `agree` decides; the texts say why."""
+    """One comparison. `agree` is the result; the texts show the values."""
 
     subject: str
     what: str
@@ -31,12 +31,12 @@ class Row:
 
 
 def same(subject: str, what: str, kernel: str, fieldcal: str) -> Row:
-    """They agree if they say the same."""
+    """A row whose two texts must be equal."""
     return Row(subject, what, kernel, fieldcal, kernel == fieldcal)
 
 
 class Machine:
-    """The machine with the twins on its bus."""
+    """The virtual machine with the twins on its bus."""
 
     def __init__(self, guest: Guest, twins: Twins, adapter: TinyUsb) -> None:
         self.guest = guest
@@ -48,7 +48,7 @@ class Machine:
         self.bus = int(self.node.removeprefix("/dev/i2c-"))
 
     def bind(self, kernel_driver: str, device: str) -> str:
-        """Let a driver of the kernel have a device; the directory of its accelerometer."""
+        """Bind a kernel driver to a device; returns the directory of its accelerometer."""
         address = ADDRESSES[device]
         self.guest.write(f"/sys/bus/i2c/devices/i2c-{self.bus}/new_device", f"{kernel_driver} 0x{address:02x}")
         found = self.guest.sh(f"ls -d {IIO}/*/in_accel_x_raw | xargs -n 1 dirname | xargs -n 1 readlink -f")
@@ -57,12 +57,12 @@ class Machine:
         return directory
 
     def hex_of(self, device: str, register: int) -> str:
-        """What a register of the twin holds."""
+        """Contents of a register of the twin, in hexadecimal."""
         return f"0x{self.twins.by_name[device].registers[register]:02X}"
 
 
 def i2c_dev(machine: Machine) -> Iterator[Row]:
-    """The stand-in for the kernel answers as the kernel does."""
+    """The twin of i2c-dev answers like the kernel."""
     machine.twins.hold(INDICATIONS[0])
     there = json.loads(machine.guest.python("-m", "tests.nightly.answers", "answers", machine.node))
     with installed({machine.node: machine.twins.bus}):
@@ -72,7 +72,7 @@ def i2c_dev(machine: Machine) -> Iterator[Row]:
 
 
 def held_address(machine: Machine) -> Iterator[Row]:
-    """As `i2c_dev`, once a driver of the kernel holds an MPU-6050."""
+    """As `i2c_dev`, after a kernel driver has taken an MPU-6050."""
     address = ADDRESSES["mpu6050"]
     there = json.loads(machine.guest.python("-m", "tests.nightly.answers", "held", machine.node, hex(address)))
     bus = machine.twins.bus
@@ -84,18 +84,18 @@ def held_address(machine: Machine) -> Iterator[Row]:
 
 
 def unplugging(machine: Machine) -> Iterator[Row]:
-    """The adapter goes while its node is open. Says what the stand-in does: EIO, then no node."""
+    """The adapter is removed while its node is open. Expected, as in the twin: EIO, then no node."""
     call = ("-m", "tests.nightly.answers", "gone", machine.node, "/run/open")
     machine.guest.start_python(*call, output="/run/gone")
     machine.guest.sh("until [ -e /host/run/open ]; do sleep 0.1; done")
     machine.adapter.unplug()
     there = json.loads(machine.guest.sh("until [ -s /host/run/gone ]; do sleep 0.1; done; cat /host/run/gone"))
     yield same("i2c-dev", "adapter gone, open node", there["adapter gone, open node"], "EIO")
-    yield same("i2c-dev", "adapter gone, opened anew", there["adapter gone, opened anew"], "ENOENT")
+    yield same("i2c-dev", "adapter gone, opened again", there["adapter gone, opened again"], "ENOENT")
 
 
 def probe(machine: Machine) -> Iterator[Row]:
-    """`fieldcal probe` in the machine: whoever answers is found with its identity."""
+    """`fieldcal probe` in the machine: every device on the bus is found with its identity."""
     found = json.loads(machine.guest.python("-m", "agent", "probe", "--bus", str(machine.bus), "--json", "-"))
     said = {answer["address"]: answer["identity"] for answer in found["i2c"][0]["answers"]}
     identities = {
@@ -118,7 +118,7 @@ def mpu6050(machine: Machine) -> Iterator[Row]:
     part = mpu6050_registers.PARTS[0x68]
     for range_g, counts in mpu6050_registers.COUNTS_PER_G.items():
         settings = mpu6050_registers.settings(part, 1000.0, range_g)
-        # The kernel's table says 598 um/s2 and its multiples; 2 g / 2^15 is 598.55.
+        # The kernel's table has 598 um/s2 and multiples of it; 2 g / 2^15 is 598.55.
         yield from scale("mpu6050", machine, here, counts / STANDARD_GRAVITY_MPS2, 1e-3)
         register, wanted = mpu6050_registers.ACCEL_CONFIG, settings[mpu6050_registers.ACCEL_CONFIG][1]
         yield same("mpu6050", f"ACCEL_CONFIG at {range_g} g", machine.hex_of("mpu6050", register), f"0x{wanted:02X}")
@@ -134,20 +134,20 @@ def mpu6050(machine: Machine) -> Iterator[Row]:
         found = int(guest.read(f"{here}/in_temp_raw"))
         kernel_degc = 1e-3 * (found + offset) * factor
         _, degc = part.temperature(raw_number.to_bytes(2, "big", signed=True))
-        # The kernel rounds 36.53 degC to 12420 counts, 36.529.
+        # The kernel rounds 36.53 degC to 12420 counts, which are 36.529 degC.
         agree = found == raw_number and abs(kernel_degc - degc) < 0.002
         yield Row("mpu6050", f"temperature {raw_number}", f"{kernel_degc:.3f} degC", f"{degc:.3f} degC", agree)
 
 
 def lsm6dso(machine: Machine) -> Iterator[Row]:
-    """st_lsm6dsx_i2c against `hw.lsm6dso_registers`; the device is bound already."""
+    """st_lsm6dsx_i2c against `hw.lsm6dso_registers`; the device is already bound."""
     twins, guest = machine.twins, machine.guest
     twins.hold(INDICATIONS[0])
     here = machine.bind("lsm6dsox", "lsm6dso")
     yield same("lsm6dso", "name", guest.read(f"{here}/name"), "lsm6dsox_accel")
     yield from raw("lsm6dso", machine, here)
     for range_g, mg in lsm6dso_registers.MG_PER_COUNT.items():
-        # Nine decimals, the last one cut: 1e-9 of 6e-4.
+        # Nine decimals, the last one truncated: 1e-9 of 6e-4.
         yield from scale("lsm6dso", machine, here, 1 / (1e-3 * mg * STANDARD_GRAVITY_MPS2), 2e-6)
         wanted = lsm6dso_registers.settings(104.0, range_g)[lsm6dso_registers.CTRL1_XL][1] & 0x0C
         found = twins.by_name["lsm6dso"].registers[lsm6dso_registers.CTRL1_XL] & 0x0C
@@ -155,24 +155,24 @@ def lsm6dso(machine: Machine) -> Iterator[Row]:
     for rate_hz in lsm6dso_registers.RATES_HZ[:7]:
         guest.write(f"{here}/sampling_frequency", f"{rate_hz:g}")
         twins.written.clear()
-        guest.read(f"{here}/in_accel_x_raw")  # only then is the rate set, and off again
+        guest.read(f"{here}/in_accel_x_raw")  # the kernel sets the rate only for this read
         codes = [value & 0xF0 for device, register, value in twins.written if (device, register) == ("lsm6dso", 0x10)]
         wanted = lsm6dso_registers.settings(rate_hz, 2)[lsm6dso_registers.CTRL1_XL][1] & 0xF0
         yield same("lsm6dso", f"CTRL1_XL, {rate_hz:g} Hz", f"0x{max(codes, default=0):02X}", f"0x{wanted:02X}")
 
 
 def adxl355(machine: Machine) -> Iterator[Row]:
-    """adxl355_i2c, where there is one, against `hw.adxl355_registers`."""
+    """adxl355_i2c, if the kernel has it, against `hw.adxl355_registers`."""
     twins, guest, part = machine.twins, machine.guest, adxl355_registers.ADXL355
     twins.hold(INDICATIONS[0])
     here = machine.bind("adxl355", "adxl355")
     yield same("adxl355", "name", guest.read(f"{here}/name"), "adxl355")
     yield from raw("adxl355", machine, here, (*INDICATIONS, (2**19 - 1, -(2**19), 0)))
-    # The kernel takes 3.9 ug a count, which the data sheet rounds from 1 g / 256000.
+    # The kernel uses 3.9 ug per count; the data sheet rounds this from 1 g / 256000.
     ours, found = STANDARD_GRAVITY_MPS2 / part.counts_per_g[2], guest.read(f"{here}/in_accel_scale")
     yield Row("adxl355", "m/s2 a count", found, f"{ours:.9f}", abs(float(found) / ours - 1) <= 2e-3)
     for rate_hz in adxl355_registers.RATES_HZ[2:]:
-        guest.write(f"{here}/in_accel_sampling_frequency", f"{rate_hz + 1e-9:.3f}")  # 7.8125 is 7.813 there
+        guest.write(f"{here}/in_accel_sampling_frequency", f"{rate_hz + 1e-9:.3f}")  # the kernel writes 7.8125 as 7.813
         wanted = adxl355_registers.settings(part, rate_hz, 2)[
             adxl355_registers.FILTER - adxl355_registers.FIRST_SETTING
         ]
@@ -189,7 +189,7 @@ def adxl355(machine: Machine) -> Iterator[Row]:
 
 
 def raw(device: str, machine: Machine, here: str, indications: Iterable[Counts] = INDICATIONS) -> Iterator[Row]:
-    """The numbers in the output registers."""
+    """Compare the values in the output registers."""
     for counts in indications:
         machine.twins.hold(counts)
         found = " ".join(machine.guest.read(f"{here}/in_accel_{axis}_raw") for axis in "xyz")
@@ -197,7 +197,7 @@ def raw(device: str, machine: Machine, here: str, indications: Iterable[Counts] 
 
 
 def scale(device: str, machine: Machine, here: str, counts_per_mps2: float, tolerance: float) -> Iterator[Row]:
-    """The one of the kernel's scales (m/s2 a count) that is nearest to ours is set, and must be ours."""
+    """Set the kernel's scale (m/s2 per count) that is nearest to ours and compare it with ours."""
     ours = 1 / counts_per_mps2
     known = machine.guest.read(f"{here}/in_accel_scale_available").split()
     nearest = min(known, key=lambda text: abs(float(text) - ours))

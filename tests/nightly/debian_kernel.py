@@ -1,4 +1,4 @@
-"""A stock Debian kernel, fetched with apt and unpacked: nothing is installed, no rights are needed."""
+"""A Debian kernel package, downloaded with apt and unpacked: nothing is installed, no rights are needed."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import shutil
 import subprocess
 from pathlib import Path
 
-# Debian 13, Linux 6.12: the kernel of Debian 12 lacks the hrtimer trigger, without which no buffer is filled.
+# Debian 13, Linux 6.12: the kernel of Debian 12 has no hrtimer trigger, which is needed to fill a buffer.
 SOURCE = "deb [signed-by=/usr/share/keyrings/debian-archive-keyring.gpg] http://deb.debian.org/debian trixie main\n"
 PACKAGE = "linux-image-amd64"
 GIVEN = "FIELDCAL_GUEST_KERNEL"
@@ -17,12 +17,12 @@ MORE_MODULES = "FIELDCAL_GUEST_MODULES"
 
 
 def cache() -> Path:
-    """Where it is kept from night to night."""
+    """Directory in which the package is kept between runs."""
     return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "fieldcal-nightly"
 
 
 class DebianKernel:
-    """An unpacked linux-image package, and modules built for it elsewhere. `release` as `uname -r` says."""
+    """An unpacked linux-image package, and modules built for it elsewhere. `release` is the output of `uname -r`."""
 
     def __init__(self, root: Path, more_modules: Path | None = None) -> None:
         (self.image,) = root.glob("boot/vmlinuz-*")
@@ -34,11 +34,14 @@ class DebianKernel:
             self._modules |= {_key(path.name): path for path in more_modules.glob("*.ko")}
 
     def has(self, module: str) -> bool:
-        """Whether there is such a module."""
+        """Whether the module exists."""
         return _key(module) in self._modules
 
     def modules(self, wanted: list[str]) -> dict[str, bytes]:
-        """The wanted modules and what they need, by name, in the order in which they load. KeyError: no such module."""
+        """The wanted modules and their dependencies, by name, in the order in which they must be loaded.
+
+        Raises KeyError if there is no such module.
+        """
         loaded: dict[str, bytes] = {}
 
         def load(name: str) -> None:
@@ -62,10 +65,10 @@ def _key(name: str) -> str:
 
 
 def fetched() -> DebianKernel:
-    """Debian's kernel, from the cache if it is the newest; FIELDCAL_GUEST_KERNEL names a package to use instead,
-    FIELDCAL_GUEST_MODULES a directory of further modules.
+    """Debian's kernel, from the cache if that is the newest one.
 
-    Raises subprocess.CalledProcessError where apt cannot get it.
+    The environment variable FIELDCAL_GUEST_KERNEL names a package to use instead, FIELDCAL_GUEST_MODULES a directory
+    with further modules. Raises subprocess.CalledProcessError if apt cannot download it.
     """
     given = os.environ.get(GIVEN)
     package = Path(given) if given else _downloaded(cache())
@@ -79,7 +82,7 @@ def fetched() -> DebianKernel:
 
 
 def _downloaded(directory: Path) -> Path:
-    """The newest package of SOURCE, with lists and keys apart from the machine's own."""
+    """Download the newest package of SOURCE, with package lists and keys separate from the machine's."""
     apt = directory / "apt"
     (apt / "lists" / "partial").mkdir(parents=True, exist_ok=True)
     (apt / "sources.list").write_text(SOURCE)
@@ -103,7 +106,7 @@ def _downloaded(directory: Path) -> Path:
     ).stdout
     package = directory / uris.split()[1]
     if not package.exists():
-        for older in directory.glob("linux-image-*"):  # half a gigabyte each
+        for older in directory.glob("linux-image-*"):  # each has half a gigabyte
             shutil.rmtree(older) if older.is_dir() else older.unlink()
         subprocess.run(["apt-get", *given, "-qq", "download", name], check=True, cwd=directory)
     return package

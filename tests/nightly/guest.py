@@ -1,4 +1,4 @@
-"""The virtual machine: QEMU without hardware help, so that it runs wherever QEMU does, and a shell in it."""
+"""The virtual machine: QEMU without hardware acceleration, so that it runs wherever QEMU does; and a shell in it."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ END = re.compile(rb"<ended with (\d+)>\n")
 
 
 class GuestError(Exception):
-    """The machine did not start, a command in it failed or took too long."""
+    """The machine did not start, or a command in it failed or took too long."""
 
 
 class Guest:
-    """Context manager. `directory` takes sockets and the kernel's messages (console.log)."""
+    """Context manager of the machine. `directory` holds its sockets and the kernel's messages (console.log)."""
 
     def __init__(self, image: Path, initramfs: bytes, directory: Path, usb: Path) -> None:
         self.console = directory / "console.log"
@@ -56,7 +56,7 @@ class Guest:
         self._process.communicate()
 
     def sh(self, command: str, timeout_s: float = 60.0) -> str:
-        """What a line of shell prints. Raises GuestError if it fails."""
+        """Run a line of shell and return its output. Raises GuestError if it fails."""
         self._shell.sendall(command.encode() + b"\n")
         output, end = self._read_to(END, timeout_s)
         if end[1] != b"0":
@@ -64,23 +64,23 @@ class Guest:
         return output
 
     def read(self, path: str) -> str:
-        """A file's text."""
+        """Text of a file."""
         return self.sh(f"cat {path}")
 
     def write(self, path: str, text: str) -> None:
-        """Write it into a file of the kernel's."""
+        """Write text into a file of the kernel."""
         self.sh(f"echo {shlex.quote(text)} > {path}")
 
     def put(self, path: str, text: str) -> None:
-        """Write a file of several lines, by its path as programs of the host see it (below /run)."""
+        """Write a file of several lines. `path` is as programs of the host see it (below /run)."""
         self.sh(f"echo {base64.b64encode(text.encode()).decode()} | base64 -d > /host{path}")
 
     def python(self, *arguments: str, timeout_s: float = 300.0) -> str:
-        """This Python, with the same packages and sources as here, in the machine."""
+        """Run this Python in the machine, with the same packages and sources as on the host; returns its output."""
         return self.sh(_python(arguments), timeout_s)
 
     def start_python(self, *arguments: str, output: str) -> None:
-        """As `python`, and do not wait; what it prints goes to a file below /run."""
+        """As `python`, without waiting; the output goes to a file below /run."""
         self.sh(f"{_python(arguments)} > /host{output} 2>&1 &")
 
     def _connect(self) -> None:

@@ -1,4 +1,4 @@
-"""Driver `iio` where the kernel refuses, as JSON. Run in the machine, with the trigger `lsm6dso` there."""
+"""Requests of driver `iio` that the kernel refuses, as JSON. Run in the machine, with the trigger `lsm6dso` present."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ RATE_HZ = 26.0
 
 
 def opened(options: dict[str, Any]) -> str:
-    """What opening with these options says."""
+    """Message when the driver is opened with these options."""
     sensor = Iio("sensor", IioOptions.model_validate(options))
     try:
         sensor.open()
@@ -24,7 +24,7 @@ def opened(options: dict[str, Any]) -> str:
 
 
 def refusals() -> dict[str, str]:
-    """By question."""
+    """Messages by question."""
     found = {
         "a rate that is rounded": opened(LSM6DSO | {"rate_hz": 100}),
         "a rate that is refused": opened(LSM6DSO | {"rate_hz": 5000}),
@@ -33,10 +33,10 @@ def refusals() -> dict[str, str]:
     first = Iio("first", IioOptions.model_validate(LSM6DSO | {"rate_hz": RATE_HZ}))
     first.open()
     before = first.read_block()
-    found["somebody else reads it"] = opened(LSM6DSO | {"rate_hz": RATE_HZ})
+    found["another process reads the device"] = opened(LSM6DSO | {"rate_hz": RATE_HZ})
     after = first.read_block()
     first.close()
-    found["the first reader goes on"] = "samples come" if before and after else "it fell silent"
+    found["the first reader continues"] = "samples arrive" if before and after else "no samples"
     return found
 
 

@@ -1,4 +1,4 @@
-"""The machine's first files: busybox, the modules, a script that loads them and then takes orders."""
+"""First files of the machine: busybox, the modules, and a script that loads them and then executes commands."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ INIT = Path(__file__).with_name("init.sh")
 
 
 def initramfs(modules: dict[str, bytes]) -> bytes:
-    """An initial file system, compressed. Raises FileNotFoundError without a busybox."""
+    """An initial file system, compressed. Raises FileNotFoundError if busybox is missing."""
     busybox = shutil.which("busybox")
     if busybox is None:
-        raise FileNotFoundError("no busybox (apt-get install busybox-static)")
+        raise FileNotFoundError("busybox is missing: apt-get install busybox-static")
     files = {"init": INIT.read_bytes(), "bin/busybox": Path(busybox).read_bytes()}
     files |= {f"modules/{number:02}-{name}.ko": content for number, (name, content) in enumerate(modules.items())}
     return gzip.compress(b"".join(_archive(files)), compresslevel=1)

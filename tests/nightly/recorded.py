@@ -1,4 +1,4 @@
-"""What the agent recorded in the machine, as JSON: `python -m tests.nightly.recorded DATA_DIR`."""
+"""Summary of the agent's recording in the machine, as JSON: `python -m tests.nightly.recorded DATA_DIR`."""
 
 from __future__ import annotations
 
@@ -19,8 +19,11 @@ TOLD = BlockFlags.GAP | BlockFlags.RESTART
 
 
 def summary(data_dir: Path) -> dict[str, Any]:
-    """Losses in words; by device the number of each sample, bursts as (stamp, samples so far), how many breaks in the
-    numbers the blocks tell of, the first included, and how many they do not."""
+    """Losses as text; and by device its samples, bursts and breaks.
+
+    Of each device: the number of each sample; the bursts as (stamp, samples so far); the number of breaks in the sample
+    numbers that the blocks report (the first block included), and the number that they do not report.
+    """
     losses: list[str] = []
     devices: dict[str, dict[str, Any]] = {}
     for file in recordings(data_dir):

@@ -1,4 +1,4 @@
-"""The agent itself in the machine: `fieldcal run` on the kernel's own adapter, and on the kernel's own IIO device."""
+"""The agent in the machine: `fieldcal run` on the kernel's own adapter and on the kernel's own IIO device."""
 
 from __future__ import annotations
 
@@ -12,18 +12,21 @@ from tests.nightly.checks import IIO, Machine, Row, same
 from tests.nightly.site import ADDRESSES, RATES_HZ
 
 RUN_S = 15.0
-SHORTEST_S = 3.0  # of it: before that, devices open one after the other
+SHORTEST_S = 3.0  # of the recording: at the start the devices are opened one after the other
 TRIGGERS = "/sys/kernel/config/iio/triggers/hrtimer"
 NOTHING: dict[str, Any] = {"numbers": [], "stamps_ns": [], "told": 0, "untold": 0}
 PACED = {"lsm6dso": ("lsm6dsox_accel", 26.0), "adxl355": ("adxl355", 31.25)}  # name in the kernel, rate in Hz
-# The stamp is taken at the trigger, the number when the kernel's thread has the processor and the transfer is through:
-# some ms, 275 on a machine under heavy load. Stamps of another clock or unit are off by seconds.
+# The stamp is taken at the trigger. The sample number is read when the kernel's thread runs and the transfer is done:
+# some ms later, 275 ms on a machine under heavy load. A stamp of another clock or in another unit would be off by
+# seconds.
 LATE_S = 0.5
 
 
 def own_drivers(machine: Machine) -> Iterator[Row]:
-    """Four FIFOs at once through i2c-dev: no sample may be lost, doubled or shifted without being told. (A machine that
-    waits for a processor is late, and FIFOs run over: that is told.)"""
+    """Read four FIFOs at once through i2c-dev: no sample may be lost, doubled or shifted without a report.
+
+    If the machine waits for a processor, FIFOs may overrun; then the loss is reported.
+    """
     machine.twins.hold(None)
     devices = {
         name: (name, f"bus = {machine.bus}, address = {address}, rate_hz = {RATES_HZ[name]}")
@@ -39,7 +42,8 @@ def own_drivers(machine: Machine) -> Iterator[Row]:
 
 
 def through_iio(machine: Machine) -> Iterator[Row]:
-    """Driver `iio` on the kernel's drivers, paced by its timer: each number stands at the time of its stamp."""
+    """Driver `iio` on the kernel's drivers, triggered by the kernel's timer: each sample belongs to its stamp's
+    time."""
     machine.twins.hold(None)
     paced = {name: pace for name, pace in PACED.items() if name in machine.bound}
     devices = {}
@@ -62,32 +66,32 @@ def through_iio(machine: Machine) -> Iterator[Row]:
 
 
 def add_trigger(machine: Machine, name: str, rate_hz: float) -> None:
-    """A timer of the kernel's that makes its drivers sample."""
+    """Add a timer of the kernel that triggers the samples of its drivers."""
     machine.guest.sh(f"mkdir {TRIGGERS}/{name}")
     directory = machine.guest.sh(f"grep -l {name} {IIO}/trigger*/name | xargs dirname")
     machine.guest.write(f"{directory}/sampling_frequency", f"{rate_hz:g}")
 
 
 def iio_refusals(machine: Machine) -> Iterator[Row]:
-    """What driver `iio` says where the kernel refuses; LSM6DSO and trigger as `through_iio` left them."""
+    """Messages of driver `iio` when the kernel refuses; the LSM6DSO and its trigger are as `through_iio` left them."""
     said = json.loads(machine.guest.python("-m", "tests.nightly.iio_refusals"))
     rates = machine.guest.sh(f"cat {IIO}/*/sampling_frequency_available | grep 26.000 | head -n 1")
     wanted = {
-        "a rate that is rounded": "wrote 100, it says 104.000000",
-        "a rate that is refused": f"5000 is refused, it takes {rates}",
+        "a rate that is rounded": "wrote 100, the kernel driver set 104.000000",
+        "a rate that is refused": f"5000 is refused; accepted values: {rates}",
         "no buffer": "no buffer",
-        "somebody else reads it": "Device or resource busy",
+        "another process reads the device": "Device or resource busy",
     }
     for question, words in wanted.items():
         found = said[question]
         kind, _, message = found.partition(": ")
         agree = kind == "ConfigurationError" and words in message
         yield Row("driver iio", question, words if agree else found, kind, agree)
-    yield same("driver iio", "the first reader goes on", said["the first reader goes on"], "samples come")
+    yield same("driver iio", "the first reader continues", said["the first reader continues"], "samples arrive")
 
 
 def agent_run(machine: Machine, name: str, devices: dict[str, tuple[str, str]]) -> dict[str, Any]:
-    """Run the agent in the machine on these devices (driver, options); what it recorded."""
+    """Run the agent in the machine with these devices (driver, options); returns the summary of its recording."""
     text = '[gateway]\nsite = "nightly"\nname = "guest"\n[zenoh]\nenabled = false\n'
     for device, (driver, options) in devices.items():
         text += f'[[devices]]\nname = "{device}"\ndriver = "{driver}"\noptions = {{ {options} }}\n'

@@ -1,4 +1,4 @@
-"""The twins on one bus, plugged into the machine over USB; what drivers write to them is kept."""
+"""The twins on one bus, connected to the machine over USB; register writes of the drivers are kept."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from hw.virtual.mpu6050_twin import Mpu6050Twin
 from tests.numbered import numbered, since_now
 
 ADDRESSES = {"adxl355": 0x1D, "adxl345": 0x53, "mpu6050": 0x68, "lsm6dso": 0x6A}
-# The FIFOs of the first two hold 32 samples: slow enough for an emulated machine that waits for a processor.
+# The FIFOs of the first two hold 32 samples: a low rate for an emulated machine that may wait for a processor.
 RATES_HZ = {"adxl355": 31.25, "adxl345": 25.0, "mpu6050": 100.0, "lsm6dso": 104.0}
 
 
 class Twins:
-    """All of them with numbered samples, or with the indication that `hold` sets."""
+    """All twins, with numbered samples or with the constant indication set by `hold`."""
 
     def __init__(self) -> None:
         self.written: list[tuple[str, int, int]] = []  # device, register, value
@@ -39,15 +39,15 @@ class Twins:
         self.by_name = {name: self._twin(name, twin) for name, twin in classes.items()}
         self.bus = I2CBus(
             {ADDRESSES[name]: twin for name, twin in self.by_name.items()},
-            absent_errno=errno.ENXIO,  # as i2c-tiny-usb says it
+            absent_errno=errno.ENXIO,  # as i2c-tiny-usb reports it
         )
 
     def hold(self, counts: tuple[int, int, int] | None) -> None:
-        """From now on this indication, None: numbered ones again."""
+        """Set a constant indication from now on; None: numbered samples again."""
         self._held = None if counts is None else np.array(counts, np.int32)
 
     def warm(self, device: str, raw: int) -> None:
-        """From now on this raw temperature."""
+        """Set a constant raw temperature from now on."""
         self._temperature[device] = raw
 
     def _twin(self, name: str, twin: type[FifoTwin]) -> FifoTwin:

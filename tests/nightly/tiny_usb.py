@@ -1,8 +1,8 @@
-"""An i2c-tiny-usb adapter for a virtual machine: a USB device in this process, over QEMU's USB redirection.
+"""An i2c-tiny-usb adapter for a virtual machine: a USB device in this process, connected by QEMU's USB redirection.
 
-The device: three vendor requests (Linux, drivers/i2c/busses/i2c-tiny-usb.c). Redirection: usbredir's protocol 0.7 with
-ids of 64 bits (spice, usbredir/docs/usb-redirection-protocol.md): packets of type, length, id and content; this side
-describes the device, then answers control transfers.
+The device has three vendor requests (Linux, drivers/i2c/busses/i2c-tiny-usb.c). Redirection uses the usbredir protocol
+0.7 with 64-bit ids (spice, usbredir/docs/usb-redirection-protocol.md): packets of type, length, id and content. This
+side describes the device and then answers control transfers.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from hw.virtual.kernel import READ, I2CBus
 VENDOR, PRODUCT = 0x0403, 0xC631
 FULL_SPEED, VENDOR_CLASS, NO_ENDPOINT = 1, 0xFF, 255
 PACKET_BYTES = 64
-CAPABILITIES = 1 << 4 | 1 << 5 | 1 << 6  # packet sizes, ids of 64 bits, long bulk transfers: QEMU wants them for XHCI
+CAPABILITIES = 1 << 4 | 1 << 5 | 1 << 6  # packet sizes, 64-bit ids, long bulk transfers: QEMU requires them for XHCI
 HELLO_HEAD, HEAD = struct.Struct("<III"), struct.Struct("<IIQ")
 CONTROL = struct.Struct("<BBBBHHH")  # endpoint, request, its type, status, value, index, length
 SUCCESS, STALL = 0, 4
-TO_HOST, STANDARD = 0x80, 0x00  # in a request's type; bits 6:5 tell standard from vendor
+TO_HOST, STANDARD = 0x80, 0x00  # in the type of a request; bits 6:5 tell standard from vendor requests
 GET_DESCRIPTOR, GET_FUNCTIONS, SET_DELAY, GET_STATUS, TRANSFERS = 6, 1, 2, 3, range(4, 8)
 ACKNOWLEDGED, NOT_ACKNOWLEDGED = b"\x01", b"\x02"
 
@@ -62,7 +62,7 @@ DESCRIPTORS = {
 
 
 class TinyUsb:
-    """Context manager: listens at `path` for QEMU and is plugged in from the start."""
+    """Context manager: listens at `path` for QEMU; the device is plugged in from the start."""
 
     def __init__(self, bus: I2CBus, path: Path) -> None:
         self._bus = bus
@@ -86,14 +86,14 @@ class TinyUsb:
         self._thread.join()
 
     def plug(self) -> None:
-        """Put it in."""
+        """Plug the device in."""
         self._send(Packet.INTERFACES, struct.pack("<I", 1) + bytes(32) + bytes([VENDOR_CLASS, *bytes(31)]) + bytes(64))
         ends = bytes([0, *[NO_ENDPOINT] * 15]) * 2  # the control endpoint, out and in
         self._send(Packet.ENDPOINTS, ends + bytes(64) + struct.pack("<H", PACKET_BYTES) * 32)
         self._send(Packet.CONNECT, struct.pack("<BBBBHH", FULL_SPEED, VENDOR_CLASS, 0, 0, VENDOR, PRODUCT))
 
     def unplug(self) -> None:
-        """Pull it out."""
+        """Unplug the device."""
         self._send(Packet.DISCONNECT, b"")
 
     def _run(self) -> None:
@@ -124,7 +124,7 @@ class TinyUsb:
                 self._send(Packet.CONTROL, head + (sent if kind_of_request & TO_HOST else b""), number)
 
     def _control(self, request: int, kind: int, value: int, index: int, length: int, data: bytes) -> bytes | None:
-        """What is sent back, None for a request that is not understood."""
+        """The answer, or None for a request that is not supported."""
         if kind & 0x60 == STANDARD:
             if request == GET_DESCRIPTOR:
                 descriptor = DESCRIPTORS.get(value)
@@ -141,7 +141,7 @@ class TinyUsb:
         return None
 
     def _transfer(self, address: int, message: int | bytes) -> bytes:
-        """One I2C message; whether it was acknowledged is asked for afterwards."""
+        """Do one I2C message; another request asks whether it was acknowledged."""
         try:
             (read,) = self._bus.transfer([(address, message)])
         except OSError:

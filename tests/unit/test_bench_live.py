@@ -1,4 +1,4 @@
-"""The bench in real time, seen through the real drivers."""
+"""The bench in real time, read through the real drivers."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from hw.virtual.timebase import BenchTime
 
 
 class HandClock:
-    """A clock that moves when somebody sleeps, and by 20 us whenever it is read: time passes while code runs."""
+    """A clock that moves when `sleep` is called, and by 20 us on every read, because running code takes time."""
 
     def __init__(self) -> None:
         self.now_s = 1000.0
@@ -53,7 +53,7 @@ def test_the_driver_gets_the_benchs_counts_from_its_zero_on() -> None:
         assert not live.time.begun
         sensor = adxl355_of(live, clock)
         info = sensor.open()
-        assert live.time.begun, "the bench begins when the sensor is set to measure"
+        assert live.time.begun, "the bench starts when the sensor is set to measure"
         assert info.nominal_sensitivity == pytest.approx(COUNTS_PER_MPS2)
         blocks = blocks_of(sensor, 40)
         sensor.close()
@@ -66,7 +66,8 @@ def test_the_driver_gets_the_benchs_counts_from_its_zero_on() -> None:
         newest = block.first_index + block.burst_count - 1
         taken_s = zero_s + bench.parameters.sensor.clock.offset_s + newest / bench.parameters.sensor.clock.rate_hz
         late_s = block.burst_t_monotonic_ns / 1e9 - taken_s
-        # read right after the newest sample at best, right before the next at worst; wander within 20 s: < 1 ms
+        # The read is at best directly after the newest sample and at worst directly before the next; wander within 20
+        # s: < 1 ms.
         assert late_s.min() > -0.5e-3
         assert late_s.max() < 1 / 1013 + 1.5e-3
 
@@ -89,7 +90,7 @@ def test_the_reference_comes_over_its_port_in_real_time() -> None:
         reference = SerialCsv("reference", SerialCsv.options_model.model_validate(live.reference_options))
         sensor = Adxl355("mems", Adxl355.options_model.model_validate(live.sensor_options))
         reference.open()
-        assert reference.read_block() is None, "nothing is sampled before the bench begins"
+        assert reference.read_block() is None, "nothing is sampled before the bench starts"
         sensor.open()
         start_s = time.monotonic()
         blocks = [block for block in (reference.read_block() for _ in range(3)) if block is not None]
@@ -99,7 +100,8 @@ def test_the_reference_comes_over_its_port_in_real_time() -> None:
         values = np.concatenate([block.indications for block in blocks])
         assert np.array_equal(values, live.bench.reference_values(0, len(values)).round(5))
         last_s = blocks[-1].t_monotonic_ns / 1e9 - start_s
-        assert 1000 * last_s - 300 < len(values) < 1000 * last_s + 60  # bursts, opening; a busy machine reads late
+        # Limits for bursts and opening; a busy machine reads late
+        assert 1000 * last_s - 300 < len(values) < 1000 * last_s + 60
         port = live.port.path
     assert not port.exists()
     assert not port.is_symlink()

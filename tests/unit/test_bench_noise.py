@@ -66,7 +66,7 @@ def test_white_noise_has_its_sd_and_is_white() -> None:
         assert np.abs(shifted).max() < 4 / np.sqrt(n)
     v = bench.sensor_values(0, n)
     assert np.abs(np.corrcoef(v.T)[~np.eye(3, dtype=bool)]).max() < 4 / np.sqrt(n)
-    # the same numbers in both devices would show in the order in which they are drawn
+    # If both devices had the same numbers, these would appear in the order in which they are drawn.
     drawn_first, reference = v.ravel()[:BLOCK], bench.reference_values(0, BLOCK)[:, 0]
     assert abs(np.corrcoef(drawn_first, reference)[0, 1]) < 4 / np.sqrt(BLOCK)
 
@@ -78,7 +78,7 @@ def test_coloured_noise_is_ar1_across_blocks(phi) -> None:
     innovation = (x[1:] - phi * x[:-1]) / np.sqrt(1 - phi**2)
     n = len(innovation)
     assert np.mean(innovation**2, axis=0) == pytest.approx(1.0, rel=4 * np.sqrt(2 / n))
-    for lag in (1, 2, 31, 32, 33):  # 32: the step in which it is computed
+    for lag in (1, 2, 31, 32, 33):  # 32: number of steps that are computed at a time
         assert np.abs(np.mean(innovation[lag:] * innovation[:-lag], axis=0)).max() < 4.5 / np.sqrt(n)
     # stationary from the first sample on; effective number of samples n (1 - phi^2) / (1 + phi^2)
     assert np.mean(x**2) == pytest.approx(1.0, rel=4 * np.sqrt(2 / (3 * n) * (1 + phi**2) / (1 - phi**2)))
@@ -183,6 +183,6 @@ def test_plain_method_3_finds_the_truth_of_the_plain_bench_and_misses_it_on_the_
         S, Q = plain_method_3(bench)
         S_off = np.abs(S - bench.truth.sensitivity / COUNTS_PER_MPS2).max()
         Q_off = np.abs(Q - bench.truth.offset / COUNTS_PER_MPS2).max()
-        # plain: linear interpolation of a 1 kHz reference at 8 Hz costs 1e-4, noise less
+        # plain Method 3: linear interpolation of a 1 kHz reference at 8 Hz has an error of 1e-4, noise has less
         assert least <= S_off < most
         assert Q_off < 10 * most

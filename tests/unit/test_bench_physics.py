@@ -1,4 +1,4 @@
-"""The virtual bench against closed forms written here by hand."""
+"""The virtual bench compared with closed forms, written here by hand."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from hw.virtual.scene import Scene
 from hw.virtual.schedule import Schedule, clamped, directed, resting
 
 G = 9.80665
-STILL = 1e-12  # rounding of sums of a few numbers of size 10
+STILL = 1e-12  # rounding of sums of a few numbers of about 10
 
 
 def one_position(theta_deg: float = 35.0, alpha_deg: float = 30.0, **changes: object) -> BenchParameters:
@@ -68,7 +68,7 @@ def test_static_sign_turns_gravity_alone() -> None:
 def test_velocity_and_acceleration_are_derivatives_also_while_fading(motion) -> None:
     scene = Scene(BenchParameters(motion=motion), seed=1)
     h = 1e-4
-    t = np.arange(0.2, 9.0, 0.0137)  # fade-in before 1 s, two holds, both fades of the turnings
+    t = np.arange(0.2, 9.0, 0.0137)  # fade-in before 1 s, two holds, fade-out and fade-in around the turns
     velocity, acceleration = scene.slide(t)
     ahead, behind = scene.slide(t + h)[0], scene.slide(t - h)[0]
     # h^2/6 of a third derivative: (2 pi 10)^2 * 3 m/s2 in the steady part, a few hundred m/s4 in the fades
@@ -136,7 +136,7 @@ def test_clamp_errors_are_those_of_a_differently_set_clamp_and_repeat_with_the_p
     assert_allclose(wrong.truth.theta_error_deg, [0.23, 0.16])
     assert_allclose(wrong.truth.alpha_error_deg, [0.6, -0.2])
     assert [pose.alpha_deg for pose in wrong.poses] == [0, 120]
-    # 6 s is one repetition, 18 cycles of 3 Hz: the second repetition is the first once more
+    # 6 s is one repetition, 18 cycles of 3 Hz: the second repetition equals the first
     assert_allclose(wrong.sensor_values(6000, 2000), wrong.sensor_values(0, 2000), atol=1e-9)
 
 
@@ -174,8 +174,8 @@ def test_knocks_hit_the_sensor_alone_at_the_stated_rate_and_size() -> None:
     # 180 expected; each lasts 20 samples and few overlap. Poisson 99.9 %: 137..226
     assert 137 * 20 * 0.95 < np.count_nonzero(blow) < 226 * 20
     peaks = blow.reshape(-1, 1000).max(axis=1)
-    assert peaks.max() < 12.0  # two at once at most
-    assert np.count_nonzero(peaks > 3.0) > 40  # in 90 s with 2 a second, 57 % of them above 3
+    assert peaks.max() < 12.0  # no more than two at once
+    assert np.count_nonzero(peaks > 3.0) > 40  # in 90 s with 2 per second, 57 % of them above 3
 
 
 def test_saturation_and_quantisation() -> None:
@@ -267,7 +267,7 @@ def test_turning_by_hand_keeps_gravity_and_is_smooth_even_through_180_degrees() 
 
 
 def test_nothing_moves_before_the_start_and_the_motion_is_full_in_every_hold() -> None:
-    bench = Bench(BenchParameters(), seed=1)  # starts at 1 s, holds of 2 s, turnings of 1 s
+    bench = Bench(BenchParameters(), seed=1)  # starts at 1 s, holds of 2 s, turns of 1 s
     a = bench.reference_values(0, 12_000)[:, 0]
     assert np.abs(a[:600]).max() == 0.0
     assert [(p.start_s, p.stop_s, p.alpha_deg) for p in bench.poses] == [
@@ -280,7 +280,7 @@ def test_nothing_moves_before_the_start_and_the_motion_is_full_in_every_hold() -
         first, last = round(1000 * pose.start_s), round(1000 * pose.stop_s)
         t = bench.reference_times(first, last - first)
         assert_allclose(a[first:last], 10 * np.sin(2 * pi * 3 * t), atol=1e-10)
-    assert np.abs(a[3500]) == 0.0  # half way through the first turning the slide rests
+    assert np.abs(a[3500]) == 0.0  # the slide is at rest in the middle of the first turn
 
 
 def test_contradicting_parameters_are_refused() -> None:
@@ -290,5 +290,5 @@ def test_contradicting_parameters_are_refused() -> None:
         Bench(one_position(sensor=SensorParameters(noise_mps2=0.1)), -1).sensor_values(0, 1)
     with pytest.raises(ValueError, match="positions on the clamp"):
         Bench(replace(one_position(clamp=ClampErrors(0.1)), schedule=Schedule((resting(np.ones(3), 1.0),))), 1)
-    with pytest.raises(ValueError, match="measures acceleration"):
+    with pytest.raises(ValueError, match="must measure acceleration"):
         Bench(one_position(reference=ReferenceParameters(rotation=np.eye(3), quantity="velocity")), 1)

@@ -97,14 +97,14 @@ def test_a_track_keeps_the_files_own_digits(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "line 1: no columns vx,vy,vz or ax,ay,az or a or v in the header ''"),
-        ("time_s,b\n0,1\n", "line 1: no columns vx,vy,vz or ax,ay,az or a or v in the header 'time_s,b'"),
+        ("", "line 1: none of the columns vx,vy,vz or ax,ay,az or a or v in the header ''"),
+        ("time_s,b\n0,1\n", "line 1: none of the columns vx,vy,vz or ax,ay,az or a or v in the header 'time_s,b'"),
         ("vx,vy,vz\n1,2,3\n", "line 1: no column time_s in the header 'vx,vy,vz'"),
         ("time_s,a\n", "no samples"),
         ("time_s,a\n0,1\n1\n", "line 3: 1 fields, the header has 2"),
         ("time_s,a\n0,1\n1,x\n", "line 3, column a: 'x' is not a finite number"),
         ("time_s,a\n0,1\nnan,1\n", "line 3, column time_s: 'nan' is not a finite number"),
-        ("time_s,a\n0,1\n\n2,1\n1.5,1\n", "sample 3, column time_s: 1.5 after 2.0"),
+        ("time_s,a\n0,1\n\n2,1\n1.5,1\n", "sample 3, column time_s: 1.5 is earlier than 2.0 before it"),
     ],
 )
 def test_bad_recordings_are_named_by_file_line_column_and_value(text, message, tmp_path, capsys) -> None:
@@ -142,7 +142,7 @@ def test_a_link_that_exists_or_cannot_be_made_is_named(tmp_path, capsys) -> None
     assert run_cli(["simulate", "--preset", "plain", "--csv", str(path / "in-a-file")]) == 2
     (tmp_path / "bench-reference").touch()
     assert run_cli(["simulate", "--preset", "plain", "--link", str(tmp_path / "bench")]) == 2
-    assert not (tmp_path / "bench-sensor").is_symlink(), "the port that could be made must not stay behind"
+    assert not (tmp_path / "bench-sensor").is_symlink(), "the port that was made must be removed"
 
 
 def test_a_player_sends_what_is_due_once(tmp_path) -> None:
@@ -180,7 +180,7 @@ def test_a_recording_is_played_whole_at_its_own_pace_and_the_port_ends_with_it(t
                 arrived.append((port.readline().strip(), time.monotonic()))
         assert process.wait(timeout=5) == 0
     assert [line for line, _ in arrived] == [b"# playing", *(row.split(",", 1)[1].encode() for row in rows)]
-    # 0.79 s from first to last; bursts, and a busy machine may be late at either end, more so at the last
+    # 0.79 s from first to last; limits for bursts and for a busy machine, which may be late at either end
     assert 0.6 < arrived[-1][1] - arrived[1][1] < 1.5
     assert not link.is_symlink()
 
@@ -197,7 +197,8 @@ def test_a_reader_that_sets_its_port_up_slowly_and_reads_late_loses_nothing(tmp_
             deadline = time.monotonic() + 5
             while _waiting(port) < len(whole) and time.monotonic() < deadline:
                 select.select([], [], [], 0.01)
-            with pytest.raises(subprocess.TimeoutExpired):  # it lingers: a hang-up would throw the text away
+            # The process keeps the port open, because closing it would discard the text
+            with pytest.raises(subprocess.TimeoutExpired):
                 process.wait(timeout=0.3)
             assert os.read(port, 1000) == whole
             assert process.wait(timeout=5) == 0

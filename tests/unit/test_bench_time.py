@@ -20,7 +20,7 @@ def test_clock_has_the_stated_rate_offset_and_wander() -> None:
     clock = Clock(1000.0, rate_error=0.013, offset_s=0.25, wander=250e-6, wander_period_s=100.0)
     assert clock.times(0, 1)[0] == 0.25
     assert clock.rate_hz == pytest.approx(1013.0)
-    # over whole thermal cycles the wander averages out, and its extremes are those stated
+    # over whole thermal cycles the wander averages to zero, and its extremes are the stated ones
     t = clock.times(0, 101_301)
     assert t[-1] - t[0] == pytest.approx(100.0, abs=1e-9)
     change = np.diff(t) * 1013.0 - 1
@@ -54,7 +54,7 @@ def test_stamps_are_late_arrivals_never_early() -> None:
     stamps, count = np.unique(recording.sensor_stamp_s, return_counts=True)
     assert np.all(np.diff(recording.sensor_stamp_s) >= 0)
     assert count.mean() == pytest.approx(16 * 1.013, rel=0.01)
-    # how late the reads were against their plan: 3750 draws of 80 us + exponential(200 us) + 1 % * 9.75 ms
+    # delay of the reads against their plan: 3750 draws of 80 us + exponential(200 us) + 1 % * 9.75 ms
     read_late = stamps - 0.016 * np.arange(1, len(stamps) + 1)
     assert read_late.min() >= 80e-6 - 1e-12
     ordinary = read_late[read_late < 3e-3]

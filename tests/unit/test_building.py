@@ -1,4 +1,4 @@
-"""The virtual building: what its blocks hold is what its truth says, and each harm does what it is named for."""
+"""The virtual building: its blocks agree with its truth, and each fault (harm) has the effect that its name states."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ EXACT = Clock(100.0)
 
 
 def small(**changes: Any) -> BuildingParameters:
-    """A minute every ten minutes at 100 Hz."""
+    """One minute of motion every ten minutes, at 100 Hz."""
     parameters = BuildingParameters(
         window_s=60.0, every_s=600.0, sensitivity=SENSITIVITY, offset=np.array([0.1, -0.2, 0.3]),
         sensor=Instrument(0.005, Clock(100.0, 1e-4, 0.0013, 20e-6)), reference=Instrument(0.001, Clock(100.0, -6e-5)),
@@ -79,7 +79,7 @@ def test_any_visit_gives_the_same_bits_whatever_was_asked_before() -> None:
 
 
 def test_indications_are_the_truth_of_that_day() -> None:
-    """No noise and one clock for both: V = S (R a_ref + g) + Q holds to the motion's last digit."""
+    """Without noise and with one clock for both devices, V = S (R a_ref + g) + Q holds to rounding."""
     quiet = Instrument(0.0, EXACT)
     turn = rotation(np.array([0.0, 0.6, 0.8]), 0.3)
     step = np.zeros((3, 3))
@@ -109,7 +109,7 @@ def test_the_sensor_lags_and_moves_with_the_stated_level() -> None:
     building = Building(replace(parameters, sensitivity=np.eye(3), offset=np.zeros(3)), 3)
     blocks = building.visit(1)
     V, a = values(blocks, "sensor")[:, 1], values(blocks, "reference")[:, 1]
-    assert np.abs(V[2:] - a[:-2]).max() < 1e-10  # two periods; times are right to 1e-13 s
+    assert np.abs(V[2:] - a[:-2]).max() < 1e-10  # shifted by two sample periods; times are right to 1e-13 s
     whole = a[100:-100]
     assert whole.std() == pytest.approx(building.level_mps2(1), rel=0.1)
     assert 0.02 <= building.level_mps2(1) <= 0.3
@@ -126,7 +126,7 @@ def test_some_visits_move_elsewhere() -> None:
 
 
 def test_motion_between_grid_points_is_the_band_limited_one() -> None:
-    """A grid twice as fine shows the same motion: what the cubic pieces leave out is 3e-6 of it."""
+    """A grid twice as fine gives the same motion: the cubic interpolation differs by 3e-6 of it."""
     band = Band()
     coarse = BuildingMotion(np.random.default_rng(1), band, 0.0, 20.0, 0.1, np.eye(3)[1:2])
     lines = np.fft.rfft(coarse._value[:, 0])
@@ -138,7 +138,7 @@ def test_motion_between_grid_points_is_the_band_limited_one() -> None:
 
 
 def visited(harm: Harm, visit: int = 2, **changes: Any) -> tuple[list[SampleBlock], list[SampleBlock]]:
-    """The visit without and with the harm."""
+    """The blocks of the visit without and with the fault."""
     parameters = small(**changes)
     return Building(parameters, 6).visit(visit), Building(parameters, 6, harm, 2).visit(visit)
 

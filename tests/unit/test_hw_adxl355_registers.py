@@ -1,4 +1,4 @@
-"""Bytes of the ADXL355 and what they mean; triples against a plain reading of the markers."""
+"""Bytes of the ADXL355 and their meaning; `triples` compared with a simple parser of the markers."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_entry(entry: str, count: int) -> None:
 
 
 def test_temperature_ignores_what_is_above_12_bits() -> None:
-    # Data sheet: 1885 at 25 degC, -9.05 LSB a degree.
+    # Data sheet: 1885 at 25 degC, -9.05 LSB per degC.
     assert temperature(ADXL355, bytes.fromhex("075d")) == (1885, 25.0)
     raw, degc = temperature(ADXL355, bytes.fromhex("f702"))
     assert raw == 1794
@@ -62,7 +62,7 @@ def test_empty_entries_are_left_out() -> None:
 
 
 def plain_reading(marks: str) -> tuple[list[int], int]:
-    """Starts of the whole triples in a string of X and o, and how many entries at the end may still become one."""
+    """Starts of the complete triples in a string of X and o; number of entries at the end that may become a triple."""
     starts = [i for i in range(len(marks) - 2) if marks[i : i + 3] == "Xoo" and marks[i + 3 : i + 4] in ("", "X")]
     rest = 2 if marks.endswith("Xo") else 1 if marks.endswith("X") else 0
     return starts, rest
@@ -117,11 +117,11 @@ def test_a_bus_that_is_too_slow_is_refused_with_the_arithmetic() -> None:
 
 
 def test_a_poll_that_the_fifo_cannot_wait_for_is_refused() -> None:
-    assert "lets 29 samples gather" in refusal(poll_interval_s=0.029)
+    assert "gathers 29 samples" in refusal(poll_interval_s=0.029)
     assert Adxl355Options(poll_interval_s=0.028).interval_s == 0.028
 
 
 def test_rates() -> None:
     assert Adxl355Options(rate_hz=3.906).rate_hz == 3.90625
     assert Adxl355Options(rate_hz=3.90625).interval_s == 0.1
-    assert "900 Hz is not a rate of this device: 4000, 2000, 1000" in refusal(rate_hz=900.0)
+    assert "900 Hz is not a rate of this device; use one of 4000, 2000, 1000" in refusal(rate_hz=900.0)

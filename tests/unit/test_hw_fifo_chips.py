@@ -1,4 +1,4 @@
-"""Bytes of the ADXL345, LSM6DSO and MPU-6050 families and what they mean; any bytes decode; what options refuse."""
+"""Bytes of the ADXL345, LSM6DSO and MPU-6050 families and their meaning; any bytes can be decoded; refused options."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def by_name(settings: dict[int, tuple[str, int]]) -> dict[str, int]:
     [
         ("0001 00ff ff7f", "<", [256, -256, 32767]),
         ("0100 ff00 7fff", ">", [256, -256, 32767]),
-        ("ff0f 00f0 0000", "<", [4095, -4096, 0]),  # the ends of the ADXL345's 13 bits
+        ("ff0f 00f0 0000", "<", [4095, -4096, 0]),  # the lowest and highest value of the ADXL345's 13 bits
     ],
 )
 def test_plain_samples(data: str, byte_order: str, counts: list[int]) -> None:
@@ -90,7 +90,7 @@ def test_mpu6050_self_test_figures_of_the_maker() -> None:
         pytest.approx(0.92),
         0.0,
     ]
-    # AN-MPU-9250A-03: 2620 counts at 2 g, and 1 % more a code
+    # AN-MPU-9250A-03: 2620 counts at 2 g, 1 % more per code
     later = mpu6050_registers.PARTS[0x71]
     assert mpu6050_registers.factory_trim_g(later, bytes([1, 2, 0, 9])) == [
         pytest.approx(2620 / 16384),
@@ -156,6 +156,8 @@ def test_what_the_bus_or_the_fifo_cannot_do_is_refused_with_the_arithmetic() -> 
     # 6 bytes x 9 bit x 1000 Hz + 12 bytes x 9 bit x 62.5 polls/s = 60.75 kbit/s
     assert Mpu6050Options(bus_khz=100.0).interval_s == 0.016
     assert "bus too slow" in refusal(Lsm6dsoOptions, rate_hz=6667.0)
-    assert "the FIFO holds 85, at most 74" in refusal(Mpu6050Options, poll_interval_s=0.08)
-    assert "900 Hz is not a rate of this device: 1000, 500, 250, 200" in refusal(Mpu6050Options, rate_hz=900.0)
+    assert "the FIFO holds 85 and at most 74" in refusal(Mpu6050Options, poll_interval_s=0.08)
+    assert "900 Hz is not a rate of this device; use one of 1000, 500, 250, 200" in refusal(
+        Mpu6050Options, rate_hz=900.0
+    )
     assert "1600 Hz is not a rate" in refusal(Adxl345Options, rate_hz=1600.0)

@@ -1,4 +1,4 @@
-"""Frames against byte pairs and a plain reading; any bytes pass through every stream of frames."""
+"""Frames compared with byte pairs and with a simple parser; any bytes can be fed into every stream of frames."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LAYOUT = Layout(b"\xaa\x55", 6, "sum8")
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    # check values of "123456789", as every table of checksums gives them
+    # published check values for "123456789"
     [("sum8", 0xDD), ("xor8", 0x31), ("crc16-ccitt", 0x29B1), ("crc16-modbus", 0x4B37), ("none", 0)],
 )
 def test_checksums(name: ChecksumName, value: int) -> None:
@@ -64,7 +64,7 @@ pieces = st.lists(
 
 
 def plain_reading(data: bytes) -> tuple[list[int], int]:
-    """Ends of the frames, and from where on the bytes may still become one."""
+    """Ends of the frames, and the position from which the bytes may still become a frame."""
     ends, at = [], 0
     while at < len(data):
         whole = data[at : at + 6]
@@ -122,7 +122,7 @@ def test_witmotion_bytes() -> None:
     assert wit.counts(data).tolist() == [[1, -1, -32768]]
     assert wit.temperature(data[0]) == (2503, 25.03)
     assert frame(0x51, 1, -1, -32768, 2503) == closed(sent)
-    # 23:59:59.995, and 5 ms later the next day
+    # 23:59:59.995, and 5 ms later on the next day
     late = np.frombuffer(frame(0x50, 24 | 1 << 8, 1 | 23 << 8, 59 | 59 << 8, 995), np.uint8)
     early = np.frombuffer(frame(0x50, 24 | 1 << 8, 2, 0, 0), np.uint8)
     times_ms = wit.milliseconds(np.stack([late, early]))
@@ -138,12 +138,12 @@ def options(**changes: object) -> dict[str, object]:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"length": 8}, "the i16 at 7 ends at byte 9; a frame of 8 bytes has room up to 7"),
-        ({"indications": [{"at": 2, "type": "u8"}] * 2}, "1 or 3 numbers, not 2"),
-        ({"sequence": {"at": 2, "type": "i8"}}, "u8, u16 or u32, not i8"),
-        ({"rate_hz": 1000.0}, "1000 frames/s of 12 bytes, 10 bits each, are 120000 bit/s; baud_rate is 115200"),
+        ({"length": 8}, "the i16 at 7 ends at byte 9; in a frame of 8 bytes numbers must end at 7 or before"),
+        ({"indications": [{"at": 2, "type": "u8"}] * 2}, "1 or 3 numbers are needed, not 2"),
+        ({"sequence": {"at": 2, "type": "i8"}}, "type must be u8, u16 or u32, not i8"),
+        ({"rate_hz": 1000.0}, "1000 frames/s of 12 bytes, 10 bits each, are 120000 bit/s; baud_rate is only 115200"),
         ({"start": "aa5"}, "two hexadecimal digits each"),
-        ({"temperature": {"at": 9, "type": "i16", "counts_per_degc": 0.0}}, "no thermometer"),
+        ({"temperature": {"at": 9, "type": "i16", "counts_per_degc": 0.0}}, "0 counts per degree"),
     ],
 )
 def test_frames_that_cannot_be_are_refused(changes: dict[str, object], message: str) -> None:
@@ -153,10 +153,10 @@ def test_frames_that_cannot_be_are_refused(changes: dict[str, object], message: 
 
 def test_witmotion_refuses_what_its_port_cannot_carry() -> None:
     with pytest.raises(
-        ValidationError, match="100 samples/s of 22 bytes, 10 bits each, are 22000 bit/s; baud_rate is 9600"
+        ValidationError, match="100 samples/s of 22 bytes, 10 bits each, are 22000 bit/s; baud_rate is only 9600"
     ):
         WitMotionOptions(port="p", baud_rate=9600)
-    with pytest.raises(ValidationError, match="60 Hz is not a rate of this device: 200, 100"):
+    with pytest.raises(ValidationError, match="60 Hz is not a rate of this device; use one of 200, 100"):
         WitMotionOptions(port="p", rate_hz=60.0)
 
 

@@ -1,4 +1,4 @@
-"""Decoding of lines against a plain reading of the protocol, line by line."""
+"""Decoding of lines, compared with a simple parser of the protocol, line by line."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from hw.cutting import Cutter
 from hw.line_stream import LineStream
 from hw.lines import decode
 
-# The protocol, said once more: a decimal is sign, digits with at most one point, exponent; spaces around it do no harm.
+# The protocol as a second implementation: sign, digits with at most one point, exponent; spaces around a number are
+# allowed.
 DECIMAL = re.compile(rb"[+-]?(\d*)\.?(\d*)([eE][+-]?\d+)?\Z")
 
 
@@ -149,7 +150,7 @@ NONE, GAP, RESTART = BlockFlags.NONE, BlockFlags.GAP, BlockFlags.RESTART
 )
 def test_sequence(numbers: list[int], expected: list[tuple[int, int, BlockFlags]]) -> None:
     assert shape(feed(stream(), numbered(*numbers))) == expected
-    # cut into blocks anywhere, the joints are the same
+    # cut anywhere into blocks, the result is the same
     for cut in range(1, len(numbers)):
         listening = stream()
         blocks = feed(listening, numbered(*numbers[:cut])) + feed(listening, numbered(*numbers[cut:]))
@@ -162,7 +163,7 @@ def test_sequence(numbers: list[int], expected: list[tuple[int, int, BlockFlags]
 def test_a_sequence_number_is_a_whole_number(bad: bytes) -> None:
     listening = stream()
     assert shape(feed(listening, numbered(1, 2) + bad + numbered(3))) == [(0, 3, RESTART)]
-    assert listening.take_drops() == [Drop(1, "lines", "not the expected decimals")]
+    assert listening.take_drops() == [Drop(1, "lines", "line without the expected decimal numbers")]
 
 
 def test_arrivals_belong_to_the_burst_that_ends_the_line() -> None:
@@ -184,7 +185,7 @@ def test_without_sequence_a_bad_line_restarts_at_its_place() -> None:
     blocks = feed(listening, b"1\n2\nx\n3\n", b"# fine\n4\n", b"5\nbad\nworse\n")
     assert shape(blocks) == [(0, 2, RESTART), (2, 3, RESTART)]
     assert shape(feed(listening, b"6\n")) == [(5, 1, RESTART)]
-    assert listening.take_drops() == [Drop(3, "lines", "not the expected decimals")]
+    assert listening.take_drops() == [Drop(3, "lines", "line without the expected decimal numbers")]
 
 
 @pytest.mark.parametrize("rest", [b"", b"3", b"123,123", b"x" * 5000])
@@ -202,7 +203,7 @@ def test_a_new_port_begins_anew_and_the_index_goes_on() -> None:
 
 
 def damage(text: bytes, rng: np.random.Generator) -> bytes:
-    """Flip a bit, lose a byte, double one, insert one, or cut out a piece."""
+    """Flip a bit, remove a byte, double one, insert one, or remove a piece."""
     kind, place, bit, other, piece = rng.integers(0, (5, len(text), 8, 256, 40)).tolist()
     before, at, after = text[:place], text[place], text[place + 1 :]
     match kind:
@@ -220,7 +221,7 @@ def damage(text: bytes, rng: np.random.Generator) -> bytes:
 
 @pytest.mark.parametrize("sequence", [True, False])
 def test_a_hundred_thousand_damaged_bursts(sequence: bool) -> None:
-    # 50 000 each: no exception, nothing but finite numbers, indices rise, nothing is held back, most lines survive.
+    # 50 000 each: no exception, only finite numbers, increasing indices, nothing is held back, most lines are decoded.
     rng = np.random.default_rng(20240601)
     listening = stream(sequence)
     intact = [b"%d,%.3f\n" % (k, math.sin(k)) if sequence else b"%.3f\n" % math.sin(k) for k in range(8)]
@@ -238,4 +239,5 @@ def test_a_hundred_thousand_damaged_bursts(sequence: bool) -> None:
             assert sum(drop.count for drop in listening.take_drops()) > 0
             assert len(listening._tail) <= 256
             assert listening.size == 0
-    assert samples > 0.6 * 50_000 * len(intact)  # a cut-out piece takes up to five lines of eight, the others one
+    # A removed piece destroys up to five of eight lines, the other damages one line
+    assert samples > 0.6 * 50_000 * len(intact)

@@ -1,4 +1,4 @@
-"""The registry on the built-in drivers and on plug-ins that are really installed, in a directory on the path."""
+"""The registry with the built-in drivers and with plug-ins that are installed in a directory on the path."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Sensor:
 
 
 def install(directory: Path, name: str, source: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What an installer leaves of a plug-in: a module and the metadata that names it."""
+    """Write the files that an installer leaves of a plug-in: a module and the metadata that name it."""
     module = f"plugin_{name}"
     (directory / f"{module}.py").write_text(source)
     info = directory / f"{module}-1.0.dist-info"
@@ -43,23 +43,24 @@ def test_built_in_drivers() -> None:
 def test_what_is_built_in_is_what_the_package_declares() -> None:
     declared = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text("utf-8"))
     found = dict(declared["project"]["entry-points"]["fieldcal.sensors"])
-    assert found.pop("replay").startswith("agent.")  # of the agent, which hw does not know: a plug-in
+    # Part of the agent, which hw does not import: registered as a plug-in
+    assert found.pop("replay").startswith("agent.")
     assert found == BUILT_IN
 
 
 def test_an_unknown_name_tells_what_there_is() -> None:
     with pytest.raises(
-        ConfigurationError, match=r"no driver 'axl355': did you mean 'adxl355'\? there are .*serial-csv"
+        ConfigurationError, match=r"no driver 'axl355': did you mean 'adxl355'\? available drivers: .*serial-csv"
     ):
         load_driver("axl355")
-    with pytest.raises(ConfigurationError, match=r"no driver 'zzz': there are adxl345"):
+    with pytest.raises(ConfigurationError, match=r"no driver 'zzz': available drivers: adxl345"):
         load_driver("zzz")
 
 
 def test_a_plug_in_is_a_driver_like_any(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     install(tmp_path, "kx134", GOOD, monkeypatch)
     assert "kx134" in driver_names()
-    assert "plugin_kx134" not in sys.modules  # naming it did not import it
+    assert "plugin_kx134" not in sys.modules  # listing the names does not import the plug-in
     assert load_driver("kx134").options_model.__name__ == "Options"
 
 
@@ -69,8 +70,8 @@ def test_a_plug_in_is_a_driver_like_any(tmp_path: Path, monkeypatch: pytest.Monk
         ("1 / 0", r"driver 'broken' \(plugin_broken:Sensor\) cannot be loaded: ZeroDivisionError"),
         ("import no_such_library", "cannot be loaded: ModuleNotFoundError"),
         ("other = 1", "cannot be loaded: AttributeError"),
-        ("class Sensor: pass", "is no sensor class"),
-        ("class Sensor: options_model = dict", "is no sensor class"),
+        ("class Sensor: pass", "is not a sensor class"),
+        ("class Sensor: options_model = dict", "is not a sensor class"),
     ],
 )
 def test_a_broken_plug_in_is_a_clear_error(

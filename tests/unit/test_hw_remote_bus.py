@@ -1,4 +1,4 @@
-"""Twins behind a socket are what they are in the process itself."""
+"""Twins behind a socket behave like twins in the same process."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def machine() -> Machine:
 
 @pytest.fixture
 def bus(machine: Machine, tmp_path: Path) -> Iterator[I2CBus]:
-    """The twins' side; the driver's is installed."""
+    """The bus with the twins; the driver uses the other end of the socket."""
     twin = Adxl355Twin(
         lambda first, n: np.arange(3 * first, 3 * (first + n), dtype=np.int32).reshape(n, 3),
         lambda t_s: int(1000 * t_s + 1e-6),
@@ -77,7 +77,7 @@ def test_errors_come_through(bus: I2CBus, machine: Machine) -> None:
 
 def test_transfers_of_several_threads_do_not_mix(tmp_path: Path) -> None:
     class Echo:
-        """Says in its bytes who it is and how many were asked for."""
+        """Returns bytes that name the target and the number of requested bytes."""
 
         def __init__(self, number: int) -> None:
             self.number = number

@@ -1,4 +1,4 @@
-"""Sample times from a driver's arrivals against the twin's truth: rate error, thermal wander, scheduler stalls."""
+"""Sample times from a driver's arrivals compared with the twin's truth: rate error, thermal wander, stalls."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from hw.virtual.mpu6050_twin import Mpu6050Twin
 from hw.virtual.timebase import Clock
 
 SECONDS = 120.0
-# Scheduler: 0.2 ms mean, 1 % stalls of 5 to 20 ms, as measured on a loaded gateway (and the FIFO outlasts them).
+# Scheduler: 0.2 ms mean, 1 % stalls of 5 to 20 ms, as measured on a loaded gateway. The FIFO is large enough for them.
 MEAN_LATE_S, STALLS, STALL_S = 0.2e-3, 0.01, (5e-3, 20e-3)
 
 
 class Machine:
-    """A simulated clock, and a scheduler that lets a sleeper wait longer than asked."""
+    """A simulated clock, and a scheduler that sometimes wakes a sleeper later than requested."""
 
     def __init__(self, seed: int) -> None:
         self.t_s = 0.0

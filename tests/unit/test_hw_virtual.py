@@ -1,4 +1,4 @@
-"""The stand-ins against what was measured on a real kernel, a real terminal and the data sheet."""
+"""The twins compared with measurements on a real kernel and a real terminal, and with the data sheet."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from hw.virtual.serial_port import PtyDevice, SampleLines, format_lines
 
 
 class Memory:
-    """256 registers with auto-increment, the plainest target there is."""
+    """256 registers with auto-increment, the simplest possible target."""
 
     def __init__(self) -> None:
         self.registers = bytearray(range(256))
@@ -43,7 +43,7 @@ def adapter() -> Iterator[I2CBus]:
 
 
 def failure(call: object, *arguments: object) -> int | None:
-    with pytest.raises(OSError) as raised:  # noqa: PT011 - the errno is what is asked
+    with pytest.raises(OSError) as raised:  # noqa: PT011 - the test checks the errno
         call(*arguments)  # type: ignore[operator]
     return raised.value.errno
 
@@ -136,15 +136,15 @@ def test_twin_fifo_holds_96_entries_and_tells_once_that_it_ran_over() -> None:
     clock.t_s = 10.0
     chip.write(b"\x2d\x00")
     clock.t_s = 10.0325
-    assert registers(chip, 0x04, 2) == bytes([0b011, 96])  # full, not over
+    assert registers(chip, 0x04, 2) == bytes([0b011, 96])  # full, not overrun
     clock.t_s = 10.0335
     assert registers(chip, 0x04, 2) == bytes([0b111, 96])
     assert registers(chip, 0x04, 2) == bytes([0b011, 96])
     oldest = registers(chip, 0x11, 9)
-    assert oldest.hex() == "027111027110027110"  # sample 10001, X marked
+    assert oldest.hex() == "027111027110027110"  # sample 10001 with the X marker
     assert registers(chip, 0x05, 1) == bytes([93])
     rest = registers(chip, 0x11, 3 * 93 + 3)
-    assert rest[-3:] == b"\x00\x00\x02"  # nothing left: empty
+    assert rest[-3:] == b"\x00\x00\x02"  # nothing left: an entry marked as empty
     assert registers(chip, 0x04, 2) == bytes([0b000, 0])
 
 
@@ -161,7 +161,7 @@ def test_twin_needs_time_after_a_reset() -> None:
 
 
 class Noise:
-    """Answers anything, fails at times: a bus in trouble."""
+    """Answers every request and fails at times, like a disturbed bus."""
 
     def __init__(self, seed: int, chip: Adxl355Twin, share: float) -> None:
         self.rng = np.random.default_rng(seed)
@@ -250,7 +250,7 @@ def test_a_reader_that_sleeps_does_not_stop_the_device(silent_port: PtyDevice) -
     for _ in range(20):
         silent_port.inject(b"x" * 5000)
         silent_port.serve()
-    assert silent_port.lost_bytes > 50_000  # Linux keeps 20 kB or so
+    assert silent_port.lost_bytes > 50_000  # Linux keeps about 20 kB
     os.close(file)
 
 

@@ -37,8 +37,8 @@ def test_the_stand_in_answers_as_linux_6_12_did(twins: Twins) -> None:
         twins.bus.claimed.add(0x68)
         found |= held(NODE, 0x68)
     assert {question: found[question] for question in found if found[question].startswith("E")} == {
-        "nobody there, byte": "ENXIO",
-        "nobody there, transfer": "ENXIO",
+        "no device, byte": "ENXIO",
+        "no device, transfer": "ENXIO",
         "43 messages": "EINVAL",
         "8193 bytes": "EINVAL",
         "no such node": "ENOENT",

@@ -1,4 +1,4 @@
-"""`fieldcal probe` on adapters under the real smbus2: what answers, who it is, whether it is sound."""
+"""`fieldcal probe` on adapters under the real smbus2: which devices answer, their identity, the self-test."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_who_answers(bus: I2CBus, capsys: pytest.CaptureFixture[str]) -> None:
     registers = {address: bytes(target.registers) for address, target in bus.targets.items()}  # type: ignore[attr-defined]
     found = probed(capsys)
     assert {address: answer["drivers"] for address, answer in found.items()} == {
-        0x1D: ["adxl355", "adxl357"],  # they have the same part ID
+        0x1D: ["adxl355", "adxl357"],  # the two parts have the same part ID
         0x53: ["adxl345"],
         0x68: ["mpu6050"],
     }

@@ -52,7 +52,7 @@ def test_an_unknown_driver_is_bad_usage(capsys: pytest.CaptureFixture[str]) -> N
     assert run_cli(["sensors", "adxl355", "adxl999"]) == 2
     out, err = capsys.readouterr()
     assert out == ""
-    assert err.startswith("fieldcal sensors: no driver 'adxl999': there are adxl345, ")
+    assert err.startswith("fieldcal sensors: no driver 'adxl999'; available drivers: adxl345, ")
 
 
 def test_plug_ins_are_shown_and_a_broken_one_says_why(
