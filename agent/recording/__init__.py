@@ -1,1 +1,1 @@
-"""Recordings: written, read back, checked byte by byte, and compared with what they give again."""
+"""Recordings (MCAP files): writing, reading, byte-by-byte checks, repair, signatures and comparison with a replay."""

@@ -1,4 +1,4 @@
-"""Blocks of the corrected stream as protobuf messages; their arrays pass as bytes, as in agent.recording.raw_block."""
+"""Blocks of the corrected stream as protobuf messages. Arrays are copied as bytes, as in agent.recording.raw_block."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from agent.proto import fieldcal_pb2 as pb
 
 
 def encode_acceleration(event_sequence: int, block: Acceleration) -> bytes:
-    """Wire bytes of a block."""
+    """Encode a block as protobuf wire bytes."""
     columns = np.ascontiguousarray(block.acceleration.T, "<f8")
     message = pb.AccelerationBytes(
         event_sequence=event_sequence, sensor=block.sensor, t_utc_ns=block.t_utc_ns, first_index=block.first_index,
@@ -22,12 +22,12 @@ def encode_acceleration(event_sequence: int, block: Acceleration) -> bytes:
 
 
 def decode_acceleration(data: bytes) -> tuple[int, Acceleration]:
-    """(event_sequence, block) of wire bytes. Raises ValueError or protobuf's DecodeError where they are none."""
+    """Decode wire bytes into (event_sequence, block). Raises ValueError or protobuf's DecodeError for invalid bytes."""
     m = pb.AccelerationBytes.FromString(data)
     columns = [np.frombuffer(part, "<f8") for part in (m.x, m.y, m.z)]
     covariance, noise = np.frombuffer(m.covariance, "<f8"), np.frombuffer(m.noise, "<f8")
     if len({len(c) for c in columns}) != 1 or len(covariance) != 9 or len(noise) != 3 or len(m.determined) != 12:
-        raise ValueError(f"{len(columns[0])} samples, but axes or uncertainties of other lengths")
+        raise ValueError(f"x has {len(columns[0])} samples; another axis or an uncertainty has an unexpected length")
     return m.event_sequence, Acceleration(
         sensor=m.sensor, t_utc_ns=m.t_utc_ns, first_index=m.first_index, rate_hz=m.rate_hz,
         acceleration=np.column_stack(columns), covariance=covariance.reshape(3, 3), noise=noise,

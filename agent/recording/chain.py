@@ -1,5 +1,8 @@
-"""Do recordings follow one another? Each names the SHA-256 of the one before; a number that is missing must have been
-deleted by retention, and a record must say so."""
+"""Check that recordings follow one another without a gap.
+
+Each recording holds the SHA-256 of the recording before it. Where a file number is missing, a record must say that
+retention deleted that file.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ from agent.recording.pruned_ranges import Ranges, first_outside
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """A recording, as far as its neighbours must agree with it."""
+    """The properties of one recording that must agree with the recording before it and the one after it."""
 
     path: str
     gateway: str
@@ -27,10 +30,11 @@ class Link:
 def chain_faults(
     links: Sequence[Link], pruned: Sequence[Pruned], deleted: Ranges, *, from_first: bool
 ) -> Iterator[tuple[int, str]]:
-    """(index, what is wrong) for each recording that does not follow the one before.
+    """Yield (index in `links`, what is wrong) for each recording that does not follow the one before it.
 
-    `pruned` are the events that say what retention deleted, `deleted` all numbers of which anything says so.
-    Compared are neighbours of one gateway with rising numbers. `from_first`: before the first there must be nothing.
+    `pruned`: the Pruned events of these recordings. `deleted`: all file numbers that events or metadata name as deleted
+    by retention. Only neighbours of the same gateway with rising numbers are compared. `from_first`: all recordings
+    from number 1 must be there or be named as deleted.
     """
     if from_first and links:
         yield from ((0, fault) for fault in _gap(0, links[0], pruned, deleted))
@@ -40,29 +44,29 @@ def chain_faults(
         if before.file_sequence + 1 < after.file_sequence:
             yield from ((index, fault) for fault in _gap(before.file_sequence, after, pruned, deleted))
         elif not _follows(before, after):
-            yield index, f"{before.path} is not the file that was there before this one: its SHA-256 differs"
+            yield index, f"{before.path} is not the file that this one names as the one before it: its SHA-256 differs"
 
 
 def _follows(before: Link, after: Link) -> bool:
-    # One that was closed only after the next had begun could not be named yet.
+    # A file that was repaired after the next one had begun had no SHA-256 yet that the next one could name.
     unnamed = before.repaired and not after.previous_sha256
     return before.incomplete or unnamed or after.previous_sha256 == before.sha256
 
 
 def missing_after(last: int, expected: int) -> str:
-    """What to say where numbers up to `expected` were given, and `last` is the highest that is there."""
+    """The fault where file numbers up to `expected` were used and `last` is the highest there; "" where none is."""
     return f"{_span(last + 1, expected)} missing at the end" if expected > last else ""
 
 
 def _gap(before: int, after: Link, pruned: Sequence[Pruned], deleted: Ranges) -> Iterator[str]:
-    """What is wrong with the numbers missing between one and the next recording."""
+    """Yield the faults of the file numbers that are missing between number `before` and the recording `after`."""
     unsaid = first_outside(deleted, before + 1, after.file_sequence - 1)
     if unsaid is not None:
-        yield f"{_span(*unsaid)} missing before it, and nothing here says that retention deleted it"
+        yield f"{_span(*unsaid)} missing before it, and no recording given here says that retention deleted it"
     for event in pruned:
         neighbour = event.last_file + 1 == after.file_sequence
         if neighbour and after.previous_sha256 and event.last_sha256 != after.previous_sha256:
-            yield f"the recording {event.last_file} that was deleted is not the one that was there before this one"
+            yield f"the deleted recording {event.last_file} had another SHA-256 than this one names for it"
 
 
 def _span(first: int, last: int) -> str:

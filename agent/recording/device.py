@@ -1,4 +1,4 @@
-"""Driver `replay`: a device of a recording, at the recording's own pace or faster. A plug-in like any other."""
+"""Driver `replay`: plays a device of a recording as if it were connected, as fast as recorded, or slower or faster."""
 
 from __future__ import annotations
 
@@ -21,36 +21,37 @@ BLOCK_S = 0.5
 
 
 class ReplayOptions(Options):
-    """Options of `replay`. Devices with the same recordings and speed play together."""
+    """Options of `replay`. Devices with the same recordings and the same speed share one clock: they stay in step."""
 
     recordings: tuple[Path, ...] = Field(min_length=1, description="files (.mcap) of one run, in order")
-    device: str = Field("", description="its name there; by default its own")
-    speed: float = Field(1.0, gt=0, le=1000, description="times as fast as recorded, stamps included")
+    device: str = Field("", description="name of the device in the recording; by default the name of this device")
+    speed: float = Field(1.0, gt=0, le=1000, description="playing speed; 2: twice as fast as recorded, stamps included")
 
 
 class PlayClock:
-    """The recording's time as this machine's: it begins when the first device that plays is opened."""
+    """Converts the recording's time to this machine's. Playing begins when the first of the devices is opened."""
 
     def __init__(self, clock: Clock, speed: float) -> None:
         self.data = DataClock(clock, speed)
         self._shift_ns: int | None = None
 
     def begin(self, recorded_ns: int) -> None:
-        """The recording's `recorded_ns` is now; nothing if it plays already."""
+        """Start playing: the recording's time `recorded_ns` is now. Does nothing if it plays already."""
         if self._shift_ns is None:
             self._shift_ns = self.data()[0] - recorded_ns
 
     @property
     def shift_ns(self) -> int:
-        """From the recording's CLOCK_MONOTONIC to this machine's."""
+        """Nanoseconds to add to the recording's CLOCK_MONOTONIC to get this machine's."""
         return self._shift_ns or 0
 
 
 class Replay:
-    """Blocks with their recorded bursts, counts and flags; stamps moved to this machine's clock, indices counted anew.
+    """Gives the recorded blocks with their bursts, counts and flags.
 
-    A device that was lost is lost here, and opens again when it did. What was due while it was closed is skipped. After
-    the end there is silence.
+    Time stamps are shifted to this machine's clock; sample indices are counted anew. Where the device was lost in the
+    recording it is lost here too, and it can be opened again when it came back in the recording. Samples that are due
+    while the device is closed are skipped. After the end of the recording no samples come.
     """
 
     options_model: ClassVar[type[Options]] = ReplayOptions
@@ -75,11 +76,15 @@ class Replay:
         self._absence = "not opened yet"
         self._opened = False
         self._index = 0  # of the next sample
-        self._offset: int | None = None  # from the recorded index to it
+        self._offset: int | None = None  # to add to a recorded sample index
         self._drops: list[Drop] = []
 
     def open(self) -> DeviceInfo:
-        """Raises DeviceLost (no file, or the device is not there now), ConfigurationError (files of another kind)."""
+        """Open the device.
+
+        Raises DeviceLost where a file is missing or the recorded device was not connected at this moment,
+        ConfigurationError where the files are not recordings of one run that has this device.
+        """
         self.close()
         if self._events is None:
             start = self._begin()
@@ -98,7 +103,7 @@ class Replay:
         return self._info
 
     def read_block(self) -> SampleBlock | None:
-        """The next block when it is due; None when none is within BLOCK_S. Raises DeviceLost."""
+        """Wait for the next block and return it; None where no block is due within BLOCK_S. Raises DeviceLost."""
         end_ns = self._clock()[0] + round(BLOCK_S * 1e9)
         while self._opened and self._info is not None:
             if not self._due_within(end_ns):
@@ -111,32 +116,36 @@ class Replay:
         raise DeviceLost(f"{self._options.recordings[0]}: device {self._recorded_name!r}: {absence}")
 
     def take_drops(self) -> list[Drop]:
-        """What of the files could not be read."""
+        """The parts of the files that could not be read since the last call."""
         drops, self._drops = self._drops, []
         return drops
 
     def close(self) -> None:
-        """Time goes on meanwhile."""
+        """Close the device. The recording's time goes on while it is closed."""
         self._opened = False
 
     def _begin(self) -> RunStart:
-        """The first file's start; all files must be of one run, and know the device."""
+        """Return the first file's RunStart; check that all files are of one run and that the run has the device."""
         starts: list[RunStart] = []
         for path in self._options.recordings:
             start = first_event(path)
             if start is None and not path.is_file():
                 raise DeviceLost(f"{path}: no such file")
             if start is None:
-                raise ConfigurationError(f"{path}: no recording of fieldcal")
+                raise ConfigurationError(f"{path}: not a recording made by fieldcal")
             starts.append(start)
             if start.run_id != starts[0].run_id:
-                raise ConfigurationError(f"{path}: of run {start.run_id}, not of {starts[0].run_id} as the first file")
+                raise ConfigurationError(
+                    f"{path}: belongs to run {start.run_id}, but the first file to run {starts[0].run_id}; "
+                    f"give files of one run only"
+                )
         if starts[0].continuation:
-            raise ConfigurationError(f"{self._options.recordings[0]}: goes on from another file, which must come first")
+            where = self._options.recordings[0]
+            raise ConfigurationError(f"{where}: the run began in an earlier file; begin with the first file of the run")
         names = [device["name"] for device in json.loads(starts[0].config_json)["devices"]]
         if self._recorded_name not in names:
             where = self._options.recordings[0]
-            raise ConfigurationError(f"{where}: no device {self._recorded_name!r}: there are {', '.join(names)}")
+            raise ConfigurationError(f"{where}: no device {self._recorded_name!r}; its devices are {', '.join(names)}")
         return starts[0]
 
     def _recorded(self) -> Iterator[Event]:
@@ -150,15 +159,15 @@ class Replay:
                 self._drops.append(Drop(unread, "bytes", f"{path}: {reader.fault}"))
 
     def _due_within(self, end_ns: int) -> bool:
-        """Whether an event is due by then; at the end of the recording none is."""
+        """Whether the next event is due by `end_ns`; false at the end of the recording."""
         if self._coming is None and self._events is not None:
             self._coming = next(self._events, None)
         return self._coming is not None and self._due_ns(self._coming) <= end_ns
 
     def _pass(self) -> Event:
-        """Wait until the coming event is due; take what it says of the device."""
+        """Wait until the next event is due and return it; note whether the device was connected from then on."""
         event, self._coming = self._coming, None
-        assert event is not None  # it is due
+        assert event is not None  # the caller has asked `_due_within`
         self._sleep(max(0.0, (self._due_ns(event) - self._clock()[0]) * 1e-9))
         if isinstance(event, DeviceChange) and event.device == self._recorded_name:
             if event.state == "open":
@@ -171,7 +180,7 @@ class Replay:
         return event.t_monotonic_ns + self._play.shift_ns
 
     def _shifted(self, block: SampleBlock) -> SampleBlock:
-        """As if it had been read here and now."""
+        """The block with stamps, boot identifier and sample index as if it had been read on this machine now."""
         flags = block.flags
         if self._offset is None:
             self._offset = self._index - block.first_index

@@ -1,4 +1,4 @@
-"""The files of a recording: `fieldcal-<sequence>.mcap`, with `.active` behind it until it is closed."""
+"""The files of a recording: `fieldcal-<sequence>.mcap`; until the file is closed its name ends with `.active`."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ _NAME = re.compile(r"fieldcal-(\d{6,18})\.mcap(\.active)?")
 
 
 class _HashedFile:
-    """A new file, unbuffered, with the SHA-256 of what was written: what mcap's Writer needs of a stream.
+    """A new file that computes the SHA-256 of what is written; it has the methods that mcap's Writer calls.
 
-    Unbuffered, since a buffer would be written once more on close, after an error.
+    It is unbuffered: after an error, a buffered file would write its buffer once more when it is closed.
     """
 
     def __init__(self, path: Path) -> None:
@@ -56,9 +56,10 @@ class _HashedFile:
 
 
 class RecordingFile:
-    """One file, from its RunStart to its footer. Every method may raise OSError; after one, only `abandon`.
+    """Writes one file, from its RunStart to its footer.
 
-    `origin` goes into the metadata at its beginning: the file before with its SHA-256, the store's marks.
+    Every method may raise OSError. After an OSError call `abandon` and no other method.
+    `origin`: metadata written at the beginning of the file: name and SHA-256 of the previous file, the store's marks.
     """
 
     def __init__(
@@ -89,23 +90,23 @@ class RecordingFile:
 
     @property
     def size(self) -> int:
-        """Bytes on disk; up to one chunk more waits in memory."""
+        """Bytes in the file; up to one further chunk is in memory."""
         return self._stream.tell()
 
     def append(self, topic: str, data: bytes, log_time: int, publish_time: int, sequence: int) -> None:
         """Add a message; it is on disk after the next `sync`."""
-        # MCAP's sequence has 32 bits; the whole number is in the message.
+        # MCAP's sequence has 32 bits only; the message itself holds the full number.
         self._writer.add_message(self._channel(topic), log_time, data, publish_time, sequence & 0xFFFFFFFF)
         self._unsynced = True
 
     def note(self, name: str, metadata: dict[str, str]) -> None:
-        """Add a metadata record behind all that was appended."""
+        """Add a metadata record after all messages appended so far."""
         self._writer.flush()
         self._writer.add_metadata(name, metadata)
         self._unsynced = True
 
     def sync(self) -> None:
-        """Write the open chunk and wait until the disk has it."""
+        """Write the open chunk and wait until it is on disk (fsync)."""
         if self._unsynced:
             self._writer.flush()
             self._stream.sync()
@@ -125,11 +126,14 @@ class RecordingFile:
         return self._stream.sha256().hex()
 
     def abandon(self) -> None:
-        """Let go of the file as it is: after an error, writing on would tear a record in the middle of the file."""
+        """Close the file as it is, without summary and footer.
+
+        For use after a write error: writing further would leave a broken record in the middle of the file.
+        """
         self._stream.close()
 
     def discard(self) -> None:
-        """Remove a file that has not got as far as its RunStart: on a full disk one would be left at every attempt."""
+        """Delete a file that does not hold its RunStart yet. On a full disk each attempt would leave such a file."""
         self._stream.close()
         self.path.unlink(missing_ok=True)
 
@@ -143,24 +147,24 @@ class RecordingFile:
 
 
 def recordings(directory: Path) -> list[tuple[int, Path]]:
-    """(file sequence, path) of every recording in a directory, finished or not, in order."""
+    """(file sequence, path) of every recording in a directory, finished or not, sorted by file sequence."""
     found = [(_NAME.fullmatch(path.name), path) for path in directory.iterdir()]
     return sorted((int(match[1]), path) for match, path in found if match)
 
 
 def final_name(path: Path) -> str:
-    """The name that a recording has, or will have, when it is closed."""
+    """The name of a recording without `.active`: the name that it has after it is closed."""
     return path.name.removesuffix(ACTIVE_SUFFIX)
 
 
 def file_number(name: str) -> int | None:
-    """The number in the name of a recording, finished or not; None where it is the name of none."""
+    """The number in the file name of a recording, finished or not; None where it is not such a name."""
     match = _NAME.fullmatch(name)
     return int(match[1]) if match else None
 
 
 def newest(directory: Path) -> tuple[str, str]:
-    """Name and SHA-256 of the newest recording; the hash is empty where it was never finished."""
+    """Name and SHA-256 of the newest recording; the SHA-256 is "" where the file was never closed, both without one."""
     _, path = max(recordings(directory), default=(0, None))
     if path is None:
         return "", ""
@@ -171,7 +175,7 @@ def newest(directory: Path) -> tuple[str, str]:
 
 
 def sync_directory(directory: Path) -> None:
-    """Make the names in a directory durable."""
+    """Bring created, renamed and deleted names in a directory to the disk (fsync). Raises OSError."""
     descriptor = os.open(directory, os.O_RDONLY)
     try:
         os.fsync(descriptor)

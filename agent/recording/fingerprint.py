@@ -1,7 +1,8 @@
-"""What the last bit of a result depends on beside the data: CPU kernels, libraries, threads.
+"""The numeric fingerprint of a machine: what else than the data decides the last bits of a result.
 
-numpy and OpenBLAS choose their kernels by the CPU they find; sums then differ in the last bit. Both can be told to
-choose as another CPU would, by environment variables that they read when they load.
+numpy and OpenBLAS choose their computing kernels by the features of the CPU. Other kernels add in another order, and
+sums then differ in the last bit. Environment variables, read when the libraries load, make both choose as on another
+CPU.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import sys
 
 import numpy as np
 
-# Not public, but where numpy.show_runtime has them from.
+# Not public names of numpy; numpy.show_runtime reads the same ones.
 from numpy._core._multiarray_umath import __cpu_dispatch__ as _dispatched  # type: ignore[import-not-found]
 from numpy._core._multiarray_umath import __cpu_features__ as _features
 
@@ -22,28 +23,28 @@ _AGAIN = "FIELDCAL_KERNELS_CHOSEN"
 
 
 def versions() -> dict[str, str]:
-    """Versions of what computes: python, numpy, scipy."""
+    """Versions of python, numpy and scipy, which do the computing."""
     from importlib.metadata import version
 
     return {"python": platform.python_version(), "numpy": np.__version__, "scipy": version("scipy")}
 
 
 def fingerprint() -> dict[str, str]:
-    """All that must be the same for the same bits: versions, machine, C library, BLAS and its kernel, CPU features."""
+    """What must be equal for results equal in every bit: versions, machine, C library, BLAS, kernel, CPU features."""
     return versions() | {
         "machine": platform.machine(),
         "libc": " ".join(platform.libc_ver()),
         **_blas(),
-        # All that numpy was built to make use of, and finds: what it lacks counts as much as what it has.
+        # The features that numpy was built to use and that this CPU has; a missing feature also changes the bits.
         "cpu_features": " ".join(name for name in _dispatched if _features[name]),
     }
 
 
 def environment_for(recorded: dict[str, str]) -> dict[str, str] | None:
-    """Environment variables with which a new process would compute as `recorded` did; None where that cannot be.
+    """Environment variables with which a new process computes with the kernels of the fingerprint `recorded`.
 
-    The libraries must be the same, and this CPU must have all features of the recorded one: a kernel for a missing
-    feature would end the process.
+    None where this machine cannot do so: the libraries must be the same, and this CPU must have all features of the
+    recorded CPU, since a kernel that uses a missing feature ends the process.
     """
     here = fingerprint()
     choosable = {"blas_kernel", "cpu_features", "blas_threads"}
@@ -60,7 +61,10 @@ def environment_for(recorded: dict[str, str]) -> dict[str, str] | None:
 
 
 def compute_as(recorded: dict[str, str]) -> None:
-    """Begin this process anew with the kernels of `recorded`, where they differ and can be had; once only."""
+    """Restart this process with the kernels of the fingerprint `recorded`, where they differ and this machine can.
+
+    The process is restarted once at most.
+    """
     if recorded == fingerprint() or _AGAIN in os.environ:
         return
     chosen = environment_for(recorded)
@@ -70,7 +74,10 @@ def compute_as(recorded: dict[str, str]) -> None:
 
 
 def _blas() -> dict[str, str]:
-    """Kernel and threads of the BLAS that numpy loaded (scipy has its own of the same choice, but loads it late)."""
+    """Version, kernel and threads of the BLAS that numpy loaded.
+
+    scipy's own BLAS chooses the same kernel, but is loaded later.
+    """
     from threadpoolctl import threadpool_info
 
     libraries = [info for info in threadpool_info() if info["user_api"] == "blas"]

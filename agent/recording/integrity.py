@@ -1,6 +1,7 @@
-"""Is a recording, byte for byte, what a writer would have left?
+"""Check that each byte of a recording is as its writer wrote it.
 
-Magic, boundaries, every CRC, and a summary that agrees with the data. Messages' meaning is not looked at.
+Checked are the magic bytes, the record boundaries, every CRC, and that the summary agrees with the data section. The
+content of the messages is not checked.
 """
 
 from __future__ import annotations
@@ -16,12 +17,12 @@ from agent.recording.crc_location import changed_byte
 from agent.recording.records import MAGIC, Fault, Record, RecordError, parse, record_name, refusal, walk
 from agent.recording.summary import KINDS, DerivedSummary
 
-FAULTS_KEPT = 20  # of one file; the first tells where, the count how bad
+FAULTS_KEPT = 20  # faults kept for one file; the others are only counted
 
 
 @dataclass(slots=True)
 class Integrity:
-    """What the check found. `good_bytes`: end of the last record whose boundaries were sound."""
+    """What the check found. `good_bytes`: offset of the end of the last record with valid boundaries."""
 
     faults: list[Fault] = field(default_factory=list)
     fault_count: int = 0
@@ -39,7 +40,7 @@ class Integrity:
 
 
 def check_integrity(file: BinaryIO, size: int) -> Integrity:
-    """Check an MCAP file of `size` bytes from its beginning. Raises OSError."""
+    """Check an open MCAP file of `size` bytes, which is read from its beginning. Raises OSError."""
     found = Integrity()
     check = _Check(found)
     try:
@@ -57,7 +58,7 @@ def check_integrity(file: BinaryIO, size: int) -> Integrity:
 
 @dataclass(frozen=True, slots=True)
 class _BrokenSum:
-    """A CRC over bytes start to end that does not fit them."""
+    """A recorded CRC of bytes `start` to `end` that differs from the computed one."""
 
     start: int
     end: int
@@ -67,14 +68,15 @@ class _BrokenSum:
 
 
 def _located(file: BinaryIO, size: int, broken: _BrokenSum) -> Fault:
-    """The fault at the one byte that explains a CRC, if there is such a byte."""
+    """The fault at the single changed byte that explains a wrong CRC; where there is no such byte, the CRC's fault."""
     at = changed_byte(broken.recorded, broken.computed, broken.end - broken.start)
     if at is None:
         return broken.fault
     at += broken.start
     file.seek(0)
     kind = next((record.name for record in walk(file, size) if record.offset <= at < record.end), "magic")
-    return Fault("corrupt", at, kind, f"this one byte changed, by the CRC of bytes {broken.start} to {broken.end}")
+    reason = f"this one byte changed, as the CRC of bytes {broken.start} to {broken.end} shows"
+    return Fault("corrupt", at, kind, reason)
 
 
 class _Check:
@@ -90,7 +92,7 @@ class _Check:
         self.broken_sums: list[_BrokenSum] = []
 
     def take(self, record: Record) -> None:
-        """Check one record in its place; what is wrong with it is added to the faults."""
+        """Check the next record of the file; add what is wrong to the faults."""
         before = self._crc
         self._crc = zlib.crc32(record.body, zlib.crc32(record.head, before))
         try:
@@ -123,7 +125,7 @@ class _Check:
             return self._derived.add_metadata(record, parsed)
         if isinstance(parsed, Attachment):
             return self._derived.add_attachment(record, parsed)
-        raise refusal(record, "does not belong here")
+        raise refusal(record, "does not belong here, in the data section")
 
     def _data_end(self, record: Record, crc: int) -> None:
         self._take = self._summary
@@ -137,17 +139,17 @@ class _Check:
         if recorded == 0:
             raise refusal(record, f"has no CRC of bytes {start} to {end}")
         if recorded != computed:
-            reason = f"its CRC of bytes {start} to {end} does not fit them"
+            reason = f"the CRC in it does not fit bytes {start} to {end}: at least one byte changed"
             fault = Fault("corrupt", record.offset, record.name, reason)
             self.broken_sums.append(_BrokenSum(start, end, recorded, computed, fault))
 
     def _summary(self, record: Record) -> None:
         if record.opcode not in KINDS:
-            raise refusal(record, "does not belong here")
+            raise refusal(record, "does not belong here, in the summary")
         group = self._groups.setdefault(record.opcode, [])
         group.append((record, parse(record)))
         if len(group) > 1 and group[-2][0].end != record.offset:
-            raise refusal(record, "stands apart from its kind")
+            raise refusal(record, "stands apart from the other summary records of its kind")
 
     def _footer(self, record: Record, crc: int) -> None:
         if not self._summary_start:
@@ -157,7 +159,7 @@ class _Check:
         end = record.offset + len(covered)
         self._compare_sums(self._summary_start, end, footer.summary_crc, zlib.crc32(covered, crc), record)
         if self._found.faults or self.broken_sums:
-            return  # what the summary must say is not known where the data are damaged
+            return  # where the data are damaged, the correct summary is not known
         offsets = self._groups.get(Opcode.SUMMARY_OFFSET)
         if not offsets or footer.summary_start != self._summary_start:
             raise refusal(record, f"the summary begins at {self._summary_start} and has offsets at its end")
@@ -167,7 +169,7 @@ class _Check:
             self._compare_group(record, kind)
 
     def _compare_group(self, footer: Record, kind: Opcode) -> None:
-        """Hold the summary's records of one kind against what the data section says."""
+        """Compare the summary's records of one kind with the ones derived from the data section."""
         present, expected = self._groups.get(kind, []), self._derived.expected(kind, self._groups)
         for (record, parsed), wanted in zip(present, expected, strict=False):
             if parsed != wanted:

@@ -1,6 +1,7 @@
-"""Reads a recording back: its events in order, each with the results recorded for it.
+"""Reads a recording: its events in order, each with the results recorded for it.
 
-Linear and without trust: the summary is not used, a torn tail ends the reading where the last good record ends.
+The file is read from its beginning, and every record is checked; the summary is not used. Where a power cut left an
+incomplete record at the end, reading ends after the last good record.
 """
 
 from __future__ import annotations
@@ -25,7 +26,10 @@ from agent.recording.records import ChunkMessage, Fault, Record, RecordError, co
 
 @dataclass(slots=True)
 class Step:
-    """An event and the results recorded for it; `complete` when the recording went on after them."""
+    """An event and the results recorded for it.
+
+    `complete`: something was recorded after them, or the file was closed; otherwise results may be missing.
+    """
 
     event_sequence: int
     event: Event
@@ -34,9 +38,9 @@ class Step:
 
 
 class RecordingReader:
-    """One pass over a recording. `fault` says afterwards why it ended early (None: it reached the footer).
+    """One pass over a recording. `fault` says afterwards why the pass ended early (None: it reached the footer).
 
-    `good_bytes` is the end of the last record that was read and understood.
+    `good_bytes`: offset of the end of the last record that was read and understood.
     """
 
     def __init__(self, path: Path) -> None:
@@ -47,14 +51,14 @@ class RecordingReader:
         self._channels: dict[int, Channel] = {}
 
     def steps(self) -> Iterator[Step]:
-        """Events in recorded order, the first a RunStart, numbers without a gap. Raises OSError."""
+        """Yield the events in recorded order. The first is a RunStart; event numbers have no gap. Raises OSError."""
         step: Step | None = None
         try:
             with open_recording(self.path) as file:
                 for record, number, item in self._items(file):
                     if isinstance(item, Output):
                         if step is None or number != step.event_sequence:
-                            raise refusal(record, f"a result of event {number} does not follow it")
+                            raise refusal(record, f"a result of event {number} does not follow that event")
                         step.results.append(item)
                         continue
                     self._check_order(record, step, number, item)
@@ -71,13 +75,14 @@ class RecordingReader:
     @staticmethod
     def _check_order(record: Record, before: Step | None, number: int, event: Event) -> None:
         if isinstance(event, RunStart) != (before is None):
-            where = "does not begin with" if before is None else "has a second"
+            where = "does not begin with a" if before is None else "has a second"
             raise refusal(record, f"the recording {where} RunStart")
         if before is not None and number != before.event_sequence + 1:
-            raise refusal(record, f"event {number} follows event {before.event_sequence}")
+            expected = before.event_sequence + 1
+            raise refusal(record, f"event {number} follows event {before.event_sequence}; expected event {expected}")
 
     def _items(self, file: BinaryIO) -> Iterator[tuple[Record, int, Event | Output]]:
-        """(chunk, event sequence, event or result) of every message."""
+        """Yield (chunk record, event sequence, event or result) for every message."""
         for record in walk(file, os.fstat(file.fileno()).st_size):
             if record.opcode == Opcode.CHUNK:
                 for part in content(record, unpack(record)):
@@ -95,31 +100,31 @@ class RecordingReader:
         channel = self._channels.get(message.channel_id)
         schema = self._schemas.get(channel.schema_id) if channel else None
         if channel is None or schema is None:
-            raise refusal(record, f"message on channel {message.channel_id}, which is not declared")
+            raise refusal(record, f"message on channel {message.channel_id}, which no record before it declares")
         try:
             number, item = decode(schema.name, message.data)
         except MessageError as error:
             raise refusal(record, f"{channel.topic}: {error}") from None
         if topic_of(item) != channel.topic or number & 0xFFFFFFFF != message.sequence:
-            raise refusal(record, f"{channel.topic}: the message says {topic_of(item)}, event {number}")
+            raise refusal(record, f"{channel.topic}: the message says topic {topic_of(item)} and event {number}")
         return number, item
 
 
 def open_recording(path: Path) -> BufferedReader:
-    """Open for reading; until it is closed, retention leaves the file alone.
+    """Open a recording for reading. Retention does not delete the file while it is open.
 
-    Raises OSError, also for what is no file: a pipe or a device may never begin, or never end.
+    Raises OSError, also where `path` is a pipe or a device: reading from one could wait or last for ever.
     """
     if path.exists() and not path.is_file() and not path.is_dir():
         raise OSError(errno.EINVAL, "Not a file", str(path))
-    file = open(path, "rb")  # noqa: SIM115 - closed by whoever asked
-    with contextlib.suppress(OSError):  # a file system that knows no locks
+    file = open(path, "rb")  # noqa: SIM115 - the caller closes it
+    with contextlib.suppress(OSError):  # the file system has no locks
         fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
     return file
 
 
 def first_event(path: Path) -> RunStart | None:
-    """The RunStart of a recording; None where there is none or the file cannot be read."""
+    """The RunStart at the beginning of a recording; None where there is none or the file cannot be read."""
     try:
         step = next(RecordingReader(path).steps(), None)
     except OSError:

@@ -1,4 +1,4 @@
-"""What a recording leaves in memory: it is stepped through once more, and the states at its end are taken."""
+"""Gets the states of the estimation at the end of a recording, by replaying the recording."""
 
 from __future__ import annotations
 
@@ -16,28 +16,29 @@ _log = logging.getLogger(__name__)
 
 
 class Remembering(Protocol):
-    """What is stepped: agent.core.pipeline.Pipeline."""
+    """The methods needed of the pipeline that is replayed; agent.core.pipeline.Pipeline has them."""
 
     def step(self, event: Event) -> list[Output]: ...
     def all_memories(self) -> list[Memory]: ...
 
 
 def memories_of(path: Path, restore: Callable[[str, bytes], Remembering]) -> list[Memory]:
-    """The states where a recording ends, or is torn; what does not replay is told, and leaves none.
+    """The states of the estimation where a recording ends, or where a power cut tore it.
 
-    `restore(config_json, snapshot)` makes the pipeline. All that its snapshot kept of runs before is among the states.
+    `restore(config_json, snapshot)` makes the pipeline. The states include those of earlier runs in its snapshot.
+    A recording that cannot be replayed gives no states; a warning in the log says why.
     """
     pipeline: Remembering | None = None
     try:
         for step in RecordingReader(path).steps():
             if isinstance(step.event, RunStart):
                 pipeline = restore(step.event.config_json, step.event.snapshot)
-            assert pipeline is not None  # the reader lets nothing come before a RunStart
+            assert pipeline is not None  # the reader ensures that the first event is a RunStart
             before = [] if step.complete else pipeline.all_memories()
             outputs = recorded_ones(pipeline.step(step.event))
             if not step.complete and len(outputs) > len(step.results):
-                return before  # the tear took results of this event: nobody ever had them
-    except Exception as error:  # whatever stands in the file: a hostile snapshot may raise anything
-        _log.warning("%s: does not replay, what it knows of a calibration is lost: %s", path, error)
+                return before  # results of this event are not in the file, so they were never published: leave it out
+    except Exception as error:  # a damaged or forged snapshot may raise any exception
+        _log.warning("%s: does not replay; the states of the estimation in it are not restored: %s", path, error)
         return []
     return [] if pipeline is None else pipeline.all_memories()

@@ -1,6 +1,6 @@
-"""Walks the records of an MCAP file from the front, trusting nothing: every length is checked before it is used.
+"""Reads the records of an MCAP file one after the other from the beginning; checks every length before using it.
 
-The summary at the end of the file is walked like everything else, never looked up.
+The summary at the end of the file is read as records like all others. It is never used to find data.
 """
 
 from __future__ import annotations
@@ -34,9 +34,10 @@ from mcap.records import (
 )
 
 MAGIC = b"\x89MCAP0\r\n"
-# Bytes of a record or an unpacked chunk, so that memory is bounded. Ours: 1 MiB and a snapshot, of which the largest
-# that a configuration allows, at 10 kHz on six axes, has 76 MB.
+# Largest record or unpacked chunk in bytes; it bounds the memory used. The agent writes chunks of 1 MiB, and a
+# snapshot, of which the largest that a configuration allows (10 kHz, six axes) has 76 MB.
 RECORD_LIMIT = 128 << 20
+_INCONSISTENT = "the lengths in it do not agree with its size"
 _HEAD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
 _CHUNK = struct.Struct("<QQQII")
@@ -60,9 +61,9 @@ _READERS: dict[int, Any] = {
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """What is wrong with a file, and where: `offset` in bytes, `record` the kind of record that begins there.
+    """What is wrong with a file, and where: `offset` in bytes; `record` is the kind of record that begins there.
 
-    `torn`: the file just ends early, as after a power cut; `corrupt`: what is there is not what was written.
+    `torn`: the file only ends early, as after a power cut. `corrupt`: bytes in it differ from what was written.
     """
 
     kind: Literal["torn", "corrupt"]
@@ -75,7 +76,7 @@ class Fault:
 
 
 class RecordError(Exception):
-    """Ends a walk; carries the Fault."""
+    """A record cannot be read. `fault` says where and why."""
 
     def __init__(self, kind: Literal["torn", "corrupt"], offset: int, record: str, reason: str) -> None:
         self.fault = Fault(kind, offset, record, reason)
@@ -84,7 +85,7 @@ class RecordError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """One record of the file: where it begins, its opcode, and its bytes without the nine of the head."""
+    """One record of the file: its offset in bytes, its opcode, and its content without the head of nine bytes."""
 
     offset: int
     opcode: int
@@ -92,12 +93,12 @@ class Record:
 
     @property
     def name(self) -> str:
-        """Kind of the record, for people."""
+        """Kind of the record, for messages."""
         return record_name(self.opcode)
 
     @property
     def end(self) -> int:
-        """Offset of the byte after it."""
+        """Offset of the first byte after the record."""
         return self.offset + _HEAD.size + len(self.body)
 
     @property
@@ -108,7 +109,7 @@ class Record:
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """A chunk unpacked, its CRC checked."""
+    """A chunk, decompressed, with its CRC checked."""
 
     start_time: int
     end_time: int
@@ -130,57 +131,61 @@ class ChunkMessage:
 
 
 def refusal(record: Record, reason: str) -> RecordError:
-    """A RecordError for a record that is there but wrong."""
+    """A RecordError of kind `corrupt` for a record."""
     return RecordError("corrupt", record.offset, record.name, reason)
 
 
 def record_name(opcode: int) -> str:
-    """Kind of record for people: `Chunk`, `MessageIndex`.."""
+    """Kind of record for messages: `Chunk`, `MessageIndex`, ..."""
     if opcode not in _KNOWN:
         return f"opcode 0x{opcode:02x}"
     return Opcode(opcode).name.title().replace("_", "")
 
 
 def walk(file: BinaryIO, size: int) -> Iterator[Record]:
-    """Every record of a file of `size` bytes, from the header to the footer. Raises RecordError where it goes wrong."""
+    """Yield every record of a file of `size` bytes, from the header to the footer. Raises RecordError at a fault."""
     magic = file.read(len(MAGIC))
     if magic != MAGIC:
-        raise _ended(file, size, 0, "magic", "the file does not begin as MCAP does", early=MAGIC.startswith(magic))
+        reason = "the file does not begin with the bytes of an MCAP file"
+        raise _ended(file, size, 0, "magic", reason, early=MAGIC.startswith(magic))
     offset, opcode = len(MAGIC), 0
     while opcode != Opcode.FOOTER:
         head = file.read(_HEAD.size)
-        if len(head) < _HEAD.size or not any(head):  # some file systems fill with zeros what they lost
-            raise _ended(file, size, offset, "end of file", "no record follows")
+        if len(head) < _HEAD.size or not any(head):  # some file systems replace lost data with zeros
+            raise _ended(file, size, offset, "end of file", "the file ends here without a footer")
         opcode, length = _HEAD.unpack(head)
         if opcode not in _KNOWN:
-            raise RecordError("corrupt", offset, record_name(opcode), "no such kind of record")
+            raise RecordError("corrupt", offset, record_name(opcode), "MCAP has no such kind of record")
         if length > size - offset - _HEAD.size:
             reason = f"its {length} bytes reach beyond the end of the file"
             raise _ended(file, size, offset, record_name(opcode), reason)
         if length > RECORD_LIMIT:
-            raise RecordError("corrupt", offset, record_name(opcode), f"{length} bytes, more than {RECORD_LIMIT}")
+            reason = f"its {length} bytes are more than the limit of {RECORD_LIMIT}"
+            raise RecordError("corrupt", offset, record_name(opcode), reason)
         yield Record(offset, opcode, file.read(length))
         offset += _HEAD.size + length
     end = file.read(len(MAGIC))
     if end != MAGIC:
         early = len(end) < len(MAGIC) and MAGIC.startswith(end)
-        raise RecordError("torn" if early else "corrupt", offset, "magic", "the file does not end as MCAP does")
+        reason = "the file does not end with the bytes of an MCAP file"
+        raise RecordError("torn" if early else "corrupt", offset, "magic", reason)
     if offset + len(MAGIC) != size:
-        raise RecordError("corrupt", offset + len(MAGIC), "end of file", f"{size - offset - 8} bytes follow the end")
+        reason = f"{size - offset - len(MAGIC)} bytes follow the end of the MCAP data"
+        raise RecordError("corrupt", offset + len(MAGIC), "end of file", reason)
 
 
 def _ended(file: BinaryIO, size: int, offset: int, name: str, reason: str, *, early: bool = True) -> RecordError:
-    """A walk that cannot go on: torn, unless the file has its end, so that it was once whole."""
+    """The error where reading cannot go on: torn; or corrupt where the file ends as a complete MCAP file does."""
     file.seek(max(0, size - len(MAGIC)))
     torn = early and (file.read() != MAGIC or size <= len(MAGIC))
     return RecordError("torn" if torn else "corrupt", offset, name, reason)
 
 
 def parse(record: Record) -> McapRecord:
-    """A record as mcap's type (chunks have `unpack`).
+    """A record as mcap's type (for chunks use `unpack`). Raises RecordError.
 
-    Whatever would not be written again as the very same bytes is refused: lengths that disagree, a wrong CRC of an
-    attachment, text that is no UTF-8, keys given twice. Raises RecordError.
+    A record is refused if writing the parsed record gives other bytes: lengths that disagree, a wrong CRC of an
+    attachment, text that is not UTF-8, keys given twice.
     """
     kind = _READERS.get(record.opcode)
     if kind is None:
@@ -190,10 +195,10 @@ def parse(record: Record) -> McapRecord:
         parsed: McapRecord = kind.read(ReadDataStream(io.BytesIO(record.body)))
         parsed.write(again)
     except (McapError, ValueError, OverflowError, struct.error) as error:
-        reason = str(error) or "its parts do not add up"
+        reason = str(error) or _INCONSISTENT
         raise refusal(record, reason) from None
     if again.end() != record.head + record.body:
-        raise refusal(record, "its parts do not add up")
+        raise refusal(record, _INCONSISTENT)
     return parsed
 
 
@@ -211,35 +216,35 @@ def _unpack(body: bytes) -> Chunk:
     start_time, end_time, size, crc, name_length = _CHUNK.unpack_from(body)
     data_at = _CHUNK.size + name_length + 8
     if data_at > len(body) or int.from_bytes(body[data_at - 8 : data_at], "little") != len(body) - data_at:
-        raise ValueError("its parts do not add up")
+        raise ValueError(_INCONSISTENT)
     compression = body[_CHUNK.size : data_at - 8]
     packed = memoryview(body)[data_at:]
     if size > RECORD_LIMIT:
-        raise ValueError(f"{size} bytes unpacked, more than {RECORD_LIMIT}")
+        raise ValueError(f"{size} bytes decompressed, more than the limit of {RECORD_LIMIT}")
     if compression == b"zstd":
-        # zstd allocates what the frame announces, whatever limit it is given: so that is looked at first.
+        # zstd allocates the size that the frame states, whatever limit it is given. So this size is checked first.
         if zstandard.frame_content_size(packed) != size:
-            raise ValueError(f"its zstd frame announces other than {size} bytes")
+            raise ValueError(f"the size in its zstd frame is not the {size} bytes that the chunk states")
         data = zstandard.ZstdDecompressor().decompress(packed, allow_extra_data=False)
     elif compression == b"":
         data = bytes(packed)
     else:
         raise ValueError(f"compression {compression!r} is neither zstd nor none")
     if len(data) != size:
-        raise ValueError(f"{len(data)} bytes unpacked, {size} announced")
+        raise ValueError(f"{len(data)} bytes after decompression, but the chunk states {size}")
     if crc == 0 or zlib.crc32(data) != crc:
         raise ValueError("its CRC does not fit its content")
     return Chunk(start_time, end_time, compression.decode(), len(packed), data)
 
 
 def content(record: Record, chunk: Chunk) -> Iterator[ChunkMessage | Schema | Channel]:
-    """Messages, schemas and channels of a chunk (`record` as unpacked) in order. Raises RecordError."""
+    """Yield messages, schemas and channels of `chunk`, unpacked from `record`, in order. Raises RecordError."""
     data, offset, size = chunk.data, 0, len(chunk.data)
     while offset < size:
         body_at = offset + _HEAD.size
         opcode, length = _HEAD.unpack_from(data, offset) if body_at <= size else (0, 0)
         if length > size - body_at:
-            reason = f"{record_name(opcode)} inside, at {offset}, is too long"
+            reason = f"{record_name(opcode)} at byte {offset} of the decompressed chunk reaches beyond the chunk's end"
             raise refusal(record, reason)
         if opcode == Opcode.MESSAGE and length >= _MESSAGE.size:
             channel_id, sequence, log_time, publish_time = _MESSAGE.unpack_from(data, body_at)
@@ -249,6 +254,6 @@ def content(record: Record, chunk: Chunk) -> Iterator[ChunkMessage | Schema | Ch
             inside = Record(record.offset, opcode, data[body_at : body_at + length])
             yield cast(Schema | Channel, parse(inside))
         else:
-            reason = f"{record_name(opcode)} of {length} bytes inside, at {offset}"
+            reason = f"{record_name(opcode)} of {length} bytes is not allowed at byte {offset} of a decompressed chunk"
             raise refusal(record, reason)
         offset = body_at + length

@@ -1,7 +1,8 @@
-"""Closes the files that a crash left open: what is sound stays byte for byte, a proper end is put behind it.
+"""Closes the files that a crash left open. All intact records stay unchanged, and a proper end is written after them.
 
-In place, since the disk may be full: from the end of the last sound record on, what was torn is overwritten by an
-attachment that holds it, then come a note of the repair, the signature where there is a key, and the summary.
+The file is repaired in place, since the disk may be full. The incomplete bytes after the last intact record are
+replaced by an attachment that contains them, a metadata record about the repair, the signature where there is a key,
+and the summary.
 """
 
 from __future__ import annotations
@@ -26,16 +27,20 @@ from agent.recording.summary import KINDS, DerivedSummary
 
 REPAIR_METADATA = "fieldcal.repair"
 TAIL_ATTACHMENT = "torn"
-# A crash tears what was written after the last flush: a chunk or two. More behind a broken record is damage of another
-# kind, and hides what can still be read; zeros are none.
+# Bytes. A crash damages only what was written after the last flush: one or two chunks. Where more data other than zeros
+# follow a broken record, the damage has another cause. Such a file is not closed, since data after the damage may be
+# readable.
 TAIL_MAX = 8 << 20
 
 _log = logging.getLogger(__name__)
 
 
 def close_torn(directory: Path, signer: Signer | None = None) -> None:
-    """Close every file in `directory` that was left `.active`; nothing may be writing one. Raises OSError for the
-    directory alone: a file that cannot be closed is told and stays as it is."""
+    """Close every `.active` file in `directory`. No process may be writing to one of them.
+
+    A file that cannot be closed stays as it is; a warning in the log names it. Raises OSError where the directory
+    cannot be read.
+    """
     for _, path in recordings(directory):
         if path.name.endswith(ACTIVE_SUFFIX):
             try:
@@ -45,10 +50,10 @@ def close_torn(directory: Path, signer: Signer | None = None) -> None:
 
 
 def close_file(path: Path, signer: Signer | None = None) -> str:
-    """Close one file; returns what was done. Raises OSError, or RecordError where it is damaged inside."""
+    """Close one file; return what was done, as a sentence. Raises OSError, or RecordError where data would be lost."""
     final = path.with_name(path.name.removesuffix(ACTIVE_SUFFIX))
     if final.exists():
-        raise FileExistsError(f"{final.name} is there as well")
+        raise FileExistsError(f"{final.name} exists already")
     with open(path, "r+b") as file:
         size = os.fstat(file.fileno()).st_size
         sound = _sound_part(file, size)
@@ -56,20 +61,20 @@ def close_file(path: Path, signer: Signer | None = None) -> str:
         if sound.chunks == 0:
             path.unlink()
             sync_directory(path.parent)
-            return f"{path} was left without its first event, and removed"
+            return f"{path} was left unfinished before its first event was written; the file is deleted"
         file.seek(0)
         if check_integrity(file, size).finished:
-            torn = 0  # it only lacks its name
+            torn = 0  # the file is complete; only its final name is missing
         else:
             _append(file, sound, size, signer)
     path.rename(final)
     sync_directory(path.parent)
-    return f"{final} was left unfinished and is closed now; {torn} bytes at its end were torn"
+    return f"{final} was left unfinished and is closed now; the last {torn} bytes were incomplete"
 
 
 @dataclass(slots=True)
 class _Sound:
-    """The data section up to the first record that is not whole."""
+    """The data section up to the first record that is not intact."""
 
     length: int
     crc: int
@@ -87,7 +92,7 @@ def _sound_part(file: BinaryIO, size: int) -> _Sound:
         sound.sha256.update(data)
 
     broken: RecordError | None = None
-    goes_on = False  # something sound follows what is broken: no crash did that
+    goes_on = False  # an intact chunk follows the broken record: a crash does not cause that
     try:
         for record in walk(file, size):
             if broken is not None:
@@ -120,7 +125,7 @@ def _is_sound(chunk: Record) -> bool:
 
 
 def _ends_in_zeros(file: BinaryIO, offset: int) -> bool:
-    """Whether nothing but zeros follows: some file systems fill with them what they lost."""
+    """Whether all bytes from `offset` on are zeros; some file systems replace lost data with zeros."""
     file.seek(offset)
     while piece := file.read(1 << 20):
         if any(piece):
@@ -145,7 +150,7 @@ def _take(derived: DerivedSummary, record: Record) -> None:
 
 
 def _append(file: BinaryIO, sound: _Sound, size: int, signer: Signer | None) -> None:
-    """Write the end; where there is no room for it, leave the file as it was."""
+    """Write the end of the file. Where the disk has no space for it, restore the file as it was and raise OSError."""
     length = sound.length
     file.seek(length)
     tail = file.read(TAIL_MAX)
@@ -164,7 +169,7 @@ def _append(file: BinaryIO, sound: _Sound, size: int, signer: Signer | None) -> 
 
 
 def _end(sound: _Sound, tail: bytes, size: int, signer: Signer | None) -> bytes:
-    """The bytes that close the file behind its sound part."""
+    """The bytes that close the file, to be written after its intact part."""
     parts: list[bytes] = []
 
     def add(record: Any) -> None:

@@ -1,4 +1,4 @@
-"""Runs recordings through the pipeline again, and holds what comes out against what was recorded."""
+"""Runs recordings through the pipeline again and compares the computed results with the recorded ones."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from agent.recording.records import Fault
 
 
 class PipelineLike(Protocol):
-    """What is replayed: agent.core.pipeline.Pipeline."""
+    """The methods needed of the pipeline that is replayed; agent.core.pipeline.Pipeline has them."""
 
     def step(self, event: Event) -> list[Output]: ...
     def snapshot(self) -> bytes: ...
@@ -26,45 +26,45 @@ Restore = Callable[[str, bytes], PipelineLike]
 
 
 class ReplayedFile(msgspec.Struct, kw_only=True):
-    """What became of one file."""
+    """What the replay of one file gave."""
 
     path: str
     run_id: str = ""
     gateway: str = ""  # <site>/<gateway>
     file_sequence: int = 0
-    in_chain: bool = False  # went on from the file before, whose state at its end equals the snapshot here
+    in_chain: bool = False  # continues the previous file, whose state at its end equals this file's snapshot
     events: int = 0
     results: int = 0  # computed
     fault: Fault | None = None
     good_bytes: int = 0
-    refused: str = ""  # why the pipeline would not take it
-    different: int = 0  # events after which results differ
+    refused: str = ""  # why the file cannot be replayed
+    different: int = 0  # events after which computed and recorded results differ
     first_difference: Difference | None = None
     undecidable: int = 0
     tolerance: float = 0.0
     notes: list[str] = []
-    pruned: list[Pruned] = []  # recordings that were deleted, as this one says
+    pruned: list[Pruned] = []  # events in this file that say which recordings retention deleted
 
     @property
     def equal(self) -> bool:
-        """Whether all that was recorded here follows from the events recorded here."""
+        """Whether all results recorded in this file follow from the events recorded in it."""
         return not self.different and not self.refused and self.events > 0
 
 
 class Replay:
-    """Replays files one after the other; one that goes on where the last ended is replayed without restoring.
+    """Replays files one after the other. `files`, `calibrations` and `windows` hold what came out.
 
-    A file begins with its RunStart: the pipeline is restored from the snapshot in it, then steps the RunStart itself.
-    `restore(config_json, snapshot)` makes the pipeline. Results equal in every bit, but where the recording has another
-    numeric fingerprint than `here`: there within the relative tolerance `elsewhere`. `files`, `calibrations`,
-    `windows` hold what came out.
+    A file begins with a RunStart. `restore(config_json, snapshot)` makes the pipeline from the configuration and the
+    snapshot in it, and the pipeline then steps the RunStart itself. A file that continues the previous one is replayed
+    without restoring. Computed results must equal the recorded ones in every bit. Where the recording's numeric
+    fingerprint is not `here`, they must agree within the relative tolerance `elsewhere`.
     """
 
     def __init__(self, restore: Restore, here: dict[str, str], elsewhere: float) -> None:
         self._restore = restore
         self._here = here
         self._elsewhere = elsewhere
-        self._pipeline: PipelineLike | None = None  # as the last file left it, if the next may go on with it
+        self._pipeline: PipelineLike | None = None  # as the last file left it, if the next file may continue with it
         self._next_event = 0
         self.files: list[ReplayedFile] = []
         self.calibrations: list[CalibrationUpdate] = []
@@ -100,7 +100,7 @@ class Replay:
         other = sorted(name for name, value in self._here.items() if start.fingerprint.get(name) != value)
         if other:
             file.tolerance = self._elsewhere
-            file.notes.append(f"recorded with another {', '.join(other)} than is here: the last bits may differ")
+            file.notes.append(f"recorded with another {', '.join(other)} than on this machine: last bits may differ")
         before = self.files[-2] if len(self.files) > 1 else None
         follows = before is not None and before.run_id == start.run_id and start.continuation
         if follows and start.event_sequence > self._next_event:
@@ -112,16 +112,18 @@ class Replay:
             self._differ(file, _snapshot_difference(file, start))
         try:
             self._pipeline = self._restore(start.config_json, start.snapshot)
-        except Exception as error:  # whatever stands in the file: a hostile snapshot may raise anything
-            file.refused = f"its configuration or snapshot does not restore: {type(error).__name__}: {error}"
+        except Exception as error:  # a damaged or forged snapshot may raise any exception
+            file.refused = (
+                f"no pipeline can be made from its configuration and snapshot: {type(error).__name__}: {error}"
+            )
 
     def _step(self, file: ReplayedFile, step: Step) -> None:
         assert self._pipeline is not None
         try:
             outputs = recorded_ones(self._pipeline.step(step.event))
             computed = [_as_recorded(step.event_sequence, output) for output in outputs]
-        except Exception as error:  # as above; live, the same event would have ended the agent
-            file.refused = f"event {step.event_sequence} fails: {type(error).__name__}: {error}"
+        except Exception as error:  # as above
+            file.refused = f"the pipeline fails at event {step.event_sequence}: {type(error).__name__}: {error}"
             return
         file.results += len(computed)
         self.calibrations += [result for result in computed if isinstance(result, CalibrationUpdate)]
@@ -136,16 +138,16 @@ class Replay:
     @staticmethod
     def _differ(file: ReplayedFile, difference: Difference) -> None:
         if difference.undecidable:
-            # From here on the other branch was taken; the next file's snapshot leads back.
+            # After this event the replay may differ for good reason. The next file's snapshot brings it back in step.
             file.undecidable += 1
-            file.notes.append(f"undecidable here: {difference}")
+            file.notes.append(f"undecidable on this machine: {difference}")
             return
         file.different += 1
         file.first_difference = file.first_difference or difference
 
 
 def _as_recorded(event_sequence: int, result: Output) -> Output:
-    """A result as it would be read from a recording: numpy's scalars become plain ones."""
+    """A result as it is after writing to and reading from a recording: numpy's scalars become Python's."""
     _, read = decode(schema_of(topic_of(result)), encode(event_sequence, result))
     return cast(Output, read)
 
@@ -155,7 +157,7 @@ def _snapshot_difference(file: ReplayedFile, start: RunStart) -> Difference:
         file=file.path,
         event_sequence=start.event_sequence,
         what="snapshot",
-        field="state at the end of the file before",
+        field="state at the end of the previous file",
         recorded=f"{len(start.snapshot)} bytes",
         computed="other bytes",
     )

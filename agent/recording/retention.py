@@ -1,4 +1,8 @@
-"""Which recordings are deleted, and when: the oldest by number, never one that somebody reads or still waits for."""
+"""Decides which recordings are deleted, and deletes them.
+
+The recording with the lowest number goes first. A recording that is open for reading, or that holds a result not
+published yet, is kept.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +23,7 @@ from agent.recording.files import file_number, recordings, sync_directory
 if TYPE_CHECKING:
     from agent.config.sinks import Recording
 
-PIN_SUFFIX = ".lock"  # `fieldcal-000007.mcap.lock` beside a recording, whatever is in it, keeps it
+PIN_SUFFIX = ".lock"  # a file `fieldcal-000007.mcap.lock`, of any content, keeps the recording beside it
 DAY_NS = 86_400_000_000_000
 
 _log = logging.getLogger(__name__)
@@ -27,7 +31,10 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class KeepFiles:
-    """How much of the recordings stays; None is no limit. `least_free_bytes` is of the whole file system."""
+    """How many recordings are kept: at most `days` days and `bytes` bytes; None is no limit.
+
+    `least_free_bytes`: free space to keep in the file system, by deleting recordings if need be.
+    """
 
     days: float | None = None
     bytes: int | None = None
@@ -38,16 +45,17 @@ FOR_EVER = KeepFiles()
 
 
 def keep_files(section: Recording) -> KeepFiles:
-    """What the configuration says."""
+    """The limits that the section [recording] of the configuration sets."""
     most = int(section.keep_bytes) if section.keep_bytes is not None else None
     return KeepFiles(section.keep_days, most, int(section.least_free_bytes))
 
 
 def due(directory: Path, keep: KeepFiles, active: Path | None, waiting: str, *, by_age: bool = True) -> Pruned | None:
-    """The next files to delete, consecutive by number; None where none is due.
+    """The next files to delete, consecutive by number, as an event; None where none is due. Raises OSError.
 
-    `active` is the file being written; `waiting` names the recording with the first result that is not published: it
-    and those after it stay. By age one file goes at a time, and only where `by_age` allows it. Raises OSError.
+    `active`: the file being written, which is kept. `waiting`: name of the recording with the first result that is not
+    published; this recording and all later ones are kept. For its age only one file is deleted per call, and only with
+    `by_age`.
     """
     if keep == FOR_EVER:
         return None
@@ -82,7 +90,7 @@ def due(directory: Path, keep: KeepFiles, active: Path | None, waiting: str, *, 
 
 
 def delete(directory: Path, pruned: Pruned) -> None:
-    """Delete the files of a range, but those that somebody began to read since. Raises OSError."""
+    """Delete the files of a range, except those that a reader has opened since `due` named them. Raises OSError."""
     for number, path in recordings(directory):
         if pruned.first_file <= number <= pruned.last_file and not _is_kept(path):
             path.unlink(missing_ok=True)
@@ -91,13 +99,13 @@ def delete(directory: Path, pruned: Pruned) -> None:
 
 
 def free_bytes(directory: Path) -> int:
-    """What is free for us in the file system. Raises OSError."""
+    """Bytes in the file system that this user may still write. Raises OSError."""
     space = os.statvfs(directory)
     return space.f_bavail * space.f_frsize
 
 
 def _excess(directory: Path, keep: KeepFiles, total: int) -> int:
-    """Bytes that must go."""
+    """Bytes of recordings that must be deleted."""
     excess = keep.least_free_bytes - free_bytes(directory)
     return max(excess, total - keep.bytes) if keep.bytes is not None else excess
 
@@ -109,5 +117,5 @@ def _is_kept(path: Path) -> bool:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
-            return error.errno in (errno.EWOULDBLOCK, errno.EACCES)  # else: this file system knows no locks
+            return error.errno in (errno.EWOULDBLOCK, errno.EACCES)  # any other error: the file system has no locks
     return False

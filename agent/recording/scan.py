@@ -1,6 +1,6 @@
-"""The results in a recording, found without unpacking what holds none: seconds for gigabytes.
+"""Finds the results in a recording. Chunks without results are not decompressed: gigabytes take seconds.
 
-For a store that has to be made again. What cannot be read is left out and told; the audit is for finding why.
+Used to make a lost store again. What cannot be read is left out and named in `faults`; `fieldcal audit` tells why.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ _CHANNEL_ID = struct.Struct("<H")
 
 @dataclass(slots=True)
 class ScannedFile:
-    """What a recording says without being replayed: its results in order, its metadata, and what could not be read."""
+    """What is read from a recording without replaying it: results in order, metadata, and what could not be read."""
 
     results: list[Result] = field(default_factory=list)
-    metadata: dict[str, dict[str, str]] = field(default_factory=dict)  # the last of each name
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)  # by name; of one name, the last record
     faults: list[str] = field(default_factory=list)
 
 
@@ -41,7 +41,7 @@ def scan(path: Path) -> ScannedFile:
 
 
 def metadata_of(path: Path) -> dict[str, dict[str, str]]:
-    """The metadata of a recording alone; empty where none can be read. Raises OSError."""
+    """Only the metadata of a recording; empty where none can be read. Raises OSError."""
     found = ScannedFile()
     with open_recording(path) as file:
         _Scan(file, found).run(results=False)
@@ -72,7 +72,7 @@ class _Scan:
         self._take_chunk(chunk, indexed)
 
     def _heads(self) -> Iterator[tuple[int, int, int]]:
-        """(offset, opcode, length) of every record up to DataEnd; the file stands after the head then."""
+        """Yield (offset, opcode, length) of every record up to DataEnd; the file is then positioned after its head."""
         size = self._file.seek(0, 2)
         offset = len(MAGIC)
         while offset + _HEAD.size <= size:
@@ -97,7 +97,8 @@ class _Scan:
             self._found.metadata[metadata.name] = metadata.metadata
 
     def _take_chunk(self, chunk: tuple[int, int] | None, indexed: set[int]) -> None:
-        # A chunk that declares channels holds messages on them: all others are known to hold no results.
+        # A chunk that declares a channel also holds messages on it. So a chunk whose indexes name only channels that
+        # are known to carry no results holds no results.
         if chunk is None or (indexed and indexed <= self._others):
             return
         record = self._record(chunk[0], Opcode.CHUNK, chunk[1])

@@ -1,4 +1,4 @@
-"""What the summary of an MCAP file must say, gathered from its data section."""
+"""Derives from the data section of an MCAP file what its summary must contain."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ KINDS = (
 
 
 class DerivedSummary:
-    """Fed with the records of a data section in order; every method raises RecordError where they contradict.
+    """Takes the records of a data section in order; `expected(kind)` gives the records the summary must then hold.
 
-    `expected(kind)` are then the records of that kind that the summary must hold, in order.
+    Every method may raise RecordError, where a record contradicts the ones before it.
     """
 
     def __init__(self) -> None:
@@ -46,19 +46,19 @@ class DerivedSummary:
         self._metadata: list[MetadataIndex] = []
         self._counts: dict[int, int] = {}
         self._start_time = self._end_time = 0
-        # Message indexes that must follow the last chunk, by channel; None where that chunk is damaged.
+        # Message indexes that must follow the last chunk, by channel; None where this chunk is damaged.
         self._awaited: dict[int, list[tuple[int, int]]] | None = {}
 
     def add_chunk(self, record: Record) -> None:
-        """A Chunk record, which is unpacked and walked."""
-        self._awaited = None  # as long as it is not sound
+        """Take a Chunk record: decompress it and read the records in it."""
+        self._awaited = None  # until the chunk is known to be intact
         chunk = unpack(record)
         times: list[int] = []
         awaited: dict[int, list[tuple[int, int]]] = {}
         for part in content(record, chunk):
             if isinstance(part, ChunkMessage):
                 if part.channel_id not in self._channels:
-                    raise refusal(record, f"message on channel {part.channel_id}, which is not declared")
+                    raise refusal(record, f"message on channel {part.channel_id}, which no record before it declares")
                 times.append(part.log_time)
                 awaited.setdefault(part.channel_id, []).append((part.log_time, part.offset))
                 self._counts[part.channel_id] = self._counts.get(part.channel_id, 0) + 1
@@ -66,7 +66,7 @@ class DerivedSummary:
                 self._declare(record, part)
         start, end = min(times, default=0), max(times, default=0)
         if (start, end) != (chunk.start_time, chunk.end_time):
-            raise refusal(record, "its times are not those of its messages")
+            raise refusal(record, "its start and end times are not those of its messages")
         if times:
             self._start_time = min(start, self._start_time) if self.messages else start
             self._end_time = max(end, self._end_time)
@@ -88,35 +88,35 @@ class DerivedSummary:
     def _declare(self, record: Record, part: Schema | Channel) -> None:
         known: dict[int, Any] = self._schemas if isinstance(part, Schema) else self._channels
         if known.setdefault(part.id, part) != part:
-            raise refusal(record, f"{type(part).__name__} {part.id} is declared twice, differently")
+            raise refusal(record, f"{type(part).__name__} {part.id} is declared twice, with different content")
         if isinstance(part, Channel) and part.schema_id not in self._schemas:
-            raise refusal(record, f"channel {part.topic} has schema {part.schema_id}, which is not declared")
+            raise refusal(record, f"channel {part.topic} has schema {part.schema_id}, which no record before declares")
 
     def add_message_index(self, record: Record, index: MessageIndex) -> None:
-        """One of the message indexes after a chunk."""
+        """Take one of the message indexes after a chunk."""
         if self._awaited is None:
             return
         if self._awaited.pop(index.channel_id, None) != index.records:
-            raise refusal(record, f"is not that of channel {index.channel_id} in the chunk before")
+            raise refusal(record, f"does not agree with channel {index.channel_id} in the chunk before it")
         self.chunks[-1].message_index_offsets[index.channel_id] = record.offset
         self.chunks[-1].message_index_length += record.end - record.offset
 
     def end_of_indexes(self, record: Record) -> None:
-        """Something else follows: are all message indexes of the last chunk there?"""
+        """Take a record that is not a message index: all message indexes of the last chunk must be before it."""
         missing, self._awaited = sorted(self._awaited or ()), {}
         if missing:
             raise refusal(record, f"comes before the message index of channels {missing}")
 
     def awaited_indexes(self) -> list[MessageIndex]:
-        """The message indexes that are still missing behind the last chunk."""
+        """The message indexes of the last chunk that are still missing after it."""
         return [MessageIndex(channel_id, records) for channel_id, records in (self._awaited or {}).items()]
 
     def add_metadata(self, record: Record, metadata: Metadata) -> None:
-        """A Metadata record."""
+        """Take a Metadata record."""
         self._metadata.append(MetadataIndex(record.offset, record.end - record.offset, metadata.name))
 
     def add_attachment(self, record: Record, attachment: Attachment) -> None:
-        """An Attachment record."""
+        """Take an Attachment record."""
         index = AttachmentIndex(
             offset=record.offset,
             length=record.end - record.offset,
@@ -129,7 +129,7 @@ class DerivedSummary:
         self._attachments.append(index)
 
     def expected(self, kind: Opcode, groups: dict[int, list[tuple[Record, Any]]]) -> list[Any]:
-        """Records of one kind that the summary must hold; `groups` is what it holds, by opcode."""
+        """The records of one kind that the summary must hold. `groups`: the records that it does hold, by opcode."""
         if kind == Opcode.SUMMARY_OFFSET:
             return [_offset(offset, groups.get(offset.group_opcode)) for _, offset in groups.get(kind, [])]
         derived: dict[int, list[Any]] = {
@@ -157,7 +157,7 @@ class DerivedSummary:
 
 
 def _offset(present: SummaryOffset, group: list[tuple[Record, Any]] | None) -> SummaryOffset:
-    """What a SummaryOffset must be; that of an empty group points at where the group would stand."""
+    """The correct SummaryOffset; for an empty group it names the place where the group would be."""
     if not group:
         return SummaryOffset(present.group_opcode, present.group_start, 0)
     start, end = group[0][0].offset, group[-1][0].end

@@ -1,4 +1,4 @@
-"""The one thread that owns the recording, and hands results on once the disk has them."""
+"""The thread that writes the recording. It passes results on after they are on disk."""
 
 from __future__ import annotations
 
@@ -15,12 +15,15 @@ from agent.core.memory import Memory
 from agent.recording.messages import recorded_ones
 from agent.recording.writer import Recorder
 
-FLUSH_S = 2.0  # s; a power cut costs at most this much of the recording, for 11 % more disk than one long chunk
-LOOK_S = 10.0  # s; how often it is asked whether recordings are due to be deleted
-CAPACITY = 256  # events; half a minute of two devices and ticks, while a slow card takes its time
-# s; what waits for the disk when a run ends has this long. systemd kills after 10, and files are to be closed first.
+FLUSH_S = 2.0  # s between two flushes; a power cut loses at most this much. Takes 11 % more disk than one long chunk
+LOOK_S = 10.0  # s between two checks whether recordings are due to be deleted
+CAPACITY = 256  # events that may wait for a slow disk; half a minute of two devices and ticks
+# s that events still waiting at the end of a run have to be written. systemd kills the agent after 10 s, and the files
+# must be closed before that.
 CLOSE_S = 4.0
-HANG_S = 4.0  # s; then for the one call it is in, the store and the end of the file; beyond, the disk does not answer
+# s more for the call to the disk that is under way, for the store and for closing the file. After that the disk counts
+# as not responding.
+HANG_S = 4.0
 
 _log = logging.getLogger(__name__)
 
@@ -31,10 +34,11 @@ Entry = tuple[int, Event, Sequence[Output], Sequence[Memory]]
 
 
 class RecordingThread:
-    """Takes events with their results from the main loop, in order, and records them.
+    """Takes events with their results from the main loop, in order, and records them in a thread of its own.
 
-    `deliver(event_sequence, results, recorded, memories)` is called in this thread after the results are on disk (or,
-    with `recorded` false, could not be); it must not raise. What is raised nevertheless comes out of the next `put`.
+    `deliver(event_sequence, results, recorded, memories)` is called in this thread after the results are on disk;
+    `recorded` is false where they could not be written. It must not raise. An exception that it raises nevertheless
+    ends the thread and is raised again by the next `put` or `close`.
     """
 
     def __init__(
@@ -54,22 +58,25 @@ class RecordingThread:
 
     @property
     def wants_rotation(self) -> bool:
-        """Whether the next event should be a RunStart; false while one is on its way."""
+        """Whether the next event should be a RunStart (a new file); false while a RunStart waits to be recorded."""
         return self._starts_sent == self._starts_done and self._recorder.wants_rotation
 
     def take_pruning(self) -> Pruned | None:
-        """The next event, where recordings are due to be deleted; None while one is on its way."""
+        """The Pruned event to record next, where recordings are due to be deleted; None while one waits."""
         return None if self._pruning_sent else self._recorder.pruning
 
     @property
     def waiting(self) -> int:
-        """Events that wait for the disk; `put` waits from CAPACITY on."""
+        """Number of events that wait for the disk; at CAPACITY, `put` blocks."""
         return self._queue.qsize()
 
     def put(
         self, event_sequence: int, event: Event, outputs: Sequence[Output], memories: Sequence[Memory] = ()
     ) -> None:
-        """Hand over an event and what came of it; waits while the disk is far behind."""
+        """Hand over an event, its outputs and its states; blocks while CAPACITY events wait.
+
+        Raises what ended the thread, where it has ended.
+        """
         if isinstance(event, RunStart):
             self._starts_sent += 1
         elif isinstance(event, Pruned):
@@ -77,19 +84,24 @@ class RecordingThread:
         self._hand_over((event_sequence, event, recorded_ones(outputs), memories))
 
     def close(self) -> bool:
-        """Record what is waiting, for `close_s` at most, and finish the file; nothing may be put any more.
+        """Record the waiting events, for `close_s` seconds at most, and finish the file. After this call no `put`.
 
-        The results of what was not recorded are delivered as such. Returns whether the thread has ended: where the disk
-        does not answer it is left behind, and may still hold what `deliver` uses.
+        Results of events that could not be recorded in that time are delivered with `recorded` false.
+        Returns whether the thread has ended. Where the disk does not respond the thread goes on, and may still use
+        what `deliver` uses.
         """
         end = self._give_up_at = time.monotonic() + self._close_s
         if self._thread.is_alive():
-            with suppress(queue.Full):  # then it does not wait for this word
+            with suppress(queue.Full):  # the thread is behind; it ends when it reaches `_give_up_at`
                 self._queue.put(None, timeout=self._close_s)
         self._thread.join(max(0.0, end - time.monotonic()) + HANG_S)
         self._raise()
         if self._thread.is_alive():
-            _log.error("the disk does not answer: the recording is left unfinished, %d events wait", self.waiting)
+            _log.error(
+                "the disk does not respond: the recording is left unfinished, and %d events are not recorded; the next "
+                "start repairs the file",
+                self.waiting,
+            )
         return not self._thread.is_alive()
 
     def _hand_over(self, entry: Entry) -> None:
@@ -98,7 +110,7 @@ class RecordingThread:
             try:
                 return self._queue.put(entry, timeout=1.0)
             except queue.Full:
-                continue  # look again whether the thread still lives
+                continue  # `_raise` then sees whether the thread has failed
 
     def _raise(self) -> None:
         if self._error is not None:
@@ -141,14 +153,15 @@ class RecordingThread:
                 self._deliver(event_sequence, results, recorded, memories)
 
     def _give_up(self, entry: Entry) -> None:
-        """The results that wait, from `entry` on, at once: each alone would wait for the disk."""
+        """Deliver the results of `entry` and of all waiting events in one call, since each call waits for the disk."""
         waiting = [entry]
         with suppress(queue.Empty):
             while (following := self._queue.get_nowait()) is not None:
                 waiting.append(following)
         results = [item for _, _, outputs, _ in waiting for item in outputs if isinstance(item, Result)]
         _log.warning(
-            "the disk is too slow to record what waited: events %d to %d are not recorded, %d results are kept without",
+            "the disk is too slow to record the last events: events %d to %d are not in the recording; "
+            "their %d results are kept in the store only",
             entry[0], waiting[-1][0], len(results),
         )  # fmt: skip
         if results:

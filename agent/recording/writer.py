@@ -1,7 +1,7 @@
-"""Writes the recording: MCAP files `fieldcal-<sequence>.mcap`, each standing alone, in order of events.
+"""Writes the recording: MCAP files `fieldcal-<sequence>.mcap`, events in order. Each file can be read on its own.
 
-One thread owns a Recorder. Nothing here raises for a disk that is full or failing: the file is given up where it stood,
-`recording` turns false, and `wants_rotation` asks for a new RunStart some time later.
+Only one thread uses a Recorder. A disk that is full or failing raises no exception here: the file is left as it is,
+`recording` becomes false, and some time later `wants_rotation` asks for a new RunStart, which begins a new file.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from agent.recording.signing import Signer
 
 log = logging.getLogger(__name__)
 
-MAX_BYTES = 64 << 20  # bytes on disk; about 2.5 hours of two devices at 1 kHz, copied and hashed in a second
-MAX_AGE_S = 3600.0  # s of event time; what an audit loses when a file is damaged
-# s of event time after a failed file, doubled with each that fails; a full disk is asked again, not hammered.
+MAX_BYTES = 64 << 20  # bytes of one file; about 2.5 hours of two devices at 1 kHz, copied and hashed in a second
+MAX_AGE_S = 3600.0  # s of event time in one file; an audit loses at most this much where a file is damaged
+# s of event time until the next attempt after a failed file. The time doubles with each failure, up to RETRY_MAX_NS.
 RETRY_S = 10.0
 RETRY_MAX_NS = 320_000_000_000
-# Bytes free that are left to the store: results are worth more than what they came from. A thousand of them, and the
-# store's log. A file is begun only where there is twice as much: otherwise it would hold a snapshot and nothing else.
+# Free bytes that the recording leaves to the store, since results matter more than raw data: enough for a thousand
+# results and the store's log. A file is begun only where twice as much is free, so that it holds more than a snapshot.
 LEAST_ROOM = 4 << 20
 
 
 class Ledger(Protocol):
-    """What the store knows for the recording. Every method may raise StoreError, an Exception."""
+    """The methods of the store that the recording uses. Every method may raise StoreError, an Exception."""
 
     def published(self) -> int: ...
     def file_sequence(self) -> int: ...
@@ -44,11 +44,15 @@ class Ledger(Protocol):
 
 
 class Recorder:
-    """The recording of a gateway: takes events with their results in order, and keeps the files.
+    """The recording of a gateway: takes events with their results, in order, and writes and deletes the files.
 
-    `directory` must exist. `devices`, `sensors` name the channels that each file declares at its start (others are
-    declared when they come). A file wants to be followed by the next beyond `max_bytes` or `max_age_s` of event time.
-    The `ledger` remembers file numbers over the deletion of files; without one the directory alone tells.
+    `directory`: of the recordings; it must exist.
+    `devices`, `sensors`: their channels are declared at the start of each file, others with their first message.
+    `max_bytes`, `max_age_s`: size in bytes and age in seconds of event time from which a new file is wanted.
+    `retry_s`: seconds of event time until the first attempt after a failure; the time doubles with each failure.
+    `keep`: limits beyond which old recordings are deleted.
+    `ledger`: the store, which remembers the highest file number also when all files are deleted; without it the numbers
+    go on from the files in the directory. `signer`: signs each file; None: files are not signed.
     """
 
     def __init__(
@@ -74,21 +78,21 @@ class Recorder:
         self._ledger = ledger
         self._signer = signer
         self._file: RecordingFile | None = None
-        self._failures = 0  # since a file lasted
+        self._failures = 0  # since the last file that was written without a failure
         self._utc_minus_monotonic_ns = 0
-        self._now_ns = self._since_ns = 0  # event time now; and when the file began, or failed
+        self._now_ns = self._since_ns = 0  # event time of the last event; event time when the file began or failed
         self._numbered = ledger.file_sequence() if ledger is not None else 0
         self._pruned = _pruned_before(directory)
-        self._due: Pruned | None = None  # files that may go
-        self._unsaid = False  # they went while nothing was recorded
-        # By age one file goes for each that begins: a clock that jumped ahead by years costs only as many recordings as
-        # begin before it is set right.
+        self._due: Pruned | None = None  # files that may be deleted
+        self._unsaid = False  # the files of `_due` were deleted, but the event is in no recording yet
+        # For its age, one file is deleted for each file that begins. Where the clock jumps ahead by years, only as many
+        # recordings are lost as begin before the clock is corrected.
         self._may_age = True
-        self.fault = ""  # why nothing is recorded
+        self.fault = ""  # why nothing is recorded; "" where there is no fault
 
     @property
     def recording(self) -> bool:
-        """Whether what is given to `record` reaches a file."""
+        """Whether a file is open, so that events given to `record` are written."""
         return self._file is not None
 
     @property
@@ -98,19 +102,19 @@ class Recorder:
 
     @property
     def size_bytes(self) -> int:
-        """Bytes of the file being written that are on disk."""
+        """Bytes written to the current file; 0 where there is none."""
         file = self._file
         return file.size if file is not None else 0
 
     @property
     def next_file_sequence(self) -> int:
-        """The number for the next RunStart: one above all that files here ever had, finished, not, or deleted."""
+        """The number for the next file: one above all numbers used so far, also by unfinished and deleted files."""
         return max([self._numbered, *(number for number, _ in recordings(self._directory))]) + 1
 
     @property
     def wants_rotation(self) -> bool:
-        """Whether the next event should be a RunStart: the file is full or old, or it is time to try again."""
-        file = self._file  # once: another thread may ask
+        """Whether the next event should be a RunStart: the file is full or old, or another attempt is due."""
+        file = self._file  # read once: another thread may ask
         age_ns = self._now_ns - self._since_ns
         if file is None:
             return age_ns >= min(self._retry_ns << min(max(0, self._failures - 1), 20), RETRY_MAX_NS)
@@ -118,29 +122,33 @@ class Recorder:
 
     @property
     def pruning(self) -> Pruned | None:
-        """The next event, where there is one: its files are due to be deleted, or were, while nothing was recorded."""
+        """The Pruned event to record next, or None. Its files are due to be deleted.
+
+        Where nothing was recorded at the time, its files are deleted already, and the event must still be recorded.
+        """
         return self._due if self.recording or not self._unsaid else None
 
     def close_torn(self) -> None:
-        """Close what a crash left open. To be called before the first RunStart is numbered. Raises OSError."""
+        """Close the files that a crash left open. Call it before `next_file_sequence` is first used. Raises OSError."""
         close_torn(self._directory, self._signer)
 
     def look_for_pruning(self) -> None:
-        """See whether files are due to be deleted; `pruning` says so then. Cheap, but it asks the disk."""
+        """Check whether files are due to be deleted; `pruning` then tells which. Fast, but it accesses the disk."""
         if self._due is not None:
             return
         try:
             waiting = self._ledger.first_waiting_recording() if self._ledger is not None else ""
             self._due = due(self._directory, self._keep, self.path, waiting, by_age=self._may_age)
-        except Exception as error:  # a disk or a store that fails is told by whoever writes to it
-            log.info("whether recordings are to be deleted cannot be seen: %s", error)
+        except Exception as error:  # the next write to the failing disk or store reports the failure
+            log.info("cannot determine which recordings to delete: %s", error)
 
     def record(self, event_sequence: int, event: Event, results: Sequence[Output]) -> bool:
-        """Write an event and what came of it; with results, or for a RunStart, wait for the disk.
+        """Write an event and its results. With results, and for a RunStart or a Pruned, wait until they are on disk.
 
-        A RunStart finishes the file before and begins the next; the files of a Pruned are deleted once it is on disk.
-        Returns whether it is in a file; where that is so and there are results, all of them and every event before them
-        survive a power cut.
+        A RunStart finishes the current file and begins the next one. The files that a Pruned names are deleted after
+        the event is on disk.
+        Returns whether the event is in a file. If so, and if there are results, the event, its results and all events
+        before it survive a power cut.
         """
         log_time, publish_time = self._stamp(event)
         try:
@@ -169,13 +177,13 @@ class Recorder:
                 self._file = None
             self._fail(f"{error.strerror or error} ({where})")
         except (ValueError, TypeError) as error:
-            # This event has no form in a recording: the file ends before it, the next begins with a snapshot after it.
+            # The event cannot be encoded. The file ends before it; the next file begins with a snapshot taken after it.
             self.close()
             self._fail(f"event {event_sequence} cannot be recorded: {error}")
         return self.recording
 
     def sync(self) -> None:
-        """Bring what was recorded to the disk; cheap where nothing waits."""
+        """Write all recorded events to the disk; fast where none waits."""
         try:
             if self._file is not None:
                 self._file.sync()
@@ -188,7 +196,7 @@ class Recorder:
             self._fail(f"{error.strerror or error} ({self.path})")
 
     def close(self) -> None:
-        """Finish the file, if there is one."""
+        """Finish the current file, if there is one."""
         if self._file is None:
             return
         try:
@@ -204,7 +212,7 @@ class Recorder:
         if free_bytes(self._directory) < 2 * LEAST_ROOM:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self._directory))
         if self._failures:
-            close_torn(self._directory, self._signer)  # the file that was given up: the next one names its SHA-256
+            close_torn(self._directory, self._signer)  # the failed file, so that the next one can name its SHA-256
         name, digest = newest(self._directory)
         origin = {"previous_file": name, "previous_sha256": digest}
         if self._ledger is not None:
@@ -215,20 +223,25 @@ class Recorder:
         self.fault = ""
 
     def _number(self, file_sequence: int) -> None:
-        # Once its RunStart is on disk: until then a crash leaves no file, and the number is used again.
+        # Called when the RunStart is on disk. A crash before that leaves no file, and the number is used again.
         self._numbered = file_sequence
         if self._ledger is not None:
             try:
                 self._ledger.mark_file(file_sequence)
-            except Exception as error:  # the next commit keeps it
-                log.warning("the number of the recording cannot be kept: %s", error)
+            except Exception as error:  # the store tries again with its next commit
+                log.warning(
+                    "the store cannot write the number of recording %d yet, and tries again: %s", file_sequence, error
+                )
 
     def _prune(self, pruned: Pruned) -> None:
-        """Delete, and look again. Where nothing is recorded the room is needed first; the next file says it then."""
+        """Delete the files; check whether more are due.
+
+        Where nothing is recorded, space is needed first: the event is then recorded again in the next file.
+        """
         try:
             delete(self._directory, pruned)
         except OSError as error:
-            log.warning("recordings that are due cannot be deleted: %s", error)
+            log.warning("recordings %d to %d cannot be deleted: %s", pruned.first_file, pruned.last_file, error)
         if self._file is None:
             self._unsaid = True
             self._failures, self._since_ns = 1, self._now_ns - self._retry_ns
@@ -248,7 +261,10 @@ class Recorder:
         self.look_for_pruning()
 
     def _stamp(self, event: Event) -> tuple[int, int]:
-        """(UTC, monotonic) in ns for MCAP; without UTC, from the clocks of the last event that had both."""
+        """(UTC, monotonic) in ns, the log time and the publish time of MCAP.
+
+        For an event without UTC it follows from the difference of the clocks at the last event that had both.
+        """
         monotonic_ns = event.t_monotonic_ns
         utc_ns = getattr(event, "t_utc_ns", None)
         if utc_ns is None:
@@ -260,11 +276,11 @@ class Recorder:
 
 
 def _pruned_before(directory: Path) -> Ranges:
-    """What retention deleted before this run, as the newest recording that can be read says."""
+    """The recordings that retention deleted before this run, as the newest readable recording says."""
     try:
         for _, path in reversed(recordings(directory)):
             if metadata := metadata_of(path):
                 return from_metadata(metadata.get(PRUNED_METADATA))
-    except OSError as error:  # whoever writes to this disk will tell it
-        log.info("what was deleted before cannot be read: %s", error)
+    except OSError as error:  # the next write to the failing disk reports the failure
+        log.info("cannot read which recordings were deleted before this run: %s", error)
     return ()

@@ -232,12 +232,12 @@ def test_a_recording_that_ends_early(recording: Path, tmp_path: Path) -> None:
 def test_files_that_cannot_be_played(recording: Path, tmp_path: Path) -> None:
     text = tmp_path / "text.mcap"
     text.write_text("no recording")
-    with pytest.raises(ConfigurationError, match=f"{text}: no recording of fieldcal"):
+    with pytest.raises(ConfigurationError, match=f"{text}: not a recording made by fieldcal"):
         Machine().build(text).open()
-    with pytest.raises(ConfigurationError, match="no device 'mesm': there are mems, reference"):
+    with pytest.raises(ConfigurationError, match="no device 'mesm'; its devices are mems, reference"):
         Machine().build(recording, name="mesm").open()
     other = tmp_path / "other"
     record(other, 1.0, run_id="run-2")
     (second,) = other.glob("*.mcap")
-    with pytest.raises(ConfigurationError, match=f"{second}: of run run-2, not of run-1"):
+    with pytest.raises(ConfigurationError, match=f"{second}: belongs to run run-2, but the first file to run run-1"):
         Machine().build(recording, second).open()

@@ -126,7 +126,7 @@ def test_a_file_in_the_place_of_the_last_deleted_is_seen(tmp_path: Path, limit: 
     first.write_bytes(with_sums(data[:at] + other + data[at + 1 :]))
     status, text = said(tmp_path)
     assert status == 3
-    assert f"the recording {pruned.last_file} that was deleted is not the one that was there before this one" in text
+    assert f"the deleted recording {pruned.last_file} had another SHA-256 than this one names for it" in text
 
 
 def test_neighbours_of_two_runs_are_held_against_each_other(tmp_path: Path) -> None:
@@ -140,7 +140,7 @@ def test_neighbours_of_two_runs_are_held_against_each_other(tmp_path: Path) -> N
     (other / last.name).rename(last)
     status, text = said(tmp_path)
     assert status == 3
-    assert f"{last} is not the file that was there before this one: its SHA-256 differs" in text
+    assert f"{last} is not the file that this one names as the one before it: its SHA-256 differs" in text
 
 
 def test_a_file_closed_after_a_crash_passes_and_is_counted(tmp_path: Path) -> None:
@@ -155,7 +155,7 @@ def test_a_file_closed_after_a_crash_passes_and_is_counted(tmp_path: Path) -> No
     recorder.close_torn()
     status, text = said(tmp_path)
     assert status == 0, text
-    assert "note: unsealed: left open by a crash, closed later, 20 torn bytes set aside" in text
+    assert "note: unsealed: left open by a crash, closed later; the last 20 bytes, incomplete, were set aside" in text
     assert said(tmp_path, strict=True)[0] == 3
     runner = CliRunner()
     with runner.isolation() as (out, _, _):
@@ -208,7 +208,7 @@ def test_every_signed_byte_counts_though_the_sums_fit(tmp_path: Path) -> None:
         "signed byte": (whole[:at] + b"F" + whole[at + 1 :], "its signature is of other bytes"),
         "signature": (
             whole[: signature.end - 9] + bytes([whole[signature.end - 9] ^ 1]) + whole[signature.end - 8 :],
-            "its signature is not the key's",
+            "its signature was not made with this key",
         ),
         "length": (whole.replace(b"bytes\x04", b"bytes\x05"), "signature"),
     }
@@ -235,7 +235,7 @@ def test_a_file_that_is_no_key_is_one_clear_line(tmp_path: Path, content: str) -
         Signer.load(tmp_path / "gone")
     other = X25519PrivateKey.generate().private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
     path.write_bytes(other)
-    with pytest.raises(KeyFileError, match="but not of Ed25519"):
+    with pytest.raises(KeyFileError, match="but not an Ed25519 key"):
         Signer.load(path)
 
 

@@ -223,7 +223,7 @@ def test_after_an_undecidable_decision_the_next_snapshot_leads_back(tmp_path: Pa
     replay = Replay(OnTheEdge.restore, fingerprint(), elsewhere=OTHER_CPU)
     first, second = (replay.run(path) for path in files_of(directory))
     assert (first.undecidable, first.different, first.equal) == (1, 0, True)
-    assert any("undecidable here" in note for note in first.notes)
+    assert any("undecidable on this machine" in note for note in first.notes)
     assert (second.undecidable, second.different, second.equal) == (0, 0, True)
     assert second.results > 0
 
@@ -287,7 +287,7 @@ def test_a_run_start_that_does_not_restore_is_refused_with_its_reason(
 
     path = record_again(tmp_path / "again", recorded, spoil)
     assert run_replay([path], StandIn.restore, as_json=False) == 3
-    assert "cannot be replayed: its configuration or snapshot does not restore" in capsys.readouterr().out
+    assert "cannot be replayed: no pipeline can be made from its configuration and snapshot" in capsys.readouterr().out
 
 
 def test_json_says_all_and_is_all_of_the_output(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -54,13 +54,13 @@ def late_result(messages: Messages) -> Messages:
 @pytest.mark.parametrize(
     ("alter", "reason"),
     [
-        (lambda messages: messages[1:], "a result of event 0 does not follow it"),
-        (lambda messages: messages[2:], "does not begin with RunStart"),
+        (lambda messages: messages[1:], "a result of event 0 does not follow that event"),
+        (lambda messages: messages[2:], "does not begin with a RunStart"),
         (lambda messages: [messages[0], *messages], "has a second RunStart"),
         (lambda messages: messages[:4] + messages[5:], "follows event"),
         (swap, "follows event"),
-        (late_result, "a result of event 0 does not follow it"),
-        (other_topic, "the message says /acc/raw"),
+        (late_result, "a result of event 0 does not follow that event"),
+        (other_topic, "the message says topic /acc/raw"),
         (other_sequence, "the message says"),
     ],
 )
