@@ -1,1 +1,1 @@
-"""What leaves the gateway: the store that is also the outbox, and Zenoh on both sides."""
+"""Delivery of results: the store, which is also the outbox; publication over Zenoh; the consumer's client library."""

@@ -1,4 +1,4 @@
-"""The client library: every result of the gateways one follows, each once and in order, over any interruption."""
+"""The client library: receives every result of the chosen gateways once and in order, also after interruptions."""
 
 from __future__ import annotations
 
@@ -23,28 +23,31 @@ from agent.delivery.keys import PREFIX, narrow
 from agent.delivery.received import Received, receive
 from agent.delivery.session import session_config
 
-INBOX = 1000  # samples that may wait, or be held; what is dropped is fetched from the gateway's store
-ANSWER_S = 5.0  # for one query
-RETRY_S = 1.0  # between questions to a gateway whose results are held because something before them is missing
+INBOX = 1000  # samples that may wait or be held; further ones are dropped and later fetched from the gateway's store
+ANSWER_S = 5.0  # s that one query waits for its answer
+RETRY_S = 1.0  # s between two queries to a gateway whose results are held because an earlier one is missing
 CONNECT_S = 10.0
-SAVE_S = 1.0  # while results come without a pause; where one has to be waited for, at once
+SAVE_S = 1.0  # s between two writes of the memory file while results come without a pause; a pause writes it at once
 
 
 __all__ = ["Consumer", "Received"]
 
 
 class Consumer:
-    """Follows the results under `key` through the routers at `endpoints`.
+    """Receives the results under the key expression `key`, through the routers at `endpoints`.
 
-    Iterating yields the results of each gateway in the order of their sequence, each once. A gateway met for the first
-    time begins with the values in force; one named in `last_sequence` (`<site>/<gateway>`: number) with all that came
-    after. A result whose number before it is not the last one known shows that something is missing: then the gateway's
-    store is asked with `?after=`, and until it answers what came later is held. After a cut the newest results come
-    again by themselves (history and recovery of the advanced subscriber), so that this is noticed at once.
-    With a `memory`, a file that is made if need be, it goes on after its own restart where it was: a result counts as
-    done when the next one is asked for. Within a second of a crash results may come again, with the same number.
+    Iterating yields the results of each gateway in the order of their sequence, each once.
+    `last_sequence`: the last result known of each gateway (`<site>/<gateway>`: number). Such a gateway begins with the
+    results after that number, any other gateway with the values in force.
+    `memory`: a file, made if it does not exist, in which the consumer keeps the last result that it has processed, so
+    that it continues there after a restart. A result counts as processed when the next one is asked for. After a crash
+    the results of its last second may come again, with the same numbers.
+
+    Each result names the result published before it. Where this is not the last one known, results are missing: the
+    consumer asks the gateway's store with `?after=` and holds later results until it answers. After a lost connection
+    the newest results come again (history and recovery of Zenoh's advanced subscriber), so that a gap is seen at once.
     `close` may be called from another thread than the one that iterates.
-    Raises EndpointError, ConnectionError or MemoryFileError; iterating, OSError where the memory cannot be written.
+    Raises EndpointError, ConnectionError or MemoryFileError; iterating raises OSError where `memory` cannot be written.
     """
 
     def __init__(
@@ -60,12 +63,12 @@ class Consumer:
         self._done = memory_file.load(memory) if memory is not None else {}
         self._saved_s = time.monotonic()
         self._saved = dict(self._done)
-        self._told: dict[str, int] = {}  # up to where results of a source are known to be removed
+        self._told: dict[str, int] = {}  # by source: number up to which the user was told that results are removed
         self.last_sequence = self._done | dict(last_sequence or {})
         self._key = key
-        self._inbox: queue.Queue[zenoh.Sample | None] = queue.Queue(maxsize=INBOX)  # None: closed
+        self._inbox: queue.Queue[zenoh.Sample | None] = queue.Queue(maxsize=INBOX)  # None: the session is closed
         self._held: dict[str, deque[Received]] = {}
-        self._mutex = threading.Lock()  # closing a session that another thread uses raises in that moment
+        self._mutex = threading.Lock()  # closing a session while another thread uses it raises an exception there
         self._closed = False
         config = session_config("client", connect=endpoints, tls=tls)
         config.insert_json5("connect/timeout_ms", json.dumps(int(CONNECT_S * 1000)))
@@ -120,7 +123,7 @@ class Consumer:
     def _take_samples(self, subscriber: Iterable[zenoh.Sample]) -> None:
         for sample in subscriber:
             self._inbox.put(sample)
-        self._inbox.put(None)  # undeclared
+        self._inbox.put(None)  # the subscriber is undeclared
 
     def _follow(self, result: Received) -> Iterator[Received]:
         source = result.address.source
@@ -164,11 +167,11 @@ class Consumer:
             self._saved, self._saved_s = dict(self._done), time.monotonic()
 
     def _get(self, selector: str) -> tuple[list[Received], bool, int]:
-        """The results in order, whether anybody answered at all, and up to which number some are no longer kept."""
+        """Query a gateway: (results in order, whether it answered, number up to which it has deleted results or 0)."""
         with self._mutex:
             if self._closed:
                 return [], False, 0
-            # Without consolidation, else only the last result of each key would come.
+            # With consolidation Zenoh would pass on only the last result of each key.
             replies = self._session.get(selector, consolidation=zenoh.ConsolidationMode.NONE, timeout=ANSWER_S)
         answered, removed = False, 0
         results = []
@@ -182,7 +185,7 @@ class Consumer:
 
 
 def _removed(error: zenoh.ReplyError) -> int:
-    """The number in an answer REMOVED; 0 in any other."""
+    """The number in an answer REMOVED; 0 for any other answer."""
     try:
         number = error.payload.to_string().removeprefix(REMOVED)
     except zenoh.ZError:

@@ -6,26 +6,28 @@ import re
 from dataclasses import dataclass
 
 PREFIX = "fieldcal/v1"
-# ASCII, no wildcard, no '@' at the front (Zenoh matches '@' chunks only verbatim), nothing that needs quoting.
+# ASCII, no wildcard, no '@' at the front (wildcards do not match a part that begins with '@'), no quoting needed.
 CHUNK = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,62}")
 
 
 def gateway_key(site: str, gateway: str) -> str:
-    """`fieldcal/v1/<site>/<gateway>`, under which all of a gateway lives. Raises ValueError on a bad name."""
+    """`fieldcal/v1/<site>/<gateway>`, with which all keys of a gateway begin. Raises ValueError for an invalid name."""
     for name in (site, gateway):
         if not CHUNK.fullmatch(name):
-            raise ValueError(f"{name!r} cannot be part of a Zenoh key: 1 to 63 ASCII letters, digits, '-', '_', '.'")
+            raise ValueError(
+                f"{name!r} cannot be part of a Zenoh key; use 1 to 63 ASCII letters, digits, '-', '_' and '.'"
+            )
     return f"{PREFIX}/{site}/{gateway}"
 
 
 def result_key(gateway: str, sensor: str, what: str) -> str:
-    """Key of a result under the gateway's own key; an empty `sensor` means the gateway itself."""
+    """Key of a result of `sensor` under the key `gateway`; an empty `sensor` means a result of the gateway itself."""
     return f"{gateway}/{sensor}/{what}" if sensor else f"{gateway}/{what}"
 
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """A key taken apart. `sensor` is empty where the gateway itself speaks."""
+    """The parts of a key. `sensor` is empty where the key belongs to the gateway itself."""
 
     site: str
     gateway: str
@@ -34,12 +36,12 @@ class Address:
 
     @property
     def source(self) -> str:
-        """`<site>/<gateway>`: who counts the sequence."""
+        """`<site>/<gateway>`; each gateway counts its own sequence."""
         return f"{self.site}/{self.gateway}"
 
 
 def parse_key(key: str) -> Address | None:
-    """Take the key of a result apart; None where it is not one."""
+    """Split the key of a result into its parts; None where it is not such a key."""
     chunks = key.split("/")
     if "/".join(chunks[:2]) != PREFIX or len(chunks) not in (5, 6):
         return None
@@ -47,7 +49,7 @@ def parse_key(key: str) -> Address | None:
 
 
 def narrow(key: str, source: str) -> str:
-    """The key expression `key` restricted to one gateway, `<site>/<gateway>`; it must match that gateway at all."""
+    """The key expression `key` restricted to one gateway, `<site>/<gateway>`; `key` must match that gateway."""
     rest = key.removeprefix(PREFIX + "/").split("/")
     named = 0
     while named < 2 and rest and rest[0] != "**":

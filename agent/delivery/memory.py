@@ -1,4 +1,4 @@
-"""What a consumer remembers over its own restarts: the last result of each gateway that it was done with."""
+"""The memory file of a consumer: the number of the last result of each gateway that it has processed."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from pathlib import Path
 
 import msgspec
 
-SIZE_MAX = 16 << 20  # bytes; a gateway has fifty
+SIZE_MAX = 16 << 20  # bytes read at most; one gateway takes about 50
 
 
 class MemoryFileError(Exception):
-    """The file cannot be read, or is not what was written. The message names it."""
+    """The memory file cannot be read or is damaged. The message names the file."""
 
 
 class _Content(msgspec.Struct, forbid_unknown_fields=True):
     last_sequence: dict[str, int]
-    crc32: int  # of last_sequence: a digit that changed would skip results in silence
+    crc32: int  # of last_sequence; without it, a changed digit would skip results unnoticed
 
 
 def load(path: Path) -> dict[str, int]:
-    """`<site>/<gateway>`: number; empty where there is no file yet. Raises MemoryFileError."""
+    """Read the last sequence number by `<site>/<gateway>`; empty where there is no file. Raises MemoryFileError."""
     try:
         with open(path, "rb") as file:
             content = msgspec.json.decode(file.read(SIZE_MAX), type=_Content)
@@ -31,14 +31,16 @@ def load(path: Path) -> dict[str, int]:
     except OSError as error:
         raise MemoryFileError(f"{path}: cannot be read: {error.strerror}") from None
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise MemoryFileError(f"{path}: not what a consumer remembers: {error}") from None
+        raise MemoryFileError(f"{path}: not the memory file of a consumer: {error}") from None
     if content.crc32 != _crc32(content.last_sequence):
-        raise MemoryFileError(f"{path}: damaged: its CRC does not fit; without the file everything comes again")
+        raise MemoryFileError(
+            f"{path}: damaged: its CRC does not fit; delete the file to begin again with the values in force"
+        )
     return content.last_sequence
 
 
 def save(path: Path, last_sequence: Mapping[str, int]) -> None:
-    """Replace the file; it is the old or the new one whenever the power goes. Raises OSError."""
+    """Replace the file; after a power cut it is the complete old or the complete new one. Raises OSError."""
     kept = dict(last_sequence)
     new = path.with_name(path.name + ".new")
     with open(new, "wb") as file:

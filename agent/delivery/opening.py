@@ -1,4 +1,4 @@
-"""Opens the store's file: locked against a second agent, checked wholly, set aside where it is damaged, migrated."""
+"""Opens the store's file: locks it against a second agent, checks it, renames a damaged one, migrates an older one."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from agent.delivery.schema import (
 )
 
 LOCK_NAME = "state.lock"
-LOG_PAGES = 256  # 1 MiB; a full disk has to have room for the log as well
-CACHE_KIB = 512  # of pages in memory; SQLite's own 2 MiB fill over hours, and each row is written once
-# What SQLite says of a sound file on a machine that is not: anything else means that the file is damaged.
+LOG_PAGES = 256  # pages of the write-ahead log, 1 MiB; the log needs disk space too
+CACHE_KIB = 512  # KiB of pages in memory; SQLite's default of 2 MiB would fill over hours without use
+# SQLite's error codes for faults of the machine (disk, rights, memory). Any other error means that the file is damaged.
 _OF_THE_MACHINE = frozenset(
     {
         sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_FULL,
@@ -32,7 +32,7 @@ _OF_THE_MACHINE = frozenset(
 
 
 def lock(data_dir: Path) -> int:
-    """The descriptor that holds a data directory for this process. Raises StoreError."""
+    """Lock a data directory for this process; returns the descriptor that holds the lock. Raises StoreError."""
     try:
         data_dir.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(data_dir / LOCK_NAME, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
@@ -42,14 +42,17 @@ def lock(data_dir: Path) -> int:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
         os.close(descriptor)
-        raise StoreError(f"{data_dir}: another process is using it") from None
+        remedy = "stop that process, or use another directory"
+        raise StoreError(f"{data_dir}: another process is using it; {remedy}") from None
     return descriptor
 
 
 def open_or_set_aside(path: Path) -> tuple[Path | None, sqlite3.Connection]:
-    """(where a damaged file was put, a connection to a store of this version or to an empty file).
+    """Open the store; returns (new path of a damaged file or None, connection).
 
-    Raises StoreError for a store of a later version, sqlite3.Error where the machine does not let it be opened.
+    The connection is to a store of this version, or to an empty file, which also replaces a damaged one. A damaged file
+    is renamed to `<name>.corrupt-<n>`.
+    Raises StoreError for a store of a later version, sqlite3.Error where the machine cannot open the file.
     """
     if not path.exists():
         return None, _open(path)
@@ -71,15 +74,18 @@ def open_or_set_aside(path: Path) -> tuple[Path | None, sqlite3.Connection]:
 
 
 def _roll_back(path: Path) -> None:
-    """Undo what a kill left half done before the file had its log: reading alone may not do that, and would refuse."""
+    """Roll back a transaction that was interrupted before the file had a write-ahead log.
+
+    A read-only connection, as `_is_damaged` uses, cannot roll back and would refuse to open the file.
+    """
     if not path.with_name(path.name + "-journal").exists() or path.with_name(path.name + "-wal").exists():
         return
-    with closing(sqlite3.connect(path, timeout=5.0)) as connection, suppress(sqlite3.Error):  # `_is_damaged` tells why
+    with closing(sqlite3.connect(path, timeout=5.0)) as connection, suppress(sqlite3.Error):  # `_is_damaged` reports it
         version_of(connection)
 
 
 def _is_damaged(path: Path) -> bool:
-    # Read-only: a connection that may write would fold the log into the broken file and delete it when it closes.
+    # Read-only, since a connection that may write copies the log into the damaged file and deletes the log on closing.
     with closing(connect_read_only(path)) as connection:
         try:
             version = version_of(connection)
@@ -97,14 +103,14 @@ def _is_damaged(path: Path) -> bool:
 def _means_damage(error: Exception, path: Path) -> bool:
     code = getattr(error, "sqlite_errorcode", None)
     if code is None:
-        return True  # of Python's own: text that cannot be decoded
-    if code & 0xFF == sqlite3.SQLITE_READONLY:  # also said of a version of the file format that is none
+        return True  # an error of Python, not of SQLite: text that cannot be decoded
+    if code & 0xFF == sqlite3.SQLITE_READONLY:  # SQLite's code also for an invalid version of the file format
         return os.access(path, os.W_OK)
     return code & 0xFF not in _OF_THE_MACHINE
 
 
 def _open(path: Path) -> sqlite3.Connection:
-    # Any thread: a mutex guards the connection, and the thread that opens is not the one that commits.
+    # Another thread than this one commits, so check_same_thread is off; the Store's mutex guards the connection.
     connection = sqlite3.connect(path, timeout=5.0, isolation_level=None, check_same_thread=False)
     try:
         connection.execute("PRAGMA journal_mode = WAL")
@@ -113,9 +119,12 @@ def _open(path: Path) -> sqlite3.Connection:
         connection.execute(f"PRAGMA cache_size = -{CACHE_KIB}")
         version = version_of(connection)
         if not known_version(version) and version != 0:
-            raise StoreError(f"{path}: written in version {version}, this program writes version {SCHEMA_VERSION}")
+            raise StoreError(
+                f"{path}: written by a later version of fieldcal (store version {version}, this program writes "
+                f"version {SCHEMA_VERSION}); run that version, or use another data directory"
+            )
         if version == SCHEMA_VERSION:
-            # Whether it can be written at all shows here; and where a bit of the number had changed, it is right.
+            # This write fails if the file cannot be written. It also corrects a version number with a changed bit.
             connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
         elif version != 0:
             bring_up_to_date(connection, version)

@@ -1,4 +1,4 @@
-"""What the recordings know and the store does not: all of it after a store was lost, the end after a crash."""
+"""Restores from the recordings what the store lacks: everything after the store was lost, the end after a crash."""
 
 from __future__ import annotations
 
@@ -17,14 +17,17 @@ from agent.recording.scan import scan
 
 _log = logging.getLogger(__name__)
 
-Recall = Callable[[Path], Sequence[Memory]]  # the states of the estimation where a recording ends
-# s; a start waits no longer for states, but for the file it is in: an hour of recording, which is replayed in seconds.
+Recall = Callable[[Path], Sequence[Memory]]  # gives the states of the estimation at the end of a recording
+# s; after this time no further recording is replayed at a start. One replay takes seconds for an hour of recording.
 LONGEST_S = 60.0
 
 
 @dataclass(slots=True)
 class Recovered:
-    """How many results came back, from how many files, and states of how many devices; the newest file's marks."""
+    """What was restored: `results` from `files` recordings, states (`memories`) of so many devices.
+
+    `file_sequence`, `published`: number of the newest recording, and the last published result when it began.
+    """
 
     results: int = 0
     memories: int = 0
@@ -34,10 +37,10 @@ class Recovered:
 
 
 def recover(connection: sqlite3.Connection, directory: Path, *, everything: bool) -> Recovered:
-    """Add the recorded results that the store lacks; within the caller's transaction.
+    """Add the recorded results that the store lacks, within the caller's transaction.
 
-    Goes back from the newest file to the first from which nothing is missing, or through all where `everything` is
-    wanted. Raises sqlite3.Error, DamagedRow; files that cannot be read are told and left out.
+    Reads the recordings from the newest one back to the first of which no result is missing; all of them with
+    `everything`. A file that cannot be read is skipped, with a warning in the log. Raises sqlite3.Error, DamagedRow.
     """
     recovered = Recovered()
     rows = connection.execute("SELECT sensor, what, count, up_to, crc FROM removed")
@@ -46,10 +49,10 @@ def recover(connection: sqlite3.Connection, directory: Path, *, everything: bool
         try:
             found = scan(path)
         except OSError as error:
-            _log.warning("%s: cannot be read, its results are not found again: %s", path, error.strerror)
+            _log.warning("%s: cannot be read, its results are not restored to the store: %s", path, error.strerror)
             continue
         for fault in found.faults:
-            _log.warning("%s: results are not found again: %s", path, fault)
+            _log.warning("%s: some results are not restored to the store: %s", path, fault)
         if not recovered.file_sequence:
             recovered.file_sequence = number
             recovered.published = _published(found.metadata.get(FILE_METADATA, {}))
@@ -66,10 +69,11 @@ def recover(connection: sqlite3.Connection, directory: Path, *, everything: bool
 
 
 def recover_memories(connection: sqlite3.Connection, directory: Path, recall: Recall) -> int:
-    """Bring the states of the estimation up to what the recordings know; within the caller's transaction.
+    """Update the states of the estimation from the recordings, within the caller's transaction.
 
-    The newest file knows every device of its run and all that was kept before it. Then, newest first, the files with
-    calibrations that are newer than what is known of their device. Returns how many devices have another state now.
+    The newest recording gives the states of all devices of its run and those kept from before. Then follow, newest
+    first, the recordings with a calibration that is newer than the state known of its device.
+    Returns how many devices got another state.
     """
     rows = connection.execute("SELECT sensor, identity, sequence, state, crc FROM memory")
     known: dict[tuple[str, str], int] = {(row[0], row[1]): row[2] for row in map(checked, rows)}
@@ -99,12 +103,12 @@ WHERE what = 'calibration' AND recorded = 1 GROUP BY sensor, identity, recording
 
 
 def no_memories(_: Path) -> Sequence[Memory]:
-    """Nothing is replayed."""
+    """A Recall that replays nothing and gives no states."""
     return ()
 
 
 def name_latest(connection: sqlite3.Connection) -> None:
-    """Name the newest result of every channel anew, and the calibrations that are in force no more."""
+    """Write the table `latest` anew: the newest result of every channel; mark calibrations no longer in force."""
     newest = "SELECT sensor, what, max(sequence) FROM results GROUP BY sensor, what"
     calibrations: dict[str, int] = {}
     for sensor, what, sequence in connection.execute(newest).fetchall():
@@ -128,6 +132,6 @@ def _missing(connection: sqlite3.Connection, records: Iterable[Record]) -> list[
 
 
 def _published(metadata: dict[str, str]) -> int:
-    """The mark as it stood when a file began; 0 where it does not say: results go out twice rather than never."""
+    """The last published result when a recording began; 0 where unknown: better published twice than never."""
     text = metadata.get("published", "")
     return int(text) if text.isascii() and text.isdigit() and len(text) < 19 else 0

@@ -1,4 +1,4 @@
-"""What the store lets go of, so that years do not fill the disk: the oldest results, two at most for each new one."""
+"""Deletes old results from the store, so that it does not fill the disk: two at most for each new result."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ if TYPE_CHECKING:
     from agent.config.sinks import Results
 
 DAY_NS = 86_400_000_000_000
-# A store that is too large shrinks as fast as it grows, and a clock that jumped ahead by years has deleted little when
-# somebody sets it right.
+# Results deleted at most for each new one. With 2, a store that is too large shrinks as fast as it otherwise grows.
+# Where the clock jumps ahead by years, only few results are deleted before somebody corrects the clock.
 FOR_EACH_NEW = 2
 
 
 @dataclass(frozen=True, slots=True)
 class KeepResults:
-    """How long results stay; None is for ever.
+    """How long results are kept; None is for ever.
 
-    `days`, `bytes`: of what is published, by the UTC in the results and by the pages of the store in use.
-    `waiting_days`: of what no router ever took. The newest result of each channel stays, and the newest calibration of
-    each device that a sensor ever was, however old.
+    `days`, `bytes`: limits for published results: their age by their UTC, and the size of the store's used pages.
+    `waiting_days`: limit of age for results that were never published.
+    Always kept: the newest result of each channel, and the newest calibration of each device that a sensor ever had.
     """
 
     days: float | None = None
@@ -37,7 +37,7 @@ FOR_EVER = KeepResults()
 
 
 def keep_results(section: Results) -> KeepResults:
-    """What the configuration says."""
+    """The limits that the section [results] of the configuration sets."""
     most = int(section.keep_bytes) if section.keep_bytes is not None else None
     return KeepResults(section.keep_days, most, section.waiting_days)
 
@@ -52,15 +52,18 @@ class _Result:
 
 
 class Sweep:
-    """Deletes with every commit, in its transaction; counts what it deleted in the table `removed`."""
+    """Deletes old results in the transaction of each commit; counts them in the table `removed`."""
 
     def __init__(self, keep: KeepResults) -> None:
         self._keep = keep
-        self._looked_at = 0  # up to this number nothing is left but what stays
-        self._staying: list[_Result] = []  # old, but the newest of their kind when they were looked at
+        self._looked_at = 0  # up to this number only results that must be kept are left
+        self._staying: list[_Result] = []  # old results kept because each was the newest of its channel or device
 
     def run(self, connection: sqlite3.Connection, new: Sequence[Record], published: int) -> None:
-        """Delete the oldest for the sake of `new` ones. Raises sqlite3.Error, DamagedRow."""
+        """Delete the oldest results, FOR_EACH_NEW at most for each of `new`. `published`: the last published result.
+
+        Raises sqlite3.Error, DamagedRow.
+        """
         if self._keep == FOR_EVER or not new:
             return
         self._staying = [result for result in self._staying if not _delete(connection, result)]
@@ -78,7 +81,7 @@ class Sweep:
                 return
             if not _delete(connection, result):
                 self._staying.append(result)
-            # Where the transaction fails, what was deleted is looked at again after a restart.
+            # If the transaction fails, these results are examined again only after a restart.
             self._looked_at = result.sequence
 
     def _too_large(self, connection: sqlite3.Connection) -> bool:
@@ -95,7 +98,10 @@ def _beyond(age_days: float, limit_days: float | None) -> bool:
 
 
 def _delete(connection: sqlite3.Connection, result: _Result) -> bool:
-    """Delete it, unless it is the newest of its channel, a calibration the newest of its device."""
+    """Delete a result and return True; False where it must be kept.
+
+    Kept are the newest result of each channel and the newest calibration of each device.
+    """
     newer = "SELECT 1 FROM results WHERE sensor = ? AND what = ? AND sequence > ? LIMIT 1"
     values: tuple[object, ...] = (result.sensor, result.what, result.sequence)
     if result.what == "calibration":

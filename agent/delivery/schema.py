@@ -1,7 +1,7 @@
-"""The tables of the store, how an older store is brought up to date, and what tells that one is damaged.
+"""The tables of the store, the migration of older stores, and the check for damage.
 
-SQLite finds a page that is broken, not a digit that changed within a value. So each row carries the CRC-32 of its other
-columns; whoever reads a row checks it.
+SQLite detects a broken page, but not a changed digit within a value. So each row has a column with the CRC-32 of its
+other columns, which is checked whenever the row is read.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ _RESULTS = """CREATE TABLE results (
     sequence INTEGER PRIMARY KEY, run_id TEXT NOT NULL, sensor TEXT NOT NULL, what TEXT NOT NULL,
     payload BLOB NOT NULL, t_utc_ns INTEGER NOT NULL, recorded INTEGER NOT NULL, recording TEXT NOT NULL,
     identity TEXT NOT NULL, crc INTEGER NOT NULL) STRICT"""
-# `withdrawn`: a calibration is in force no more, since the status was UNCALIBRATED after it.
+# `withdrawn`: the calibration is no longer in force, since a later status was UNCALIBRATED.
 _LATEST = """CREATE TABLE latest (
     sensor TEXT NOT NULL, what TEXT NOT NULL, sequence INTEGER NOT NULL, withdrawn INTEGER NOT NULL,
     crc INTEGER NOT NULL, PRIMARY KEY (sensor, what)) STRICT"""
 _MARKS = "CREATE TABLE marks (name TEXT PRIMARY KEY, value INTEGER NOT NULL, crc INTEGER NOT NULL) STRICT"
-# What retention deleted, by channel: how many results, and the number of the last of them.
+# What retention deleted, by channel: the number of results, and the sequence number of the last of them.
 _REMOVED = """CREATE TABLE removed (
     sensor TEXT NOT NULL, what TEXT NOT NULL, count INTEGER NOT NULL, up_to INTEGER NOT NULL, crc INTEGER NOT NULL,
     PRIMARY KEY (sensor, what)) STRICT"""
-# What outlives a run of a device's estimation: the newest state of each identity, opaque here.
+# The state of the estimation that is kept between runs: the newest one of each device, as bytes not interpreted here.
 _MEMORY = """CREATE TABLE memory (
     sensor TEXT NOT NULL, identity TEXT NOT NULL, sequence INTEGER NOT NULL, state BLOB NOT NULL, crc INTEGER NOT NULL,
     PRIMARY KEY (sensor, identity)) STRICT"""
@@ -46,8 +46,8 @@ class StoreError(Exception):
     """The store cannot be read or written. The message names the file and the reason."""
 
 
-class DamagedRow(StoreError):  # noqa: N818 - said of what was read
-    """A row is not what was written."""
+class DamagedRow(StoreError):  # noqa: N818 - names the row that was read
+    """A row of the store differs from what was written."""
 
 
 def row_crc(*columns: object) -> int:
@@ -56,7 +56,7 @@ def row_crc(*columns: object) -> int:
 
 
 def checked(row: tuple[Any, ...]) -> tuple[Any, ...]:
-    """The columns of a row without its last, the CRC of the others. Raises DamagedRow where it does not fit."""
+    """The columns of a row without the last one, the CRC. Raises DamagedRow where the CRC does not fit the others."""
     *columns, crc = row
     try:
         fits = row_crc(*columns) == crc
@@ -68,22 +68,22 @@ def checked(row: tuple[Any, ...]) -> tuple[Any, ...]:
 
 
 def write_mark(connection: sqlite3.Connection, name: str, value: int) -> None:
-    """Set one of the MARKS."""
+    """Set one of the numbers named in MARKS."""
     row = (name, value, row_crc(name, value))
     connection.execute("INSERT OR REPLACE INTO marks (name, value, crc) VALUES (?, ?, ?)", row)
 
 
 def read_marks(connection: sqlite3.Connection) -> dict[str, int]:
-    """All of the MARKS. Raises DamagedRow or sqlite3.Error."""
+    """Read all numbers named in MARKS. Raises DamagedRow or sqlite3.Error."""
     rows = connection.execute("SELECT name, value, crc FROM marks").fetchall()
     marks = {str(name): value for name, value in map(checked, rows) if isinstance(value, int)}
     if marks.keys() != MARKS:
-        raise DamagedRow(f"the marks are {', '.join(sorted(marks))}, not {', '.join(sorted(MARKS))}")
+        raise DamagedRow(f"the table marks has {', '.join(sorted(marks))} instead of {', '.join(sorted(MARKS))}")
     return marks
 
 
 def write_latest(connection: sqlite3.Connection, sensor: str, what: str, sequence: int, *, withdrawn: bool) -> None:
-    """Name the newest result of a channel."""
+    """Set the newest result of a channel in the table `latest`."""
     row = (sensor, what, sequence, int(withdrawn))
     connection.execute(
         "INSERT OR REPLACE INTO latest (sensor, what, sequence, withdrawn, crc) VALUES (?, ?, ?, ?, ?)",
@@ -92,22 +92,22 @@ def write_latest(connection: sqlite3.Connection, sensor: str, what: str, sequenc
 
 
 def withdraw(connection: sqlite3.Connection, sensor: str) -> None:
-    """The newest calibration of a sensor, if there is one, is in force no more."""
+    """Mark the newest calibration of a sensor, if there is one, as no longer in force."""
     where = "SELECT sequence FROM latest WHERE sensor = ? AND what = 'calibration'"
     for (sequence,) in connection.execute(where, (sensor,)).fetchall():
         write_latest(connection, sensor, "calibration", sequence, withdrawn=True)
 
 
 def insert_results(connection: sqlite3.Connection, rows: Iterable[tuple[object, ...]]) -> None:
-    """Add rows of RESULT_COLUMNS with their CRC. Raises sqlite3.IntegrityError where a number is there already."""
+    """Insert rows of RESULT_COLUMNS and CRC. Raises sqlite3.IntegrityError where a sequence number exists already."""
     places = ", ".join("?" * 10)
     connection.executemany(f"INSERT INTO results ({RESULT_COLUMNS}, crc) VALUES ({places})", rows)
 
 
 def write_memory(connection: sqlite3.Connection, row: tuple[str, str, int, bytes]) -> None:
-    """Keep the state of a device's estimation in place of the one before: sensor, identity, sequence, state.
+    """Write the state of the estimation of a device: `row` is (sensor, identity, sequence, state).
 
-    Of the devices that stood in one place the newest MOST_MEMORIES stay.
+    It replaces the device's previous state. For each sensor, only the MOST_MEMORIES newest devices are kept.
     """
     connection.execute(
         "INSERT OR REPLACE INTO memory (sensor, identity, sequence, state, crc) VALUES (?, ?, ?, ?, ?)",
@@ -120,7 +120,7 @@ def write_memory(connection: sqlite3.Connection, row: tuple[str, str, int, bytes
 
 
 def create_tables(connection: sqlite3.Connection, marks: dict[str, int]) -> None:
-    """Make an empty store; within the caller's transaction."""
+    """Make an empty store, within the caller's transaction."""
     for statement in _STATEMENTS:
         connection.execute(statement)
     for name, value in marks.items():
@@ -129,7 +129,7 @@ def create_tables(connection: sqlite3.Connection, marks: dict[str, int]) -> None
 
 
 def bring_up_to_date(connection: sqlite3.Connection, version: int) -> None:
-    """Migrate a store of an older version, in one transaction: it is wholly of the old version or of this one."""
+    """Migrate a store of an older version in one transaction: a crash leaves it complete, in the old or new version."""
     connection.execute("BEGIN IMMEDIATE")
     with connection:
         for older in range(version, SCHEMA_VERSION):
@@ -143,7 +143,7 @@ def known_version(version: int) -> bool:
 
 
 def _add_crcs(connection: sqlite3.Connection) -> None:
-    """1 to 2: CRCs, withdrawal kept beside the newest calibration, the marks of retention and of file numbers."""
+    """Version 1 to 2 adds CRCs, the column `withdrawn`, and the marks of retention and of file numbers."""
     withdrawn = {sensor for (sensor,) in connection.execute(_WITHDRAWN_IN_1)}
     newest = connection.execute("SELECT sensor, what, sequence FROM latest").fetchall()
     marks = dict(connection.execute("SELECT name, value FROM marks").fetchall())
@@ -173,9 +173,9 @@ _MIGRATIONS: dict[int, Callable[[sqlite3.Connection], None]] = {1: _add_crcs}
 
 
 def damage(connection: sqlite3.Connection) -> str:
-    """What is wrong with a store of this version, every page and row looked at; "" where nothing is.
+    """Check every page and row of a store of this version; returns what is damaged, or "".
 
-    Raises sqlite3.Error: the caller knows which of them mean damage too.
+    Raises sqlite3.Error. The caller decides which of these errors also mean damage.
     """
     (said,) = connection.execute("PRAGMA integrity_check(1)").fetchone()
     if said != "ok":
@@ -192,17 +192,17 @@ def damage(connection: sqlite3.Connection) -> str:
     except DamagedRow as error:
         return str(error)
     if named != set(connection.execute(newest)):
-        return "it does not name the newest results"
+        return "the table latest does not name the newest results"
     return ""
 
 
 def version_of(connection: sqlite3.Connection) -> int:
     """The version of a store; 0 where it is empty.
 
-    A number of ours on tables that are none of that version, or the other way round, is told by `damage`.
+    Where the version number and the tables do not belong together, `damage` says so.
     """
     (version,) = connection.execute("PRAGMA user_version").fetchone()
-    # A later version has other tables: with ours, it is the number that is damaged.
+    # A later version would have other tables. Where the tables are of this version, the number itself is damaged.
     return SCHEMA_VERSION if version != SCHEMA_VERSION and _is_ours(connection) else int(version)
 
 

@@ -1,4 +1,4 @@
-"""How a Zenoh session of this project is set: nothing found by multicast or gossip, nothing opened to the network."""
+"""The Zenoh configuration of every session: no search for peers by multicast or gossip, and only named endpoints."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import zenoh
 
 from agent.config.tls import TlsFiles
 
-# Bytes. A block of corrected accelerations at 10 kHz has a fifth of it; Zenoh's own limit is a GiB.
+# Bytes. A block of corrected acceleration at 10 kHz takes a fifth of this; Zenoh's default limit is 1 GiB.
 LARGEST_MESSAGE = 1 << 20
 
 
 class EndpointError(Exception):
-    """An endpoint that Zenoh cannot use. The message names it."""
+    """Zenoh cannot use an endpoint. The message names the endpoint or the file."""
 
 
-class EndpointRefused(EndpointError):  # noqa: N818 - said of a sound endpoint
-    """The machine does not serve an endpoint that is one: its port is taken, its address is another's."""
+class EndpointRefused(EndpointError):  # noqa: N818 - the endpoint itself is valid
+    """A valid endpoint that this machine cannot listen at: the port is in use, or the address is not its own."""
 
 
 def session_config(
@@ -29,17 +29,17 @@ def session_config(
     listen: Sequence[str] = (),
     tls: TlsFiles | None = None,
 ) -> zenoh.Config:
-    """A configuration with explicit end points only; with `tls` both sides of a link show who they are.
+    """A Zenoh configuration that uses only the given endpoints; with `tls`, both sides of a link show certificates.
 
-    Raises EndpointError where one is not an endpoint.
+    Raises EndpointError where a given endpoint is not valid.
     """
     config = zenoh.Config()
     for key, value in {
         "mode": mode,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
-        "scouting/delay": 0,  # nothing is scouted for: by default opening waits half a second
-        # Two files of 16 MiB in /dev/shm, left behind by a kill, for payloads that are never that large.
+        "scouting/delay": 0,  # scouting is off; the default would delay opening by half a second
+        # Off: it makes two files of 16 MiB in /dev/shm, which stay after a kill, and the payloads here never need it.
         "transport/shared_memory/enabled": False,
         "transport/link/rx/max_message_size": LARGEST_MESSAGE,
         "transport/link/tls": _tls(tls),
@@ -61,6 +61,6 @@ def _tls(files: TlsFiles | None) -> dict[str, object]:
         "root_ca_certificate": files.ca,
         "connect_certificate": files.certificate,
         "connect_private_key": files.key,
-        "enable_mtls": True,  # without it we would not show our own certificate
+        "enable_mtls": True,  # without it this side would not show its certificate
         "verify_name_on_connect": True,
     }

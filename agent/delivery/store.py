@@ -27,24 +27,26 @@ from agent.delivery.schema import (
     write_memory,
 )
 
-# After a run that did not close well, numbers may be out in the world that no commit has kept; the next run counts on
-# from beyond them. More than a week of one unkept result a second.
+# After a crash, results may have been published with sequence numbers that no commit has kept. The next run therefore
+# skips so many numbers: more than a week of one result a second that the disk refused.
 UNKEPT_MAX = 1_000_000
-# Results that a failing disk refused wait in memory for the next commit; beyond this the oldest are given up.
+# Results that a failing disk refused wait in memory for the next commit; beyond this number the oldest are dropped.
 WAITING_MAX = 1000
 
 
 class Store:
-    """Commits results durably (WAL, synchronous FULL) and remembers up to where they are published.
+    """Keeps results durably (WAL, synchronous FULL) and the number up to which they are published.
 
-    May be called from any thread; reading is done by a `History` of one's own on `path`.
-    Every page and row is checked at the start. `set_aside` names the damaged file that was found and renamed, None
-    where there was none; `recovered` says what was found again in the recordings of `data_dir`: everything that they
-    hold where the store is new, what the last moments before a crash left out where it is not. With results come the
-    states of the estimation: `recall` tells which a recording leaves.
-    A new store cannot know which numbers were used before it; it counts on from `count_from`, by default the UTC
-    milliseconds, and from beyond what the recordings hold. They still fit a number of JavaScript.
-    Raises StoreError where the directory cannot be written or another process has the store.
+    All methods may be called from any thread. To read, open a `History` on `path` in the reading thread.
+    Opening checks every page and row. `set_aside`: new path of a damaged file, which is renamed; None where the file
+    was good. `recovered`: what was restored from the recordings in `data_dir`: everything where the store is new; after
+    a crash the results that were recorded but not committed.
+
+    `count_from`: a new store does not know which sequence numbers were used before. It begins after this number, by
+    default the UTC in milliseconds (small enough for JavaScript's numbers), and after all numbers in the recordings.
+    `keep`: limits beyond which old results are deleted.
+    `recall`: gives the states of the estimation at the end of a recording, to restore them with the results.
+    Raises StoreError where the directory cannot be written or another process uses the store.
     """
 
     def __init__(
@@ -73,13 +75,14 @@ class Store:
             raise
 
     def last_sequence(self) -> int:
-        """The number after which this run may count."""
+        """The highest sequence number used; the next result must have a higher one."""
         return self._last
 
     def commit(self, records: Iterable[Record], memories: Iterable[Memory] = ()) -> None:
-        """Keep the results and states in one transaction; when this returns they survive a power cut.
+        """Write results and states in one transaction; when this returns they survive a power cut.
 
-        Raises StoreError where they cannot be kept (they are tried again with the next commit) or are out of order.
+        Raises StoreError where they cannot be written (the next commit tries again), or where a result's number is not
+        above the one before.
         """
         with self._mutex:
             self._enqueue(records)
@@ -96,19 +99,22 @@ class Store:
             self._memories.clear()
 
     def published(self) -> int:
-        """Results up to this number have been put on the network; those after it are the outbox."""
+        """The last published result. The results after it are the outbox: they still wait for a router."""
         return self._published
 
     def mark_published(self, sequence: int) -> None:
-        """Results up to `sequence` are out. Kept with the next commit: after a crash a few go out twice."""
+        """Note that results up to `sequence` are published.
+
+        The next commit writes it; after a crash, a few results are therefore published twice.
+        """
         self._published = max(self._published, sequence)
 
     def file_sequence(self) -> int:
-        """The highest number that a recording here ever had, also one that is deleted."""
+        """The highest file number of all recordings, deleted ones included."""
         return self._file_sequence
 
     def mark_file(self, file_sequence: int) -> None:
-        """A recording of this number is there. Raises StoreError where that cannot be kept; the next commit tries."""
+        """Note that a recording of this number exists. Raises StoreError on failure; the next commit tries again."""
         self._file_sequence = max(self._file_sequence, file_sequence)
         self.commit([])
 
@@ -123,7 +129,7 @@ class Store:
             return str(row[0]) if row else ""
 
     def close(self) -> None:
-        """Keep what is left and let go of the file. May be called twice."""
+        """Write what still waits and close the file. May be called twice. Raises StoreError."""
         with self._mutex:
             if self._lock < 0:
                 return
@@ -142,7 +148,7 @@ class Store:
     def _enqueue(self, records: Iterable[Record]) -> None:
         for record in records:
             if record.sequence <= self._last:
-                raise StoreError(f"{self.path}: result {record.sequence} does not come after {self._last}")
+                raise StoreError(f"{self.path}: result {record.sequence} does not come after result {self._last}")
             self._waiting.append(record)
             self._last = record.sequence
 
@@ -158,7 +164,7 @@ class Store:
         write_mark(self._connection, "file", self._file_sequence)
 
     def _begin_run(self, first: int, recall: Recall) -> Recovered:
-        """Read the marks; make the tables where the file is new; fetch from the recordings what is not here."""
+        """Read the marks, make the tables where the file is new, and restore missing results from the recordings."""
         with self._connection:
             self._connection.execute("BEGIN IMMEDIATE")
             new = version_of(self._connection) == 0

@@ -102,5 +102,5 @@ def test_a_memory_that_is_none_is_refused_and_none_is_empty(tmp_path: Path) -> N
     chance = random.Random(1)
     for _ in range(100):
         (tmp_path / "noise").write_bytes(chance.randbytes(chance.randrange(200)))
-        with pytest.raises(MemoryFileError, match="not what a consumer remembers"):
+        with pytest.raises(MemoryFileError, match="not the memory file of a consumer"):
             memory.load(tmp_path / "noise")

@@ -35,14 +35,14 @@ def test_a_taken_port_is_one_clear_line_and_status_1() -> None:
         router = router_process("--listen", endpoint)
         said, faults = router.communicate(timeout=5)
         assert router.returncode == 1
-        assert (said, faults) == ("", f"fieldcal router: {endpoint}: the port is taken\n")
+        assert (said, faults) == ("", f"fieldcal router: {endpoint}: another program uses this port\n")
         assert not router_running(endpoint), "what listens there is no router"
 
 
 def test_a_router_that_is_there_is_found() -> None:
     site = Site()
     assert router_running(site.endpoint)
-    with pytest.raises(EndpointError, match="the port is taken"):
+    with pytest.raises(EndpointError, match="another program uses this port"):
         open_router(site.endpoint)
     site.kill()
 

@@ -147,7 +147,7 @@ def test_a_new_store_counts_on_from_the_clock_beyond_all_that_was_used_before(tm
 def test_a_number_that_does_not_rise_is_refused(tmp_path: Path) -> None:
     store = Store(tmp_path, 0)
     store.commit([record(5)])
-    with pytest.raises(StoreError, match="result 5 does not come after 5"):
+    with pytest.raises(StoreError, match="result 5 does not come after result 5"):
         store.commit([record(5)])
     store.close()
 
