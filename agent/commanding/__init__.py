@@ -1,1 +1,1 @@
-"""Operators' commands: signed, checked one by one, then taken into the pipeline's events or refused for the record."""
+"""Signed commands of operators: each is checked, then put among the pipeline's events, or refused and recorded."""

@@ -1,10 +1,10 @@
-"""How many may pass: some at once, then so many a second. What did not pass is counted."""
+"""A rate limit: a burst at once, then a number per second."""
 
 from __future__ import annotations
 
 
 class Allowance:
-    """`burst` at once, then `rate_hz`. Time comes from the caller, in s, and never goes back."""
+    """Lets `burst` items pass at once, then `rate_hz` per second. The caller gives the time; it must not decrease."""
 
     def __init__(self, burst: int, rate_hz: float) -> None:
         self._burst = burst
@@ -13,7 +13,7 @@ class Allowance:
         self._asked_s = 0.0
 
     def passes(self, now_s: float) -> bool:
-        """Whether one more may pass now; if so, it has."""
+        """Whether an item may pass at `now_s`; if True, the item is counted."""
         self._left = min(self._burst, self._left + (now_s - self._asked_s) * self._rate_hz)
         self._asked_s = now_s
         if self._left < 1:

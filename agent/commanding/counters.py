@@ -1,4 +1,4 @@
-"""The highest counter taken of each key, kept over restarts: a command that was seen once is none any more."""
+"""Keeps the highest counter accepted of each key over restarts, so that no command is accepted twice."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ FILE_NAME = "command-counters.json"
 
 
 class Counters:
-    """Counters of the keys in a file of a data directory.
+    """The highest accepted counters, by key, in a file of a data directory.
 
-    Counters are UTC in ns (agent.commanding.envelope), so where the file is missing or cannot be read nothing from
-    before this moment is taken: a lost file opens no way for an old command. `set_aside` names an unreadable one.
+    Counters are UTC in ns (agent.commanding.envelope). Where the file is missing or unreadable, only counters above the
+    present time are accepted, so that a lost file does not let an old command pass.
+    `set_aside`: new path of an unreadable file, which is renamed; None where there was none.
     """
 
     def __init__(self, data_dir: Path) -> None:
@@ -33,11 +34,11 @@ class Counters:
             self._path.rename(self.set_aside)
 
     def last(self, key_id: str) -> int:
-        """A command of this key must have a greater counter."""
+        """The highest counter accepted of this key; a command must have a greater one."""
         return max(self._floor, self._taken.get(key_id, 0))
 
     def take(self, key_id: str, counter: int) -> None:
-        """Keep the counter; when this returns it survives a power cut. Raises OSError, and nothing is taken."""
+        """Write the counter; when this returns it survives a power cut. After an OSError the old counter holds."""
         taken = self._taken | {key_id: counter}
         draft = self._path.with_suffix(".new")
         with open(draft, "wb") as file:

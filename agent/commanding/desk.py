@@ -1,4 +1,4 @@
-"""Where commands arrive: each is checked, its counter kept, and it goes into the events; or it is refused, with why."""
+"""Checks each command that arrives: keeps its counter and puts it among the events, or refuses it with a reason."""
 
 from __future__ import annotations
 
@@ -22,34 +22,36 @@ from agent.core.events import Command
 from agent.delivery.history import History, StoreError
 from agent.delivery.keys import CHUNK
 
-# A gateway that asks for the time is right within a second; one that just woke up gets half a minute.
+# s by which a gateway's clock may be off: with NTP it is right within a second, but not soon after a start.
 CLOCK_TOLERANCE_S = 30.0
-# A command is for now. One that is good for longer could be held back and sent when it does harm.
+# s that a command may be valid. A command that is valid for longer could be intercepted and sent when it does harm.
 LONGEST_VALIDITY_S = 600.0
-# Recorded refusals: 20 at once, then 8640 a day, 3 MB. All are counted.
+# Refusals that are recorded: 20 at once, then 0.1 per second, which is 8640 or 3 MB a day. All refusals are counted.
 RECORDED_REFUSALS = (20, 0.1)
-# An operator needs no more; a script that ran wild, with a good key, fills no disk.
+# Commands that are accepted: 20 at once, then 1 per second. A faulty script with a valid key cannot fill the disk.
 TAKEN = (20, 1.0)
 LONGEST_REASON = 300  # characters
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What whoever sent a command is told."""
+    """The answer to the sender of a command: whether it was accepted, and why not."""
 
     taken: bool
     reason: str = ""
 
     @property
     def json(self) -> bytes:
-        """As it is sent."""
+        """The answer as JSON, as it is sent."""
         return msgspec.json.encode({"taken": self.taken, "reason": self.reason})
 
 
 class CommandDesk:
-    """Takes commands for the gateway `<site>/<gateway>`; `put` is told of each, also of the refused.
+    """Accepts or refuses commands for the gateway `gateway` (`<site>/<gateway>`) and its `sensors`.
 
-    May be called from any thread.
+    `settings`: the keys and their rights. `data_dir`: where the counters are kept. `store`: path of the store, in which
+    accept and rollback find what they name. `put`: called with each accepted command and with each recorded refusal.
+    All methods may be called from any thread.
     """
 
     def __init__(
@@ -76,20 +78,20 @@ class CommandDesk:
         self._closed = False
 
     def counts(self) -> dict[str, int]:
-        """How many were taken, and refused by kind, since the start."""
+        """Number of commands since the start: accepted under "taken", refused under each kind of refusal."""
         with self._mutex:
             return dict(sorted(self._counts.items()))
 
     def close(self) -> None:
-        """Take nothing more: nobody listens to `put` any longer."""
+        """Refuse all further commands, since the main loop no longer takes what `put` gives it."""
         with self._mutex:
             self._closed = True
 
     def receive(self, address: str, data: bytes) -> Answer:
-        """A command that came for `address`, `<sensor>/command/<verb>`; whatever the bytes are, there is an answer."""
+        """Check a command sent to `address` (`<sensor>/command/<verb>`). Returns an answer for any bytes."""
         with self._mutex:
             if self._closed:
-                return Answer(False, "the agent is ending")
+                return Answer(False, "the agent is stopping; send the command again after it has started")
             try:
                 event = self._check(address, data)
             except Refused as refused:
@@ -103,7 +105,7 @@ class CommandDesk:
         envelope = parse_envelope(data)
         key = self._keys.get(envelope.key_id)
         if key is None:
-            raise Refused("unknown key", f"there is no key {envelope.key_id}")
+            raise Refused("unknown key", f"the gateway's configuration has no key {envelope.key_id} in commands.keys")
         order = envelope.open(key)
         now_utc_ns = time.time_ns()
         self._check_place(order, address)
@@ -111,15 +113,15 @@ class CommandDesk:
         _check_time(order, now_utc_ns)
         last = self.counters.last(envelope.key_id)
         if order.counter <= last:
-            raise Refused("replayed", f"its counter {order.counter} is not above {last}, the last of this key")
+            raise Refused("replayed", f"its counter {order.counter} is not above {last}, the last one of this key")
         arguments = parse_arguments(order.verb, bytes(order.arguments))
         kept = self._kept(order.sensor, arguments)
         if not self._taken.passes(time.monotonic()):
-            raise Refused("too many", "too many commands, wait a few seconds")
+            raise Refused("too many", "too many commands; wait a few seconds and send it again")
         try:
             self.counters.take(envelope.key_id, order.counter)
         except OSError as error:
-            raise Refused("not kept", f"its counter cannot be kept: {error.strerror}") from None
+            raise Refused("not kept", f"the gateway cannot write its counter: {error.strerror}") from None
         return Command(
             sensor=order.sensor,
             verb=order.verb,
@@ -133,19 +135,22 @@ class CommandDesk:
 
     def _check_place(self, order: Order, address: str) -> None:
         if order.gateway != self._gateway:
-            raise Refused("other gateway", f"it is for {order.gateway!r}, this is {self._gateway}")
+            raise Refused("other gateway", f"it is for {order.gateway!r}, but this gateway is {self._gateway!r}")
         if f"{order.sensor}/command/{order.verb}" != address:
-            raise Refused("malformed", f"{order.verb} of {order.sensor!r} was sent to {address}")
+            raise Refused("malformed", f"{order.verb} for {order.sensor!r} was sent to {address}")
         if order.sensor not in self._sensors:
             known = ", ".join(sorted(self._sensors))
-            raise Refused("no such sensor", f"there is no sensor {order.sensor!r}; there are {known}")
+            raise Refused("no such sensor", f"there is no sensor {order.sensor!r}; the sensors are {known}")
 
     def _check_right(self, order: Order, rights: CommandKey) -> None:
         if not rights.may(order.verb, order.sensor):
-            raise Refused("no right", f"key {rights.id} has no right to {order.verb} {order.sensor}")
+            raise Refused("no right", f"key {rights.id} has no right to send {order.verb} to {order.sensor}")
 
     def _kept(self, sensor: str, arguments: Arguments) -> str:
-        """The calibration that a rollback names, as JSON. Raises Refused where the store has not what is named."""
+        """The calibration that a rollback names, as JSON; "" for other commands.
+
+        Raises Refused where the store does not have the calibration or estimate that the command names.
+        """
         if not isinstance(arguments, (Accept, Rollback)):
             return ""
         what = "calibration" if isinstance(arguments, Rollback) else "estimate"
@@ -155,7 +160,7 @@ class CommandDesk:
         except StoreError as error:
             raise Refused("not kept", str(error)) from None
         if not found or found[0].sequence != arguments.sequence:
-            raise Refused("out of limits", f"{sensor} has no {what} with the number {arguments.sequence}")
+            raise Refused("out of limits", f"{sensor} has no {what} with the sequence number {arguments.sequence}")
         return found[0].payload.decode() if what == "calibration" else ""
 
     def _refuse(self, address: str, data: bytes, refused: Refused) -> None:
@@ -164,7 +169,7 @@ class CommandDesk:
         if not CHUNK.fullmatch(sensor) or verb not in VERBS or not self._recorded.passes(time.monotonic()):
             self._unrecorded += 1
             return
-        others = f" (and {self._unrecorded} more refused before, not recorded)" if self._unrecorded else ""
+        others = f" ({self._unrecorded} more were refused before this one and not recorded)" if self._unrecorded else ""
         self._unrecorded = 0
         self._put(
             Command(
@@ -184,13 +189,15 @@ def _check_time(order: Order, now_utc_ns: int) -> None:
         raise Refused("expired", f"it expired {-left_s:.0f} s ago by this gateway's clock")
     if left_s > LONGEST_VALIDITY_S + CLOCK_TOLERANCE_S:
         raise Refused(
-            "expired", f"it is good for {left_s:.0f} s by this gateway's clock, {LONGEST_VALIDITY_S:g} at most"
+            "expired",
+            f"it is valid for {left_s:.0f} s by this gateway's clock; at most {LONGEST_VALIDITY_S:g} s are allowed",
         )
 
     ahead_s = (order.counter - now_utc_ns) * 1e-9
-    if ahead_s > CLOCK_TOLERANCE_S:  # taken, it would shut its own key out until then
+    if ahead_s > CLOCK_TOLERANCE_S:  # if accepted, no command of this key would be accepted until that time
         raise Refused(
-            "expired", f"its counter, the time of signing, lies {ahead_s:.0f} s ahead of this gateway's clock"
+            "expired",
+            f"its counter (time of signing) is {ahead_s:.0f} s ahead of this gateway's clock",
         )
 
 

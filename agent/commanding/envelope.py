@@ -1,10 +1,10 @@
-"""A command as bytes: a line with the key's name and the signature, then what was signed.
+"""A command as bytes: a line with the key's identifier and the signature, then the signed body.
 
     fieldcal-command-1 <key id> <Ed25519 signature, base64>\\n<body>
 
-Signed are `fieldcal-command-1 <key id>\\n<body>`. The body is one JSON object in UTF-8. Nothing of it is read before
-the signature holds, so that only who has a key reaches a parser; and since the bytes themselves are signed, no second
-spelling of the same command is one.
+The signed bytes are `fieldcal-command-1 <key id>\\n<body>`. The body is one JSON object in UTF-8. It is parsed only
+after its signature is verified, so that only the owner of a key can reach the parser. Since the bytes themselves are
+signed, the same command with other spacing or order of fields is not valid.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey,
 from agent.commanding.arguments import Arguments, Verb
 from agent.commanding.refusal import Refused
 
-LARGEST = 4096  # bytes; the longest pose has 400
+LARGEST = 4096  # bytes of a command; the longest pose takes 400
 _MARK = b"fieldcal-command-1"
 _HEAD = re.compile(_MARK + rb" ([A-Za-z0-9][A-Za-z0-9_.-]{0,62}) ([A-Za-z0-9+/]{86}==)\n")
 Int64 = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 
 
 class Order(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What is signed. `gateway` is `<site>/<gateway>`; `counter` the sender's UTC in ns, above all before."""
+    """The signed content. `gateway`: `<site>/<gateway>`; `counter`: the sender's UTC in ns, above all earlier ones."""
 
     gateway: str
     sensor: str
@@ -39,7 +39,7 @@ class Order(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
     @staticmethod
     def of(gateway: str, sensor: str, verb: Verb, arguments: Arguments, counter: int, expires_utc_ns: int) -> Order:
-        """An order with these arguments."""
+        """Make an order with these arguments; they are encoded as JSON."""
         raw = msgspec.Raw(msgspec.json.encode(arguments))
         return Order(
             gateway=gateway, sensor=sensor, verb=verb, arguments=raw, counter=counter, expires_utc_ns=expires_utc_ns
@@ -48,18 +48,18 @@ class Order(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
 @dataclass(frozen=True, slots=True)
 class Envelope:
-    """The bytes taken apart; nothing in it is proven yet."""
+    """The parts of the bytes of a command. The signature is not verified yet."""
 
     key_id: str
     signature: bytes
     body: bytes
 
     def open(self, key: Ed25519PublicKey) -> Order:
-        """What was signed with `key`. Raises Refused."""
+        """Verify the signature with `key` and return the signed order. Raises Refused."""
         try:
             key.verify(self.signature, _signed(self.key_id, self.body))
         except InvalidSignature:
-            raise Refused("bad signature", f"the signature is not that of key {self.key_id}") from None
+            raise Refused("bad signature", f"the signature was not made with key {self.key_id}") from None
         try:
             return msgspec.json.decode(self.body, type=Order)
         except (msgspec.DecodeError, ValueError, RecursionError) as error:
@@ -67,19 +67,19 @@ class Envelope:
 
 
 def seal(order: Order, key_id: str, key: Ed25519PrivateKey) -> bytes:
-    """The bytes to send."""
+    """Sign an order; returns the bytes to send."""
     body = msgspec.json.encode(order)
     signature = b64encode(key.sign(_signed(key_id, body)))
     return b" ".join([_MARK, key_id.encode(), signature]) + b"\n" + body
 
 
 def parse_envelope(data: bytes) -> Envelope:
-    """Take the bytes apart without trusting them. Raises Refused."""
+    """Split the bytes of a command into their parts, without verifying the signature. Raises Refused."""
     if len(data) > LARGEST:
-        raise Refused("too large", f"{len(data)} bytes, more than {LARGEST}")
+        raise Refused("too large", f"{len(data)} bytes, more than the limit of {LARGEST}")
     head = _HEAD.match(data)
     if head is None:
-        raise Refused("unsigned", "does not begin with a key's name and a signature")
+        raise Refused("unsigned", "it does not begin with a key identifier and a signature")
     return Envelope(head[1].decode(), b64decode(head[2]), data[head.end() :])
 
 

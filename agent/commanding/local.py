@@ -1,7 +1,7 @@
-"""Commands on the gateway itself, through a socket in the data directory: the same bytes, the same checks.
+"""Commands sent on the gateway itself, through a socket in the data directory: same bytes and checks as over Zenoh.
 
-Who connects is told the gateway's `<site>/<gateway>` in a line, sends `<sensor>/command/<verb>` in a line and the
-command's bytes, shuts its side, and is answered in JSON.
+The agent sends `<site>/<gateway>` in a line. The sender then sends `<sensor>/command/<verb>` in a line and the bytes of
+the command, and shuts down its sending side. The agent answers in JSON.
 """
 
 from __future__ import annotations
@@ -19,19 +19,21 @@ from agent.commanding.desk import CommandDesk
 from agent.commanding.envelope import LARGEST
 
 SOCKET_NAME = "commands.sock"
-ANSWER_S = 5.0  # the agent answers within one fsync
-SENDER_S = 2.0  # who has not said all by then is not heard
-LINE_MAX = 256  # bytes; two names of 63 and what is between
+ANSWER_S = 5.0  # s; the agent answers after one fsync
+SENDER_S = 2.0  # s in which a sender must have sent the whole command
+LINE_MAX = 256  # bytes; two names of up to 63 and what is between them
 
 
 class LocalDoor:
-    """Listens in a data directory, one command after the other, until closed. Raises OSError where it cannot."""
+    """Listens on a socket in a data directory and serves one command after the other, until closed. Raises OSError."""
 
     def __init__(self, data_dir: Path, gateway: str, desk: CommandDesk) -> None:
         self._gateway = gateway
         self._desk = desk
         self._path = data_dir / SOCKET_NAME
-        self._path.unlink(missing_ok=True)  # of a run that was killed; the store's lock keeps a second one out
+        self._path.unlink(
+            missing_ok=True
+        )  # left by a killed run; no other run can use it: it would hold the store's lock
         self._socket = socket.socket(socket.AF_UNIX)
         with _short(data_dir) as directory:
             self._socket.bind(f"{directory}/{SOCKET_NAME}")
@@ -40,9 +42,9 @@ class LocalDoor:
         threading.Thread(target=self._serve, name="local commands", daemon=True).start()
 
     def close(self) -> None:
-        """Listen no more."""
+        """Stop listening."""
         with suppress(OSError):
-            self._socket.shutdown(socket.SHUT_RDWR)  # closing alone would not wake the thread that waits in accept
+            self._socket.shutdown(socket.SHUT_RDWR)  # close alone would not wake the thread that waits in `accept`
         self._socket.close()
         self._path.unlink(missing_ok=True)
 
@@ -67,7 +69,10 @@ class LocalDoor:
 
 
 class LocalAgent:
-    """The agent that uses a data directory. Raises ConnectionError where there is none that takes commands."""
+    """A connection to the agent that uses a data directory; `gateway` is its `<site>/<gateway>`.
+
+    Raises ConnectionError where no agent accepts commands there.
+    """
 
     def __init__(self, data_dir: Path) -> None:
         self._socket = socket.socket(socket.AF_UNIX)
@@ -82,11 +87,14 @@ class LocalAgent:
                 line += byte
         except OSError as error:
             self._socket.close()
-            raise ConnectionError(f"{data_dir}: no agent takes commands here: {error.strerror or error}") from None
+            raise ConnectionError(
+                f"{data_dir}: no agent takes commands here: {error.strerror or error}; "
+                f"is the agent running, and is commands.enabled set in its configuration?"
+            ) from None
         self.gateway = line.decode(errors="replace").strip()
 
     def send(self, address: str, data: bytes) -> bytes:
-        """Send a command for `address`; the answer. Raises OSError."""
+        """Send a command to `address` (`<sensor>/command/<verb>`) and return the answer. Raises OSError."""
         self._socket.sendall(address.encode() + b"\n" + data)
         self._socket.shutdown(socket.SHUT_WR)
         return _read(self._socket, LARGEST, ANSWER_S)
@@ -100,7 +108,7 @@ class LocalAgent:
 
 @contextmanager
 def _short(directory: Path) -> Iterator[str]:
-    # The address of a socket has 107 bytes, a path may have more.
+    # The address of a socket is limited to 107 bytes; a path may be longer.
     descriptor = os.open(directory, os.O_PATH | os.O_DIRECTORY)
     try:
         yield f"/proc/self/fd/{descriptor}"
@@ -109,7 +117,7 @@ def _short(directory: Path) -> Iterator[str]:
 
 
 def _read(connection: socket.socket, most: int, timeout_s: float) -> bytes:
-    """All up to the end, or `most` bytes, whichever is first. Raises TimeoutError."""
+    """Read to the end, or `most` bytes if more come. Raises TimeoutError after `timeout_s`."""
     end_s = time.monotonic() + timeout_s
     said = b""
     while len(said) < most:

@@ -1,4 +1,4 @@
-"""Commands that come as Zenoh queries on `<gateway>/<sensor>/command/<verb>`."""
+"""Commands that arrive as Zenoh queries on `<gateway>/<sensor>/command/<verb>`."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import zenoh
 
 from agent.commanding.desk import CommandDesk
 
-# Those that wait. A flood pushes the oldest out; it must not hold up what else comes through the session.
+# Commands that may wait. In a flood the oldest are dropped, so that other messages of the session are not delayed.
 WAITING_MAX = 16
 _log = logging.getLogger(__name__)
 _Queryable = zenoh.Queryable[zenoh.Handler[zenoh.Query]]
 
 
 def serve_queries(session: zenoh.Session, gateway: str, desk: CommandDesk, open_things: ExitStack) -> None:
-    """Answer commands below the key `gateway`, in a thread of its own, until `open_things` close."""
+    """Answer commands below the key `gateway` in a thread of their own. Closing `open_things` ends this."""
     queryable = session.declare_queryable(
         f"{gateway}/*/command/*", zenoh.handlers.RingChannel(WAITING_MAX), complete=True
     )
@@ -27,10 +27,10 @@ def serve_queries(session: zenoh.Session, gateway: str, desk: CommandDesk, open_
 
 def _answer(queryable: _Queryable, gateway: str, desk: CommandDesk) -> None:
     for query in queryable:
-        with query:  # a query that stays alive makes the one who asked wait for its whole time
+        with query:  # without closing the query, the sender waits until its timeout
             key = str(query.key_expr)
             if "*" in key:
-                continue  # who asks for results with a wildcard asks here as well, and commands nothing
+                continue  # a query for results with a wildcard arrives here too; it is not a command
             try:
                 payload = query.payload.to_bytes() if query.payload is not None else b""
                 answer = desk.receive(key.removeprefix(gateway + "/"), payload)

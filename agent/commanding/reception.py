@@ -1,4 +1,4 @@
-"""All ways by which commands reach an agent, with the desk behind them."""
+"""All ways by which commands reach an agent: the local socket and Zenoh, both leading to the CommandDesk."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ _log = logging.getLogger(__name__)
 
 
 class Reception:
-    """Open from the start; `put` is told of every command, taken or refused. What is wrong is logged and left out."""
+    """Accepts commands from construction to `close`. `put` is called with every command, accepted or refused.
+
+    Where the local socket cannot be opened a warning is logged, and commands come over Zenoh only.
+    """
 
     def __init__(self, config: Config, data_dir: Path, store: Path, put: Callable[[Command], None]) -> None:
         gateway = config.gateway
@@ -30,20 +33,20 @@ class Reception:
         self.desk = CommandDesk(name, sensors, config.commands, data_dir, store, put)
         if self.desk.counters.set_aside:
             _log.warning(
-                "the counters of commands were unreadable and are kept as %s; commands signed before now are refused",
+                "the file of command counters was unreadable and is kept as %s; commands signed before now are refused",
                 self.desk.counters.set_aside,
             )
         self._open = ExitStack()
         try:
             self._open.enter_context(LocalDoor(data_dir, name, self.desk))
         except OSError as error:
-            _log.warning("no commands on the gateway itself: %s", error)
+            _log.warning("commands cannot be sent on the gateway itself, its socket cannot be opened: %s", error)
 
     def serve(self, session: zenoh.Session, open_things: ExitStack) -> None:
-        """Take commands from a session as well, until `open_things` close."""
+        """Accept commands from a Zenoh session too. Closing `open_things` ends this."""
         serve_queries(session, self._key, self.desk, open_things)
 
     def close(self) -> None:
-        """Take no more, whichever way it comes."""
+        """Accept no more commands."""
         self.desk.close()
         self._open.close()

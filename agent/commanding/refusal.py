@@ -1,4 +1,4 @@
-"""Why a command is refused: a kind, which is counted, and the words for whoever sent it."""
+"""The refusal of a command: a kind, which is counted, and a reason for the sender."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ Kind = Literal[
 ]  # fmt: skip
 
 
-class Refused(Exception):  # noqa: N818 - an answer, no error of the program
-    """A command that is not taken. `str` says why, with the numbers."""
+class Refused(Exception):  # noqa: N818 - an answer to the sender, not an error of the program
+    """A command is refused. `str` gives the reason with its values."""
 
     def __init__(self, kind: Kind, reason: str) -> None:
         super().__init__(reason)

@@ -1,6 +1,6 @@
-"""A small certificate authority: who may connect to the router, and under which name.
+"""A small certificate authority. Its certificates decide who may connect to the router, and under which name.
 
-The router knows everyone by the common name of their certificate: its access control is written in those names.
+The router's access rules use the common name of the certificate that a gateway, consumer or commander shows.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-# A certificate is good from a day before it was made: the clock of a gateway that just woke up may be behind.
+# A certificate is valid from one day before it was made, since a gateway's clock may be slow just after a start.
 BEFORE = timedelta(days=1)
 LONGEST_NAME = 64  # characters of a common name, by X.520
 
@@ -40,7 +40,7 @@ class Credential:
 
 
 def make_authority(name: str, days: int, now: datetime) -> Credential:
-    """An authority of one's own: it signs certificates of ends, no other authority."""
+    """Make an authority named `name`, valid for `days` days from `now`. It cannot certify other authorities."""
     key = ec.generate_private_key(ec.SECP256R1())
     builder = (
         _builder(name, _common_name(name), days, now, key)
@@ -51,7 +51,10 @@ def make_authority(name: str, days: int, now: datetime) -> Credential:
 
 
 def issue(authority: Credential, name: str, days: int, now: datetime, hosts: Sequence[str] = ()) -> Credential:
-    """A certificate with the common name `name`; with `hosts` (names and addresses) it may serve at these as well."""
+    """Issue a certificate with the common name `name`, valid for `days` days from `now`.
+
+    With `hosts` (host names and IP addresses) it is also a server certificate for these hosts.
+    """
     key = ec.generate_private_key(ec.SECP256R1())
     purposes = [ExtendedKeyUsageOID.CLIENT_AUTH, *([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])]
     builder = (

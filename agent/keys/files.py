@@ -1,4 +1,4 @@
-"""Files that hold keys: private ones are their owner's alone, and none is ever written over."""
+"""Key files: only the owner may read a private key, and an existing file is never overwritten."""
 
 from __future__ import annotations
 
@@ -21,30 +21,36 @@ _NAMED = "fieldcal command key "
 
 
 class KeyFileError(Exception):
-    """A file of a key that cannot be read or written. The message names it."""
+    """A key file cannot be read or written. The message names the file."""
 
 
 @dataclass(frozen=True, slots=True)
 class SigningKey:
-    """An operator's private key with the name by which gateways know it."""
+    """An operator's private key with its identifier, which gateways have in their configuration."""
 
     key_id: str
     key: Ed25519PrivateKey
 
     @property
     def pem(self) -> bytes:
-        """The file: the name in a line before the PEM, as RFC 7468 allows."""
+        """The content of the key file: a line with the identifier before the PEM, as RFC 7468 allows."""
         text = self.key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
         return f"{_NAMED}{self.key_id}\n".encode() + text
 
 
 def write_new(directory: Path, files: Mapping[str, bytes]) -> None:
-    """Write all of them, those named .key for the owner alone. Raises KeyFileError, before any, if one is there."""
+    """Write `files` (name: content) into `directory`; only the owner may read those named `*.key`.
+
+    Raises KeyFileError. Where one of the files exists already, none is written.
+    """
     try:
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)
         for name in files:
             if (directory / name).exists():
-                raise KeyFileError(f"{directory / name} is there already; keys are never written over")
+                raise KeyFileError(
+                    f"{directory / name} exists already, and keys are never overwritten; "
+                    f"use another directory, or move the old file away"
+                )
         for name, content in files.items():
             mode = 0o600 if name.endswith(".key") else 0o644
             descriptor = os.open(directory / name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
@@ -55,11 +61,13 @@ def write_new(directory: Path, files: Mapping[str, bytes]) -> None:
 
 
 def read_signing_key(path: Path) -> SigningKey:
-    """An operator's key from its file. Raises KeyFileError."""
+    """Read an operator's key from its file. Raises KeyFileError."""
     try:
         with open(path, "rb") as file:
             if os.fstat(file.fileno()).st_mode & 0o077:
-                raise KeyFileError(f"{path}: others can read it: chmod 600, and better make a new one")
+                raise KeyFileError(
+                    f"{path}: other users can read this private key; make a new key, or run chmod 600 on this file"
+                )
             text = file.read(LARGEST)
     except OSError as error:
         raise KeyFileError(f"{path}: cannot be read: {error.strerror}") from None

@@ -134,9 +134,13 @@ def test_commands_from_end_to_end(site: SecuredSite) -> None:
                          "--data-dir", data_dir)  # fmt: skip
         assert (local.returncode, local.stderr) == (0, "")
         for arguments, status, said in (
-            (["accept", "--sequence", "5", "--sensor", "mems"], 3, "refused: key anna has no right to accept mems\n"),
+            (
+                ["accept", "--sequence", "5", "--sensor", "mems"],
+                3,
+                "refused: key anna has no right to send accept to mems\n",
+            ),
             (["rollback", "--sequence", "5", "--sensor", "mems"], 3, "refused: mems has no calibration with the"),
-            (["hold", "--sensor", "other"], 3, "refused: there is no sensor 'other'; there are mems\n"),
+            (["hold", "--sensor", "other"], 3, "refused: there is no sensor 'other'; the sensors are mems\n"),
             (["pose", "--theta-deg", "100", "--alpha-deg", "0", "--sensor", "mems"], 2, "theta_deg"),
         ):
             found, words = command_line(*arguments, *signing, *over)

@@ -174,7 +174,7 @@ def test_a_counter_that_cannot_be_kept_refuses_the_command(site: DeskSite) -> No
 def test_a_desk_that_is_closed_takes_nothing_and_costs_no_counter(site: DeskSite) -> None:
     data = sealed()
     site.desk.close()
-    assert site.send(data).reason == "the agent is ending"
+    assert site.send(data).reason == "the agent is stopping; send the command again after it has started"
     assert (site.events, site.desk.counts()) == ([], {})
     assert not (site.directory / FILE_NAME).exists()
 
@@ -188,7 +188,7 @@ def test_a_flood_is_counted_but_fills_no_recording(site: DeskSite) -> None:
     site.desk._recorded._left = 1.0  # as after ten seconds
     left_out = 1000 - len(site.events)
     site.send(b"junk")
-    assert site.events[-1].refused.endswith(f"(and {left_out} more refused before, not recorded)")
+    assert site.events[-1].refused.endswith(f"({left_out} more were refused before this one and not recorded)")
 
 
 def test_a_script_that_runs_wild_with_a_good_key_is_slowed(site: DeskSite) -> None:

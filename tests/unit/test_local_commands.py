@@ -46,7 +46,7 @@ def test_the_command_line_sends_what_the_desk_takes(site: DeskSite) -> None:
         {"sequence": 101},
     ]
     refused = run(site, "accept", "--sensor", "mems", "--sequence", "101")
-    assert (refused.return_value, refused.stderr) == (3, "refused: key anna has no right to accept mems\n")
+    assert (refused.return_value, refused.stderr) == (3, "refused: key anna has no right to send accept to mems\n")
     elsewhere = run(site, "hold", "--sensor", "mems", "--gateway", "workshop/gateway-2")
     assert (elsewhere.return_value, "it is for 'workshop/gateway-2'" in elsewhere.stderr) == (3, True)
 

@@ -43,7 +43,7 @@ def test_a_command_is_answered_on_its_own_key(site: DeskSite, session: zenoh.Ses
     assert isinstance(again, dict)
     assert not again["taken"]
     (other,) = ask(session, f"{KEY}/mems/command/pose", sealed())
-    assert "hold of 'mems' was sent to mems/command/pose" in str(other)
+    assert "hold for 'mems' was sent to mems/command/pose" in str(other)
     assert [event.verb for event in site.events] == ["hold", "hold", "pose"]
 
 
