@@ -1,1 +1,1 @@
-"""Devices read by threads, and the one loop that feeds the pipeline."""
+"""Acquisition: one thread for each device, and the main loop that feeds the pipeline."""

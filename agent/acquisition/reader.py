@@ -1,4 +1,7 @@
-"""Reader threads: one a device, into one bounded queue. Devices may come and go; nothing is dropped in silence."""
+"""Reader threads, one for each device, which fill one bounded queue.
+
+Devices may be unplugged and plugged in again. All dropped data are reported.
+"""
 
 from __future__ import annotations
 
@@ -14,24 +17,27 @@ from hw.block import BlockFlags, SampleBlock
 from hw.sensor import ConfigurationError, DeviceError, Sensor
 
 BLOCKS_A_SECOND = 2
-QUEUE_S = 30  # the queue holds this much of every device (architecture.md, flow)
-BACK_OFF_S = (0.1, 5.0)  # first and longest pause between attempts to reopen
-CONFIGURATION_BACK_OFF_S = 5.0  # somebody has to change something first; no use in hurrying
+QUEUE_S = 30  # s of blocks of every device that the queue can hold
+BACK_OFF_S = (0.1, 5.0)  # first and longest pause between two attempts to open a device again
+CONFIGURATION_BACK_OFF_S = 5.0  # after a configuration error, which only a person can correct
 
 
 class EventQueue:
-    """Blocks are bounded. When it is full a block is counted as dropped, and the count leaves as a `Gap` before the
-    next event. Other events, a few a second at the most, always enter."""
+    """The queue from the readers to the main loop.
+
+    Only blocks are limited in number. When the queue is full a new block is dropped and counted; `take_gaps` gives the
+    counts as `Gap` events. Other events, at most a few per second, are always accepted.
+    """
 
     def __init__(self, devices: int) -> None:
         self._queue: queue.SimpleQueue[Event] = queue.SimpleQueue()
         self._size = QUEUE_S * BLOCKS_A_SECOND * devices
         self._dropped: dict[str, int] = {}
-        self._flags: dict[str, BlockFlags] = {}  # of dropped blocks, for the next one: it does not go on in time either
+        self._flags: dict[str, BlockFlags] = {}  # of dropped blocks; the next block takes them over
         self._lock = threading.Lock()
 
     def put(self, device: str, event: Event) -> None:
-        """Add an event of the device's own thread, or count it as dropped. Never blocks."""
+        """Add an event, or count a block as dropped. Only the device's own thread may call it. Never blocks."""
         if isinstance(event, SampleBlock):
             flags = self._flags.pop(device, BlockFlags.NONE) | event.flags
             if self._queue.qsize() >= self._size:
@@ -49,7 +55,7 @@ class EventQueue:
 
     @property
     def capacity(self) -> int:
-        """Events with which blocks are dropped."""
+        """Number of waiting events from which new blocks are dropped."""
         return self._size
 
     def get(self, timeout_s: float) -> Event | None:
@@ -60,7 +66,7 @@ class EventQueue:
             return None
 
     def take_gaps(self) -> list[Gap]:
-        """What was dropped since the last call. Cheap when nothing was."""
+        """The blocks dropped since the last call, as one Gap for each device; fast where there is none."""
         if not self._dropped:
             return []
         with self._lock:
@@ -73,7 +79,7 @@ class EventQueue:
 
 
 class Reader(threading.Thread):
-    """Opens a device, reads it until told to stop, reopens it with back-off when it is lost."""
+    """Opens a device and reads it until `stop`. Where the device is lost it opens it again, with growing pauses."""
 
     def __init__(self, name: str, sensor: Sensor, events: EventQueue) -> None:
         super().__init__(name=f"reader-{name}", daemon=True)
@@ -82,14 +88,14 @@ class Reader(threading.Thread):
         self._events = events
         self._stop_request = threading.Event()
         self._said = ""
-        self._attempt = 0  # since the last block
+        self._attempt = 0  # attempts to open the device since the last block
 
     def stop(self) -> None:
-        """Ask the thread to end; it does within one block."""
+        """Ask the thread to end. It ends within the time of one block."""
         self._stop_request.set()
 
     def run(self) -> None:
-        """Read until stopped. An error of a driver never ends the thread."""
+        """Read until `stop`. An exception in a driver is reported and does not end the thread."""
         while not self._stop_request.is_set():
             least_pause_s = 0.0
             try:
@@ -129,7 +135,7 @@ class Reader(threading.Thread):
                 self._events.put(self.device, block)
 
     def _report_lost(self, message: str) -> None:
-        # The same words every few seconds for a month would fill the recording; they are said when they change.
+        # Only a new message is reported: the same one every few seconds for a month would fill the recording.
         if message != self._said:
             self._report("lost", message, "")
             self._said = message

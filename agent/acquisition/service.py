@@ -1,4 +1,4 @@
-"""The agent at work: readers -> one queue -> pipeline -> recording -> store -> network. One loop, one order."""
+"""One run of the agent: readers -> queue -> pipeline -> recording -> store -> network, driven by one main loop."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ from hw.sensor import Sensor, boot_id, load_driver
 _log = logging.getLogger(__name__)
 
 TICK_S = 1.0
-POLL_S = 0.2  # how soon a signal is seen when no device speaks
-READER_STOP_S = 0.7  # a reader ends within one block; one that hangs in a driver is left behind
+POLL_S = 0.2  # s after which a stop signal is noticed where no event comes
+READER_STOP_S = 0.7  # s to wait for readers at the end; a reader ends within one block unless it hangs in its driver
 
 
 class Service:
-    """One run. `stop` may be called from a signal handler; `run` returns when all files are closed."""
+    """One run of the agent. `stop` may be called from a signal handler; `run` returns after all files are closed."""
 
     def __init__(self, config: Config, data_dir: Path, watch: Watch) -> None:
         self._config = config
@@ -59,10 +59,11 @@ class Service:
         self._stop_request.set()
 
     def run(self, duration_s: float | None) -> bool:
-        """Read, calibrate, record and publish until stopped or `duration_s` is over.
+        """Read, calibrate, record and publish until `stop` is called or `duration_s` seconds have passed.
 
-        Returns whether all threads have ended; where a frozen router or disk holds one, end the process by `os._exit`.
-        Raises StoreError or OSError where the data directory cannot be used at all, KeyFileError for a bad signing key.
+        Returns whether all threads have ended. Where it returns False, a router or disk that does not respond blocks
+        one of them, and the caller must end the process with `os._exit`.
+        Raises StoreError or OSError where the data directory cannot be used, KeyFileError for an unusable signing key.
         """
         self._data_dir.mkdir(parents=True, exist_ok=True)
         config = self._config
@@ -70,9 +71,12 @@ class Service:
         recall = partial(memories_of, restore=Pipeline.restore)
         self._store = Store(self._data_dir, keep=keep_results(config.results), recall=recall)
         if self._store.set_aside:
-            _log.warning("the state file was corrupt and is kept as %s", self._store.set_aside)
+            _log.warning(
+                "the state file was corrupt and is kept as %s; a new one is made from the recordings",
+                self._store.set_aside,
+            )
         if (found := self._store.recovered).results or found.memories:
-            lacked = "%d results that the state file lacked were found in the recordings, and the state of %d devices"
+            lacked = "%d results and the states of %d devices that the state file lacked were found in the recordings"
             _log.warning(lacked, found.results, found.memories)
         self._recorder = Recorder(
             self._data_dir,
@@ -146,7 +150,10 @@ class Service:
         )
 
     def _kept(self) -> dict[str, dict[str, bytes]]:
-        """What runs before left of every device, by sensor. What cannot be read is said and left."""
+        """The states of the estimation that earlier runs left, by sensor and by identity of the device.
+
+        Where the store cannot be read a warning is logged, and there are none.
+        """
         kept: dict[str, dict[str, bytes]] = {}
         try:
             with History(self._store.path) as history:
@@ -154,7 +161,7 @@ class Service:
                     memories = history.memories(channel.sensor)
                     kept[channel.sensor] = {identity: memory.state for identity, memory in memories.items()}
         except StoreError as error:
-            _log.warning("the calibration in force cannot be restored: %s", error)
+            _log.warning("the calibrations in force cannot be restored, and the run begins without them: %s", error)
         return kept
 
     def _run_start(self, *, continuation: bool) -> RunStart:
@@ -209,15 +216,19 @@ class Service:
     def _deliver(
         self, event_sequence: int, results: Sequence[Result], recorded: bool, memories: Sequence[Memory]
     ) -> None:
-        """In the recording's thread, when the disk has the results: store, then network."""
+        """Put results into the store, then give them to the publisher. The recording's thread calls this."""
         path = self._recorder.path if recorded else None
         records = [Record.of(r, recorded=recorded, recording=final_name(path) if path else "") for r in results]
         try:
             self._store.commit(records, memories)
         except StoreError as error:
-            _log.error("the store cannot keep results up to event %d: %s", event_sequence, error)
+            _log.error(
+                "the store cannot write the results up to event %d, and tries again with the next: %s",
+                event_sequence,
+                error,
+            )
         if self._publisher is None:
-            self._store.mark_published(records[-1].sequence)  # nobody waits for them
+            self._store.mark_published(records[-1].sequence)  # publication is off: no result waits for it
             return
         for record in records:
             self._publisher.publish(record)

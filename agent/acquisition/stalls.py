@@ -1,4 +1,4 @@
-"""What would hold all threads up while devices measure, done before: the FIFO of an ADXL355 at 1 kHz holds 32 ms."""
+"""Avoids stalls of all threads while devices measure: the FIFO of an ADXL355 at 1 kHz holds only 32 ms of samples."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import numpy.fft
-import numpy.ma  # noqa: F401 - numpy loads both at their first use, which would be in the first window
+import numpy.ma  # noqa: F401 - else numpy loads both at their first use, in the first window
 
 
 @contextmanager
 def few_objects() -> Iterator[None]:
-    """Within, the garbage collector leaves alone what was made before.
+    """Within this context, the garbage collector ignores the objects that existed before.
 
-    It looks at all objects each time a quarter of them is new, in one go: 60,000 of them, most of them modules, take
-    10 to 30 ms, what a run makes 0.2 ms.
+    The collector examines all objects without a pause each time a quarter of them is new. The 60,000 objects of the
+    loaded modules take 10 to 30 ms; the objects that a run makes take 0.2 ms.
     """
     gc.collect()
     gc.freeze()

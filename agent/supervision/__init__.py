@@ -1,1 +1,1 @@
-"""How the agent tells others that it is well: systemd, the gateway's status, Prometheus, the log."""
+"""Reports how the agent is working: to systemd, in the gateway's status, to Prometheus and in the log."""

@@ -1,4 +1,4 @@
-"""What is known of one device's way into the agent: rate, losses, lag, clock, temperature."""
+"""The health of one device: rate, lost samples, lag, clock and temperature."""
 
 from __future__ import annotations
 
@@ -12,30 +12,30 @@ from agent.core.events import DeviceChange, Gap
 from calib.signal.timing import ClockModel
 from hw.block import BlockFlags, SampleBlock
 
-RATE_OVER_BLOCKS = 20  # ten seconds of most devices: what a person calls "now"
-CLOCK_FROM_BURSTS = 20  # before, the model gives the nominal rate back (calib.signal.timing)
+RATE_OVER_BLOCKS = 20  # blocks for the present rate; ten seconds of most devices
+CLOCK_FROM_BURSTS = 20  # with fewer bursts, the clock model only returns the nominal rate (calib.signal.timing)
 
 
 class ClockQuality(msgspec.Struct, frozen=True, kw_only=True):
-    """The device's clock against the gateway's, over the last minute."""
+    """The device's clock compared with the gateway's, over the last minute."""
 
     rate_hz: float
     u_rate_hz: float  # standard uncertainty
-    residual_sd_s: float  # of the bursts' arrivals about the model: polling, transport and stalls
+    residual_sd_s: float  # standard deviation of the bursts' arrivals about the model: polling, transport and stalls
 
 
 class DeviceHealth(msgspec.Struct, frozen=True, kw_only=True):
-    """One device since the run began. Counts only grow; what is not known is null."""
+    """One device since the run began. Counts never decrease; unknown values are null."""
 
     state: Literal["opening", "open", "lost"]
-    message: str  # who it is, or why it is lost
+    message: str  # kind and serial number, or why the device is lost
     samples: int
     blocks: int
-    gaps: int  # times that samples were missing
-    missing: int  # samples that are known to be missing there
+    gaps: int  # number of gaps in the samples
+    missing: int  # samples known to be missing in these gaps
     overruns: int
     saturated: int  # blocks with an indication at the end of the range
-    dropped: dict[str, int]  # by unit: what was read and could not be used
+    dropped: dict[str, int]  # by unit (lines, blocks, ...): the amount that was read but could not be used
     losses: int  # times the device was lost
     nominal_rate_hz: float | None
     rate_hz: float | None
@@ -45,7 +45,7 @@ class DeviceHealth(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class DeviceWatch:
-    """Follows one device by the events of the run. Only `health` costs more than a few microseconds."""
+    """Collects the health of one device from the events of the run. Only `health` takes more than some microseconds."""
 
     def __init__(self) -> None:
         self._state: Literal["opening", "open", "lost"] = "opening"
@@ -63,18 +63,18 @@ class DeviceWatch:
 
     @property
     def tried(self) -> bool:
-        """Whether the device was opened, or has said why it cannot be."""
+        """Whether the device was opened, or the attempt failed and gave a reason."""
         return self._state != "opening"
 
     def fault(self, now_ns: int, silent_s: float) -> str:
-        """Why the device is not well, without numbers that change; "" where it is."""
+        """The device's fault, without numbers that change with time; "" where it has none."""
         if self._state != "open":
             return f"is lost: {self._message}" if self._state == "lost" else "is not open yet"
         newest_ns = self._newest[-1][1] if self._newest else self._opened_ns
         return f"is silent for more than {silent_s:g} s" if now_ns - newest_ns > silent_s * 1e9 else ""
 
     def on_block(self, block: SampleBlock) -> None:
-        """A block went through the pipeline."""
+        """Take a block that the pipeline has processed."""
         restarts = bool(block.flags & BlockFlags.RESTART) or self._clock is None
         self._blocks += 1
         self._samples += block.n
@@ -98,7 +98,7 @@ class DeviceWatch:
             self._temperature_degc = block.temperature_degc
 
     def on_change(self, change: DeviceChange) -> None:
-        """The device was opened or lost."""
+        """Take a DeviceChange: the device was opened or lost."""
         self._losses += change.state == "lost"
         self._state, self._message = change.state, change.message
         self._opened_ns = change.t_monotonic_ns
@@ -106,11 +106,11 @@ class DeviceWatch:
         self._clock = None
 
     def on_gap(self, gap: Gap) -> None:
-        """Something was dropped on the way."""
+        """Take a Gap: data of the device were dropped."""
         self._dropped[gap.unit] = self._dropped.get(gap.unit, 0) + gap.dropped
 
     def health(self, now_ns: int) -> DeviceHealth:
-        """As it is at `now_ns` (CLOCK_MONOTONIC); fits the clock, some milliseconds."""
+        """The health at `now_ns` (CLOCK_MONOTONIC). Takes some milliseconds, since the clock model is fitted."""
         return DeviceHealth(
             state=self._state,
             message=self._message,
@@ -144,5 +144,5 @@ class DeviceWatch:
         except np.linalg.LinAlgError:
             return None
         if not np.isfinite(figures).all():
-            return None  # of a count that jumps at will no arrivals make a clock
+            return None  # sample counts that jump at random do not give a clock
         return ClockQuality(rate_hz=figures[0], u_rate_hz=figures[1], residual_sd_s=figures[2])

@@ -1,7 +1,7 @@
-"""The gateway's status: what its devices, queues, disk and network do, and whether that is well.
+"""The gateway's status: the state of its devices, queues, disk and network, and whether any of them has a fault.
 
-It is about this process and this minute, so it is neither a result nor recorded: a replay could not make it again, and
-the recording holds what it is made of (blocks, gaps, device changes, ticks).
+The status describes this process at this moment. It is not a result and is not recorded: a replay could not compute it
+again (memory, queues, disk), and the recording has the events that it follows from.
 """
 
 from __future__ import annotations
@@ -16,8 +16,10 @@ from agent.core.events import CalibrationUpdate, DeviceChange, Event, Gap, Resul
 from agent.supervision.devices import DeviceHealth, DeviceWatch
 from hw.block import SampleBlock
 
-SILENT_S = 5.0  # of an open device: ten blocks of most; the default after which a sensor's status is INVALID, too
-BEHIND = 0.5  # of a queue's capacity: it was never above a tenth on a machine that keeps up
+# s without samples after which an open device is reported; ten blocks of most devices. By default a sensor's status
+# becomes INVALID after the same time.
+SILENT_S = 5.0
+BEHIND = 0.5  # fraction of a queue's capacity from which it is reported; a machine that keeps up stays below 0.1
 
 State = Literal["starting", "running", "degraded", "stopping"]
 
@@ -39,7 +41,7 @@ class RecordingHealth(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PublicationHealth(msgspec.Struct, frozen=True, kw_only=True):
-    """The way out. `unpublished` results wait in the store; null where it cannot be read."""
+    """The publication. `unpublished`: results that wait in the store; null where the store cannot be read."""
 
     enabled: bool
     connected: bool
@@ -48,7 +50,7 @@ class PublicationHealth(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ProcessHealth(msgspec.Struct, frozen=True, kw_only=True):
-    """This process."""
+    """Resources that this process uses."""
 
     rss_bytes: int
     threads: int
@@ -57,7 +59,7 @@ class ProcessHealth(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Situation(msgspec.Struct, frozen=True, kw_only=True):
-    """What is measured at one moment, and does not follow from the events."""
+    """What is measured at one moment, apart from what follows from the events."""
 
     queues: dict[str, Queue]
     recording: RecordingHealth
@@ -77,7 +79,7 @@ class SensorHealth(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class GatewayStatus(Situation, frozen=True, kw_only=True):
-    """What is published at `<gateway>/status`. `reasons`: why it is degraded."""
+    """The content of `<gateway>/status`. `reasons`: why `state` is degraded."""
 
     site: str
     gateway: str
@@ -92,7 +94,7 @@ class GatewayStatus(Situation, frozen=True, kw_only=True):
 
     @property
     def line(self) -> str:
-        """In one line, for people."""
+        """The status in one line of text."""
         if self.reasons:
             return f"{self.state}: {'; '.join(self.reasons)}"
         rates = ", ".join(f"{n} {d.rate_hz:.1f} Hz" for n, d in self.devices.items() if d.rate_hz is not None)
@@ -101,7 +103,7 @@ class GatewayStatus(Situation, frozen=True, kw_only=True):
 
 
 class Health:
-    """Follows the events and results of a run. Not thread-safe: it is the main loop's."""
+    """Collects the status from the events and results of a run. Not thread-safe: only the main loop may call it."""
 
     def __init__(self, config: Config, version: str, run_id: str, origin_ns: int) -> None:
         self._config = config
@@ -114,11 +116,11 @@ class Health:
 
     @property
     def started(self) -> bool:
-        """Whether every device was opened, or has said why it cannot be."""
+        """Whether every device was opened, or the attempt failed and gave a reason."""
         return all(device.tried for device in self._devices.values())
 
     def update(self, event: Event, results: Sequence[Result]) -> None:
-        """An event went through the pipeline, and what came of it."""
+        """Take an event that the pipeline has processed, with its results."""
         if isinstance(event, SampleBlock):
             self._devices[event.device].on_block(event)
         elif isinstance(event, DeviceChange):
@@ -129,7 +131,7 @@ class Health:
             self._take(result)
 
     def state(self, now_ns: int, situation: Situation, faults: Sequence[str]) -> tuple[State, list[str]]:
-        """How it is at `now_ns` (CLOCK_MONOTONIC), and why; `faults` are the supervision's own. Cheap."""
+        """The state at `now_ns` (CLOCK_MONOTONIC) and its reasons, which include `faults`. Takes microseconds."""
         reasons = [
             f"{name} {fault}" for name, device in self._devices.items() if (fault := device.fault(now_ns, SILENT_S))
         ]
@@ -137,7 +139,7 @@ class Health:
         return ("degraded" if reasons else "running") if self.started else "starting", reasons
 
     def status(self, now_ns: int, utc_ns: int, situation: Situation, state: State, reasons: list[str]) -> GatewayStatus:
-        """All of it at `now_ns` (CLOCK_MONOTONIC). Costs some milliseconds a device."""
+        """The whole status at `now_ns` (CLOCK_MONOTONIC). Takes some milliseconds for each device."""
         return GatewayStatus(
             site=self._config.gateway.site,
             gateway=self._config.gateway.name,
@@ -164,7 +166,7 @@ class Health:
         self._sensors[result.sensor] = sensor
 
     def _troubles(self, now: Situation) -> list[str]:
-        """Without numbers that change, so that a trouble that goes on is the same words."""
+        """The faults of the situation. Their text has no changing numbers, so that a lasting fault keeps its text."""
         least, publication = int(self._config.supervision.least_disk_free), now.publication
         behind = [name for name, queue in now.queues.items() if queue.waiting > BEHIND * queue.capacity]
         told = {

@@ -1,4 +1,4 @@
-"""The gateway's status for Prometheus, at `/metrics`. prometheus_client loads only where it is turned on."""
+"""The gateway's status for Prometheus, at `/metrics`. prometheus_client is loaded only where metrics are enabled."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ if TYPE_CHECKING:
 CALIBRATION_STATES = ("UNCALIBRATED", "COLLECTING", "VALID", "HELD", "RECALIBRATING", "INVALID")
 
 Number = float | int | bool | None
-Values = Iterable[tuple[tuple[str, ...], Number]]  # by the values of the labels
-# name without prefix: (what it is, whether it only grows, where it stands)
+Values = Iterable[tuple[tuple[str, ...], Number]]  # (values of the labels, value)
+# name without prefix: (help text, whether it is a counter, where the value comes from)
 DEVICE_METRICS: dict[str, tuple[str, bool, Callable[[DeviceHealth], Number]]] = {
     "up": ("Whether the device is open", False, lambda d: d.state == "open"),
     "samples": ("Samples that went through the pipeline", True, lambda d: d.samples),
     "blocks": ("Blocks that went through the pipeline", True, lambda d: d.blocks),
-    "gaps": ("Times that samples were missing", True, lambda d: d.gaps),
+    "gaps": ("Number of gaps in the samples", True, lambda d: d.gaps),
     "missing_samples": ("Samples known to be missing in the gaps", True, lambda d: d.missing),
     "overruns": ("Blocks before which the device lost samples", True, lambda d: d.overruns),
     "saturated_blocks": ("Blocks with an indication at the end of the range", True, lambda d: d.saturated),
-    "losses": ("Times that the device was lost", True, lambda d: d.losses),
-    "sample_rate_hertz": ("Rate at which samples came over the last blocks", False, lambda d: d.rate_hz),
+    "losses": ("Number of times that the device was lost", True, lambda d: d.losses),
+    "sample_rate_hertz": ("Sample rate over the last blocks", False, lambda d: d.rate_hz),
     "nominal_sample_rate_hertz": ("Rate that the device was set to", False, lambda d: d.nominal_rate_hz),
     "lag_seconds": ("Age of the newest sample", False, lambda d: d.lag_s),
-    "temperature_celsius": ("The device's own temperature", False, lambda d: d.temperature_degc),
+    "temperature_celsius": ("Temperature that the device measures in itself", False, lambda d: d.temperature_degc),
 }
 CLOCK_METRICS: dict[str, tuple[str, Callable[[ClockQuality], float]]] = {
     "rate_hertz": ("The device's rate by the gateway's clock", lambda c: c.rate_hz),
@@ -37,18 +37,18 @@ CLOCK_METRICS: dict[str, tuple[str, Callable[[ClockQuality], float]]] = {
 }
 GATEWAY_METRICS: dict[str, tuple[str, bool, Callable[[GatewayStatus], Number]]] = {
     "uptime_seconds": ("Time since the run began", False, lambda s: s.uptime_s),
-    "status_timestamp_seconds": ("UTC of the report these figures are from", False, lambda s: s.t_utc_ns * 1e-9),
-    "recording_active": ("Whether raw data reach a file", False, lambda s: s.recording.active),
+    "status_timestamp_seconds": ("UTC of the status that these figures are from", False, lambda s: s.t_utc_ns * 1e-9),
+    "recording_active": ("Whether raw data are being recorded", False, lambda s: s.recording.active),
     "recording_file_bytes": ("Size of the file being written", False, lambda s: s.recording.size_bytes),
-    "disk_free_bytes": ("Free on the disk of the data", False, lambda s: s.disk_free_bytes),
-    "publication_connected": ("Whether a Zenoh router is there", False, lambda s: s.publication.connected),
-    "unpublished_results": ("Results that wait in the store", False, lambda s: s.publication.unpublished),
+    "disk_free_bytes": ("Free bytes on the disk of the data directory", False, lambda s: s.disk_free_bytes),
+    "publication_connected": ("Whether a Zenoh router is connected", False, lambda s: s.publication.connected),
+    "unpublished_results": ("Stored results that are not published yet", False, lambda s: s.publication.unpublished),
     "threads": ("Threads of the agent", False, lambda s: s.process.threads if s.process else None),
 }
 
 
 class StatusCollector:
-    """Turns the newest status into metrics whenever somebody scrapes. `newest` is called in the server's thread."""
+    """Converts the newest status to metrics at each scrape. `newest` is called in the server's thread."""
 
     def __init__(self, newest: Callable[[], GatewayStatus | None]) -> None:
         self._newest = newest
@@ -66,12 +66,12 @@ class StatusCollector:
         from prometheus_client.metrics_core import GaugeMetricFamily, InfoMetricFamily
 
         who = {"site": status.site, "gateway": status.gateway, "version": status.version}
-        yield InfoMetricFamily("fieldcal_gateway", "Who this is", value=who)
+        yield InfoMetricFamily("fieldcal_gateway", "Site, name and version of the gateway", value=who)
         yield _states("fieldcal_state", "State of the gateway", [], [((), status.state)], get_args(State))
         for name, (text, grows, value) in GATEWAY_METRICS.items():
             yield _family(f"fieldcal_{name}", text, grows, [], [((), value(status))])
         waiting = GaugeMetricFamily("fieldcal_queue_events", "Events that wait between two threads", labels=["queue"])
-        capacity = GaugeMetricFamily("fieldcal_queue_capacity_events", "Events that fit", labels=["queue"])
+        capacity = GaugeMetricFamily("fieldcal_queue_capacity_events", "Events that the queue holds", labels=["queue"])
         for name, queue in status.queues.items():
             waiting.add_metric([name], queue.waiting)
             capacity.add_metric([name], queue.capacity)
@@ -87,7 +87,7 @@ class StatusCollector:
                 f"fieldcal_device_clock_{name}", text, False, ["device"], [(of, figure(c)) for of, c in clocks]
             )
         dropped = [((d, unit), n) for d, health in status.devices.items() for unit, n in health.dropped.items()]
-        yield _family("fieldcal_device_dropped", "Read and not usable", True, ["device", "unit"], dropped)
+        yield _family("fieldcal_device_dropped", "Data read but not usable", True, ["device", "unit"], dropped)
 
     def _sensors(self, status: GatewayStatus) -> Iterator[Metric]:
         statuses = [((name,), sensor.status) for name, sensor in status.sensors.items()]
@@ -102,7 +102,7 @@ class StatusCollector:
 
 
 def serve_metrics(host: str, port: int, newest: Callable[[], GatewayStatus | None]) -> str:
-    """Answer scrapes, in threads that end with the process; returns the address. Raises OSError."""
+    """Serve the metrics over HTTP, in threads that end with the process; returns the address. Raises OSError."""
     from prometheus_client import CollectorRegistry, ProcessCollector, start_http_server
 
     registry = CollectorRegistry()
@@ -113,7 +113,7 @@ def serve_metrics(host: str, port: int, newest: Callable[[], GatewayStatus | Non
 
 
 def _family(name: str, text: str, grows: bool, labels: list[str], values: Values) -> Metric:
-    """A counter or gauge; what is not known is not there, as Prometheus wants it."""
+    """A counter or gauge. Unknown values are left out, as Prometheus recommends."""
     from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily
 
     family = (CounterMetricFamily if grows else GaugeMetricFamily)(name, text, labels=labels)

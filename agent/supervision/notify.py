@@ -1,6 +1,6 @@
-"""What systemd is told, by the protocol of sd_notify(3): datagrams of `KEY=value` lines to the socket it names.
+"""Notifications to systemd, by the protocol of sd_notify(3): datagrams of `KEY=value` lines to a socket.
 
-Without systemd there is no socket, and nothing is sent.
+systemd names the socket in the environment. Without systemd nothing is sent.
 """
 
 from __future__ import annotations
@@ -10,15 +10,15 @@ import socket
 import time
 from collections.abc import MutableMapping
 
-FEED_FRACTION = 0.25  # of the watchdog's time; systemd advises half, and a block may come half a second late
-STATUS_MAX = 400  # characters; what `systemctl status` shows in a line
+FEED_FRACTION = 0.25  # of the watchdog's time between two messages; systemd advises 0.5, but a block may be 0.5 s late
+STATUS_MAX = 400  # characters that `systemctl status` shows in a line
 
 
 class Notifier:
     """Sends notifications; none of its methods blocks or raises.
 
-    `environment` names socket and watchdog (NOTIFY_SOCKET, WATCHDOG_USEC, WATCHDOG_PID). They are taken out of it:
-    a child process is not this service.
+    `environment`: has the socket and the watchdog's time (NOTIFY_SOCKET, WATCHDOG_USEC, WATCHDOG_PID). These variables
+    are removed from it, so that no child process sends notifications in the name of this service.
     """
 
     def __init__(self, environment: MutableMapping[str, str]) -> None:
@@ -34,21 +34,21 @@ class Notifier:
         self._status = ""
 
     def ready(self) -> bool:
-        """The service is up. Returns whether that was taken; else it must be said again."""
+        """Report that the service has started. Returns whether systemd got the message; if False, call again later."""
         return self._send("READY=1")
 
     def stopping(self) -> None:
-        """The service began to end."""
+        """Report that the service is stopping."""
         self._send("STOPPING=1")
 
     def status(self, text: str) -> None:
-        """A line for people, sent when it changes."""
+        """Set the line of text that `systemctl status` shows. It is sent only when it changes."""
         line = " ".join(text.split())[:STATUS_MAX]
         if line != self._status and self._send(f"STATUS={line}"):
             self._status = line
 
     def feed(self) -> None:
-        """Something went through the agent; the watchdog is told so as often as it needs."""
+        """Report that the agent works: call it for each block. The watchdog gets a message as often as it needs one."""
         if not self.watchdog_s:
             return
         now_s = time.monotonic()
@@ -56,7 +56,7 @@ class Notifier:
             self._fed_s = now_s
 
     def close(self) -> None:
-        """Let go of the socket."""
+        """Close the socket."""
         if self._socket is not None:
             self._socket.close()
 
@@ -65,6 +65,6 @@ class Notifier:
             return True
         try:
             self._socket.sendto(message.encode(), self._address)
-        except OSError:  # systemd is being started anew, or its queue is full: the next one will do
+        except OSError:  # systemd restarts, or its queue is full: the next message serves as well
             return False
         return True

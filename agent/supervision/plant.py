@@ -1,4 +1,4 @@
-"""The parts of a run that the supervision looks at, and what it measures there."""
+"""The parts of a run that the supervision watches, and what it measures of them."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 
 
 class Waiting(Protocol):
-    """A bounded queue: how many entries wait in it, and with how many it is full."""
+    """A bounded queue: the number of entries that wait in it, and the number at which it is full."""
 
     @property
     def waiting(self) -> int: ...
@@ -35,7 +35,7 @@ class Waiting(Protocol):
 
 
 class Outbox:
-    """Counts the results that wait in the store; asks it only when that number may have changed."""
+    """Counts the results that wait in the store. The store is read only when this number may have changed."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
@@ -43,7 +43,7 @@ class Outbox:
         self._count: int | None = 0
 
     def count(self) -> int | None:
-        """Results that are kept and not published; None where the store cannot be read."""
+        """Number of stored results that are not published yet; None where the store cannot be read."""
         now = self._store.published(), self._store.last_sequence()
         if now != self._asked:
             self._asked, self._count = now, self._read(*now)
@@ -61,7 +61,7 @@ class Outbox:
 
 @dataclass(frozen=True, slots=True)
 class Plant:
-    """One run. Everything here may be asked from the main loop at any time; nothing of it waits."""
+    """The parts of one run. The main loop may read them at any time; no method waits."""
 
     data_dir: Path
     events: Waiting
@@ -71,7 +71,7 @@ class Plant:
     publisher: Publisher | None
 
     def situation(self) -> Situation:
-        """As it is now; half a millisecond."""
+        """Measure the present situation. Takes half a millisecond."""
         path = self.recorder.path
         return Situation(
             queues={
@@ -112,8 +112,8 @@ def _process() -> ProcessHealth | None:
         return ProcessHealth(
             rss_bytes=resident_pages * _PAGE_BYTES,
             threads=len(os.listdir("/proc/self/task")),
-            open_files=len(os.listdir("/proc/self/fd")) - 1,  # the listing has one of its own
+            open_files=len(os.listdir("/proc/self/fd")) - 1,  # without the one that the listing itself opens
             cpu_s=time.process_time(),
         )
-    except OSError:  # no file can be opened: the agent goes on with those it has
+    except OSError:  # no further file can be opened: the agent continues with the open ones
         return None

@@ -1,4 +1,4 @@
-"""Watches over a run: after every event it knows how the agent is, and tells whoever should know."""
+"""Supervises a run: keeps the agent's status up to date and reports it to systemd, Zenoh, Prometheus and the log."""
 
 from __future__ import annotations
 
@@ -22,11 +22,12 @@ _log = logging.getLogger(__name__)
 
 
 class Supervisor:
-    """The main loop's: `on_event` after each event that went through the pipeline and to the recording, `closing` once.
+    """Supervises one run. The main loop calls `on_event` after the pipeline has processed an event, and `closing` once.
 
-    systemd's watchdog is fed by blocks alone, here at the end of their way: a loop that stands still, a reader that
-    hangs in a driver and a device that says nothing all look the same to it. READY is said when every device was
-    opened or has said why not: an absent one is tried again for ever, and the others go on meanwhile.
+    Only blocks that have passed through the pipeline feed systemd's watchdog. So it restarts the agent where the main
+    loop stops, where all readers hang in their drivers, and where no device sends anything. READY is sent when every
+    device was opened or has failed with a reason: an absent device is tried again for ever, and the others are used
+    meanwhile.
     """
 
     def __init__(self, config: Config, run_id: str, origin_ns: int, plant: Plant, notifier: Notifier) -> None:
@@ -44,7 +45,7 @@ class Supervisor:
             self._serve_metrics()
 
     def on_event(self, event: Event, results: Sequence[Result]) -> None:
-        """An event, and what came of it."""
+        """Take an event that the pipeline has processed, with its results."""
         self._health.update(event, results)
         log_event(event, results)
         for result in results:
@@ -58,7 +59,7 @@ class Supervisor:
             self._ready = self._notifier.ready()
 
     def closing(self) -> None:
-        """The run ends: said before devices and files are closed."""
+        """Report that the run ends. Call it before devices and files are closed."""
         self._notifier.stopping()
         self._report("stopping", [], time.monotonic_ns(), time.time_ns())
         self._notifier.close()
@@ -84,7 +85,7 @@ class Supervisor:
         try:
             address = serve_metrics(metrics.host, metrics.port, lambda: self._newest)
         except OSError as error:
-            fault = f"no metrics at {metrics.host}:{metrics.port}: {error.strerror or error}"
+            fault = f"metrics cannot be served at {metrics.host}:{metrics.port}: {error.strerror or error}"
             self._faults.append(fault)
             _log.warning("%s", fault)
         else:

@@ -102,7 +102,7 @@ def test_a_life_of_recordings(tmp_path: Path, port: PtyDevice) -> None:
         interrupt(agent)
     text = output.read_text()
     assert f"the state file was corrupt and is kept as {data}/state.sqlite.corrupt-1" in text
-    assert "results that the state file lacked were found in the recordings" in text
+    assert "that the state file lacked were found in the recordings" in text
     assert "Traceback" not in text
     again = {window["sequence"]: window for window in results(data, "window")}
     found = [window for window in windows if window["sequence"] in again]
