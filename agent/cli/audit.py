@@ -1,4 +1,4 @@
-"""`fieldcal audit`: is every byte of a recording as it was written, and do its results follow from its data?"""
+"""`fieldcal audit`: checks that every byte of a recording is as written and that its results follow from its data."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ if TYPE_CHECKING:
 
 
 class AuditedFile(msgspec.Struct, kw_only=True):
-    """The verdict on one file. `reasons` is empty where it passed; `notes` say what could not be decided."""
+    """The verdict on one file. `reasons` why it failed, empty where it passed; `notes`: what could not be decided."""
 
     path: str
     ok: bool
     incomplete: bool
-    repaired: bool  # torn by a crash, closed later
+    repaired: bool  # a crash left it open, and a later start closed it
     reasons: list[str]
     notes: list[str]
     size: int
     sha256: str
     good_bytes: int
-    faults: list[Fault]  # the first of `fault_count`
+    faults: list[Fault]  # the first ones of `fault_count` faults
     fault_count: int
     chunks: int
     messages: int
@@ -52,13 +52,15 @@ class AuditedFile(msgspec.Struct, kw_only=True):
 @click.option(
     "--public-key", metavar="K", type=click.Path(path_type=Path), help="Require signatures by this key (PEM)."
 )
-@click.option("--strict", is_flag=True, help="Fail also where something cannot be decided here, or was repaired.")
+@click.option(
+    "--strict", is_flag=True, help="Fail also for repaired files, and where a result cannot be decided on this machine."
+)
 @click.option("--json", "json_to", type=click.Choice(["-"]), help="One JSON object on standard output.")
 def audit(files: tuple[Path, ...], public_key: Path | None, strict: bool, json_to: str | None) -> int:
-    """Check recordings, in order: every byte, whether the results follow from the data, whether any is missing.
+    """Check recordings, given in order: every byte, whether results follow from the data, whether a file is missing.
 
-    A data directory instead of files: all its recordings, none of which may be missing. Exit status 0 when all is as it
-    should be, 3 when not, 2 when a file cannot be read.
+    Give a data directory instead of files to check all its recordings; then no recording may be missing. Exit status: 0
+    all passed, 3 a check failed, 2 a file cannot be read.
     """
     from agent.config.key_file import KeyFileError
     from agent.core.pipeline import Pipeline
@@ -73,8 +75,8 @@ def audit(files: tuple[Path, ...], public_key: Path | None, strict: bool, json_t
         click.echo(str(error), err=True)
         return 2
     if not given.paths and not given.up_to:
-        # Where there were recordings once, all of them being gone is for the audit to say.
-        click.echo(f"{files[0]}: no recordings are there", err=True)
+        # Where the store knows of recordings that are gone, the audit itself reports them.
+        click.echo(f"{files[0]}: this directory has no recordings (fieldcal-*.mcap)", err=True)
         return 2
     start = first_event(given.paths[0]) if given.paths else None
     if start is not None:
@@ -84,14 +86,14 @@ def audit(files: tuple[Path, ...], public_key: Path | None, strict: bool, json_t
 
 @dataclass(frozen=True, slots=True)
 class Given:
-    """Recordings to audit. Of a whole directory none may be missing: `up_to` is the highest number it ever had."""
+    """Recordings to audit. `up_to`: for a whole directory, the highest file number; none up to it may be missing."""
 
     paths: Sequence[Path]
     up_to: int | None = None
 
 
 def recordings_of(paths: Sequence[Path]) -> Given:
-    """The files, or those of the one directory. Raises StoreError."""
+    """The given files, or all recordings of a single given directory. Raises StoreError."""
     if len(paths) != 1 or not paths[0].is_dir():
         return Given(paths)
     files = recordings(paths[0])
@@ -106,7 +108,7 @@ def recordings_of(paths: Sequence[Path]) -> Given:
 def run_audit(
     given: Given, restore: Restore, *, as_json: bool, strict: bool = False, key: Ed25519PublicKey | None = None
 ) -> int:
-    """Audit, print, and return the exit status. With a `key` signatures are asked for."""
+    """Audit, print, and return the exit status. With a `key`, files must be signed by it."""
     try:
         audited = audit_files(given, restore, strict=strict, key=key)
     except OSError as error:
@@ -131,14 +133,14 @@ def run_audit(
 def audit_files(
     given: Given, restore: Restore, *, strict: bool = False, key: Ed25519PublicKey | None = None
 ) -> list[AuditedFile]:
-    """The verdict on each file; neighbours, in order, are also held against each other. Raises OSError."""
+    """The verdict on each file. Each file is also compared with the one before it. Raises OSError."""
     from agent.recording.fingerprint import fingerprint
 
     replayed = Replay(restore, fingerprint(), elsewhere=OTHER_CPU)
     audited: list[AuditedFile] = []
     links: list[Link] = []
     said: list[tuple[int, int]] = []  # recordings that retention deleted
-    with ExitStack() as held:  # until all are done: retention deletes none meanwhile
+    with ExitStack() as held:  # kept open to the end, so that retention deletes none meanwhile
         files = [held.enter_context(open_recording(path)) for path in given.paths]
         for path, file in zip(given.paths, files, strict=True):
             sha256 = hashlib.file_digest(file, "sha256").hexdigest()
@@ -167,7 +169,8 @@ def _verdict(path: Path, sha256: str, size: int, integrity: Integrity, replay: R
     repair = integrity.metadata.get(REPAIR_METADATA)
     notes = list(replay.notes)
     if repair is not None:
-        notes.append(f"unsealed: left open by a crash, closed later, {repair.get('torn_bytes')} torn bytes set aside")
+        torn = repair.get("torn_bytes")
+        notes.append(f"unsealed: left open by a crash, closed later; the last {torn} bytes, incomplete, were set aside")
     return AuditedFile(
         path=str(path),
         ok=False,
@@ -219,17 +222,17 @@ def _reasons(integrity: Integrity, replay: ReplayedFile) -> list[str]:
 
 
 def _metadata_reasons(integrity: Integrity, replay: ReplayedFile) -> list[str]:
-    """What does not fit between a file and its own metadata."""
+    """The contradictions between a file's events and its own metadata."""
     metadata = integrity.metadata.get(FILE_METADATA)
     if metadata is None:
         return [f"no metadata record {FILE_METADATA}"] if replay.events else []
     if replay.events and metadata.get("file_sequence") != str(replay.file_sequence):
-        return [f"its metadata says file {metadata.get('file_sequence')}, its RunStart {replay.file_sequence}"]
+        return [f"its metadata says file number {metadata.get('file_sequence')}, its RunStart {replay.file_sequence}"]
     return []
 
 
 def describe(file: AuditedFile) -> str:
-    """The verdict in a line, and a line more for each reason and note."""
+    """The verdict as text: one line, and one more line for each reason and note."""
     replay = file.replay
     how = f"equal within {replay.tolerance:g}" if replay.tolerance else "equal bit for bit"
     verdict = f"passed, {replay.results} results {how}" if file.ok else "FAILED"

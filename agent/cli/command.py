@@ -21,7 +21,7 @@ from agent.delivery.keys import CHUNK, gateway_key
 from agent.delivery.session import EndpointError
 from agent.keys.files import KeyFileError, SigningKey, read_signing_key
 
-VALID_S = 60.0  # a command is for now
+VALID_S = 60.0  # s; a command takes effect when it arrives, or not at all
 
 
 class _Answer(msgspec.Struct):
@@ -30,21 +30,21 @@ class _Answer(msgspec.Struct):
 
 
 _OPTIONS: list[Callable[[Callable[..., Any]], Callable[..., Any]]] = [
-    click.option("--sensor", required=True, help="Whom it is about."),
+    click.option("--sensor", required=True, help="The sensor that the command is for."),
     click.option("--key", "key_file", required=True, metavar="F", type=click.Path(path_type=Path),
-                 help="Private key that signs, from `fieldcal keys command`."),
+                 help="Private key that signs the command, made by `fieldcal keys command`."),
     click.option("--data-dir", type=click.Path(path_type=Path), default=Path("data"), show_default=True,
-                 help="Of the agent on this machine."),
-    click.option("--connect", multiple=True, metavar="ENDPOINT", help="A router: send over Zenoh instead."),
-    click.option("--gateway", metavar="SITE/NAME", help="Which gateway, with --connect."),
+                 help="Data directory of this machine's agent; unused with --connect."),
+    click.option("--connect", multiple=True, metavar="ENDPOINT", help="Zenoh router that passes the command on."),
+    click.option("--gateway", metavar="SITE/NAME", help="The gateway that the command is for; needed with --connect."),
     tls_options,
     click.option("--valid", "valid_s", type=click.FloatRange(1, LONGEST_VALIDITY_S), default=VALID_S,
-                 show_default=True, metavar="S", help="How long the command may take to arrive."),
+                 show_default=True, metavar="S", help="Seconds in which the command must arrive; later it is refused."),
 ]  # fmt: skip
 
 
 def common_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """What every command needs besides its arguments."""
+    """Add the options that all commands have."""
     for option in reversed(_OPTIONS):
         command = option(command)
     return command
@@ -52,16 +52,18 @@ def common_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 @click.group()
 def command() -> None:
-    """Sign a command and send it. Exit status: 0 taken, 3 refused with the reason, 1 nobody answers."""
+    """Sign a command and send it to an agent. Exit status: 0 taken, 3 refused (with the reason), 1 no answer."""
 
 
 @command.command()
 @click.option("--theta-deg", type=float, help="Clamp angle theta (with --alpha-deg).")
 @click.option("--alpha-deg", type=float, help="Rotation alpha about the clamp's axis.")
-@click.option("--direction", type=float, nargs=3, metavar="X Y Z", help="Unit vector of the motion, sensor's frame.")
+@click.option(
+    "--direction", type=float, nargs=3, metavar="X Y Z", help="Unit vector of the motion in the sensor's frame."
+)
 @click.option("--gravity", "gravity_mps2", type=float, nargs=3, metavar="X Y Z",
-              help="What an ideal sensor reads at rest, m/s2; alone: a rest.")  # fmt: skip
-@click.option("--position", help="A name for it.")
+              help="What an ideal sensor reads at rest there, m/s2. Given alone: the sensor is at rest.")  # fmt: skip
+@click.option("--position", help="A name for the position.")
 @common_options
 def pose(
     theta_deg: float | None,
@@ -71,22 +73,22 @@ def pose(
     position: str | None,
     **options: Any,
 ) -> int:
-    """Say how the sensor stands from now on."""
+    """Tell the agent the sensor's position from now on."""
     given = {"theta_deg": theta_deg, "alpha_deg": alpha_deg, "direction": direction, "gravity_mps2": gravity_mps2,
              "position": position}  # fmt: skip
     return _run("pose", {name: value for name, value in given.items() if value is not None}, **options)
 
 
 @command.command()
-@click.option("--release", is_flag=True, help="End it.")
+@click.option("--release", is_flag=True, help="End the hold.")
 @common_options
 def hold(release: bool, **options: Any) -> int:
-    """Change nothing of the calibration in force until released."""
+    """Keep the calibration in force unchanged until `hold --release`."""
     return _run("hold", {"release": True} if release else {}, **options)
 
 
 @command.command()
-@click.option("--sequence", type=int, required=True, help="Number of the estimate.")
+@click.option("--sequence", type=int, required=True, help="Sequence number of the estimate.")
 @common_options
 def accept(sequence: int, **options: Any) -> int:
     """Bring an estimate into force."""
@@ -94,7 +96,7 @@ def accept(sequence: int, **options: Any) -> int:
 
 
 @command.command()
-@click.option("--sequence", type=int, required=True, help="Number of the calibration, see `fieldcal show`.")
+@click.option("--sequence", type=int, required=True, help="Sequence number of the calibration, see `fieldcal show`.")
 @common_options
 def rollback(sequence: int, **options: Any) -> int:
     """Bring an earlier calibration into force again."""
@@ -116,7 +118,10 @@ def _run(
     valid_s: float,
 ) -> int:
     if not CHUNK.fullmatch(sensor):
-        raise click.BadParameter(f"{sensor!r} is no name of a sensor", param_hint="--sensor")
+        raise click.BadParameter(
+            f"{sensor!r} cannot be the name of a sensor: 1 to 63 ASCII letters, digits, '-', '_', '.'",
+            param_hint="--sensor",
+        )
     try:
         arguments = parse_arguments(verb, msgspec.json.encode(given))
         key = read_signing_key(key_file)
@@ -150,10 +155,10 @@ def _run(
 
 def _gateway_name(gateway: str | None) -> str:
     if gateway is None:
-        raise click.UsageError("--connect needs --gateway SITE/NAME: a command is signed for one gateway")
+        raise click.UsageError("--connect needs --gateway SITE/NAME, since a command is signed for one gateway only")
     site, _, name = gateway.partition("/")
     if not (CHUNK.fullmatch(site) and CHUNK.fullmatch(name)):
-        raise click.BadParameter(f"{gateway!r} is not SITE/NAME", param_hint="--gateway")
+        raise click.BadParameter(f"{gateway!r} does not have the form SITE/NAME", param_hint="--gateway")
     return gateway
 
 

@@ -19,20 +19,20 @@ from agent.keys.certificates import LONGEST_NAME, Credential, issue, make_author
 from agent.keys.files import KeyFileError, SigningKey, write_new
 
 AUTHORITY_DAYS = 3650
-# A gateway stands for years, and its certificate must not end before somebody comes by.
+# Five years: a gateway is used for years, and its certificate must not expire before somebody visits it.
 DAYS = 1825
 
 directory_option = click.option(
     "--dir", "directory", type=click.Path(file_okay=False, path_type=Path), default=Path("keys"), show_default=True,
-    help="Where the authority and all keys are.")  # fmt: skip
+    help="Directory of the authority's files and of all keys.")  # fmt: skip
 days_option = click.option(
-    "--days", type=click.IntRange(1, 36500), default=DAYS, show_default=True, help="How long it is good."
+    "--days", type=click.IntRange(1, 36500), default=DAYS, show_default=True, help="Days that the certificate is valid."
 )
 
 
 def _checked_name(_: click.Context, parameter: click.Parameter, value: str) -> str:
     if not CHUNK.fullmatch(value):
-        raise click.BadParameter(f"{value!r}: 1 to 63 ASCII letters, digits, '-', '_', '.'", param=parameter)
+        raise click.BadParameter(f"{value!r}: use 1 to 63 ASCII letters, digits, '-', '_' and '.'", param=parameter)
     return value
 
 
@@ -53,30 +53,40 @@ def _refusing(command: Callable[..., None]) -> Callable[..., int]:
 def keys() -> None:
     """Certificates for Zenoh over TLS, and keys that sign commands.
 
-    First `authority`, once a site; then one certificate each for the router, every gateway, consumer and commander.
-    Private keys (*.key) are readable by their owner alone and never written over.
+    First make the authority, once for a site. Then make a certificate for the router and for each gateway, consumer and
+    commander. Only the owner can read the private keys (*.key), and no file is ever overwritten.
     """
 
 
 @keys.command()
 @directory_option
-@click.option("--name", default="fieldcal authority", show_default=True, help="Its common name.")
-@click.option("--days", type=click.IntRange(1, 36500), default=AUTHORITY_DAYS, show_default=True)
+@click.option("--name", default="fieldcal authority", show_default=True, help="Common name of the authority.")
+@click.option("--days", type=click.IntRange(1, 36500), default=AUTHORITY_DAYS, show_default=True,
+              help="Days that the certificate is valid.")  # fmt: skip
 @_refusing
 def authority(directory: Path, name: str, days: int) -> None:
-    """The authority that signs all certificates of a site: ca.pem, which everybody needs, and ca.key, which nobody may
-    have who is not to let others in."""
+    """Make the authority that signs all certificates of a site.
+
+    Everybody needs ca.pem. Keep ca.key secret: whoever has it can make certificates that the router accepts.
+    """
     _save(directory, "ca", make_authority(name, days, datetime.now(UTC)))
 
 
 @keys.command()
-@click.option("--host", "hosts", multiple=True, required=True, help="Name or address by which it is reached; repeat.")
-@click.option("--name", default="router", show_default=True, callback=_checked_name)
+@click.option(
+    "--host",
+    "hosts",
+    multiple=True,
+    required=True,
+    help="Host name or IP address of the router; may be given several times.",
+)
+@click.option("--name", default="router", show_default=True, callback=_checked_name,
+              help="Name of the files and common name of the certificate.")  # fmt: skip
 @directory_option
 @days_option
 @_refusing
 def router(hosts: tuple[str, ...], name: str, directory: Path, days: int) -> None:
-    """A router's certificate: good for the hosts alone."""
+    """Make a router's certificate, valid for the given hosts only."""
     _issue(directory, name, name, days, hosts)
 
 
@@ -87,7 +97,7 @@ def router(hosts: tuple[str, ...], name: str, directory: Path, days: int) -> Non
 @days_option
 @_refusing
 def gateway(site: str, name: str, directory: Path, days: int) -> None:
-    """A gateway's certificate, common name SITE/NAME, file SITE.NAME.pem."""
+    """Make a gateway's certificate with the common name SITE/NAME, in the file SITE.NAME.pem."""
     _issue(directory, f"{site}.{name}", f"{site}/{name}", days)
 
 
@@ -97,7 +107,7 @@ def gateway(site: str, name: str, directory: Path, days: int) -> None:
 @days_option
 @_refusing
 def consumer(name: str, directory: Path, days: int) -> None:
-    """A consumer's certificate: the router's rules let NAME listen and ask."""
+    """Make a consumer's certificate. The router's rules must allow NAME to receive results."""
     _issue(directory, name, name, days)
 
 
@@ -107,7 +117,7 @@ def consumer(name: str, directory: Path, days: int) -> None:
 @days_option
 @_refusing
 def commander(name: str, directory: Path, days: int) -> None:
-    """A commander's certificate: the router's rules let NAME send commands; each must be signed as well."""
+    """Make a commander's certificate. The router's rules must allow NAME to send commands, which must be signed too."""
     _issue(directory, name, name, days)
 
 
@@ -116,32 +126,32 @@ def commander(name: str, directory: Path, days: int) -> None:
 @directory_option
 @_refusing
 def command(key_id: str, directory: Path) -> None:
-    """An operator's key that signs commands: KEY_ID.command.key. Prints what the gateway's configuration needs."""
+    """Make an operator's key that signs commands, KEY_ID.command.key; print its section of the configuration."""
     key = Ed25519PrivateKey.generate()
     write_new(directory, {f"{key_id}.command.key": SigningKey(key_id, key).pem})
     public = b64encode(key.public_key().public_bytes(Encoding.Raw, PublicFormat.Raw)).decode()
     click.echo(f"""\
-# {directory / key_id}.command.key stays with {key_id}. For the gateway's configuration:
+# Only {key_id} may have {directory / key_id}.command.key. Add this to the gateway's configuration:
 [commands]
 enabled = true
 
 [[commands.keys]]
 id = "{key_id}"
 public_key = "{public}"
-verbs = ["pose", "hold", "accept", "rollback"]   # leave out what {key_id} may not do
+verbs = ["pose", "hold", "accept", "rollback"]   # remove the commands that {key_id} may not send
 sensors = ["*"]""")
 
 
 def _issue(directory: Path, file: str, name: str, days: int, hosts: tuple[str, ...] = ()) -> None:
     if len(name) > LONGEST_NAME:
-        raise KeyFileError(f"{name}: {len(name)} characters, a common name has {LONGEST_NAME} at most")
+        raise KeyFileError(f"{name}: {len(name)} characters, but a common name may have {LONGEST_NAME} at most")
     _save(directory, file, issue(_read_authority(directory), name, days, datetime.now(UTC), hosts))
 
 
 def _save(directory: Path, file: str, credential: Credential) -> None:
     write_new(directory, {f"{file}.key": credential.key_pem, f"{file}.pem": credential.certificate_pem})
     ends = credential.certificate.not_valid_after_utc
-    click.echo(f"{directory / file}.pem, good until {ends:%Y-%m-%d}, and {directory / file}.key")
+    click.echo(f"{directory / file}.pem, valid until {ends:%Y-%m-%d}, and {directory / file}.key")
 
 
 def _read_authority(directory: Path) -> Credential:
@@ -149,7 +159,7 @@ def _read_authority(directory: Path) -> Credential:
         certificate = load_pem_x509_certificate((directory / "ca.pem").read_bytes())
         key = load_pem_private_key((directory / "ca.key").read_bytes(), password=None)
     except OSError as error:
-        raise KeyFileError(f"{error.filename}: {error.strerror}; first `fieldcal keys authority`") from None
+        raise KeyFileError(f"{error.filename}: {error.strerror}; run `fieldcal keys authority` first") from None
     except (ValueError, TypeError):
-        raise KeyFileError(f"{directory}: ca.pem or ca.key is not PEM") from None
+        raise KeyFileError(f"{directory}: ca.pem or ca.key is not a PEM file that can be read") from None
     return Credential(certificate, key)  # type: ignore[arg-type]

@@ -1,4 +1,7 @@
-"""The command line: which command is where, and what becomes of errors. Commands load when they are called."""
+"""The command line: the module of each command, and the exit status of each error.
+
+A command's module is loaded when the command is called.
+"""
 
 from __future__ import annotations
 
@@ -11,27 +14,27 @@ import click
 from agent import __version__
 
 COMMANDS = {
-    "run": ("agent.cli.run", "The agent: read, calibrate, record and publish; without CONFIG on the virtual bench."),
-    "calibrate": ("agent.cli.calibrate", "Calibrate from files."),
+    "run": ("agent.cli.run", "Run the agent: read devices, calibrate, record and publish."),
+    "calibrate": ("agent.cli.calibrate", "Calibrate a sensor from recorded files (CSV)."),
     "replay": ("agent.cli.replay", "Run recordings through the same pipeline and print the calibrations."),
-    "audit": ("agent.cli.audit", "Check a recording: every byte, and that its results follow from its data."),
-    "show": ("agent.cli.show", "Calibration in force, status and history of a data directory."),
-    "report": ("agent.cli.report", "Figures and one page of a calibration."),
-    "sensors": ("agent.cli.sensors", "Drivers with their options."),
-    "probe": ("agent.cli.probe", "What answers on this machine's buses and ports, with self-test."),
-    "command": ("agent.cli.command", "A signed command to an agent: pose, hold, accept, rollback."),
-    "keys": ("agent.cli.keys", "Certificates for Zenoh over TLS, and keys that sign commands."),
-    "router": ("agent.cli.router", "A Zenoh router, for tests and small sites."),
+    "audit": ("agent.cli.audit", "Check recordings: every byte, and that the results follow from the data."),
+    "show": ("agent.cli.show", "Show the calibration in force, status and history of a data directory."),
+    "report": ("agent.cli.report", "Make figures and a one-page report of a calibration."),
+    "sensors": ("agent.cli.sensors", "List the drivers with their options."),
+    "probe": ("agent.cli.probe", "Find and self-test the devices on this machine's buses and ports."),
+    "command": ("agent.cli.command", "Send a signed command to an agent: pose, hold, accept, rollback."),
+    "keys": ("agent.cli.keys", "Make certificates for Zenoh over TLS, and keys that sign commands."),
+    "router": ("agent.cli.router", "Run a Zenoh router, for tests and small sites."),
     "simulate": (
         "agent.cli.simulate",
-        "Virtual devices on pseudo-terminals, or a recording with known truth.",
+        "Serve virtual devices on pseudo-terminals, or write a recording with known true values.",
     ),
-    "check": ("agent.cli.check", "All faults of a configuration at once."),
+    "check": ("agent.cli.check", "List all faults of a configuration."),
 }
 
 
 class LazyGroup(click.Group):
-    """Loads a command's module when it is asked for: `fieldcal show` need not pay for Zenoh."""
+    """Loads a command's module only when the command is called, so that `fieldcal show` does not load Zenoh."""
 
     def list_commands(self, _: click.Context) -> list[str]:
         return list(COMMANDS)
@@ -55,12 +58,12 @@ def fieldcal() -> None:
 
 
 def _discard_output() -> None:
-    """Let what is still in the buffer of our output go nowhere when Python flushes it at exit."""
+    """Discard what is still in the output buffer, so that Python's flush at exit does not fail."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def run_cli(arguments: list[str] | None = None) -> int:
-    """Run and return the exit status: 0 done, 1 our or the machine's fault, 2 usage or bad input, 3 refused.
+    """Run a command; returns the exit status: 0 done, 1 internal fault or fault of the machine, 2 bad input, 3 refused.
 
     No traceback reaches a user unless FIELDCAL_TRACEBACK is set.
     """
@@ -75,7 +78,7 @@ def run_cli(arguments: list[str] | None = None) -> int:
         click.echo("interrupted", err=True)
         return 1
     except BrokenPipeError:
-        # The reader of our output went away.
+        # The program that reads the output has ended.
         _discard_output()
         return 1
     except OSError as error:
@@ -86,6 +89,8 @@ def run_cli(arguments: list[str] | None = None) -> int:
         if os.environ.get("FIELDCAL_TRACEBACK"):
             raise
         click.echo(f"fieldcal: internal fault: {type(error).__name__}: {error}", err=True)
-        click.echo("Set FIELDCAL_TRACEBACK=1 to see where, and please report it.", err=True)
+        click.echo(
+            "This is a fault of fieldcal. Please report it, with the output that FIELDCAL_TRACEBACK=1 gives.", err=True
+        )
         return 1
     return result if isinstance(result, int) else 0

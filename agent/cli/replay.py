@@ -1,4 +1,4 @@
-"""`fieldcal replay`: run recordings through the same pipeline and print the calibrations."""
+"""`fieldcal replay`: runs recordings through the same pipeline and prints the calibrations."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import msgspec
 from agent.core.events import CalibrationUpdate
 from agent.recording.replaying import Replay, ReplayedFile, Restore
 
-SHOWN = 12  # lines of a table; `--json` has them all
+SHOWN = 12  # calibrations shown in the table; `--json` gives all
 
 
 @click.command()
@@ -22,7 +22,7 @@ SHOWN = 12  # lines of a table; `--json` has them all
 def replay(files: tuple[Path, ...], json_to: str | None) -> int:
     """Run recordings through the pipeline, in the order given, and print the calibrations.
 
-    Exit status 0 when the recorded results came out again bit for bit; 3 when not; 2 when a file cannot be read.
+    Exit status: 0 the computed results equal the recorded ones bit for bit, 3 they do not, 2 a file cannot be read.
     """
     from agent.core.pipeline import Pipeline
     from agent.recording.fingerprint import compute_as
@@ -35,7 +35,7 @@ def replay(files: tuple[Path, ...], json_to: str | None) -> int:
 
 
 def run_replay(files: Sequence[Path], restore: Restore, *, as_json: bool) -> int:
-    """Replay, print, and return the exit status."""
+    """Replay the files, print the calibrations, and return the exit status."""
     from agent.recording.fingerprint import fingerprint
 
     replayed = Replay(restore, fingerprint(), elsewhere=0.0)
@@ -47,7 +47,7 @@ def run_replay(files: Sequence[Path], restore: Restore, *, as_json: bool) -> int
             unreadable.append(f"{path}: {error.strerror or error}")
             continue
         if not file.events:
-            unreadable.append(f"{path}: {file.fault or 'no recording of fieldcal'}")
+            unreadable.append(f"{path}: {file.fault or 'not a recording made by fieldcal'}")
     if as_json:
         click.echo(msgspec.json.encode(as_object(replayed)).decode())
     elif not unreadable:
@@ -61,7 +61,7 @@ def run_replay(files: Sequence[Path], restore: Restore, *, as_json: bool) -> int
 
 
 def as_object(replayed: Replay) -> dict[str, Any]:
-    """What `--json -` prints."""
+    """The object that `--json -` prints."""
     files = replayed.files
     return {
         "files": files,
@@ -89,21 +89,21 @@ def _print(replayed: Replay) -> None:
         table.add_row(update.sensor, str(update.sequence), str(update.windows), *_cells(update), update.output_unit)
     console.print(table)
     if len(replayed.calibrations) > SHOWN:
-        console.print(f"the last {SHOWN} of {len(replayed.calibrations)} calibrations")
+        console.print(f"only the last {SHOWN} of {len(replayed.calibrations)} calibrations are shown; --json - has all")
     for file in replayed.files:
         console.print(describe(file), markup=False, soft_wrap=True)
 
 
 def describe(file: ReplayedFile) -> str:
-    """One file in a line, and a line more for each thing to say of it."""
-    how = "goes on from the file before" if file.in_chain else "alone, from its own snapshot"
+    """The replay of one file as text: one line, and one more line for each result, fault and note."""
+    how = "continued from the file before" if file.in_chain else "from its own snapshot"
     lines = [f"{file.path}: {file.events} events, {file.results} results, {how}"]
     if file.refused:
         lines.append(f"  cannot be replayed: {file.refused}")
     elif file.first_difference:
         lines.append(f"  results differ after {file.different} events, first {file.first_difference}")
     elif not file.results:
-        lines.append("  no results, as recorded")
+        lines.append("  no results were recorded, and none were computed")
     elif file.tolerance:
         lines.append(f"  results equal the recorded ones within {file.tolerance:g}")
     else:

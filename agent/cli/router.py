@@ -1,4 +1,4 @@
-"""`fieldcal router`: a Zenoh router in one process, for tests and small sites."""
+"""`fieldcal router`: runs a Zenoh router in one process, for tests and small sites."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from agent.delivery.router import DEFAULT_ENDPOINT, open_router
 from agent.delivery.session import EndpointError, EndpointRefused
 
 
-@click.command(help="A Zenoh router, for tests and small sites. Prints its endpoint and runs until it is interrupted.")
+@click.command(help="Run a Zenoh router, for tests and small sites. It prints its endpoint and runs until Ctrl-C.")
 @click.option(
-    "--listen", metavar="ENDPOINT", help=f"Where to listen; port 0 takes a free one.  [default: {DEFAULT_ENDPOINT}]"
+    "--listen", metavar="ENDPOINT", help=f"Where to listen; with port 0, any free port.  [default: {DEFAULT_ENDPOINT}]"
 )
 @click.option(
     "--config",
@@ -25,7 +25,7 @@ from agent.delivery.session import EndpointError, EndpointRefused
     help="A Zenoh configuration (JSON5), for TLS and access control.",
 )
 def router(listen: str | None, config_file: Path | None) -> int:
-    """Serve until SIGINT or SIGTERM. Exit status 2 for what is no endpoint or configuration, 1 for a taken port."""
+    """Serve until SIGINT or SIGTERM. Exit status: 2 invalid endpoint or configuration, 1 the port is in use."""
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
@@ -34,7 +34,7 @@ def router(listen: str | None, config_file: Path | None) -> int:
     except EndpointError as error:
         click.echo(f"fieldcal router: {error}", err=True)
         return 1 if isinstance(error, EndpointRefused) else 2
-    # From now on who is not let in, and why, is in our output; RUST_LOG asks for more (docs/security.md).
+    # From now on Zenoh prints which clients it refuses, and why; RUST_LOG sets other levels (docs/security.md).
     zenoh.init_log_from_env_or("warn")
     click.echo(f"router at {', '.join(endpoints)}")
     stop.wait()

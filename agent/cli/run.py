@@ -1,4 +1,4 @@
-"""`fieldcal run`: the agent on a configuration, or on the virtual bench."""
+"""`fieldcal run`: runs the agent, on the devices of a configuration or on the virtual bench."""
 
 from __future__ import annotations
 
@@ -24,14 +24,15 @@ STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 @click.command()
 @click.argument("config", required=False, type=click.Path(path_type=Path))
 @click.option("--data-dir", type=click.Path(path_type=Path), default=Path("data"), show_default=True,
-              help="Recordings and state.")  # fmt: skip
+              help="Where recordings and results are kept.")  # fmt: skip
 @click.option("--duration", type=click.FloatRange(min=0, min_open=True), metavar="S", help="End after S seconds.")
 @click.option("--preset", type=click.Choice(["plain", "faulty"]), default="plain", show_default=True,
-              help="Which virtual bench, where there is no CONFIG.")  # fmt: skip
-@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=1, show_default=True, help="Of the virtual bench.")
+              help="The kind of virtual bench, without CONFIG.")  # fmt: skip
+@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=1, show_default=True,
+              help="Seed of the virtual bench's random numbers.")  # fmt: skip
 @click.option("--log", type=click.Choice(["plain", "json"]),
-              help="What standard error gets: JSON, one object a line, the default under systemd.")  # fmt: skip
-@click.option("--with-router", is_flag=True, help=f"Start a Zenoh router at {LOOPBACK} unless one is there.")
+              help="Form of the log on standard error; json, one object a line, by default under systemd.")  # fmt: skip
+@click.option("--with-router", is_flag=True, help=f"Start a Zenoh router at {LOOPBACK} unless one runs there.")
 def run(
     config: Path | None,
     data_dir: Path,
@@ -41,13 +42,13 @@ def run(
     log: str | None,
     with_router: bool,
 ) -> int:
-    """Read, calibrate, record and publish until Ctrl-C. Without CONFIG on the virtual bench."""
+    """Read devices, calibrate, record and publish until Ctrl-C. Without CONFIG the virtual bench is used."""
     from agent.supervision.logs import log_as_json, under_journal
     from agent.terminal.watch import Watch
 
     if duration is not None and not math.isfinite(duration):
-        raise click.BadParameter(f"{duration} is not a time", param_hint="--duration")
-    # Until the service takes them over: as Ctrl-C, so that a router or a bench started here does not stay behind.
+        raise click.BadParameter(f"{duration} is not a number of seconds", param_hint="--duration")
+    # Until the service handles these signals, they act as Ctrl-C, so that a router or bench started here is stopped.
     for number in STOP_SIGNALS:
         signal.signal(number, signal.default_int_handler)
     with ExitStack() as stack:
@@ -71,7 +72,7 @@ def run(
 
 
 def serve(config: Config, data_dir: Path, watch: Any, duration_s: float | None) -> int:
-    """Run the service until a signal or `duration_s`; the exit status."""
+    """Run the service until a signal or for `duration_s` seconds; returns the exit status."""
     from agent.acquisition.service import Service
     from agent.config.key_file import KeyFileError
 
@@ -87,7 +88,7 @@ def serve(config: Config, data_dir: Path, watch: Any, duration_s: float | None) 
         click.echo(f"fieldcal run: {error}", err=True)
         return 1
     if not ended:
-        # A router that is frozen holds Zenoh's thread, or a disk the recording's; nobody can wait for it.
+        # A router or disk that does not respond blocks a thread. Do not wait for this thread.
         watch.__exit__()
         sys.stdout.flush()
         os._exit(0)
@@ -96,7 +97,7 @@ def serve(config: Config, data_dir: Path, watch: Any, duration_s: float | None) 
 
 @contextmanager
 def virtual_bench(preset: str, seed: int) -> Iterator[tuple[Config, Any]]:
-    """The paper's bench under the real drivers: its configuration and its truth."""
+    """Run the paper's bench as virtual devices under the real drivers; yields (configuration, true values)."""
     from hw.virtual import presets
     from hw.virtual.live import LiveBench
 
@@ -106,7 +107,7 @@ def virtual_bench(preset: str, seed: int) -> Iterator[tuple[Config, Any]]:
             {"start_s": p.start_s, "stop_s": p.stop_s, "theta_deg": p.theta_deg, "alpha_deg": p.alpha_deg}
             for p in live.bench.poses
         ]
-        number = f"{preset}-{seed}"  # each is a sensor of its own: one's calibration is not another's
+        number = f"{preset}-{seed}"  # each bench has another serial number, so that none gets another's calibration
         raw = {
             "gateway": {"site": "virtual", "name": "bench"},
             "devices": [
@@ -129,14 +130,14 @@ def virtual_bench(preset: str, seed: int) -> Iterator[tuple[Config, Any]]:
 
 @contextmanager
 def router(endpoint: str) -> Iterator[str]:
-    """A router process beside the agent, or the one that is there; yields what to tell the user."""
+    """Use the router that runs at `endpoint`, or start one as a process; yields a line for the user."""
     from agent.delivery.router import router_running
 
     if router_running(endpoint):
-        yield f"using the Zenoh router that is already at {endpoint}"
+        yield f"using the Zenoh router that runs already at {endpoint}"
         return
     command = [sys.executable, "-m", "agent", "router", "--listen", endpoint]
-    # In a session of its own: Ctrl-C in the terminal must let the agent say its last words through it.
+    # In a session of its own, so that Ctrl-C does not stop the router before the agent has published its last results.
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True, env=os.environ)
     try:
         yield f"started a Zenoh router at {endpoint}"

@@ -1,4 +1,4 @@
-"""Who may command the agent, and what."""
+"""Settings of operators' commands: whose commands are accepted, and which."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class CommandKey(Section):
     """One operator's key and its rights."""
 
     id: Name
-    # As `fieldcal keys command` prints it: Ed25519, the 32 bytes in base64. It is no secret.
+    # The 32 bytes of an Ed25519 public key in base64, as `fieldcal keys command` prints them. It is not secret.
     public_key: str
     verbs: Annotated[tuple[Literal["pose", "hold", "accept", "rollback"], ...], Field(min_length=1, max_length=4)]
     sensors: Annotated[tuple[Name | Literal["*"], ...], Field(min_length=1, max_length=100)]
@@ -28,23 +28,23 @@ class CommandKey(Section):
         try:
             length = len(base64.b64decode(value, validate=True))
         except (binascii.Error, ValueError):
-            raise ValueError("not base64") from None
+            raise ValueError("not base64; copy it from the output of `fieldcal keys command`") from None
         if length != PUBLIC_KEY_BYTES:
-            raise ValueError(f"{length} bytes, an Ed25519 public key has {PUBLIC_KEY_BYTES}")
+            raise ValueError(f"{length} bytes, but an Ed25519 public key has {PUBLIC_KEY_BYTES}")
         return value
 
     @property
     def public_bytes(self) -> bytes:
-        """The key itself."""
+        """The 32 bytes of the public key."""
         return base64.b64decode(self.public_key)
 
     def may(self, verb: str, sensor: str) -> bool:
-        """Whether this key has the right."""
+        """Whether this key has the right to send the command `verb` to `sensor`."""
         return verb in self.verbs and ("*" in self.sensors or sensor in self.sensors)
 
 
 class Commands(Section):
-    """Commands of operators. Off, unless this says otherwise."""
+    """Commands of operators. They are refused unless `enabled` is set."""
 
     enabled: bool = False
     keys: Annotated[tuple[CommandKey, ...], Field(max_length=100)] = ()
@@ -52,5 +52,5 @@ class Commands(Section):
     @model_validator(mode="after")
     def _keys(self) -> Commands:
         if self.enabled and not self.keys:
-            raise ValueError("enabled without keys: nobody could command")
+            raise ValueError("enabled, but without keys no command can be accepted; add a section [[commands.keys]]")
         return self

@@ -1,4 +1,4 @@
-"""How the sensor may stand: stated for a stretch of time, or one of several stops that gravity tells apart."""
+"""Positions of the sensor: stated for an interval of time, or several stops that the agent tells apart by gravity."""
 
 from __future__ import annotations
 
@@ -12,16 +12,17 @@ from agent.config.section import Section, Vector
 from calib.geometry import along, at_rest, clamp
 from calib.model import Pose
 
-# Stops nearer to each other are told apart by nothing that anybody knows of a sensor: 1 deg is 0.17 m/s2 of offset.
+# Smallest angle between the directions of gravity at two stops. At 1 deg they differ by 0.17 m/s2, and the offset of a
+# sensor is not known better than that.
 LEAST_APART_DEG = 1.0
 
 
 class Stop(Section):
-    """One way in which the sensor can stand.
+    """One position of the sensor. Give one of three forms:
 
-    One of: theta_deg and alpha_deg (clamp, Eqs. 9-11); direction (unit vector of the motion in the sensor's frame) with
-    gravity_mps2 where the sensor feels it; gravity_mps2 alone (a rest; gravity is the excitation). gravity_mps2 is
-    what an ideal sensor reads at rest there: +g on the axis that points up.
+    theta_deg and alpha_deg (clamp, Eqs. 9-11 of the paper); direction (unit vector of the motion in the sensor's
+    frame), with gravity_mps2 where the sensor feels gravity; gravity_mps2 alone (a rest: gravity is the excitation).
+    gravity_mps2 is what an ideal sensor reads at rest in this position: +g on the axis that points up.
     """
 
     theta_deg: Annotated[float | None, Field(ge=-90, le=90)] = None
@@ -32,9 +33,9 @@ class Stop(Section):
     @model_validator(mode="after")
     def _one_form(self) -> Stop:
         if (self.theta_deg is None) != (self.alpha_deg is None):
-            raise ValueError("theta_deg and alpha_deg go together")
+            raise ValueError("theta_deg and alpha_deg must be given together")
         if self.theta_deg is not None and (self.direction or self.gravity_mps2):
-            raise ValueError("theta_deg and alpha_deg exclude direction and gravity_mps2")
+            raise ValueError("give theta_deg and alpha_deg, or direction and gravity_mps2, not both")
         if self.theta_deg is None and self.direction is None and self.gravity_mps2 is None:
             raise ValueError("needs theta_deg and alpha_deg, or direction, or gravity_mps2")
         if self.direction is not None and abs(sum(x * x for x in self.direction) - 1) > 1e-3:
@@ -43,26 +44,30 @@ class Stop(Section):
 
     @property
     def moves(self) -> bool:
-        """Whether there is a motion for a reference to measure."""
+        """Whether the position has a motion, which a reference measures."""
         return self.theta_deg is not None or self.direction is not None
 
     def fault(self, reference: bool) -> str:
-        """Why it cannot be of a channel with, or without, a reference; "" where it can."""
+        """Why the position does not suit a channel with a reference (or without one); "" where it does."""
         if self.moves and not reference:
-            return "needs a reference (only gravity_mps2 alone does without)"
+            return "a position with motion needs a reference; without a reference, give gravity_mps2 alone (a rest)"
         if reference and not self.moves:
-            return "a rest (gravity_mps2 alone) is for a channel without a reference"
+            return "a rest (gravity_mps2 alone) is only for a channel without a reference; give direction too"
         return ""
 
     @property
     def hidden(self) -> str:
-        """Why gravity cannot tell that a sensor stands here; "" where it can."""
+        """Why the agent cannot find this position by gravity; "" where it can."""
         if self.theta_deg is None and (self.gravity_mps2 is None or not any(self.gravity_mps2)):
-            return "gravity_mps2 is needed, by which it is found"
+            return "needs gravity_mps2 other than zero, by which the agent finds this position"
         return ""
 
     def pose(self, gravity_mps2: float, static_sign: int, *, feels_gravity: bool) -> Pose:
-        """What is stated, for a sensor that feels gravity or does not."""
+        """The pose of the sensor in this position.
+
+        `gravity_mps2`: local gravity. `static_sign`: sign of gravity in Eqs. (9)-(11). Without `feels_gravity` (an
+        AC-coupled sensor) its gravity is zero.
+        """
         if self.theta_deg is not None and self.alpha_deg is not None:
             theta_rad, alpha_rad = np.deg2rad(self.theta_deg), np.deg2rad(self.alpha_deg)
             return clamp(float(theta_rad), float(alpha_rad), gravity_mps2 if feels_gravity else 0.0, static_sign)
@@ -73,7 +78,7 @@ class Stop(Section):
 
 
 class PoseInterval(Stop):
-    """How the sensor stands between two times, in seconds since the sensor's first sample."""
+    """The sensor's position between two times, in seconds since the sensor's first sample."""
 
     start_s: Annotated[float, Field(ge=0)]
     stop_s: Annotated[float, Field(gt=0)]
@@ -86,13 +91,13 @@ class PoseInterval(Stop):
 
 
 def tell_apart(stops: Sequence[Pose]) -> None:
-    """Raises ValueError, naming both, where gravity does not tell two stops from each other."""
+    """Check that gravity differs between all stops. Raises ValueError, which names two stops where it does not."""
     for i, stop in enumerate(stops):
         for k, other in enumerate(stops[:i]):
             between = stop.gravity_mps2 / np.linalg.norm(stop.gravity_mps2)
             apart = np.linalg.norm(between - other.gravity_mps2 / np.linalg.norm(other.gravity_mps2))
             if not apart >= np.deg2rad(LEAST_APART_DEG):
                 raise ValueError(
-                    f"positions.{k} and positions.{i} have the same gravity to {np.degrees(apart):.2g} deg: nothing "
-                    "tells which of them the sensor stands in"
+                    f"gravity at positions.{k} and positions.{i} differs by {np.degrees(apart):.2g} deg only: the "
+                    f"agent cannot tell which of them the sensor is in; at least {LEAST_APART_DEG:g} deg are needed"
                 )

@@ -1,4 +1,4 @@
-"""What the agent tells of itself, and to whom."""
+"""Settings of the gateway's status and of its metrics."""
 
 from __future__ import annotations
 
@@ -10,19 +10,23 @@ from agent.config.section import Section
 
 
 class Metrics(Section):
-    """An endpoint for Prometheus. It has no password: let nobody but the scraper reach it."""
+    """An HTTP endpoint for Prometheus. It has no password: make sure that only the Prometheus server can reach it."""
 
     enabled: bool = False
-    host: Annotated[str, Field(min_length=1, description="address to listen at; loopback unless you know better")] = (
+    host: Annotated[str, Field(min_length=1, description="address to listen at; by default this machine only")] = (
         "127.0.0.1"
     )
-    port: Annotated[int, Field(ge=0, le=65535, description="0: any free one, told in the log")] = 9478
+    port: Annotated[int, Field(ge=0, le=65535, description="0: any free port, which the log names")] = 9478
 
 
 class Supervision(Section):
-    """The gateway's own status."""
+    """Settings of the gateway's status."""
 
-    status_s: Annotated[float, Field(ge=1, le=3600, description="between two reports; a change is told at once")] = 10.0
-    # An hour of two devices at 1 kHz is 25 MB: there is time to come.
-    least_disk_free: Annotated[ByteSize, Field(description="below it the gateway is degraded")] = ByteSize(250_000_000)
+    status_s: Annotated[
+        float, Field(ge=1, le=3600, description="seconds between two reports; a change is reported at once")
+    ] = 10.0
+    # Two devices at 1 kHz record 25 MB an hour, so that ten hours are left when the status becomes degraded.
+    least_disk_free: Annotated[ByteSize, Field(description="with less free disk space the status is degraded")] = (
+        ByteSize(250_000_000)
+    )
     metrics: Metrics = Metrics()

@@ -1,4 +1,4 @@
-"""The files that TLS takes, and whether they fit together."""
+"""The certificate files for TLS, and the check that they belong together."""
 
 from __future__ import annotations
 
@@ -8,16 +8,19 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:  # only who checks files pays for it
+if TYPE_CHECKING:  # loaded only when files are checked, since it is slow
     from cryptography.x509 import Certificate
 
-# Time to make a certificate, travel and put it in place.
+# A warning is given this long before a certificate expires: time to make a new one, travel and install it.
 SOON = timedelta(days=60)
 
 
 @dataclass(frozen=True, slots=True)
 class TlsFiles:
-    """PEM files, see `fieldcal keys`: who is trusted, who we are, and the private key to it."""
+    """Paths of PEM files, see `fieldcal keys`.
+
+    `ca`: certificate of the trusted authority. `certificate`: the one that this side shows. `key`: its private key.
+    """
 
     ca: str
     certificate: str
@@ -25,9 +28,9 @@ class TlsFiles:
 
 
 def tls_faults(files: TlsFiles) -> list[str]:
-    """What is wrong with them, one line each, naming the field, the file and why. Empty where they fit together.
+    """The faults of the files, one line each with field, file and reason; empty where the files belong together.
 
-    A certificate whose time is over is none of these (`expiry_warning`): a gateway must go on measuring without one.
+    An expired certificate is not a fault but a warning (`expiry_warning`): the gateway must go on measuring without it.
     """
     from cryptography.exceptions import InvalidSignature
     from cryptography.hazmat.primitives.serialization import load_pem_private_key
@@ -40,26 +43,26 @@ def tls_faults(files: TlsFiles) -> list[str]:
         try:
             key = load_pem_private_key(text, password=None)
         except (ValueError, TypeError):
-            faults.append(f"key: {files.key}: no private key in PEM without a password")
+            faults.append(f"key: {files.key}: not a private key in PEM without a password")
         if Path(files.key).stat().st_mode & (stat.S_IROTH | stat.S_IWOTH):
-            faults.append(f"key: {files.key}: everybody can read it: chmod 600")
+            faults.append(f"key: {files.key}: all users can read or write this private key; run chmod 600 on it")
     if key is not None and certificate is not None and key.public_key() != certificate.public_key():
-        faults.append(f"key: {files.key}: not the key of {files.certificate}")
+        faults.append(f"key: {files.key}: not the private key of the certificate {files.certificate}")
     if ca is not None and certificate is not None:
         try:
             certificate.verify_directly_issued_by(ca)
         except (InvalidSignature, ValueError, TypeError):
-            faults.append(f"certificate: {files.certificate}: not signed by {files.ca}")
+            faults.append(f"certificate: {files.certificate}: not signed by the authority in {files.ca}")
     return faults
 
 
 def expiry_warning(files: TlsFiles, now: datetime) -> str:
-    """What to say of certificates that are over, or will be within SOON; "" where there is nothing to say."""
+    """A warning about certificates that have expired or expire within SOON of `now`; "" where none does."""
     faults: list[str] = []
     for name in ("ca", "certificate"):
         certificate = _certificate(name, getattr(files, name), faults)
         if certificate is not None and (left := certificate.not_valid_after_utc - now) < SOON:
-            over = "is over since" if left.total_seconds() < 0 else f"has {left.days} days left, to"
+            over = "expired on" if left.total_seconds() < 0 else f"expires in {left.days} days, on"
             faults.append(
                 f"{name}: {getattr(files, name)}: {over} {certificate.not_valid_after_utc:%Y-%m-%d %H:%M} UTC"
             )
@@ -75,7 +78,7 @@ def _certificate(name: str, path: str, faults: list[str]) -> Certificate | None:
     try:
         return load_pem_x509_certificate(text)
     except ValueError:
-        faults.append(f"{name}: {path}: no certificate in PEM")
+        faults.append(f"{name}: {path}: not a certificate in PEM")
         return None
 
 

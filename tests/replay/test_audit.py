@@ -94,7 +94,7 @@ def test_a_file_number_that_was_changed_is_found_though_the_sums_fit(files: list
     assert data[at : at + 1] == b"1"
     files[0].write_bytes(with_sums(data[:at] + b"7" + data[at + 1 :]))
     (file,) = audit_files(Given(files[:1]), StandIn.restore)
-    assert file.reasons == ["its metadata says file 7, its RunStart 1"]
+    assert file.reasons == ["its metadata says file number 7, its RunStart 1"]
 
 
 def test_results_that_do_not_follow_fail_though_every_sum_is_right(
@@ -109,7 +109,7 @@ def test_results_that_do_not_follow_fail_though_every_sum_is_right(
 def test_a_missing_recording_fails(files: list[Path], capsys: pytest.CaptureFixture[str]) -> None:
     status, said = audit([files[0], files[2]], capsys)
     assert status == 3
-    assert "recording 2 is missing before it, and nothing here says that retention deleted it" in said
+    assert "recording 2 is missing before it, and no recording given here says that retention deleted it" in said
     assert "note: events 9 to 19 are in none of these files" in said
 
 

@@ -84,23 +84,23 @@ def test_the_files_of_one_certificate_fit_together_and_others_do_not(site: Path,
     assert expiry_warning(files, now + timedelta(days=1760)) == ""
     assert "certificate: " in expiry_warning(files, now + timedelta(days=1770))
     assert " 5" in expiry_warning(files, now + timedelta(days=1770)).split(": ")[2], "days left"
-    assert "is over since" in expiry_warning(files, now + timedelta(days=1830))
+    assert "expired on" in expiry_warning(files, now + timedelta(days=1830))
     assert tls_faults(TlsFiles(ca, f"{gateway}.pem", str(site / "dashboard.key"))) == [
-        f"key: {site}/dashboard.key: not the key of {gateway}.pem"
+        f"key: {site}/dashboard.key: not the private key of the certificate {gateway}.pem"
     ]
     foreign = issue(make_authority("fieldcal authority", 9, now), "workshop/gateway-1", 9, now)
     (tmp_path / "f.pem").write_bytes(foreign.certificate_pem)
     (tmp_path / "f.key").write_bytes(foreign.key_pem)
     (tmp_path / "f.key").chmod(0o644)
     assert tls_faults(TlsFiles(ca, str(tmp_path / "f.pem"), str(tmp_path / "f.key"))) == [
-        f"key: {tmp_path}/f.key: everybody can read it: chmod 600",
-        f"certificate: {tmp_path}/f.pem: not signed by {ca}",
+        f"key: {tmp_path}/f.key: all users can read or write this private key; run chmod 600 on it",
+        f"certificate: {tmp_path}/f.pem: not signed by the authority in {ca}",
     ]
     assert tls_faults(TlsFiles(str(tmp_path / "no"), f"{gateway}.key", f"{gateway}.pem")) == [
         f"ca: {tmp_path}/no: cannot be read: No such file or directory",
-        f"certificate: {gateway}.key: no certificate in PEM",
-        f"key: {gateway}.pem: no private key in PEM without a password",
-        f"key: {gateway}.pem: everybody can read it: chmod 600",
+        f"certificate: {gateway}.key: not a certificate in PEM",
+        f"key: {gateway}.pem: not a private key in PEM without a password",
+        f"key: {gateway}.pem: all users can read or write this private key; run chmod 600 on it",
     ]
 
 
@@ -110,14 +110,14 @@ def test_nothing_is_written_over(site: Path, arguments: tuple[str, ...]) -> None
     before = {path: path.read_bytes() for path in site.iterdir()}
     result = run(site, *arguments)
     assert result.return_value == 2
-    assert "never written over" in result.stderr
+    assert "never overwritten" in result.stderr
     assert {path: path.read_bytes() for path in site.iterdir()} == before
 
 
 def test_without_an_authority_nothing_is_signed(tmp_path: Path) -> None:
     result = run(tmp_path / "new", "gateway", "workshop", "gateway-1")
     assert result.return_value == 2
-    assert "ca.pem: No such file or directory; first `fieldcal keys authority`" in result.stderr
+    assert "ca.pem: No such file or directory; run `fieldcal keys authority` first" in result.stderr
     result = CliRunner().invoke(keys, ["gateway", "work/shop", "x", "--dir", str(tmp_path)])
     assert result.exit_code == 2
     assert run_long_name(tmp_path) == 2
@@ -126,7 +126,7 @@ def test_without_an_authority_nothing_is_signed(tmp_path: Path) -> None:
 def run_long_name(directory: Path) -> int:
     run(directory, "authority")
     result = run(directory, "gateway", "s" * 40, "g" * 40)
-    assert "a common name has 64 at most" in result.stderr
+    assert "a common name may have 64 at most" in result.stderr
     return int(result.return_value)
 
 
@@ -139,7 +139,7 @@ def test_a_command_key_comes_with_the_configuration_that_lets_it_in(tmp_path: Pa
     assert signing.key.public_key().public_bytes_raw() == commands.keys[0].public_bytes
     assert commands.keys[0].may("hold", "any")
     path.chmod(0o640)
-    with pytest.raises(KeyFileError, match="others can read it"):
+    with pytest.raises(KeyFileError, match="other users can read this private key"):
         read_signing_key(path)
 
 

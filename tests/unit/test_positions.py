@@ -188,7 +188,7 @@ def test_an_operators_pose_holds_until_the_next_change() -> None:
         ({"positions": [{"gravity_mps2": [0, 0, 9.8]}, {"gravity_mps2": [0, 0, 0]}]}, "positions.1"),
         ({"positions": [{"theta_deg": 35, "alpha_deg": 0}, {"theta_deg": 35, "alpha_deg": 90}]}, "needs a reference"),
         ({"positions": [{"gravity_mps2": g} for g in FACES.tolist()], "reference": "r"}, "without a reference"),
-        ({"positions": [{"direction": [1, 0, 0]}] * 2, "reference": "r"}, "gravity_mps2 is needed"),
+        ({"positions": [{"direction": [1, 0, 0]}] * 2, "reference": "r"}, "needs gravity_mps2"),
         ({"positions": "free"}, "needs a reference"),
         ({"positions": "free", "reference": "r", "clamp_theta_deg": 2}, "tells no alpha"),
         ({"clamp_theta_deg": 35}, 'goes with positions = "free"'),
