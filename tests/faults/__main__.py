@@ -1,4 +1,4 @@
-"""`make faults`: all faults in full number, or those named; writes the table in docs/reliability.md row by row."""
+"""`make faults`: injects all faults in full number, or only those named; writes the table in docs/reliability.md."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ LINES: dict[str, Callable[[Path], Outcome]] = {
 
 
 def main() -> int:
-    """Run the lines named on the command line, or all; exit status 3 where something does not hold."""
+    """Run the table lines named on the command line, or all of them; exit status 3 where a requirement fails."""
     names = sys.argv[1:] or list(LINES)
     if unknown := [name for name in names if name not in LINES]:
         print(f"no fault {', '.join(unknown)}; there are {', '.join(LINES)}", file=sys.stderr)
@@ -46,7 +46,7 @@ def main() -> int:
     if missing := needs.missing():
         print(f"not here, and needed: {', '.join(missing)}", file=sys.stderr)
         return 1
-    # Before all else on this machine: the agent is measured, not its neighbours.
+    # With the highest priority on this machine, so that other processes do not disturb the measurement.
     os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
     good = True
     for name in names:
@@ -60,7 +60,7 @@ def main() -> int:
 
 
 def _write(outcome: Outcome) -> None:
-    """Put the row into the table in place of the one from before; other rows stay, each with its own day."""
+    """Replace the row of this line in the table; the other rows stay, each with the day of its own run."""
     page = PAGE.read_text().split(f"<!-- {PART}: begin -->", 1)[1].split(f"<!-- {PART}: end -->", 1)[0]
     known = [line for line in page.splitlines() if line.startswith("| ") and line not in HEAD.splitlines()]
     rows = {line.split(" | ", 1)[0]: line for line in known}

@@ -1,4 +1,4 @@
-"""Did reading go on? Told by the recordings, and by the port, which loses what nobody reads."""
+"""Checks whether reading of the device went on, by the recordings and by the port, which loses unread data."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from agent.recording.reading import RecordingReader
 from hw.block import BlockFlags, SampleBlock
 from tests.scenarios.processes import recordings
 
-LONGEST_S = 1.0  # that reading may stop, besides what the machine gives nobody time
+LONGEST_S = 1.0  # s that reading may pause, besides the time in which the machine runs no process of ours
 
 
 @dataclass(frozen=True, slots=True)
 class Acquisition:
-    """What the recordings tell of one device, in the order of events.
+    """How one device was read, according to the recordings.
 
-    `longest_pause_s` between two reads of the port, in real time; `missing` samples between blocks of one opening;
-    `openings` how often an index did not go on in time; `dropped` blocks for which the agent had no room.
+    `longest_pause_s`: longest real time between two reads of the port. `missing`: samples missing between blocks while
+    the device was open. `openings`: how often the sample index began anew. `dropped`: blocks that the agent dropped.
     """
 
     longest_pause_s: float
@@ -37,7 +37,7 @@ class Acquisition:
 
 
 def acquisition(data_dir: Path, speed: int) -> Acquisition:
-    """Of all recordings of one run on a sensor whose clock runs `speed` times as fast."""
+    """Read all recordings of one run. `speed`: how many times faster than real time the sensor's clock runs."""
     last_ns = expected = -1
     pause_ns = missing = openings = dropped = 0
     for event in _events(recordings(data_dir)):

@@ -1,4 +1,4 @@
-"""UTC is stepped under the running agent, and while it is away: by hours, and back before its time."""
+"""UTC is stepped by hours and by decades, while the agent runs and between two runs."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SHIM = Path(__file__).with_name("clock_shim.c")
 
 
 def stepped(directory: Path) -> Outcome:
-    """One run through all steps, then two runs 30 years before the first one, the second with the state file lost."""
+    """One run in which UTC makes all steps; then two runs with UTC 30 years earlier, the last without a state file."""
     directory.mkdir(exist_ok=True)
     library, step = directory / "clock_shim.so", directory / "step"
     subprocess.run(["gcc", "-O2", "-shared", "-fPIC", "-o", str(library), str(SHIM)], check=True)
@@ -80,7 +80,7 @@ def stepped(directory: Path) -> Outcome:
 
 
 def step_clock(path: Path, seconds: int) -> None:
-    """UTC of the processes that look at `path` is off by so much from now on."""
+    """Shift UTC by `seconds`, from now on, for all processes that have loaded the clock shim with the file `path`."""
     if not path.exists():
         path.write_bytes(bytes(8))
     with open(path, "r+b", buffering=0) as file:

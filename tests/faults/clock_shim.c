@@ -1,5 +1,6 @@
-/* Steps CLOCK_REALTIME of a process, while it runs, by the int64 of ns at the beginning of the file named by
-   FIELDCAL_CLOCK_STEP; all other clocks stay. gcc -O2 -shared -fPIC -o clock_shim.so clock_shim.c, then LD_PRELOAD. */
+/* Shifts CLOCK_REALTIME of a running process; all other clocks stay. The shift, an int64 in ns, is at the beginning of
+   the file that FIELDCAL_CLOCK_STEP names. Build: gcc -O2 -shared -fPIC -o clock_shim.so clock_shim.c. Load the library
+   into the process with LD_PRELOAD. */
 #define _GNU_SOURCE
 #include <fcntl.h>
 #include <stdlib.h>

@@ -21,26 +21,27 @@ from tests.scenarios.processes import recordings
 
 SEED = 20261121
 FS_IOC_SHUTDOWN = 0x8004587D
-# What is lost is what was not synced. XFS: 1 flushes the log and 2 does not; ext4 drops an unwritten journal with 2.
+# Flag of the shutdown ioctl with which exactly the unsynced data are lost: XFS does not flush its log with 2 (1 would);
+# ext4 drops its unwritten journal with 2.
 NO_LOG_FLUSH = 2
-SIZE_MB = {"ext4": 64, "xfs": 320}  # XFS makes none below 300 MB
+SIZE_MB = {"ext4": 64, "xfs": 320}  # XFS needs at least 300 MB
 MAKE = {"ext4": ["mkfs.ext4", "-q", "-F"], "xfs": ["mkfs.xfs", "-q", "-f"]}
-BAD_S = 5.0  # longer than the pause between two attempts to record, 10 s of the ten times faster clock
-GOOD_AGAIN_S = 60.0  # what waited for the slow disk must drain first
-# So many results in so many seconds, the last of them recorded: it is as before. A good disk takes 2.5 s for them, a
-# slow one 10 s or more, and while it is slow a stop leaves results unrecorded.
+BAD_S = 5.0  # longer than the pause between two attempts to record: 10 s of a clock that runs 10 times as fast, so 1 s
+GOOD_AGAIN_S = 60.0  # includes the time to write what waited for the slow disk
+# The agent has recovered when so many results came within so many seconds and the last one is recorded. A good disk
+# takes 2.5 s for them, a slow one 10 s or more. Stopped on a slow disk, the agent leaves results unrecorded.
 AGAIN, AGAIN_S = 20, 5.0
-SLOW_MS = 500  # a worn card that collects its garbage
-BACKLOG_S = 8.0  # of results, each of which waits for half a second and more
+SLOW_MS = 500  # as a worn SD card takes during its garbage collection
+BACKLOG_S = 8.0  # s of results that wait, each of which takes half a second or more to write
 
 
 def nothing() -> None:
-    """The injector begins and ends by itself."""
+    """Do nothing: the injector begins and ends by itself."""
 
 
 @dataclass(frozen=True, slots=True)
 class Spell:
-    """A time in which the disk is bad. `recorded`: whether recordings go on through it."""
+    """A time in which the disk is bad. `recorded`: whether recording goes on during it."""
 
     prefix: Sequence[str] = ()
     begin: Callable[[], None] = nothing
@@ -50,7 +51,7 @@ class Spell:
 
 @contextmanager
 def loop_disk(directory: Path, kind: str, size_mb: int = 0) -> Iterator[Path]:
-    """A new file system of its own, mounted at the path yielded."""
+    """Make a new file system in a loop file, mount it and yield its path."""
     image, mount = directory / f"{kind}.image", directory / f"{kind}.mount"
     mount.mkdir(parents=True)
     with open(image, "wb") as file:
@@ -65,7 +66,7 @@ def loop_disk(directory: Path, kind: str, size_mb: int = 0) -> Iterator[Path]:
 
 
 def power_cut(directory: Path, kind: str, cuts: int) -> Outcome:
-    """The file system is shut down without its journal under the running agent, mounted again, and looked at."""
+    """Shut the file system down without its journal while the agent runs; mount it again and check what is left."""
     moments = Random(SEED)
     with loop_disk(directory, kind) as mount, witnessed(directory, SEED, data_dir=mount / "data") as (rig, witness):
         ledger = Ledger(rig.data_dir)
@@ -86,7 +87,7 @@ def power_cut(directory: Path, kind: str, cuts: int) -> Outcome:
 
 
 def full(directory: Path) -> Outcome:
-    """The disk is filled to its last byte under the running agent, and emptied again."""
+    """Fill the disk to its last byte while the agent runs, and empty it again."""
     with (
         loop_disk(directory, "ext4", 16) as mount,
         witnessed(directory, SEED, data_dir=mount / "data") as (rig, witness),
@@ -102,9 +103,10 @@ def full(directory: Path) -> Outcome:
 
 
 def read_only(directory: Path) -> Outcome:
-    """ext4 aborts its journal and turns read-only under the running agent, as after an error of the medium.
+    """Make ext4 abort its journal and turn read-only while the agent runs, as after an error of the medium.
 
-    It stays so until it is mounted again: what was not kept by then is gone from the store; consumers have it.
+    The file system stays read-only until it is mounted again. Results that were not stored by then are missing in the
+    store, but consumers have received them.
     """
     with loop_disk(directory, "ext4") as mount, witnessed(directory, SEED, data_dir=mount / "data") as (rig, witness):
         ledger = Ledger(rig.data_dir)
@@ -141,7 +143,7 @@ def slow(directory: Path) -> Outcome:
 
 
 def slow_at_the_end(directory: Path) -> Outcome:
-    """fsync and fdatasync take long from some time on, and the agent is stopped with much waiting for the disk."""
+    """fsync and fdatasync become slow, and the agent is stopped while many events wait for the disk."""
     prefix = strace("fsync,fdatasync", f"delay_enter={SLOW_MS * 1000}:when=20+")
     with witnessed(directory, SEED) as (rig, witness):
         with rig.agent(prefix) as agent:
@@ -176,7 +178,7 @@ def _injected(directory: Path, line: str, how: str, *, recorded: bool) -> Outcom
 
 
 def _spell(line: str, injected: str, rig: Rig, witness: Witness, spell: Spell) -> Outcome:
-    """A disk that is bad for a while: the agent goes on, and afterwards nothing is missing."""
+    """Make the disk bad for a while; the agent must go on, and afterwards no result may be missing."""
     with rig.agent(spell.prefix) as agent:
         rig.run(agent, until=lambda: len(witness.received) > 20)
         began_s = time.monotonic()
@@ -217,7 +219,7 @@ def _good_again(witness: Witness, since_s: float) -> bool:
 
 
 def shut_down(mount: Path) -> None:
-    """No more writes reach the file system, and its journal is dropped: as when the power goes."""
+    """Stop all writes to the file system and drop its journal, as in a power cut."""
     descriptor = os.open(mount, os.O_RDONLY)
     try:
         fcntl.ioctl(descriptor, FS_IOC_SHUTDOWN, struct.pack("I", NO_LOG_FLUSH))

@@ -1,4 +1,4 @@
-"""Bits of a state file and of a recording, flipped one at a time."""
+"""Flips bits of a state file and of a recording, one at a time."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from tests.faults.rig import SENSOR, rig, stop
 from tests.scenarios.processes import recordings
 
 SEED = 20261121
-STARTED_S = 1.0  # after the port was opened: the first results
-RUN_S = 8.0  # leaves a state file with two dozen calibrations
+STARTED_S = 1.0  # s from the opening of the port to the first results
+RUN_S = 8.0  # s of a run that leaves about 24 calibrations in the state file
 
 
 def of_state(directory: Path, flips: int) -> Outcome:
-    """Each flip is met by a start: the store is opened and what was in force is read, as the service does."""
+    """After each flip the store is opened and the calibration in force is read, as the service does at its start."""
     data_dir = _recorded(directory, RUN_S)
     whole = (data_dir / FILE_NAME).read_bytes()
     with History(data_dir / FILE_NAME) as history:
@@ -58,9 +58,9 @@ def of_state(directory: Path, flips: int) -> Outcome:
 
 
 def of_recording(directory: Path, flips: int, size_bytes: int, edge_bytes: int) -> Outcome:
-    """Each flip must be a fault for the audit, also at the ends, where magic, header and footer are.
+    """The audit must report each flip, also at both ends of the file, where magic, header and footer are.
 
-    What is read nevertheless must be events and results as they were: a replay follows from those and nothing else.
+    Events and results that can still be read must be unchanged, since a replay follows from them alone.
     """
     data_dir = _recorded(directory, RUN_S, size_bytes)
     path = recordings(data_dir)[0]
@@ -109,7 +109,7 @@ def _recorded(directory: Path, seconds: float, size_bytes: int = 0) -> Path:
 
 
 def _start(data_dir: Path, right: list[Record], in_force: Record) -> str:
-    """What a start makes of a state file; "silently wrong" where it takes other values for the truth."""
+    """What a start does with a state file; "silently wrong" where it uses changed values without noticing."""
     try:
         store = Store(data_dir)
     except StoreError:
@@ -161,7 +161,7 @@ def _words(became: Counter[str]) -> str:
 
 
 def at_starts(directory: Path, starts: int) -> Outcome:
-    """The real agent is started on a state file with a flipped bit beside the recordings, which know what it was."""
+    """Start the real agent on a state file with a flipped bit; the intact recordings are in the same directory."""
     bits = random.Random(SEED)
     data_dir = _recorded(directory, RUN_S)
     whole = (data_dir / FILE_NAME).read_bytes()
@@ -193,7 +193,7 @@ def at_starts(directory: Path, starts: int) -> Outcome:
 
 
 def _begun(data_dir: Path, before: list[object]) -> str:
-    """With what the newest run began."""
+    """What the newest run began with: the calibration in force before, another one, or none."""
     try:
         with History(data_dir / FILE_NAME) as history:
             records = history.after(-1, limit=10_000_000)

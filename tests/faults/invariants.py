@@ -1,4 +1,4 @@
-"""What must hold however the agent ended: nothing accepted is lost, the store is readable, recordings replay."""
+"""What must hold after every end of the agent: no accepted result is lost, the store is readable, recordings replay."""
 
 from __future__ import annotations
 
@@ -22,38 +22,38 @@ from agent.recording.replaying import Replay
 from tests.faults.rig import OFFSET, SENSITIVITY
 from tests.scenarios.processes import recordings
 
-# A torn window of 1.25 s shifts its mean by 0.1 m/s2 and more for every sample of the wrong position; noise makes 1e-4.
+# In a window of 1.25 s, each sample from a wrong position shifts the mean by 0.1 m/s2 or more; noise shifts it by 1e-4.
 S_TOLERANCE = 0.005
 Q_TOLERANCE_MPS2 = 0.05
 
 
 @dataclass
 class Findings:
-    """Counts of what must be zero, the first words on each, and of what was looked at."""
+    """Counts of violations, which must be zero, with their first descriptions; and counts of what was checked."""
 
-    lost: int = 0  # calibrations that a consumer had, or that the store had, and that are gone
+    lost: int = 0  # calibrations that a consumer or the store had, and that are missing now
     unreadable: int = 0  # stores
     not_replaying: int = 0  # recordings
-    wrong: int = 0  # calibrations off the truth
-    not_restored: int = 0  # runs whose first calibration is not the last of the run before
+    wrong: int = 0  # calibrations that differ from the true values
+    not_restored: int = 0  # runs whose first calibration is not the last one of the run before
     calibrations: int = 0
     recordings: int = 0
     restored: int = 0
     words: list[str] = field(default_factory=list)
 
     def say(self, words: str) -> None:
-        """Keep the first few."""
+        """Keep the description of a violation, if it is among the first."""
         if len(self.words) < 20:
             self.words.append(words)
 
     @property
     def zeros(self) -> bool:
-        """Whether all that must be zero is."""
+        """Whether there is no violation."""
         return not (self.lost or self.unreadable or self.not_replaying or self.wrong or self.not_restored)
 
 
 class Ledger:
-    """Looks at a data directory again and again; what was seen once must be there ever after."""
+    """Inspects a data directory repeatedly; a result that was seen once must be there at every later inspection."""
 
     def __init__(self, data_dir: Path) -> None:
         self.data_dir = data_dir
@@ -65,7 +65,7 @@ class Ledger:
         self.records: list[Record] = []
 
     def inspect(self, witnessed: Iterable[Received] = ()) -> None:
-        """Look at the store and at what is new among the recordings. No agent may be running."""
+        """Inspect the store and the new recordings. No agent may be running."""
         found = self.findings
         for path in {*self.data_dir.glob(f"{FILE_NAME}.corrupt-*")} - self._aside:
             self._aside.add(path)
@@ -96,7 +96,7 @@ class Ledger:
         self._replay()
 
     def _look_for_restored(self) -> None:
-        """The first calibration of each run is the one that was in force."""
+        """Check that the first calibration of each run is the one that was in force before."""
         before: CalibrationUpdate | None = None
         self.findings.restored = self.findings.not_restored = 0
         for record in self.records:
@@ -128,7 +128,7 @@ class Ledger:
                 self.findings.say(f"calibration {record.sequence} is off: {update.sensitivity} {update.offset}")
 
     def _replay(self) -> None:
-        """Every recording gives its results again, bit for bit, and holds those that the store says it does."""
+        """Check that each recording replays bit for bit and holds the results that the store says are in it."""
         found = self.findings
         for path in recordings(self.data_dir):
             name = path.name.removesuffix(".active")
@@ -152,13 +152,13 @@ class Ledger:
 
 
 def read_store(data_dir: Path) -> list[Record]:
-    """All results of a store, read from a copy, so that the next start finds the very files that a fault left.
+    """Read all results of a store, from a copy, so that the next start finds the files exactly as the fault left them.
 
     Raises StoreError, also where the file would be set aside as corrupt.
     """
     with tempfile.TemporaryDirectory() as name:
         copy = Path(name)
-        for end in ("", "-wal", "-journal"):  # the fourth, -shm, is made anew, as after a power cut
+        for end in ("", "-wal", "-journal"):  # not -shm: SQLite makes it anew, as after a power cut
             path = data_dir / f"{FILE_NAME}{end}"
             if path.exists():
                 shutil.copy(path, copy)

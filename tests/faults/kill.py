@@ -13,13 +13,14 @@ from tests.faults.rig import Rig, Witness, stop, strace, witnessed
 from tests.scenarios.processes import recordings
 
 SEED = 20261121
-# What SQLite does in a commit, and what closes or names a file; recordings are written by `write`, looked at apart.
+# The system calls of a commit of SQLite, and those that close or rename a file. `write`, which writes the recordings,
+# is tested separately.
 SAVING = "pwrite64,fsync,fdatasync,ftruncate,rename,unlink"
-SURVIVED = 12  # results of a life in which the nth call did not come: six windows, their calibrations
+SURVIVED = 12  # results of a run in which the nth call did not come: six windows with their calibrations
 
 
 def at_random_moments(directory: Path, kills: int) -> Outcome:
-    """The agent is killed and started again on the same directory; what it left is looked at in between."""
+    """Kill the agent and start it again on the same directory, many times; inspect the directory after each kill."""
     moments = Random(SEED)
     with witnessed(directory, SEED) as (rig, witness):
         ledger = Ledger(rig.data_dir)

@@ -44,7 +44,7 @@ LIBC = ctypes.CDLL(None, use_errno=True)
 
 
 def directives(unit: Path) -> dict[str, list[str]]:
-    """What the unit says, all values of a key in order."""
+    """All values of each key in the unit file, in order."""
     found: dict[str, list[str]] = {}
     for line in unit.read_text().splitlines():
         key, separator, value = line.partition("=")
@@ -54,7 +54,7 @@ def directives(unit: Path) -> dict[str, list[str]]:
 
 
 def system_calls(filters: Iterable[str]) -> list[str]:
-    """The calls that SystemCallFilter lines leave, groups resolved; systemd adds @default to an allow-list."""
+    """The system calls that SystemCallFilter lines allow, groups resolved; systemd adds @default to an allow-list."""
     allowed = expand("@default")
     for line in filters:
         for name in line.removeprefix("~").split():
@@ -63,7 +63,7 @@ def system_calls(filters: Iterable[str]) -> list[str]:
 
 
 def expand(name: str) -> set[str]:
-    """A call, or all calls of a group and of the groups in it."""
+    """A single system call, or all calls of a group and of the groups in it."""
     if not name.startswith("@"):
         return {name}
     told = subprocess.run(["systemd-analyze", "syscall-filter", name], capture_output=True, text=True, check=True)
@@ -72,7 +72,7 @@ def expand(name: str) -> set[str]:
 
 
 class Filter:
-    """A seccomp filter; several that are loaded all hold."""
+    """A seccomp filter. Where several filters are loaded, all of them apply."""
 
     def __init__(self, default: int) -> None:
         self._library = ctypes.CDLL("libseccomp.so.2")
@@ -83,19 +83,19 @@ class Filter:
         self._context = ctypes.c_void_p(self._library.seccomp_init(ctypes.c_uint32(default)))
 
     def add(self, action: int, call: str, *where: tuple[int, int, int, int]) -> None:
-        """`action` for a call whose arguments are as `where` says; calls of other machines are left out."""
+        """Add `action` for a call with arguments as in `where`; a call that this machine does not have is ignored."""
         number = self._library.seccomp_syscall_resolve_name(call.encode())
         if number >= 0:
             comparisons = (Comparison * len(where))(*where)
             check(-self._library.seccomp_rule_add_array(self._context, action, number, len(where), comparisons))
 
     def load(self) -> None:
-        """From now on, also over exec."""
+        """Load the filter; it also applies after exec."""
         check(-self._library.seccomp_load(self._context))
 
 
 def check(error: int) -> None:
-    """Raise what a C call returned."""
+    """Raise OSError where the return value of a C call says that it failed."""
     if error:
         raise OSError(error, os.strerror(error))
 
@@ -107,7 +107,7 @@ def mount(source: str, target: str, kind: str, flags: int, options: str = "") ->
 
 
 def set_read_only(path: str, read_only: bool) -> None:
-    """All mounts below a path."""
+    """Set all mounts below a path read-only or writable."""
     attributes = MountAttributes(set=read_only * MOUNT_ATTR_RDONLY, clear=(not read_only) * MOUNT_ATTR_RDONLY)
     size = ctypes.sizeof(attributes)
     if LIBC.syscall(SYS_MOUNT_SETATTR, AT_FDCWD, path.encode(), AT_RECURSIVE, ctypes.byref(attributes), size):
@@ -115,7 +115,7 @@ def set_read_only(path: str, read_only: bool) -> None:
 
 
 def limit_files(writable: list[str], kept: Iterable[str]) -> None:
-    """All read-only but /dev and what is writable; no others' processes; of homes only what is kept."""
+    """Make files read-only except /dev and `writable`; hide others' processes, and home directories except `kept`."""
     if LIBC.unshare(CLONE_NEWNS):
         check(ctypes.get_errno())
     mount("", "/", "", MS_REC | MS_PRIVATE)
@@ -135,7 +135,7 @@ def limit_files(writable: list[str], kept: Iterable[str]) -> None:
 
 
 def limit_rights(uid: int) -> None:
-    """Another user, no capability, none to be had."""
+    """Change to the user `uid` without capabilities and without a way to get any."""
     for capability in range(LAST_CAPABILITY + 1):
         LIBC.prctl(PR_CAPBSET_DROP, capability, 0, 0, 0)
     os.setgroups([])
@@ -145,7 +145,7 @@ def limit_rights(uid: int) -> None:
 
 
 def limit_memory() -> None:
-    """Nothing that is written is executed: as the kernel refuses it since 6.3, and as systemd did before."""
+    """Forbid memory that is both writable and executable, as the kernel can since 6.3 and as systemd did before."""
     check(LIBC.prctl(PR_SET_MDWE, 1, 0, 0, 0) and ctypes.get_errno())
     both = mmap.PROT_WRITE | mmap.PROT_EXEC
     rules = Filter(ALLOW)
@@ -156,13 +156,13 @@ def limit_memory() -> None:
 
 
 def limit_calls(filters: list[str], families: list[str], refusal: int) -> None:
-    """System calls of the unit's groups, sockets of its families, no namespaces."""
+    """Allow only the system calls of the unit's groups, sockets of its address families, and no namespaces."""
     rules = Filter(ALLOW)
     known = {int(getattr(socket, family)) for family in families}
     for family in set(range(FAMILIES_END)) - known:
         rules.add(ERRNO | errno.EAFNOSUPPORT, "socket", (0, EQ, family, 0))
     rules.add(ERRNO | errno.EAFNOSUPPORT, "socket", (0, GREATER, FAMILIES_END - 1, 0))
-    rules.add(ERRNO | errno.ENOSYS, "clone3")  # its flags are out of a filter's sight; glibc then calls clone
+    rules.add(ERRNO | errno.ENOSYS, "clone3")  # a filter cannot see its flags; after ENOSYS glibc calls clone
     for bit in (1 << n for n in range(32) if CLONE_NEW_ANY >> n & 1):
         rules.add(ERRNO | errno.EPERM, "clone", (0, MASKED_EQ, bit, bit))
         rules.add(ERRNO | errno.EPERM, "unshare", (0, MASKED_EQ, bit, bit))
@@ -175,7 +175,7 @@ def limit_calls(filters: list[str], families: list[str], refusal: int) -> None:
 
 
 def main() -> None:
-    """Take the limits on and become the program."""
+    """Apply the limits and execute the program."""
     unit, data_dir, uid, _, *command = sys.argv[1:]
     said = directives(Path(unit))
     assert said["ProtectSystem"] == ["strict"]

@@ -1,4 +1,4 @@
-"""What a fault needs of the machine; tests skip where it is not there, and say what."""
+"""What the faults need of the machine. A test is skipped where something is missing, and names it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ TOOLS = {"strace": "strace", "gcc": "gcc", "mkfs.ext4": "e2fsprogs", "mkfs.xfs":
 
 
 def missing(*tools: str, root: bool = True) -> list[str]:
-    """Of these tools (all, if none is named), of root and of loop devices, what is not here."""
+    """What is missing of these tools (of all, if none is named), root's rights and loop devices."""
     lacking = [f"{name} (package {TOOLS[name]})" for name in tools or TOOLS if shutil.which(name) is None]
     if root and os.geteuid() != 0:
         lacking.append("root")

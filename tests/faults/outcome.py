@@ -1,4 +1,4 @@
-"""What came of one kind of fault: a row of the table in docs/reliability.md."""
+"""The outcome of one kind of fault: a row of the table in docs/reliability.md."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ from tests.faults.invariants import Findings
 
 @dataclass
 class Outcome:
-    """`injected` says what was done and how often, `also` what was measured besides; `bad` what must not be."""
+    """The outcome of one fault.
+
+    `injected`: what was done, and how often. `also`: what else was measured. `bad`: requirements that failed.
+    """
 
     line: str
     injected: str
@@ -19,11 +22,11 @@ class Outcome:
 
     @property
     def good(self) -> bool:
-        """Whether all that must be zero is."""
+        """Whether no requirement failed."""
         return self.findings.zeros and not self.bad
 
     def require(self, holds: bool, words: str) -> None:
-        """Remember what does not hold."""
+        """Add `words` to the failed requirements unless `holds`."""
         if not holds:
             self.bad.append(words)
 

@@ -1,4 +1,4 @@
-"""What is broken: the real agent process on a virtual sensor that is turned through six rests, and who watches it."""
+"""The test rig: the real agent as a process, a virtual sensor that is turned through six rests, and a consumer."""
 
 from __future__ import annotations
 
@@ -27,10 +27,11 @@ SITE, GATEWAY = "faults", "rig"
 SOURCE = f"{SITE}/{GATEWAY}"
 SENSOR = "imu"
 RATE_HZ = 100.0
-# A rest is looked for in blocks of 0.25 s, wants 1 s and leaves 0.25 s at both ends; with the guards this is the least.
+# The shortest rest that gives a window: rests are found in blocks of 0.25 s, need 1 s and lose 0.25 s and the guard at
+# both ends.
 HOLD_S = 2.5
 GUARD_S = 0.25
-SPEED = 10  # a window each 0.25 s instead of 2.5: more is at stake at any moment
+SPEED = 10  # a window each 0.25 s instead of 2.5 s, so that a fault at a random moment hits more of the agent's work
 POLL_S = 0.005
 G_MPS2 = 9.80665
 UP = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0], [0, 0, -1], [-1, 0, 0], [0, -1, 0]], dtype=float)
@@ -40,11 +41,11 @@ NOISE_MPS2 = 0.005
 LINE_BYTES = 28
 STOP_S = 10.0
 IN_START, START_S, WORK_S = 0.25, 1.0, 4.0  # rests begin to count after 0.25 s, four determine S and Q
-GIVE_UP_S = 120.0  # what takes seconds; on a machine under load more
+GIVE_UP_S = 120.0  # s after which a test fails; what is waited for takes seconds, on a machine under load more
 
 
 def never() -> bool:
-    """No condition."""
+    """A condition that never becomes true."""
     return False
 
 
@@ -57,17 +58,17 @@ class TurnedSensor:
         self._next = 0
 
     def begin(self, t_s: float) -> None:
-        """The first sample is due at `t_s`."""
+        """Start sending; the first sample is due at `t_s`."""
         self._next = 0
         self._began_s = t_s
 
     @property
     def speaks(self) -> bool:
-        """Whether it has begun: its port was opened."""
+        """Whether sending has started."""
         return self._began_s is not None
 
     def silence(self) -> None:
-        """No samples until the next `begin`."""
+        """Send no samples until the next `begin`."""
         self._began_s = None
 
     def __call__(self, t_s: float) -> bytes:
@@ -86,7 +87,7 @@ class TurnedSensor:
 
 
 class Witness:
-    """A consumer far away: all that left the gateway, with when it came (time.monotonic)."""
+    """A consumer that keeps all results it received, each with its time of arrival (time.monotonic)."""
 
     def __init__(self, endpoint: str, last_sequence: Mapping[str, int] | None = None) -> None:
         self.received: list[tuple[float, Received]] = []
@@ -99,7 +100,7 @@ class Witness:
             self.received.append((time.monotonic(), result))
 
     def before(self, t_s: float) -> list[Received]:
-        """What had come by then."""
+        """The results that had arrived by `t_s`."""
         return [result for came_s, result in self.received if came_s <= t_s]
 
     def close(self) -> None:
@@ -110,7 +111,7 @@ class Witness:
 
 @dataclass
 class Rig:
-    """A directory with a configuration, a sensor, and whoever listens at `endpoint`."""
+    """A directory with a configuration, a sensor, and the Zenoh endpoint to which agents publish."""
 
     directory: Path
     endpoint: str
@@ -119,25 +120,25 @@ class Rig:
     device: PtyDevice
     config: Path
     data_dir: Path
-    late_s: float = 0.0  # the longest that this process itself had to wait for the machine
+    late_s: float = 0.0  # longest time that this process itself had to wait for the processor
     _said: int = 0
 
     @property
     def output(self) -> str:
-        """All that the agents of this rig have said."""
+        """The output of all agents of this rig."""
         path = self.directory / "output"
         return path.read_text(errors="replace") if path.exists() else ""
 
     @property
     def unread_s(self) -> float:
-        """How much of the sensor's text nobody read and the port lost, as a time."""
+        """The sensor's output that the port lost because nobody read it, as a time in s."""
         return self.device.lost_bytes / (LINE_BYTES * RATE_HZ * self.speed)
 
     @contextmanager
     def agent(
         self, prefix: Sequence[str] = (), variables: dict[str, str] | None = None
     ) -> Iterator[subprocess.Popen[bytes]]:
-        """The real agent; `prefix` is a command that starts it (strace). Killed at the end if it still runs."""
+        """Start the real agent, through the command `prefix` (strace) if given; at the end it is killed if it runs."""
         self.sensor.silence()
         self._said = len(self.output)
         command = [
@@ -163,15 +164,15 @@ class Rig:
             process.wait()
 
     def _opened(self) -> bool:
-        """Whether the agent has opened the port, and thrown away what came before: then it says the sensor's status."""
+        """Whether the agent has opened the port and discarded old input: after that it prints the sensor's status."""
         return self.device.has_reader() and f"{SENSOR}: " in self.output[self._said :]
 
     def run(
         self, process: subprocess.Popen[bytes], seconds: float | None = None, until: Callable[[], bool] = never
     ) -> bool:
-        """Let the agent work for so long or `until` that holds; the rests begin when it opens its port, if silent.
+        """Let the agent work for `seconds`, or until `until()` is true. A silent sensor starts when the port is opened.
 
-        False where it ended before. Without `seconds`, `until` must come.
+        Returns False where the agent ended before. Without `seconds`, `until()` must become true within GIVE_UP_S.
         """
         end_s = time.monotonic() + (GIVE_UP_S if seconds is None else seconds)
         while process.poll() is None and not until():
@@ -186,9 +187,9 @@ class Rig:
         return process.poll() is None
 
     def run_to_a_moment(self, process: subprocess.Popen[bytes], random: Random) -> None:
-        """To a moment in which something may happen: one of four within the start, the others while it works.
+        """Let the agent work up to a random moment: one of four within its start, the others while it works.
 
-        Counted from the opening of its port, since a machine under load takes its time for a start.
+        The time counts from the opening of the port, since a start takes longer on a machine under load.
         """
         if random.random() < IN_START:
             self.run(process, random.uniform(0.0, START_S))
@@ -201,7 +202,7 @@ class Rig:
 def rig(
     directory: Path, seed: int, *, endpoint: str = "", speed: int = SPEED, data_dir: Path | None = None
 ) -> Iterator[Rig]:
-    """A rig in `directory`; without `endpoint` nothing is published."""
+    """Make a rig in `directory`; without `endpoint` its agents publish nothing."""
     directory.mkdir(parents=True, exist_ok=True)
     sensor = TurnedSensor(seed)
     device = PtyDevice(sensor, lambda: speed * time.monotonic(), directory / "port")
@@ -250,7 +251,7 @@ rotate_s = 86400  # a file begins by the agent's clock and ages by the driver's,
 
 @contextmanager
 def local_router() -> Iterator[str]:
-    """A router in this process; yields its endpoint."""
+    """Run a router in this process; yields its endpoint."""
     session, endpoints = open_router("tcp/127.0.0.1:0")
     try:
         yield endpoints[0]
@@ -260,7 +261,7 @@ def local_router() -> Iterator[str]:
 
 @contextmanager
 def witnessed(directory: Path, seed: int, *, data_dir: Path | None = None) -> Iterator[tuple[Rig, Witness]]:
-    """A rig with a router and a witness."""
+    """Make a rig with a router and a consumer that keeps all results."""
     with ExitStack() as stack:
         endpoint = stack.enter_context(local_router())
         witness = Witness(endpoint)
@@ -269,7 +270,7 @@ def witnessed(directory: Path, seed: int, *, data_dir: Path | None = None) -> It
 
 
 def stop(process: subprocess.Popen[bytes]) -> int:
-    """End an agent as systemd does, also one under strace; its exit status."""
+    """End an agent as systemd does, also one that runs under strace; returns its exit status."""
     for pid in descendants(process.pid) or [process.pid]:
         with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGTERM)
@@ -277,10 +278,10 @@ def stop(process: subprocess.Popen[bytes]) -> int:
 
 
 def strace(calls: str, how: str, path: Path | None = None) -> list[str]:
-    """A command before the agent's that spoils these system calls `how`, on `path` alone if given.
+    """A command to put before the agent's. It injects faults (`how`) into the system calls `calls`, on `path` if given.
 
-    Where it can, all other calls go through untouched, so that the agent is not slowed down; strace 6.1 does not inject
-    signals so.
+    Where strace can, it does not stop at other system calls, so that the agent is not slowed down. strace 6.1 cannot do
+    this when it injects signals.
     """
     where = ["-P", str(path)] if path else []
     fast = [] if how.startswith("signal") else ["--seccomp-bpf"]
@@ -288,7 +289,7 @@ def strace(calls: str, how: str, path: Path | None = None) -> list[str]:
 
 
 def descendants(pid: int) -> list[int]:
-    """Processes that this one has started, and theirs."""
+    """All processes that the process `pid` has started, directly or indirectly."""
     with suppress(OSError):
         children = [int(c) for c in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
         return [d for child in children for d in [*descendants(child), child]]
@@ -296,7 +297,7 @@ def descendants(pid: int) -> list[int]:
 
 
 def free_port() -> int:
-    """A port of 127.0.0.1 that nobody has now."""
+    """A port of 127.0.0.1 that is not in use."""
     with socket.socket() as s:
         s.bind(("127.0.0.1", 0))
         return int(s.getsockname()[1])

@@ -1,4 +1,4 @@
-"""The router is away for thousands of results, freezes, is killed and comes back."""
+"""The router is missing for thousands of results, freezes, is killed and comes back."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from tests.faults.outcome import Outcome
 from tests.faults.rig import ROOT, SOURCE, Rig, Witness, free_port, rig, stop
 
 SEED = 20261121
-LEAST_A_SECOND = 5  # results, on a machine under load
-FROZEN_S = 15.0  # Zenoh gives up a link after 10 s
+LEAST_A_SECOND = 5  # results per second that must come even on a machine under load
+FROZEN_S = 15.0  # s; Zenoh closes a link after 10 s without an answer
 DEAD_S = 5.0
 ALIVE_S = 5.0
 CAUGHT_UP_S = 60.0
 
 
 def away(directory: Path, results: int, speed: int) -> Outcome:
-    """No router until the store holds so many results; then one that freezes, is killed, and comes back.
+    """Run without a router until the store holds `results` results; then with one that freezes, is killed, and returns.
 
-    At 50 times the speed there are 40 results a second.
+    At a `speed` of 50 there are 40 results per second.
     """
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with rig(directory, SEED, endpoint=endpoint, speed=speed) as r, r.agent() as agent:
@@ -90,7 +90,7 @@ def away(directory: Path, results: int, speed: int) -> Outcome:
 
 @contextmanager
 def router(endpoint: str) -> Iterator[subprocess.Popen[bytes]]:
-    """A router process; killed at the end if it still runs."""
+    """Run a router as a process; it is killed at the end if it still runs."""
     command = [sys.executable, "-m", "agent", "router", "--listen", endpoint]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL)
     try:
@@ -108,11 +108,11 @@ def _kept(r: Rig) -> int:
         return 0
     with closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as connection, suppress(sqlite3.OperationalError):
         return int(connection.execute("SELECT count(*) FROM results").fetchone()[0])
-    return 0  # the agent is making its tables
+    return 0  # the agent has not made its tables yet
 
 
 def _settled(r: Rig, agent: subprocess.Popen[bytes]) -> int:
-    """How many results there are once no more come."""
+    """Wait until no more results come; returns their number."""
     before = -1
     while (now := _kept(r)) != before:
         before = now

@@ -1,4 +1,4 @@
-"""Disks gone bad, in short."""
+"""Faults of the disk, in small numbers; `make faults` injects them in full number."""
 
 from __future__ import annotations
 

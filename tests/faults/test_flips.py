@@ -1,4 +1,4 @@
-"""Flipped bits, in short."""
+"""Flipped bits, in small numbers; `make faults` flips the full number."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The agent works under the limits of its systemd unit, and the limits are there: no init is started for it."""
+"""The agent works under the limits of its systemd unit, and the limits are effective. systemd itself is not started."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ libc = ctypes.CDLL(None, use_errno=True)
 if libc.unshare(0x10000000):
     raise OSError(ctypes.get_errno(), "unshare")
 """
-# Six rests, and what an ideal sensor reads there.
+# What an ideal sensor reads in six rests.
 RESTS = [[sign * 9.81 if axis == i else 0.0 for i in range(3)] for axis in range(3) for sign in (1, -1)]
 REST_S = 3
 SENSITIVITY = np.array([[1.01, 0.02, 0.0], [0.0, 0.98, -0.01], [0.03, 0.0, 1.02]])
@@ -80,7 +80,7 @@ pytestmark = [
 
 @pytest.fixture
 def data_dir() -> Iterator[Path]:
-    # Not pytest's own: only its maker may enter that.
+    # Not pytest's temporary directory, which only its owner may enter.
     directory = Path(tempfile.mkdtemp(prefix="fieldcal-", dir="/var/tmp"))
     os.chown(directory, NOBODY, NOBODY)
     yield directory
@@ -145,12 +145,12 @@ def port(data_dir: Path) -> Iterator[PtyDevice]:
     def samples_due(t_s: float) -> int:
         nonlocal began_s
         if began_s is None and device.has_reader():
-            began_s = t_s  # the poses count from the first sample that is read
+            began_s = t_s  # the times of the poses count from the first sample that is read
         return 0 if began_s is None else int((t_s - began_s) * RATE_HZ)
 
     device = PtyDevice(SampleLines(values, samples_due), link=data_dir / "port")
     device.start()
-    os.chown(device.path.resolve(), NOBODY, NOBODY)  # as a group that may use the port
+    os.chown(device.path.resolve(), NOBODY, NOBODY)  # stands for a group whose members may use the port
     yield device
     device.stop()
 
@@ -173,7 +173,7 @@ def configuration(port: Path, endpoint: str, metrics_port: int) -> str:
 
 
 class Systemd:
-    """Takes notifications as systemd does: at once, since ten fill the queue of a socket."""
+    """Receives notifications as systemd does: without delay, since ten fill the queue of a socket."""
 
     def __init__(self, path: Path) -> None:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -225,7 +225,8 @@ def test_the_agent_calibrates_publishes_and_records(data_dir: Path, port: PtyDev
     router.close()
     found = json.loads(published.payload.to_string())
     main = np.diag(SENSITIVITY)
-    # Noise of 0.01 over 260 samples a rest leaves 1e-4; a sample that strays over a pose's edge would be off by 10 %.
+    # Noise of 0.01 over the 260 samples of a rest leaves about 1e-4. One sample from another pose would cause errors of
+    # 10 %.
     assert np.abs((np.array(found["sensitivity"]) - SENSITIVITY) / main).max() < 1e-3
     assert np.abs(np.array(found["offset"]) - OFFSET).max() < 5e-3
     assert 'fieldcal_device_up{device="imu"} 1.0' in scraped

@@ -1,4 +1,4 @@
-"""kill -9, in short; `make faults` does it 200 times and at every write."""
+"""kill -9, a few times; `make faults` does it 200 times and at every write."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The sensor, the router and the clock, in short."""
+"""Faults of the sensor, the router and the clock, in small numbers; `make faults` injects them in full number."""
 
 from __future__ import annotations
 

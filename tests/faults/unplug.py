@@ -14,13 +14,11 @@ from tests.faults.rig import stop, witnessed
 SEED = 20261121
 PLUGGED_S = (0.05, 1.5)  # real time; at ten times the speed up to six rests
 UNPLUGGED_S = (0.0, 0.5)
-BACK_S = (
-    1.0  # back-off begins at 0.1 s and doubles: plugged in again it is read within as long as it was away, and this
-)
+BACK_S = 1.0  # allowed besides the time unplugged: the pause between attempts to open begins at 0.1 s and doubles
 
 
 def unplugged(directory: Path, times: int) -> Outcome:
-    """Hang up the port under the running agent, at random moments and for random times."""
+    """Hang up the port while the agent runs, at random moments and for random times."""
     moments = random.Random(SEED)
     slowest_s = 0.0
     with witnessed(directory, SEED) as (rig, witness):
