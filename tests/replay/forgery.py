@@ -1,4 +1,4 @@
-"""Files that a careful forger would make: what they say is wrong, every sum in them is right."""
+"""Makes forged files as a careful forger would: their content is wrong, but every CRC in them is right."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from agent.recording.records import MAGIC, Record, walk
 
 
 def records(data: bytes) -> list[Record]:
-    """All records of a file that can be walked."""
+    """All records of a file, which must be readable to its end."""
     return list(walk(io.BytesIO(data), len(data)))
 
 
 def with_sums(data: bytes) -> bytes:
-    """The file with the CRCs of data section and summary made to fit."""
+    """The file with the CRCs of data section and summary computed anew."""
     parts = records(data)
     end = next(record for record in parts if record.name == "DataEnd")
     crc = zlib.crc32(data[: end.offset])
@@ -29,7 +29,7 @@ def with_sums(data: bytes) -> bytes:
 
 
 def write_messages(path: Path, messages: Iterable[tuple[str, int, bytes]]) -> None:
-    """A sound file of messages (topic, sequence, data)."""
+    """Write a valid file of messages (topic, sequence, data)."""
     with open(path, "wb") as file:
         writer = Writer(file, compression=CompressionType.NONE, enable_data_crcs=True)
         writer.start()

@@ -1,5 +1,8 @@
-"""The golden recordings: where they are, what a replay of one gives. `python -m tests.replay.golden_files` writes
-expected.json of each anew: only after a change that moves results on purpose."""
+"""The golden recordings: their directories, and the results that a replay gives.
+
+`python -m tests.replay.golden_files` writes each expected.json anew. Run it only after a change that is meant to change
+results.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,7 @@ RECORDING, STATE, EXPECTED = "fieldcal-000001.mcap", "state.sqlite", "expected.j
 
 
 def results_of(path: Path) -> list[dict[str, Any]]:
-    """All results of a replay, in order, as JSON holds them."""
+    """All results of a replay, in order, as they are after JSON encoding and decoding."""
     replay = Replay(Pipeline.restore, fingerprint(), elsewhere=0.0)
     file = replay.run(path)
     assert not file.refused, file.refused
@@ -29,9 +32,9 @@ def results_of(path: Path) -> list[dict[str, Any]]:
 
 
 def config_of(path: Path) -> str:
-    """The configuration in a recording's RunStart, JSON."""
+    """The configuration in a recording's RunStart, as JSON text."""
     start = next(step.event for step in RecordingReader(path).steps())
-    return str(start.config_json)  # type: ignore[union-attr] - the reader lets nothing come before a RunStart
+    return str(start.config_json)  # type: ignore[union-attr] - the reader ensures that the first event is a RunStart
 
 
 if __name__ == "__main__":

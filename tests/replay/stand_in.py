@@ -1,4 +1,4 @@
-"""A small deterministic pipeline and a run for it: what recording, replay and audit are tested with."""
+"""A small deterministic pipeline, and a run for it, with which recording, replay and audit are tested."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ Recorded = tuple[int, Event, list[Result]]
 
 
 class StandIn:
-    """A window each few blocks, with the blocks' product sums in it; a calibration each second window.
+    """Gives a window for each few blocks, with the blocks' sums of products, and a calibration for each second window.
 
-    The sums go through BLAS, so that they depend on the CPU kernel as the true pipeline's do.
+    BLAS computes the sums, so that they depend on the CPU kernel, as those of the real pipeline do.
     """
 
     def __init__(self, config_json: str) -> None:
@@ -135,7 +135,7 @@ def block(device: str, number: int, rng: np.random.Generator, n: int = 20) -> Sa
 
 
 def happenings(blocks: int, seed: int) -> Iterator[Event]:
-    """Events of a run but its RunStart: two devices' blocks, a tick a second, and one of each other kind."""
+    """Events of a run without its RunStart: blocks of two devices, a tick each second, one event of each other kind."""
     rng = np.random.default_rng(seed)
     for number in range(blocks):
         now_ns = 5 * SECOND + number * SECOND // 2
@@ -149,7 +149,7 @@ def happenings(blocks: int, seed: int) -> Iterator[Event]:
 
 
 def run_start(pipeline: StandIn, event_sequence: int, file_sequence: int, now_ns: int = 5 * SECOND) -> RunStart:
-    """RunStart of the first file (event 0), or of one that goes on."""
+    """RunStart of the first file (event 0) or of a file that continues the run."""
     return RunStart(
         run_id="run-1",
         site="site",
@@ -170,7 +170,7 @@ def run_start(pipeline: StandIn, event_sequence: int, file_sequence: int, now_ns
 def record_run(
     directory: Path, *, blocks: int = 12, rotate_at: Sequence[int] = (), seed: int = 1, close: bool = True
 ) -> list[Recorded]:
-    """Record a run, in a new file before each event number in `rotate_at`; returns all that went in."""
+    """Record a run, with a new file before each event number in `rotate_at`; returns all that was recorded."""
     recorder = Recorder(directory, ["acc", "ref"], ["bridge-1"])
     pipeline = StandIn(CONFIG)
     recorded: list[Recorded] = []

@@ -1,4 +1,4 @@
-"""The audit passes what is sound, and tells where and why a recording is not: bytes, chain, results, signature."""
+"""The audit passes intact recordings, and says where and why others fail: bytes, chain, results or signature."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_an_unfinished_file_is_incomplete(files: list[Path], capsys: pytest.Capt
     first = audit_files(Given(files), StandIn.restore)[0]
     assert first.incomplete
     assert f"incomplete, last good byte {first.good_bytes}: byte" in said
-    assert said.count("FAILED") == 1  # the next file is not blamed for it
+    assert said.count("FAILED") == 1  # the next file passes
     assert first.replay.equal
 
 

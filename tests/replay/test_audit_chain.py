@@ -1,4 +1,4 @@
-"""The audit over several recordings: what was deleted and what was stolen, what a crash left, and who signed it."""
+"""The audit of several recordings: deleted by retention or missing without reason, left by a crash, and signed."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def write_keys(directory: Path) -> tuple[Path, Path]:
 
 
 def record(directory: Path, *, keep: KeepFiles | None = None, signer: Signer | None = None) -> None:
-    """A run of five files with a store beside it, keeping to `keep`."""
+    """Record a run of five files, with a store in the same directory and the retention limits `keep`."""
     store = Store(directory, 0)
     recorder = Recorder(directory, ["acc", "ref"], ["bridge-1"], keep=keep or KeepFiles(), ledger=store, signer=signer)
     pipeline = StandIn(CONFIG)
@@ -76,7 +76,7 @@ def size(directory: Path, count: int) -> int:
 
 @pytest.fixture
 def limit(tmp_path_factory: pytest.TempPathFactory) -> KeepFiles:
-    """Room for some two of the files."""
+    """Retention limits that leave about two of the files."""
     directory = tmp_path_factory.mktemp("size")
     record(directory)
     return KeepFiles(bytes=int(size(directory, FILES) * 2.5 / FILES))

@@ -1,7 +1,7 @@
-"""Recordings and states of every format that was released stay readable, and give the results that stand beside them.
+"""Recordings and stores of every released format can be read, and replay to the results in `expected.json` beside them.
 
-`expected.json` holds what this version of the program computes from a recording. Where a change of the estimator moves
-a result on purpose, `python -m tests.replay.golden_files` writes the file anew, and CHANGELOG.md says why.
+Where a change of the estimator changes a result on purpose, `python -m tests.replay.golden_files` writes expected.json
+anew, and CHANGELOG.md gives the reason.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ TOLERANCE = 1e-9  # relative: kernels of other CPUs differ by 1e-12 at most
 
 
 def differing(found: Any, expected: Any, path: str = "") -> list[str]:
-    """Where two results are not the same to TOLERANCE; what is missing, NaN or more on one side is a difference."""
+    """The places where two results differ by more than TOLERANCE, or only one of them has a field or a number."""
     if isinstance(found, dict) and isinstance(expected, dict):
         if found.keys() != expected.keys():
             return [f"{path}: members {sorted(found.keys() ^ expected.keys())}"]

@@ -1,4 +1,4 @@
-"""A recording replays bit for bit: whole, each file alone, all in chain, torn; and what does not follow is told."""
+"""A recording replays bit for bit: whole, each file alone, files in sequence, torn files. Differences are reported."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def replayed(files: list[Path], restore: Callable[[str, bytes], StandIn] = Stand
 
 
 def record_again(path: Path, recorded: list[Recorded], alter: Callable[[Recorded], Recorded]) -> Path:
-    """Write a run anew with some of it altered: all sums are right, what it says is not."""
+    """Write a run again with altered content and correct CRCs."""
     path.mkdir()
     recorder = Recorder(path, ["acc", "ref"], ["bridge-1"])
     for entry in recorded:
@@ -100,7 +100,7 @@ def test_a_state_that_does_not_go_on_is_a_difference(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path, ["acc", "ref"], ["bridge-1"])
     start = run_start(pipeline, 0, 1)
     recorder.record(0, start, pipeline.step(start))
-    pipeline.sums[0, 0] = np.nextafter(0.0, 1.0)  # between the files, by no event
+    pipeline.sums[0, 0] = np.nextafter(0.0, 1.0)  # the state changes between the files without an event
     recorder.record(1, run_start(pipeline, 1, 2), [])
     recorder.close()
     replay = replayed(files_of(tmp_path))
@@ -204,7 +204,7 @@ def test_a_recording_from_elsewhere_is_compared_within_the_tolerance(tmp_path: P
 
 
 def test_after_an_undecidable_decision_the_next_snapshot_leads_back(tmp_path: Path) -> None:
-    """The first file's window was refused by a hair where it was recorded; here it is used."""
+    """Where it was recorded, the first file's window was refused, just below the threshold; here it is just above."""
     directory = tmp_path / "again"
     directory.mkdir()
     recorder = Recorder(directory, ["acc", "ref"], ["bridge-1"])
@@ -234,7 +234,7 @@ def refused_by_a_hair(report: WindowReport) -> WindowReport:
 
 
 class OnTheEdge(StandIn):
-    """The stand-in, whose windows of the first file are used by a hair."""
+    """The stand-in pipeline, with windows of the first file that are just above the threshold of use."""
 
     first_file = False
 
@@ -255,7 +255,7 @@ class OnTheEdge(StandIn):
 
 
 class WithNumpy(StandIn):
-    """The stand-in, with numpy's scalars in its results."""
+    """The stand-in pipeline, with numpy's scalars in its results."""
 
     def step(self, event: Event) -> list[Result]:
         return [self._numpy(result) for result in super().step(event)]

@@ -1,4 +1,4 @@
-"""A gateway's outgoing side and a consumer as processes of their own, to be cut off and killed."""
+"""A gateway's store with publisher, and a consumer, each as a process that tests can disconnect and kill."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ with Consumer([sys.argv[1]], memory=Path(sys.argv[2])) as consumer, open(sys.arg
 
 @contextmanager
 def process(*arguments: str | Path) -> Iterator[subprocess.Popen[str]]:
-    """Python with these arguments; killed at the end if it still runs."""
+    """Run Python with these arguments; the process is killed at the end if it still runs."""
     command = [sys.executable, *map(str, arguments)]
     running = subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     try:
@@ -64,7 +64,7 @@ def process(*arguments: str | Path) -> Iterator[subprocess.Popen[str]]:
 
 @contextmanager
 def router(endpoint: str) -> Iterator[subprocess.Popen[str]]:
-    """`fieldcal router`, listening when this returns."""
+    """Run `fieldcal router`; it listens already when this returns."""
     with process("-m", "agent", "router", "--listen", endpoint) as running:
         assert running.stdout is not None
         assert endpoint in running.stdout.readline()
@@ -79,13 +79,13 @@ class Gateway:
         self.begin = int(self._line())
 
     def send(self, count: int, *, size: int = 100, pause_s: float = 0.0) -> None:
-        """Give it results to commit and publish, tens at a time."""
+        """Make it commit and publish `count` results, ten at a time."""
         assert self._process.stdin is not None
         self._process.stdin.write(f"{count} {size} {pause_s}\n")
         self._process.stdin.flush()
 
     def sent(self) -> tuple[int, float, int]:
-        """When they are handed over: last number, the longest that publishing ten took in s, what is published."""
+        """Wait until all are handed over: (last number, longest time to hand over ten in s, last published number)."""
         number, longest_s, published = self._line().split()
         return int(number), float(longest_s), int(published)
 
@@ -95,12 +95,12 @@ class Gateway:
 
 
 def free_endpoint() -> str:
-    """A port of this machine that nobody listens at."""
+    """An endpoint on this machine with a port that is not in use."""
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{listener.getsockname()[1]}"
 
 
 def numbers(path: Path) -> list[int]:
-    """What a consumer wrote, whole lines only."""
+    """The numbers that a consumer has written, in complete lines."""
     return [int(line) for line in path.read_text().split("\n")[:-1]] if path.exists() else []

@@ -1,4 +1,4 @@
-"""Starts the real program, as a user would, and reads what it leaves."""
+"""Starts the real program as a user does, and reads its output files."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
-START_S = 20.0  # a start takes about one second; a machine under load gets twenty
+START_S = 20.0  # s allowed for a start; it takes about 1 s, on a machine under load more
 
 
 def fieldcal(*arguments: str | Path, timeout_s: float = 60.0) -> subprocess.CompletedProcess[str]:
-    """Run a command to its end."""
+    """Run a `fieldcal` command to its end."""
     command = [sys.executable, "-m", "agent", *map(str, arguments)]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=timeout_s, check=False)
 
 
 @contextmanager
 def started(*arguments: str | Path, output: Path, directory: Path = ROOT) -> Iterator[subprocess.Popen[bytes]]:
-    """A command that goes on; killed at the end if it still runs. Its output goes to a file."""
+    """Start a command that keeps running, with its output in the file `output`. It is killed at the end if it runs."""
     with open(output, "ab") as file:
         process = subprocess.Popen(
             [sys.executable, "-u", "-m", "agent", *map(str, arguments)],
@@ -44,7 +44,7 @@ def started(*arguments: str | Path, output: Path, directory: Path = ROOT) -> Ite
 
 
 def interrupt(process: subprocess.Popen[bytes]) -> float:
-    """Ctrl-C; returns how long it took to end, in s."""
+    """Interrupt a process as Ctrl-C does; returns the time that it took to end, in s."""
     began_s = time.monotonic()
     process.send_signal(signal.SIGINT)
     process.wait(timeout=START_S)
@@ -52,7 +52,7 @@ def interrupt(process: subprocess.Popen[bytes]) -> float:
 
 
 def wait_until(condition: Any, timeout_s: float, what: str) -> Any:
-    """What `condition()` returns once it is true. Fails after `timeout_s`."""
+    """Wait until `condition()` is true and return its value. Fails after `timeout_s`; `what` names what was awaited."""
     end_s = time.monotonic() + timeout_s
     while time.monotonic() < end_s:
         value = condition()
@@ -63,14 +63,14 @@ def wait_until(condition: Any, timeout_s: float, what: str) -> Any:
 
 
 def results(data_dir: Path, what: str) -> list[dict[str, Any]]:
-    """Results of one kind in a data directory's store, in order; empty before there is a store."""
+    """Results of the kind `what` in the store of a data directory, in order; empty where there is no store yet."""
     path = data_dir / "state.sqlite"
     if not path.exists():
         return []
     connection = sqlite3.connect(f"file:{path}?mode=ro", uri=True)
     try:
         rows = connection.execute("SELECT payload FROM results WHERE what = ? ORDER BY sequence", (what,)).fetchall()
-    except sqlite3.OperationalError:  # the agent is making its tables
+    except sqlite3.OperationalError:  # the agent has not made its tables yet
         return []
     finally:
         connection.close()

@@ -1,4 +1,4 @@
-"""A site under TLS: the router with the file of deploy/zenoh, an agent that takes commands, and keys for all."""
+"""A site under TLS: the router with deploy/zenoh/router.json5, an agent that accepts commands, and keys for all."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.scenarios.processes import ROOT, START_S, started, wait_until
 READY = ROOT / "deploy" / "zenoh" / "router.json5"
 GATEWAY = "workshop/gateway-1"
 KEY = f"fieldcal/v1/{GATEWAY}"
-OPEN_MS = 2500  # on one machine a session opens in some milliseconds; who is refused waits as long
+OPEN_MS = 2500  # a session opens within milliseconds; a client that is refused waits for this whole time
 
 AGENT = """
 [gateway]
@@ -47,7 +47,7 @@ key = "{keys}/workshop.gateway-1.key"
 
 @dataclass(frozen=True)
 class SecuredSite:
-    """Paths and the router's endpoint."""
+    """The directory of the site and the endpoint of its router."""
 
     directory: Path
     endpoint: str
@@ -64,7 +64,7 @@ class SecuredSite:
         return TlsFiles(str(self.keys / f"{ca}.pem"), str(self.keys / f"{name}.pem"), str(self.keys / f"{name}.key"))
 
     def session(self, name: str, ca: str = "ca", endpoint: str | None = None) -> zenoh.Session:
-        """A client session under a name. Raises zenoh.ZError where it is refused."""
+        """Open a client session with the certificate of `name`. Raises zenoh.ZError where the router refuses it."""
         return self.open(session_config("client", connect=[endpoint or self.endpoint], tls=self.files(name, ca)))
 
     @staticmethod
@@ -73,14 +73,14 @@ class SecuredSite:
         return zenoh.open(config)
 
     def options(self, name: str) -> list[str]:
-        """Of a command, to go over the network under a name."""
+        """Options with which a command goes over the network with the certificate of `name`."""
         files = self.files(name)
         return ["--connect", self.endpoint, "--gateway", GATEWAY, "--ca", files.ca, "--certificate", files.certificate,
                 "--certificate-key", files.key]  # fmt: skip
 
 
 def make_keys(directory: Path) -> None:
-    """The keys of a site as its documentation makes them, and those of people who should not come in."""
+    """Make the keys of a site as docs/security.md says, and keys that the router must not accept."""
     for arguments in (
         ["authority"], ["router", "--host", "localhost", "--host", "127.0.0.1"], ["consumer", "dashboard"],
         ["gateway", "workshop", "gateway-1"], ["gateway", "workshop", "gateway-2"], ["commander", "operator"],
@@ -95,12 +95,12 @@ def make_keys(directory: Path) -> None:
     write_new(directory, {"stranger.pem": stranger.certificate_pem, "late-ca.pem": ours.certificate_pem})
     write_new(directory, {"forged.pem": forged.certificate_pem, "forged.key": forged.key_pem})
     write_new(directory, {"late.pem": late.certificate_pem, "late.key": late.key_pem})
-    # One authority for both: only the time is wrong.
+    # Signed by the same authority: only the time of validity is wrong.
     (directory / "ca-and-late.pem").write_bytes((directory / "ca.pem").read_bytes() + ours.certificate_pem)
 
 
 def router_file(directory: Path, certificate: str = "router", ca: str = "ca-and-late") -> str:
-    """The ready file, at a free port of loopback, with the keys of `directory`."""
+    """The text of deploy/zenoh/router.json5 with a free port of this machine and the keys in `directory`."""
     text = READY.read_text().replace("tls/0.0.0.0:7447", "tls/127.0.0.1:0")
     text = text.replace("/etc/fieldcal/keys/router", f"{directory}/{certificate}")
     return text.replace("/etc/fieldcal/keys/ca.pem", f"{directory}/{ca}.pem")
@@ -108,12 +108,12 @@ def router_file(directory: Path, certificate: str = "router", ca: str = "ca-and-
 
 @contextmanager
 def router(directory: Path, keys_dir: Path, certificate: str = "router") -> Iterator[str]:
-    """`fieldcal router` on the ready file; yields its endpoint. Its log goes to `directory`/router.log."""
+    """Run `fieldcal router` with this text; yields its endpoint. Its log goes to `directory`/router.log."""
     file, log = directory / "router.json5", directory / "router.log"
     file.write_text(router_file(keys_dir, certificate))
     with ExitStack() as stack:
         with pytest.MonkeyPatch.context() as patch:
-            # What access control turns away is logged at this level alone.
+            # Zenoh logs what its access control refuses at this level only.
             patch.setenv("RUST_LOG", "warn,zenoh::net::routing::interceptor::access_control=trace")
             process = stack.enter_context(started("router", "--config", file, output=log))
         wait_until(lambda: log.read_text().startswith("router at ") or process.poll() is not None, START_S, "a router")
@@ -122,7 +122,7 @@ def router(directory: Path, keys_dir: Path, certificate: str = "router") -> Iter
 
 @contextmanager
 def commanded_agent(site: SecuredSite, name: str) -> Iterator[Path]:
-    """`fieldcal run` at the site, with commands of anna enabled; yields its data directory when it is connected."""
+    """Run `fieldcal run` at the site, which accepts anna's commands; yields its data directory once it is connected."""
     printed = CliRunner().invoke(keys, ["command", name, "--dir", str(site.keys)], standalone_mode=False).stdout
     config, data_dir, log = (site.directory / f"{name}{end}" for end in (".toml", "", ".log"))
     config.write_text(AGENT.format(keys=site.keys, endpoint=site.endpoint) + printed.replace(', "accept"', ""))

@@ -1,4 +1,4 @@
-"""What an agent does when its devices are not as they should be: a message or a counted event, and it goes on."""
+"""Where a device is faulty, the agent gives a message or counts an event, and goes on."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ enabled = false
 
 
 class Lines:
-    """One sample each 10 ms: its number, and gravity on z."""
+    """Sends a sample each 10 ms: its number, and gravity on z."""
 
     def __init__(self) -> None:
         self._began_s: float | None = None

@@ -1,4 +1,4 @@
-"""A bench day: nobody tells how the sensor stands or since when, and S and Q come out as if somebody had."""
+"""A day on the bench without stated poses: the agent finds positions and times itself; S and Q are as with poses."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SEED = 1
 def test_s_and_q_are_those_of_fieldcal_calibrate_told_everything(rate_hz: float) -> None:
     day = bench.day(SEED, rate_hz)
     stops = [f"theta {theta_deg:g} deg, alpha {alpha_deg:g} deg" for theta_deg, alpha_deg in bench.STOPS]
-    # Before the first motion the reference is calm; that window is used by nobody.
+    # Before the first motion the reference is silent; that window is not used.
     assert [position for position in day.positions if position] == stops * bench.ROUNDS
     assert day.windows == (len(stops) * bench.ROUNDS,) * 2
     assert day.apart.max() < 0.2
@@ -34,7 +34,7 @@ def test_s_and_q_are_those_of_fieldcal_calibrate_told_everything(rate_hz: float)
 
 @pytest.mark.parametrize("said", [1e5, 1e20])
 def test_a_garbled_line_makes_no_place_deaf(said: float) -> None:
-    """Counted large, every later turn would be small beside it."""
+    """A garbled line gives a huge value, which must not raise the threshold so far that later turns are not found."""
     world = bench.world(SEED, 200.0)
     run = Run(bench.config(world))
     duration_s = world.parameters.schedule.duration_s(1) + bench.AFTER_S
@@ -50,7 +50,10 @@ def test_a_garbled_line_makes_no_place_deaf(said: float) -> None:
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_reads_that_beat_with_the_samples_cost_no_window(seed: int) -> None:
-    """Another gateway's reads, every 16 and 10 ms at 200 Hz: lags differ by some 0.3 ms. 12 parameters within 4 u."""
+    """Sensor and reference are read every 16 and 10 ms at 200 Hz: the lag differs by about 0.3 ms between windows.
+
+    All 12 parameters must be within 4 u.
+    """
     p = bench.world(seed, 200.0).parameters
     sensor, reference = (replace(part, bursts=replace(part.bursts, apart_s=0.0)) for part in (p.sensor, p.reference))
     world = Bench(replace(p, sensor=sensor, reference=reference), seed)
@@ -58,14 +61,14 @@ def test_reads_that_beat_with_the_samples_cost_no_window(seed: int) -> None:
     update, reports = bench.online(world, duration_s)
     assert sum(r.used for r in reports) == len(bench.STOPS) * bench.ROUNDS
     applied_s = [r.numbers["lag_applied_s"] for r in reports if r.used]
-    assert np.ptp(applied_s) > 1e-4  # else this seed shows nothing
+    assert np.ptp(applied_s) > 1e-4  # else the lags are equal and the test shows nothing
     found = np.append(np.ravel(update.sensitivity), update.offset)
     truth = np.append(world.truth.sensitivity.ravel(), world.truth.offset)
     assert np.all(np.abs(found - truth) < 4.0 * np.array(update.standard_uncertainty))
 
 
 def test_with_free_angles_s_and_q_are_within_their_uncertainty() -> None:
-    """No stop is told either. 12 parameters within 4 u: by chance outside once in 1300 such days."""
+    """The stops are not given either. All 12 parameters must be within 4 u; chance alone fails once in 1300 days."""
     world = bench.world(SEED)
     duration_s = world.parameters.schedule.duration_s(1) + bench.AFTER_S
     update, reports = bench.online(world, duration_s, positions="free", gate=bench.FREE_GATE)

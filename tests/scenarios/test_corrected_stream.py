@@ -42,7 +42,7 @@ def test_each_block_is_what_its_calibration_makes_of_the_raw_one(recorded: tuple
                 in_force = result
     assert len(blocks) > 80
     first, last = blocks[0][1], blocks[-1][1]
-    assert (first.calibration_sequence, first.determined.any()) == (0, False)  # the prior
+    assert (first.calibration_sequence, first.determined.any()) == (0, False)  # corrected with the prior
     assert in_force is not None
     assert (last.calibration_sequence, last.calibration_run_id) == (in_force.sequence, in_force.run_id)
     for raw, corrected, used in blocks:
@@ -57,7 +57,7 @@ def test_each_block_is_what_its_calibration_makes_of_the_raw_one(recorded: tuple
     assert np.all(np.abs(away) < 3.0 * np.sqrt(np.diag(corrected.covariance)))
     assert np.sqrt(np.diag(corrected.covariance)).max() < 0.2
     np.testing.assert_allclose(corrected.noise, 3.5e-3, rtol=0.1)  # the ADXL355's 22.5 ug over 250 Hz
-    # The last sample of a block was taken just before the block came.
+    # The last sample of a block was taken just before the block arrived.
     end_ns = corrected.t_utc_ns + (raw.n - 1) / corrected.rate_hz * 1e9
     assert 0 <= raw.t_utc_ns - end_ns < 40e6
 

@@ -1,4 +1,4 @@
-"""Results over outages of every party, with real processes: none lost, order kept, nothing held up."""
+"""Outages of router, gateway and consumer, with real processes: no result is lost, order is kept, nobody is blocked."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.scenarios.delivery_processes import CONSUMER, GATEWAY, Gateway, free_
 from tests.scenarios.processes import wait_until
 
 OUTAGE = 10_000  # results
-FREEZE_S = 12.0  # Zenoh gives a link up after ten
+FREEZE_S = 12.0  # Zenoh closes a link after 10 s without an answer
 
 
 def follow(stack: ExitStack, endpoint: str, directory: Path) -> object:

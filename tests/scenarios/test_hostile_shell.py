@@ -1,4 +1,4 @@
-"""Commands given what is no file, and outputs that take nothing: one clear line, an exit status, and an end."""
+"""Commands whose input is not a regular file, or whose output cannot be written, end with one line and a status."""
 
 from __future__ import annotations
 

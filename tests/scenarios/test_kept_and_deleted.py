@@ -1,4 +1,4 @@
-"""The agent with retention and a signing key, killed and started again: what is left, and what an audit says of it."""
+"""The agent with retention and a signing key is killed and started again: what it keeps, and what an audit says."""
 
 from __future__ import annotations
 

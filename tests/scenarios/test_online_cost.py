@@ -1,4 +1,4 @@
-"""What a window costs does not grow with the windows before it; ten thousand are in docs/performance.md."""
+"""The cost of a window does not grow with the number of windows before it; docs/performance.md has ten thousand."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from benchmarks.online.node import Timing, node
 from benchmarks.online.runner import Run, visits
 
 WINDOWS = 170
-EARLY, LATE = range(60, 70), range(160, 170)  # the newest 48 windows are kept in summary, no more
+EARLY, LATE = range(60, 70), range(160, 170)  # the agent keeps summaries of the newest 48 windows only
 
 
 def test_work_and_state_are_flat() -> None:
-    """Python functions called a window, and bytes of the snapshot: no clock, so that a busy machine does not matter."""
+    """Python function calls for each window, and bytes of the snapshot. Unlike time, they do not depend on load."""
     drawn = node(2, all_axes=True, timing=Timing(10.0, 3600.0, WINDOWS))
     run = Run(drawn.config)
     calls = itertools.count()
@@ -34,5 +34,5 @@ def test_work_and_state_are_flat() -> None:
             sizes.append(len(run.pipeline.snapshot()))
     assert len(sizes) > 0.95 * WINDOWS
     early, late = (sum(at[k + 1] - at[k] for k in part) for part in (EARLY, LATE))
-    assert late < 1.1 * early  # it was some thousand calls a window
+    assert late < 1.1 * early  # about a thousand calls for each window
     assert max(sizes[k] for k in LATE) < 1.05 * max(sizes[k] for k in EARLY)

@@ -17,7 +17,7 @@ def test_errors_are_as_large_as_u_says() -> None:
     ratios = np.array([coverage.one(coverage.SEED + k) for k in range(RUNS)])
     assert np.isfinite(ratios).all()  # all twelve are determined by motion in three directions
     squares = np.sum((2 * ratios) ** 2, axis=0)  # U is 2 u at the degrees of freedom of a run
-    # Chi-squared of 12 degrees of freedom; 24 bounds, all together at 99.9 %. u half or double what is true fails.
+    # Chi-squared with RUNS degrees of freedom; 24 bounds, jointly at 99.9 %. A u of half or twice the true one fails.
     low, high = (chi2_quantile(p, RUNS) for p in (0.001 / 24, 1 - 0.001 / 24))
     assert np.all(squares > low), squares
     assert np.all(squares < high), squares
@@ -28,8 +28,8 @@ def test_the_band_is_the_binomial_one() -> None:
     assert (low, high) == (268, 297)
     probability = [_within(300, low, high, share) for share in (0.95, 0.85, 0.999)]
     assert 1 - probability[0] < 0.001 / 12
-    assert probability[1] < 0.02  # what covers 85 % is found
-    assert probability[2] < 0.1  # and so is what is far too careful
+    assert probability[1] < 0.02  # an estimator that covers 85 % is found out
+    assert probability[2] < 0.1  # and so is one whose U is far too large
 
 
 def _within(n: int, low: int, high: int, share: float) -> float:
@@ -38,7 +38,10 @@ def _within(n: int, low: int, high: int, share: float) -> float:
 
 
 def test_the_first_window_alone_is_as_uncertain_as_it_says() -> None:
-    """Its own segments are all that tells how coloured its noise is. Rms of 480 errors over u: 3 % by chance."""
+    """The colour of the noise is estimated from the segments of this one window.
+
+    The rms of 480 errors divided by u must be 1; by chance it differs by 3 %.
+    """
     errors = []
     for seed in range(160):
         drawn = node(seed, all_axes=True, timing=Timing(20.0, 60.0, 1))

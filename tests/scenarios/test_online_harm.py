@@ -1,6 +1,6 @@
-"""What befalls sensor or reference does not get into S and Q in force; what is harmless is taken.
+"""Faults of sensor or reference do not change S and Q in force; harmless windows are used.
 
-Two runs a kind here; a thousand are in docs/online.md (`python -m benchmarks.online harm`).
+Here two runs of each kind of fault; docs/online.md has a thousand (`python -m benchmarks.online harm`).
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from benchmarks.online.node import Node, node
 from benchmarks.online.runner import Run, visits
 from hw.virtual.harm import KINDS
 
-# Kinds of which no window can be right: each is refused or held. Of the others some draws are harmless (a dead channel
-# of the reference where nothing moves along it, samples lost and told, a step of UTC).
+# Faults after which every window is wrong and must be refused or held. The other faults are harmless in some draws: a
+# dead reference channel without motion along it, lost samples that are reported, a step of UTC.
 HOPELESS = ("reference unplugged", "dead channel of the sensor", "swapped axes", "knocked off its mount", "clipping")
 
 
@@ -32,8 +32,8 @@ def test_nothing_wrong_gets_in(kind: str) -> None:
 
 @pytest.mark.parametrize("seed", [20188, 20208, 20588, 20728, 20838, 20908])
 def test_pieces_between_lost_samples_are_not_believed_too_much(seed: int) -> None:
-    """Pieces of a second gave S_yy off by 4 to 7 u: jumps at holes were taken for noise of the reference, and a filter
-    left hardly more independent points than unknowns."""
+    """A regression test. Between lost samples, pieces of 1 s gave S_yy wrong by 4 to 7 u: jumps at the gaps were taken
+    for noise of the reference, and the filter left hardly more independent points than unknowns."""
     assert harm.harmed("10 % lost", seed).wrong == ""
 
 
@@ -42,7 +42,7 @@ def test_harmless_windows_are_taken() -> None:
     assert [o.wrong for o in outcomes] == [""] * 12
     windows, used = sum(o.windows for o in outcomes), sum(o.used for o in outcomes)
     assert windows >= 12 * harm.TIMING.windows
-    # At 95 % about seven of 144 would be refused; a sound window in 10,000 is held.
+    # A test at 95 % would refuse about seven of 144 windows; the agent holds one good window in 10,000.
     assert used >= windows - 2
     assert all(o.updates == o.used for o in outcomes)
     assert {o.status for o in outcomes} == {"VALID"}

@@ -1,4 +1,4 @@
-"""Every scenario's recording, made on the fly, replays bit for bit."""
+"""A recording of every scenario, made by the test, replays bit for bit."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SEED = 3
 
 
 def worlds() -> Iterator[tuple[str, Building, Config]]:
-    """A small one of each scenario."""
+    """A short version of each scenario."""
     for kind in ("", *KINDS):
         befalls = KINDS[kind](np.random.default_rng(SEED)) if kind else HARMLESS
         drawn = node(SEED, all_axes=kind != "", harm=befalls, harmed_from=2, timing=TIMING)
@@ -46,11 +46,11 @@ def test_a_recording_replays_bit_for_bit(name: str, tmp_path: Path) -> None:
     found = replay.run(path)
     assert replay.first_difference is None
     assert found.equal
-    assert found.results == len(recorded) > TIMING.windows  # a status and a verdict on each window
+    assert found.results == len(recorded) > TIMING.windows  # window reports and status changes
 
 
 def test_going_on_from_any_window_equals_going_on(tmp_path: Path) -> None:
-    """A pipeline restored from its snapshot between any two visits gives what the other gives, bit for bit."""
+    """A pipeline that is restored from its snapshot between two visits gives the same results, bit for bit."""
     building, config = WORLDS["nothing wrong"]
     played(Run(config, tmp_path), visits(building, range(TIMING.windows)))
     (path,) = tmp_path.glob("*.mcap")
@@ -73,7 +73,7 @@ def test_a_harmed_run_says_the_same_twice() -> None:
 
 
 def played(run: Run, events: Iterable[Event]) -> list[Result]:
-    """All results of a run, which is closed then."""
+    """Run a pipeline to the end of its events; returns all results."""
     results = [result for event in events for result in run.feed(event)]
     run.close()
     return results

@@ -1,6 +1,6 @@
-"""Three months of a year in a building, a short window a day: the step is found, nothing else moves.
+"""Three months of a year in a building, with a short window each day: the step is found, all else stays.
 
-The whole year, a window an hour, is in docs/online.md (`python -m benchmarks.online year`).
+docs/online.md has the whole year with a window each hour (`python -m benchmarks.online year`).
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def test_a_step_of_one_per_cent_is_found_and_followed(elsewhere: float) -> None:
     assert np.abs(np.array(seen.syy_error)[after]).max() < 0.003
     before = np.array(seen.time_s) < year.STEP_DAY * DAY_S
     assert before.sum() > 30
-    assert np.abs(np.array(seen.syy_error)[before]).max() < 0.003  # it was no better for having been in the dark
+    assert np.abs(np.array(seen.syy_error)[before]).max() < 0.003  # as good before the step as after it
     assert seen.alarms_before() == []
 
 
@@ -47,17 +47,17 @@ def test_the_mean_output_is_right_and_q_within_its_uncertainty(elsewhere: float)
     seen = followed(elsewhere)
     assert np.abs(seen.mean_error_mps2).max() < 2e-3
     assert np.all(np.abs(seen.offset_error) < 2 * np.array(seen.u_offset))
-    # Q is in the data only as far as tilt and gravity are known: 0.1 deg is 17 mm/s2 on a horizontal axis.
+    # The data determine Q only as well as tilt and gravity are known: 0.1 deg is 17 mm/s2 on a horizontal axis.
     assert np.min(np.array(seen.u_offset)[:, :2]) > np.deg2rad(0.1) * 9.8
 
 
 def test_what_was_not_excited_stays_as_it_was() -> None:
     columns = np.array(followed(0.0).columns)
     assert np.abs(columns - columns[0]).max() < 1e-12
-    assert np.abs(np.array(followed(0.3).columns) - columns[0]).max() > 1e-3  # else this would show nothing
+    assert np.abs(np.array(followed(0.3).columns) - columns[0]).max() > 1e-3  # with other motion they change
 
 
 def test_no_number_of_windows_makes_it_better_known_than_the_reference() -> None:
     for elsewhere in (0.0, 0.3):
         assert min(followed(elsewhere).u_syy) > 0.7e-3
-    assert followed(0.0).u_syy[-1] > 1e-3  # along the reference's y alone: u of that channel, 0.1 %
+    assert followed(0.0).u_syy[-1] > 1e-3  # motion along the reference's y only: u of that channel is 0.1 %

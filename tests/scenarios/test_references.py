@@ -16,11 +16,11 @@ from hw.sensor import Sensor
 from hw.virtual.device import ROTATION, Virtual, VirtualOptions
 from hw.virtual.presets import plain
 
-SECONDS = 70.0  # four positions; and a minute, the window of a reference that needs none
+SECONDS = 70.0  # enough for four positions, and for the window of 60 s of a reference that needs no positions
 
 
 class Machine:
-    """A simulated clock for one of two devices: each is read up to the same time in turn."""
+    """A simulated clock for one of two devices; both are read in turn up to the same time."""
 
     t_s = 0.0
 
@@ -45,7 +45,7 @@ def opened(name: str, sensor: Sensor, machine: Machine) -> DeviceChange:
 
 
 def calibrated(reference: str, **channel: Any) -> CalibrationUpdate:
-    """The last calibration of a run."""
+    """Run sensor and reference through the pipeline; returns the last calibration."""
     machines = {role: Machine() for role in ("sensor", "reference")}
     devices = {role: build(machine, role=role, reference=reference) for role, machine in machines.items()}
     config = {
@@ -86,6 +86,7 @@ def test_s_and_q_are_found(reference: str, channel: dict[str, Any]) -> None:
     update = calibrated(reference, **channel)
     truth = plain(1).sensor
     error = np.array(update.sensitivity) / truth.nominal_sensitivity - truth.sensitivity / truth.nominal_sensitivity
-    # Angles are known to 0.2 deg, the reference to 0.1 %, offsets to 0.05 m/s2: a wrong unit, axis or phase costs more.
+    # Angles are known to 0.2 deg, the reference to 0.1 %, offsets to 0.05 m/s2. A wrong unit, axis or phase gives a
+    # larger error than this bound.
     assert np.abs(error).max() < 3e-3
     assert np.abs(np.array(update.offset) - truth.offset).max() < 0.05 * truth.nominal_sensitivity

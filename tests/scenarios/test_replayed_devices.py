@@ -1,4 +1,4 @@
-"""A recording, its devices played by driver `replay` into a pipeline: the same S and Q as when it was recorded."""
+"""The driver `replay` plays the devices of a recording into a pipeline, which gives the recorded S and Q."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ START_NS = 500 * 10**9
 
 
 class Machine:
-    """A simulated clock for one of the devices, which plays its part alone."""
+    """A simulated clock for one of the devices, which is played without the other one."""
 
     t_ns = START_NS
 

@@ -1,4 +1,4 @@
-"""A run over two serial ports whose recording is cut into short files: each stands alone, the chain too."""
+"""A run on two serial ports with many short recording files: each file replays alone, and all replay in sequence."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def data_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
         started("simulate", "--preset", "plain", "--link", link, output=directory / "simulate"),
         started("run", config, "--data-dir", data_dir, output=directory / "run") as agent,
     ):
-        wait_until(lambda: results(data_dir, "calibration"), 170, "a calibration")  # the bench goes round
+        wait_until(lambda: results(data_dir, "calibration"), 170, "a calibration")  # the bench repeats its positions
         interrupt(agent)
     return data_dir
 
@@ -75,7 +75,7 @@ def test_replay_gives_the_same_on_one_core(data_dir: Path) -> None:
     files = recordings(data_dir)
     script = "import os, sys; os.sched_setaffinity(0, {0}); from agent.__main__ import main; main()"
     command = [sys.executable, "-c", script, "replay", *map(str, files), "--json", "-"]
-    # Without the entry point's own setting a second thread would split the sums.
+    # Without the entry point's setting of one thread, BLAS would split the sums between threads and change their bits.
     environment = {k: v for k, v in os.environ.items() if k != "OPENBLAS_NUM_THREADS"}
     pinned = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True)
     assert json.loads(pinned.stdout)["calibrations"] == json.loads(

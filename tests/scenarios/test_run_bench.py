@@ -1,4 +1,4 @@
-"""`fieldcal run` on the virtual bench: one real run of a minute, looked at from all sides."""
+"""`fieldcal run` on the virtual bench: the output, results and files of one real run of a minute."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ KEY = "fieldcal/v1/virtual/bench/mems/calibration"
 CLOCK_KEY = "fieldcal/v1/virtual/bench/mems/clock"
 ALL = zenoh.ConsolidationMode.NONE
 SEED = 1
-# Of bench time: S and Q are in force after 39 to 52 s, on a busy machine that lost samples once round later.
+# s of bench time. S and Q are in force after 39 to 52 s; where a busy machine lost samples, one round later.
 THROUGH_S = 112.0
 CLOCKS_S = 70.0  # from the start at most: clock results come after each minute
 
@@ -32,9 +32,9 @@ CLOCKS_S = 70.0  # from the start at most: clock results come after each minute
 class Run:
     data_dir: Path
     output: str
-    live: list[dict[str, Any]]  # calibrations that a plain Zenoh client saw, from before the start on
-    late: list[dict[str, Any]]  # what one that came later got from a plain get
-    clocks: list[dict[str, Any]]  # and all clock results
+    live: list[dict[str, Any]]  # calibrations that a plain Zenoh client received, which listened from before the start
+    late: list[dict[str, Any]]  # what a client that came later got by a plain get
+    clocks: list[dict[str, Any]]  # all clock results, which the later client also got
     stopped_in_s: float
     exit_status: int
 
@@ -61,7 +61,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 @pytest.fixture(scope="module", autouse=True)
 def router() -> Iterator[None]:
-    if router_running(ENDPOINT):  # the machine's own serves as well
+    if router_running(ENDPOINT):  # a router that already runs on this machine serves as well
         yield
         return
     session, _ = open_router(ENDPOINT)

@@ -1,4 +1,4 @@
-"""A site under TLS with the ready files: who is let in, what each may do, and commands from end to end."""
+"""A site under TLS with the files in deploy: who can connect, what each may do, and commands from end to end."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tests.scenarios.processes import fieldcal, recordings, wait_until
 from tests.scenarios.secured_site import GATEWAY, KEY, SecuredSite, commanded_agent, make_keys, router
 from tests.unit.zenoh_site import record
 
-SEEN_S = 5.0  # what is let through arrives within milliseconds
+SEEN_S = 5.0  # s to wait for a message; it arrives within milliseconds where the router lets it through
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +76,7 @@ def test_we_do_not_talk_to_a_router_of_another_authority_or_name(site: SecuredSi
 
 
 def test_each_puts_only_what_is_theirs(site: SecuredSite) -> None:
-    """Non-delivery is seen by a later result that is delivered; the router's log says who was turned away."""
+    """A later result that arrives shows that the earlier one was refused; the router's log names the refused sender."""
     forged = record(1).payload
     with ExitStack() as stack:
         listener, gateway, *others = (
@@ -153,7 +153,7 @@ def test_commands_from_end_to_end(site: SecuredSite) -> None:
 
 
 def command_line(*arguments: str) -> tuple[int, str]:
-    """Exit status and what was said, of `fieldcal command` in this process."""
+    """Run `fieldcal command` in this process; returns its exit status and its output."""
     result = CliRunner().invoke(command, arguments, standalone_mode=False)
     if isinstance(result.exception, click.ClickException):
         return result.exception.exit_code, result.exception.format_message()
@@ -177,7 +177,7 @@ def check_replay_and_flood(site: SecuredSite) -> None:
 
 
 def check_consumer(site: SecuredSite) -> None:
-    """The status INVALID of the sensor without a port, through the library, over TLS."""
+    """The client library receives, over TLS, the status INVALID of the sensor, which has no port."""
     with Consumer([site.endpoint], f"{KEY}/**", tls=site.files("dashboard")) as consumer:
         first = next(iter(consumer))
     assert (first.address.what, first.fields["status"]) == ("status", "INVALID")
@@ -189,7 +189,7 @@ def recorded_commands(data_dir: Path) -> list[Command]:
 
 
 def check_recording(site: SecuredSite, data_dir: Path) -> None:
-    """What was taken is on the disk, with what was refused, and no secret beside it."""
+    """Accepted and refused commands are in the recording, and no secret is in the data directory."""
     wait_until(lambda: any("too large" in c.refused for c in recorded_commands(data_dir)), SEEN_S, "the last command")
     (path,) = recordings(data_dir)
     events = [step.event for step in RecordingReader(path).steps()]
@@ -197,7 +197,8 @@ def check_recording(site: SecuredSite, data_dir: Path) -> None:
     assert [c.verb for c in commands if not c.refused] == ["hold", "pose", "hold"]
     kinds = [c.refused.split(":")[0] for c in commands if c.refused]
     wanted = ["no right", "out of limits", "no such sensor", "replayed", "too large"]
-    assert [kind for kind in kinds if kind != "unsigned"] == wanted  # unsigned: whether the agent is there was asked
+    # "unsigned": the fixture had asked whether the agent answers.
+    assert [kind for kind in kinds if kind != "unsigned"] == wanted
     start = next(event for event in events if isinstance(event, RunStart))
     assert "workshop.gateway-1.key" in start.config_json
     assert b"PRIVATE" not in path.read_bytes()

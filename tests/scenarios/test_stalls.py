@@ -1,4 +1,4 @@
-"""What would hold all threads of a run up: modules loaded late, and a garbage collector with much to look at."""
+"""What would stop all threads of a run: modules that are loaded late, and a garbage collector with many objects."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from agent.terminal.watch import Watch
 from tests.scenarios.processes import ROOT, wait_until
 from tests.unit.recorded_bench import record
 
-# A service has loaded all; then it gets events until windows were judged, and records them and what came of them.
+# Imports the service, then steps and records events until windows were used, and prints the modules loaded meanwhile.
 STEPS = """
 import json, sys
 from pathlib import Path
@@ -53,7 +53,7 @@ def test_all_that_windows_need_is_loaded_with_the_service(tmp_path: Path) -> Non
 
 
 STANDS = {"start_s": 0, "stop_s": 3600, "gravity_mps2": [0, 0, 9.81]}
-FEW = 10_000  # objects, walked through in 2 ms; a run makes about 700, modules alone are 50,000
+FEW = 10_000  # objects that the collector examines in 2 ms; a run makes about 700, the modules have 50,000
 
 
 def test_the_collector_walks_through_what_the_run_made_only(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The real agent under what looks like systemd: ready, fed by blocks alone, degraded and back, stopping."""
+"""The real agent under a substitute of systemd: ready, watchdog fed only by blocks, degraded and running, stopping."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ connect = ["{endpoint}"]
 
 
 class Systemd:
-    """Takes notifications, each with when it came."""
+    """Receives notifications, each with its time of arrival."""
 
     def __init__(self, path: Path) -> None:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -48,7 +48,7 @@ class Systemd:
         self.told: list[tuple[float, str]] = []
 
     def has(self, message: str, since_s: float = 0.0) -> bool:
-        """Whether something that begins so has come since then."""
+        """Whether a notification that begins with `message` has come since `since_s`."""
         while True:
             try:
                 self.told.append((time.monotonic(), self._socket.recv(4096).decode()))
@@ -56,7 +56,7 @@ class Systemd:
                 return any(t >= since_s and m.startswith(message) for t, m in self.told)
 
     def fed_within(self, duration_s: float) -> bool:
-        """Whether the watchdog is fed at all in the time that comes."""
+        """Whether the watchdog is fed at least once in the next `duration_s` seconds."""
         since_s = time.monotonic()
         while time.monotonic() < since_s + duration_s:
             if self.has("WATCHDOG=1", since_s):

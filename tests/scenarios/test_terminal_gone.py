@@ -1,4 +1,4 @@
-"""The terminal goes away under the agent: a closed window or a dropped connection."""
+"""The agent's terminal disappears: its window is closed or the connection is lost."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ enabled = false
 
 @contextmanager
 def on_a_terminal(tmp_path: Path, *, controlling: bool) -> Iterator[tuple[subprocess.Popen[bytes], int]]:
-    """The agent on a terminal, recording; and the descriptor behind which a person would sit."""
+    """Run the agent on a pseudo-terminal until it records; yields it and the descriptor of the user's side."""
     config, data_dir = tmp_path / "config.toml", tmp_path / "data"
     config.write_text(CONFIG)
     person, terminal = pty.openpty()

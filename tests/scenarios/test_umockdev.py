@@ -1,4 +1,4 @@
-"""The program as it is installed, in a process of its own, on register-level twins behind libumockdev's preload."""
+"""The installed program, as a process, on simulated chips (register-level twins) that libumockdev presents to it."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ ABSENCE = absence()
 pytestmark = pytest.mark.skipif(ABSENCE is not None, reason=str(ABSENCE))
 
 NODE = "/dev/i2c-1"
-# Slow enough that no FIFO (the first two hold 32 samples) runs over while a machine under load does something else.
+# Rates at which no FIFO (the first two hold 32 samples) overflows while a machine under load runs other processes.
 DEVICES: dict[str, tuple[type[FifoTwin], int, float]] = {
     "adxl355": (Adxl355Twin, 0x1D, 62.5),
     "adxl345": (Adxl345Twin, 0x53, 50.0),
@@ -135,7 +135,7 @@ def test_a_run_loses_no_sample_of_any_device(tmp_path: Path, site: UmockdevSite,
         assert [block.flags for block in blocks] == [BlockFlags.RESTART] + [BlockFlags.NONE] * (len(blocks) - 1), name
         numbers = np.concatenate([number(block.indications) for block in blocks])
         assert (np.diff(numbers) == 1).all(), name
-        assert len(numbers) > 4 * rate_hz, name  # of the six seconds, those in which devices open and the last block
+        assert len(numbers) > 4 * rate_hz, name  # of 6 s; the rest is the opening of the devices and the last block
 
 
 def test_unplugged_and_back_it_goes_on(tmp_path: Path, site: UmockdevSite, bus: I2CBus, port: PtyDevice) -> None:
@@ -149,7 +149,7 @@ def test_unplugged_and_back_it_goes_on(tmp_path: Path, site: UmockdevSite, bus: 
         wait_until(lambda: not lost(data_dir), 20, "all are back")
         for target in bus.targets.values():
             assert isinstance(target, FifoTwin)
-            target.fail(errno.EREMOTEIO, 3)  # passes
+            target.fail(errno.EREMOTEIO, 3)  # three errors only, then it works again
         before = {name: len(of(name, events(data_dir))) for name in DEVICES}
         wait_until(
             lambda: all(len(of(name, events(data_dir))) > n + 1 for name, n in before.items()), 20, "samples go on"
@@ -172,6 +172,6 @@ def test_unplugged_and_back_it_goes_on(tmp_path: Path, site: UmockdevSite, bus: 
 
 
 def lost(data_dir: Path) -> set[str]:
-    """Devices whose last change is a loss."""
+    """Devices whose last DeviceChange is "lost"."""
     last = {event.device: event.state for event in events(data_dir) if isinstance(event, DeviceChange)}
     return {name for name, state in last.items() if state == "lost"}

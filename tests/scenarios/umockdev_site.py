@@ -1,9 +1,9 @@
-"""Simulated I2C adapters for another, unmodified process: libumockdev's preload library carries its system calls here.
+"""Simulated I2C adapters for another, unmodified process, whose system calls libumockdev's preload library sends here.
 
-The library hands each ioctl on a node of its test bed to a socket, and reads and writes the process's memory for who
-answers there. A request is three unsigned longs (umockdev, src/libumockdev-preload.c: no documented interface; so in
-0.17.16 and in its newest source): 1 ioctl, 7 read and 8 write, each with two arguments, come from the process; 3 ends
-one with its return value and errno, 5 asks for memory, 6 sets it.
+The library sends each ioctl on a device node of its test bed to a socket. The program at the socket can let it read and
+write the memory of the process. A request is three unsigned longs. From the process come 1 (ioctl), 7 (read) and
+8 (write), each with two arguments. The answers are 3 (end of the call, with return value and errno), 5 (read memory)
+and 6 (write memory). This interface is not documented; source: umockdev 0.17.16, src/libumockdev-preload.c.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ LIBRARY = "libumockdev-preload.so.0"
 REQUEST = struct.Struct("@LLL")
 IOCTL, DONE, READ_MEMORY, WRITE_MEMORY = 1, 3, 5, 6
 FAILED = -1 & 0xFFFFFFFFFFFFFFFF
-NOT_MINE = -100 & 0xFFFFFFFFFFFFFFFF  # the library then makes the system call itself
+NOT_MINE = -100 & 0xFFFFFFFFFFFFFFFF  # return value with which the library makes the real system call
 
 
 def absence() -> str | None:
-    """Why it cannot be used here, None if it can."""
+    """Why umockdev cannot be used on this machine; None if it can."""
     done = subprocess.run(
         ["/bin/true"], env={"LD_PRELOAD": LIBRARY}, capture_output=True, text=True, timeout=10, check=False
     )
@@ -41,19 +41,19 @@ def absence() -> str | None:
 
 
 class UmockdevSite:
-    """Context manager: processes started with `environment` find these adapters, by path, and no others."""
+    """Context manager. Processes started with `environment` find these adapters under their paths, and no others."""
 
     def __init__(self, nodes: Mapping[str, I2CBus]) -> None:
         self._nodes = nodes
         self._kernel = Kernel(nodes)
-        # The path of a socket has 107 characters at most; those of pytest are long.
+        # The path of a socket may have 107 characters at most, and pytest's directories have long paths.
         self._directory = Path(tempfile.mkdtemp(prefix="fieldcal-"))
         self._listeners: list[socket.socket] = []
         self._connections: list[socket.socket] = []
 
     @property
     def environment(self) -> dict[str, str]:
-        """What a process must find in its environment."""
+        """The environment variables that a process needs."""
         return {"UMOCKDEV_DIR": str(self._directory), "LD_PRELOAD": LIBRARY}
 
     def __enter__(self) -> UmockdevSite:
@@ -78,12 +78,12 @@ class UmockdevSite:
         shutil.rmtree(self._directory)
 
     def unplug(self, node: str) -> None:
-        """Take the adapter away, with its node."""
+        """Remove the adapter and its device node."""
         self._nodes[node].unplug()
         self._file(node).unlink()
 
     def replug(self, node: str) -> None:
-        """Bring it back."""
+        """Add the adapter and its device node again."""
         self._nodes[node].replug()
         self._file(node).touch()
 
@@ -98,11 +98,11 @@ class UmockdevSite:
                 threading.Thread(target=self._serve, args=(connection, node), daemon=True).start()
 
     def _serve(self, connection: socket.socket, node: str) -> None:
-        """One open file of the process."""
+        """Answer the system calls on one open file of the process."""
         memory = Memory(connection)
         try:
             file = self._kernel.open(node, os.O_RDWR)
-        except FileNotFoundError:  # taken away since the process opened it
+        except FileNotFoundError:  # the adapter was removed after the process had opened it
             file = None
         with contextlib.suppress(EOFError, OSError):
             while True:
@@ -126,13 +126,13 @@ class UmockdevSite:
 
 
 class Memory:
-    """That of the process behind a connection."""
+    """The memory of the process at the other end of a connection."""
 
     def __init__(self, connection: socket.socket) -> None:
         self._connection = connection
 
     def receive(self, count: int) -> bytes:
-        """So many bytes. EOFError at the end."""
+        """Receive `count` bytes. Raises EOFError at the end."""
         data = b""
         while len(data) < count:
             part = self._connection.recv(count - len(data))
@@ -142,24 +142,24 @@ class Memory:
         return data
 
     def send(self, data: bytes) -> None:
-        """All of it."""
+        """Send all of `data`."""
         self._connection.sendall(data)
 
     def read(self, address: int, count: int) -> bytes:
-        """Bytes at an address."""
+        """Read `count` bytes at an address of the process."""
         if not count:
             return b""
         self.send(REQUEST.pack(READ_MEMORY, address, count))
         return self.receive(count)
 
     def write(self, address: int, data: bytes) -> None:
-        """Bytes to an address."""
+        """Write bytes to an address of the process."""
         if data:
             self.send(REQUEST.pack(WRITE_MEMORY, address, len(data)) + data)
 
 
 def ioctl(memory: Memory, call: Callable[[object], int], request: int, address: int) -> int:
-    """`call` with the argument that lies at `address`, copied here and, changed, back."""
+    """Make the ioctl `call` with a copy of the argument at `address`, and write the changed argument back."""
     match request:
         case s2.I2C_SLAVE | s2.I2C_SLAVE_FORCE:
             return call(address)
