@@ -55,7 +55,7 @@ class AuditedFile(msgspec.Struct, kw_only=True):
 @click.option(
     "--strict", is_flag=True, help="Fail also for repaired files, and where a result cannot be decided on this machine."
 )
-@click.option("--json", "json_to", type=click.Choice(["-"]), help="One JSON object on standard output.")
+@click.option("--json", "json_to", type=click.Choice(["-"]), help="Print one JSON object on standard output.")
 def audit(files: tuple[Path, ...], public_key: Path | None, strict: bool, json_to: str | None) -> int:
     """Check recordings, given in order: every byte, whether results follow from the data, whether a file is missing.
 

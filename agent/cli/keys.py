@@ -51,7 +51,7 @@ def _refusing(command: Callable[..., None]) -> Callable[..., int]:
 
 @click.group()
 def keys() -> None:
-    """Certificates for Zenoh over TLS, and keys that sign commands.
+    """Make certificates for Zenoh over TLS, and keys that sign commands.
 
     First make the authority, once for a site. Then make a certificate for the router and for each gateway, consumer and
     commander. Only the owner can read the private keys (*.key), and no file is ever overwritten.

@@ -54,7 +54,7 @@ class LazyGroup(click.Group):
 @click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
 @click.version_option(__version__, prog_name="fieldcal")
 def fieldcal() -> None:
-    """Recalibrate tri-axial accelerometers where they stand (Method 3 of D'Emilia et al. 2018)."""
+    """Recalibrate tri-axial accelerometers in place (Method 3 of D'Emilia et al. 2018)."""
 
 
 def _discard_output() -> None:

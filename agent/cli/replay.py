@@ -18,7 +18,7 @@ SHOWN = 12  # calibrations shown in the table; `--json` gives all
 
 @click.command()
 @click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="FILE.mcap...")
-@click.option("--json", "json_to", type=click.Choice(["-"]), help="One JSON object on standard output.")
+@click.option("--json", "json_to", type=click.Choice(["-"]), help="Print one JSON object on standard output.")
 def replay(files: tuple[Path, ...], json_to: str | None) -> int:
     """Run recordings through the pipeline, in the order given, and print the calibrations.
 

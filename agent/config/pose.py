@@ -39,7 +39,7 @@ class Stop(Section):
         if self.theta_deg is None and self.direction is None and self.gravity_mps2 is None:
             raise ValueError("needs theta_deg and alpha_deg, or direction, or gravity_mps2")
         if self.direction is not None and abs(sum(x * x for x in self.direction) - 1) > 1e-3:
-            raise ValueError(f"direction {self.direction} is not a unit vector")
+            raise ValueError(f"direction {self.direction} is not a unit vector; divide it by its length")
         return self
 
     @property

@@ -72,7 +72,7 @@ class Replay:
         self._clock, self._sleep = self._play.data, self._play.data.slowed(sleep)
         self._events: Iterator[Event] | None = None
         self._coming: Event | None = None
-        self._info: DeviceInfo | None = None  # of the device while it is there
+        self._info: DeviceInfo | None = None  # of the device while the recording says that it is connected
         self._absence = "not opened yet"
         self._opened = False
         self._index = 0  # of the next sample

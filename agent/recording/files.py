@@ -75,7 +75,7 @@ class RecordingFile:
         self.path = self.final_path.with_name(self.final_path.name + ACTIVE_SUFFIX)
         self._stream = _HashedFile(self.path)
         self._unsynced = False
-        stream = cast(IO[bytes], self._stream)  # all of it that the Writer uses
+        stream = cast(IO[bytes], self._stream)  # it has all methods that the Writer calls
         self._writer = Writer(stream, compression=CompressionType.ZSTD, enable_data_crcs=True)
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}

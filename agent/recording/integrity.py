@@ -30,7 +30,7 @@ class Integrity:
     good_bytes: int = 0
     chunks: int = 0
     messages: int = 0
-    metadata: dict[str, dict[str, str]] = field(default_factory=dict)  # the last of each name
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)  # by name; of one name, the last record
 
     def add(self, fault: Fault) -> None:
         """Count a fault; keep it if it is among the first."""
@@ -137,7 +137,7 @@ class _Check:
 
     def _compare_sums(self, start: int, end: int, recorded: int, computed: int, record: Record) -> None:
         if recorded == 0:
-            raise refusal(record, f"has no CRC of bytes {start} to {end}")
+            raise refusal(record, f"the CRC of bytes {start} to {end} is missing in it")
         if recorded != computed:
             reason = f"the CRC in it does not fit bytes {start} to {end}: at least one byte changed"
             fault = Fault("corrupt", record.offset, record.name, reason)
@@ -153,7 +153,7 @@ class _Check:
 
     def _footer(self, record: Record, crc: int) -> None:
         if not self._summary_start:
-            raise refusal(record, "no DataEnd before it")
+            raise refusal(record, "there is no record DataEnd before it")
         footer = cast(Footer, parse(record))
         covered = record.head + record.body[:16]
         end = record.offset + len(covered)
@@ -162,9 +162,11 @@ class _Check:
             return  # where the data are damaged, the correct summary is not known
         offsets = self._groups.get(Opcode.SUMMARY_OFFSET)
         if not offsets or footer.summary_start != self._summary_start:
-            raise refusal(record, f"the summary begins at {self._summary_start} and has offsets at its end")
+            reason = f"it must name byte {self._summary_start}, where the summary begins, and offsets must be before it"
+            raise refusal(record, reason)
         if footer.summary_offset_start != offsets[0][0].offset or offsets[-1][0].end != record.offset:
-            raise refusal(record, f"the summary's offsets begin at {offsets[0][0].offset} and go up to here")
+            first = offsets[0][0].offset
+            raise refusal(record, f"it must name byte {first}, where the summary's offsets begin, and follow them")
         for kind in KINDS:
             self._compare_group(record, kind)
 
@@ -173,7 +175,9 @@ class _Check:
         present, expected = self._groups.get(kind, []), self._derived.expected(kind, self._groups)
         for (record, parsed), wanted in zip(present, expected, strict=False):
             if parsed != wanted:
-                raise refusal(record, "does not agree with the data")
+                raise refusal(record, "does not agree with the data section")
         if len(present) != len(expected):
             at = present[-1][0] if present else footer
-            raise refusal(at, f"{len(present)} of {record_name(kind)} in the summary, {len(expected)} by the data")
+            kind_name = record_name(kind)
+            reason = f"the summary has {len(present)} of {kind_name}, but the data section needs {len(expected)}"
+            raise refusal(at, reason)

@@ -49,7 +49,7 @@ def decode_block(data: bytes) -> tuple[int, SampleBlock]:
     """
     m = pb.RawBlockBytes.FromString(data)
     if m.axes not in (1, 3):
-        raise ValueError(f"axes {m.axes}, not 1 or 3")
+        raise ValueError(f"the block says {m.axes} axes; only 1 and 3 are possible")
     arrival = np.frombuffer(m.burst_t_monotonic_ns, "<i8")
     count = np.frombuffer(m.burst_count, "<i4")
     names, kind = (DECIMALS, "<f8") if m.decimal else (COUNTS, "<i4")

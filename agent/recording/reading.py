@@ -93,7 +93,7 @@ class RecordingReader:
                     else:
                         self._channels[part.id] = part
             elif record.opcode == Opcode.MESSAGE:
-                raise refusal(record, "a message outside a chunk")
+                raise refusal(record, "a message outside a chunk; a recording has messages only in chunks")
             self.good_bytes = record.end
 
     def _item(self, record: Record, message: ChunkMessage) -> tuple[int, Event | Output]:

@@ -36,7 +36,7 @@ class DeviceHealth(msgspec.Struct, frozen=True, kw_only=True):
     overruns: int
     saturated: int  # blocks with an indication at the end of the range
     dropped: dict[str, int]  # by unit (lines, blocks, ...): the amount that was read but could not be used
-    losses: int  # times the device was lost
+    losses: int  # number of times that the device was lost
     nominal_rate_hz: float | None
     rate_hz: float | None
     lag_s: float | None  # age of the newest sample
@@ -57,7 +57,7 @@ class DeviceWatch:
         self._nominal_rate_hz: float | None = None
         self._temperature_degc: float | None = None
         self._clock: ClockModel | None = None
-        self._bursts = 0  # in the clock model since it began
+        self._bursts = 0  # number of bursts in the clock model
         self._origin_ns = 0
         self._opened_ns = 0
 

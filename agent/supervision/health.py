@@ -175,6 +175,6 @@ class Health:
             "the store cannot be read": publication.unpublished is None,
             "no Zenoh router, results wait in the store": publication.enabled and not publication.connected,
             f"publication: {publication.fault}": publication.fault,
-            f"behind: {', '.join(behind)}": behind,
+            f"queue more than half full, the agent is too slow: {', '.join(behind)}": behind,
         }
         return [words for words, holds in told.items() if holds]

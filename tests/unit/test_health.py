@@ -159,7 +159,8 @@ def test_an_open_device_that_says_nothing_is_silent() -> None:
          "the store cannot be read"),
         ({"publication": PublicationHealth(enabled=True, connected=True, unpublished=0, fault="bad endpoint")},
          "publication: bad endpoint"),
-        ({"queues": {"pipeline": Queue(waiting=61, capacity=120)}}, "behind: pipeline"),
+        ({"queues": {"pipeline": Queue(waiting=61, capacity=120)}},
+         "queue more than half full, the agent is too slow: pipeline"),
     ],
 )  # fmt: skip
 def test_what_is_not_well_is_said(situation: dict[str, Any], reason: str) -> None:

@@ -131,12 +131,12 @@ def test_message_indexes_are_held_against_the_chunk(recording: bytes) -> None:
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        ({"enable_data_crcs": False}, "has no CRC"),
+        ({"enable_data_crcs": False}, "is missing in it"),
         ({"enable_crcs": False}, "CRC does not fit"),
         ({"index_types": IndexType.NONE}, "comes before the message index"),
-        ({"index_types": IndexType.MESSAGE}, "0 of ChunkIndex in the summary, 1 by the data"),
-        ({"use_statistics": False}, "0 of Statistics in the summary, 1 by the data"),
-        ({"repeat_channels": False}, "0 of Channel in the summary, 1 by the data"),
+        ({"index_types": IndexType.MESSAGE}, "the summary has 0 of ChunkIndex, but the data section needs 1"),
+        ({"use_statistics": False}, "the summary has 0 of Statistics, but the data section needs 1"),
+        ({"repeat_channels": False}, "the summary has 0 of Channel, but the data section needs 1"),
         ({"use_summary_offsets": False}, "has offsets at its end"),
         ({"use_chunking": False}, "does not belong here"),
     ],
