@@ -107,7 +107,7 @@ def virtual_bench(preset: str, seed: int) -> Iterator[tuple[Config, Any]]:
             {"start_s": p.start_s, "stop_s": p.stop_s, "theta_deg": p.theta_deg, "alpha_deg": p.alpha_deg}
             for p in live.bench.poses
         ]
-        number = f"{preset}-{seed}"  # each bench has another serial number, so that none gets another's calibration
+        number = f"{preset}-{seed}"  # each bench has its own serial number and so its own calibration
         raw = {
             "gateway": {"site": "virtual", "name": "bench"},
             "devices": [

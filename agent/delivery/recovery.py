@@ -73,7 +73,7 @@ def recover_memories(connection: sqlite3.Connection, directory: Path, recall: Re
 
     The newest recording gives the states of all devices of its run and those kept from before. Then follow, newest
     first, the recordings with a calibration that is newer than the state known of its device.
-    Returns how many devices got another state.
+    Returns the number of devices whose state was replaced.
     """
     rows = connection.execute("SELECT sensor, identity, sequence, state, crc FROM memory")
     known: dict[tuple[str, str], int] = {(row[0], row[1]): row[2] for row in map(checked, rows)}

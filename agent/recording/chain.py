@@ -66,7 +66,7 @@ def _gap(before: int, after: Link, pruned: Sequence[Pruned], deleted: Ranges) ->
     for event in pruned:
         neighbour = event.last_file + 1 == after.file_sequence
         if neighbour and after.previous_sha256 and event.last_sha256 != after.previous_sha256:
-            yield f"the deleted recording {event.last_file} had another SHA-256 than this one names for it"
+            yield f"the SHA-256 of the deleted recording {event.last_file} is not the one that this recording names"
 
 
 def _span(first: int, last: int) -> str:

@@ -20,7 +20,7 @@ def changed_byte(recorded: int, computed: int, length: int) -> int | None:
     for offset in range(length - 1, max(-1, length - 1 - SEARCHED), -1):
         if remainder in _ONE_BYTE:
             return offset
-        # Each table entry has another top byte. The top byte therefore tells which entry the step for a zero byte used.
+        # The top bytes of all table entries differ. So the top byte tells which entry the step for a zero byte used.
         index = _BY_TOP_BYTE[remainder >> 24]
         remainder = ((remainder ^ _TABLE[index]) << 8 | index) & 0xFFFFFFFF
     return None

@@ -1,8 +1,8 @@
 """The numeric fingerprint of a machine: what else than the data decides the last bits of a result.
 
-numpy and OpenBLAS choose their computing kernels by the features of the CPU. Other kernels add in another order, and
-sums then differ in the last bit. Environment variables, read when the libraries load, make both choose as on another
-CPU.
+numpy and OpenBLAS choose their computing kernels by the features of the CPU. Different kernels add in a different
+order, and their sums differ in the last bit. Environment variables, read when the libraries load, make both choose as
+on another CPU.
 """
 
 from __future__ import annotations

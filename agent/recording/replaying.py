@@ -138,7 +138,8 @@ class Replay:
     @staticmethod
     def _differ(file: ReplayedFile, difference: Difference) -> None:
         if difference.undecidable:
-            # After this event the replay may differ for good reason. The next file's snapshot brings it back in step.
+            # The replay has taken the other decision, so all later results of this file differ. The next file begins
+            # with a snapshot and can be compared again.
             file.undecidable += 1
             file.notes.append(f"undecidable on this machine: {difference}")
             return

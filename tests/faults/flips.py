@@ -193,7 +193,7 @@ def at_starts(directory: Path, starts: int) -> Outcome:
 
 
 def _begun(data_dir: Path, before: list[object]) -> str:
-    """What the newest run began with: the calibration in force before, another one, or none."""
+    """What the newest run began with: the calibration in force before, a different one, or none."""
     try:
         with History(data_dir / FILE_NAME) as history:
             records = history.after(-1, limit=10_000_000)

@@ -126,7 +126,7 @@ def test_a_file_in_the_place_of_the_last_deleted_is_seen(tmp_path: Path, limit: 
     first.write_bytes(with_sums(data[:at] + other + data[at + 1 :]))
     status, text = said(tmp_path)
     assert status == 3
-    assert f"the deleted recording {pruned.last_file} had another SHA-256 than this one names for it" in text
+    assert f"the SHA-256 of the deleted recording {pruned.last_file} is not the one that this recording names" in text
 
 
 def test_neighbours_of_two_runs_are_held_against_each_other(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from tests.scenarios.processes import ROOT, interrupt, started, wait_until
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 FENCE = re.compile(r"^```sh\n(.*?)^```", re.MULTILINE | re.DOTALL)
-# These go on until somebody ends them; what they print first says that they run.
+# Commands that run until they are stopped, each with a text in its first output.
 ENDLESS = {"run": "recording", "router": "tcp/", "simulate": "sensor "}
 
 

@@ -28,8 +28,8 @@ def test_the_band_is_the_binomial_one() -> None:
     assert (low, high) == (268, 297)
     probability = [_within(300, low, high, share) for share in (0.95, 0.85, 0.999)]
     assert 1 - probability[0] < 0.001 / 12
-    assert probability[1] < 0.02  # an estimator that covers 85 % is found out
-    assert probability[2] < 0.1  # and so is one whose U is far too large
+    assert probability[1] < 0.02  # an estimator that covers 85 % fails
+    assert probability[2] < 0.1  # and so does one whose U is far too large
 
 
 def _within(n: int, low: int, high: int, share: float) -> float:
