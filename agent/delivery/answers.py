@@ -1,4 +1,4 @@
-"""Answers to queries on a gateway's keys, from its store: the value in force, or all after a sequence number."""
+"""Answers queries on a gateway's keys from its store: the values in force, or all results after a sequence number."""
 
 from __future__ import annotations
 
@@ -11,26 +11,27 @@ import zenoh
 from agent.delivery.history import History, Record, StoreError
 from agent.delivery.keys import result_key
 
-REPLIES_MAX = 500  # per query, about 1 MB; who asks goes on from the last number until nothing comes
+REPLIES_MAX = 500  # results per query, about 1 MB; the consumer asks again from the last number until nothing comes
 NOTHING = b"nothing to tell"
-REMOVED = "no longer kept: some results up to "  # and the number; retention was faster than who asks
+REMOVED = "no longer kept: some results up to "  # followed by the number; retention has deleted them
 
 _log = logging.getLogger(__name__)
 _Queryable = zenoh.Queryable[zenoh.Handler[zenoh.Query]]
 
 
 def answer_queries(queryable: _Queryable, gateway: str, store: Path, status: Callable[[], bytes]) -> None:
-    """Answer until the queryable is undeclared or its session closes. Runs in a thread of its own.
+    """Answer queries until the queryable is undeclared or its session closes. Runs in a thread of its own.
 
-    `<keys>`: the newest result of each channel that matches; a calibration only where it is in force. And the gateway's
-    own `status`, where that is asked for and not empty.
-    `<keys>?after=<sequence>`: the first REPLIES_MAX results after that number, in order. Several come on one key, so
-    the query must be sent with consolidation NONE, else Zenoh keeps the last of each key.
-    Where retention deleted some of those, an error REMOVED comes before the results.
-    Where there is none the answer is the error NOTHING, since silence also comes from a gateway that is not there.
+    `gateway`: Zenoh key of the gateway. `store`: path of its store. `status`: gives the gateway's status, JSON or b"".
+    A query for `<keys>` gets the newest result of each channel that matches, a calibration only while it is in force,
+    and the gateway's status where its key matches.
+    A query for `<keys>?after=<sequence>` gets the first REPLIES_MAX results after that number, in order. Several of
+    them have the same key, so the query must use the consolidation NONE; otherwise Zenoh passes on only the last one.
+    Where retention has deleted some of these results, the error REMOVED comes first.
+    Where there is no result, the answer is the error NOTHING: no answer at all would mean that the gateway is absent.
     """
     for query in queryable:
-        with query:  # a query that stays alive makes the one who asked wait for its whole time
+        with query:  # without closing the query, the sender waits until its timeout
             try:
                 records, removed = _answers(query, gateway, store)
                 told = _reply_status(query, gateway, status())
@@ -59,7 +60,7 @@ def _reply_status(query: zenoh.Query, gateway: str, status: bytes) -> bool:
 
 
 def _answers(query: zenoh.Query, gateway: str, store: Path) -> tuple[list[Record], int]:
-    """The records, and the number up to which some that were asked for are gone; 0 where none is."""
+    """(the records asked for, the number up to which some of them have been deleted, or 0)."""
     after = query.parameters.get("after")
     with History(store) as history:
         wanted = [

@@ -1,4 +1,4 @@
-"""The results a gateway has kept: what a record is, and how it is read while the agent goes on writing."""
+"""Reads the results that a gateway has stored, also while the agent writes."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ FILE_NAME = "state.sqlite"
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """A result as it is kept and published.
+    """A result as it is stored and published.
 
-    `payload` is its JSON with the field `recorded` added: false where the recording failed, and the raw data behind
-    the result are not kept. `sensor` is empty where the gateway itself speaks. `sequence` counts the results of a
-    gateway over all its runs, with gaps.
+    `payload`: its JSON with the added field `recorded`, which is false where the result and its raw data are in no
+    recording. `sensor`: empty for a result of the gateway itself. `sequence`: rises over all runs of a gateway, with
+    gaps.
     """
 
     sequence: int
@@ -49,12 +49,12 @@ class Record:
     payload: bytes
     t_utc_ns: int
     recorded: bool
-    recording: str  # name of the file
-    identity: str = ""  # of the device, where this is a calibration
+    recording: str  # name of the recording's file; "" where the result is in none
+    identity: str = ""  # for a calibration, the identity of the device
 
     @staticmethod
     def of(result: Result, *, recorded: bool, recording: str) -> Record:
-        """The record of a result; a number that is not finite becomes null."""
+        """Make the record of a result. A number that is not finite becomes null in the JSON."""
         fields = {**msgspec.structs.asdict(result), "recorded": recorded}
         identity = result.identity if isinstance(result, CalibrationUpdate) else ""
         return Record(
@@ -71,7 +71,7 @@ class Record:
 
     @staticmethod
     def of_row(row: tuple[Any, ...]) -> Record:
-        """The record of a row of RESULT_COLUMNS and its CRC. Raises DamagedRow."""
+        """Make the record from a row: RESULT_COLUMNS and their CRC. Raises DamagedRow."""
         sequence, run_id, sensor, what, payload, t_utc_ns, recorded, recording, identity = checked(row)
         return Record(sequence, run_id, sensor, what, payload, t_utc_ns, bool(recorded), recording, identity)
 
@@ -84,12 +84,12 @@ class Record:
 
     @property
     def is_withdrawal(self) -> bool:
-        """Whether a calibration is in force no more after this: it says that the sensor is UNCALIBRATED."""
+        """Whether this status (UNCALIBRATED) ends the time in force of the sensor's calibration."""
         return self.what == "status" and self.fields.get("status") == "UNCALIBRATED"
 
     @property
     def fields(self) -> dict[str, Any]:
-        """The payload decoded. Raises StoreError where it is not JSON."""
+        """The payload, decoded from JSON. Raises StoreError where it is not JSON."""
         try:
             return msgspec.json.decode(self.payload, type=dict[str, Any])
         except (msgspec.DecodeError, UnicodeDecodeError) as error:
@@ -97,7 +97,7 @@ class Record:
 
     @property
     def result(self) -> Result:
-        """The result again; null becomes NaN. Raises StoreError where the payload is not of this version."""
+        """The result, decoded; null becomes NaN. Raises StoreError where this version cannot decode the payload."""
         try:
             return msgspec.convert(_null_to_nan(self.fields), RESULTS[self.what])
         except (KeyError, msgspec.ValidationError) as error:
@@ -106,7 +106,7 @@ class Record:
 
 @dataclass(frozen=True, slots=True)
 class Removed:
-    """What retention deleted of a channel: `count` results, the last of them number `up_to`."""
+    """What retention deleted of a channel: `count` results; the last of them had the sequence number `up_to`."""
 
     sensor: str
     what: str
@@ -115,9 +115,9 @@ class Removed:
 
 
 class History:
-    """Reads the store through a connection of its own, also while the agent writes. Belongs to the thread that made it.
+    """Reads the store through a connection of its own, also while the agent writes.
 
-    Raises StoreError where there is no store, or what is read of it is not what was written.
+    Only the thread that made it may use it. Every method raises StoreError where the store is missing or damaged.
     """
 
     def __init__(self, path: Path) -> None:
@@ -133,10 +133,12 @@ class History:
         if version != SCHEMA_VERSION:
             self.close()
             hint = "; `fieldcal run` brings it up to date" if known_version(version) else ""
-            raise StoreError(f"{path}: written in version {version}, this program reads version {SCHEMA_VERSION}{hint}")
+            raise StoreError(
+                f"{path}: the store has version {version}, but this program reads version {SCHEMA_VERSION}{hint}"
+            )
 
     def check(self) -> None:
-        """Look at every page and row, as the agent does when it starts; 6 s a GB. Raises StoreError on damage."""
+        """Check every page and row, as the agent does at its start; takes 6 s per GB. Raises StoreError on damage."""
         try:
             found = damage(self._connection)
         except (sqlite3.Error, UnicodeDecodeError) as error:
@@ -145,7 +147,7 @@ class History:
             raise StoreError(f"{self._path}: damaged: {found}")
 
     def after(self, sequence: int, channels: Collection[tuple[str, str]] | None = None, *, limit: int) -> list[Record]:
-        """The first `limit` results after `sequence`, in order; of the `channels` (sensor, what) if given."""
+        """The first `limit` results after number `sequence`, in order; only of `channels` (sensor, what) if given."""
         where, values = "sequence > ?", [sequence]
         if channels is not None:
             rows = ", ".join(["(?, ?)"] * len(channels)) or "(NULL, NULL)"
@@ -154,28 +156,28 @@ class History:
         return self._records(f"WHERE {where} ORDER BY sequence LIMIT ?", *values, *names, limit)
 
     def count_after(self, sequence: int) -> int:
-        """How many results came after `sequence`: of the number published last, what the outbox holds."""
-        # By the channels' index: the table itself would be read with all payloads.
+        """The number of results after `sequence`. For the last published number this is the size of the outbox."""
+        # This join uses the index of the channels; otherwise SQLite would read the whole table with all payloads.
         counted = "SELECT count(*) FROM latest AS l CROSS JOIN results AS r USING (sensor, what) WHERE r.sequence > ?"
         return int(self._rows(counted, sequence)[0][0])
 
     def channels(self) -> list[tuple[str, str]]:
-        """All (sensor, what) that ever gave a result."""
+        """All channels (sensor, what) that have ever had a result."""
         return sorted((sensor, what) for sensor, what, _, _ in self._latest())
 
     def latest(self) -> list[Record]:
-        """The newest result of every channel, in order; a calibration only where it is in force."""
+        """The newest result of every channel, in order of sequence; a calibration only while it is in force."""
         return sorted(
             (self._record(sequence) for _, _, sequence, withdrawn in self._latest() if not withdrawn),
             key=lambda record: record.sequence,
         )
 
     def in_force(self, sensor: str) -> Record | None:
-        """The newest calibration of a sensor; None if it has none, or its status was UNCALIBRATED since."""
+        """The calibration in force of a sensor; None if it has none, or if a later status was UNCALIBRATED."""
         return next((r for r in self.latest() if r.sensor == sensor and r.what == "calibration"), None)
 
     def calibrations(self, sensor: str) -> dict[str, Record]:
-        """The newest calibration of a sensor by each identity it ever had: device, serial number, settings."""
+        """The newest calibration of each device that a sensor ever had, by identity (kind, serial number, settings)."""
         rows = self._rows(
             "SELECT max(sequence) FROM results WHERE sensor = ? AND what = 'calibration' GROUP BY identity", sensor
         )
@@ -183,7 +185,7 @@ class History:
         return {record.identity: record for record in records}
 
     def memories(self, sensor: str) -> dict[str, Memory]:
-        """The newest state of the devices that this sensor was last, by identity, oldest first."""
+        """The newest state of the estimation of each of this sensor's last devices, by identity, oldest first."""
         rows = self._rows(
             "SELECT sensor, identity, sequence, state, crc FROM memory WHERE sensor = ? ORDER BY sequence", sensor
         )
@@ -193,7 +195,7 @@ class History:
             raise StoreError(f"{self._path}: {error}") from None
 
     def file_sequence(self) -> int:
-        """The highest number that a recording here ever had."""
+        """The highest file number of all recordings, deleted ones included."""
         rows = self._checked("SELECT name, value, crc FROM marks WHERE name = 'file'")
         return int(rows[0][1]) if rows else 0
 
@@ -224,7 +226,7 @@ class History:
     def _record(self, sequence: int) -> Record:
         found = self._records("WHERE sequence = ?", sequence)
         if not found:
-            raise StoreError(f"{self._path}: result {sequence} is not there")
+            raise StoreError(f"{self._path}: damaged: result {sequence} is missing")
         return found[0]
 
     def _records(self, clause: str, *values: object) -> list[Record]:
@@ -241,7 +243,7 @@ class History:
             raise StoreError(f"{self._path}: {error}") from None
 
     def _rows(self, sql: str, *values: object) -> list[tuple[Any, ...]]:
-        # A whole answer at once: a reader that stays in a transaction keeps the log from being folded in.
+        # All rows at once: while a reader stays in a transaction, SQLite cannot copy the log into the file.
         try:
             with closing(self._connection.execute(sql, values)) as cursor:
                 return cursor.fetchall()
@@ -263,8 +265,8 @@ def _null_to_nan(value: Any) -> Any:
 
 
 def connect_read_only(path: Path) -> sqlite3.Connection:
-    """Open without leave to write. Raises sqlite3.Error only when something is read."""
-    # Where nobody writes there is no log, and `immutable` alone opens a file in a directory that cannot be written.
+    """Open the store for reading only. A missing or damaged file raises sqlite3.Error only when something is read."""
+    # Without a writer there is no log. In a directory without write permission only `immutable` can then open the file.
     log = path.with_name(path.name + "-wal")
     idle = not log.exists() and not os.access(path.parent, os.W_OK)
     option = "immutable=1" if idle else "mode=ro"

@@ -1,4 +1,4 @@
-"""What leaves the gateway: results in order, from the outbox, over Zenoh. Nothing here can hold the agent up."""
+"""Publishes a gateway's results over Zenoh, in order, from the outbox. It never delays the rest of the agent."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from agent.delivery.session import session_config
 from agent.delivery.store import Store
 
 BATCH = 100  # results read from the store at a time
-POLL_S = 0.2  # how soon a router that came back is seen; asking costs a microsecond
-SETTLE_S = 0.2  # a router tells who subscribes just after it connects; what is put before goes only to the cache
-REOPEN_S = 5.0  # between attempts to open a session that the machine refuses
-CACHE_SAMPLES = 100  # per channel, for subscribers that come late; all before is in the store
-HEARTBEAT_S = 10.0  # tells a subscriber that it missed the last sample; 40 bytes each, only where one listens
-RECENT_MAX = 1000  # results handed over last: those that the store refused go out from here
-BLOCKS_MAX = 64  # of the corrected stream, half a minute of one sensor; they are not results, nobody asks for old ones
-CLOSE_S = 1.2  # a frozen router blocks a put for 5 s; leaving must not wait for it
+POLL_S = 0.2  # s after which a router that came back is noticed; asking takes a microsecond
+SETTLE_S = 0.2  # s to wait for a new router to name its subscribers; samples put before reach only the cache
+REOPEN_S = 5.0  # s between two attempts to open a session
+CACHE_SAMPLES = 100  # samples per channel for subscribers that come later; older results are in the store
+HEARTBEAT_S = 10.0  # s between messages that let a subscriber notice a missed last sample; 40 bytes for each subscriber
+RECENT_MAX = 1000  # newest results; those that the store could not write are published from here
+BLOCKS_MAX = 64  # blocks of the corrected stream that may wait, half a minute of one sensor; older ones are dropped
+CLOSE_S = 1.2  # s to wait at the end; a router that does not respond blocks a put for 5 s
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class PublicationState:
-    """What the publisher is doing: endpoints it knows, whether a router is there, up to which result all are out."""
+    """The state of the publisher. `connected`: whether to a router. `published`: the last published result."""
 
     key: str
     endpoints: tuple[str, ...]
@@ -46,15 +46,19 @@ class PublicationState:
 
 
 class Publisher:
-    """Publishes the results of a gateway, in the order of their sequence, each once the store has it.
+    """Publishes the results of a gateway in the order of their sequence, each after the store has it.
 
-    The store is the outbox: Zenoh acknowledges nothing, so a result counts as published when it was put while a router
-    was connected, and what is lost with a dying link is still in the publisher's cache and behind the queryable
-    (`?after=<sequence>`, see agent.delivery.answers). Each sample's attachment is the number of the result put before
-    it, "0" where that says nothing (put again at the start, or not kept by the store): a consumer whose last number is
-    another has missed something, or must ask.
-    The session is a peer that does not listen; it connects when a router appears. `serve` is told of each new session.
-    Raises ValueError on a bad name, EndpointError on a bad endpoint; after that no method raises.
+    The store is the outbox. Zenoh does not acknowledge, so a result counts as published when it was put while a router
+    was connected. Results lost with a broken connection are still in the publisher's cache, and consumers can query
+    them (`?after=<sequence>`, see agent.delivery.answers).
+    The attachment of each sample is the number of the result put before it, or "0" where this number has no meaning:
+    for a result that is put again at the start, or that the store could not write. A consumer that has another last
+    number has missed results, or must ask.
+
+    `site`, `gateway`: names. `connect`: endpoints of routers. The session is a peer that does not listen; it connects
+    when a router appears. `tls`: certificates, for endpoints tls/... `serve(session, open_things)` is called with each
+    new session.
+    Raises ValueError for an invalid name, EndpointError for an invalid endpoint. The methods raise nothing.
     """
 
     def __init__(
@@ -82,43 +86,44 @@ class Publisher:
         self._said = ""
         self._previous = store.published()
         self._publishers: dict[str, AdvancedPublisher] = {}
-        self._status = b""  # the gateway's own, as told last
+        self._status = b""  # the gateway's newest status
         self._status_put = b""
         self._thread = threading.Thread(target=self._run, name="publication", daemon=True)
 
     def start(self) -> None:
-        """Begin, in a thread of its own."""
-        # For who forgets to close: a thread that comes back from Zenoh while the interpreter shuts down aborts it.
+        """Start publishing in a thread of its own."""
+        # In case nobody calls `close`: a thread that returns from Zenoh during the interpreter's shutdown aborts it.
         atexit.register(self.close)
         self._thread.start()
 
     def publish(self, record: Record) -> None:
-        """A result was committed, or could not be: send it when its turn comes. Returns at once."""
+        """Publish a result in its order. Call it after the commit, also after one that failed. Returns at once."""
         self._recent.append(record)
         self._wake.set()
 
     def stream(self, sensor: str, block: bytes) -> None:
-        """A block of the corrected stream: sent as soon as may be, and not kept. Returns at once."""
-        self._blocks.append((sensor, block))  # without a router the oldest fall out
+        """Publish a block of the corrected stream as soon as possible. It is not stored. Returns at once."""
+        self._blocks.append((sensor, block))  # without a router the oldest blocks are dropped
         self._wake.set()
 
     def tell_status(self, status: bytes) -> None:
-        """The gateway's own status (JSON) for `<gateway>/status`: only the newest is put, and none is kept on disk.
+        """Publish the gateway's status (JSON) at `<gateway>/status`. Returns at once.
 
-        It is about this process, no result: it has no sequence, and `?after=` does not bring it. Returns at once.
+        Only the newest status is published, and none is stored. It is not a result: it has no sequence number, and a
+        query with `?after=` does not return it.
         """
         self._status = status
         self._wake.set()
 
     def state(self) -> PublicationState:
-        """What is being done, for a view."""
+        """The present state, for the terminal and the gateway's status."""
         return PublicationState(self._key, self._endpoints, self._connected, self._store.published(), self._fault)
 
     def close(self, timeout_s: float = CLOSE_S) -> bool:
-        """Send what waits if a router is there, undeclare, close; give up after `timeout_s`. May be called twice.
+        """Publish what waits if a router is connected, and close; give up after `timeout_s` s. May be called twice.
 
-        False: the thread is still held by a frozen router. The process must then end by os._exit: a thread that comes
-        back from Zenoh while the interpreter shuts down aborts it.
+        Returns False where a router that does not respond still blocks the thread. The process must then end with
+        `os._exit`: a thread that returns from Zenoh during the interpreter's shutdown aborts it.
         """
         atexit.unregister(self.close)
         self._stop.set()
@@ -154,7 +159,7 @@ class Publisher:
                 self._serve_more(session, open_things)
             token = session.liveliness().declare_token(f"{self._key}/alive")
             open_things.callback(token.undeclare)
-            # Before the session closes: Zenoh is known to leak what belongs to a publisher otherwise.
+            # Before the session closes, otherwise Zenoh leaks the memory of the publishers.
             open_things.callback(self._undeclare_publishers)
             for record in history.latest():
                 if record.sequence <= self._store.published():
@@ -162,7 +167,7 @@ class Publisher:
             self._status_put = b""
             stopping = False
             while not stopping:
-                stopping = self._stop.is_set()  # asked before the last round, so that nothing handed over is left
+                stopping = self._stop.is_set()  # read first: the last round then sends all that was handed over
                 if self._find_router(session):
                     self._send_status(session)
                     self._send_waiting(session, history)
@@ -193,18 +198,18 @@ class Publisher:
                     self._put(session, record, self._previous)
                     self._store.mark_published(record.sequence)
                 if self._stop.is_set() and len(records) == BATCH:
-                    return  # a long backlog waits for the next run
+                    return  # the rest of a long backlog waits for the next run
         except StoreError as error:
             self._fail(str(error))
         while self._recent:
             record = self._recent.popleft()
             if record.sequence > self._previous:
-                self._put(session, record, previous=0)  # what the store may hold before it is not known here
+                self._put(session, record, previous=0)  # the number before it may be in the store only
 
     def _send_blocks(self, session: zenoh.Session) -> None:
         while self._blocks:
             sensor, block = self._blocks.popleft()
-            # A slow consumer loses blocks rather than hold up the results.
+            # DROP: a slow consumer loses blocks, and does not delay the results.
             session.put(
                 result_key(self._key, sensor, "acceleration"),
                 block,
@@ -223,7 +228,7 @@ class Publisher:
                 session,
                 key,
                 encoding=zenoh.Encoding.APPLICATION_JSON,
-                # Only this thread waits, and on one link a later result cannot then overtake an earlier one.
+                # BLOCK: only this thread waits, and on one link no later result can overtake an earlier one.
                 congestion_control=zenoh.CongestionControl.BLOCK,
                 cache=CacheConfig(max_samples=cached),
                 sample_miss_detection=MissDetectionConfig(heartbeat=HEARTBEAT_S),  # type: ignore[call-arg]

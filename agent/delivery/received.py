@@ -1,4 +1,4 @@
-"""One result as a consumer gets it: bounded and checked, since others may put what they like on a key."""
+"""One result as a consumer receives it. Its size and content are checked, since others may publish on the same key."""
 
 from __future__ import annotations
 
@@ -11,29 +11,29 @@ from agent.core.events import CalibrationUpdate, Estimate
 from agent.delivery.history import result_of
 from agent.delivery.keys import Address, parse_key
 
-LARGEST_RESULT = 256 << 10  # bytes; a calibration, the largest, has 5 kB
+LARGEST_RESULT = 256 << 10  # bytes; the largest result, a calibration, has 5 kB
 LARGEST_NUMBER = 2**63 - 1
 _DIGITS_MAX = 19
 
 
 @dataclass(frozen=True, slots=True)
 class Received:
-    """One result. `fields` is its JSON: the fields of agent.core.events, and `recorded`."""
+    """One result. `fields`: its JSON, with the fields of its kind in agent.core.events and the field `recorded`."""
 
     key: str
     address: Address
     sequence: int
     fields: dict[str, Any]
-    previous: int | None  # the result that the gateway put before this one; None in an answer to a query
-    # Some results after the last one known, up to this number, are no longer kept: whoever wants them came too late.
+    previous: int | None  # number of the result that the gateway published before; None in an answer to a query
+    # Where not None: retention has deleted results between the last one received and this number.
     removed_up_to: int | None = None
 
 
 def receive(key: str, payload: bytes, attachment: bytes | None) -> Received | None:
-    """The result in a sample; None for what is none of ours, whatever the bytes are.
+    """Decode a sample; returns None where it is not a result of a gateway, for any bytes.
 
-    A kind of result that this version knows has all its fields, of the right types and shapes; of a kind it does not
-    know only the sequence and the sensor are looked at.
+    A result of a known kind must have all its fields, of the right types and shapes. Of a kind that this version does
+    not know, only the fields `sequence` and `sensor` are checked.
     """
     address = parse_key(key)
     if address is None or len(payload) > LARGEST_RESULT:
@@ -41,7 +41,7 @@ def receive(key: str, payload: bytes, attachment: bytes | None) -> Received | No
     try:
         fields = msgspec.json.decode(payload, type=dict[str, Any])
         result = result_of(address.what, fields)
-    except (msgspec.DecodeError, ValueError, RecursionError):  # bytes that are no UTF-8; a thousand brackets deep
+    except (msgspec.DecodeError, ValueError, RecursionError):  # not UTF-8; or too many nested brackets
         return None
     calibration = result.calibration if isinstance(result, Estimate) else result
     if isinstance(calibration, CalibrationUpdate) and not _has_its_shapes(calibration):

@@ -137,7 +137,7 @@ def test_message_indexes_are_held_against_the_chunk(recording: bytes) -> None:
         ({"index_types": IndexType.MESSAGE}, "the summary has 0 of ChunkIndex, but the data section needs 1"),
         ({"use_statistics": False}, "the summary has 0 of Statistics, but the data section needs 1"),
         ({"repeat_channels": False}, "the summary has 0 of Channel, but the data section needs 1"),
-        ({"use_summary_offsets": False}, "has offsets at its end"),
+        ({"use_summary_offsets": False}, "offsets must be before it"),
         ({"use_chunking": False}, "does not belong here"),
     ],
 )
