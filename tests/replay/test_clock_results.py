@@ -1,4 +1,4 @@
-"""Clock results in recordings: they follow from the data, and a recording of a version without them is still sound."""
+"""Clock results in recordings follow from the data; a recording made before they existed still passes the audit."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def _halved(result: Result) -> Result:
 def test_a_recording_of_a_version_without_clock_results_is_sound(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """As that version wrote it: its state knows no clock results, and there are none."""
+    """A recording as the version before clock results wrote it: neither its snapshot nor its results have any."""
 
     def before(entry: Recorded) -> Recorded:
         number, event, results = entry
