@@ -23,7 +23,7 @@ def load_private_key(path: Path) -> Ed25519PrivateKey:
 
     try:
         key = load_pem_private_key(read_key_file(path), password=None)
-    except (ValueError, TypeError, UnsupportedAlgorithm):  # do not pass on what `cryptography` says: it may quote the key
+    except (ValueError, TypeError, UnsupportedAlgorithm):  # its message may quote the key
         raise KeyFileError(f"{path}: not a private key in PEM without a password") from None
     if not isinstance(key, Ed25519PrivateKey):
         raise KeyFileError(
