@@ -74,7 +74,7 @@ _VERSION_1_BY_POSITION: Mapping[str, Kind] = {
 def from_version_1(state: dict[str, Any]) -> None:
     """Each unknown gets its kind. Raises KeyError for a name that version 1 did not have.
 
-    The summary of a window told which of its blocks is which window: a summary has one.
+    The summary of a window told which of its blocks is which window, a summary has one; noise is now by window.
     """
     for estimation in _estimations(state):
         recursion = estimation["recursion"]
@@ -83,6 +83,7 @@ def from_version_1(state: dict[str, Any]) -> None:
         for summary in (*recursion["recent"], *estimation["held"]):
             for gone in ("block_window", "mean_omega2"):
                 del summary["data"][gone]
+            summary["data"]["type_a"]["noise"] = summary["data"]["type_a"]["noise"][None]
 
 
 def _estimations(state: Mapping[str, Any]) -> Iterator[dict[str, Any]]:

@@ -39,8 +39,11 @@ class Condensed:
     type_a: TypeA
 
 
-def condense(windows: Sequence[Window]) -> Condensed:
-    """Condense the windows' sums; M is the largest number of reference channels among them."""
+def condense(windows: Sequence[Window], *, alike: bool = False) -> Condensed:
+    """Condense the windows' sums; M is the largest number of reference channels among them.
+
+    `alike` as in calib.estimate.type_a.pooled.
+    """
     channels = max(w.sums.reference_channels for w in windows)
     segments = [_segments(w, channels) for w in windows]
     roots, whiteners = zip(*(_root(s.xx.sum(0)) for s in segments), strict=True)
@@ -52,7 +55,7 @@ def condense(windows: Sequence[Window]) -> Condensed:
         mean_x=np.array([s.mean[:-3] for s in segments]),
         mean_v=np.array([s.mean[-3:] for s in segments]),
         count=np.array([s.count.sum() for s in segments]),
-        type_a=pooled(segments, roots, whiteners),
+        type_a=pooled(segments, roots, whiteners, alike=alike),
     )
 
 

@@ -154,8 +154,8 @@ class Equations:
         for i in range(3):
             jacobian[:, :, i, 3 * i : 3 * i + 3] = np.einsum("brc,bkc->brk", data.root, per_row[:, i])
         jacobian[..., 12:] = np.einsum("brc,bicj->brij", data.root, d_z)
-        noise = data.type_a.noise
-        return self._whitened(residual / noise), self._whitened(jacobian / noise[:, None])
+        noise = data.type_a.noise[:, None]
+        return self._whitened(residual / noise), self._whitened(jacobian / noise[..., None])
 
     def _whitened(self, slopes: Array) -> Array:
         """Rows (W, 2M, 3, ...) with the scatter between windows taken into their weight."""

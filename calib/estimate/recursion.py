@@ -188,7 +188,7 @@ class Recursion:
         if len(self._joint.recent) > MOST_RECENT:
             self._absorb(1)
         self._noise = self._noise.pooled(rows.noise)
-        self._residual_sd = summary.data.type_a.noise.copy()
+        self._residual_sd = summary.data.type_a.noise[0].copy()
         if np.isfinite(summary.temperature_degc):
             low, high = self._temperature_range
             self._temperature_range = (min(low, summary.temperature_degc), max(high, summary.temperature_degc))

@@ -41,9 +41,9 @@ class SlopeScatter:
         """The loadings of condensed windows; `lag_s` and `attenuation` (B,) or one for all."""
         m, blocks = data.channels, len(data.slopes)
         own = np.linalg.pinv(data.root, rcond=1e-9) @ data.slopes  # zero rows of an unexcited channel stay zero
-        lag = -np.einsum("brc,bci->bri", data.root[:, :, m:], own[:, :m]) / data.type_a.noise
+        lag = -np.einsum("brc,bci->bri", data.root[:, :, m:], own[:, :m]) / data.type_a.noise[:, None]
         signal = np.zeros_like(data.slopes)
-        signal[:, :m] = data.slopes[:, :m] / data.type_a.noise
+        signal[:, :m] = data.slopes[:, :m] / data.type_a.noise[:, None]
         return SlopeScatter(
             np.broadcast_to(np.asarray(lag_s, dtype=float), blocks), lag.reshape(blocks, -1),
             np.broadcast_to(np.asarray(attenuation, dtype=float), blocks), signal.reshape(blocks, -1),

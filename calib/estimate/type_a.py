@@ -37,7 +37,7 @@ class Segments:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TypeA:
-    """`noise` (3,): SD of the residuals within windows, output unit. `slopes` (6M, 6M) in the order basis, axis and
+    """`noise` (W, 3): SD of the residuals within each window, output unit. `slopes` (6M, 6M) in the order basis, axis and
     `means` (3, 3): covariance of the whitened slopes and means, identities if the residuals were white and
     independent between axes. `degrees_of_freedom` of both, inf where single segments allow no such estimate."""
 
@@ -47,16 +47,24 @@ class TypeA:
     degrees_of_freedom: float
 
 
-def pooled(windows: Sequence[Segments], roots: Sequence[Array], whiteners: Sequence[Array]) -> TypeA:
-    """Scatter of the whitened scores over all windows; slopes are whitened by T = `whiteners`."""
+def pooled(
+    windows: Sequence[Segments], roots: Sequence[Array], whiteners: Sequence[Array], *, alike: bool = False
+) -> TypeA:
+    """Scatter of the whitened scores over all windows; slopes are whitened by T = `whiteners`.
+
+    `alike`: all windows are taken to be as noisy as their mean, so that all points weigh the same (Method 3).
+    """
     slopes = [t.T @ (t @ w.xv.sum(0)) for t, w in zip(whiteners, windows, strict=True)]
-    noise = _noise(windows, list(zip(slopes, roots, strict=True)))
+    noise = np.array([_noise(*each) for each in zip(windows, slopes, roots, strict=True)])
+    if alike:
+        count = np.array([w.count.sum() for w in windows])
+        noise = np.tile(np.sqrt(count @ noise**2 / count.sum()), (len(noise), 1))
     size = roots[0].shape[0]
     slope_scores, mean_scores = [], []
-    for window, beta, t in zip(windows, slopes, whiteners, strict=True):
-        score = np.einsum("rc,kci->kri", t, window.xv - window.xx @ beta) / noise
+    for window, beta, t, sd in zip(windows, slopes, whiteners, noise, strict=True):
+        score = np.einsum("rc,kci->kri", t, window.xv - window.xx @ beta) / sd
         slope_scores.append(score.reshape(len(score), 3 * size))
-        score = (window.total[:, -3:] - window.total[:, :-3] @ beta) / noise
+        score = (window.total[:, -3:] - window.total[:, :-3] @ beta) / sd
         mean_scores.append(score / np.sqrt(window.count.sum()))
     live = np.repeat([any(r[j, j] > 0.0 for r in roots) for j in range(size)], 3)
     slope_cov, slope_dof = _scatter(slope_scores, live)
@@ -64,17 +72,14 @@ def pooled(windows: Sequence[Segments], roots: Sequence[Array], whiteners: Seque
     return TypeA(noise, slope_cov, mean_cov, min(slope_dof, mean_dof))
 
 
-def _noise(windows: Sequence[Segments], own: Sequence[tuple[Array, Array]]) -> Array:
-    """SD of the residuals within windows, by each window's (slopes, root)."""
-    left, freedom, signal, counts = np.zeros(3), 0.0, np.zeros(3), 0.0
-    for window, (beta, root) in zip(windows, own, strict=True):
-        xx = window.xx.sum(0) + window.count.sum() * np.diag(window.noise)
-        xv, vv = window.xv.sum(0), np.diag(window.vv.sum(0))
-        left += vv - 2.0 * np.einsum("ci,ci->i", beta, xv) + np.einsum("ci,cd,di->i", beta, xx, beta)
-        signal += vv + window.count.sum() * window.mean[-3:] ** 2
-        freedom += window.count.sum() - 1 - np.count_nonzero(np.diag(root))
-        counts += float(window.count.sum())
-    floor = NOISE_FLOOR * np.sqrt(signal.max() / counts) or 1.0
+def _noise(window: Segments, slopes: Array, root: Array) -> Array:
+    """(3,) SD of the residuals of a window with these slopes."""
+    count, xv, vv = float(window.count.sum()), window.xv.sum(0), np.diag(window.vv.sum(0))
+    xx = window.xx.sum(0) + count * np.diag(window.noise)
+    left = vv - 2.0 * np.einsum("ci,ci->i", slopes, xv) + np.einsum("ci,cd,di->i", slopes, xx, slopes)
+    signal = vv + count * window.mean[-3:] ** 2
+    freedom = count - 1.0 - np.count_nonzero(np.diag(root))
+    floor = NOISE_FLOOR * np.sqrt(signal.max() / count) or 1.0
     return np.asarray(np.sqrt(np.maximum(left, 0.0) / max(freedom, 1.0)).clip(min=floor))
 
 

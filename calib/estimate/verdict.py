@@ -191,13 +191,13 @@ def misfit(solution: Solution) -> float:
     equations = solution.equations
     data, noise = equations.data, equations.data.type_a.noise
     slope, mean = equations.split(solution.residual)
-    parts = [(slope * noise, data.slopes, noise)]
+    parts = [(slope * noise[:, None], data.slopes, np.broadcast_to(noise[:, None], slope.shape))]
     weight = np.where(equations.mean_weight > 0.0, equations.mean_weight, np.inf)
     root = np.sqrt(data.count)[:, None]
     held = equations.known
     if np.ptp(np.nan_to_num(equations.nuisances.gravity)[equations.pose_of_window], axis=0).any():
         centred = data.mean_v - data.count @ data.mean_v / data.count.sum()
-        parts.append(((mean / weight * root)[held], (centred * root)[held], noise))
+        parts.append(((mean / weight * root)[held], (centred * root)[held], noise[held]))
     shares = [0.0]
     for left, signal, sd in parts:
         power = float((signal**2).sum())
