@@ -2,7 +2,7 @@
 
 python -m docs.images.import_graph
 
-A room is a sub-package of `agent` or `calib`, or a file beside them in `calib`; `hw`, `hw.virtual` and `hw.conformance`.
+A room is a sub-package of `agent` or `calib`, or a file of `calib` beside them; `hw`, `hw.virtual`, `hw.conformance`.
 The list names all imports. The drawing leaves out an arrow where a longer way leads to the same room, so that it can be
 read. Imports for type checking alone do not count.
 """
@@ -125,7 +125,7 @@ def _places(imports: Imports, row: Mapping[str, int], ways: Sequence[Sequence[st
         for a, b in itertools.pairwise(way):
             joined[a].append(b)
             joined[b].append(a)
-    x = {node: float(k) for level in levels for k, node in enumerate(_spaced(level, {n: 0.0 for n in level}))}
+    x = {node: float(k) for level in levels for k, node in enumerate(_spaced(level, dict.fromkeys(level, 0.0)))}
     for _ in range(SWEEPS):
         for level in [*levels, *reversed(levels)]:
             wanted = {n: sum(x[m] for m in joined[n]) / len(joined[n]) if joined[n] else x[n] for n in level}
