@@ -223,8 +223,8 @@ reference {soaked.rate_hz} Hz, seed {SEED}; exit status {soaked.exit_status};
 
 {len(numbers)} results, {calibrations} of them calibrations, {used} of {windows} windows used. Results that did not
 reach the consumer: {lost}; out of order: {sum(np.diff(soaked.received) <= 0) if len(soaked.received) > 1 else 0}.
-Largest error of a main sensitivity in any calibration: {soaked.worst_error_pct:.3f} %. Bytes that the ports lost because the machine
-was late: {soaked.lost_bytes}.
+Largest error of a main sensitivity in any calibration: {soaked.worst_error_pct:.3f} %.
+Bytes that the ports lost because the machine was late: {soaked.lost_bytes}.
 """
 
 

@@ -114,7 +114,7 @@ def table() -> str:
     cpu_s, windows, updates = measure(DAY_S)
     blocks = 2 * int(DAY_S / BLOCK_S)
     return (
-        f"The pipeline needs **{cpu_s:.0f} s** of one core for a day of the bench: sensor 1 kHz x 3 and reference 1 kHz, "
-        f"{blocks} blocks, {windows} windows used, {updates} calibrations. {CYCLES} cycles of four minutes are simulated "
-        "and repeated; the time for the simulation is not in the figure."
+        f"The pipeline needs **{cpu_s:.0f} s** of one core for a day of the bench: sensor 1 kHz x 3 and reference "
+        f"1 kHz, {blocks} blocks, {windows} windows used, {updates} calibrations. {CYCLES} cycles of four minutes are "
+        "simulated and repeated; the time for the simulation is not in the figure."
     )
