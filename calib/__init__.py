@@ -12,21 +12,24 @@ if TYPE_CHECKING:
     from calib.estimate.correction import corrected
     from calib.estimate.norm_fit import norm_fit
     from calib.estimate.nuisances import Priors
-    from calib.excitation.windows import Points, motion_windows, rest_window, rests_anywhere
+    from calib.excitation.front_end import windows_of
+    from calib.excitation.windows import rests_anywhere
     from calib.geometry import along, at_rest, beside, clamp, on_axis
     from calib.model import PARAMETERS, Calibration, Pose, Window
     from calib.paper.method3 import fit as fit_method3
     from calib.paper.sine_fit import four_parameter as four_parameter_sine
     from calib.paper.sine_fit import three_parameter as three_parameter_sine
-    from calib.signal.resampling import differentiate, resample
+    from calib.signal.instrument import Instrument
+    from calib.signal.samples import Samples
     from calib.signal.stamps import clock_from_stamps
 
 __all__ = [
     "PARAMETERS",
     "Calibration",
-    "Points",
+    "Instrument",
     "Pose",
     "Priors",
+    "Samples",
     "Window",
     "adjust",
     "along",
@@ -35,16 +38,13 @@ __all__ = [
     "clamp",
     "clock_from_stamps",
     "corrected",
-    "differentiate",
     "fit_method3",
     "four_parameter_sine",
-    "motion_windows",
     "norm_fit",
     "on_axis",
-    "resample",
-    "rest_window",
     "rests_anywhere",
     "three_parameter_sine",
+    "windows_of",
 ]
 
 _PLACES = {
@@ -52,10 +52,12 @@ _PLACES = {
     "calib.estimate.correction": ("corrected",),
     "calib.estimate.norm_fit": ("norm_fit",),
     "calib.estimate.nuisances": ("Priors",),
-    "calib.excitation.windows": ("Points", "motion_windows", "rest_window", "rests_anywhere"),
+    "calib.excitation.front_end": ("windows_of",),
+    "calib.excitation.windows": ("rests_anywhere",),
     "calib.geometry": ("along", "at_rest", "beside", "clamp", "on_axis"),
     "calib.model": ("PARAMETERS", "Calibration", "Pose", "Window"),
-    "calib.signal.resampling": ("differentiate", "resample"),
+    "calib.signal.instrument": ("Instrument",),
+    "calib.signal.samples": ("Samples",),
     "calib.signal.stamps": ("clock_from_stamps",),
 }
 _PLACE = {name: (module, name) for module, names in _PLACES.items() for name in names} | {

@@ -40,11 +40,12 @@ def test_every_parameter_is_documented(name: str) -> None:
     assert section is not None, f"docs/api.md has no section for {name}"
     documented = re.findall(r"^\| `(\w+)`", section[1], re.MULTILINE)
     thing = getattr(calib, name)
-    if dataclasses.is_dataclass(thing):
-        expected = [field.name for field in dataclasses.fields(thing)]
+    if name == "Priors":  # its numbers are those of the table of unknowns, which has an order of its own
+        assert sorted(documented) == sorted([*calib.Priors.table, "parameters", "covariance"])
+    elif dataclasses.is_dataclass(thing):
+        assert documented == [field.name for field in dataclasses.fields(thing)]
     else:
-        expected = list(inspect.signature(thing).parameters)
-    assert documented == expected
+        assert documented == list(inspect.signature(thing).parameters)
 
 
 def test_every_name_is_there_and_the_page_has_no_others() -> None:
