@@ -191,7 +191,8 @@ def table(days: Sequence[Day], rate_hz: float) -> str:
         f"{len(days)} days at {rate_hz:g} Hz. Each day has {len(STOPS)} stops, which are visited {ROUNDS} times for "
         f"{HOLD_S:g} s. Windows taken: {windows[:, 0].sum()} on-line, {windows[:, 1].sum()} by `fieldcal calibrate`.",
         "",
-        "| | mean u of `calibrate` | largest difference between on-line and `calibrate`, in u | rms of this difference, in u | rms error of on-line, in u |",
+        "| | mean u of `calibrate` | largest difference between on-line and `calibrate`, in u "
+        "| rms of this difference, in u | rms error of on-line, in u |",
         "| --- | --- | --- | --- | --- |",
     ]
     for name, unit, k in KINDS:
