@@ -13,6 +13,7 @@ ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md"))]
 NAMED = re.compile(r"`((?:agent|calib|hw|tests|docs|examples|benchmarks|deploy)/[\w./-]*)`")
 LINK = re.compile(r"\]\(([^)\s]+)\)")
+CITED = re.compile(r"(?<![\w/.-])(?:docs/)?[\w-]+\.md\b")
 HEADING = re.compile(r"^#+ (.*)$", re.MULTILINE)
 
 
@@ -39,6 +40,16 @@ def test_links_lead_somewhere(page: Path) -> None:
         if not target.exists() or (anchor and anchor not in anchors(target)):
             broken.append(link)
     assert broken == []
+
+
+def test_comments_cite_pages_that_exist() -> None:
+    pages = {page.name for page in PAGES} | {str(page.relative_to(ROOT)) for page in PAGES}
+    missing = []
+    for room in ("agent", "calib", "hw", "tests", "benchmarks", "examples", "docs"):
+        for path in sorted((ROOT / room).rglob("*.py")):
+            cited = CITED.findall(path.read_text("utf-8"))
+            missing += [f"{path.relative_to(ROOT)}: {name}" for name in cited if name not in pages]
+    assert missing == []
 
 
 def test_import_graph_is_that_of_the_code() -> None:
