@@ -55,7 +55,7 @@ def resident_mb() -> float:
 
 
 def table(costs: list[Cost]) -> str:
-    """A row a window number."""
+    """One row per stated window."""
     lines = [
         "| window | CPU for this window, ms | state, kB | memory of the process, MB |",
         "| --- | --- | --- | --- |",
