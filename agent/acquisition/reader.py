@@ -18,8 +18,8 @@ from hw.sensor import ConfigurationError, DeviceError, Sensor
 
 BLOCKS_A_SECOND = 2
 QUEUE_S = 30  # s of blocks of every device that the queue can hold
-BACK_OFF_S = (0.1, 5.0)  # first and longest pause between attempts to reopen
-CONFIGURATION_BACK_OFF_S = 5.0  # somebody has to change something first; no use in hurrying
+BACK_OFF_S = (0.1, 5.0)  # first and longest pause between two attempts to open a device again
+CONFIGURATION_BACK_OFF_S = 5.0  # after a configuration error, which only a person can correct
 
 
 class EventQueue:
