@@ -114,13 +114,13 @@ def main() -> None:
         "agent_cost",
         f"""
 `python -m benchmarks agent_cost` on {machine()}; sensor 1 kHz x 3 and reference 1 kHz on two serial ports (served by
-another process), recorded, windows solved, published to a router; {MEASURED_S:g} s measured after {WARM_UP_S:g} s,
-agent and bare loop in turn, twice.
+another process). The agent records them, finds windows, and publishes to a router. {MEASURED_S:g} s are measured after
+a warm-up of {WARM_UP_S:g} s; agent and bare loop are measured in turn, twice.
 
 | figure | measured | goal |
 | --- | --- | --- |
-| CPU of the live agent over that of the bare loop that only reads and records | {cost} | 1.3 |
-| from start to the first recorded block, median of {len(starts)} | {start} | 1.5 s |
+| CPU of the agent, divided by that of a bare loop that only reads and records | {cost} | 1.3 |
+| time from the start to the first recorded block, median of {len(starts)} | {start} | 1.5 s |
 | peak memory of the agent (VmHWM) | {max(peaks):.0f} MB | 130 MB |
 """,
     )

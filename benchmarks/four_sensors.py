@@ -211,20 +211,20 @@ def main() -> None:
         "four_sensors",
         f"""
 `python -m benchmarks four_sensors` on {machine()}; four ADXL355 twins at 1 kHz (register level, each on a bus of its
-own) and two references at 1 kHz (serial) in another process, recorded, windows solved; {SECONDS:g} s;
+own) and two references at 1 kHz (serial) in another process. The agent records them and finds windows; {SECONDS:g} s;
 {circumstances(before, stood)}.
 
 | figure | measured | goal |
 | --- | --- | --- |
-| blocks flagged with a loss (overrun, restart, gap) | {lost} | none |
+| blocks that report a loss (overrun, restart, gap) | {lost} | none |
 | samples missing, of {samples} | {missing} | 0 |
 | dropped between driver and pipeline | {json.dumps(dict(gaps)) if gaps else "nothing"} | nothing |
 | longest time between two reads of a FIFO | {told(reads_late(blocks), stood)} | 32 ms |
-| largest number of events in the queue | {found["queue"]:.0f} of {60 * len(blocks)} | |
-| CPU of the agent, of one core | {found["agent"]:.1%} | |
-| CPU of the twins, of one core | {found["twins"]:.1%} | |
+| largest number of events that waited in the queue | {found["queue"]:.0f} of {60 * len(blocks)} | |
+| CPU of the agent, share of one core | {found["agent"]:.1%} | |
+| CPU of the twins, share of one core | {found["twins"]:.1%} | |
 | peak memory of the agent (VmHWM) | {found["peak_mb"]:.0f} MB | |
-| calibrations made by the agent | {calibrations} | |
+| calibrations made | {calibrations} | |
 """,
     )
 

@@ -132,17 +132,17 @@ def main() -> None:
         plain_s = cpu_s(decompress_and_check, path)
         rows = [(name, cpu_s(work, path)) for name, work in WORK]
     samples = sum(event.indications.size for event in events if isinstance(event, SampleBlock))
-    rows = [("plain", plain_s), *rows]
+    rows = [("decompressing and CRC alone", plain_s), *rows]
     lines = [f"| {name} | {DURATION_S / s:,.0f} | {s / plain_s:.1f} |" for name, s in rows]
     writing_us = writing_s / len(events) * 1e6
     write_part(
         "recording",
         f"""
 `python -m benchmarks recording` on {machine()}: half an hour of a sensor (1 kHz x 3) and a reference (1 kHz), blocks of
-0.5 s, flushed and synced every {FLUSH_S:g} s. Making the results and writing cost {writing_us:.0f} us of CPU
-a block; {size / samples:.2f} bytes a number.
+0.5 s, flushed and synced every {FLUSH_S:g} s. To make the results and write them takes {writing_us:.0f} us of CPU for
+each block, and {size / samples:.2f} bytes for each number.
 
-| CPU time | times real time | over plain decompress-and-CRC of the same file |
+| work | speed, in multiples of real time | CPU time, divided by that of decompressing and CRC alone |
 | --- | --- | --- |
 """
         + "\n".join(lines),

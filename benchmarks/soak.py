@@ -214,16 +214,17 @@ def table(soaked: Soaked) -> str:
     return f"""
 {time.strftime("%Y-%m-%d", time.gmtime())}, {machine()}: {soaked.hours:.2f} h of the drivers' clock in
 {soaked.samples[-1].elapsed_s / 60:.0f} min, {soaked.speed} times real time; sensor {soaked.rate_hz} Hz x 3 and
-reference {soaked.rate_hz} Hz, seed {SEED}; {len(soaked.samples)} observations; exit status {soaked.exit_status}.
+reference {soaked.rate_hz} Hz, seed {SEED}; exit status {soaked.exit_status};
+{len(soaked.samples)} readings of memory, threads and descriptors.
 
 | median of a quarter of the time | first | second | third | last | last over second at most {FLAT} |
 | --- | --- | --- | --- | --- | --- |
 {chr(10).join(rows)}
 
-{len(numbers)} results, {calibrations} of them calibrations, {used} of {windows} windows used; lost on the way to a
-consumer: {lost}, out of order: {sum(np.diff(soaked.received) <= 0) if len(soaked.received) > 1 else 0}. Largest error
-of a main sensitivity in any calibration: {soaked.worst_error_pct:.3f} %. Bytes that the ports lost because the machine
-was late: {soaked.lost_bytes}.
+{len(numbers)} results, {calibrations} of them calibrations, {used} of {windows} windows used. Results that did not
+reach the consumer: {lost}; out of order: {sum(np.diff(soaked.received) <= 0) if len(soaked.received) > 1 else 0}.
+Largest error of a main sensitivity in any calibration: {soaked.worst_error_pct:.3f} %.
+Bytes that the ports lost because the machine was late: {soaked.lost_bytes}.
 """
 
 

@@ -147,9 +147,9 @@ def main() -> None:
     write_part(
         "sums",
         f"""
-`python -m benchmarks sums` on {machine()}. Samples a CPU second on one core, 3 outputs:
+`python -m benchmarks sums` on {machine()}. Samples for each second of CPU on one core, 3 outputs:
 
-| estimator | samples/s | the first row is faster by |
+| estimator | samples/s | speed of the first row, divided by that of this row |
 | --- | --- | --- |
 """
         + "\n".join(lines)
@@ -159,7 +159,7 @@ An adjustment over {WINDOWS} windows in 12 positions takes {adjusting_ms:.0f} ms
 
 `fieldcal calibrate` (by adjustment) on an hour of 1 kHz, sensor and reference, as a whole process:
 
-| process | wall time | calibrate over it |
+| process | wall time | time of `fieldcal calibrate`, divided by this time |
 | --- | --- | --- |
 | fieldcal calibrate | {seconds["calibrate"]:.1f} s | |
 | numpy.loadtxt of both files | {seconds["numpy"]:.1f} s | {seconds["calibrate"] / seconds["numpy"]:.1f} |

@@ -112,9 +112,10 @@ def _mm(values: np.ndarray) -> str:
 
 HOW = (
     "Theta 35°, alpha 0, 30, 120, 210°, three repetitions of six cycles at 3 Hz and "
-    "10 m/s²; for every recording faults are drawn from the priors that the adjustment gets. Root mean square "
-    "error, worst axis: main / transverse sensitivity in % of 1, Q in mm/s². In brackets the 99.9 % band, Bonferroni "
-    "over the table. The bound of the clean row is Cramér-Rao's."
+    "10 m/s²; the faults are drawn anew for every recording, from the priors that the adjustment is given. The table "
+    "has the root mean square error of the worst axis: main / transverse sensitivity in % of 1, Q in mm/s². The "
+    "brackets have the 99.9 % band (Bonferroni over the table). The bound of the row without faults is that of Cramér "
+    "and Rao."
 )
 HEADER = (
     "| fault in the recording | recordings | plain: main / transverse / Q | adjustment | bound (posterior u) "

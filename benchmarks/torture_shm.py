@@ -42,8 +42,8 @@ UP = np.array([0.0, 0.0, 9.80665])
 ALONG = np.array([1.0, 0.0, 0.0])
 LIMIT_PCT = 0.25  # of the root mean square error of an element
 HOW = (
-    "Rms 0.02 m/s², 0.5 to 10 Hz, 600 s, ten seconds in turn at full level and at "
-    "0.15 of it; noise of the reference 0.006 m/s²; both devices at 100 Hz."
+    "The motion has an rms of 0.02 m/s² from 0.5 to 10 Hz for 600 s, in turn ten seconds at full level and ten at "
+    "0.15 of it. The noise of the reference is 0.006 m/s²; both devices run at 100 Hz."
 )
 
 

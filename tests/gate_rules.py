@@ -59,7 +59,7 @@ def unsupported(reason: str = "coherence 0.2 below 0.9") -> Evidence:
 
 
 def within_max_change(now: Calibration, anchor: Calibration, main_pct: float, transverse_pct: float) -> bool:
-    """The rule as method.md 8 states it, written plainly."""
+    """The rule as docs/online.md states it, written plainly."""
     S, S0 = now.sensitivity, anchor.sensitivity
     full_scale = (abs(S0[0, 0]) + abs(S0[1, 1]) + abs(S0[2, 2])) / 3
     for i, j in product(range(3), range(3)):

@@ -1,4 +1,4 @@
-"""Whether a window may change S and Q, and the status of the calibration that follows (method.md 8)."""
+"""Whether a window may change S and Q, and the status of the calibration that follows (docs/online.md)."""
 
 from __future__ import annotations
 

@@ -188,10 +188,11 @@ def table(days: Sequence[Day], rate_hz: float) -> str:
     u = np.array([day.u for day in days])
     windows = np.array([day.windows for day in days])
     lines = [
-        f"{len(days)} days at {rate_hz:g} Hz of {len(STOPS)} stops visited {ROUNDS} times, {HOLD_S:g} s each. Windows "
-        f"taken on-line {windows[:, 0].sum()}, by `fieldcal calibrate` {windows[:, 1].sum()}.",
+        f"{len(days)} days at {rate_hz:g} Hz. Each day has {len(STOPS)} stops, which are visited {ROUNDS} times for "
+        f"{HOLD_S:g} s. Windows taken: {windows[:, 0].sum()} on-line, {windows[:, 1].sum()} by `fieldcal calibrate`.",
         "",
-        "| | u of calibrate, mean | on-line minus calibrate, worst / u | rms / u | on-line minus truth, rms / u |",
+        "| | mean u of `calibrate` | largest difference between on-line and `calibrate`, in u "
+        "| rms of this difference, in u | rms error of on-line, in u |",
         "| --- | --- | --- | --- | --- |",
     ]
     for name, unit, k in KINDS:
@@ -219,7 +220,7 @@ def free_table(days: Sequence[tuple[Array, Array]]) -> str:
     lines = [
         f'{len(days)} days with `positions = "free"` at {RATES_HZ[0]:g} Hz; {inside:.1f} % of all errors within 2 u.',
         "",
-        "| | u on-line, mean | errors, rms / u | worst / u |",
+        "| | mean u of on-line | rms error, in u | largest error, in u |",
         "| --- | --- | --- | --- |",
     ]
     for name, unit, k in KINDS:

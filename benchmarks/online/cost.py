@@ -56,6 +56,9 @@ def resident_mb() -> float:
 
 def table(costs: list[Cost]) -> str:
     """One row per stated window."""
-    lines = ["| window | CPU a window, ms | state, kB | memory of the process, MB |", "| --- | --- | --- | --- |"]
+    lines = [
+        "| window | CPU for this window, ms | state, kB | memory of the process, MB |",
+        "| --- | --- | --- | --- |",
+    ]
     lines += [f"| {c.window} | {c.cpu_ms:.2f} | {c.snapshot_bytes / 1024:.1f} | {c.resident_mb:.1f} |" for c in costs]
     return "\n".join(lines)

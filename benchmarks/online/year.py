@@ -142,22 +142,24 @@ def facts(building: Building, year: Year) -> dict[str, str]:
     after = time_s > settled_s(building)
     found = year.step_found_after(building)
     return {
-        "windows, number of used ones": f"{year.windows}, {year.used}",
-        f"step of {100 * STEP:g} % in S_yy on day {STEP_DAY:g} found after": (
+        "windows, and how many of them were used": f"{year.windows}, {year.used}",
+        f"step of {100 * STEP:g} % in S_yy on day {STEP_DAY:g} was detected after": (
             "never" if found is None else f"{found} windows of level {LOUD_MPS2:g} or more"
         ),
-        "verdicts before the step": "; ".join(d.reason for d in year.alarms_before()) or "none",
-        f"largest error of S_yy, from {LOUD_WINDOWS} such windows after the step on": (
+        "verdicts of the drift test before the step": "; ".join(d.reason for d in year.alarms_before()) or "none",
+        f"largest error of S_yy, beginning {LOUD_WINDOWS} such windows after the step": (
             f"{100 * syy[after].max():.3f} %" if after.any() else ""
         ),
         "u(S_yy) at the end": f"{100 * u_syy[-1]:.3f} %",
         "largest error of the mean output (of 99 % of the windows)": (
             f"{1e3 * mean.max():.2f} ({1e3 * np.quantile(mean, 0.99):.2f}) mm/s2"
         ),
-        "largest error of Q over its U": f"{offset.max():.2f}",
+        "largest error of Q, divided by its U": f"{offset.max():.2f}",
         "U(Q) at the end": ", ".join(f"{2e3 * u:.0f}" for u in year.u_offset[-1]) + " mm/s2",
         "largest change of columns x and z of S": f"{np.abs(np.array(year.columns) - year.columns[0]).max():.1e}",
-        "status": ", ".join(f"{s.status} ({seconds(s.t_utc_ns) / DAY_S:.1f} d)" for s in year.statuses[-6:]),
+        "last changes of status": ", ".join(
+            f"{s.status} ({seconds(s.t_utc_ns) / DAY_S:.1f} d)" for s in year.statuses[-6:]
+        ),
     }
 
 

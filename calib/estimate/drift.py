@@ -1,6 +1,6 @@
 """Sequential test for drift: has a parameter stepped, is it drifting, and since when?
 
-Each window gives a score for each parameter (the normalised innovation, method.md 7 and 8). The test is a generalised
+Each window gives a score for each parameter (the normalised innovation, docs/online.md). The test is a generalised
 likelihood ratio over all onsets (onsets.py); its threshold follows from a false-alarm rate stated for a year
 (false_alarms.py). A change of the sensor and one of the reference give the same scores: every verdict that is not
 "stable" says so.

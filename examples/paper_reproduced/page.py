@@ -52,32 +52,32 @@ def _introduction() -> str:
             ("α in common", f"{np.rad2deg(STATED.alpha_common_rad):g}°"),
             ("offset between positions", f"{STATED.offset_mps2:g} m/s²"),
             ("reference", f"{100 * STATED.reference:g} %"),
-            ("motion across the slide", f"{100 * STATED.transverse:g} %"),
+            ("motion transverse to the slide", f"{100 * STATED.transverse:g} %"),
             ("gravity", f"{STATED.gravity_mps2:g} m/s²"),
             ("lag of the sensor behind the reference", f"{1000 * STATED.lag_s:g} ms"),
         ),
     )
     return f"""# The paper on the virtual bench
 
-Written by `python examples/paper.py` (fixed seeds; do not edit). D'Emilia, Gaspari, Mazzoleni, Natale and Schiavi,
-*Calibration of tri-axial MEMS accelerometers in the low-frequency range, Part 1: comparison among methods*,
-J. Sens. Sens. Syst. 7, 2018.
+`python examples/paper.py` writes this page, with fixed seeds; do not edit it. The paper is: D'Emilia, Gaspari,
+Mazzoleni, Natale and Schiavi, *Calibration of tri-axial MEMS accelerometers in the low-frequency range, Part 1:
+comparison among methods*, J. Sens. Sens. Syst. 7, 2018.
 
 The bench is the paper's: a horizontal slide moved by a sine of 3 or 6 Hz and 2 to 20 m/s², a laser vibrometer as the
-reference (Eq. 12), 1000 samples a second, six cycles a run, three repetitions. Method 1 has one axis along the motion
-(Eqs. 1-4), Method 2 the clamp at θ = 35°, α = 135° (Eqs. 5-7), Method 3 four α on the same clamp (Eqs. 8-11), solved
-by least squares over all points as printed. Sensors: {PIEZO.name} (10 mV per m/s², AC-coupled)
-and {MEMS.name} (DC, output in m/s²). The paper does not say which four α each sensor had; taken here:
-{_list(PIEZO.alphas_deg)}° and {_list(MEMS.alphas_deg)}°. The sensors' S is invented within the paper's
-bounds (transverse below {TRANSVERSE_PCT["piezo"]:g} and {TRANSVERSE_PCT["mems"]:g} %); Q is that of sections 3.1.3 and
-3.2.3 at 3 Hz.
+reference (Eq. 12), 1000 samples a second, six cycles a run, three repetitions. In Method 1 one axis of the sensor is
+along the motion (Eqs. 1-4). In Method 2 the sensor is on the clamp at θ = 35°, α = 135° (Eqs. 5-7). In Method 3 it is
+on the same clamp at four α (Eqs. 8-11), and the equations are solved by least squares over all points, as printed.
+The sensors are the {PIEZO.name} (10 mV per m/s², AC-coupled) and the {MEMS.name} (DC-coupled, output in m/s²). The
+paper does not say which four α each sensor had; here they are {_list(PIEZO.alphas_deg)}° and
+{_list(MEMS.alphas_deg)}°. The true S of the sensors is chosen inside the paper's bounds (transverse below
+{TRANSVERSE_PCT["piezo"]:g} and {TRANSVERSE_PCT["mems"]:g} %); Q is that of sections 3.1.3 and 3.2.3 at 3 Hz.
 
-The table states the standard uncertainties that are assumed for the bench. The paper leaves its own to Part 2.
+The table has the *stated* standard uncertainties of the bench. Those of the paper's own bench are left to its Part 2.
 
 {stated}
 
-Methods 1 and 2 are `method1.py` and `method2.py` in `calib/paper/`, Method 3 as printed `method3.py`, Appendix A
-`statistics.py`, the sine fit of ISO 16063 `sine_fit.py`, the budgets `propagation.py`.
+The code is in `calib/paper/`: `method1.py`, `method2.py`, `method3.py` (Method 3 as printed), `statistics.py`
+(Appendix A), `sine_fit.py` (the sine fit of ISO 16063), and `propagation.py` (the uncertainty budgets).
 
 ![Outputs and reference inputs over one period](paper/figure-2.svg)
 
@@ -101,7 +101,7 @@ def _device(device: Device, found: Findings) -> str:
     if device is MEMS:
         note = """
 
-¹ A misprint: d₃₁ must be -1.1 for d₃₂ to be -0.93. All other entries of both tables follow from each other within
+¹ A misprint: d₃₂ is -0.93 only if d₃₁ is -1.1. All other entries of both tables follow from each other within
 their rounding (`tests/unit/test_paper_tables.py`)."""
     transverse = max(float(np.nanmax(np.abs(r))) for c in at.values() for r in c.rel_s_pct.values())
     return f"""## {device.name[0].upper()}{device.name[1:]}
@@ -110,9 +110,9 @@ their rounding (`tests/unit/test_paper_tables.py`)."""
 
 {table}{note}
 
-Without faults Methods 1 and 3 agree to {_worst(at, (3, 1)):.3f} %. Method 2 differs because it neglects transverse
-sensitivities: values of at most {transverse:.1f} % (paper: all under {TRANSVERSE_PCT[device.key]:g} %) are enough to
-explain the paper's differences between Methods 2 and 1.
+Without faults Methods 1 and 3 agree to {_worst(at, (3, 1)):.3f} %. Method 2 differs because it neglects the
+transverse sensitivities. Transverse sensitivities of at most {transverse:.1f} % (paper: all under
+{TRANSVERSE_PCT[device.key]:g} %) explain the paper's differences between Methods 2 and 1.
 
 {_offsets(device, found)}
 
@@ -123,7 +123,7 @@ explain the paper's differences between Methods 2 and 1.
 ![Main sensitivities by method](paper/methods-{device.key}.svg)
 
 **Figures {bars}.** Main sensitivities with expanded uncertainty (k = 2).
-Crosses: Method 1 of the bench plus the printed d_rel."""
+Crosses: values calculated from the printed d_rel."""
 
 
 def _offsets(device: Device, found: Findings) -> str:
@@ -146,8 +146,8 @@ def _repeatability(found: Findings) -> str:
     return f"""## Repeatability
 
 s_rel over the six cycles (Appendix A) at 10 m/s², in %: the largest of three repetitions, three axes and both
-frequencies. White noise of {MEMS.noise_mps2:g} m/s² on the sensor gives s_rel of the size that the paper found; s_rel
-is inversely proportional to the amplitude.
+frequencies. White noise of {MEMS.noise_mps2:g} m/s² on the sensor gives values of the paper's order. s_rel is
+inversely proportional to the amplitude.
 
 {_table(("sensor", "method", "paper", "bench"), lines)}
 
@@ -169,17 +169,17 @@ def _uncertainty(found: Findings) -> str:
     head = ("sensor", "method", "paper", "GUM", "Monte Carlo", "errors within U")
     return f"""## Uncertainty
 
-Expanded uncertainty (k = 2) of S_xx · S_yy · S_zz in %, 3 Hz. The Monte Carlo simulates that many virtual benches and
-sensors, drawn from the stated uncertainties; transverse sensitivities are drawn evenly below the verified limit. It
-shares no code with the budgets.
+Expanded uncertainty (k = 2) of S_xx · S_yy · S_zz in %, 3 Hz. For the Monte Carlo, virtual benches and sensors are
+drawn from the stated uncertainties, with transverse sensitivities anywhere below the verified limit. The last column
+counts the errors of the three axes that lie within U. The Monte Carlo shares no code with the budgets.
 
 {_table(head, lines)}
 
 ![Budget by source](paper/budgets.svg)
 
-The uncertainty of half a degree in θ gives Method 3 its U of about 3 %. Transverse sensitivities, of which only an
-upper limit is known, give Method 2 its U of about 5 %. The adjustment (`calib/estimate/`, "3, adjusted") uses the
-recordings of Method 3 and the same stated uncertainties; it estimates θ from the data of the DC-coupled sensor."""
+The main source of the 3 % of Method 3 is the half degree in θ. The main source of the 5 % of Method 2 are the
+transverse sensitivities, which are only known to be small. The adjustment (`calib/estimate/`, "3, adjusted") uses the
+recordings of Method 3 and the same stated uncertainties. With the DC-coupled sensor it can estimate θ from the data."""
 
 
 def _alone(found: Findings) -> str:
@@ -188,15 +188,16 @@ def _alone(found: Findings) -> str:
     residual = float(tilted.three.residual_sd.max())
     return f"""## Which fault explains differences like the paper's
 
-Each fault alone, no noise. In the first row d₂₁ comes from the transverse sensitivities, which Method 2 neglects. d₂₁
-is the same at both frequencies.
+In each row there is one fault alone, and no noise. In the first row there is no fault: its d₂₁ comes from the
+transverse sensitivities, which Method 2 neglects. d₂₁ is the same at both frequencies.
 
 {tables}
 
-The methods differ because the same fault has a different effect in each. Half a degree of θ changes S_zz of the MEMS by
-{tilted.differences_pct[3, 1][2]:.1f} % in Method 3 but leaves a residual of only {residual:.2f} m/s², so the fit does
-not show the fault. Only two kinds of fault make the results of Method 3 at 6 Hz differ from those at 3 Hz: faults that
-turn the phase (a lag, an AC corner), and faults that change from run to run (angles set again, offsets)."""
+The methods differ because the same fault affects each of them differently. An error of half a degree in θ moves S_zz
+of the MEMS by {tilted.differences_pct[3, 1][2]:.1f} % in Method 3 and leaves a residual of only {residual:.2f} m/s²:
+the residual does not reveal it. Only two kinds of fault make the results of Method 3 different at 3 Hz and 6 Hz:
+faults that change the phase (a lag, the corner of an AC-coupled instrument), and faults that change from run to run
+(angles set anew, offsets)."""
 
 
 def _alone_table(device: Device, rows: Sequence[Alone]) -> str:
@@ -219,18 +220,20 @@ def _explained(found: Findings) -> str:
     moved = abs(OFFSET[MEMS.key, 3][0] - OFFSET[MEMS.key, 6][0])
     return f"""## The smallest faults that give the paper's numbers
 
-Each frequency is treated as a separate bench. The table has the smallest set of faults, in units of their stated
-standard uncertainties, that gives the printed d₂₁ and d₃₁ and, for the MEMS, the printed Q (its true Q is taken as the
-mean of both frequencies). The last column of the tables above is the virtual bench with exactly these faults. χ²
-compares the paper's numbers with the stated uncertainties: if these explain the numbers, χ² is about their count.
+Which faults would give exactly the printed d₂₁ and d₃₁ and, for the MEMS, the printed Q? Many sets of faults would; the
+table has the smallest set, in units of their stated standard uncertainties. Each frequency is treated as a separate
+bench; the true Q of the MEMS is the mean of both. The last column of the tables above is the virtual bench with exactly
+these faults. χ² compares the paper's numbers with the stated uncertainties. If the stated uncertainties explain the
+numbers, χ² is about as large as the count of the numbers.
 
 {_table(("sensor", "", "χ²", "largest faults, in units of their u"), lines)}
 
-The stated uncertainties explain the piezo-electric sensor at 3 Hz. At 6 Hz a lag between sensor and vibrometer is
-needed as well. The MEMS's numbers, with its Q, need {" and ".join(factors)} times the stated uncertainties, spread over
-many faults: its data came over USB with a clock of its own, and q_x changed by {moved:.2f} m/s² between two fits of one
-sensor. The cause is geometry, offset and time in the fit, not the sensor; the adjustment has them as unknowns. The
-printed numbers cannot tell which of these faults the bench had, because there are more faults than numbers."""
+For the piezo-electric sensor at 3 Hz the stated uncertainties explain the numbers. At 6 Hz the numbers need a lag
+between sensor and vibrometer. The numbers of the MEMS, with its Q, need {" and ".join(factors)} times the stated
+uncertainties, spread over many faults. Its data came over USB with a clock of its own, and q_x changed by {moved:.2f}
+m/s² between two fits of the same sensor. So the cause is geometry, offset and time in the fit, not the sensor; the
+adjustment has these as unknowns. The printed numbers cannot show which of these faults the bench had, because there
+are more faults than numbers."""
 
 
 def _pull(name: str, size: float) -> str:
