@@ -92,9 +92,10 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
     if never_turned(np.array([mean_input(w) for w in used])):
         priors = _without_offset(priors)
     found = [excited(w) for w in used]
-    # With every nuisance fixed it is Method 3, in which all points weigh the same.
-    data = condense([e.window for e in found], alike=not any(priors.values.values()))
-    data = effective(data, min(w.independent for w in used))
+    plain = not any(priors.values.values())  # with every nuisance fixed it is Method 3: all points weigh the same
+    data = condense([e.window for e in found], alike=plain)
+    if not plain:
+        data = effective(data, min(w.independent for w in used))
     u_lag_s = [max(w.u_lag_s, priors.lag_window_s) if priors.lag_s > 0.0 else 0.0 for w in used]
     scatter = SlopeScatter.of(data, u_lag_s, [e.attenuation for e in found])
     solution = _solution([e.window for e in found], data, priors, applied, scatter)

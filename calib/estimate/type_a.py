@@ -56,12 +56,14 @@ def pooled(
     """
     slopes = [t.T @ (t @ w.xv.sum(0)) for t, w in zip(whiteners, windows, strict=True)]
     noise = np.array([_noise(*each) for each in zip(windows, slopes, roots, strict=True)])
+    # Scores are summed in one unit: in units of each window's own noise, which its scores made, they would seem too few.
+    count = np.array([w.count.sum() for w in windows])
+    sd = np.sqrt(count @ noise**2 / count.sum())
     if alike:
-        count = np.array([w.count.sum() for w in windows])
-        noise = np.tile(np.sqrt(count @ noise**2 / count.sum()), (len(noise), 1))
+        noise = np.tile(sd, (len(noise), 1))
     size = roots[0].shape[0]
     slope_scores, mean_scores = [], []
-    for window, beta, t, sd in zip(windows, slopes, whiteners, noise, strict=True):
+    for window, beta, t in zip(windows, slopes, whiteners, strict=True):
         score = np.einsum("rc,kci->kri", t, window.xv - window.xx @ beta) / sd
         slope_scores.append(score.reshape(len(score), 3 * size))
         score = (window.total[:, -3:] - window.total[:, :-3] @ beta) / sd
