@@ -68,7 +68,7 @@ def effective(data: Condensed, independent: float) -> Condensed:
     type_a, live = data.type_a, np.repeat(np.any(np.diagonal(data.root, axis1=1, axis2=2) > 0.0, axis=0), 3)
     freedom = type_a.degrees_of_freedom if np.isfinite(type_a.degrees_of_freedom) else 0.0
     own = min(freedom / FEWEST_FREEDOM, 1.0)
-    seen = [np.diag(type_a.slopes)[live].mean() if live.any() else 1.0, np.diag(type_a.means).mean()]
+    seen = [type_a.slope_ratio(live) if live.any() else 1.0, np.diag(type_a.means).mean()]
     slopes, means = (max(own * float(ratio) + (1.0 - own) / independent, LEAST_INFLATION) for ratio in seen)
     return replace(
         data,

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.estimate.joint_state import JointState
+from calib.estimate.linearised import Linearised
 from calib.estimate.nuisances import Applied, Nuisances, Priors
 from calib.estimate.terms import Term
 from calib.estimate.window_rows import Summary
@@ -60,6 +61,23 @@ class Held:
         felt = variance[9:12] + variance[:9].reshape(3, 3) @ self.mps2**2
         tilted = sum((S @ moves * u_terms[name]) ** 2 for name, moves in self.by.items())
         return np.sqrt(felt + tilted)
+
+    def mount(self, joint: Linearised, terms: Sequence[Term]) -> None:
+        """The mean output takes the place of Q in a joint state; nuisances of the mount (`terms`) come in."""
+        u = self.mean_output_u(joint.state, {term.name: term.uncertainty for term in terms})
+        for state in (joint.state, joint.base):
+            S = state.mean[:9].reshape(3, 3)
+            state.replace(slice(9, 12), state.mean[9:12] + S @ self.mps2, np.diag(u**2))
+        joint.point[9:12] = joint.state.mean[9:12]
+        joint.bound[9:12] = u**2
+        joint.append(terms)
+
+    def unmount(self, joint: Linearised) -> None:
+        """Q takes its place back; all windows must be in the base."""
+        for state in (joint.state, joint.base):
+            state.mean[:12], state.factor[:12] = self.parameters(state)
+        joint.point = joint.state.mean.copy()
+        joint.bound[9:12] = joint.state.variance[9:12]
 
     def moved_by(self, other: Held, names: Sequence[str]) -> Held:
         """The same acceleration, which nuisances of these names move as `other` says."""

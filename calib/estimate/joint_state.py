@@ -95,10 +95,10 @@ class JointState:
         self.mean[where], self.factor[where] = mean, shared
         self.factor = _square(np.hstack([self.factor, own]))
 
-    def correct(self, step: Array, gain: Array, jacobian: Array, noise: Array) -> None:
-        """x -> x + step, P -> (1 - K H) P (1 - K H)' + K R K', R = noise noise': true for any gain K (Joseph)."""
+    def correct(self, step: Array, gain: Array, jacobian: Array) -> None:
+        """x -> x + step, P -> (1 - K H) P (1 - K H)' + K K': for rows of unit covariance and any gain (Joseph)."""
         self.mean = self.mean + step
-        self.factor = _square(np.hstack([self.factor - gain @ (jacobian @ self.factor), gain @ noise]))
+        self.factor = _square(np.hstack([self.factor - gain @ (jacobian @ self.factor), gain]))
 
     def copy(self) -> JointState:
         """An independent copy."""

@@ -27,7 +27,7 @@ import numpy as np
 from calib.distributions import coverage_factor
 from calib.estimate.correction import Law
 from calib.estimate.determined import determined
-from calib.estimate.fixed_mount import Held, held_at
+from calib.estimate.fixed_mount import Held, held_at, never_turned
 from calib.estimate.gauss_newton import Flags
 from calib.estimate.innovation import Innovation, innovation
 from calib.estimate.joint_state import JointState, gain_of
@@ -249,20 +249,20 @@ class Recursion:
 
     def _mount(self, summary: Summary) -> None:
         """At the first window of a fixed mount: Q gives its place to the mean output there."""
-        if not self._fixed or self._held is not None or not np.isfinite(summary.held_mps2).all():
-            return
-        held, terms = held_at(summary, self._priors)
-        u = held.mean_output_u(self._joint.state, {term.name: term.uncertainty for term in terms})
-        for state in (self._joint.state, self._joint.base):
-            S = state.mean[:9].reshape(3, 3)
-            state.replace(slice(9, 12), state.mean[9:12] + S @ summary.held_mps2, np.diag(u**2))
-        self._joint.point[9:12] = self._joint.state.mean[9:12]
-        self._joint.bound[9:12] = u**2
-        self._joint.append(terms)
-        self._held = held
+        if self._fixed and self._held is None and np.isfinite(summary.held_mps2).all():
+            self._held, terms = held_at(summary, self._priors)
+            self._held.mount(self._joint, terms)
+
+    def _unmount(self, held: Held) -> None:
+        """The mount turned after all: from now on means tell Q and S alike."""
+        self._absorb(len(self._joint.recent))
+        held.unmount(self._joint)
+        self._held, self._fixed = None, False
 
     def _know(self, summary: Summary) -> WindowRows:
         """Nuisances that no window had before come in with their priors; the window's rows."""
+        if self._held is not None and not never_turned(np.array([self._held.mps2, summary.held_mps2])):
+            self._unmount(self._held)
         self._mount(summary)
         rows = self._rows(summary)
         new = self._joint.append(rows.terms)
@@ -278,7 +278,7 @@ class Recursion:
         own = rows.at(state, self._joint.point, self._noise)
         gain = gain_of(own.jacobian, state.factor)
         step = gain @ (own.residual + own.jacobian @ (self._joint.point - state.mean))
-        state.correct(step, gain, own.jacobian, own.noise)
+        state.correct(step, gain, own.jacobian)
         return state
 
     def _settle(self) -> None:
@@ -320,6 +320,7 @@ class Recursion:
             "day": self._day,
             "temperature_range": list(self._temperature_range),
             "residual_sd": self._residual_sd.copy(),
+            "fixed": self._fixed,
             "held": None if self._held is None else {"mps2": self._held.mps2, "by": dict(self._held.by)},
             "windows": self.windows,
             "scale": self.scale,
@@ -338,6 +339,7 @@ class Recursion:
         low, high = state["temperature_range"]
         self._temperature_range = (low, high)
         self._residual_sd = np.array(state["residual_sd"])
+        self._fixed = self._fixed and state.get("fixed", True)  # a mount that turned once is fixed no more
         self._held = None if state["held"] is None else Held(**state["held"])
         self.windows, self.scale = state["windows"], state["scale"]
         for summary in self._joint.recent[-1:]:

@@ -14,6 +14,8 @@ import numpy as np
 from calib.excitation.sums import NOISE_FLOOR
 from calib.model import Array
 
+Flags = np.ndarray[tuple[int], np.dtype[np.bool_]]
+
 # Correlation of neighbours above which segments are joined in pairs: they are shorter than 3 correlation times.
 RHO_COARSEN = 0.35
 FEWEST_FREEDOM = 10.0  # degrees of freedom: from fewer, a mean of squares is off by 40 % and more
@@ -37,14 +39,22 @@ class Segments:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TypeA:
-    """`noise` (W, 3): SD of the residuals within each window, output unit. `slopes` (6M, 6M) in the order basis, axis and
-    `means` (3, 3): covariance of the whitened slopes and means, identities if the residuals were white and
-    independent between axes. `degrees_of_freedom` of both, inf where single segments allow no such estimate."""
+    """How much slopes and means scatter.
+
+    `noise` (W, 3): SD of the residuals within each window, output unit. `slopes` (6M, 6M) in the order basis, axis and
+    `means` (3, 3): covariance of the whitened slopes and means, identities if the residuals were white and independent
+    between axes. `degrees_of_freedom` of both, inf where single segments allow no such estimate.
+    """
 
     noise: Array
     slopes: Array
     means: Array
     degrees_of_freedom: float
+
+    def slope_ratio(self, live: Flags) -> float:
+        """Variance of the slopes on u over that of white noise, mean over those with data (`live`, 6M)."""
+        on_u = live & (np.arange(len(live)) < len(live) // 2)  # S rests on these; the others tell the lag
+        return float(np.diag(self.slopes)[on_u if on_u.any() else live].mean())
 
 
 def pooled(
@@ -56,7 +66,7 @@ def pooled(
     """
     slopes = [t.T @ (t @ w.xv.sum(0)) for t, w in zip(whiteners, windows, strict=True)]
     noise = np.array([_noise(*each) for each in zip(windows, slopes, roots, strict=True)])
-    # Scores are summed in one unit: in units of each window's own noise, which its scores made, they would seem too few.
+    # Scores are summed in one unit. Each in units of its own window's noise would seem too small: it made that noise.
     count = np.array([w.count.sum() for w in windows])
     sd = np.sqrt(count @ noise**2 / count.sum())
     if alike:
@@ -85,7 +95,7 @@ def _noise(window: Segments, slopes: Array, root: Array) -> Array:
     return np.asarray(np.sqrt(np.maximum(left, 0.0) / max(freedom, 1.0)).clip(min=floor))
 
 
-def _scatter(scores: list[Array], live: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> tuple[Array, float]:
+def _scatter(scores: list[Array], live: Flags) -> tuple[Array, float]:
     """Covariance (D, D) of a window's summed scores and its degrees of freedom; `live` (D,) are those with data."""
     lengths = np.array([len(s) for s in scores])
     freedom = float(np.sum(lengths - 1))

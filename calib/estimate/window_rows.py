@@ -40,9 +40,6 @@ class Noise:
         return Noise(slopes + (1.0 - share) * own.slopes, means + (1.0 - share) * own.means, total)
 
 
-# A window's own covariance of slopes, from its segments alone, is drawn to the pooled one by as many degrees of freedom
-# as it has rows, three times: estimated from fewer it would be too sure of some direction.
-SHRINKAGE = 3.0
 MOST_FREEDOM = 400.0  # degrees of freedom: beyond, the oldest windows' scatter is forgotten
 
 
@@ -101,15 +98,13 @@ class Summary:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rows:
-    """Observed less predicted (R,) and Jacobian (R, N), slopes first, in units in which they are weighed alike.
+    """Observed less predicted (R,) and Jacobian (R, N), slopes first, in units in which their covariance is one.
 
-    `noise` (R, R) is a factor of their covariance: near the identity, since the weights take the noise of segments for
-    white, as calib.estimate.adjustment does, and the covariance is what the segments show.
+    The noise of all windows' segments together scales that covariance, as in calib.estimate.adjustment.
     """
 
     residual: Array
     jacobian: Array
-    noise: Array
     slopes: int
 
 
@@ -155,7 +150,7 @@ class WindowRows:
         type_a, live, filtered = self.data.type_a, self._live, 1.0 / self.summary.independent
         freedom = type_a.degrees_of_freedom if np.isfinite(type_a.degrees_of_freedom) else 0.0
         own = min(freedom / FEWEST_FREEDOM, 1.0)
-        slopes = float(np.diag(type_a.slopes)[live].mean()) if live.any() else filtered
+        slopes = type_a.slope_ratio(live) if live.any() else filtered
         means = float(np.diag(type_a.means).mean())
         return Noise(own * slopes + (1.0 - own) * filtered, own * means + (1.0 - own) * filtered, freedom)
 
@@ -168,25 +163,20 @@ class WindowRows:
         slope, d_slope = rows.slope.reshape(-1), rows.d_slope.reshape(-1, len(x))
         mean, d_mean = rows.mean.reshape(-1), rows.d_mean.reshape(-1, len(x))
         slope, d_slope = slope[self._live], d_slope[self._live]
-        weights, covariance = self._slope_covariances(noise)
+        covariance = self._slope_covariance(noise)
         if self._held_mps2 is not None:
             mean, d_mean = self._fixed_means(x, self._held_mps2)
             d_slope, missed = self._without_silent(d_slope, state)
-            weights, covariance = weights + np.diag(missed), covariance + np.diag(missed)
+            covariance = covariance + np.diag(missed)
         parts = []
         if slope.size:
-            parts.append(_weighed(slope, d_slope, weights, covariance))
+            parts.append(_weighed(slope, d_slope, covariance))
         if self.equations.known[0]:
-            perhaps = self._perhaps(state, at)
-            weights, covariance = self._mean_covariances(noise)
-            parts.append(_weighed(mean, d_mean, weights + perhaps, covariance + perhaps))
+            parts.append(_weighed(mean, d_mean, self._mean_covariance(noise) + self._perhaps(state, at)))
         if not parts:
-            return Rows(np.zeros(0), np.zeros((0, len(state))), np.zeros((0, 0)), 0)
-        residual, jacobian, roots = zip(*parts, strict=True)
-        root = np.zeros((sum(map(len, roots)),) * 2)
-        root[: len(roots[0]), : len(roots[0])] = roots[0]
-        root[len(roots[0]) :, len(roots[0]) :] = roots[-1] if len(roots) > 1 else 0.0
-        return Rows(np.concatenate(residual), np.vstack(jacobian) @ chain, root, slope.size)
+            return Rows(np.zeros(0), np.zeros((0, len(state))), 0)
+        residual, jacobian = zip(*parts, strict=True)
+        return Rows(np.concatenate(residual), np.vstack(jacobian) @ chain, slope.size)
 
     def _own(self, state: JointState, at: Array) -> tuple[Array, Array]:
         """The equations' own unknowns [S, Q, nuisances] at this temperature, and their derivatives (n, N)."""
@@ -225,31 +215,19 @@ class WindowRows:
             found += np.outer(moved, moved) / len(self._perhaps_k)
         return found
 
-    def _slope_covariances(self, noise: Noise) -> tuple[Array, Array]:
-        """For weights and true, of the live slopes in units of the noise within the window.
+    def _slope_covariance(self, noise: Noise) -> Array:
+        """Of the live slopes in units of the noise within the window.
 
-        In both are what two clocks differ by from window to window, and what the correction for noise leaves.
+        In it are what two clocks differ by from window to window, and what the correction for noise leaves.
         """
-        live = self._live
-        both = self._scatter.covariance()[0][np.ix_(live, live)]
-        own, white = self._drawn(self.data.type_a.slopes[np.ix_(live, live)], noise.slopes)
-        return white + both, own + both
+        live = np.ix_(self._live, self._live)
+        white = max(noise.slopes, LEAST_INFLATION) * np.eye(int(self._live.sum()))
+        return np.asarray(white + self._scatter.covariance()[0][live])
 
-    def _mean_covariances(self, noise: Noise) -> tuple[Array, Array]:
-        """The same of the weighted means: the noise in their share, the offset between windows in the rest."""
+    def _mean_covariance(self, noise: Noise) -> Array:
+        """Of the weighted means: the noise in their share, the offset between windows in the rest."""
         share = self.equations.white_share[0]
-        own, white = self._drawn(self.data.type_a.means, noise.means)
-        within, between = np.sqrt(np.outer(share, share)), np.diag(1.0 - share)
-        return within * white + between, within * own + between
-
-    def _drawn(self, own: Array, pooled: float) -> tuple[Array, Array]:
-        """A window's own covariance drawn to the pooled ratio, and white noise of that ratio."""
-        white = max(pooled, LEAST_INFLATION) * np.eye(len(own))
-        freedom = self.data.type_a.degrees_of_freedom
-        if not np.isfinite(freedom):
-            return white, white
-        pull = SHRINKAGE * len(own)
-        return (freedom * own + pull * white) / (freedom + pull), white
+        return np.diag(max(noise.means, LEAST_INFLATION) * share + 1.0 - share)
 
     def _fixed_means(self, x: Array, held_mps2: Array) -> tuple[Array, Array]:
         """Weighted residuals (3,) and Jacobian (3, n) of the means at a fixed mount: the mean output alone."""
@@ -271,9 +249,7 @@ class WindowRows:
         return kept, missed
 
 
-def _weighed(residual: Array, jacobian: Array, weights: Array, covariance: Array) -> tuple[Array, Array, Array]:
-    """Rows in which `weights` is the identity, and the factor of `covariance` there."""
-    root = np.linalg.cholesky(weights)
-    both = np.linalg.solve(root, np.column_stack([residual, jacobian, np.linalg.cholesky(covariance)]))
-    n = jacobian.shape[1]
-    return both[:, 0], both[:, 1 : 1 + n], both[:, 1 + n :]
+def _weighed(residual: Array, jacobian: Array, covariance: Array) -> tuple[Array, Array]:
+    """Rows in units in which `covariance` is the identity."""
+    both = np.linalg.solve(np.linalg.cholesky(covariance), np.column_stack([residual, jacobian]))
+    return both[:, 0], both[:, 1:]

@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.excitation import detection
+from calib.excitation.turning import feels_gravity, standing_parts
 from calib.excitation.window_verdict import DEFAULT_LIMITS, Limits
-from calib.excitation.windows import Points, motion_windows, rest_window
+from calib.excitation.windows import Points, motion_windows, rest_window, still_window
 from calib.model import Array, Pose, Window, WindowSums
 from calib.signal.band import band_above_noise, lowpass, noise_in_band
 from calib.signal.corner import integral, with_integral, without_corner
@@ -27,6 +28,7 @@ LEAST_MARGIN_S = 1.0
 MOST_MARGIN_S = 5.0  # a differentiator at 10 Hz takes 3.3 s
 # Of many holes pieces of a second are left: too short for the reference's noise, and for type A by segments.
 MOST_MISSING_PCT = 5.0
+MOST_NOISE_MPS2 = 0.1  # 1 % of gravity: a reference that moves more beside a sensor that does not is no rest
 NOISE_MATTERS = 1e-5  # of the motion's power: a filter against less of it would cost its ends for nothing
 FILTER_BAND = 1.197  # times its band: the noise-equivalent bandwidth of calib.signal.band.lowpass
 RESAMPLED_BAND = 0.35  # of the reference's rate, to which interpolation itself passes noise
@@ -196,14 +198,42 @@ def _motion(
         return []
     if instrument.has_corner:
         pose = with_integral(pose)
-    windows = motion_windows(pose, found.points, settings.limits, leave_out=settings.leave_out)
     u_lag_s = float(np.hypot(sensor.clock.u_offset_s, reference.clock.u_offset_s))
+    windows = _beside(pose, found, settings)
     return [replace(_told(window, found), u_lag_s=u_lag_s) for window in windows]
+
+
+def _beside(pose: Pose, found: Aligned, settings: Settings) -> list[Window]:
+    """Windows in motion and, where the reference feels gravity, at rest; each in one position against gravity."""
+    points, limits, leave_out = found.points, settings.limits, settings.leave_out
+    if points.u.shape[1] != 3 or not feels_gravity(points.u):
+        return motion_windows(pose, points, limits, leave_out=leave_out)
+    rate_hz = (len(points.time_s) - 1) / (points.time_s[-1] - points.time_s[0])
+    windows: list[Window] = []
+    for part in [points.part(a, b) for a, b in standing_parts(points.u, rate_hz)] or [points]:
+        made = motion_windows(pose, part, limits, leave_out=leave_out)
+        if made and all(_silent(window) for window in made):
+            made = [still_window(pose, part, limits, leave_out=leave_out)]
+        windows += made
+    return windows
+
+
+def _silent(window: Window) -> bool:
+    """Whether the reference did not move in a window: what it shows is its noise, or so little that it may be."""
+    numbers = window.numbers
+    level, coherence = numbers.get("reference_rms_mps2", np.inf), numbers.get("coherence", 0.0)
+    if window.used or numbers.get("stuck_axes", 0.0):
+        return False
+    noisy = level <= MOST_NOISE_MPS2 and coherence < DEFAULT_LIMITS.least_coherence
+    return window.kind == "quiet" or noisy or level <= numbers["reference_rms_mps2_threshold"]
 
 
 def _told(window: Window, found: Aligned) -> Window:
     """The window with what was known before the filter, and what the filter left."""
-    window = replace(window, reference_noise=found.reference_noise, independent=found.independent)
+    window = replace(window, independent=found.independent)
+    if window.kind == "rest":
+        return window
+    window = replace(window, reference_noise=found.reference_noise)
     points, least = found.independent * window.points, float(DEFAULT_LIMITS.least_points)
     if window.used and points < least:
         # A regression on hardly more points than it has unknowns leaves no residual to judge it by.

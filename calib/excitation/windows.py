@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -109,6 +110,22 @@ def rest_window(
         numbers["sd_over_floor"] = float(np.max(_within_sd(clean) / least))
     left_out = int(struck.sum()) if leave_out else 0
     return _window("rest", pose, t, sums, judge(sums, struck, numbers, limits), left_out)
+
+
+def still_window(pose: Pose, points: Points, limits: Limits = DEFAULT_LIMITS, *, leave_out: bool = True) -> Window:
+    """The window of samples in which a sensor and the reference beside it stand still, n >= 2.
+
+    The reference feels gravity as the sensor does, so the means of both tell; what else the reference shows is noise.
+    """
+    V = np.asfortranarray(points.V)
+    struck, _ = detection.knocked(V, np.ones((len(V), 1)), detection.least_step(V))
+    kept = ~struck if leave_out else np.ones(len(V), dtype=bool)
+    sums = _sums(V[kept], points.u[kept], points.du[kept], _rate(points.time_s), limits)
+    m = sums.reference_channels
+    noise = np.sqrt(np.diag(sums.scatter.sum(axis=0))[: 2 * m] / sums.count.sum()).reshape(2, m)
+    left_out = int(struck.sum()) if leave_out else 0
+    window = _window("rest", pose, points.time_s, sums, judge(sums, struck, {}, limits), left_out)
+    return replace(window, reference_noise=noise)
 
 
 def rests_anywhere(time_s: Array, V: Array, gravity_mps2: float, limits: Limits = DEFAULT_LIMITS) -> list[Window]:

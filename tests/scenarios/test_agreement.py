@@ -1,0 +1,18 @@
+"""`fieldcal calibrate` and the agent say the same of the same recordings, to a twentieth of u (benchmarks.online)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from benchmarks.online.agreement import LIMIT_U, Both, bench_day, building
+
+
+@pytest.mark.parametrize(("recording", "seed"), [(bench_day, 2), (bench_day, 3), (building, 5), (building, 18)])
+def test_files_and_agent_agree(recording: Callable[[int], Both], seed: int) -> None:
+    both = recording(seed)
+    assert both.windows[0] == both.windows[1] >= 10
+    assert np.isfinite(both.apart).sum() >= 8
+    assert np.nanmax(both.apart) <= LIMIT_U
