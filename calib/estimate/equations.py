@@ -101,7 +101,8 @@ class Equations:
         """The sensor's scale: root mean square of output over input, of all slopes and means."""
         data, m = self.data, self.data.channels
         moved = np.einsum("brc,bkc->brk", data.root[:, :m, :m], self.nuisances.direction[self.pose_of_window])
-        gravity, n = self.nuisances.gravity[self.pose_of_window][self.known], data.count[self.known]
+        felt = np.einsum("wkm,wm->wk", self.nuisances.mean_direction[self.pose_of_window], data.mean_x[:, :m])
+        gravity, n = (felt + self.nuisances.gravity[self.pose_of_window])[self.known], data.count[self.known]
         held, level = np.zeros((1, 3)), np.zeros((1, 3))
         if n.size:
             held = np.sqrt(n)[:, None] * (gravity - n @ gravity / n.sum())

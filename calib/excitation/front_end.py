@@ -209,23 +209,25 @@ def _beside(pose: Pose, found: Aligned, settings: Settings) -> list[Window]:
     if points.u.shape[1] != 3 or not feels_gravity(points.u):
         return motion_windows(pose, points, limits, leave_out=leave_out)
     rate_hz = (len(points.time_s) - 1) / (points.time_s[-1] - points.time_s[0])
-    windows: list[Window] = []
-    for part in [points.part(a, b) for a, b in standing_parts(points.u, rate_hz)] or [points]:
-        made = motion_windows(pose, part, limits, leave_out=leave_out)
-        if made and all(_silent(window) for window in made):
-            made = [still_window(pose, part, limits, leave_out=leave_out)]
-        windows += made
-    return windows
+    standing = standing_parts(points.u, rate_hz)
+    if standing == [(0, len(points.u))]:
+        made = motion_windows(pose, points, limits, leave_out=leave_out)
+        calm = made and all(_silent(window) for window in made)
+        return [still_window(pose, points, limits, leave_out=leave_out)] if calm else made
+    if not standing:
+        return motion_windows(pose, points, limits, leave_out=leave_out)
+    # Where hands turn both, gravity is the excitation; what hands shake between two turns is left out.
+    return [still_window(pose, points.part(a, b), limits, leave_out=leave_out) for a, b in standing]
 
 
 def _silent(window: Window) -> bool:
     """Whether the reference did not move in a window: what it shows is its noise, or so little that it may be."""
     numbers = window.numbers
     level, coherence = numbers.get("reference_rms_mps2", np.inf), numbers.get("coherence", 0.0)
-    if window.used or numbers.get("stuck_axes", 0.0):
+    if window.used or numbers.get("stuck_axes", 0.0) or level > MOST_NOISE_MPS2:
         return False
-    noisy = level <= MOST_NOISE_MPS2 and coherence < DEFAULT_LIMITS.least_coherence
-    return window.kind == "quiet" or noisy or level <= numbers["reference_rms_mps2_threshold"]
+    noisy = coherence < DEFAULT_LIMITS.least_coherence or level <= numbers["reference_rms_mps2_threshold"]
+    return noisy or window.kind == "quiet"
 
 
 def _told(window: Window, found: Aligned) -> Window:

@@ -113,19 +113,26 @@ def rest_window(
 
 
 def still_window(pose: Pose, points: Points, limits: Limits = DEFAULT_LIMITS, *, leave_out: bool = True) -> Window:
-    """The window of samples in which a sensor and the reference beside it stand still, n >= 2.
+    """The window of all rests in samples, n >= 2, of a sensor and the reference beside it.
 
     The reference feels gravity as the sensor does, so the means of both tell; what else the reference shows is noise.
     """
-    V = np.asfortranarray(points.V)
-    struck, _ = detection.knocked(V, np.ones((len(V), 1)), detection.least_step(V))
+    rests = find_rests(points.V, _rate(points.time_s))
+    if not rests:
+        sums = _sums(*points[1:], _rate(points.time_s), limits)
+        numbers = {"points": float(len(points.V)), "left_out_pct": 0.0}
+        return _window("rest", pose, points.time_s, sums, _never(numbers), 0)
+    at_rest = np.concatenate([np.arange(a, b) for a, b in rests])
+    t, V, u, du = (column[at_rest] for column in points)
+    struck, _ = detection.knocked(np.asfortranarray(V), np.ones((len(V), 1)), detection.least_step(V))
     kept = ~struck if leave_out else np.ones(len(V), dtype=bool)
-    sums = _sums(V[kept], points.u[kept], points.du[kept], _rate(points.time_s), limits)
+    sums = _sums(V[kept], u[kept], du[kept], _rate(points.time_s), limits)
     m = sums.reference_channels
-    noise = np.sqrt(np.diag(sums.scatter.sum(axis=0))[: 2 * m] / sums.count.sum()).reshape(2, m)
-    left_out = int(struck.sum()) if leave_out else 0
-    window = _window("rest", pose, points.time_s, sums, judge(sums, struck, {}, limits), left_out)
-    return replace(window, reference_noise=noise)
+    power = np.diag(sums.scatter.sum(axis=0))[: 2 * m]
+    numbers = {"at_rest_pct": 100.0 * len(V) / len(points.V)}
+    verdict = judge(sums, struck, numbers, limits)
+    window = _window("rest", pose, t, sums, verdict, int(struck.sum()) if leave_out else 0)
+    return replace(window, reference_noise=np.sqrt(power / sums.count.sum()).reshape(2, m))
 
 
 def rests_anywhere(time_s: Array, V: Array, gravity_mps2: float, limits: Limits = DEFAULT_LIMITS) -> list[Window]:

@@ -1,7 +1,7 @@
 """Eight IMUs turned together by hand through 20 rests, then shaken violently: IMU 1 is the reference of the others.
 
-Truth is each IMU's own norm fit of the same recording. A rotation of the frame is free there, so the lengths of S's rows
-and its singular values are compared: for these IMUs a row's length is its main sensitivity to 0.02 %.
+Truth is each IMU's own norm fit of the same recording. A rotation of the frame is free there, so the lengths of S's
+rows and its singular values are compared: for these IMUs a row's length is its main sensitivity to 0.02 %.
 """
 
 from __future__ import annotations
