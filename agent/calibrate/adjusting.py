@@ -33,7 +33,7 @@ def adjusted(files: Files, priors: Priors) -> Outcome:
             latest[lag_s] = adjust(_used(windows), priors, replace(applied, lag_s=lag_s))
         return latest[lag_s]
 
-    windows, lag_s = without_lag(applied.lag_s, files.windows, _used, lambda made, lag_s: _lag(at(made, lag_s)) or 0.0)
+    windows, lag_s = without_lag(applied.lag_s, files.windows, _used, lambda made, lag_s: at(made, lag_s).lag_s or 0.0)
     if not _used(windows):
         return nothing_used(windows, files.rate_hz, "3 (adjustment)")
     return _outcome(at(windows, lag_s), windows, files.rate_hz)
@@ -72,7 +72,7 @@ def _outcome(found: Adjustment, windows: Sequence[Window], rate_hz: float) -> Ou
         coverage_factor=found.coverage_factor,
         uncertainty_kind="combined",
         nuisances=nuisances,
-        lag_s=_lag(found),
+        lag_s=found.lag_s,
         rank=found.rank,
         more={
             "frame": "stated",
@@ -89,8 +89,3 @@ def _outcome(found: Adjustment, windows: Sequence[Window], rate_hz: float) -> Ou
             "invariant": None if found.reasons else found.invariant,
         },
     )  # fmt: skip
-
-
-def _lag(found: Adjustment) -> float | None:
-    """The lag that the adjustment estimated; None where it is no unknown."""
-    return next((n.value for n in found.nuisances if n.name == "lag"), None)

@@ -20,6 +20,7 @@ from calib.estimate.equations import Equations
 from calib.estimate.fixed_mount import mean_input, never_turned
 from calib.estimate.gauss_newton import Solution, slope_residuals, solve
 from calib.estimate.nuisances import Applied, Nuisances, Priors
+from calib.estimate.quantities import LAG, Kind
 from calib.estimate.slope_scatter import SlopeScatter, estimated
 from calib.estimate.verdict import misfit, nuisance_pull, reasons, turned_windows
 from calib.excitation.excited import excited
@@ -34,6 +35,7 @@ class Nuisance:
     """A nuisance after the adjustment, in total with what the front end applied."""
 
     name: str
+    kind: Kind
     value: float
     standard_uncertainty: float
     prior_uncertainty: float
@@ -72,6 +74,11 @@ class Adjustment:
     def expanded_uncertainty(self) -> Array:
         """(12,) for about 95 % coverage."""
         return self.coverage_factor * self.calibration.standard_uncertainty
+
+    @property
+    def lag_s(self) -> float | None:
+        """By how much the sensor's indications come after the reference's; None where the lag is no unknown."""
+        return next((n.value for n in self.nuisances if n.kind is LAG), None)
 
     @property
     def invariant(self) -> Array:
@@ -177,6 +184,6 @@ def _calibration(solution: Solution, shares: Budget, told: Flags) -> Calibration
 def _reported(solution: Solution, shares: Budget) -> tuple[Nuisance, ...]:
     uncertainty = np.sqrt(np.diag(shares.covariance)[12:])
     return tuple(
-        Nuisance(t.name, float(value) + t.applied, float(u), t.uncertainty, t.unit)
+        Nuisance(t.name, t.kind, float(value) + t.applied, float(u), t.uncertainty, t.unit)
         for t, value, u in zip(solution.equations.nuisances.terms, solution.x[12:], uncertainty, strict=True)
     )
