@@ -10,7 +10,7 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from benchmarks.online import bench, cost, coverage, day, harm, year
+from benchmarks.online import agreement, bench, cost, coverage, day, harm, year
 from benchmarks.page import PAGE, machine, write_part
 from hw.virtual.building import Building
 from hw.virtual.harm import KINDS
@@ -95,12 +95,22 @@ def _bench(workers: int, runs: int | None) -> tuple[Path, str]:
     return ONLINE, "\n\n".join(tables)
 
 
+def _agreement(workers: int, runs: int | None) -> tuple[Path, str]:
+    seeds = range(agreement.SEED, agreement.SEED + (runs or agreement.RUNS))
+    rows = [
+        agreement.table(spread(one, seeds, workers), kind)
+        for kind, one in (("bench day", agreement.bench_day), ("building", agreement.building))
+    ]
+    return ONLINE, "\n".join([agreement.HEADER, *rows])
+
+
 def _cost(_workers: int, runs: int | None) -> tuple[Path, str]:
     return PAGE, cost.table(cost.measure(runs or cost.TIMING.windows))
 
 
 PARTS: dict[str, Callable[[int, int | None], tuple[Path, str]]] = {
     "bench": _bench,
+    "agreement": _agreement,
     "year": _year,
     "harm": _harm,
     "coverage": _coverage,
