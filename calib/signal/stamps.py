@@ -11,13 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.model import Array
-from calib.signal.timing import HORIZON_S, ClockFit, Edge, IntArray, parabola
+from calib.signal.timing import FEWEST_FOR_RATE, HORIZON_S, ClockFit, Edge, IntArray, parabola
 
 Kind = Literal["grid", "bursts", "spread", "jittery"]
 SAME_BURST = 0.3  # of the mean period: samples cannot have been taken that close together
 MANY = 0.3  # of all steps: so many short ones are no accident
 GRID = 0.02  # of the mean period: what a step may differ from the usual one on a grid
 FEW = 1e-3  # of all steps: odd steps of a grid (samples missing)
+SEVERAL = 8  # samples: more than a displaced stamp and its neighbours, less than most bursts
+RESOLUTIONS_S = tuple(digit * 10.0**-decimals for decimals in range(2, 7) for digit in (5, 2, 1))
+LINE = 1024  # stamps through which the clock is a straight line
+TAIL = 0.05  # of all stamps, on either side: a few late or repeated ones say nothing of how the others were made
 NEIGHBOURS = 32  # bursts on each side that tell a gap (all later ones stay late) from a stall (they catch up)
 FEWEST_NEIGHBOURS = 4  # the last burst of a file may be cut off, its newest sample is then none
 # Of the usual period. Less cannot be told from the scatter of bursts, and then costs less than it does; exact stamps
@@ -117,15 +121,42 @@ def _classified(t: Array) -> tuple[Kind, NDArray[np.bool_]]:
     each = np.ones(len(steps), dtype=bool)
     if np.mean(odd) < FEW or np.count_nonzero(odd) < 2:
         return "grid", each
-    return ("spread", odd) if np.mean(odd) < 0.5 else ("jittery", each)
+    if _last(t, float(np.mean(odd)), GRID * usual):
+        return "spread", odd
+    return ("grid" if _evenly(t, usual) else "jittery"), each
+
+
+def _last(t: Array, odd: float, least: float) -> bool:
+    """Whether steps that differ by `least` from the usual one shift all later stamps too, as the ends of bursts do.
+
+    `odd` is the share of such steps. A stamp that is displaced alone, by rounding or jitter, makes no more of them over
+    several samples than over one.
+    """
+    if odd >= 0.5:
+        return False
+    over = t[SEVERAL:] - t[:-SEVERAL]
+    return len(over) == 0 or bool(np.mean(np.abs(over - np.median(over)) > least) > 2.0 * odd)
+
+
+def _evenly(t: Array, period: float) -> bool:
+    """Whether stamps scatter equally far to both sides, within a period in all: rounded ones do, late ones do not.
+
+    Each stretch of `LINE` stamps has a straight line of its own.
+    """
+    size = min(len(t), LINE)
+    y = (t[: len(t) // size * size] - t[0]).reshape(-1, size)
+    x = np.arange(size) - 0.5 * (size - 1)
+    rest = y - y.mean(axis=1, keepdims=True) - np.outer(y @ x / (x @ x), x)
+    low, middle, high = np.quantile(rest, [TAIL, 0.5, 1.0 - TAIL])
+    return bool(high - low <= period and high - middle <= 2.0 * (middle - low) + GRID * period)
 
 
 def _resolution(t: Array) -> float:
-    """The decimal step the stamps are rounded to, 0 where finer than a microsecond."""
+    """The step the stamps are rounded to, one, two or five of a decimal; 0 where finer than a microsecond."""
     some = t[:4096] - t[0]
-    for decimals in range(2, 7):
-        if np.abs(some - np.round(some, decimals)).max() < 1e-9:
-            return float(10.0**-decimals)
+    for step in RESOLUTIONS_S:
+        if np.abs(some - np.round(some / step) * step).max() < 1e-9:
+            return step
     return 0.0
 
 
@@ -175,6 +206,9 @@ def _piece(index: IntArray, arrival_s: Array, first: int, last: int, nominal_hz:
     fits = []
     for centre in centres:
         a, b = np.searchsorted(arrival_s, [centre - HORIZON_S / 2, centre + HORIZON_S / 2])
+        if b - a < FEWEST_FOR_RATE:  # bursts are rare: those around the centre, however far
+            a = max(int(np.searchsorted(arrival_s, centre)) - FEWEST_FOR_RATE // 2, 0)
+            b = a + FEWEST_FOR_RATE
         fits.append(parabola(index[a:b], arrival_s[a:b], nominal_hz, edge))
     knots = np.array([first, *np.interp(centres, arrival_s, index), last], dtype=float)
     at = [fits[0], *fits, fits[-1]]

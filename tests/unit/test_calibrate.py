@@ -17,6 +17,7 @@ from hw.virtual.bench import Bench
 from hw.virtual.parameters import BenchParameters, Knocks
 from hw.virtual.presets import plain
 from hw.virtual.schedule import Schedule, clamped, directed
+from hw.virtual.timebase import Clock
 
 MEMBERS = {
     "sensitivity", "offset", "standard_uncertainty", "expanded_uncertainty", "covariance", "determined", "nuisances",
@@ -173,6 +174,31 @@ def test_a_dead_reference_is_refused(
         "no window can be used, of 4, the first (theta 35 deg, alpha 0 deg): the reference is silent"
     )
     assert all("silent" in w["reason"] for w in found["windows"])
+
+
+def rounded(path: Path, step_s: float, share: float) -> None:
+    """The stamps of a share of the rows rounded."""
+    random, (head, *rows) = np.random.default_rng(1), path.read_text().splitlines()
+    parts = [row.split(",", 1) for row in rows]
+    stamps = np.array([float(stamp) for stamp, _ in parts])
+    some = random.random(len(stamps)) < share
+    stamps[some] = np.round(stamps[some] / step_s) * step_s
+    path.write_text("\n".join([head, *(f"{t:.6f},{p[1]}" for t, p in zip(stamps, parts, strict=True))]) + "\n")
+
+
+@pytest.mark.parametrize("rate_hz", [50.0, 125.0, 200.0, 1000.0])
+def test_stamps_of_which_some_are_rounded(rate_hz: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    p = plain(7)
+    stands = tuple(clamped(35.0, alpha, 25.0) for alpha in (0.0, 30.0, 120.0, 210.0))
+    sensor = replace(p.sensor, clock=Clock(rate_hz, rate_error=3e-6, offset_s=0.49e-3), bursts=None)
+    bench = files(tmp_path, replace(p, sensor=sensor, schedule=Schedule(stands, 3.0, 3.0)))
+    exact = (tmp_path / "sensor.csv").read_bytes()
+    for step_s, share in ((0.5e-3, 0.02), (1e-3, 0.005), (1e-3, 0.3)):
+        (tmp_path / "sensor.csv").write_bytes(exact)
+        rounded(tmp_path / "sensor.csv", step_s, share)
+        status, found, said = run(capsys, *arguments(tmp_path))
+        assert (status, said) == (0, "")
+        assert errors(found, bench)[0] < 0.01, (step_s, share)  # u of white noise is 0.007 at 50 Hz
 
 
 def later(path: Path) -> None:

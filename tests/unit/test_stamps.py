@@ -6,9 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 
 from calib.signal import stamps as stamps_module
-from calib.signal.stamps import arrivals_from_stamps, clock_from_stamps
+from calib.signal.stamps import arrivals_from_stamps, clock_from_stamps, counted
 from tests.unit.test_timing import polled, sample_times
 
 TRUE, NEWEST, ARRIVAL = polled(100.0, 1013.0, 0.016, seed=1, wander=50e-6)
@@ -95,3 +97,46 @@ def test_few_rows(n: int) -> None:
 def test_time_that_does_not_pass_is_refused(make: Callable[[], np.ndarray]) -> None:
     with pytest.raises(ValueError, match="time must pass"):
         clock_from_stamps(make())
+
+
+@given(
+    rate_hz=st.floats(50.0, 1000.0),
+    seconds=st.floats(5.0, 200.0),
+    rounding_s=st.sampled_from([0.5e-3, 1e-3]),
+    rounded=st.sampled_from([0.001, 0.005, 0.02, 0.3, 0.7, 1.0]),
+    repeated=st.sampled_from([0.0, 0.0, 0.001, 0.02]),
+    seed=st.integers(0, 2**32 - 1),
+)
+@settings(max_examples=60)
+@example(50.0, 200.0, 1e-3, 0.02, 0.0, 1)
+@example(125.0, 150.0, 0.5e-3, 0.02, 0.0, 1)
+@example(50.003, 90.0, 1e-3, 0.02, 0.0, 2)
+def test_stamps_some_of_which_are_rounded_or_repeated(
+    rate_hz: float, seconds: float, rounding_s: float, rounded: float, repeated: float, seed: int
+) -> None:
+    """A repeated stamp is that of the sample before. Times are never off by more than what displaced a stamp."""
+    random = np.random.default_rng(seed)
+    true = random.uniform(0.0, 10.0) + np.arange(round(seconds * rate_hz)) / rate_hz
+    stamps = np.round(true, 6)
+    some = random.random(len(true)) < rounded
+    stamps[some] = np.round(stamps[some] / rounding_s) * rounding_s
+    again = np.flatnonzero(random.random(len(true) - 1) < repeated)
+    stamps[again + 1] = stamps[again]
+    clock, rows, numbers = counted(clock_from_stamps(stamps))
+    assert (rows.tolist(), numbers.tolist()) == ([0], [0])
+    times_s = clock.time_of(np.arange(len(true)))
+    assert (np.diff(times_s) > 0).all()
+    assert np.abs(times_s - true).max() < rounding_s + (1.0 / rate_hz if repeated else 0.0) + 1e-6
+
+
+@pytest.mark.parametrize("every_s", [40.0, 100.0])
+def test_bursts_that_come_less_than_once_a_minute(every_s: float) -> None:
+    t = np.arange(round(30 * 2.0 * every_s)) / 2.0
+    stamps = np.ceil((t + 1e-3) / every_s) * every_s
+    error = clock_from_stamps(stamps).time_of(np.arange(len(t))) - t
+    assert np.ptp(error) < 0.6  # a sample's period: the newest of a burst may be as old as that
+
+
+def test_a_device_slower_than_a_sample_a_minute() -> None:
+    t = np.arange(30) * 100.0
+    np.testing.assert_allclose(clock_from_stamps(t).time_of(np.arange(30)), t, atol=1e-6)
