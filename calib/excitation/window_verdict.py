@@ -22,6 +22,9 @@ class Limits:
     least_level: float = 3.0  # motion over the reference's noise, in band: 10 % of attenuation is then the worst
     least_coherence: float = 0.5  # in band, part of the sensor's power; a working pair shows above 0.95
     most_left_out_pct: float = 5.0  # knocks of 20 ms twice a second; more is no knock
+    # Of a segment, in a window beyond the limit above: more, and the whole segment is left out. Where 8 % are knocked
+    # out here and there, one segment in 500 of 25 points has as many.
+    most_left_out_of_segment_pct: float = 25.0
     most_drift_mps2: float = 0.2  # of the mean within a window: offsets creep by 0.05, a turned clamp by metres
     most_drift_pct: float = 10.0  # or of the motion's own size, where that is more
 

@@ -12,6 +12,7 @@ from dataclasses import replace
 from typing import Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.excitation import detection
 from calib.excitation.rests import find_rests
@@ -74,7 +75,8 @@ def judged(
     for first, stop in _unbroken(points.time_s):
         longest = round(limits.longest_s * _rate(points.time_s[first:stop]))
         for a, b in _pieces(first, stop, longest):
-            windows.append(_motion(kind, pose, points.part(a, b), limits, leave_out))
+            part = points.part(a, b)
+            windows.append(_motion(kind, pose, part, _rate(part.time_s), limits, leave_out))
     return windows
 
 
@@ -158,17 +160,23 @@ def rest_sd(V: Array, rate_hz: float) -> Array | None:
     return np.median([V[a:b].std(axis=0) for a, b in rests], axis=0) if rests else None
 
 
-def _motion(kind: Kind, pose: Pose, points: Points, limits: Limits, leave_out: bool) -> Window:
-    """One window. It is judged without the knocks, also where they stay in its sums."""
+def _motion(kind: Kind, pose: Pose, points: Points, rate_hz: float, limits: Limits, leave_out: bool) -> Window:
+    """One window. It is judged without the knocks, also where they stay in its sums.
+
+    Where knocks lie together, whole segments are left out; the limits are held against the other segments.
+    """
     t, _, u, du = points
     V = np.asfortranarray(points.V)  # medians and extremes of an axis are several times faster this way
-    rate_hz = _rate(t)
     if len(V) < max(limits.least_points, 2 * u.shape[1] + 2):
         sums = _sums(V, u, du, rate_hz, limits)
         return _window(kind, pose, t, sums, judge(sums, np.zeros(len(V), dtype=bool), {}, limits), 0)
     basis = np.column_stack([np.ones(len(u)), u, du])
     finest = detection.least_step(V)
     struck, residual = detection.knocked(V, basis, finest)
+    sound = _sound(struck, rate_hz, limits)
+    if leave_out and not sound.all():
+        rest = _motion(kind, pose, Points(*(column[sound] for column in points)), rate_hz, limits, leave_out)
+        return _without_segments(rest, int((~sound).sum()))
     clean = sums = _sums(V, u, du, rate_hz, limits)
     if struck.any():
         kept = ~struck
@@ -182,6 +190,24 @@ def _motion(kind: Kind, pose: Pose, points: Points, limits: Limits, leave_out: b
     if kind == "quiet" and verdict.used:
         verdict = Verdict(False, "the reference is calm here", verdict.numbers)
     return _window(kind, pose, t, sums, verdict, int(struck.sum()) if leave_out else 0)
+
+
+def _sound(struck: NDArray[np.bool_], rate_hz: float, limits: Limits) -> NDArray[np.bool_]:
+    """Points (n,) that are in no segment full of knocks; all where the limit is kept, or no segment would be left."""
+    every = np.ones(len(struck), dtype=bool)
+    if 100.0 * struck.mean() <= limits.most_left_out_pct:
+        return every
+    edges = _edges(len(struck), rate_hz, limits)
+    count = np.diff(edges)
+    full = 100.0 * np.add.reduceat(struck, edges[:-1], dtype=float) > limits.most_left_out_of_segment_pct * count
+    return every if full.all() else np.repeat(~full, count)
+
+
+def _without_segments(window: Window, points: int) -> Window:
+    """The window of what was left when segments of so many points were left out."""
+    dropped = points + window.numbers.get("dropped_points", 0.0)
+    numbers = {**window.numbers, "dropped_points": float(dropped)}
+    return replace(window, left_out=window.left_out + points, numbers=numbers)
 
 
 def _motion_numbers(sums: WindowSums, basis: Array, V: Array, rate_hz: float) -> dict[str, float]:
@@ -220,9 +246,13 @@ def _drift(sums: WindowSums) -> float:
 
 def _sums(V: Array, u: Array, du: Array, rate_hz: float, limits: Limits) -> WindowSums:
     """Sums by segments of `segment_s`; what is left over at the end goes into the last one."""
+    return window_sums(u, du, V, _edges(len(V), rate_hz, limits))
+
+
+def _edges(n: int, rate_hz: float, limits: Limits) -> NDArray[np.int64]:
+    """(K + 1,) where the segments of n samples begin, and n."""
     size = max(1, round(limits.segment_s * rate_hz))
-    edges = np.arange(0, max(len(V) - size // 2, 1), size)
-    return window_sums(u, du, V, np.append(edges, len(V)))
+    return np.append(np.arange(0, max(n - size // 2, 1), size), n)
 
 
 def _rest_sums(V: Array, rate_hz: float, limits: Limits) -> WindowSums:
