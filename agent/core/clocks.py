@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -46,11 +45,10 @@ class Clocks:
             newest_s, nominal_rate_hz = streams[name].newest_arrival_s, streams[name].nominal_rate_hz
             if newest_s is None or newest_s < since_s or nominal_rate_hz is None:
                 continue  # silent, or another device is there now, and has sent nothing yet
-            # Sample numbers that jump at will make no clock, and there is nothing to report.
-            with np.errstate(all="ignore"), suppress(np.linalg.LinAlgError):
-                clock, lateness_s = streams[name].clock()
-                lag_s = lag if name == source.sensor else UNKNOWN
-                found.append(_report(source, name, nominal_rate_hz, clock, lateness_s, lag_s))
+            if (known := streams[name].clock()) is None:
+                continue  # sample numbers that jump at will make no clock, and there is nothing to report
+            lag_s = lag if name == source.sensor else UNKNOWN
+            found.append(_report(source, name, nominal_rate_hz, *known, lag_s))
         return found
 
     def snapshot(self) -> dict[str, Any]:

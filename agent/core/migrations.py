@@ -74,8 +74,13 @@ _VERSION_1_BY_POSITION: Mapping[str, Kind] = {
 def from_version_1(state: dict[str, Any]) -> None:
     """Each unknown gets its kind. Raises KeyError for a name that version 1 did not have.
 
-    The summary of a window told which of its blocks is which window, a summary has one; noise is now by window.
+    The summary of a window told which of its blocks is which window, a summary has one; noise is now by window. A
+    stream had one clock, now each run between two restarts of a device has its own.
     """
+    for channel in state.get("channels", {}).values():
+        for stream in channel["streams"].values():
+            run = {"clock": stream.pop("clock"), "blocks": stream.pop("blocks")}
+            stream["runs"] = [run] if run["clock"] else []
     for estimation in _estimations(state):
         recursion = estimation["recursion"]
         for joint in (recursion["state"], recursion["base"]):

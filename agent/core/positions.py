@@ -11,13 +11,13 @@ import numpy as np
 
 from agent.config import Channel
 from agent.core.schedule import Piece, Stance, pieces
-from agent.core.stream import DeviceStream
+from agent.core.stream import UNCOUNTED, DeviceStream
 from calib.estimate.recursion import Recursion
 from calib.excitation.placing import SHORTEST_S, Knowledge, Placed, clamp_angles, mean_output, nearest_stop
 from calib.excitation.standing import KEPT, MEAN_S, Standing
 from calib.model import Array, Pose
 from calib.signal.samples import Samples
-from hw.block import BlockFlags, SampleBlock
+from hw.block import SampleBlock
 
 FOUND_WITHIN_S = KEPT * MEAN_S  # of samples that may still turn out to belong to a stretch
 # A garbled line may say 1e20; beside it every departure would look small. No motion that gravity is seen in is larger.
@@ -142,11 +142,13 @@ class FoundPositions:
 
     def update(self, block: SampleBlock, stream: DeviceStream, scale: float) -> None:
         """Take the sensor's next block, which `stream` has already."""
+        size = max(round(MEAN_S * block.nominal_rate_hz), 1)
+        if block.flags & UNCOUNTED and self._expected is not None:
+            # What stood until then is a stretch of its own, timed by the clock that the stream had then.
+            self._end(self._standing.interrupt(), size, stream, before_restart=True)
+            self._expected = None
         if block.indications.ndim != 2 or block.indications.shape[1] != 3:
             return
-        if block.flags & BlockFlags.RESTART:
-            self.forget()
-        size = max(round(MEAN_S * block.nominal_rate_hz), 1)
         missing = 0 if self._expected is None else block.first_index - self._expected
         if self._expected is None or not 0 <= missing < size:
             self._end(self._standing.interrupt(), size, stream)
@@ -159,7 +161,7 @@ class FoundPositions:
         self._oldest_s = self._time_of(self._standing.oldest, size, stream)
 
     def forget(self) -> None:
-        """The stream has dropped its samples and knows no times of them any more, nor are there windows of them."""
+        """The stream has dropped its samples, which are of another device: there are no windows of them."""
         self._standing.interrupt()
         self._stretches, self._angles, self._expected = [], {}, None
 
@@ -190,20 +192,21 @@ class FoundPositions:
             start_s = self._time_of(self._standing.first, size, stream)
             self._stretches.append(Stretch(self._serial, start_s, math.inf))
 
-    def _end(self, number: int | None, size: int, stream: DeviceStream) -> None:
+    def _end(self, number: int | None, size: int, stream: DeviceStream, *, before_restart: bool = False) -> None:
         """The stretch ends before the mean of this number, if any."""
         if number is None:
             return
         newest = self._stretches[-1]
-        newest.stop_s = max(self._time_of(number, size, stream), newest.start_s)
+        newest.stop_s = max(self._time_of(number, size, stream, before_restart=before_restart), newest.start_s)
         if newest.stop_s - newest.start_s <= 2.0 * self._channel.guard_s:
             self._stretches.pop()
         self._told = list(self._ended(newest.stop_s)) + [t for t in self._told if t.start_s >= newest.stop_s]
 
-    def _time_of(self, number: int, size: int, stream: DeviceStream) -> float:
+    def _time_of(self, number: int, size: int, stream: DeviceStream, *, before_restart: bool = False) -> float:
         index, first = self._origin
         assert stream.first_sample_s is not None  # it has a block
-        return stream.taken_at(index + (number - first) * size)[0] - stream.first_sample_s
+        taken_s, _ = stream.taken_at(index + (number - first) * size, before_restart=before_restart)
+        return taken_s - stream.first_sample_s
 
     # --- state
 

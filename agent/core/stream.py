@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import deque
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -17,11 +19,71 @@ from hw.block import BlockFlags, SampleBlock
 FASTEST = 10.0
 
 
+# Samples of which nobody can count how many are missing before them: they get a clock of their own.
+UNCOUNTED = BlockFlags.RESTART | BlockFlags.OVERRUN
+
+
+class Run:
+    """Blocks whose samples are counted on from each other, with the clock of these samples."""
+
+    def __init__(self, clock: ClockModel) -> None:
+        self.blocks: deque[SampleBlock] = deque()
+        self.model = clock
+        self._fitted: ClockFit | None = None  # the clock model's result, until the next block
+        self._in_time = True
+
+    def update(self, block: SampleBlock, arrivals_s: Array) -> None:
+        """Take the next block, whose bursts arrived at these times (B,)."""
+        self.model.update(block.first_index + block.burst_count.astype(np.int64) - 1, arrivals_s)
+        self.blocks.append(block)
+        self._fitted = None
+
+    @property
+    def in_time(self) -> bool:
+        """Whether the sample numbers and arrivals make a clock at all."""
+        self.clock()
+        return self._in_time
+
+    def clock(self) -> ClockFit:
+        """The clock as it is now. Where the sample numbers make none, one that counts back from the newest arrival."""
+        if self._fitted is None:
+            with np.errstate(all="ignore"):
+                fitted = self._result()
+            self._in_time = fitted is not None
+            self._fitted = fitted or self.model.nominal()
+        return self._fitted
+
+    def _result(self) -> ClockFit | None:
+        try:
+            fitted = self.model.result()
+        except (np.linalg.LinAlgError, ZeroDivisionError):  # numbers that jump at will: 0, 1, 0, 1, ...
+            return None
+        return fitted if np.isfinite([*fitted.knot_time_s, *fitted.knot_period_s]).all() else None
+
+    @property
+    def span_s(self) -> tuple[float, float]:
+        """From the oldest sample that is held to one period after the newest."""
+        oldest, newest = self.blocks[0], self.blocks[-1]
+        start_s, stop_s = self.clock().time_of([oldest.first_index, newest.first_index + newest.n]).tolist()
+        return start_s, stop_s
+
+    def snapshot(self) -> dict[str, Any]:
+        """State for `restore`, bit-exact."""
+        return {"clock": self.model.snapshot(), "blocks": [_block_state(block) for block in self.blocks]}
+
+    @classmethod
+    def restore(cls, state: Mapping[str, Any]) -> Run:
+        """The run whose `snapshot` this is."""
+        run = cls(ClockModel.restore(state["clock"]))
+        run.blocks.extend(_block_of(s) for s in state["blocks"])
+        return run
+
+
 class DeviceStream:
     """Blocks of one device as they come, forgotten when `forget_before` says so.
 
-    Times are seconds since the run's origin on the gateway's monotonic clock. A RESTART (the index does not go on in
-    time) empties the buffer and starts the clock model anew.
+    Times are seconds since the run's origin on the gateway's monotonic clock. After a RESTART or an OVERRUN (nobody can
+    count the samples on) a new `Run` begins, with a clock of its own; runs before are kept as long as they are needed.
     """
 
     def __init__(self, name: str, origin_ns: int, horizon_s: float = HORIZON_S) -> None:
@@ -29,63 +91,87 @@ class DeviceStream:
         self._name = name
         self._origin_ns = origin_ns
         self._horizon_s = horizon_s
-        self._blocks: deque[SampleBlock] = deque()
-        self._clock: ClockModel | None = None
-        self._fitted: ClockFit | None = None  # the clock model's result, until the next block
+        self._runs: list[Run] = []  # in order of time; of all but the newest there are blocks
         self.newest_arrival_s: float | None = None
         self.first_sample_s: float | None = None
 
     def update(self, block: SampleBlock) -> None:
         """Take the next block."""
-        arrivals_s = (block.burst_t_monotonic_ns - self._origin_ns) * 1e-9
+        arrivals_s: Array = (block.burst_t_monotonic_ns - self._origin_ns) * np.float64(1e-9)
         first_arrival_s = float(arrivals_s[0])
-        if self._clock is None:
-            self._clock = ClockModel(block.nominal_rate_hz, self._horizon_s)
+        if self.first_sample_s is None:
             self.first_sample_s = first_arrival_s - int(block.burst_count[0]) / block.nominal_rate_hz
-        elif block.flags & BlockFlags.RESTART:
-            self._clock = ClockModel(block.nominal_rate_hz, self._horizon_s)
-            self._blocks.clear()
-        self._clock.update(block.first_index + block.burst_count.astype(np.int64) - 1, arrivals_s)
-        self._fitted = None
-        self._blocks.append(block)
+        if not self._runs or block.flags & UNCOUNTED:
+            self._runs = [run for run in self._runs if run.blocks]
+            self._runs.append(Run(ClockModel(block.nominal_rate_hz, self._horizon_s)))
+        self._runs[-1].update(block, arrivals_s)
         self.newest_arrival_s = float(arrivals_s[-1])
 
     @property
     def nominal_rate_hz(self) -> float | None:
         """As the newest block tells it; None before any."""
-        return self._blocks[-1].nominal_rate_hz if self._blocks else None
+        return self._runs[-1].blocks[-1].nominal_rate_hz if self._holds else None
+
+    @property
+    def _holds(self) -> bool:
+        return bool(self._runs and self._runs[-1].blocks)
 
     def reaches(self, time_s: float) -> bool:
         """Whether samples up to `time_s` are there."""
         # A sample never arrives before it was taken: as long as nothing arrived since, the clock need not be asked.
-        if self.newest_arrival_s is None or self.newest_arrival_s < time_s or not self._blocks:
+        if self.newest_arrival_s is None or self.newest_arrival_s < time_s or not self._holds:
             return False
-        newest = self._blocks[-1]
-        return bool(self._fit().time_of(newest.first_index + newest.n - 1) >= time_s)
+        newest = self._runs[-1].blocks[-1]
+        return bool(self._runs[-1].clock().time_of(newest.first_index + newest.n - 1) >= time_s)
 
-    def taken_at(self, index: int) -> tuple[float, float]:
-        """(time in s since the origin, rate in Hz) of a sample, by the clock as it is now."""
-        clock = self._fit()
+    def taken_at(self, index: int, *, before_restart: bool = False) -> tuple[float, float]:
+        """(time in s since the origin, rate in Hz) of a sample, by the clock as it is now.
+
+        `before_restart`: a sample of the run before the newest one.
+        """
+        clock = self._runs[-2 if before_restart and len(self._runs) > 1 else -1].clock()
         return float(clock.time_of(index)), clock.rate_hz
 
-    def clock(self) -> tuple[ClockFit, Array]:
-        """The clock as it is now, and how late each burst behind it arrived (B,) in s. There must be a block."""
-        clock = self._fit()
-        assert self._clock is not None
-        return clock, self._clock.lateness_s(clock)
+    def clock(self) -> tuple[ClockFit, Array] | None:
+        """The clock as it is now, and how late each burst behind it arrived (B,) in s; None where there is none.
 
-    def _fit(self) -> ClockFit:
-        if self._fitted is None:
-            assert self._clock is not None  # there are blocks
-            self._fitted = self._clock.result()
-        return self._fitted
+        There must be a block.
+        """
+        if not self._runs[-1].in_time:
+            return None
+        clock = self._runs[-1].clock()
+        return clock, self._runs[-1].model.lateness_s(clock)
+
+    def breaks(self, start_s: float, stop_s: float) -> list[tuple[float, float]]:
+        """Between `start_s` and `stop_s`: when a run ended, and when the next one began."""
+        spans = [run.span_s for run in self._runs if run.blocks]
+        found = [(ended, max(ended, began)) for (_, ended), (began, _) in itertools.pairwise(spans)]
+        return [(ended, began) for ended, began in found if ended < stop_s and began > start_s]
+
+    def missing(self, start_s: float, stop_s: float) -> int:
+        """How many samples are known to be missing in holes that reach between these times."""
+        count = 0
+        for run in self._runs:
+            for before, after in itertools.pairwise(run.blocks):
+                hole = (before.first_index + before.n, after.first_index)
+                if hole[1] > hole[0] and run.in_time:
+                    began_s, ended_s = run.clock().time_of(hole).tolist()
+                    count += hole[1] - hole[0] if began_s < stop_s and ended_s > start_s else 0
+        return count
 
     def cut(self, start_s: float, stop_s: float) -> Samples | None:
-        """All samples with start_s <= t < stop_s by the clock model as it is now; None if there are none."""
-        if not self._blocks:
+        """All samples with start_s <= t < stop_s by the clock model as it is now; None if there are none.
+
+        They are of one run, the one that has most of this time.
+        """
+        run = self._run_of(start_s, stop_s)
+        if run is None:
             return None
-        clock, rate_hz, axes = self._fit(), self._blocks[-1].nominal_rate_hz, self._blocks[-1].indications.shape[1]
-        oldest, end = self._blocks[0].first_index, self._blocks[-1].first_index + self._blocks[-1].n
+        blocks, clock = run.blocks, run.clock()
+        rate_hz, axes = blocks[-1].nominal_rate_hz, blocks[-1].indications.shape[1]
+        if not run.in_time:
+            return Samples(self._name, 0, np.empty((0, axes)), clock, in_time=False)
+        oldest, end = blocks[0].first_index, blocks[-1].first_index + blocks[-1].n
         edges = np.nan_to_num(clock.index_of(np.array([start_s, stop_s])))
         first, stop = (int(i) for i in np.clip(np.ceil(edges), oldest, end))
         if stop <= first:
@@ -97,7 +183,7 @@ class DeviceStream:
         in_time = bool(within and (np.diff(times_s) > 0).all())
         held = np.full((stop - first, axes), np.nan)
         saturated, temperatures = False, []
-        for block in self._blocks:
+        for block in blocks:
             a, b = max(first, block.first_index), min(stop, block.first_index + block.n)
             if a < b:
                 if block.temperature_degc is not None:
@@ -107,20 +193,32 @@ class DeviceStream:
         degc = float(np.mean(temperatures)) if temperatures else float("nan")
         return Samples(self._name, first, held, clock, saturated, in_time, degc)
 
+    def _run_of(self, start_s: float, stop_s: float) -> Run | None:
+        held = [run for run in self._runs if run.blocks]
+        if len(held) < 2:
+            return held[0] if held else None
+        spans = [run.span_s for run in held]
+        within_s = [min(stop, stop_s) - max(start, start_s) for start, stop in spans]
+        return held[int(np.argmax(within_s))]
+
     def forget_before(self, time_s: float) -> None:
         """Drop whole blocks that ended before `time_s` (by arrival, which is never early)."""
-        while len(self._blocks) > 1 and (self._blocks[0].t_monotonic_ns - self._origin_ns) * 1e-9 < time_s:
-            self._blocks.popleft()
+        for run in self._runs:
+            least = 1 if run is self._runs[-1] else 0
+            while len(run.blocks) > least and (run.blocks[0].t_monotonic_ns - self._origin_ns) * 1e-9 < time_s:
+                run.blocks.popleft()
+        self._runs = [run for run in self._runs if run.blocks or run is self._runs[-1]]
 
     def clear(self) -> None:
         """Drop all samples: they are of another device than the next ones."""
-        self._blocks.clear()
+        self._runs = self._runs[-1:]
+        for run in self._runs:
+            run.blocks.clear()
 
     def snapshot(self) -> dict[str, Any]:
         """State for `restore`, bit-exact."""
         return {
-            "clock": self._clock.snapshot() if self._clock else None,
-            "blocks": [_block_state(block) for block in self._blocks],
+            "runs": [run.snapshot() for run in self._runs],
             "newest_arrival_s": self.newest_arrival_s,
             "first_sample_s": self.first_sample_s,
         }
@@ -129,9 +227,7 @@ class DeviceStream:
     def restore(cls, name: str, origin_ns: int, state: dict[str, Any], horizon_s: float = HORIZON_S) -> DeviceStream:
         """The stream whose `snapshot` this is."""
         stream = cls(name, origin_ns, horizon_s)
-        if state["clock"] is not None:
-            stream._clock = ClockModel.restore(state["clock"])
-        stream._blocks.extend(_block_of(s) for s in state["blocks"])
+        stream._runs = [Run.restore(run) for run in state["runs"]]
         stream.newest_arrival_s = state["newest_arrival_s"]
         stream.first_sample_s = state["first_sample_s"]
         return stream

@@ -21,6 +21,9 @@ from calib.model import Pose, Window
 from calib.signal.timing import HORIZON_S
 from hw.block import LARGEST, SampleBlock
 
+LEAST_PART_S = 1.0  # between two restarts of a device; less makes no window
+FOUND_EDGE_S = 1.0  # from a hole to the end of the stretch that it ends, where gravity tells the stretches
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Verdict:
@@ -32,6 +35,11 @@ class Verdict:
     window: Window
     judged: Judged | None
     lag_s: float
+
+
+def told_in(window: Window, missing: Mapping[str, float]) -> Window:
+    """The window with what is missing in its numbers."""
+    return replace(window, numbers={**window.numbers, **missing}) if missing else window
 
 
 class Streams:
@@ -85,10 +93,43 @@ class Streams:
     ) -> Iterator[Verdict]:
         """A verdict on each window of a piece. `first_day` is the run's origin in the estimation's own count.
 
-        `unusable` says why the reference may not be used, "" where it may.
+        `unusable` says why the reference may not be used, "" where it may. The parts of the piece between which a
+        device began to count anew have windows of their own; what is missing is told in their numbers.
         """
         first_s = self._sensor.first_sample_s
         assert first_s is not None  # a piece was due
+        missing = self._missing(piece, first_s)
+        for part in self._parts(piece, first_s):
+            for verdict in self._of_part(part, first_s, first_day, estimation, unusable):
+                yield replace(verdict, window=told_in(verdict.window, missing))
+
+    def _parts(self, piece: Piece, first_s: float) -> list[Piece]:
+        """What lies between the breaks of both devices; the whole piece where no part of it is long enough."""
+        start_s, stop_s = first_s + piece.start_s, first_s + piece.stop_s
+        breaks = [found for stream in self.by_device.values() for found in stream.breaks(start_s, stop_s)]
+        if not breaks:
+            return [piece]
+        parts, at_s = [], start_s
+        for ended_s, began_s in [*sorted(breaks), (stop_s, stop_s)]:
+            if ended_s - at_s >= LEAST_PART_S:
+                parts.append(replace(piece, start_s=at_s - first_s, stop_s=ended_s - first_s))
+            at_s = max(at_s, began_s)
+        return parts or [piece]
+
+    def _missing(self, piece: Piece, first_s: float) -> dict[str, float]:
+        """Numbers for the windows of a piece that holes cut, or end where a position was found by gravity."""
+        beyond_s = self._channel.guard_s + FOUND_EDGE_S if self._finder else 0.0
+        start_s, stop_s = first_s + piece.start_s - beyond_s, first_s + piece.stop_s + beyond_s
+        numbers = {}
+        for name, stream in self.by_device.items():
+            of = "" if name == self._channel.sensor else "reference_"
+            numbers[f"{of}missing_samples"] = stream.missing(start_s, stop_s)
+            numbers[f"{of}restarts"] = len(stream.breaks(start_s, stop_s))
+        return {name: float(count) for name, count in numbers.items() if count}
+
+    def _of_part(
+        self, piece: Piece, first_s: float, first_day: float, estimation: Estimation | None, unusable: str
+    ) -> Iterator[Verdict]:
         day = first_day + (first_s + piece.stop_s) / DAY_S
         placed, lag_s = Placed(piece.pose, "", {}), 0.0
         if unsound := self._unsound(first_s + piece.start_s, first_s + piece.stop_s):

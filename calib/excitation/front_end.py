@@ -129,7 +129,9 @@ def aligned(
     u, lost = differentiate(raw, rate_hz, instrument.derivatives) if instrument.derivatives else (raw, 0)
     m, V = u.shape[1], sensor.values
     time_s = sensor.time_s
-    sensor_rate_hz = float((len(time_s) - 1) / (time_s[-1] - time_s[0])) if len(time_s) > 1 else 0.0
+    if len(time_s) < 2:
+        return None
+    sensor_rate_hz = float((len(time_s) - 1) / (time_s[-1] - time_s[0]))
     if instrument.has_corner:
         u = np.hstack([without_corner(u, rate_hz, instrument.corner_hz), integral(u, rate_hz)])
         V = without_corner(V, sensor_rate_hz, instrument.sensor_corner_hz)

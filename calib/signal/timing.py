@@ -124,6 +124,13 @@ class ClockModel:
             raise ValueError("no burst yet")
         return parabola(self._index, self._arrival_s, self._nominal_rate_hz).clock(self._index[0], self._index[-1])
 
+    def nominal(self) -> ClockFit:
+        """The clock at the nominal rate under which the newest burst came at once. There must be a burst."""
+        newest, period_s = self._index[-1], 1.0 / self._nominal_rate_hz
+        unknown = np.diag([period_s, 0.01 * period_s, 0.0]) ** 2
+        line = Parabola(int(newest), float(self._arrival_s[-1]), np.array([0.0, period_s, 0.0]), unknown)
+        return line.clock(newest, newest)
+
     def lateness_s(self, clock: ClockFit) -> Array:
         """How late each burst of the last minute arrived (B,): its arrival less the time that `clock` gives its newest
         sample, in s."""

@@ -156,8 +156,7 @@ def test_sample_numbers_that_make_no_clock_are_no_fault() -> None:
     for k in range(3000):  # 0, 1, 0, 1, ..
         arrival = np.array([k * SECOND // 50], dtype=np.int64)
         stream.update(SampleBlock("s", "boot", 0, k % 2, 50.0, arrival, np.ones(1, np.int32), np.zeros((1, 3))))
-    with pytest.raises(np.linalg.LinAlgError):
-        stream.clock()
+    assert stream.clock() is None
     assert Clocks().reports(Source("s", "", "", 0), 60.0, {"s": stream}, None) == []
 
 
