@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import reduce
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from agent.config.gate import DriftOptions, GateSettings
 from agent.config.section import Section, Vector
@@ -15,7 +15,7 @@ from calib.estimate.nuisances import Priors
 from calib.estimate.quantities import PRIORS, WALKS, Statement
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import Array
-from calib.signal.instrument import Instrument
+from calib.signal.instrument import QUANTITIES, Instrument
 
 Percent = Annotated[float, Field(gt=0, le=100)]
 Positive = Annotated[float, Field(gt=0)]
@@ -60,11 +60,17 @@ def scale_of(S: Array) -> float:
     return float(np.sqrt(np.mean(np.diag(S) ** 2)))
 
 
+def _quantity(name: str) -> str:
+    if name not in QUANTITIES:
+        raise ValueError(f"must be one of {', '.join(QUANTITIES)}")
+    return name
+
+
 class Certificate(Section):
     """The reference's certificate. Where it states a `serial_number`, a reference that tells another one is not used;
     `calibrated` is for the record."""
 
-    quantity: Literal["acceleration", "velocity"] = "acceleration"
+    quantity: Annotated[str, AfterValidator(_quantity)] = "acceleration"
     sensitivity: Annotated[float, Field(gt=0, description="indication per m/s2, or per m/s")] = 1.0
     u_sensitivity_pct: Annotated[float, Field(gt=0, le=50)] = 0.1
     lag_s: Annotated[float, Field(ge=-0.1, le=0.1, description="by which its indications come late")] = 0.0
@@ -72,11 +78,6 @@ class Certificate(Section):
     noise_mps2: Annotated[float, Field(ge=0, description="rms over its whole band; 0: as the data show")] = 0.0
     serial_number: str = ""
     calibrated: str = ""
-
-    @property
-    def instrument(self) -> Instrument:
-        """What the front end must know of the reference."""
-        return Instrument(self.quantity, self.sensitivity, self.noise_mps2)
 
 
 class Uncertainty(Section):
@@ -138,6 +139,12 @@ class Knowledge(Section):
         if self.certificate.lag_s and not self.certificate.u_lag_s:
             raise ValueError("certificate.lag_s needs certificate.u_lag_s")
         return self
+
+    @property
+    def instrument(self) -> Instrument:
+        """What the front end must know of the reference."""
+        c = self.certificate
+        return Instrument(c.quantity, c.sensitivity, c.noise_mps2)
 
     def priors(self, *, fixed_mount: bool) -> Priors:
         """The nuisances' priors."""
