@@ -27,7 +27,8 @@ class Prior(Section):
     """S and Q of the sensor before any data, from its certificate or data sheet; the agent does not start without.
 
     `sensitivity` is the main one in output unit per m/s2, or all nine, row by row (row = output axis); left out, it is
-    the data sheet's, which the drivers of the chips know. `offset` is in m/s2, as are its uncertainties.
+    the data sheet's, which the drivers of the chips know. `offset` is in m/s2, as are its uncertainties. `corner_hz`
+    and `u_corner_hz` are of an AC-coupled sensor (first order), 0 where it responds to constants.
     """
 
     sensitivity: Positive | Nine | None = None
@@ -35,6 +36,8 @@ class Prior(Section):
     u_transverse_pct: Percent = 3.0  # of the main one: data sheets of MEMS say 1 to 3 %
     offset_mps2: Vector = (0.0, 0.0, 0.0)
     u_offset_mps2: Positive = 20.0  # two g: nothing is known
+    corner_hz: NotNegative = 0.0
+    u_corner_hz: NotNegative = 0.0
 
     def mean(self, nominal: float | None) -> Array:
         """(12,) S row by row and Q. Raises ValueError where neither configuration nor device tells a sensitivity."""
@@ -76,6 +79,8 @@ class Certificate(Section):
     lag_s: Annotated[float, Field(ge=-0.1, le=0.1, description="by which its indications come late")] = 0.0
     u_lag_s: Annotated[float, Field(ge=0, le=0.1, description="0: the lag is found from the data alone")] = 0.0
     noise_mps2: Annotated[float, Field(ge=0, description="rms over its whole band; 0: as the data show")] = 0.0
+    corner_hz: Annotated[float, Field(ge=0, description="of an AC-coupled reference, first order; 0: none")] = 0.0
+    u_corner_hz: NotNegative = 0.0
     serial_number: str = ""
     calibrated: str = ""
 
@@ -140,11 +145,20 @@ class Knowledge(Section):
             raise ValueError("certificate.lag_s needs certificate.u_lag_s")
         return self
 
+    @model_validator(mode="after")
+    def _corners(self) -> Knowledge:
+        if self.instrument.derivatives and self.instrument.has_corner:
+            quantity = self.certificate.quantity
+            raise ValueError(f"a {quantity} reference has no corner frequency to undo; leave corner_hz and u_corner_hz")
+        return self
+
     @property
     def instrument(self) -> Instrument:
-        """What the front end must know of the reference."""
-        c = self.certificate
-        return Instrument(c.quantity, c.sensitivity, c.noise_mps2)
+        """What the front end must know of the reference, and of the sensor beside it."""
+        c, s = self.certificate, self.prior
+        return Instrument(
+            c.quantity, c.sensitivity, c.noise_mps2, c.corner_hz, c.u_corner_hz, s.corner_hz, s.u_corner_hz
+        )
 
     def priors(self, *, fixed_mount: bool) -> Priors:
         """The nuisances' priors."""
