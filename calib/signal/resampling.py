@@ -80,7 +80,7 @@ def differentiate(x: Array, rate_hz: float, order: int = 1) -> tuple[Array, int]
     """
     if order != 1:
         raise ValueError(f"a derivative of order {order} is not known, only of order 1")
-    band = _differentiated_band(rate_hz)
+    band = differentiated_band_hz(rate_hz) / rate_hz
     half = differentiator_lost(rate_hz, order)
     n = np.arange(-half, half + 1)
     cut = 1.5 * band
@@ -97,12 +97,12 @@ def differentiator_lost(rate_hz: float, order: int) -> int:
     """Samples at each end for which `differentiate` has no full support (Kaiser's length for a transition `band`)."""
     if order == 0:
         return 0
-    return int(np.ceil((STOP_BAND_DB - 8.0) / (2.285 * 2 * np.pi * _differentiated_band(rate_hz)) / 2))
+    return int(np.ceil((STOP_BAND_DB - 8.0) / (2.285 * 2 * np.pi * differentiated_band_hz(rate_hz) / rate_hz) / 2))
 
 
-def _differentiated_band(rate_hz: float) -> float:
-    """Of the sampling rate, up to where a derivative is right."""
-    return min(DIFFERENTIATED_BAND_HZ / rate_hz, DIFFERENTIATED_BAND_LARGEST)
+def differentiated_band_hz(rate_hz: float) -> float:
+    """Up to where a derivative is right."""
+    return min(DIFFERENTIATED_BAND_HZ, DIFFERENTIATED_BAND_LARGEST * rate_hz)
 
 
 def _horner(sums: Array, fraction: Array) -> tuple[Array, Array]:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from agent.config import ConfigError, parse_config
-from tests.unit.drawn_recording import Devices, Recording, in_force, reports, statuses
+from tests.unit.drawn_recording import CALM, Devices, Recording, in_force, reports, statuses
 
 CORNER_HZ, U_CORNER_HZ = 0.16, 0.016
 STATED: dict[str, Any] = {"corner_hz": CORNER_HZ, "u_corner_hz": U_CORNER_HZ}
@@ -26,9 +26,9 @@ def drawn(seed: int, of: str, **more: Any) -> Devices:
 
 
 def errors(recording: Recording, **sections: Any) -> np.ndarray:
-    """(9,) errors of S over u; every window was used, and the status was never HELD."""
+    """(9,) errors of S over u; every window that moved was used, and the status was never HELD."""
     results = recording.through_agent(**sections)
-    assert [report.reason for report in reports(results) if not report.used] == []
+    assert {report.reason for report in reports(results) if not report.used} <= {CALM}
     assert "VALID" in statuses(results)
     assert "HELD" not in statuses(results)
     found = in_force(results)
