@@ -12,9 +12,10 @@ import click
 from agent.calibrate.calibrating import calibrated
 from agent.calibrate.origin import origin
 from agent.calibrate.outcome import as_json, print_outcome
-from agent.calibrate.tables import TableError
+from agent.calibrate.tables import REFERENCES, TableError
 from calib.signal.instrument import QUANTITIES
 
+_REFERENCES = " or ".join(",".join(("time_s", *names)) for names in REFERENCES)
 _FILE = click.Path(path_type=Path, dir_okay=False)
 
 
@@ -33,7 +34,7 @@ _U = _Finite(0)
 
 @click.command()
 @click.option("--sensor", type=_FILE, required=True, help="time_s,vx,vy,vz[,temperature_degc]")
-@click.option("--reference", type=_FILE, help="time_s,a or time_s,v or time_s,ax,ay,az; SI units.")
+@click.option("--reference", type=_FILE, help=f"{_REFERENCES}; SI units.")
 @click.option("--poses", type=_FILE, help="start_s,stop_s and theta_deg,alpha_deg | dx,dy,dz | axis | gx,gy,gz")
 @click.option("--method", type=click.Choice(["1", "2", "3"]), default="3", show_default=True, help="Of the paper.")
 @click.option("--reference-quantity", type=click.Choice(list(QUANTITIES)), help="By default as the header.")

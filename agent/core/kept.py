@@ -16,8 +16,8 @@ from typing import Any
 import msgspec
 
 from agent.config import Channel
-from agent.config.section import Section
 from agent.config.pose import Stop
+from agent.config.section import Section
 from agent.core.estimation import Estimation
 from agent.core.events import CalibrationUpdate
 from agent.core.memory import MOST_MEMORIES
