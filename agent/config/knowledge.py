@@ -74,11 +74,11 @@ class Certificate(Section):
     `calibrated` is for the record."""
 
     quantity: Annotated[str, AfterValidator(_quantity)] = "acceleration"
-    sensitivity: Annotated[float, Field(gt=0, description="indication per m/s2, or per m/s")] = 1.0
+    sensitivity: Annotated[float, Field(gt=0, description="indication per SI unit of the quantity")] = 1.0
     u_sensitivity_pct: Annotated[float, Field(gt=0, le=50)] = 0.1
     lag_s: Annotated[float, Field(ge=-0.1, le=0.1, description="by which its indications come late")] = 0.0
     u_lag_s: Annotated[float, Field(ge=0, le=0.1, description="0: the lag is found from the data alone")] = 0.0
-    noise_mps2: Annotated[float, Field(ge=0, description="rms over its whole band; 0: as the data show")] = 0.0
+    noise_mps2: Annotated[float, Field(ge=0, description="rms, in SI units of the quantity; 0: as the data show")] = 0.0
     corner_hz: Annotated[float, Field(ge=0, description="of an AC-coupled reference, first order; 0: none")] = 0.0
     u_corner_hz: NotNegative = 0.0
     serial_number: str = ""
