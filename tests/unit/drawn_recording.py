@@ -21,7 +21,7 @@ from benchmarks.online.runner import Run, opened, tick, ticked
 from hw.block import DeviceInfo, SampleBlock
 from tests.clamp_windows import frame
 
-G_MPS2, LINES, BURST, BLOCK_S = 9.80665, 40, 5, 2.0
+G_MPS2, BURST, BLOCK_S = 9.80665, 5, 2.0
 THETA_DEG, ALPHAS_DEG = 35.0, (0.0, 60.0, 120.0, 180.0, 240.0, 300.0)
 CALM = "the reference is calm here"  # its lines beat: now and then they cancel for a second
 STILL: dict[str, Any] = {
@@ -42,18 +42,19 @@ class Devices:
     sensor_corner_hz: float = 0.0
     band_hz: tuple[float, float] = (0.5, 8.0)
     level_mps2: float = 0.3
+    lines: int = 40  # of the motion of each axis
     lost: tuple[int, ...] = ()  # samples of the reference, by number
 
 
 class Motion:
-    """`axes` independent random motions of `LINES` lines each."""
+    """`axes` independent random motions of some lines each."""
 
     def __init__(self, random: np.random.Generator, devices: Devices, axes: int) -> None:
         low, high = devices.band_hz
-        edges = np.linspace(low, high, LINES + 1)
-        self._hz = random.uniform(edges[:-1], edges[1:], (axes, LINES))
-        drawn = random.normal(size=(2, axes, LINES))
-        self._line = devices.level_mps2 * (drawn[0] + 1j * drawn[1]) / np.sqrt(LINES)
+        edges = np.linspace(low, high, devices.lines + 1)
+        self._hz = random.uniform(edges[:-1], edges[1:], (axes, devices.lines))
+        drawn = random.normal(size=(2, axes, devices.lines))
+        self._line = devices.level_mps2 * (drawn[0] + 1j * drawn[1]) / np.sqrt(devices.lines)
 
     def at(self, t: np.ndarray, *, derivatives: int = 0, corner_hz: float = 0.0) -> np.ndarray:
         """(n, axes) of what is differentiated so often to give the acceleration, after a filter of this corner."""
