@@ -33,7 +33,7 @@ from calib.signal.samples import Samples
 # Samples beyond a window's ends, the reference's (the sensor's half of it): half the taps of resampling, of
 # differentiating and of the low-pass filter at 100 Hz and above.
 LEAST_MARGIN_S = 1.0
-MOST_MARGIN_S = 5.0  # a differentiator at 10 Hz takes 3.3 s
+MOST_MARGIN_S = 5.0  # a second derivative at 10 Hz takes 4.2 s
 # Of many holes pieces of a second are left: too short for the reference's noise, and for type A by segments.
 MOST_MISSING_PCT = 5.0
 MOST_NOISE_MPS2 = 0.1  # 1 % of gravity: a reference that moves more beside a sensor that does not is no rest
