@@ -24,7 +24,12 @@ LARGEST = 1e15  # no indication or time needs more, and squares and sums of it s
 SENSOR = ("time_s", "vx", "vy", "vz")
 TEMPERATURE = "temperature_degc"
 # Columns of a reference, and the quantity that they hold.
-REFERENCES = {("ax", "ay", "az"): "acceleration", ("a",): "acceleration", ("v",): "velocity"}
+REFERENCES = {
+    ("ax", "ay", "az"): "acceleration",
+    ("a",): "acceleration",
+    ("v",): "velocity",
+    ("d",): "displacement",
+}
 # A stamp may be older than the one before: spread back from a late burst, or jittery. Stalls reach some ten ms.
 LATEST_STAMP_S = 0.1
 ROWS_AT_ONCE = 1 << 20
@@ -70,7 +75,7 @@ def read_sensor(path: Path, progress: Progress | None = None) -> SensorTable:
 
 
 def read_reference(path: Path, progress: Progress | None = None) -> ReferenceTable:
-    """Read reference.csv: `a` or `v` alone, or `ax,ay,az`. Raises TableError."""
+    """Read reference.csv: `a`, `v` or `d` alone, or `ax,ay,az`. Raises TableError."""
     with open_table(path) as file:
         header = header_of(path, file)
         found = [names for names in REFERENCES if set(names) <= set(header)]

@@ -12,8 +12,10 @@ import click
 from agent.calibrate.calibrating import calibrated
 from agent.calibrate.origin import origin
 from agent.calibrate.outcome import as_json, print_outcome
-from agent.calibrate.tables import TableError
+from agent.calibrate.tables import REFERENCES, TableError
+from calib.signal.instrument import QUANTITIES
 
+_REFERENCES = " or ".join(",".join(("time_s", *names)) for names in REFERENCES)
 _FILE = click.Path(path_type=Path, dir_okay=False)
 
 
@@ -32,10 +34,10 @@ _U = _Finite(0)
 
 @click.command()
 @click.option("--sensor", type=_FILE, required=True, help="time_s,vx,vy,vz[,temperature_degc]")
-@click.option("--reference", type=_FILE, help="time_s,a or time_s,v or time_s,ax,ay,az; SI units.")
+@click.option("--reference", type=_FILE, help=f"{_REFERENCES}; SI units.")
 @click.option("--poses", type=_FILE, help="start_s,stop_s and theta_deg,alpha_deg | dx,dy,dz | axis | gx,gy,gz")
 @click.option("--method", type=click.Choice(["1", "2", "3"]), default="3", show_default=True, help="Of the paper.")
-@click.option("--reference-quantity", type=click.Choice(["acceleration", "velocity"]), help="By default as the header.")
+@click.option("--reference-quantity", type=click.Choice(list(QUANTITIES)), help="By default as the header.")
 @click.option("--reference-coupling", type=click.Choice(["dc", "ac"]), help="Default: ac for one axis, dc for three.")
 @click.option("--coupling", type=click.Choice(["dc", "ac"]), default="dc", show_default=True, help="Of the sensor.")
 @click.option("--u-angle-deg", type=_U, default=0.2, show_default=True, help="u of alpha or direction, by position.")

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import reduce
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from agent.config.gate import DriftOptions, GateSettings
 from agent.config.section import Section, Vector
@@ -15,7 +15,7 @@ from calib.estimate.nuisances import Priors
 from calib.estimate.quantities import PRIORS, WALKS, Statement
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import Array
-from calib.signal.instrument import Instrument
+from calib.signal.instrument import QUANTITIES, Instrument
 
 Percent = Annotated[float, Field(gt=0, le=100)]
 Positive = Annotated[float, Field(gt=0)]
@@ -27,7 +27,8 @@ class Prior(Section):
     """S and Q of the sensor before any data, from its certificate or data sheet; the agent does not start without.
 
     `sensitivity` is the main one in output unit per m/s2, or all nine, row by row (row = output axis); left out, it is
-    the data sheet's, which the drivers of the chips know. `offset` is in m/s2, as are its uncertainties.
+    the data sheet's, which the drivers of the chips know. `offset` is in m/s2, as are its uncertainties. `corner_hz`
+    and `u_corner_hz` are of an AC-coupled sensor (first order), 0 where it responds to constants.
     """
 
     sensitivity: Positive | Nine | None = None
@@ -35,6 +36,8 @@ class Prior(Section):
     u_transverse_pct: Percent = 3.0  # of the main one: data sheets of MEMS say 1 to 3 %
     offset_mps2: Vector = (0.0, 0.0, 0.0)
     u_offset_mps2: Positive = 20.0  # two g: nothing is known
+    corner_hz: NotNegative = 0.0
+    u_corner_hz: NotNegative = 0.0
 
     def mean(self, nominal: float | None) -> Array:
         """(12,) S row by row and Q. Raises ValueError where neither configuration nor device tells a sensitivity."""
@@ -60,23 +63,26 @@ def scale_of(S: Array) -> float:
     return float(np.sqrt(np.mean(np.diag(S) ** 2)))
 
 
+def _quantity(name: str) -> str:
+    if name not in QUANTITIES:
+        raise ValueError(f"must be one of {', '.join(QUANTITIES)}")
+    return name
+
+
 class Certificate(Section):
     """The reference's certificate. Where it states a `serial_number`, a reference that tells another one is not used;
     `calibrated` is for the record."""
 
-    quantity: Literal["acceleration", "velocity"] = "acceleration"
-    sensitivity: Annotated[float, Field(gt=0, description="indication per m/s2, or per m/s")] = 1.0
+    quantity: Annotated[str, AfterValidator(_quantity)] = "acceleration"
+    sensitivity: Annotated[float, Field(gt=0, description="indication per SI unit of the quantity")] = 1.0
     u_sensitivity_pct: Annotated[float, Field(gt=0, le=50)] = 0.1
     lag_s: Annotated[float, Field(ge=-0.1, le=0.1, description="by which its indications come late")] = 0.0
     u_lag_s: Annotated[float, Field(ge=0, le=0.1, description="0: the lag is found from the data alone")] = 0.0
-    noise_mps2: Annotated[float, Field(ge=0, description="rms over its whole band; 0: as the data show")] = 0.0
+    noise_mps2: Annotated[float, Field(ge=0, description="rms, in SI units of the quantity; 0: as the data show")] = 0.0
+    corner_hz: Annotated[float, Field(ge=0, description="of an AC-coupled reference, first order; 0: none")] = 0.0
+    u_corner_hz: NotNegative = 0.0
     serial_number: str = ""
     calibrated: str = ""
-
-    @property
-    def instrument(self) -> Instrument:
-        """What the front end must know of the reference."""
-        return Instrument(self.quantity, self.sensitivity, self.noise_mps2)
 
 
 class Uncertainty(Section):
@@ -138,6 +144,21 @@ class Knowledge(Section):
         if self.certificate.lag_s and not self.certificate.u_lag_s:
             raise ValueError("certificate.lag_s needs certificate.u_lag_s")
         return self
+
+    @model_validator(mode="after")
+    def _corners(self) -> Knowledge:
+        if self.instrument.derivatives and self.instrument.has_corner:
+            quantity = self.certificate.quantity
+            raise ValueError(f"a {quantity} reference has no corner frequency to undo; leave corner_hz and u_corner_hz")
+        return self
+
+    @property
+    def instrument(self) -> Instrument:
+        """What the front end must know of the reference, and of the sensor beside it."""
+        c, s = self.certificate, self.prior
+        return Instrument(
+            c.quantity, c.sensitivity, c.noise_mps2, c.corner_hz, c.u_corner_hz, s.corner_hz, s.u_corner_hz
+        )
 
     def priors(self, *, fixed_mount: bool) -> Priors:
         """The nuisances' priors."""

@@ -17,6 +17,7 @@ import msgspec
 
 from agent.config import Channel
 from agent.config.pose import Stop
+from agent.config.section import Section
 from agent.core.estimation import Estimation
 from agent.core.events import CalibrationUpdate
 from agent.core.memory import MOST_MEMORIES
@@ -78,7 +79,7 @@ def take_up(kept: bytes, channel: Channel, nominal: float | None) -> Kept:
     except MALFORMED as error:
         return Kept(fresh, None, "", 0.0, 0, f"begun anew: what was kept cannot be read: {_said(error)}")
     try:
-        changed = _changed(state["basis"], _basis(channel))
+        changed = _changed(state["basis"], channel)
         reference = str(state["reference"])
         if not changed:
             fresh.load(state["estimation"])
@@ -132,9 +133,26 @@ def _by_position(stances: Iterable[tuple[Pose, Stop]]) -> dict[str, list[str]]:
     return {name: sorted(stated) for name, stated in found.items()}
 
 
-def _changed(before: dict[str, str], now: dict[str, str]) -> list[str]:
+def _changed(before: dict[str, str], channel: Channel) -> list[str]:
     """Settings that are not as they were. What a state of an earlier version does not name is taken as unchanged."""
-    return sorted(name for name in before if before[name] != now.get(name) and not _same_mount(name, before, now))
+    now = _basis(channel)
+    return sorted(
+        name
+        for name in before
+        if before[name] != now.get(name)
+        and not _same_mount(name, before, now)
+        and not _same_section(before[name], getattr(channel, name, None))
+    )
+
+
+def _same_section(before: str, section: object) -> bool:
+    """Whether a section is as it was; a field that an earlier version did not have counts with its default."""
+    if not isinstance(section, Section):
+        return False
+    fields = type(section).model_fields.items()
+    defaults = {name: field.default for name, field in fields if not field.is_required()}
+    were = {**defaults, **msgspec.json.decode(before)}
+    return bool(msgspec.to_builtins(were) == section.model_dump(mode="json"))
 
 
 def _same_mount(name: str, before: dict[str, str], now: dict[str, str]) -> bool:

@@ -167,7 +167,7 @@ class Streams:
 
     @property
     def _horizon_s(self) -> float:
-        around_s = 2.0 * most_margin_s(self._channel.certificate.instrument)
+        around_s = 2.0 * most_margin_s(self._channel.instrument)
         return max(HORIZON_S, self._channel.window_s + around_s + (FOUND_WITHIN_S if self._finder else 0.0))
 
     @property

@@ -44,7 +44,7 @@ def windows_in(piece: Piece, first_s: float, channel: Channel, streams: dict[str
     settings = Settings(Limits(longest_s=channel.window_s))
     span_s = (start_s, stop_s)
     try:
-        found = windows_of(piece.pose, sensor, reference, channel.certificate.instrument, span_s, lag_s, settings)
+        found = windows_of(piece.pose, sensor, reference, channel.instrument, span_s, lag_s, settings)
     except Unusable as error:
         return Found([refused(piece, str(error))])
     if not found:
@@ -56,7 +56,7 @@ def windows_in(piece: Piece, first_s: float, channel: Channel, streams: dict[str
 def margin_of(channel: Channel, streams: Mapping[str, DeviceStream]) -> float:
     """How many seconds beyond both ends of a piece its windows need."""
     rate_hz = streams[channel.reference].nominal_rate_hz if channel.reference is not None else None
-    return LEAST_MARGIN_S if rate_hz is None else margin_s(channel.certificate.instrument, rate_hz)
+    return LEAST_MARGIN_S if rate_hz is None else margin_s(channel.instrument, rate_hz)
 
 
 def refused(piece: Piece, reason: str) -> Window:

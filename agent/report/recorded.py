@@ -115,7 +115,7 @@ class _Windows:
         self._channel = channel
         held = unpack(start.snapshot)["channels"][channel.sensor]
         self._streams = {n: DeviceStream.restore(n, held["origin_ns"], s) for n, s in held["streams"].items()}
-        self._keep_s = channel.window_s + channel.late_horizon_s + 2 * most_margin_s(channel.certificate.instrument)
+        self._keep_s = channel.window_s + channel.late_horizon_s + 2 * most_margin_s(channel.instrument)
 
     def update(self, event: Event) -> None:
         if isinstance(event, SampleBlock) and event.device in self._streams:
@@ -140,7 +140,7 @@ class _Windows:
         around_s = margin_of(self._channel, self._streams)
         reference = self._streams[self._channel.reference].cut(start_s - around_s, stop_s + around_s)
         lag_s = window.numbers.get("lag_applied_s", 0.0)
-        instrument, span_s = self._channel.certificate.instrument, (start_s, stop_s)
+        instrument, span_s = self._channel.instrument, (start_s, stop_s)
         found = None if reference is None else aligned(cut, reference, instrument, span_s, lag_s)
         if found is None:
             return None

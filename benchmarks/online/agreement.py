@@ -142,7 +142,7 @@ def _offline(channel: Channel, sensor: tuple[Array, Array, float], reference: tu
     files = Files(
         SensorTable(Path("sensor"), stamps, values, None),
         ReferenceTable(Path("reference"), reference[0], reference[1], "acceleration", "a"),
-        poses, channel.certificate.instrument, Options(settings, guard_s=channel.guard_s),
+        poses, channel.instrument, Options(settings, guard_s=channel.guard_s),
     )  # fmt: skip
     return adjusted(files, priors)
 

@@ -162,8 +162,8 @@ SENSITIVITY_TEMPERATURE = Kind("sensitivity over temperature")
 OFFSET_TEMPERATURE = Kind("offset over temperature", straight=LINEAR)
 SENSOR_CORNER = Kind(
     "sensor corner", "Hz", "corner frequency",
-    prior=Statement("sensor_corner_hz", option="u_sensor_corner_hz"),
-    mean=Statement("sensor_corner_at_hz", option="sensor_corner_hz"),
+    prior=Statement("sensor_corner_hz", 0.0, ("prior.u_corner_hz",), option="u_sensor_corner_hz"),
+    mean=Statement("sensor_corner_at_hz", 0.0, ("prior.corner_hz",), option="sensor_corner_hz"),
 )  # fmt: skip
 LAG = Kind(
     "lag", "s", "lag",
@@ -243,8 +243,8 @@ REFERENCE = Kind(
 )  # fmt: skip
 REFERENCE_CORNER = Kind(
     "reference corner", "Hz", "corner frequency",
-    prior=Statement("reference_corner_hz", option="u_reference_corner_hz"),
-    mean=Statement("reference_corner_at_hz", option="reference_corner_hz"),
+    prior=Statement("reference_corner_hz", 0.0, ("certificate.u_corner_hz",), option="u_reference_corner_hz"),
+    mean=Statement("reference_corner_at_hz", 0.0, ("certificate.corner_hz",), option="reference_corner_hz"),
     of_reference=True,
 )  # fmt: skip
 ROTATION = Kind(

@@ -16,22 +16,31 @@ from calib.excitation.turning import feels_gravity, standing_parts
 from calib.excitation.window_verdict import DEFAULT_LIMITS, Limits
 from calib.excitation.windows import Points, motion_windows, rest_window, still_window
 from calib.model import Array, Pose, Window, WindowSums
-from calib.signal.band import band_above_noise, lowpass, noise_in_band
+from calib.signal.band import STOP_BAND, band_above_noise, lowpass, noise_in_band
 from calib.signal.corner import integral, with_integral, without_corner
 from calib.signal.instrument import Instrument
-from calib.signal.resampling import DIFFERENTIATED_BAND_HZ, HALF, differentiate, differentiator_lost, resample
+from calib.signal.resampling import (
+    BAND,
+    DIFFERENTIATED_BAND_HZ,
+    HALF,
+    differentiate,
+    differentiated_band_hz,
+    differentiator_lost,
+    resample,
+)
 from calib.signal.samples import Samples
 
 # Samples beyond a window's ends, the reference's (the sensor's half of it): half the taps of resampling, of
 # differentiating and of the low-pass filter at 100 Hz and above.
 LEAST_MARGIN_S = 1.0
-MOST_MARGIN_S = 5.0  # a differentiator at 10 Hz takes 3.3 s
+MOST_MARGIN_S = 5.0  # a second derivative at 10 Hz takes 4.2 s
 # Of many holes pieces of a second are left: too short for the reference's noise, and for type A by segments.
 MOST_MISSING_PCT = 5.0
 MOST_NOISE_MPS2 = 0.1  # 1 % of gravity: a reference that moves more beside a sensor that does not is no rest
 NOISE_MATTERS = 1e-5  # of the motion's power: a filter against less of it would cost its ends for nothing
 FILTER_BAND = 1.197  # times its band: the noise-equivalent bandwidth of calib.signal.band.lowpass
 RESAMPLED_BAND = 0.35  # of the reference's rate, to which interpolation itself passes noise
+AS_FAST = 0.9  # of the sensor's rate; two devices of one nominal rate differ by less
 
 
 class Unusable(ValueError):  # noqa: N818 - said of samples
@@ -138,7 +147,7 @@ def aligned(
     at = resample(u, reference.clock, time_s - lag_s, reference.first_index, lost)
     columns = np.hstack([V, at.u, at.du])
     columns[~at.usable] = np.nan
-    band_hz, noise = _band(raw, at.u[at.usable][:, :m], instrument, rate_hz)
+    band_hz, noise = _band(raw, at.u[at.usable][:, :m], V, instrument, (rate_hz, sensor_rate_hz))
     clipped, independent, k = 0, 1.0, u.shape[1]
     if band_hz is not None and limit_band:
         independent = min(1.0, 2.0 * FILTER_BAND * band_hz / sensor_rate_hz)
@@ -251,8 +260,14 @@ def _told(window: Window, found: Aligned) -> Window:
     return replace(window, used=False, reason=reason, numbers={**window.numbers, **count})
 
 
-def _band(raw: Array, u: Array, instrument: Instrument, rate_hz: float) -> tuple[float | None, Array]:
-    """Where to limit both signals, None where that gains nothing, and the reference's noise (2, m) in what is left."""
+def _band(
+    raw: Array, u: Array, V: Array, instrument: Instrument, rates_hz: tuple[float, float]
+) -> tuple[float | None, Array]:
+    """Where to limit both signals, None where that gains nothing, and the reference's noise (2, m) in what is left.
+
+    `rates_hz`: of the reference and of the sensor.
+    """
+    rate_hz, sensor_rate_hz = rates_hz
     derivatives, m = instrument.derivatives, raw.shape[1]
     found_hz, density = band_above_noise(raw, rate_hz)
     density = np.maximum(density, instrument.noise / np.sqrt(0.5 * rate_hz))
@@ -262,9 +277,26 @@ def _band(raw: Array, u: Array, instrument: Instrument, rate_hz: float) -> tuple
     unlimited = noise_in_band(density, widest_hz, derivatives)
     whole = u[np.isfinite(u).all(axis=1)]  # one missing sample of the reference makes some of them NaN
     power = np.var(whole, axis=0).max(initial=0.0) if len(whole) else 0.0
-    if found_hz is None or np.max(unlimited[0] ** 2, initial=0.0) <= NOISE_MATTERS * power:
+    noisy = np.max(unlimited[0] ** 2, initial=0.0) > NOISE_MATTERS * power
+    ends_hz = [found_hz if noisy else None, _told_hz(V, instrument, rate_hz, sensor_rate_hz)]
+    band_hz = min((end_hz for end_hz in ends_hz if end_hz is not None), default=None)
+    if band_hz is None:
         return None, unlimited.reshape(2, m)
-    return found_hz, noise_in_band(density, min(FILTER_BAND * found_hz, widest_hz), derivatives)
+    return band_hz, noise_in_band(density, min(FILTER_BAND * band_hz, widest_hz), derivatives)
+
+
+def _told_hz(V: Array, instrument: Instrument, rate_hz: float, sensor_rate_hz: float) -> float | None:
+    """Where to limit both signals so that the sensor shows no motion that the reference cannot tell.
+
+    None where the sensor shows no such motion. A reference as fast as the sensor, and not differentiated, tells all.
+    """
+    if not instrument.derivatives and rate_hz > AS_FAST * sensor_rate_hz:
+        return None
+    right_hz = differentiated_band_hz(rate_hz) if instrument.derivatives else BAND * rate_hz
+    felt_hz, _ = band_above_noise(V, sensor_rate_hz)
+    if felt_hz is not None and felt_hz <= right_hz:
+        return None
+    return right_hz / STOP_BAND
 
 
 def _clipped(columns: Array) -> int:

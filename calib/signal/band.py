@@ -24,6 +24,7 @@ TINY = 1e-300
 SHORT_HOLE = 2  # samples; a straight line over them leaves 3 % of a motion at a twelfth of the rate
 WIDEST = 0.35  # of the sampling rate: beyond, a filter has nothing left to take away
 STOP_BAND_DB = 66.0
+STOP_BAND = 1.5  # times the band that the filter passes
 
 
 def band_above_noise(x: Array, rate_hz: float) -> tuple[float | None, Array]:
@@ -92,7 +93,7 @@ def noise_in_band(density: Array, band_hz: float, derivatives: int) -> Array:
 
 
 def lowpass(x: Array, rate_hz: float, band_hz: float) -> Array:
-    """x (n, k), one sample a row, limited to `band_hz`: flat to 0.1 % up to it, 66 dB down from 1.5 times it on.
+    """x (n, k), one sample a row, limited to `band_hz`: flat to 0.1 % up to it, 66 dB down from STOP_BAND times it on.
 
     No phase. Rows within `lowpass_lost` of an end, or of a NaN, are NaN.
     """

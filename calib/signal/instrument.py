@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 # How many times each quantity must be differentiated to give an acceleration.
-QUANTITIES = {"acceleration": 0, "velocity": 1}
+QUANTITIES = {"acceleration": 0, "velocity": 1, "displacement": 2}
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,5 @@
-"""The reference at the sensor's sample times, with its time derivative; and the acceleration behind a velocity.
+"""The reference at the sensor's sample times, with its time derivative; and the acceleration behind a velocity or a
+displacement.
 
 Interpolation by sixteen taps whose weights are polynomials of the fractional position (Farrow 1988), so that the value
 and its derivative come from the same sums. Up to 0.25 of the reference's sampling rate the value is right to 1e-5 and
@@ -26,8 +27,9 @@ CHUNK = 8192  # output samples worked on at a time, in cache
 # A signal is differentiated up to here and damped from twice as much: the paper's range and three octaves above it.
 DIFFERENTIATED_BAND_HZ = 50.0
 DIFFERENTIATED_BAND_LARGEST = 0.15  # of the sampling rate
-# A differentiator's ripple counts against the slope at the motion's frequency, which is as much smaller than the band.
-STOP_BAND_DB = 110.0
+# A differentiator's ripple counts against the response at the motion's frequency. Of the first derivative that is
+# smaller than at the end of the band as the frequency is, of the second by the square.
+STOP_BAND_DB = {1: 110.0, 2: 150.0}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,37 +74,57 @@ def resample(x: Array, clock: ClockFit, time_s: Array, first_index: int = 0, mar
 
 
 def differentiate(x: Array, rate_hz: float, order: int = 1) -> tuple[Array, int]:
-    """Derivative (M, m) of `order` 1 of samples x (M, m), one a sample, in x's unit per s; and how many at each end are
-    wrong.
+    """Derivative (M, m) of `order` 1 or 2 of samples x (M, m), one a sample, in x's unit per s or s2; and how many at
+    each end are wrong.
 
-    Eq. (12) holds for amplitudes only. Right to 5e-5 up to DIFFERENTIATED_BAND_HZ (at most 0.15 of the rate), damped by
-    110 dB from twice that on, since differentiation raises noise with frequency. Raises ValueError for another order.
+    Eq. (12) holds for amplitudes only. Right to 5e-5 up to `differentiated_band_hz`, damped by 110 dB from twice that
+    on, since differentiation raises noise with frequency. Raises ValueError for another order.
     """
-    if order != 1:
-        raise ValueError(f"a derivative of order {order} is not known, only of order 1")
-    band = _differentiated_band(rate_hz)
+    if order not in STOP_BAND_DB:
+        raise ValueError(f"a derivative of order {order} is not known, only of order 1 and 2")
     half = differentiator_lost(rate_hz, order)
     n = np.arange(-half, half + 1)
-    cut = 1.5 * band
-    window = np.kaiser(2 * half + 1, 0.1102 * (STOP_BAND_DB - 8.7))
+    cut = 1.5 * differentiated_band_hz(rate_hz) / rate_hz
+    window = np.kaiser(2 * half + 1, 0.1102 * (STOP_BAND_DB[order] - 8.7))
+    taps = _slope(n, cut, window) if order == 1 else _curvature(n, cut, window)
+    out = np.column_stack([np.convolve(channel, taps * rate_hz**order, mode="same") for channel in x.T])
+    return out, half
+
+
+def _slope(n: NDArray[np.int64], cut: float, window: Array) -> Array:
+    """Taps at `n` of the first derivative a sample up to `cut` of the rate; the slope of a ramp is exact."""
     phase = 2 * np.pi * cut * n
     with np.errstate(invalid="ignore", divide="ignore"):
         taps = np.where(n == 0, 0.0, (phase * np.cos(phase) - np.sin(phase)) / (np.pi * n**2)) * window
-    taps *= rate_hz / -(taps @ n)  # a ramp's slope is exact
-    out = np.column_stack([np.convolve(channel, taps, mode="same") for channel in x.T])
-    return out, half
+    return np.asarray(taps / -(taps @ n))
+
+
+def _curvature(n: NDArray[np.int64], cut: float, window: Array) -> Array:
+    """Taps at `n` of the second derivative; that of a parabola is exact.
+
+    The window smooths the response -omega^2, which adds a constant over the band: a low-pass filter takes it out.
+    """
+    phase, turn = 2 * np.pi * cut * n, 2 * np.pi * cut
+    with np.errstate(invalid="ignore", divide="ignore"):
+        taps = ((2.0 - phase**2) * np.sin(phase) - 2.0 * phase * np.cos(phase)) / (np.pi * n.astype(float) ** 3)
+    taps = np.where(n == 0, -(turn**3) / (3.0 * np.pi), taps) * window
+    constant = np.sinc(2.0 * cut * n) * window
+    taps -= taps.sum() * constant / constant.sum()
+    return np.asarray(taps * (2.0 / (taps @ n**2)))
 
 
 def differentiator_lost(rate_hz: float, order: int) -> int:
     """Samples at each end for which `differentiate` has no full support (Kaiser's length for a transition `band`)."""
     if order == 0:
         return 0
-    return int(np.ceil((STOP_BAND_DB - 8.0) / (2.285 * 2 * np.pi * _differentiated_band(rate_hz)) / 2))
+    return int(
+        np.ceil((STOP_BAND_DB[order] - 8.0) / (2.285 * 2 * np.pi * differentiated_band_hz(rate_hz) / rate_hz) / 2)
+    )
 
 
-def _differentiated_band(rate_hz: float) -> float:
-    """Of the sampling rate, up to where a derivative is right."""
-    return min(DIFFERENTIATED_BAND_HZ / rate_hz, DIFFERENTIATED_BAND_LARGEST)
+def differentiated_band_hz(rate_hz: float) -> float:
+    """Up to where a derivative is right."""
+    return min(DIFFERENTIATED_BAND_HZ, DIFFERENTIATED_BAND_LARGEST * rate_hz)
 
 
 def _horner(sums: Array, fraction: Array) -> tuple[Array, Array]:

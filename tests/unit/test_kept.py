@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import msgspec
 import pytest
 
 from agent.config import Channel, parse_config
@@ -77,3 +78,17 @@ def test_a_state_of_an_earlier_version_says_nothing_of_its_mount() -> None:
     for name in ("poses", "positions", "clamp_theta_deg", "reference"):
         del state["basis"][name]
     assert take_up(pack(state), channel(UP), None).reason == RESTORED
+
+
+def test_a_field_that_the_earlier_version_did_not_have_counts_with_its_default() -> None:
+    def of_earlier(section: str, field: str) -> bytes:
+        state = unpack(state_of(channel(UP)))
+        fields = msgspec.json.decode(state["basis"][section])
+        del fields[field]
+        state["basis"][section] = msgspec.json.encode(fields).decode()
+        return pack(state)
+
+    for section, field in (("prior", "u_offset_mps2"), ("certificate", "u_lag_s"), ("uncertainty", "lag_s")):
+        assert take_up(of_earlier(section, field), channel(UP), None).reason == RESTORED
+    stated = channel(UP, certificate={"u_lag_s": 1e-3})
+    assert take_up(of_earlier("certificate", "u_lag_s"), stated, None).reason.endswith("have changed: certificate")

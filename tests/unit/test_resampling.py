@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.signal.resampling import differentiate, resample
+from calib.signal.resampling import differentiate, differentiated_band_hz, resample
 from calib.signal.stamps import clock_from_stamps
 
 RATE_HZ = 1000.0
@@ -73,3 +73,31 @@ def test_differentiation_damps_what_is_above_the_band() -> None:
     t = np.arange(4000) / 1000.0
     acceleration, lost = differentiate(np.sin(2 * np.pi * 130 * t)[:, None], 1000.0)
     assert np.abs(acceleration[lost:-lost]).max() < 1e-3 * 2 * np.pi * 130
+
+
+@pytest.mark.parametrize("rate_hz", [10.0, 25.0, 50.0, 1000.0])
+@pytest.mark.parametrize("of_band", [0.02, 0.1, 0.5, 1.0])
+def test_displacement_becomes_acceleration(rate_hz: float, of_band: float) -> None:
+    t = np.arange(4000) / rate_hz
+    omega = 2 * np.pi * of_band * differentiated_band_hz(rate_hz)
+    acceleration, lost = differentiate(-np.sin(omega * t)[:, None] / omega**2, rate_hz, 2)
+    inner = slice(lost, -lost)
+    assert np.abs(acceleration[inner, 0] - np.sin(omega * t[inner])).max() < 5e-5
+
+
+def test_the_acceleration_of_a_parabola_is_exact_far_from_zero() -> None:
+    t = np.arange(4000) / 50.0
+    acceleration, lost = differentiate(np.column_stack([100.0 + 3.0 * t, 0.25 * t**2]), 50.0, 2)
+    inner = acceleration[lost:-lost]
+    np.testing.assert_allclose(inner, np.tile([0.0, 0.5], (len(inner), 1)), rtol=0, atol=1e-8)
+
+
+def test_a_second_derivative_damps_what_is_above_the_band() -> None:
+    t = np.arange(4000) / 1000.0
+    acceleration, lost = differentiate(np.sin(2 * np.pi * 110 * t)[:, None], 1000.0, 2)
+    assert np.abs(acceleration[lost:-lost]).max() < 3e-6 * (2 * np.pi * 110) ** 2
+
+
+def test_another_order_is_refused() -> None:
+    with pytest.raises(ValueError, match="a derivative of order 3 is not known, only of order 1 and 2"):
+        differentiate(np.zeros((4000, 1)), 1000.0, 3)

@@ -113,13 +113,19 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("header", "channels", "velocity"), [("time_s,a", 1, False), ("time_s,v", 1, True), ("ax,ay,az,time_s", 3, False)]
+    ("header", "channels", "quantity"),
+    [
+        ("time_s,a", 1, "acceleration"),
+        ("time_s,v", 1, "velocity"),
+        ("time_s,d", 1, "displacement"),
+        ("ax,ay,az,time_s", 3, "acceleration"),
+    ],
 )
-def test_references(tmp_path: Path, header: str, channels: int, velocity: bool) -> None:
+def test_references(tmp_path: Path, header: str, channels: int, quantity: str) -> None:
     fields = header.split(",")
     text = header + "\n" + "".join(",".join(str(k if f == "time_s" else 7) for f in fields) + "\n" for k in range(3))
     table = read_reference(write(tmp_path, text))
-    assert (table.x.shape, table.quantity == "velocity") == ((3, channels), velocity)
+    assert (table.x.shape, table.quantity) == ((3, channels), quantity)
     np.testing.assert_array_equal(table.x, 7)
     np.testing.assert_array_equal(table.time_s, [0, 1, 2])
 
