@@ -1,4 +1,4 @@
-"""The newest samples of one device, with the clock that says when each was taken."""
+"""The newest samples of one device, and the clock model that gives the time of each sample."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from calib.signal.samples import Samples
 from calib.signal.timing import HORIZON_S, ClockFit, ClockModel
 from hw.block import BlockFlags, SampleBlock
 
-# Times its nominal rate, more than any clock is off: a count in microseconds, say, is none of samples, and the holes
-# in it would fill the memory.
+# Largest rate of sample numbers, as a multiple of the nominal rate. A faster count is no count of samples but, for
+# example, of microseconds; filling the gaps between its numbers would use up the memory.
 FASTEST = 10.0
 
 
 class DeviceStream:
-    """Blocks of one device as they come, forgotten when `forget_before` says so.
+    """Holds the blocks of one device until `forget_before` drops them.
 
-    Times are seconds since the run's origin on the gateway's monotonic clock. A RESTART (the index does not go on in
-    time) empties the buffer and starts the clock model anew.
+    Times are seconds since the run's origin on the gateway's monotonic clock. After a RESTART (the sample index does
+    not continue) the buffer is emptied and the clock model begins again.
     """
 
     def __init__(self, name: str, origin_ns: int, horizon_s: float = HORIZON_S) -> None:
-        """`horizon_s`: how far back the clock model must know the times."""
+        """`horizon_s`: the clock model must give times this far back."""
         self._name = name
         self._origin_ns = origin_ns
         self._horizon_s = horizon_s
         self._blocks: deque[SampleBlock] = deque()
         self._clock: ClockModel | None = None
-        self._fitted: ClockFit | None = None  # the clock model's result, until the next block
+        self._fitted: ClockFit | None = None  # result of the clock model, valid until the next block
         self.newest_arrival_s: float | None = None
         self.first_sample_s: float | None = None
 
@@ -52,24 +52,25 @@ class DeviceStream:
 
     @property
     def nominal_rate_hz(self) -> float | None:
-        """As the newest block tells it; None before any."""
+        """Of the newest block; None before the first block."""
         return self._blocks[-1].nominal_rate_hz if self._blocks else None
 
     def reaches(self, time_s: float) -> bool:
-        """Whether samples up to `time_s` are there."""
-        # A sample never arrives before it was taken: as long as nothing arrived since, the clock need not be asked.
+        """Whether all samples up to `time_s` have arrived."""
+        # A sample never arrives before it was taken. If nothing has arrived since `time_s`, no fit of the clock is
+        # needed.
         if self.newest_arrival_s is None or self.newest_arrival_s < time_s or not self._blocks:
             return False
         newest = self._blocks[-1]
         return bool(self._fit().time_of(newest.first_index + newest.n - 1) >= time_s)
 
     def taken_at(self, index: int) -> tuple[float, float]:
-        """(time in s since the origin, rate in Hz) of a sample, by the clock as it is now."""
+        """(time in s since the origin, rate in Hz) of a sample, by the present fit of the clock."""
         clock = self._fit()
         return float(clock.time_of(index)), clock.rate_hz
 
     def clock(self) -> tuple[ClockFit, Array]:
-        """The clock as it is now, and how late each burst behind it arrived (B,) in s. There must be a block."""
+        """The present fit of the clock, and by how much each of its bursts arrived late (B,) in s. Needs a block."""
         clock = self._fit()
         assert self._clock is not None
         return clock, self._clock.lateness_s(clock)
@@ -81,7 +82,7 @@ class DeviceStream:
         return self._fitted
 
     def cut(self, start_s: float, stop_s: float) -> Samples | None:
-        """All samples with start_s <= t < stop_s by the clock model as it is now; None if there are none."""
+        """All samples with start_s <= t < stop_s by the present fit of the clock; None if there are none."""
         if not self._blocks:
             return None
         clock, rate_hz, axes = self._fit(), self._blocks[-1].nominal_rate_hz, self._blocks[-1].indications.shape[1]
@@ -108,12 +109,12 @@ class DeviceStream:
         return Samples(self._name, first, held, clock, saturated, in_time, degc)
 
     def forget_before(self, time_s: float) -> None:
-        """Drop whole blocks that ended before `time_s` (by arrival, which is never early)."""
+        """Drop whole blocks that arrived before `time_s`; their samples are older still."""
         while len(self._blocks) > 1 and (self._blocks[0].t_monotonic_ns - self._origin_ns) * 1e-9 < time_s:
             self._blocks.popleft()
 
     def clear(self) -> None:
-        """Drop all samples: they are of another device than the next ones."""
+        """Drop all samples, because the next ones come from another device."""
         self._blocks.clear()
 
     def snapshot(self) -> dict[str, Any]:
@@ -127,7 +128,7 @@ class DeviceStream:
 
     @classmethod
     def restore(cls, name: str, origin_ns: int, state: dict[str, Any], horizon_s: float = HORIZON_S) -> DeviceStream:
-        """The stream whose `snapshot` this is."""
+        """The stream from its `snapshot`."""
         stream = cls(name, origin_ns, horizon_s)
         if state["clock"] is not None:
             stream._clock = ClockModel.restore(state["clock"])
