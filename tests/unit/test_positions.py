@@ -182,7 +182,7 @@ def test_an_operators_pose_holds_until_the_next_change() -> None:
     ("keys", "words"),
     [
         ({"coupling": "ac"}, "does not measure"),
-        ({"poses": [{"start_s": 0, "stop_s": 9, "gravity_mps2": [0, 0, 9.8]}]}, "give only one of positions, poses and rotation"),
+        ({"poses": [{"start_s": 0, "stop_s": 9, "gravity_mps2": [0, 0, 9.8]}]}, "give only one of positions"),
         ({"positions": [{"gravity_mps2": [0, 0, 9.8]}]}, "there is only one"),
         ({"positions": [{"gravity_mps2": [0, 0, 9.8]}, {"gravity_mps2": [0.1, 0, 9.8]}]}, "positions.0 and"),
         ({"positions": [{"gravity_mps2": [0, 0, 9.8]}, {"gravity_mps2": [0, 0, 0]}]}, "positions.1"),
