@@ -259,7 +259,7 @@ def bad_inputs(recorded: Path, folder: Path) -> dict[str, tuple[list[str | Path]
         "damaged recording": ([folder / "damaged.mcap"], "damaged.mcap: the recording is damaged at "),
         "mixture": ([good, recorded], "the inputs are of several kinds"),
         "sensor": ([recorded, "--sensor", "other"], "there is no sensor 'other'; the sensors are: mems"),
-        "unit": ([good, "--unit", "count"], "one unit of the indications, here are count, mV"),
+        "unit": ([good, "--unit", "count"], "must have one unit, but here are count, mV"),
     }
 
 
@@ -295,7 +295,7 @@ def test_without_matplotlib_the_extra_is_named(
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     status, said = run(capsys, write(tmp_path / "r.json"), "-o", tmp_path / "out")
     assert status == 1
-    assert said == "fieldcal report: figures need matplotlib: pip install 'fieldcal[report]'\n"
+    assert said == "fieldcal report: the figures need matplotlib; install it with: pip install 'fieldcal[report]'\n"
 
 
 def test_what_stands_in_the_data_cannot_break_the_page(tmp_path: Path) -> None:
