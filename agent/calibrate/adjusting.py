@@ -1,4 +1,4 @@
-"""`fieldcal calibrate` without --plain: the adjustment of all windows, and the norm fit where only rests are known."""
+"""`fieldcal calibrate` without --plain: the adjustment of all windows, and the norm fit if there are only rests."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from calib.signal.stamps import clock_from_stamps
 
 
 def adjusted(files: Files, priors: Priors) -> Outcome:
-    """Windows without lag, then their adjustment."""
+    """Make windows with the lag taken out, and adjust them."""
     applied = Applied(0.0, priors.reference_corner_at_hz, priors.sensor_corner_at_hz)
-    latest: dict[float, Adjustment] = {}  # by the lag that was taken out
+    latest: dict[float, Adjustment] = {}  # key: the lag that was taken out
 
     def at(windows: Sequence[Window], lag_s: float) -> Adjustment:
         if lag_s not in latest:
@@ -44,9 +44,10 @@ def _used(windows: Sequence[Window]) -> list[Window]:
 
 
 def norm_fitted(sensor: SensorTable, options: dict[str, Any]) -> Outcome:
-    """Rests found in the sensor's file, gravity's magnitude all that is known: S upper triangular, the frame free.
+    """Fit to rests that are found in the sensor's file. Only the magnitude of gravity is known, so the frame is free
+    and S is upper triangular.
 
-    Raises TableError where --prior cannot be read.
+    Raises TableError if --prior cannot be read.
     """
     priors = priors_of(options)
     clock = clock_from_stamps(sensor.time_s)

@@ -20,20 +20,22 @@ SOLVE = {"1": method1.solve, "2": method2.solve}
 
 
 def by_amplitudes(files: Files, options: dict[str, Any]) -> Outcome:
-    """Method 1 or 2 on every used window in motion, windows of one position being repetitions.
+    """Method 1 or 2 on every used window with motion. Windows of one position are repetitions.
 
-    Raises click.UsageError for --plain, which is Method 3's, and for a tri-axial reference, TableError where --prior
-    cannot be read.
+    Raises click.UsageError for --plain, which is for Method 3 only, and for a tri-axial reference. Raises TableError if
+    --prior cannot be read.
     """
     if options["plain"]:
-        raise click.UsageError("--plain belongs to Method 3")
+        raise click.UsageError("--plain is for Method 3 only; remove --plain or --method")
     priors = priors_of(options)
     pairs = list(files.runs())
     windows = [window for _, window in pairs]
-    # what the front end has made of a velocity is an acceleration already
+    # the front end has already converted a velocity to an acceleration
     method = options["method"]
     if any(p.u.shape[1] != 1 for p, _ in pairs):
-        raise click.UsageError(f"--method {method} needs a uniaxial --reference")
+        raise click.UsageError(
+            f"--method {method} needs a uniaxial --reference, but this one is tri-axial; use --method 3"
+        )
     runs = [Run(p.time_s, p.u[:, 0], p.V, w.pose) for p, w in pairs if w.used]
     if not runs:
         return nothing_used(windows, files.rate_hz, method)
@@ -62,7 +64,7 @@ def by_amplitudes(files: Files, options: dict[str, Any]) -> Outcome:
 
 
 def _appendix_a(found: AmplitudeCalibration) -> dict[str, Any]:
-    """Appendix A: by parameter one entry a run; rel_S where transverse sensitivities are seen."""
+    """Appendix A: for each parameter one entry per run; rel_S if transverse sensitivities are determined."""
     statistics: dict[str, Any] = {
         PARAMETERS[3 * i + j]: [
             {"n": r.n, "mean": r.mean, "standard_deviation": r.standard_deviation, "s_rel_pct": r.s_rel_pct}

@@ -1,4 +1,4 @@
-"""What `fieldcal calibrate` makes of its options: files to windows, windows to an outcome."""
+"""Carries out `fieldcal calibrate`: reads the files, makes windows, and chooses the estimator by the options."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from calib.geometry import STANDARD_GRAVITY_MPS2
 from calib.paper.method3 import PLAIN, fit, refusal
 from calib.signal.instrument import Instrument
 
-BAR_FROM_BYTES = 30_000_000  # shorter files are read before a bar could be of use
-COVERAGE_FACTOR = 2.0  # of plain Method 3: thousands of points, as the paper has it
+BAR_FROM_BYTES = 30_000_000  # smaller files are read too fast for a progress bar
+COVERAGE_FACTOR = 2.0  # of plain Method 3, as in the paper: there are thousands of points
 
 
 def calibrated(options: dict[str, Any]) -> Outcome:
-    """What the files say. Raises TableError, click.UsageError."""
+    """The outcome for these options. Raises TableError and click.UsageError."""
     _check(options)
     if not options["reference"] and not options["poses"] and not options["plain"]:
         return norm_fitted(read_sensor(options["sensor"]), options)
@@ -41,9 +41,9 @@ def calibrated(options: dict[str, Any]) -> Outcome:
 
 
 def read_files(options: dict[str, Any], instrument: Instrument | None = None) -> Files:
-    """Tables, clocks and poses of the files named. Raises TableError.
+    """Read the named files: tables, clocks and poses. Raises TableError.
 
-    `instrument` as `instrument_of` gives it; None: without the corners of AC-coupled instruments.
+    `instrument` is from `instrument_of`. With None, corner frequencies of AC-coupled instruments are not used.
     """
     paths = [options[name] for name in ("sensor", "reference") if options[name]]
     size = sum(path.stat().st_size for path in paths if path.is_file())
@@ -62,13 +62,19 @@ def read_files(options: dict[str, Any], instrument: Instrument | None = None) ->
 
 def _check_quantity(reference: ReferenceTable, instrument: Instrument, stated: str | None) -> None:
     if stated and reference.quantity != stated:
-        raise TableError(f"{reference.path}, line 1: column {reference.column} is no {stated}")
+        raise TableError(
+            f"{reference.path}, line 1: column {reference.column} holds {reference.quantity}, "
+            f"but --reference-quantity says {stated}"
+        )
     if instrument.derivatives and instrument.has_corner:
-        raise TableError(f"{reference.path}: a {reference.quantity} reference has no corner frequency to undo")
+        raise TableError(
+            f"{reference.path}: a {reference.quantity} reference takes no corner "
+            "frequency; leave out the corner options"
+        )
 
 
 def setting_of(options: dict[str, Any], reference: ReferenceTable | None) -> Setting:
-    """What holds in every pose."""
+    """The settings that apply to every pose."""
     channels = 0 if reference is None else reference.x.shape[1]
     return Setting(
         gravity_mps2=options["gravity_mps2"] or STANDARD_GRAVITY_MPS2,
@@ -82,11 +88,15 @@ def setting_of(options: dict[str, Any], reference: ReferenceTable | None) -> Set
 
 def _poses(options: dict[str, Any], setting: Setting, reference: ReferenceTable | None) -> list[PoseInterval]:
     if options["rotation"] and setting.reference_channels != 3:
-        raise click.UsageError("--rotation turns a tri-axial --reference, this one has one axis")
+        raise click.UsageError(
+            "--rotation is for a tri-axial --reference, but this one has one axis; remove --rotation"
+        )
     if options["poses"]:
         return read_poses(options["poses"], setting)
     if reference is None or setting.reference_channels != 3:
-        raise click.UsageError("--poses is needed")
+        raise click.UsageError(
+            "--poses is missing; only a tri-axial --reference, or rests without a reference, need no poses"
+        )
     try:
         pose = beside_reference(setting)
     except ValueError as error:
@@ -95,13 +105,13 @@ def _poses(options: dict[str, Any], setting: Setting, reference: ReferenceTable 
 
 
 def _check(options: dict[str, Any]) -> None:
-    """What click cannot see: options that need or exclude each other."""
+    """Check options that need or exclude each other, which click cannot do. Raises click.UsageError."""
     if (options["nominal"] is None) != (options["u_nominal_pct"] is None):
-        raise click.UsageError("--nominal and --u-nominal-pct go together")
+        raise click.UsageError("--nominal and --u-nominal-pct must be given together")
     if options["nominal"] is not None and options["prior"]:
-        raise click.UsageError("give one of --nominal and --prior")
+        raise click.UsageError("give --nominal or --prior, not both")
     if options["rotation"] and not options["reference"]:
-        raise click.UsageError("--rotation turns a tri-axial --reference")
+        raise click.UsageError("--rotation needs a tri-axial --reference")
     if options["method"] != "3" and not (options["reference"] and options["poses"]):
         raise click.UsageError(f"--method {options['method']} needs --reference and --poses")
 
@@ -112,7 +122,7 @@ def _rotation(text: str | None) -> np.ndarray[Any, np.dtype[np.float64]] | None:
     try:
         return np.array([float(part) for part in text.split(",")]).reshape(3, 3)
     except ValueError:
-        raise click.BadParameter(f"{text!r} is not nine numbers r11,r12,...,r33", param_hint="--rotation") from None
+        raise click.BadParameter(f"{text!r} must be nine numbers r11,r12,...,r33", param_hint="--rotation") from None
 
 
 def _plain(files: Files, priors: Priors) -> Outcome:
@@ -139,7 +149,7 @@ def _plain(files: Files, priors: Priors) -> Outcome:
 
 
 def _bar(label: str, length: int) -> AbstractContextManager[Any]:
-    """A progress bar on a terminal; without a length nothing. What it yields is called with steps."""
+    """A progress bar on a terminal, or nothing if `length` is 0. The context gives a function that takes each step."""
     if not length or not sys.stderr.isatty():
         return nullcontext(None)
     return _Bar(click.progressbar(length=length, label=label, file=sys.stderr))

@@ -1,4 +1,4 @@
-"""Decimals out of text at the speed of memory: eight digits at a time in the bytes of one machine word.
+"""Reads decimal numbers from text fast: eight digits at a time, in the bytes of one machine word.
 
 `float` and numpy's readers take 25 to 40 MB of CSV a second, this takes 150; an hour of 1 kHz has 150 MB. Numbers of
 up to 15 digits come out as `float` gives them, longer ones to two units in the last place.
@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 
 COMMA, NEWLINE, POINT, MINUS = b",\n.-"
 WORD = 8  # digits
-LONGEST_WHOLE, LONGEST_FRACTION = 16, 24  # digits; what is longer is left to others
-EXACT = 15  # digits that a double holds, and so does their quotient by a power of ten
+LONGEST_WHOLE, LONGEST_FRACTION = 16, 24  # digits; longer numbers are read by numpy
+EXACT = (
+    15  # a whole number of so many digits, and its quotient by a power of ten, are exact to the last bit of a double
+)
 ZEROS = np.uint64(0x3030303030303030)
 POWERS = 10.0 ** np.arange(LONGEST_FRACTION + 1)
 
@@ -20,7 +22,7 @@ Positions = NDArray[np.int64]
 Words = NDArray[np.uint64]
 
 
-class _NotDecimal(Exception):  # noqa: N818 - no error, a way out
+class _NotDecimal(Exception):  # noqa: N818 - not an error: it ends the fast path
     pass
 
 
@@ -45,7 +47,7 @@ def decimals(text: bytes, columns: int) -> NDArray[np.float64] | None:
     whole, fraction = points - starts, np.maximum(ends - points - 1, 0)
     if whole.max() > LONGEST_WHOLE or fraction.max() > LONGEST_FRACTION or (whole + fraction).min() < 1:
         return None
-    # word k holds the eight bytes from k on, the first in its lowest byte
+    # word k holds the eight bytes from position k; the first of them is its lowest byte
     words = np.ndarray((len(raw) - WORD + 1,), "<u8", raw, 0, (1,))
     try:
         values = _value(words, points, ends, whole, fraction)
@@ -56,7 +58,7 @@ def decimals(text: bytes, columns: int) -> NDArray[np.float64] | None:
 
 
 def _points(raw: NDArray[np.uint8], ends: Positions) -> Positions | None:
-    """Where each field's decimal point is, its end where it has none; None where a field has two."""
+    """Position of the decimal point of each field, or of its end without a point. None if a field has two points."""
     points = np.flatnonzero(raw == POINT)
     if len(points) == len(ends) and (points < ends).all() and (points[1:] > ends[:-1]).all():
         return points
@@ -84,7 +86,7 @@ def _value(
             value = value * POWERS[fraction] + _digits(words, ends, fraction)
         return np.asarray(value / POWERS[fraction])
     part = np.zeros(len(ends))
-    for low in range(0, longest, WORD):  # digits from the last ones on, `low` of them taken before
+    for low in range(0, longest, WORD):  # from the last digits to the first; `low` digits are done
         count = np.clip(fraction - low, 0, WORD)
         part += _digits(words, np.maximum(ends - low, 2 * WORD), count) / POWERS[np.maximum(fraction - low, 0)]
     return np.asarray(value + part)

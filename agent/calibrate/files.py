@@ -1,4 +1,4 @@
-"""From files to windows: clocks out of the stamps, the poses cut into pieces, the front end on each."""
+"""Makes windows from files: fits clocks to the stamps, cuts the poses into pieces, and runs the front end on each."""
 
 from __future__ import annotations
 
@@ -28,12 +28,15 @@ from calib.model import Array, Window
 from calib.signal.instrument import Instrument
 from calib.signal.samples import Samples
 
-GUARD_S = 0.1  # left out at both ends of a pose: hands, and what the clocks do not know
+GUARD_S = 0.1  # not used at both ends of a pose, because of handling and of errors of the clocks
 
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """How windows are made of files. Method 3 as printed takes both files' clocks as they are: `align` False."""
+    """How windows are made from files.
+
+    `align` False takes the clocks of both files as they are, as printed Method 3.
+    """
 
     settings: Settings = DEFAULT_SETTINGS
     align: bool = True
@@ -41,9 +44,9 @@ class Options:
 
 
 class Files:
-    """Windows of a sensor's file, a reference's file and the poses; they can be made again with another lag.
+    """Makes windows from the sensor's file, the reference's file and the poses, as often as needed with another lag.
 
-    `instrument` describes the reference. Raises TableError where files do not overlap in time.
+    `instrument` describes the reference. Raises TableError if the files do not overlap in time.
     """
 
     def __init__(
@@ -59,19 +62,19 @@ class Files:
         self._sensor = FileStream(str(sensor.path), sensor.time_s, sensor.v)
         self._reference = None if reference is None else FileStream(str(reference.path), reference.time_s, reference.x)
         self._instrument = instrument
-        self.drift: Drift | None = None  # of the sensor's clock against the reference's, once windows were made
+        self.drift: Drift | None = None  # of the sensor's clock against the reference's; None until windows were made
         self.poses = poses
 
     @property
     def rate_hz(self) -> float:
-        """Of the sensor, as its stamps tell."""
+        """Rate of the sensor from its stamps."""
         return self._sensor.clock.rate_hz
 
     def windows(self, lag_s: float = 0.0, progress: Callable[[float], Any] | None = None) -> list[Window]:
-        """All windows in order of the poses, used or not. The sensor's indications are taken to lag by `lag_s`.
+        """All windows in the order of the poses, used or not. `lag_s` is the lag of the sensor's indications.
 
-        Where the two clocks run apart, that is found the first time and taken out. `progress` is called with the
-        seconds of recording just done.
+        The first call finds whether the two clocks have different rates, and corrects that. `progress` is called with
+        the seconds of recording that were just done.
         """
         found = self._made(lag_s, progress)
         if self._options.align and self._reference is not None and self.drift is None:
@@ -86,7 +89,7 @@ class Files:
         windows: list[Window] = []
         for interval in self.poses:
             found = [w for piece in self._pieces(interval) for w in self._windows(interval, *piece, lag_s, floor)]
-            windows += found or [_nothing(interval, "no samples of sensor and reference in this pose")]
+            windows += found or [_nothing(interval, "no samples of the sensor, or none of the reference, in this pose")]
             if progress is not None:
                 progress(interval.stop_s - interval.start_s)
         return windows
@@ -115,7 +118,7 @@ class Files:
         return sensor, self._reference.cut(start_s - around_s, stop_s + around_s)
 
     def runs(self) -> Iterator[tuple[Points, Window]]:
-        """Windows in motion with all their samples, unfiltered, for methods that need more than sums."""
+        """Windows with motion and all their samples, not filtered, for methods that need more than sums."""
         settings = self._options.settings
         for interval in self.poses:
             for piece in self._pieces(interval):
@@ -130,7 +133,10 @@ class Files:
                     yield found.points.part(first, stop), window
 
     def points(self, interval: PoseInterval, start_s: float, stop_s: float, lag_s: float = 0.0) -> Points | None:
-        """Samples of the sensor from `start_s` to `stop_s`; with a reference those that have one, when they felt it."""
+        """Samples of the sensor from `start_s` to `stop_s`.
+
+        With a reference: those with a reference value, at its times.
+        """
         if interval.pose.direction.shape[1]:
             found = self._aligned(interval, start_s, stop_s, lag_s, limit_band=self._options.settings.limit_band)
             return None if found is None else found.points
@@ -150,7 +156,7 @@ class Files:
         return aligned(sensor, reference, self._instrument, (start_s, stop_s), lag_s, limit_band=limit_band)
 
     def _rest_floor(self) -> Array | None:
-        """The sensor's usual noise at rest, over all static poses."""
+        """The usual noise of the sensor at rest: the median over all static poses."""
         found = []
         for interval in self.poses:
             if interval.pose.direction.shape[1] == 0:
@@ -168,7 +174,7 @@ def _check_overlap(sensor: SensorTable, reference: ReferenceTable | None, poses:
         spans.append(("the poses", min(p.start_s for p in poses), max(p.stop_s for p in poses)))
     if max(s for _, s, _ in spans) >= min(e for _, _, e in spans):
         told = ", ".join(f"{name} from {start:.10g} s to {stop:.10g} s" for name, start, stop in spans)
-        raise TableError(f"no overlap in time: {told}")
+        raise TableError(f"the files do not overlap in time, so their times must be on one scale: {told}")
 
 
 def _nothing(interval: PoseInterval, reason: str) -> Window:

@@ -1,4 +1,4 @@
-"""Which files and options a result came from, so that a reader can find them and see that they are the same."""
+"""The files and options from which a result was made, so that a reader can find the files and check their content."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Any
 
 import msgspec
 
-FILES = ("sensor", "reference", "poses", "prior")  # options of `fieldcal calibrate` that name one
+FILES = ("sensor", "reference", "poses", "prior")  # options of `fieldcal calibrate` that name a file
 
 
 class SourceFile(msgspec.Struct, frozen=True):
-    """A file as it was read; `path` as it was given, `sha256` in hexadecimal."""
+    """A file that was read: `path` as the user gave it, `sha256` in hexadecimal."""
 
     path: str
     size_bytes: int
@@ -27,7 +27,7 @@ def source_file(path: Path) -> SourceFile:
 
 
 def origin(options: Mapping[str, Any]) -> dict[str, Any]:
-    """`options` as JSON has them, without the way the result is printed, and `files` that they name. Raises OSError."""
+    """`options`, without the one for the output format, and the `files` that they name. Raises OSError."""
     kept = {name: str(value) if isinstance(value, Path) else value for name, value in options.items()}
     kept.pop("json_to", None)
     return {

@@ -1,4 +1,4 @@
-"""The outcome of `fieldcal calibrate`: the JSON object of the contract, and the same for people."""
+"""The outcome of `fieldcal calibrate`, as the JSON object of docs/calibrate.md and as text for people."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from agent.terminal.quantity import plus_minus
 from calib.model import PARAMETERS, Array, Calibration, Window
 
 AXES = "xyz"
-FILE_WIDTH = 120  # columns where the output is no terminal and tells none
+FILE_WIDTH = 120  # columns if the output is no terminal
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +31,7 @@ class NuisanceValue:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outcome:
-    """What the data say; `calibration` is None where they are refused, and `reasons` then say why."""
+    """The outcome of a calibration. If the data are refused, `calibration` is None and `reasons` say why."""
 
     calibration: Calibration | None
     reasons: tuple[str, ...]
@@ -49,19 +49,19 @@ class Outcome:
 
 
 def nothing_used(windows: Sequence[Window], rate_hz: float, method: str) -> Outcome:
-    """The outcome where no window can be used: how many there were, and what is wrong with the first that should."""
+    """The outcome if no window can be used. Its reason names the number of windows, and why the first is not used."""
     wanted = [w for w in windows if w.kind != "quiet"] or windows
-    first = f", the first ({wanted[0].pose.position}): {wanted[0].reason}" if wanted else ""
-    return Outcome(None, (f"no window can be used, of {len(wanted)}{first}",), windows, rate_hz, method)
+    first = f"; the first of them ({wanted[0].pose.position}): {wanted[0].reason}" if wanted else ""
+    return Outcome(None, (f"none of the {len(wanted)} windows can be used{first}",), windows, rate_hz, method)
 
 
 def as_json(outcome: Outcome) -> str:
-    """One JSON object; what is not known is null."""
+    """One JSON object, with null for values that are not known."""
     return msgspec.json.encode(_plain(as_object(outcome))).decode()
 
 
 def as_object(outcome: Outcome) -> dict[str, Any]:
-    """The members of the contract, then more."""
+    """The members of the JSON object: those that every outcome has, then those of the method."""
     c = outcome.calibration
     nothing = np.full(12, np.nan)
     values = nothing if c is None else np.append(c.sensitivity.ravel(), c.offset)
@@ -94,7 +94,7 @@ def as_object(outcome: Outcome) -> dict[str, Any]:
 
 
 def _parts(values: Array | np.ndarray[Any, np.dtype[np.bool_]]) -> dict[str, Any]:
-    """(12,) in the order of calib.model.PARAMETERS as S and Q."""
+    """S and Q from (12,) in the order of calib.model.PARAMETERS."""
     return {"sensitivity": values[:9].reshape(3, 3), "offset": values[9:]}
 
 
@@ -113,7 +113,7 @@ def _window(window: Window) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """JSON's own types; what is no finite number is null."""
+    """Converts to types that JSON has. A number that is not finite becomes null."""
     if isinstance(value, Mapping):
         return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):
@@ -124,7 +124,7 @@ def _plain(value: Any) -> Any:
 
 
 def print_outcome(outcome: Outcome) -> None:
-    """S and Q with their expanded uncertainties, the windows and what they were found fit for."""
+    """Print the windows with their verdicts, and S and Q with their expanded uncertainties."""
     from rich.console import Console
 
     console = Console(highlight=False, markup=False, width=None if sys.stdout.isatty() else FILE_WIDTH)
@@ -158,7 +158,10 @@ def _print_calibration(console: Any, outcome: Outcome) -> None:
 
 
 def _print_sources(console: Any, outcome: Outcome) -> None:
-    """Where the uncertainty of the least known main sensitivity and offset comes from, sources above a tenth of it."""
+    """Print the sources of the uncertainty of the main sensitivity with the largest u, and of such an offset.
+
+    Sources below a tenth of that u are left out.
+    """
     assert outcome.calibration is not None
     u = outcome.calibration.standard_uncertainty
     for group in ([0, 4, 8], [9, 10, 11]):
@@ -179,7 +182,7 @@ def _of(source: Mapping[str, float] | Array, k: int) -> float:
 def _cell(value: float, expanded: float, determined: bool) -> str:
     if not determined:
         return "not determined"
-    return "0" if value == expanded == 0.0 else plus_minus(value, expanded)  # 0 by choice of the frame
+    return "0" if value == expanded == 0.0 else plus_minus(value, expanded)  # 0 because the frame was chosen so
 
 
 def _print_windows(console: Any, windows: Sequence[Window]) -> None:

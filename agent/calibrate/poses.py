@@ -1,4 +1,4 @@
-"""Reads poses.csv, and makes of its lines, the reference's kind and the options what the sensor feels."""
+"""Reads poses.csv. The pose of each line also depends on the kind of the reference and on the options."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from calib.model import Array, Pose
 CLAMP, DIRECTION, AXIS, GRAVITY = ("theta_deg", "alpha_deg"), ("dx", "dy", "dz"), ("axis",), ("gx", "gy", "gz")
 FORMS = (CLAMP, DIRECTION, AXIS, GRAVITY)
 TOGETHER = ([DIRECTION, GRAVITY], [AXIS, GRAVITY])
-LEAST_GRAVITY_MPS2, MOST_GRAVITY_MPS2 = 9.65, 9.95  # on Earth 9.76 to 9.84; components may be rounded to 0.05
+LEAST_GRAVITY_MPS2, MOST_GRAVITY_MPS2 = 9.65, 9.95  # 9.76 to 9.84 on Earth; components may be rounded to 0.05
 NOT_FELT = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
 class PoseRow:
-    """One line of poses.csv: its number, from when to when in s, and the fields of its form."""
+    """One line of poses.csv: its number, start and stop in s, and the fields of its form."""
 
     line: int
     start_s: float
@@ -37,22 +37,22 @@ class PoseRow:
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """What holds in every pose: gravity there, the static sign of Eqs. (9)-(11), who feels gravity, the rotation.
+    """Settings for every pose: gravity, the static sign of Eqs. (9)-(11), the couplings, and the rotation.
 
-    `rotation` (3, 3): a tri-axial reference stands beside the sensor, a = R a_ref.
+    `rotation` (3, 3) is for a tri-axial reference beside the sensor: a = R a_ref.
     """
 
     gravity_mps2: float = STANDARD_GRAVITY_MPS2
     static_sign: int = 1
     coupling: Literal["dc", "ac"] = "dc"  # of the sensor
     reference_coupling: Literal["dc", "ac"] = "ac"
-    reference_channels: int = 1  # 0 without a reference
+    reference_channels: int = 1  # 0: there is no reference
     rotation: Array | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class PoseInterval:
-    """The sensor stands in `pose` from `start_s` to `stop_s`."""
+    """The sensor is in `pose` from `start_s` to `stop_s`."""
 
     start_s: float
     stop_s: float
@@ -71,13 +71,14 @@ def read_poses(path: Path, setting: Setting) -> list[PoseInterval]:
 
 
 def pose_of(row: PoseRow, setting: Setting) -> Pose:
-    """One line as a pose. Raises ValueError where it makes no sense with the setting."""
+    """One line as a pose. Raises ValueError if the line does not suit the setting."""
     stated = [row.values[name] for name in GRAVITY] if GRAVITY[0] in row.values else None
     gravity = _felt(stated, setting)
     if setting.reference_channels == 3:
         if CLAMP[0] in row.values or DIRECTION[0] in row.values or row.axis is not None:
             raise ValueError(
-                "a tri-axial reference needs no direction: give --rotation, and gx,gy,gz if it is AC-coupled"
+                "a tri-axial reference measures the direction itself: remove it here, and give --rotation, "
+                "and gx,gy,gz if the reference is AC-coupled"
             )
         return beside_reference(setting, stated)
     if CLAMP[0] in row.values:
@@ -91,42 +92,50 @@ def pose_of(row: PoseRow, setting: Setting) -> Pose:
     else:
         return _at_rest(stated, setting)
     if setting.reference_channels == 0:
-        raise ValueError("this pose is one of motion: --reference is needed")
+        raise ValueError(
+            "this pose states a direction of motion, so --reference is needed; for a rest give gx,gy,gz alone"
+        )
     return _without_what_the_reference_feels(pose) if setting.reference_coupling == "dc" else pose
 
 
 def beside_reference(setting: Setting, gravity: Sequence[float] | None = None) -> Pose:
-    """The pose beside a tri-axial reference; `gravity` as stated in poses.csv, if it is."""
+    """The pose beside a tri-axial reference; `gravity` is from poses.csv, None if it is not stated there."""
     if setting.rotation is None:
-        raise ValueError("a tri-axial reference needs --rotation")
+        raise ValueError("a tri-axial reference needs --rotation, its orientation against the sensor")
     if setting.coupling == "dc" and setting.reference_coupling == "dc":
         return beside(setting.rotation, NOT_FELT)
     if setting.coupling == "ac" and setting.reference_coupling == "dc":
-        return beside(setting.rotation)  # gravity is in the reference's mean alone
+        return beside(setting.rotation)  # only the mean of the reference contains gravity
     return beside(setting.rotation, _felt(gravity, setting))
 
 
 def _felt(stated: Sequence[float] | None, setting: Setting) -> Sequence[float] | None:
-    """Raises ValueError for a gravity that is none: in g, say, or in cm/s2."""
+    """Gravity that the sensor measures. Raises ValueError if its length is wrong, for example in g or in cm/s2."""
     if setting.coupling == "ac":
         return NOT_FELT
     if stated is not None and not LEAST_GRAVITY_MPS2 < math.hypot(*stated) < MOST_GRAVITY_MPS2:
         told = ", ".join(f"{g:.6g}" for g in stated)
-        raise ValueError(f"gx,gy,gz ({told}) has length {math.hypot(*stated):.6g} m/s2, gravity has 9.7 to 9.9 m/s2")
+        raise ValueError(
+            f"gx,gy,gz ({told}) has length {math.hypot(*stated):.6g} m/s2, but gravity has 9.7 to 9.9 m/s2"
+        )
     return stated
 
 
 def _at_rest(gravity: Sequence[float] | None, setting: Setting) -> Pose:
     assert gravity is not None
     if setting.coupling == "ac":
-        raise ValueError("an AC-coupled sensor does not feel gravity: a static position tells nothing")
+        raise ValueError(
+            "an AC-coupled sensor does not measure gravity, so a static position gives no information; remove it"
+        )
     if setting.reference_channels:
-        raise ValueError("gx,gy,gz alone is a static position, without --reference; add the direction of the motion")
+        raise ValueError(
+            "gx,gy,gz alone is a static position, which is for use without --reference; add the direction of motion"
+        )
     return at_rest(gravity)
 
 
 def _without_what_the_reference_feels(pose: Pose) -> Pose:
-    """A DC-coupled uniaxial reference feels gravity along its axis itself."""
+    """The pose without gravity along the axis of the reference, because a DC-coupled reference measures that itself."""
     d = pose.direction[:, 0]
     return replace(pose, gravity_mps2=pose.gravity_mps2 - d * float(d @ pose.gravity_mps2))
 
@@ -139,7 +148,7 @@ def read_rows(path: Path) -> list[PoseRow]:
             text = io.TextIOWrapper(file, encoding="utf-8", newline="")
             lines = [(n, row) for n, row in enumerate(csv.reader(text), start=2) if any(f.strip() for f in row)]
         except (UnicodeDecodeError, csv.Error) as error:
-            raise TableError(f"{path}: not text: {error}") from None
+            raise TableError(f"{path}: the file is not UTF-8 text with comma-separated fields: {error}") from None
     require(path, header, ("start_s", "stop_s"))
     forms = [form for form in FORMS if set(form) & set(header)]
     if len(forms) != 1 and forms not in TOGETHER:
@@ -151,12 +160,10 @@ def read_rows(path: Path) -> list[PoseRow]:
     rows = [_row(path, line, dict(zip(header, fields_of(path, line, row, header), strict=True)), names)
             for line, row in lines]  # fmt: skip
     if not rows:
-        raise TableError(f"{path}: no poses")
+        raise TableError(f"{path}: the file has no poses; add a line for each pose")
     for before, row in itertools.pairwise(sorted(rows, key=lambda row: row.start_s)):
         if row.start_s < before.stop_s:
-            both = (
-                f"from {row.start_s:g} s the sensor stands in this pose and, until {before.stop_s:g} s, in that of line"
-            )
+            both = f"this pose begins at {row.start_s:g} s, before {before.stop_s:g} s, the end of the pose in line"
             raise TableError(f"{path}, line {row.line}, column start_s: {both} {before.line}")
     return rows
 

@@ -1,4 +1,4 @@
-"""What the options of `fieldcal calibrate` say of the nuisances, and of S and Q beforehand, as priors."""
+"""Priors of the nuisances and of S and Q, from the options of `fieldcal calibrate`."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ from calib.estimate.quantities import PRIORS
 from calib.model import PARAMETERS, Array, Calibration
 from calib.signal.instrument import Instrument
 
-# Without a local value gravity is the standard one, which is up to 0.3 % off (poles and equator differ by 0.05 m/s2).
+# Without a stated local value, standard gravity is used. Its error is up to 0.3 %: gravity differs by 0.05 m/s2 between
+# the poles and the equator.
 U_STANDARD_GRAVITY_MPS2 = 0.03
-# A sensitivity this many standard uncertainties from what was known is another sensor, axis or reference; noise and
-# priors alone do it once in 370 times.
+# If a sensitivity differs from its prior by this many standard uncertainties, sensor, axis or reference is not the one
+# that was stated. Noise and the errors of priors alone cause this once in 370 times.
 CONTRADICTION = 3.0
 NOMINAL_TRANSVERSE = 0.03  # of the nominal sensitivity: data sheets of MEMS say 1 to 3 %
 
 
 def priors_of(options: dict[str, Any]) -> Priors:
-    """The options --u-..., --nominal and --prior as priors. Raises TableError where --prior cannot be read."""
+    """The options --u-..., --nominal and --prior as priors. Raises TableError if --prior cannot be read."""
     parameters, covariance = _known(options)
     told = options | {"u_gravity_mps2": u_gravity_mps2(options)}
     stated = {s.name: s.convert(told[s.option]) for s in PRIORS.values() if s.option}
@@ -32,7 +33,7 @@ def priors_of(options: dict[str, Any]) -> Priors:
 
 
 def instrument_of(options: dict[str, Any]) -> Instrument:
-    """What the options say of the reference and of corner frequencies; its file tells the quantity."""
+    """The reference and the corner frequencies by the options. The quantity comes from the file of the reference."""
     return Instrument(
         corner_hz=options["reference_corner_hz"],
         u_corner_hz=options["u_reference_corner_hz"],
@@ -50,7 +51,7 @@ def u_gravity_mps2(options: dict[str, Any]) -> float:
 
 
 def _known(options: dict[str, Any]) -> tuple[Array | None, Array | None]:
-    """S and Q known beforehand, (12,) and (12, 12), from --nominal or --prior."""
+    """Prior values (12,) and covariance (12, 12) of S and Q, from --nominal or --prior."""
     if options["nominal"] is not None:
         main, u = options["nominal"], options["u_nominal_pct"] / 100.0
         sd = main * np.where(np.eye(3).ravel() > 0, u, NOMINAL_TRANSVERSE)
@@ -61,7 +62,7 @@ def _known(options: dict[str, Any]) -> tuple[Array | None, Array | None]:
 
 
 def _read_prior(path: Path) -> tuple[Array, Array]:
-    """A result of this command: what it has as null is not known."""
+    """Values and covariance from a result of this command. A value that is null there is not known."""
     try:
         told = json.loads(path.read_text())
         values = np.append(np.array(told["sensitivity"], dtype=float).ravel(), np.array(told["offset"], dtype=float))
@@ -69,7 +70,7 @@ def _read_prior(path: Path) -> tuple[Array, Array]:
     except OSError as error:
         raise TableError(f"{path}: {error.strerror}") from None
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise TableError(f"{path}: not a result of fieldcal calibrate: {error}") from None
+        raise TableError(f"{path}: the file is not a result of `fieldcal calibrate --json -`: {error}") from None
     if values.shape != (12,) or covariance.shape != (12, 12):
         raise TableError(f"{path}: sensitivity must be 3 x 3, offset 3, covariance 12 x 12")
     unknown = ~(np.isfinite(values) & np.isfinite(np.diag(covariance)))
@@ -77,12 +78,12 @@ def _read_prior(path: Path) -> tuple[Array, Array]:
     covariance[unknown, unknown] = np.inf
     known = covariance[np.ix_(~unknown, ~unknown)]
     if not np.all(np.isfinite(known)) or (known.size and np.linalg.eigvalsh(known).min() <= 0.0):
-        raise TableError(f"{path}, covariance: not one: it has a direction of no or negative variance")
+        raise TableError(f"{path}, covariance: the matrix is not positive definite, so it is no covariance")
     return np.nan_to_num(values), covariance
 
 
 def contradictions(found: Calibration, priors: Priors) -> list[str]:
-    """Sensitivities that what was known of them (--nominal, --prior) contradicts, for methods that take no prior in."""
+    """Reasons for sensitivities that contradict --nominal or --prior, for methods that do not use a prior."""
     if priors.parameters is None or priors.covariance is None:
         return []
     u_known = np.sqrt(np.diag(priors.covariance))[:9]
@@ -91,7 +92,7 @@ def contradictions(found: Calibration, priors: Priors) -> list[str]:
 
 
 def row_contradictions(found: Calibration, priors: Priors) -> list[str]:
-    """The same where the frame is free: of S only the lengths of its rows are then comparable."""
+    """The same for a free frame, in which only the lengths of the rows of S can be compared."""
     if priors.parameters is None or priors.covariance is None:
         return []
     main = [0, 4, 8]
@@ -107,7 +108,7 @@ def _contradicted(names: Sequence[str], values: Array, u: Array, known: Array, u
         away = abs(values[k] - known[k]) / np.hypot(u[k], u_known[k])
         if away > CONTRADICTION:
             reasons.append(
-                f"{names[k]} is {values[k]:.4g}, {away:.1f} standard uncertainties from {known[k]:.4g} "
-                f"(u {u_known[k]:.3g}) as known before; {CONTRADICTION:g} at most"
+                f"{names[k]} is {values[k]:.4g}, {away:.1f} standard uncertainties from the prior value {known[k]:.4g} "
+                f"(u {u_known[k]:.3g}); at most {CONTRADICTION:g} are allowed: check sensor, axes and reference"
             )
     return reasons

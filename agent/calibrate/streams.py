@@ -1,4 +1,4 @@
-"""A file's samples as a stream: cut out by time, missing ones counted."""
+"""The samples of a file as a stream, from which intervals of time are cut. Missing samples are counted."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from calib.signal.timing import ClockFit
 
 
 class FileStream:
-    """Consecutive samples of a file, timed by the clock behind their stamps.
+    """Consecutive samples of a file, with times from the clock that is fitted to their stamps.
 
     `name` is the file's, for messages. `time_s` (n,) stamps, `values` (n, C); both may lie on disk.
     """
@@ -25,15 +25,15 @@ class FileStream:
 
     @property
     def axes(self) -> int:
-        """Columns of values."""
+        """Number of columns of values."""
         return int(self._values.shape[1])
 
     def stretch(self, rate: float, at_s: float) -> None:
-        """From now on the samples' times are on a scale that runs faster by `rate`, see ClockFit.stretched."""
+        """Change the times of the samples to a scale that runs faster by `rate`, see ClockFit.stretched."""
         self.clock = self.clock.stretched(rate, at_s)
 
     def cut(self, start_s: float, stop_s: float) -> Samples | None:
-        """The samples taken from `start_s` to before `stop_s`, rows of NaN where one is missing; None for none."""
+        """The samples with start_s <= t < stop_s, a row of NaN for each missing one; None if there are no samples."""
         runs = [*self._numbers.tolist(), int(self._numbers[-1]) + len(self._values) - int(self._rows[-1])]
         edges = np.ceil(self.clock.index_of(np.array([start_s, stop_s])))
         first, stop = (int(edge) for edge in np.clip(edges, 0, runs[-1]))

@@ -1,4 +1,4 @@
-"""Reads sensor.csv and reference.csv: fast, larger than memory if need be, every fault with its place."""
+"""Reads sensor.csv and reference.csv fast, also files larger than memory. Every fault is reported with its place."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from agent.calibrate.decimals import decimals
 from calib.signal.stamps import kind_of
 
 Array = NDArray[np.float64]
-Progress = Callable[[int], Any]  # called with the bytes just read
+Progress = Callable[[int], Any]  # called with the number of bytes that were just read
 
-CHUNK_BYTES = 1 << 18  # stays in the second-level cache while it is parsed
-LARGEST = 1e15  # no indication or time needs more, and squares and sums of it stay finite
+CHUNK_BYTES = 1 << 18  # fits into the second-level cache while it is parsed
+LARGEST = 1e15  # no indication or time is larger, and its squares and their sums stay finite
 SENSOR = ("time_s", "vx", "vy", "vz")
 TEMPERATURE = "temperature_degc"
 # Columns of a reference, and the quantity that they hold.
@@ -30,18 +30,19 @@ REFERENCES = {
     ("v",): "velocity",
     ("d",): "displacement",
 }
-# A stamp may be older than the one before: spread back from a late burst, or jittery. Stalls reach some ten ms.
+# A stamp may be earlier than the previous one by up to this time, because of jitter or a burst that was read late
+# (delays are some tens of ms).
 LATEST_STAMP_S = 0.1
 ROWS_AT_ONCE = 1 << 20
 
 
 class TableError(Exception):
-    """The file cannot be used; the message names file, line, column and value."""
+    """The file cannot be used. The message names file, line, column and value."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorTable:
-    """sensor.csv: stamps (n,) in s, indications (n, 3), temperature (n,) in degC or None; on disk, read as needed."""
+    """sensor.csv: stamps (n,) in s, indications (n, 3), temperature (n,) in degC or None. The arrays are on disk."""
 
     path: Path
     time_s: Array
@@ -102,28 +103,33 @@ def header_of(path: Path, file: IO[bytes]) -> list[str]:
     try:
         header = [name.strip() for name in line.decode("utf-8-sig").split(",")]
     except UnicodeDecodeError:
-        raise TableError(f"{path}, line 1: not text") from None
+        raise TableError(f"{path}, line 1: the line is not UTF-8 text") from None
     if len(set(header)) < len(header):
-        raise TableError(f"{path}, line 1: a column appears twice in {','.join(header)!r}")
+        raise TableError(f"{path}, line 1: a column is there twice, remove one: {','.join(header)!r}")
     return header
 
 
 def require(path: Path, header: Sequence[str], names: Sequence[str]) -> None:
-    """All columns are there, and none of them under another unit besides (time_ms, ax_g). Raises TableError."""
+    """Check that all columns are there, and none of them also in another unit (time_ms, ax_g). Raises TableError."""
     for name in names:
         base = name.rsplit("_", 1)[0]
         others = [n for n in header if n.isidentifier() and n.rsplit("_", 1)[0] == base and n not in names]
         if name not in header:
-            hint = f"; {others[0]} is another unit" if others else ""
-            raise TableError(f"{path}, line 1: no column {name} in the header {','.join(header)!r}{hint}")
+            hint = f"; {others[0]} has another unit, convert it" if others else ""
+            raise TableError(f"{path}, line 1: column {name} is missing in the header {','.join(header)!r}{hint}")
         if others:
-            raise TableError(f"{path}, line 1: {name} and {others[0]} in one header: which unit is meant?")
+            raise TableError(
+                f"{path}, line 1: the header has both {name} and {others[0]}; remove the one with the wrong unit"
+            )
 
 
 def _columns(
     path: Path, file: IO[bytes], header: Sequence[str], names: Sequence[str], progress: Progress | None
 ) -> Array:
-    """The named columns (n, k) of the lines that follow, n >= 2, in a file of their own on disk while they are used."""
+    """The named columns (n, k) of all further lines, n >= 2.
+
+    A temporary file on disk holds them while they are used.
+    """
     places = [header.index(name) for name in names]
     line, rest = 2, b""
     with tempfile.TemporaryFile() as spool:
@@ -134,13 +140,13 @@ def _columns(
                 progress(len(data))
         line += _append(spool, path, line, rest.rstrip(b"\r\n") + b"\n" if rest.strip() else b"", header, places)
         if line < 4:
-            raise TableError(f"{path}: {line - 2} rows of data, at least 2 are needed")
+            raise TableError(f"{path}: the file has {line - 2} rows of data, at least 2 are needed")
         spool.flush()
         return np.asarray(np.memmap(spool, dtype=np.float64, mode="r", shape=(line - 2, len(places))))
 
 
 def _whole_lines(data: bytes) -> tuple[bytes, bytes]:
-    """Up to the last line that is followed by another one: what ends a file may be blank lines."""
+    """Whole lines, and the rest. Blank lines stay in the rest, because they may be the end of the file."""
     end = data.rstrip(b"\r\n")
     cut = end.rfind(b"\n") + 1
     whole = data[:cut]
@@ -148,7 +154,10 @@ def _whole_lines(data: bytes) -> tuple[bytes, bytes]:
 
 
 def _append(spool: IO[bytes], path: Path, line: int, text: bytes, header: Sequence[str], places: Sequence[int]) -> int:
-    """Parse whole lines, the first of which is number `line`, append their columns; how many."""
+    """Parse whole lines, of which the first has the number `line`, and append their columns.
+
+    Gives the number of lines.
+    """
     if not text:
         return 0
     rows = decimals(text, len(header))
@@ -159,7 +168,7 @@ def _append(spool: IO[bytes], path: Path, line: int, text: bytes, header: Sequen
 
 
 def _rows(path: Path, first_line: int, text: bytes, header: Sequence[str]) -> Array:
-    """Any spelling of numbers; raises TableError for the first line that is wrong."""
+    """Parse numbers in any notation. Raises TableError for the first line that is wrong."""
     try:
         rows = np.loadtxt(io.BytesIO(text), delimiter=",", comments=None, ndmin=2)
     except ValueError:
@@ -174,14 +183,14 @@ def _rows(path: Path, first_line: int, text: bytes, header: Sequence[str]) -> Ar
 
 
 def fields_of(path: Path, line: int, fields: list[str], header: Sequence[str]) -> list[str]:
-    """As many fields as the header has, without blanks around. Raises TableError."""
+    """The fields without blanks around them. Raises TableError if their number is not that of the header."""
     if len(fields) != len(header):
-        raise TableError(f"{path}, line {line}: {len(fields)} fields, the header has {len(header)}")
+        raise TableError(f"{path}, line {line}: {len(fields)} fields, but the header has {len(header)}")
     return [field.strip() for field in fields]
 
 
 def number_of(path: Path, line: int, column: str, text: str) -> float:
-    """A finite number, and no larger than LARGEST. Raises TableError."""
+    """A finite number that is not larger than LARGEST. Raises TableError."""
     try:
         value = float(text)
     except ValueError:
@@ -194,7 +203,10 @@ def number_of(path: Path, line: int, column: str, text: str) -> float:
 
 
 def _check_time(path: Path, time_s: Array) -> None:
-    """Time runs forward: on a grid of exact stamps always, else but for what jitter and late bursts explain."""
+    """Check that time increases. Stamps may decrease by LATEST_STAMP_S, but not if they are on an exact grid.
+
+    Raises TableError.
+    """
     try:
         allowed = 0.0 if kind_of(np.asarray(time_s[:ROWS_AT_ONCE])) == "grid" else LATEST_STAMP_S
     except ValueError:
@@ -208,6 +220,6 @@ def _check_time(path: Path, time_s: Array) -> None:
         if len(wrong):
             at = int(wrong[0])
             later = f"{part[at]:.10g} after {before[at]:.10g}"
-            raise TableError(f"{path}, line {first + at + 2}, column time_s: {later}, time runs backwards")
+            raise TableError(f"{path}, line {first + at + 2}, column time_s: {later}; time must not decrease")
     if not newest > float(time_s[0]):
-        raise TableError(f"{path}, column time_s: {newest:.10g} in every line, time must pass")
+        raise TableError(f"{path}, column time_s: the value is {newest:.10g} in every line; time must increase")

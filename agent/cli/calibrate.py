@@ -1,4 +1,4 @@
-"""`fieldcal calibrate`: S and Q from files."""
+"""`fieldcal calibrate`: determines S and Q from files."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
 
 
 class _Finite(click.FloatRange):
-    """A range of numbers; nan and inf, which click lets through, are none."""
+    """A range of finite numbers. click alone would accept nan and inf."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         number = super().convert(value, param, ctx)
@@ -33,48 +33,72 @@ _U = _Finite(0)
 
 
 @click.command()
-@click.option("--sensor", type=_FILE, required=True, help="time_s,vx,vy,vz[,temperature_degc]")
-@click.option("--reference", type=_FILE, help=f"{_REFERENCES}; SI units.")
-@click.option("--poses", type=_FILE, help="start_s,stop_s and theta_deg,alpha_deg | dx,dy,dz | axis | gx,gy,gz")
-@click.option("--method", type=click.Choice(["1", "2", "3"]), default="3", show_default=True, help="Of the paper.")
-@click.option("--reference-quantity", type=click.Choice(list(QUANTITIES)), help="By default as the header.")
+@click.option("--sensor", type=_FILE, required=True, help="Columns time_s,vx,vy,vz[,temperature_degc].")
+@click.option("--reference", type=_FILE, help=f"Columns {_REFERENCES}, in SI units.")
+@click.option(
+    "--poses", type=_FILE, help="Columns start_s,stop_s and theta_deg,alpha_deg | dx,dy,dz | axis | gx,gy,gz."
+)
+@click.option(
+    "--method", type=click.Choice(["1", "2", "3"]), default="3", show_default=True, help="Method of the paper."
+)
+@click.option("--reference-quantity", type=click.Choice(list(QUANTITIES)), help="Default: by the header.")
 @click.option("--reference-coupling", type=click.Choice(["dc", "ac"]), help="Default: ac for one axis, dc for three.")
-@click.option("--coupling", type=click.Choice(["dc", "ac"]), default="dc", show_default=True, help="Of the sensor.")
-@click.option("--u-angle-deg", type=_U, default=0.2, show_default=True, help="u of alpha or direction, by position.")
+@click.option(
+    "--coupling", type=click.Choice(["dc", "ac"]), default="dc", show_default=True, help="Coupling of the sensor."
+)
+@click.option(
+    "--u-angle-deg", type=_U, default=0.2, show_default=True, help="u of alpha or direction, for each position."
+)
 @click.option("--u-theta-deg", type=_U, default=0.2, show_default=True, help="u of theta, common to all positions.")
-@click.option("--u-alpha-common-deg", type=_U, default=0.1, show_default=True, help="u of alpha, common.")
-@click.option("--u-theta-position-deg", type=_U, default=0.0, show_default=True, help="u of theta, by position.")
+@click.option(
+    "--u-alpha-common-deg", type=_U, default=0.1, show_default=True, help="u of alpha, common to all positions."
+)
+@click.option("--u-theta-position-deg", type=_U, default=0.0, show_default=True, help="u of theta, for each position.")
 @click.option("--u-offset-mps2", type=_U, default=0.05, show_default=True, help="u of the offset between windows.")
-@click.option("--u-offset-position-mps2", type=_U, default=0.0, show_default=True, help="u of the offset, by position.")
+@click.option(
+    "--u-offset-position-mps2", type=_U, default=0.0, show_default=True, help="u of the offset, for each position."
+)
 @click.option("--u-reference-pct", type=_U, default=0.1, show_default=True, help="u of the reference's sensitivity.")
 @click.option(
     "--u-transverse-motion-pct",
     type=_U,
     default=1.0,
     show_default=True,
-    help="u of motion across a uniaxial reference.",
+    help="u of motion transverse to a uniaxial reference.",
 )
-@click.option("--reference-corner-hz", type=_U, default=0.0, show_default=True, help="Of an AC-coupled reference.")
+@click.option(
+    "--reference-corner-hz",
+    type=_U,
+    default=0.0,
+    show_default=True,
+    help="Corner frequency of an AC-coupled reference.",
+)
 @click.option("--u-reference-corner-hz", type=_U, default=0.0, show_default=True, help="Its standard uncertainty.")
-@click.option("--sensor-corner-hz", type=_U, default=0.0, show_default=True, help="Of an AC-coupled sensor.")
+@click.option(
+    "--sensor-corner-hz", type=_U, default=0.0, show_default=True, help="Corner frequency of an AC-coupled sensor."
+)
 @click.option("--u-sensor-corner-hz", type=_U, default=0.0, show_default=True, help="Its standard uncertainty.")
 @click.option("--u-tilt-deg", type=_U, default=0.0, show_default=True, help="u of the mount's tilt.")
-@click.option("--rotation", metavar="R11,...,R33", help="Of a tri-axial reference: a = R a_ref.")
+@click.option("--rotation", metavar="R11,...,R33", help="Rotation of a tri-axial reference: a = R a_ref.")
 @click.option("--u-rotation-deg", type=_U, default=0.2, show_default=True, help="u of the rotation, about each axis.")
 @click.option("--gravity", "gravity_mps2", type=_Finite(9.7, 9.9), help="Local gravity in m/s2.")
-@click.option("--u-gravity-mps2", type=_U, help="u of gravity: 0.03, or 0 with --gravity.")
+@click.option("--u-gravity-mps2", type=_U, help="u of gravity. Default: 0.03, or 0 with --gravity.")
 @click.option(
-    "--static-sign", type=click.Choice(["+1", "-1"]), default="+1", show_default=True, help="+1: Eqs. (9)-(11)."
+    "--static-sign",
+    type=click.Choice(["+1", "-1"]),
+    default="+1",
+    show_default=True,
+    help="Sign of gravity in a pose; +1 as in Eqs. (9)-(11).",
 )
 @click.option("--nominal", type=_Finite(min=0, min_open=True), help="Nominal sensitivity, output unit per m/s2.")
 @click.option("--u-nominal-pct", type=_Finite(0, min_open=True), help="Its standard uncertainty.")
-@click.option("--prior", type=_FILE, help="A result of this command (JSON): what was known before.")
-@click.option("--plain", is_flag=True, help="Method 3 exactly as printed, no nuisances.")
-@click.option("--json", "json_to", type=click.Choice(["-"]), help="One JSON object on standard output.")
+@click.option("--prior", type=_FILE, help="Earlier result of this command (JSON), used as prior.")
+@click.option("--plain", is_flag=True, help="Method 3 exactly as in the paper, without nuisances.")
+@click.option("--json", "json_to", type=click.Choice(["-"]), help="Print one JSON object on standard output.")
 def calibrate(**options: Any) -> int:
     """Calibrate from files: sensor.csv, reference.csv, poses.csv.
 
-    Exit status 0 if accepted, 2 on bad input, 3 if the data are refused; the reasons are printed.
+    Exit status 0 if the calibration is valid, 2 on bad input, 3 if the data are refused. The reasons are printed.
     """
     try:
         outcome = calibrated(options)

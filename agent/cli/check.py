@@ -1,4 +1,4 @@
-"""`fieldcal check`: all faults of a configuration at once."""
+"""`fieldcal check`: reports all faults of a configuration together."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from agent.config.tls import expiry_warning
 @click.command()
 @click.argument("config", type=click.Path(path_type=Path))
 def check(config: Path) -> int:
-    """Name every fault of CONFIG with its line, its setting and what to do. Exit status 2 if there is one."""
+    """Report every fault in CONFIG, with its line, its setting and what to do. Exit status 2 if there is a fault."""
     try:
         loaded = load_config(config)
     except ConfigError as error:
@@ -25,6 +25,6 @@ def check(config: Path) -> int:
     stops = sum(len(channel.positions) for channel in loaded.channels if isinstance(channel.positions, tuple))
     if loaded.zenoh.tls and (warning := expiry_warning(loaded.zenoh.tls.files, datetime.now(UTC))):
         click.echo(f"{config}: zenoh.tls.{warning}", err=True)
-    told = f"{poses} poses" + (f", {stops} positions to be found" if stops else "")
+    told = f"{poses} poses" + (f", {stops} positions that the agent finds" if stops else "")
     click.echo(f"{config}: good; {len(loaded.devices)} devices, {len(loaded.channels)} channels, {told}")
     return 0

@@ -1,4 +1,4 @@
-"""`fieldcal report`: figures, one HTML page and the JSON of a calibration. Drawing needs the extra `report`."""
+"""`fieldcal report`: figures, one HTML page and JSON of a calibration. It needs the extra `report` of the package."""
 
 from __future__ import annotations
 
@@ -15,21 +15,29 @@ if TYPE_CHECKING:
 @click.command()
 @click.argument("inputs", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="INPUT...")
 @click.option("-o", "--output", type=click.Path(path_type=Path, file_okay=False), required=True, metavar="DIR",
-              help="Where report.html, report.json and the figures go.")  # fmt: skip
-@click.option("--unit", metavar="UNIT", help="Of the indications, where the result does not say it: mV, m/s2, count.")
-@click.option("--sensor", metavar="NAME", help="Which one, where the input holds several; the name on the page.")
+              help="Directory for report.html, report.json and the figures.")  # fmt: skip
+@click.option(
+    "--unit", metavar="UNIT", help="Unit of the indications, if the result does not state it: mV, m/s2, count."
+)
+@click.option(
+    "--sensor",
+    metavar="NAME",
+    help="The sensor to report, if the input has several. For results: the name on the page.",
+)
 def report(inputs: tuple[Path, ...], output: Path, unit: str | None, sensor: str | None) -> int:
-    """Figures and one page of a calibration.
+    """Make figures and one page of a calibration.
 
     INPUT is RESULT.json of `fieldcal calibrate --json -` (several are compared), a recording (several are read one
     after the other), or the data directory of an agent: the calibration in force, with its history.
 
-    Exit status 3 where the data were refused: the report then shows why. 2 where the input cannot be used.
+    Exit status 3 if the data were refused (the report then shows why), 2 if the input cannot be used.
     """
     try:
-        import matplotlib  # noqa: F401 - asked for before any work is done
+        import matplotlib  # noqa: F401 - imported to check for it before any other work
     except ImportError:
-        click.echo("fieldcal report: figures need matplotlib: pip install 'fieldcal[report]'", err=True)
+        click.echo(
+            "fieldcal report: the figures need matplotlib; install it with: pip install 'fieldcal[report]'", err=True
+        )
         return 1
     from agent.report.material import MaterialError, gather
     from agent.report.writing import write
@@ -60,7 +68,7 @@ def _status(material: Material) -> int:
 
 
 def _name_unit(material: Material, unit: str | None) -> None:
-    """Name the unit where results do not; all must be in one. Raises MaterialError."""
+    """Set the unit of results that do not state it. Raises MaterialError if the results have several units."""
     from agent.report.material import MaterialError
     from agent.report.units import output_unit
 
@@ -68,4 +76,4 @@ def _name_unit(material: Material, unit: str | None) -> None:
         material.results = [replace(r, unit=r.unit or unit) for r in material.results]
     units = {output_unit(r.unit) for r in material.results} | ({output_unit(unit)} if unit else set())
     if len(units) > 1:
-        raise MaterialError(f"one report has one unit of the indications, here are {', '.join(sorted(units))}")
+        raise MaterialError(f"all indications in a report must have one unit, but here are {', '.join(sorted(units))}")

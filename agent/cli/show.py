@@ -1,4 +1,4 @@
-"""`fieldcal show`: what a data directory knows of its sensors, also while the agent runs."""
+"""`fieldcal show`: shows the results in a data directory, also while the agent runs."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ HISTORY_SHOWN = 10  # newest calibrations and windows of a sensor
 @click.option("--limit", type=click.IntRange(1), default=HISTORY_SHOWN, show_default=True, metavar="N",
               help="Show the newest N calibrations and windows of each sensor.")  # fmt: skip
 def show(data_dir: Path, json_to: str | None, limit: int) -> int:
-    """Calibration in force, status, history and recordings of a data directory.
+    """Show calibration in force, status, history and recordings of a data directory.
 
-    Exit status 2 where there is no store, or it cannot be read.
+    Exit status 2 if there is no store, or if it cannot be read.
     """
     try:
         overview = read_overview(data_dir, limit)
@@ -48,19 +48,19 @@ def show(data_dir: Path, json_to: str | None, limit: int) -> int:
 
 @dataclass(frozen=True, slots=True)
 class SensorHistory:
-    """What is kept of one sensor; lists are newest first, each calibration once."""
+    """Results of one sensor. Lists begin with the newest; each calibration is in them once."""
 
     status: Record | None
     calibration: Record | None  # in force
     calibrations: list[Record]
     windows: list[Record]
-    drift: list[Record]  # empty until drift is watched
-    routine: dict[str, list[Record]]  # results that come by schedule, by kind
+    drift: list[Record]  # verdicts of the drift test
+    routine: dict[str, list[Record]]  # results that come by schedule; key: their kind
 
 
 @dataclass(frozen=True, slots=True)
 class Overview:
-    """What a data directory holds: sensors by name, and (name, size in bytes) of each recording in order."""
+    """Content of a data directory: sensors by name, and (name, size in bytes) of each recording in order."""
 
     data_dir: Path
     sensors: dict[str, SensorHistory]
@@ -68,7 +68,7 @@ class Overview:
 
 
 def read_overview(data_dir: Path, limit: int) -> Overview:
-    """Read it, the newest `limit` results of each kind. Raises StoreError."""
+    """Read a data directory, with the newest `limit` results of each kind. Raises StoreError."""
     from agent.recording.files import recordings
 
     with History(data_dir / FILE_NAME) as history:
@@ -93,7 +93,7 @@ def read_overview(data_dir: Path, limit: int) -> Overview:
 
 
 def as_object(overview: Overview) -> dict[str, Any]:
-    """For JSON, with results as they are published (fields of agent.core.events)."""
+    """The overview as a JSON object. Results have the same fields as published ones (agent.core.events)."""
     return {
         "version": __version__,
         "data_dir": str(overview.data_dir),

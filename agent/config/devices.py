@@ -1,4 +1,4 @@
-"""Who the gateway is, and the devices it reads."""
+"""The name of the gateway, and the devices that it reads."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from agent.config.section import Name, Section
 
 
 class Gateway(Section):
-    """Who this gateway is: the first chunks of every Zenoh key."""
+    """The names of the site and of this gateway. They are the first chunks of every Zenoh key."""
 
     site: Name = "site"
     name: Name = "gateway"

@@ -86,7 +86,7 @@ class Certificate(Section):
 
 
 class Uncertainty(Section):
-    """Standard uncertainties of what moves the data besides S and Q (method: nuisances); 0 fixes one as stated."""
+    """Standard uncertainties of the nuisances, which change the data besides S and Q; 0: the stated value is exact."""
 
     angle_deg: NotNegative = 0.2  # how the sensor stands: alpha, or a stated direction, by position
     theta_deg: NotNegative = 0.2

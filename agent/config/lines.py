@@ -1,4 +1,4 @@
-"""In which line of a TOML text a setting stands: tomllib reads values and keeps no places."""
+"""Finds the line of a setting in a TOML text, because tomllib gives values without their lines."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import tomllib
 from collections.abc import Collection
 
 Path = tuple[str | int, ...]
-"""Where a setting stands, as ("channels", 0, "prior"): names of tables, numbers of entries in a list."""
+"""Path of a setting, such as ("channels", 0, "prior"): names of tables, and numbers of entries in lists."""
 
-# Tokens of a text that is known to be TOML. Bounded repetitions alone: no text takes more than linear time.
+# Tokens of a text that is known to be TOML. No repetition can backtrack, so the time is linear for every text.
 _TOKEN = re.compile(
     r'''(?P<space>[ \t\r]++|\#[^\n]*+)
       | (?P<newline>\n)
@@ -22,7 +22,7 @@ _TOKEN = re.compile(
 
 
 def lines_of(text: str, wanted: Collection[Path]) -> dict[Path, int]:
-    """The line (from 1 on) of each path: of the setting itself, or of the innermost table around it that is there.
+    """The line (from 1) of each path. If the setting is missing: the line of the innermost table around it that exists.
 
     `text` must be TOML that tomllib reads.
     """
@@ -35,19 +35,19 @@ def lines_of(text: str, wanted: Collection[Path]) -> dict[Path, int]:
 
 
 class _Scan:
-    """Reads token by token: what is expected next, and inside which table, lists and inline tables it stands."""
+    """Reads token by token. Knows which kind comes next, and the table, lists and inline tables around it."""
 
     def __init__(self, wanted: Collection[Path]) -> None:
         self.found: dict[Path, int] = {(): 1}
         self._wanted = wanted
         self._line = 1
-        self._expected = "key"  # or "value"; "end" while the rest of a value goes by
-        self._table: Path = ()  # of the last header
-        self._entries: dict[Path, int] = {}  # of each list of tables, so far
-        self._inside: list[tuple[Path, int | None]] = []  # lists with the number of the entry, inline tables with None
+        self._expected = "key"  # or "value"; "end" until the rest of a value is read
+        self._table: Path = ()  # table of the last header
+        self._entries: dict[Path, int] = {}  # number of entries so far of each list of tables
+        self._inside: list[tuple[Path, int | None]] = []  # a list has the number of its entry, an inline table None
         self._key: list[str] = []
-        self._path: Path = ()  # of the value
-        self._brackets = 0  # of a header
+        self._path: Path = ()  # path of the value
+        self._brackets = 0  # number of "[" in a header
 
     def take(self, kind: str, text: str) -> None:
         if kind == "newline":
@@ -81,7 +81,7 @@ class _Scan:
             self._take_end(text)
 
     def _open_table(self) -> None:
-        """`[a.b]` or `[[a.b]]` is closed: a name of a list of tables stands for its newest entry."""
+        """Take a complete header `[a.b]` or `[[a.b]]`. The name of a list of tables means its newest entry."""
         if self._expected == "end" or not self._key:
             return
         path: Path = ()

@@ -1,4 +1,4 @@
-"""A TOML file read and checked wholly before anything starts, every fault named at once."""
+"""Reads a TOML file and checks all of it before anything starts. All faults are reported together."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from agent.config.lines import Path, lines_of
 from agent.config.names import Told
 from agent.config.whole import Config
 
-LARGEST_FILE = 4 << 20  # bytes; a day of a pose each second has as many
-# Sections of ours go four deep. The parser takes quadratic time for a long dotted key: hours for 4 MB of it.
+LARGEST_FILE = 4 << 20  # bytes; a day with one pose each second needs as many
+# The sections of a configuration have four levels. tomllib needs quadratic time for a long dotted key: hours for 4 MB.
 DEEPEST_KEY = 16
-LONGEST_LIST = 86_400  # a pose each second of a day; each fault in a list costs 2 kB and 25 us
+LONGEST_LIST = 86_400  # one pose each second of a day; each fault in a list needs 2 kB and 25 us
 SHOWN_FAULTS = 100
 _PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+"""
-_LINE = re.compile(r"\(at line (\d+), column \d+\)")  # as tomllib says it
+_LINE = re.compile(r"\(at line (\d+), column \d+\)")  # as in the messages of tomllib
 _LONG_KEY = re.compile(rf"(?<![\w.-]){_PART}(?:\.[ \t]*+{_PART}){{{DEEPEST_KEY},}}+")
 
 
 class ConfigError(Exception):
-    """The faults of a configuration, one line each, every one with file, line, path, value and what to do."""
+    """The faults of a configuration, one line each, with file, line, setting, value and what to do."""
 
     def __init__(self, faults: list[str]) -> None:
         super().__init__("\n".join(faults))
@@ -39,25 +39,29 @@ def load_config(path: FilePath) -> Config:
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError([f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}"]) from None
     if len(text) > LARGEST_FILE:
-        raise ConfigError([f"{path}: more than {LARGEST_FILE} bytes, no configuration"])
+        raise ConfigError(
+            [f"{path}: the file has more than {LARGEST_FILE} bytes, so it is not read; is it a configuration?"]
+        )
     if (deep := _LONG_KEY.search(text)) is not None:
         line = text.count("\n", 0, deep.start()) + 1
-        raise ConfigError([f"{path}: line {line}: a key of more than {DEEPEST_KEY} parts: {deep[0][:40]}..."])
+        raise ConfigError(
+            [f"{path}: line {line}: a key has more than {DEEPEST_KEY} parts, shorten it: {deep[0][:40]}..."]
+        )
     try:
         raw = tomllib.loads(text)
-    except ValueError as error:  # TOMLDecodeError is one, and so is an integer of thousands of digits
+    except ValueError as error:  # a TOMLDecodeError, or the error for an integer of thousands of digits
         found = _LINE.search(str(error))
         place = f"line {found[1]}: " if found else ""
         raise ConfigError([f"{path}: {place}not TOML: {error}"]) from None
     except RecursionError:
-        raise ConfigError([f"{path}: not TOML of ours: nested too deep"]) from None
+        raise ConfigError([f"{path}: its tables or lists are nested too deep to be read"]) from None
     if longest := list(_long_lists(raw, ())):
         raise _refused(longest, str(path), text)
     return parse_config(raw, str(path), text)
 
 
 def parse_config(raw: dict[str, Any], origin: str, text: str = "") -> Config:
-    """Check what a TOML file held; `origin` names it in the faults, `text` is the file, where lines shall be named.
+    """Check the values of a TOML file. `origin` names the file in the faults. With its `text`, faults name lines too.
 
     Raises ConfigError with all faults.
     """
@@ -75,12 +79,12 @@ def _refused(faults: list[Told], origin: str, text: str) -> ConfigError:
         place = f"line {lines[path]}: " if text else ""
         told.append(f"{origin}: {place}{f'{shown(path)}: ' if path else ''}{what}")
     more = len(faults) - SHOWN_FAULTS
-    return ConfigError(told + ([f"{origin}: and {more} faults more"] if more > 0 else []))
+    return ConfigError(told + ([f"{origin}: and {more} more faults, not shown"] if more > 0 else []))
 
 
 def _long_lists(value: Any, path: Path) -> Iterator[Told]:
     if isinstance(value, list) and len(value) > LONGEST_LIST:
-        yield path, f"a list of {len(value)}, more than {LONGEST_LIST}; shorten it"
+        yield path, f"has {len(value)} entries, at most {LONGEST_LIST} are allowed; shorten it"
     elif isinstance(value, dict | list):
         for name, item in value.items() if isinstance(value, dict) else enumerate(value):
             if isinstance(item, dict | list):

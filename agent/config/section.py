@@ -1,4 +1,4 @@
-"""What all sections of a configuration share: the base, and the names and vectors in them."""
+"""The base class of all sections of a configuration, and types of names and vectors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The whole configuration: all sections, and what must agree between them."""
+"""The whole configuration: all its sections, and the checks between them."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from agent.config.supervision import Supervision
 
 
 class Config(Section):
-    """All of it."""
+    """The whole configuration."""
 
     gateway: Gateway = Gateway()
-    # A gateway reads a handful; a thousand threads are a typing error.
+    # A gateway reads a few devices. Each has a thread, and a thousand would be a typing error.
     devices: Annotated[tuple[Device, ...], Field(min_length=1, max_length=100)]
     channels: Annotated[tuple[Channel, ...], Field(min_length=1, max_length=100)]
     recording: Recording = Recording()

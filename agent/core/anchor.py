@@ -1,4 +1,4 @@
-"""How far S and Q may go from what an operator last accepted."""
+"""Limits on how far S and Q may move away from the calibration that an operator last accepted."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from agent.config.gate import GateSettings
 from calib.model import PARAMETERS, Array, Calibration
 
-COVERAGE_FACTOR = 2.0  # an anchor known to u alone holds nothing tighter than U = 2 u
+COVERAGE_FACTOR = 2.0  # a limit is never narrower than U = 2 u of the anchor
 MAIN = np.isin(np.arange(12), (0, 4, 8))
 OFFSET = np.arange(12) >= 9
 TRANSVERSE = ~MAIN & ~OFFSET
@@ -19,43 +19,47 @@ TRANSVERSE = ~MAIN & ~OFFSET
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """How far a calibration is from the anchor: `reason` names every limit it is beyond, "" where it is within all."""
+    """How far a calibration is from the anchor. `reason` names every limit that is exceeded; it is "" if none is."""
 
     reason: str
     numbers: dict[str, float]
 
 
 class Anchor:
-    """The calibration that changes are counted from, cumulatively, and the limits around it.
+    """The calibration from which changes are counted, and the limits around it. Changes add up over all windows.
 
-    It is what an operator accepted: a certificate or data sheet in the configuration, later an `accept` or `rollback`.
-    A parameter of it with U beyond max_change (a data sheet's) limits at U, until the data first know that parameter to
-    within max_change: that value is then its anchor, once and for all.
+    An operator accepted this calibration: it comes from the certificate or the data sheet in the configuration, later
+    from a command `accept` or `rollback`. If U of a parameter is larger than max_change (as in a data sheet), U is its
+    limit. As soon as the data determine this parameter with U within max_change, their value becomes its anchor and
+    max_change its limit. This happens once for each parameter.
     """
 
     def __init__(self, settings: GateSettings, calibration: Calibration) -> None:
-        """Raises ValueError where S has no inverse, a main sensitivity is 0, or values are not finite."""
+        """Raises ValueError if S has no inverse, if a main sensitivity is 0, or if a value is not finite."""
         self._settings = settings
         self._value = _values(calibration)
         self._u = calibration.standard_uncertainty
         usable = np.isfinite(self._value).all() and self._value[MAIN].all()
         if not usable or np.linalg.matrix_rank(calibration.sensitivity) < 3:
-            raise ValueError("a calibration to start from needs finite S and Q, and S an inverse and no main one of 0")
+            raise ValueError(
+                "the calibration cannot be used as a start: S and Q must be finite, S must have an inverse, "
+                "and no main sensitivity may be 0"
+            )
         self._fixed = self._expanded() <= self._max_change()
 
     @property
     def calibration(self) -> Calibration:
-        """It as a calibration: an Anchor made of that is equal to this one."""
+        """The anchor as a calibration. An Anchor that is made from it is equal to this one."""
         sensitivity, offset = self._value[:9].reshape(3, 3).copy(), self._value[9:].copy()
         return Calibration(sensitivity, offset, np.diag(self._u**2), self._fixed.copy(), np.inf, "accepted")
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """(12,) whose anchor is known to within max_change; an offset that nothing limits is not."""
+        """(12,) True where the anchor is known to within max_change. False for an offset that has no limit."""
         return self._fixed & np.isfinite(self._max_change())
 
     def change(self, calibration: Calibration) -> Change:
-        """From the anchor to this calibration, held against the limits."""
+        """Compare the change from the anchor to this calibration with the limits."""
         value = _values(calibration)
         if not np.isfinite(value).all():
             return Change("S or Q is not finite", {})
@@ -70,14 +74,15 @@ class Anchor:
             reasons += [PARAMETERS[p] for p in np.flatnonzero(kind & ~(moved <= limits))]
         self._turned(calibration, numbers, reasons)
         self._off_sheet(value, numbers, reasons)
-        return Change(f"beyond max_change: {', '.join(reasons)}" if reasons else "", numbers)
+        return Change(f"S or Q changed by more than max_change: {', '.join(reasons)}" if reasons else "", numbers)
 
     def limits(self) -> Array:
-        """(12,) how far each parameter may go; inf where nothing limits an offset."""
+        """(12,) the largest allowed change of each parameter; inf for an offset that has no limit."""
         return np.where(self._fixed, self._max_change(), self._expanded())
 
     def learn(self, calibration: Calibration) -> None:
-        """What came in force: a parameter that only a data sheet anchored is anchored here once it is known well."""
+        """Take the values of a calibration that came into force as anchors, where only a data sheet was the anchor
+        before and where U is now within max_change."""
         known = calibration.determined & (COVERAGE_FACTOR * calibration.standard_uncertainty <= self._max_change())
         fresh = known & ~self._fixed
         self._value = np.where(fresh, _values(calibration), self._value)
@@ -99,7 +104,7 @@ class Anchor:
 
     def _turned(self, calibration: Calibration, numbers: dict[str, float], reasons: list[str]) -> None:
         if not self._fixed[:9].all():
-            return  # a data sheet does not say how the sensor stands to the reference
+            return  # a data sheet does not state the orientation of the sensor against the reference
         angle_deg = float(np.degrees(rotation_rad(calibration.sensitivity, self._value[:9].reshape(3, 3))))
         numbers["rotation_deg"] = angle_deg
         numbers["rotation_deg_threshold"] = self._settings.max_change_rotation_deg
@@ -111,7 +116,9 @@ class Anchor:
         if largest is None:
             return
         numbers["offset"], numbers["offset_threshold"] = float(np.abs(value[OFFSET]).max()), largest
-        reasons += [f"{PARAMETERS[p]} off the data sheet" for p in np.flatnonzero(OFFSET & (np.abs(value) > largest))]
+        reasons += [
+            f"{PARAMETERS[p]} (beyond largest_offset)" for p in np.flatnonzero(OFFSET & (np.abs(value) > largest))
+        ]
 
     def snapshot(self) -> dict[str, Any]:
         """State for `load`, bit-exact."""
@@ -123,7 +130,7 @@ class Anchor:
 
 
 def rotation_rad(sensitivity: Array, before: Array) -> float:
-    """Angle of the rotation in S S0^-1 (its polar decomposition); pi where the one is a reflection of the other."""
+    """Angle of the rotation in S S0^-1, by polar decomposition; pi if S S0^-1 contains a reflection."""
     left, _, right = np.linalg.svd(sensitivity @ np.linalg.inv(before))
     turn = left @ right
     if np.linalg.det(turn) < 0.0:

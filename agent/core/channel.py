@@ -1,4 +1,4 @@
-"""One sensor with its reference: what its events change, and the results that follow."""
+"""One sensor with its reference: how events change its state, and which results follow from them."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from calib.model import Pose, Window
 from hw.block import SampleBlock
 
 REFUSED_IN_A_ROW = 3
-# A run that begins long after the one before ended: more is a clock that was wrong, and everything has wandered anyway.
+# Longest pause between two runs that is believed. A longer one means that a clock was wrong, and counts as no pause.
 LONGEST_PAUSE_DAYS = 3650.0
 
 
 class ChannelState:
-    """All that is known of one channel; changes with events only.
+    """The state of one channel. Only events change it.
 
-    The first status comes with the first news of the sensor. `kept` states are by the identity of a device: one that
-    was there before goes on where it was.
+    The first status is published after the first event of the sensor. `kept` holds states of earlier devices by their
+    identity: when such a device is connected again, its estimation continues from its kept state.
     """
 
     def __init__(self, channel: Channel) -> None:
@@ -42,21 +42,21 @@ class ChannelState:
         self._origin_ns = 0
         self._streams = Streams(channel)
         self._unit = ""
-        self._nominal: float | None = None  # sensitivity by the device's own data sheet
+        self._nominal: float | None = None  # sensitivity by the data sheet of the device
         self._reference = ""  # identity
-        self._not_certified = ""  # why the certificate is not the reference's
+        self._not_certified = ""  # why the certificate does not belong to the reference
         self._estimation: Estimation | None = None
         self._in_force: CalibrationUpdate | None = None
         self._kept: dict[str, bytes] = {}
-        self._first_day = 0.0  # in the estimation's own count, at the run's origin
-        self._status = ""  # nothing said yet
-        self._refused = 0  # windows in a row
+        self._first_day = 0.0  # days that the estimation had counted when this run began
+        self._status = ""  # no status was published yet
+        self._refused = 0  # how many windows in a row were refused
         self._clocks = Clocks()
         self._now_ns = 0  # monotonic and UTC of the newest event that carried both
         self._utc_minus_monotonic_ns = 0
 
     def begin(self, origin_ns: int, kept: Mapping[str, bytes]) -> None:
-        """A new run: seconds count from `origin_ns`; `kept` (`memory`) waits for sensors of those identities."""
+        """Begin a new run. Seconds count from `origin_ns`. `kept`: a state (`memory`) for each identity of a sensor."""
         self._origin_ns = origin_ns
         self._now_ns = origin_ns
         self._kept = dict(kept)
@@ -65,7 +65,7 @@ class ChannelState:
     # --- events
 
     def on_block(self, block: SampleBlock) -> list[Output]:
-        """A block of the sensor or its reference; others are not this channel's."""
+        """A block of the sensor or of its reference. Blocks of other devices do not concern this channel."""
         if block.device not in self._streams.by_device:
             return []
         self._clock(block.t_monotonic_ns, block.t_utc_ns)
@@ -74,13 +74,14 @@ class ChannelState:
         if block.device == self.sensor and self._estimation is not None:
             if self._status == "INVALID":
                 self._estimation.gate.regain("")
-                results += self._say_status(f"{self.sensor} speaks again")
+                results += self._say_status(f"{self.sensor} sends data again")
             self._streams.look_where(block, self._estimation)
             results += self._corrected(block, self._estimation)
         return results + list(self._close_windows()) + self._clock_reports()
 
     def on_tick(self, tick: Tick) -> list[Result]:
-        """Time passed: late windows are refused, a silent sensor turns the status INVALID."""
+        """Time passed: windows whose samples come too late are refused; a sensor without data gets the status
+        INVALID."""
         self._clock(tick.t_monotonic_ns, tick.t_utc_ns)
         return list(self._close_windows()) + self._watch_silence() + self._clock_reports()
 
@@ -91,19 +92,21 @@ class ChannelState:
         self._clock(change.t_monotonic_ns, change.t_utc_ns)
         if change.state == "lost":
             if change.device != self.sensor:
-                return [self._told(f"the reference {change.device} is lost, nothing is updated: {change.message}")]
+                return [
+                    self._told(f"the reference {change.device} is lost, S and Q stay as they are: {change.message}")
+                ]
             return self._lose(f"{self.sensor} is lost: {change.message}")
         if change.device == self.sensor:
             return self._identify(change.info_json)
         return self._identify_reference(change.info_json)
 
     def on_command(self, command: Command) -> list[Result]:
-        """An operator's word; what was refused before it came here changes nothing."""
+        """A command of an operator. A command that was refused before changes nothing."""
         if command.sensor != self.sensor or command.refused:
             return []
         self._clock(command.t_monotonic_ns, command.t_utc_ns)
         if self._estimation is None:
-            return [self._told(f"{command.verb} refused: {self.sensor} was never there")]
+            return [self._told(f"{command.verb} refused: {self.sensor} has not been connected in this run")]
         try:
             if command.verb == "pose":
                 return self._turn(commanded_pose(command, self._channel))
@@ -118,7 +121,8 @@ class ChannelState:
     # --- time and identity
 
     def _clock(self, t_monotonic_ns: int, t_utc_ns: int) -> None:
-        # Blocks of two devices may arrive out of order by a read; time here never goes back.
+        # Blocks of two devices may arrive in the wrong order, by up to one read. The time of the channel never
+        # decreases.
         if t_monotonic_ns >= self._now_ns:
             self._now_ns = t_monotonic_ns
             self._utc_minus_monotonic_ns = t_utc_ns - t_monotonic_ns
@@ -140,11 +144,13 @@ class ChannelState:
             if self._estimation is not None:
                 self._kept = shelved(self._kept, self.identity, self.memory())
                 self._streams.forget_sensor()
-                reason = f"{self.sensor} is now {identity}, was {self.identity}"
+                reason = f"{self.sensor} is another device now: {identity} instead of {self.identity}"
             elif self._kept and identity not in self._kept:
-                reason = f"the calibration kept belongs to {', '.join(sorted(self._kept))}, this is {identity}"
+                reason = (
+                    f"the stored calibration belongs to {', '.join(sorted(self._kept))}, but this device is {identity}"
+                )
             self.identity, self._unit, self._in_force = identity, info["unit"], None
-            self._status = "" if self._status == "INVALID" else self._status  # the one that was silent is another
+            self._status = "" if self._status == "INVALID" else self._status  # the silent device was another one
             try:
                 self._nominal = nominal_of(info)
                 self._estimation = Estimation(self._channel, self._nominal)
@@ -154,7 +160,7 @@ class ChannelState:
             if identity in self._kept:
                 results, reason = self._remember(self._kept.pop(identity))
         if self._status == "INVALID":
-            # A port that opens is no sensor that speaks: one that was INVALID stays so until a block comes.
+            # An open port does not prove that the sensor sends data: the status stays INVALID until a block comes.
             self._estimation.gate.lose("")
         return results + self._say_status(reason)
 
@@ -162,12 +168,12 @@ class ChannelState:
         before, self._reference = self._reference, identity_of(info_json)
         self._not_certified = not_certified(info_json, self._channel.certificate)
         if not before or before == self._reference:
-            return [self._told(f"nothing is updated: {self._not_certified}")] if self._not_certified else []
+            return [self._told(f"S and Q are not updated: {self._not_certified}")] if self._not_certified else []
         assert self._channel.reference is not None
         self._streams.by_device[self._channel.reference].clear()
         if self._estimation is not None:
             self._estimation.forget_reference()
-        reason = self._not_certified or f"the reference is now {self._reference}, was {before}"
+        reason = self._not_certified or f"the reference is another device now: {self._reference} instead of {before}"
         return self._say_status(reason) or [self._told(reason)]
 
     def _clock_reports(self) -> list[Result]:
@@ -211,32 +217,33 @@ class ChannelState:
 
     def _turn(self, pose: Pose) -> list[Result]:
         self._streams.turn(self._now_s(), pose)
-        return [self._told(f"stands at {pose.position} from now on")]
+        return [self._told(f"an operator set the position: {pose.position}")]
 
     def _close_windows(self) -> Iterator[Result]:
-        """What becomes of all windows that are due. A fault of the program costs its window and is told."""
+        """The results of all windows that are due. After a fault of the program its window is reported and not used."""
         for piece in self._streams.due(self._now_s()):
             try:
                 for verdict in self._streams.verdicts(piece, self._first_day, self._estimation, self._not_certified):
                     yield from self._results(verdict)
             except MemoryError:
-                raise  # says nothing of the data: a replay would not have it
+                raise  # not caused by the data: a replay would not repeat it
             except Exception as error:
                 fault = told(error)
-                reason = f"a fault of the program, please report it: {fault}"
+                reason = f"a fault of the program, not of the data; please report it: {fault}"
                 yield from self._refuse(refused(piece, reason), reason, fault)
 
     def _refuse(self, window: Window, reason: str, fault: str = "") -> Iterator[Result]:
-        """Of a fault of the program, and of several refused in a row, the status, though it stands, says so too."""
+        """Report a window that is not used. After a fault of the program, and after REFUSED_IN_A_ROW such windows,
+        publish the status again with the reason, though the status does not change."""
         yield window_report(self._source(), window, used=False, reason=reason, numbers={}, fault=fault)
         self._refused += 1
         if fault or self._refused == REFUSED_IN_A_ROW:
-            yield self._told(f"nothing is updated: {reason}")
+            yield self._told(f"S and Q are not updated: {reason}")
 
     def _results(self, verdict: Verdict) -> Iterator[Result]:
         window, judged, source = verdict.window, verdict.judged, self._source()
         if judged is None or self._estimation is None:
-            yield from self._refuse(window, window.reason or f"{self.sensor} was never opened")
+            yield from self._refuse(window, window.reason or f"{self.sensor} has not been connected in this run")
             return
         self._refused = 0
         decision = judged.decision
@@ -254,14 +261,15 @@ class ChannelState:
         yield from self._say_status(decision.reason)
 
     def _put_in_force(self, earlier: CalibrationUpdate | None = None) -> CalibrationUpdate:
-        """What the estimation has in force; `earlier` is the update that made it, where it was made before."""
+        """The update that puts the estimation's calibration in force. `earlier` is the update that made this
+        calibration, if it was made before."""
         assert self._estimation is not None
         update = calibration_update(self._source(), self._estimation.in_force, self._estimation.recursion)
         self._in_force = update if earlier is None else again(update, earlier)
         return self._in_force
 
     def number(self, results: Sequence[Result]) -> None:
-        """The results as they leave, with their numbers: what is in force and what waits is known by them."""
+        """Take the numbers that the results got, so that the calibration in force and waiting estimates have theirs."""
         for result in results:
             if isinstance(result, CalibrationUpdate):
                 self._in_force = result
@@ -272,17 +280,17 @@ class ChannelState:
 
     @property
     def known(self) -> bool:
-        """Whether there is a device with anything to remember."""
+        """Whether there is a device with a state to keep."""
         return self._estimation is not None
 
     def memory(self) -> bytes:
-        """What outlives a run, of the device that is there now."""
+        """State of the device that is connected now, for later runs."""
         assert self._estimation is not None
         day = self._first_day + self._now_s() / DAY_S
         return keep(self._channel, self._estimation, self._in_force, self._reference, day, self._utc_ns())
 
     def memories(self) -> dict[str, bytes]:
-        """`memory` by identity, of the device that is there now and of those that were there before."""
+        """`memory` by identity: of the device that is connected now and of those that were connected before."""
         taught = self._estimation is not None and (self._estimation.recursion.windows or self._in_force is not None)
         return self._kept | ({self.identity: self.memory()} if taught else {})
 

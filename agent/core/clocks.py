@@ -1,4 +1,4 @@
-"""How the clocks of a channel's devices run: one result a device each minute of the run."""
+"""How the clocks of the devices of a channel run: one result for each device in each minute of the run."""
 
 from __future__ import annotations
 
@@ -21,16 +21,18 @@ UNKNOWN = (float("nan"), float("nan"))
 
 
 class Clocks:
-    """Knows when the clocks of one channel are due, and reports them."""
+    """Reports the clocks of one channel, once a minute."""
 
     def __init__(self) -> None:
-        # In s since the run's origin; None: the run was begun by a version of the program that had no clock results.
+        # Time of the next report in s since the run's origin. None: the version of the program that began the run had
+        # no clock results.
         self._due_s: float | None = EVERY_S
 
     def reports(
         self, source: Source, now_s: float, streams: Mapping[str, DeviceStream], estimation: Estimation | None
     ) -> list[Result]:
-        """At the first event of each minute since the run's origin: a report of each device that sent data since.
+        """At the first event of each minute since the run's origin: a report of each device that sent data
+        since the last report.
 
         `streams` are those of the sensor and of its reference, by name. The sensor's report comes last: a consumer that
         asks for the newest one gets it.
@@ -56,7 +58,7 @@ class Clocks:
         return {} if self._due_s is None else {"clock_due_s": self._due_s}
 
     def load(self, state: Mapping[str, Any]) -> None:
-        """Take the state that `snapshot` gave. The state of a run without clock results lacks it: none come then."""
+        """Take the state that `snapshot` gave. If the state is of a run without clock results, no reports follow."""
         self._due_s = state.get("clock_due_s")
 
 

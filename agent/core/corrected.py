@@ -1,4 +1,4 @@
-"""The corrected stream: each block of a sensor as accelerations, by the calibration in force."""
+"""The corrected stream: each block of a sensor, converted to accelerations with the calibration in force."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ def acceleration_block(
     dynamic_only: bool,
     recorded: bool,
 ) -> Acceleration | None:
-    """A block as accelerations in m/s2; None where it holds no three axes or S has no inverse.
+    """A block as accelerations in m/s2; None if the block does not have three axes or S has no inverse.
 
-    `stream` knows the sample times, `origin_utc_ns` is UTC at its origin; `in_force` None: the prior.
+    `stream` gives the sample times, `origin_utc_ns` is UTC at its origin. If `in_force` is None, the prior is used.
     """
     if block.indications.shape[1] != 3 or not block.n:
         return None

@@ -1,4 +1,4 @@
-"""One sensor's S and Q on-line: recursion, gate and drift test, window by window (method: recursion, acceptance)."""
+"""One sensor's S and Q on-line: recursion, gate and drift test, window by window (docs/online.md)."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ FIXED_MOUNT_LEAST = 4  # parameters: three of Q, and one of S; without turning, 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Judged:
-    """What became of a window: the gate's decision, the innovation, and drift verdicts that changed."""
+    """The result for a window: the decision of the gate, the innovation, and drift verdicts that changed."""
 
     decision: Decision
     innovation: Innovation
@@ -49,7 +49,7 @@ class Tried:
 
 
 class Estimation:
-    """The state, what is in force and what is kept aside. `judge` and the operator's verbs change it."""
+    """The state, the calibration in force and the held windows. `judge` and commands of an operator change them."""
 
     def __init__(self, channel: Channel, nominal: float | None) -> None:
         """`nominal` is the device's own sensitivity by its data sheet.
@@ -84,7 +84,7 @@ class Estimation:
         return trial.lag_s
 
     def judge(self, window: Window, day: float, lag_s: float, temperature_degc: float) -> Judged:
-        """Take, keep aside or refuse one used window."""
+        """Take, hold or refuse one used window."""
         tried, self._tried = self._tried, None
         if tried is None or tried.window_sums is not window.sums or tried.summary.lag_s != lag_s:
             tried = self._try(window, day, lag_s, temperature_degc)
@@ -120,7 +120,7 @@ class Estimation:
         return Tried(window.sums, summary, *self.recursion.with_window(summary))
 
     def put(self, calibration: Calibration) -> None:
-        """An operator put this in force: the state goes on from it, unless it is there anyway."""
+        """An operator put this calibration in force: the state continues from it, if it differs from the state."""
         now = self.recursion.result()
         if not (
             np.array_equal(now.sensitivity, calibration.sensitivity) and np.array_equal(now.offset, calibration.offset)
@@ -132,7 +132,7 @@ class Estimation:
         self._held = []
 
     def forget_reference(self) -> None:
-        """Another reference stands there: neither its error nor windows kept aside are of the one before."""
+        """The reference was replaced: drop the estimate of its error and the held windows."""
         self.recursion.forget_reference()
         self.gate.dismiss()
         self._held = []
@@ -216,11 +216,11 @@ def _limits(channel: Channel, scale: float) -> GateSettings:
 
 
 def _most(innovation: Innovation, scale: float) -> str:
-    """The parameter that a window contradicts most, if it alone had changed."""
+    """The parameter whose change alone explains a window best."""
     size = np.abs(np.nan_to_num(innovation.score))
     p = int(np.argmax(size))
     if size[p] == 0.0:
-        return "no single parameter explains it"
+        return "no change of a single parameter explains the window"
     change = innovation.score[p] / np.sqrt(innovation.information[p]) / scale
     told = f"{change:+.3g} m/s2" if p >= 9 else f"{100.0 * change:+.3g} %"
-    return f"most of {PARAMETERS[p]}, as if it were off by {told} ({size[p]:.1f} standard deviations)"
+    return f"a change of {PARAMETERS[p]} by {told} explains it best ({size[p]:.1f} standard deviations)"

@@ -1,6 +1,7 @@
-"""What goes into the pipeline (events) and what comes out of it (results). Both are recorded in this form.
+"""Events are the input of the pipeline, results are its output. Both are recorded in this form.
 
-All times are the gateway's: `t_monotonic_ns` is CLOCK_MONOTONIC of the boot named by `boot_id`, `t_utc_ns` is UTC.
+All times are of the gateway's clocks: `t_monotonic_ns` is CLOCK_MONOTONIC of the boot named by `boot_id`, `t_utc_ns` is
+UTC.
 """
 
 from __future__ import annotations
@@ -16,7 +17,10 @@ from hw.block import SampleBlock
 
 
 class RunStart(msgspec.Struct, frozen=True, kw_only=True):
-    """First event of every file: all that replaying it needs. `continuation`: the run goes on from another file."""
+    """First event of every file, with everything that a replay needs.
+
+    `continuation`: an earlier file has the same run.
+    """
 
     run_id: str
     site: str
@@ -29,12 +33,12 @@ class RunStart(msgspec.Struct, frozen=True, kw_only=True):
     fingerprint: dict[str, str]
     snapshot: bytes  # Pipeline.snapshot() before the next event
     file_sequence: int
-    event_sequence: int  # of this event; the next event has the next number
+    event_sequence: int  # number of this event; the next event has the next number
     continuation: bool = False
 
 
 class DeviceChange(msgspec.Struct, frozen=True, kw_only=True):
-    """A device was lost, came back, or was opened; `info` is its identity as read (JSON of DeviceInfo)."""
+    """A device was opened, lost, or opened again. `info_json` is what its driver read of it (JSON of DeviceInfo)."""
 
     device: str
     state: Literal["open", "lost"]
@@ -46,7 +50,7 @@ class DeviceChange(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Gap(msgspec.Struct, frozen=True, kw_only=True):
-    """Something between device and pipeline was dropped: a full queue, unreadable lines, a jump in the sequence."""
+    """Data between device and pipeline were lost: by a full queue, unreadable lines, or a jump of the sample number."""
 
     device: str
     t_monotonic_ns: int
@@ -56,19 +60,19 @@ class Gap(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Tick(msgspec.Struct, frozen=True, kw_only=True):
-    """Time passes though devices may be silent."""
+    """Time has passed. Ticks come also while no device sends data."""
 
     t_monotonic_ns: int
     t_utc_ns: int
 
 
 class Command(msgspec.Struct, frozen=True, kw_only=True):
-    """What an operator asked for; refused ones are events as well, for the record, and change nothing.
+    """A command of an operator. A refused command is an event too, so that it is recorded, but it changes nothing.
 
     `arguments_json` by verb: pose {"theta_deg", "alpha_deg"} or {"direction", "gravity_mps2"} or {"gravity_mps2"} with
     an optional "position"; hold {} or {"release": true}; accept {"sequence"} of an Estimate; rollback {"sequence"} of
-    a calibration, which the event then carries whole in `calibration_json`. `key_id` is of the key that signed it, in a
-    refused one what the sender said it was; `counter` is 0 there.
+    a calibration, which `calibration_json` then holds completely. `key_id` names the key that signed the command; in a
+    refused command it is what the sender stated, and `counter` is 0.
     """
 
     sensor: str
@@ -79,17 +83,17 @@ class Command(msgspec.Struct, frozen=True, kw_only=True):
     calibration_json: str = ""
     key_id: str = ""
     counter: int = 0
-    refused: str = ""  # why; "" where it was taken
+    refused: str = ""  # the reason; "" if the command was not refused
 
 
 class Pruned(msgspec.Struct, frozen=True, kw_only=True):
-    """Recordings that were deleted to keep to their limits: all of these numbers, so that no one need suspect theft."""
+    """The agent deleted its oldest recordings, to stay within the configured limits: all numbers from first to last."""
 
     t_monotonic_ns: int
     t_utc_ns: int
     first_file: int
     last_file: int
-    last_sha256: str  # of the last of them, hexadecimal: the file after it names the same
+    last_sha256: str  # of the last deleted file, hexadecimal; the next file holds the same value
     bytes: int
 
 
@@ -97,24 +101,24 @@ Event = RunStart | SampleBlock | DeviceChange | Gap | Command | Pruned | Tick
 
 
 class Result(msgspec.Struct, frozen=True, kw_only=True):
-    """What follows from events.
+    """A result of the pipeline.
 
-    A subclass here and the protobuf message that is called as its `what`, with a capital letter and fields of the same
-    names, make a new kind: it is recorded, stored, published and shown by that name. `routine` results come by
-    schedule: they are not written to the log.
+    A new kind of result needs a subclass here and a protobuf message. The message has the name in `what` with a capital
+    first letter, and fields of the same names. The result is then recorded, stored, published and shown under this
+    name. `routine` results come by schedule and are not written to the log.
     """
 
     what: ClassVar[str]
     routine: ClassVar[bool] = False
 
     run_id: str
-    sequence: int  # of all results of the gateway
+    sequence: int  # counts all results of the gateway
     sensor: str
     t_utc_ns: int
 
 
 class WindowReport(Result, frozen=True, kw_only=True):
-    """The verdict on one window."""
+    """Whether one window was used, and why not."""
 
     what: ClassVar[str] = "window"
 
@@ -125,16 +129,17 @@ class WindowReport(Result, frozen=True, kw_only=True):
     reason: str
     points: int
     left_out: int
-    numbers: dict[str, float]  # the statistics behind the verdict, each with its unit in its name
-    fault: str = ""  # where the program itself failed: exception, file and line; "" where it did not
+    numbers: dict[str, float]  # the statistics on which the verdict rests, each with its unit in its name
+    fault: str = ""  # if the program itself failed: exception, file and line; otherwise ""
 
 
 class CalibrationUpdate(Result, frozen=True, kw_only=True):
-    """S and Q in force from now on.
+    """S and Q that are in force from `t_utc_ns` on.
 
-    Where a parameter is not determined its value and uncertainty are the prior's. At a temperature T the offset is
+    If a parameter is not determined, its value and uncertainty are those of the prior. At a temperature T the offset is
     Q + sum of offset_temperature[k - 1] (T - T0)^k over k = 1.., T0 = reference_temperature_degc, and row i of S is
-    multiplied by 1 + sensitivity_temperature[i] (T - T0); both were seen between the two ends of the range only.
+    multiplied by 1 + sensitivity_temperature[i] (T - T0). Data exist only from temperature_low_degc to
+    temperature_high_degc.
     """
 
     what: ClassVar[str] = "calibration"
@@ -151,33 +156,40 @@ class CalibrationUpdate(Result, frozen=True, kw_only=True):
     residual_sd: list[float]  # per output axis, output unit
     output_unit: str
     identity: str  # device kind, serial number and settings this calibration belongs to
-    reference_temperature_degc: float = float("nan")  # NaN where the device tells no temperature
+    reference_temperature_degc: float = float("nan")  # NaN if the device measures no temperature
     temperature_low_degc: float = float("nan")
     temperature_high_degc: float = float("nan")
     offset_temperature: list[list[float]] = []  # (order, 3), output unit per K^k
     u_offset_temperature: list[list[float]] = []
-    sensitivity_temperature: list[float] = []  # (3,) per K; empty where it is not modelled
+    sensitivity_temperature: list[float] = []  # (3,) per K; empty if the model has no such term
     u_sensitivity_temperature: list[float] = []
     offset_rate: list[float] = []  # (3,) output unit per day
     u_offset_rate: list[float] = []
-    # Where it comes into force again, after a restart or by a rollback: which result it was when it was made.
+    # If the calibration comes into force again, after a restart or by a rollback: the result that first put it in
+    # force.
     made_run_id: str = ""
     made_sequence: int = 0
     made_utc_ns: int = 0
 
     @property
     def made(self) -> tuple[str, int]:
-        """(run, sequence) of the result by which it first came into force: its identity, the same each time."""
+        """(run, sequence) of the result that first put it in force.
+
+        This identifies the calibration and never changes.
+        """
         return (self.made_run_id, self.made_sequence) if self.made_sequence else (self.run_id, self.sequence)
 
     @property
     def date_utc_ns(self) -> int:
-        """When it was made; `t_utc_ns` is since when it is in force."""
+        """Date of the calibration: when it was made. `t_utc_ns` is the time at which it came into force."""
         return self.made_utc_ns or self.t_utc_ns
 
 
 class Estimate(Result, frozen=True, kw_only=True):
-    """S and Q as the data have them, not in force: they wait for an operator's `accept` of this `sequence`."""
+    """S and Q from the data that are not in force.
+
+    An operator can put them in force by `accept` with this `sequence`.
+    """
 
     what: ClassVar[str] = "estimate"
 
@@ -186,18 +198,20 @@ class Estimate(Result, frozen=True, kw_only=True):
 
 
 class DriftReport(Result, frozen=True, kw_only=True):
-    """The sequential test's verdict on one parameter, whenever it changes. It is the sensor or the reference: data
-    cannot tell."""
+    """The verdict of the sequential drift test on one parameter, published when it changes.
+
+    The data cannot show whether the sensor or the reference has changed.
+    """
 
     what: ClassVar[str] = "drift"
 
     parameter: str  # of calib.model.PARAMETERS
     verdict: Literal["stable", "drifting", "stepped"]
-    change: float  # stepped: by how much, output unit (per m/s2)
+    change: float  # for "stepped": size of the step, output unit (per m/s2)
     u_change: float
-    rate: float  # drifting: a day
+    rate: float  # for "drifting": change per day
     u_rate: float
-    onset_utc_ns: int  # stepped: since when
+    onset_utc_ns: int  # for "stepped": time of the step
     statistic: float
     threshold: float
     false_alarms_a_year: float
@@ -205,7 +219,7 @@ class DriftReport(Result, frozen=True, kw_only=True):
 
 
 class StatusChange(Result, frozen=True, kw_only=True):
-    """CalibrationStatus of a sensor, with the reason."""
+    """CalibrationStatus of a sensor, with the reason for it."""
 
     what: ClassVar[str] = "status"
 
@@ -215,10 +229,10 @@ class StatusChange(Result, frozen=True, kw_only=True):
 
 
 class ClockReport(Result, frozen=True, kw_only=True):
-    """How the clock of one device runs against the gateway's, once a minute of the run; NaN is unknown.
+    """How the clock of one device runs against the clock of the gateway, once in each minute of the run; NaN: unknown.
 
-    A clock model gives each sample its time. `offset_s`, `jitter_s` and `arrivals` are of the bursts that the model
-    rests on: those of the last minute, of a longer time where `window_s` is longer, 8192 at most.
+    A clock model gives each sample its time. `offset_s`, `jitter_s` and `arrivals` come from the bursts to which the
+    model is fitted: those of the last minute, or of `window_s` if that is longer, and 8192 at most.
     """
 
     what: ClassVar[str] = "clock"
@@ -226,13 +240,13 @@ class ClockReport(Result, frozen=True, kw_only=True):
 
     device: str
     role: Literal["sensor", "reference"]
-    nominal_rate_hz: float  # as the driver states it
+    nominal_rate_hz: float  # the rate that the driver states
     rate_hz: float  # at the newest sample
     u_rate_hz: float
-    offset_s: float  # median of: arrival of a burst, less the model's time of the newest sample in it
+    offset_s: float  # median of (arrival of a burst - time of the newest sample in it by the clock model)
     u_offset_s: float
-    jitter_s: float  # SD of the same, robust: 1.4826 times the median absolute deviation from the median
-    lag_s: float  # role sensor: by which its indications come after the reference's; reference: NaN
+    jitter_s: float  # robust SD of the same differences: 1.4826 times their median absolute deviation
+    lag_s: float  # delay of the sensor's indications after the reference's; NaN for the reference
     u_lag_s: float
     arrivals: int
 
@@ -243,8 +257,8 @@ class Acceleration:
 
     `acceleration` (N, 3); sample i was taken at `t_utc_ns` + i / `rate_hz`. `covariance` (3, 3) in m2/s4 is the
     calibration's part at the block's mean, `noise` (3,) in m/s2 the residual SD of one sample. `determined` (12,) of
-    the calibration used, which `calibration_run_id` and `calibration_sequence` name (0: the prior). It has no number of
-    its own: `first_index` counts.
+    the calibration used, which `calibration_run_id` and `calibration_sequence` name (0: the prior). Blocks have no
+    sequence number; `first_index` counts the samples.
     """
 
     sensor: str
@@ -257,8 +271,8 @@ class Acceleration:
     determined: NDArray[np.bool_]
     calibration_run_id: str
     calibration_sequence: int
-    dynamic_only: bool  # an AC-coupled sensor: its mean means nothing
-    recorded: bool  # whether it goes into the recording as well
+    dynamic_only: bool  # True for an AC-coupled sensor: the mean acceleration is not measured
+    recorded: bool  # whether the block is written to the recording too
 
 
 RESULTS: dict[str, type[Result]] = {kind.what: kind for kind in Result.__subclasses__()}

@@ -1,16 +1,16 @@
-"""A fault of the program told in a line that is the same wherever the recording is replayed."""
+"""Describes a fault of the program in one line, which is the same wherever the recording is replayed."""
 
 from __future__ import annotations
 
 import re
 
 OURS = ("agent", "calib", "hw")
-LONGEST = 200  # characters of what the exception says
-_ADDRESS = re.compile(r" at 0x[0-9a-f]+")  # of an object in memory: another one in every process
+LONGEST = 200  # characters of the exception's message
+_ADDRESS = re.compile(r" at 0x[0-9a-f]+")  # address of an object in memory: it differs between processes
 
 
 def told(error: Exception) -> str:
-    """`ValueError at agent/core/windows.py:57: what it says`: the innermost line that is of this program."""
+    """`ValueError at agent/core/windows.py:57: what it says`: the innermost line that belongs to this program."""
     place, trace = "an unknown place", error.__traceback__
     while trace is not None:
         module = str(trace.tb_frame.f_globals.get("__name__", ""))

@@ -13,13 +13,13 @@ from calib.distributions import chi2_quantile
 from calib.model import PARAMETERS, Calibration
 
 Status = Literal["UNCALIBRATED", "COLLECTING", "VALID", "HELD", "RECALIBRATING", "INVALID"]
-PROPOSALS_KEPT = 8  # an operator may answer one that newer ones have followed
+PROPOSALS_KEPT = 8  # so that an operator can accept an estimate after newer ones were published
 
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What one window says: chi-squared of its innovation against the state's own covariance, and whether its
-    excitation supports an update at all; if not, `reason` tells why."""
+    """What the gate needs of one window: chi-squared of its innovation, with the covariance of the state, and whether
+    its excitation supports an update; if not, `reason` says why."""
 
     t_s: float
     statistic: float
@@ -30,12 +30,13 @@ class Evidence:
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """What becomes of the window.
+    """What happens with the window.
 
-    `take`: it goes into the state; `hold`: it is kept aside; `adopt`: all that were kept aside go in; `refuse`: it is
-    left out. `in_force`: S and Q in force are now the state's. `propose`: publish `proposal` as an Estimate and give
-    its number to `Gate.published`, several in their order. `held`: the newest windows to keep aside, at most
-    `confirm_windows`, so that a wild one among them does not stand in the way for ever; the others are dismissed.
+    `take`: the state takes the window; `hold`: the window is held until further windows confirm it; `adopt`: the state
+    takes all held windows; `refuse`: the window is not used. `in_force`: S and Q of the state are now in force.
+    `propose`: publish `proposal` as an Estimate and give its number to `Gate.published`, several in their order.
+    `held`: how many of the newest windows stay held, at most `confirm_windows`. Older ones are dismissed, so that a
+    wrong window among them cannot prevent a confirmation for ever.
     """
 
     action: Literal["take", "hold", "adopt", "refuse"]
@@ -48,13 +49,13 @@ class Decision:
 
     @property
     def propose(self) -> bool:
-        """There is a proposal to publish."""
+        """Whether there is a proposal to publish."""
         return self.proposal is not None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Answer:
-    """What a command did: `refused` tells why it did nothing; `calibration` is in force now, where it changed."""
+    """Effect of a command. `refused` says why it had none. `calibration` is in force now; None if nothing changed."""
 
     status: Status
     reason: str
@@ -63,38 +64,39 @@ class Answer:
 
 
 class Gate:
-    """The gate of one sensor. Its status follows from what it holds; `judge`, commands and events change that.
+    """The gate of one sensor. `judge`, commands and events change its state, from which its status follows.
 
-    In the order of precedence: INVALID (silent or lost), VALID on hold (rolled back), HELD (by an operator; or windows
-    that contradict what is in force, or would lead too far), RECALIBRATING (a confirmed jump settles), VALID (something
-    is in force), COLLECTING (windows taken, too little determined), UNCALIBRATED.
+    The status is the first of these that applies: INVALID (the sensor is silent or lost), VALID on hold (after a
+    rollback), HELD (an operator put it on hold, or held windows contradict the calibration in force or would change it
+    beyond a limit), RECALIBRATING (the first windows after a confirmed jump), VALID (a calibration is in force),
+    COLLECTING (windows were taken, but too few parameters are determined), UNCALIBRATED.
     """
 
     def __init__(self, settings: GateSettings, accepted: Calibration, in_force: Calibration | None = None) -> None:
-        """`accepted`: by an operator, so a certificate or data sheet, or `Gate.accepted` of the run before; `in_force`:
-        what was in force before, if anything.
+        """`accepted`: the calibration that an operator accepted: from the certificate or the data sheet, or
+        `Gate.accepted` of the previous run. `in_force`: the calibration that was in force before, if there was one.
 
-        Raises ValueError where nothing can start from it: see Anchor, or `in_force` is beyond max_change.
+        Raises ValueError if Anchor does, or if `in_force` is beyond max_change of `accepted`.
         """
         self._settings = settings
         self._anchor = Anchor(settings, accepted)
-        self._calibrated = in_force is not None  # something is in force
+        self._calibrated = in_force is not None  # a calibration is in force
         if in_force is not None:
             beyond = self._anchor.change(in_force).reason
             if beyond:
-                raise ValueError(f"what was in force before is {beyond}")
+                raise ValueError(f"the calibration that was in force before cannot be used: {beyond}")
             self._anchor.learn(in_force)
-        self._taken = False  # a window was consistent with what was known
+        self._taken = False  # a window was consistent with the state
         self._lost = False
         self._hold: Literal["", "operator", "rollback"] = ""
-        self._held = 0  # windows kept aside
-        self._agreeing = 0  # windows in a row that are consistent again, while some are kept aside
-        self._settling = 0  # windows until a confirmed jump has settled
+        self._held = 0  # number of held windows
+        self._agreeing = 0  # consistent windows in a row since the last held one
+        self._settling = 0  # further windows with the status RECALIBRATING
         self._proposals: list[tuple[int, Calibration]] = []  # oldest first; number 0: not yet published
 
     @property
     def status(self) -> Status:
-        """CalibrationStatus as it follows from the state."""
+        """CalibrationStatus that follows from the state of the gate."""
         if self._lost:
             return "INVALID"
         if self._hold:
@@ -107,24 +109,30 @@ class Gate:
 
     @property
     def held(self) -> int:
-        """Windows kept aside; a command or a lost sensor may have dismissed them."""
+        """Number of held windows. A command or the loss of the sensor dismisses them."""
         return self._held
 
     @property
     def accepted(self) -> Calibration:
-        """What changes are counted from; a later run that begins with it goes on counting."""
+        """The calibration from which changes are counted.
+
+        A later run that begins with it continues to count from it.
+        """
         return self._anchor.calibration
 
     # --- windows
 
     def judge(self, evidence: Evidence, candidate: Calibration, confirmed: Calibration | None = None) -> Decision:
-        """One window. `candidate`: the state if it were taken; `confirmed`: where the windows kept aside lead, this one
-        among them, if they agree with each other (worth computing from `confirm_windows` on, see Decision.held).
+        """Decide on one window. `candidate`: the calibration if the state takes the window. `confirmed`: the
+        calibration if the state takes all held windows with this one; None if they do not agree with each other, or if
+        they are fewer than `confirm_windows` (see Decision.held).
         """
         if not evidence.supported:
             return self._decision("refuse", evidence.reason)
         if self._hold:
-            return self._decision("refuse", "on hold until an operator releases it")
+            return self._decision(
+                "refuse", "an operator put the calibration on hold; no window is used until an operator releases it"
+            )
         limit = chi2_quantile(1.0 - self._settings.false_holds, evidence.degrees_of_freedom)
         numbers = {"innovation_chi2": evidence.statistic, "innovation_chi2_threshold": limit}
         consistent = evidence.degrees_of_freedom <= 0 or evidence.statistic <= limit
@@ -136,7 +144,9 @@ class Gate:
             return self._confirmed(confirmed, numbers)
         if consistent:
             return self._beyond(candidate, change, numbers)
-        return self._decision("hold", "a jump not yet confirmed: innovation beyond its threshold", numbers)
+        return self._decision(
+            "hold", "the window contradicts the calibration; held until further windows confirm a jump", numbers
+        )
 
     def _consistent(self, candidate: Calibration, numbers: dict[str, float]) -> Decision:
         self._taken = True
@@ -146,7 +156,7 @@ class Gate:
                 self._held = self._agreeing = 0
         elif self._settling:
             self._settling -= 1
-        return self._accepted("take", candidate, "consistent with what was known", numbers)
+        return self._accepted("take", candidate, "consistent with the calibration so far", numbers)
 
     def _confirmed(self, confirmed: Calibration, numbers: dict[str, float]) -> Decision:
         change = self._anchor.change(confirmed)
@@ -154,29 +164,39 @@ class Gate:
             return self._beyond(confirmed, change, numbers)
         count, self._taken = self._held, True
         self._held, self._settling = 0, self._settings.settle_windows
-        return self._accepted("adopt", confirmed, f"confirmed by {count} windows that agree", numbers | change.numbers)
+        return self._accepted(
+            "adopt",
+            confirmed,
+            f"a jump was confirmed by {count} windows that agree with each other",
+            numbers | change.numbers,
+        )
 
     def _beyond(self, calibration: Calibration, change: Change, numbers: dict[str, float]) -> Decision:
-        reason = f"{change.reason}; until an operator accepts it"
+        reason = f"{change.reason}; held until an operator accepts it"
         return self._decision("hold", reason, numbers | change.numbers, proposal=calibration)
 
     def _accepted(
         self, action: Literal["take", "adopt"], calibration: Calibration, reason: str, numbers: dict[str, float]
     ) -> Decision:
-        """The window goes into the state; whether S and Q in force follow is for the policy and what is determined."""
-        # What a certificate tells well the data need not tell better.
+        """The state takes the window. Policy and determined parameters decide whether S and Q in force change too."""
+        # The data need not determine a parameter that the certificate states well enough.
         known = calibration.determined | self._anchor.known
         determined = int(np.count_nonzero(known))
         least = self._settings.least_determined or 1
         if not self._calibrated and determined < least:
             missing = [p for p, told in zip(PARAMETERS, known, strict=True) if not told]
-            self._settling = 0  # nothing in force that could settle
+            self._settling = 0  # RECALIBRATING is only for a calibration in force
             numbers |= {"determined": determined, "determined_threshold": least}
-            return self._decision(action, f"not determined yet: {', '.join(missing)}", numbers)
+            return self._decision(action, f"not in force yet, parameters not determined: {', '.join(missing)}", numbers)
         if self._settings.policy == "propose":
-            return self._decision(action, f"{reason}; waits for an operator", numbers, proposal=calibration)
+            return self._decision(
+                action,
+                f"{reason}; not in force until an operator accepts it (policy propose)",
+                numbers,
+                proposal=calibration,
+            )
         if self._settings.policy == "observe":
-            return self._decision(action, f"{reason}; only observed", numbers)
+            return self._decision(action, f"{reason}; not put in force (policy observe)", numbers)
         self._calibrated = True
         self._anchor.learn(calibration)
         return self._decision(action, reason, numbers, in_force=True)
@@ -197,7 +217,7 @@ class Gate:
         return Decision(action, self.status, reason, numbers or {}, in_force, proposal, self._held)
 
     def published(self, sequence: int) -> None:
-        """The oldest proposal without a number went out as this Estimate."""
+        """The oldest proposal without a number was published as the Estimate with this number."""
         k = next(k for k, (number, _) in enumerate(self._proposals) if not number)
         self._proposals[k] = (sequence, self._proposals[k][1])
         self._proposals = self._proposals[-PROPOSALS_KEPT:]
@@ -210,41 +230,42 @@ class Gate:
         return Answer(self.status, reason)
 
     def regain(self, reason: str) -> Answer:
-        """It speaks again; windows kept aside are from before, and dismissed."""
+        """The sensor sends data again. Held windows are older than the interruption and are dismissed."""
         self._lost = False
         self.dismiss()
         return Answer(self.status, reason)
 
     def dismiss(self) -> None:
-        """Windows kept aside tell nothing more: what they were made with is another now."""
+        """Dismiss the held windows, because the device with which they were made was replaced or interrupted."""
         self._held = self._agreeing = 0
 
     def hold(self, key: str) -> Answer:
-        """An operator stops all change."""
+        """An operator puts the calibration on hold: no window is used."""
         if self._hold:
-            return self._refused("it is on hold already")
+            return self._refused("the calibration is on hold already")
         self._hold = "operator"
         self._held = self._agreeing = 0
-        return Answer(self.status, f"on hold by {key}")
+        return Answer(self.status, f"put on hold by {key}")
 
     def release(self, key: str) -> Answer:
-        """An operator lets changes through again."""
+        """An operator ends the hold: windows are used again."""
         if not self._hold:
-            return self._refused("it is not on hold")
+            return self._refused("the calibration is not on hold")
         self._hold = ""
         return Answer(self.status, f"released by {key}")
 
     def accept(self, sequence: int, key: str) -> Answer:
-        """An operator puts an Estimate in force; it is the new anchor."""
+        """An operator puts an Estimate in force. It becomes the new anchor."""
         found = [calibration for number, calibration in self._proposals if number == sequence and number]
         if not found:
             waiting = ", ".join(str(number) for number, _ in self._proposals if number) or "none"
-            return self._refused(f"no estimate {sequence} waits to be accepted; waiting: {waiting}")
+            return self._refused(f"estimate {sequence} cannot be accepted; estimates that can be: {waiting}")
         return self._put_in_force(found[0], f"estimate {sequence} accepted by {key}")
 
     def rollback(self, calibration: Calibration, key: str) -> Answer:
-        """An operator puts an earlier calibration in force. It stays on hold: else the next windows would undo it."""
-        answer = self._put_in_force(calibration, f"rolled back by {key}; on hold until released")
+        """An operator puts an earlier calibration in force, on hold, because the next windows would undo the
+        rollback."""
+        answer = self._put_in_force(calibration, f"rolled back by {key}; on hold until an operator releases it")
         if answer.refused:
             return answer
         self._hold = "rollback"

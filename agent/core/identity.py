@@ -1,4 +1,4 @@
-"""Who a device is, and what its data sheet says, out of what it told when it was opened."""
+"""Identity of a device and its data sheet's sensitivity, from the information that its driver read at opening."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Any
 
 from agent.config.knowledge import Certificate
 
-# Ports and speeds name the way to a device, not the device: they may change without the calibration losing its sense.
+# Ports and speeds belong to the connection, not to the device: the calibration stays valid when they change.
 WAYS = frozenset({"port", "baud_rate", "bus"})
 
 
 def identity_of(info_json: str) -> str:
-    """Who a device is and how it is set: a calibration holds for this and nothing else."""
+    """Identity of a device with its settings. A calibration is valid for this identity only."""
     info = json.loads(info_json)
     settings = {k: v for k, v in info["settings"].items() if k not in WAYS}
     held = [info["driver"], info["kind"], info["serial_number"], info["unit"], info["axes"], sorted(settings.items())]
@@ -23,14 +23,15 @@ def identity_of(info_json: str) -> str:
 
 
 def nominal_of(info: Mapping[str, Any]) -> float | None:
-    """What the device's data sheet says of its sensitivity; one that tells m/s2 has 1."""
+    """Sensitivity by the data sheet of the device; 1 if the device indicates m/s2; None if it is not known."""
     nominal = info["nominal_sensitivity"]
     return 1.0 if nominal is None and info["unit"] == "m/s2" else nominal
 
 
 def not_certified(info_json: str, certificate: Certificate) -> str:
-    """Why the certificate is not this reference's, "" where it may be: a device that tells no number says nothing."""
+    """Why the certificate does not belong to this reference. "" if it may belong: also if one of the two serial numbers
+    is not known."""
     told, stated = json.loads(info_json)["serial_number"], certificate.serial_number
     if not told or not stated or told == stated:
         return ""
-    return f"the certificate is of serial number {stated}, the reference is {told}"
+    return f"the certificate is of serial number {stated}, but the reference has serial number {told}"

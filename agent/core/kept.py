@@ -1,10 +1,11 @@
-"""What of one device outlives a run, and what a later run makes of it.
+"""The state of a device that is kept for later runs, and what a later run does with it.
 
-A state holds only for what it was made with. Where the configuration states something else since, or another version
-of the program wrote it, the estimation begins anew: from the calibration in force, or from the prior if that is new.
+A state is valid only for the settings under which it was made. If these settings have changed in the configuration, or
+if the state cannot be read, the estimation begins again: from the calibration in force, or from the prior if the prior
+has changed.
 
-S and Q belong to the sensor and outlive a new mount. The rest of the state does not: at a fixed mount it holds the mean
-output there, on a clamp the errors of its angles, and everywhere the error of one reference.
+S and Q belong to the sensor and stay valid when it is mounted elsewhere. The rest of the state does not: it holds the
+mean output at a fixed mount, the errors of the angles of a clamp, and the error of the reference.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from agent.core.schedule import pose_of
 from agent.core.snapshot import pack, unpack
 from calib.model import Pose
 
-# What the numbers of a state mean; how fast they may wander and when they are believed may change at any time.
+# Settings on which the meaning of a state depends. Walks (process), gate and drift settings may change at any time.
 BASIS = frozenset(
     {"prior", "certificate", "uncertainty", "temperature", "coupling", "gravity_mps2", "static_sign", "reference"}
     | {"rotation", "rotation_gravity_mps2", "clamp_theta_deg"}
@@ -36,9 +37,10 @@ MALFORMED = (ValueError, KeyError, TypeError, AttributeError, IndexError)  # a s
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Kept:
-    """An estimation as a later run takes it up; `in_force` None: nothing was. `reason` tells what was made of it.
+    """The estimation with which a later run begins. `in_force` is None if no calibration was in force. `reason` says
+    how much of the kept state is used.
 
-    `reference` is the identity of the reference that it was made with, `day` its own count when it was kept.
+    `reference` is the identity of the reference in the kept state, `day` the days that its estimation had counted.
     """
 
     estimation: Estimation
@@ -57,7 +59,7 @@ def keep(
     day: float,
     t_utc_ns: int,
 ) -> bytes:
-    """All that `take_up` needs."""
+    """The state for `take_up`, as bytes."""
     return pack(
         {
             "in_force": plain(in_force),
@@ -71,49 +73,58 @@ def keep(
 
 
 def take_up(kept: bytes, channel: Channel, nominal: float | None) -> Kept:
-    """The estimation that `keep` took, as far as it still holds. Raises ValueError as Estimation does."""
+    """The estimation from the bytes of `keep`, as far as it is still valid. Raises ValueError as Estimation does."""
     fresh = Estimation(channel, nominal)
     try:
         state = unpack(kept)
         in_force, day, t_utc_ns = update_of(state["in_force"]), float(state["day"]), int(state["t_utc_ns"])
     except MALFORMED as error:
-        return Kept(fresh, None, "", 0.0, 0, f"begun anew: what was kept cannot be read: {_said(error)}")
+        return Kept(
+            fresh, None, "", 0.0, 0, f"begun again from the prior: the stored state cannot be read: {_said(error)}"
+        )
     try:
         changed = _changed(state["basis"], channel)
         reference = str(state["reference"])
         if not changed:
             fresh.load(state["estimation"])
-            return Kept(fresh, in_force, reference, day, t_utc_ns, "restored from the run before")
+            return Kept(fresh, in_force, reference, day, t_utc_ns, "restored from the previous run")
         why = f"these settings have changed: {', '.join(changed)}"
     except MALFORMED as error:
-        changed, reference, why = [], "", f"its state cannot be read: {_said(error)}"
+        changed, reference, why = [], "", f"the stored state cannot be read: {_said(error)}"
     fresh = Estimation(channel, nominal)
     if in_force is None or "prior" in changed:
-        return Kept(fresh, None, reference, day, t_utc_ns, f"begun anew from the prior: {why}")
+        return Kept(fresh, None, reference, day, t_utc_ns, f"begun again from the prior: {why}")
     try:
-        fresh.gate.load(state["estimation"]["gate"])  # an operator's hold, and what changes are counted from
+        fresh.gate.load(state["estimation"]["gate"])  # an operator's hold and the anchor stay
     except MALFORMED:
         refused = fresh.gate.rollback(calibration_of(in_force), "").refused
         fresh.gate.release("")
         if refused:
-            return Kept(Estimation(channel, nominal), None, reference, day, t_utc_ns, f"begun anew: {why}; {refused}")
+            return Kept(
+                Estimation(channel, nominal),
+                None,
+                reference,
+                day,
+                t_utc_ns,
+                f"begun again from the prior: {why}; {refused}",
+            )
     fresh.put(calibration_of(in_force))
-    return Kept(fresh, in_force, reference, day, t_utc_ns, f"begun anew from the calibration in force: {why}")
+    return Kept(fresh, in_force, reference, day, t_utc_ns, f"begun again from the calibration in force: {why}")
 
 
 def shelved(kept: Mapping[str, bytes], identity: str, memory: bytes) -> dict[str, bytes]:
-    """With what is kept of one more device; the one that was here longest ago goes."""
+    """`kept` with the state of one more device. If there are too many, the oldest state is dropped."""
     newest = {name: state for name, state in kept.items() if name != identity} | {identity: memory}
     return dict(list(newest.items())[-MOST_MEMORIES:])
 
 
 def plain(update: CalibrationUpdate | None) -> dict[str, Any] | None:
-    """As a snapshot can hold it."""
+    """The update in a form that a snapshot can hold."""
     return None if update is None else msgspec.structs.asdict(update)
 
 
 def update_of(state: dict[str, Any] | None) -> CalibrationUpdate | None:
-    """What `plain` took."""
+    """The update from the form that `plain` gave."""
     return None if state is None else CalibrationUpdate(**state)
 
 
@@ -126,7 +137,7 @@ def _basis(channel: Channel) -> dict[str, str]:
 
 
 def _by_position(stances: Iterable[tuple[Pose, Stop]]) -> dict[str, list[str]]:
-    """How the sensor is stated to stand, by the name of the position; at what times does not matter."""
+    """The stated orientations of the sensor, by the name of the position; their times do not matter."""
     found: dict[str, set[str]] = {}
     for pose, stop in stances:
         found.setdefault(pose.position, set()).add(stop.model_dump_json(exclude={"start_s", "stop_s"}))
@@ -156,7 +167,7 @@ def _same_section(before: str, section: object) -> bool:
 
 
 def _same_mount(name: str, before: dict[str, str], now: dict[str, str]) -> bool:
-    """Whether positions were only added or left out: at least one stayed, and all that stayed are stated as before."""
+    """Whether positions were only added or removed: at least one is in both, and all that are in both are equal."""
     if name not in ("poses", "positions"):
         return False
     were, are = msgspec.json.decode(before[name]), msgspec.json.decode(now[name])

@@ -1,15 +1,15 @@
-"""What of a device outlives a run."""
+"""State of a device that is kept for later runs."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-MOST_MEMORIES = 8  # devices that stood in one place, one after the other; 0.1 MB each
+MOST_MEMORIES = 8  # states of devices that were used under one sensor name, one after the other; 0.1 MB each
 
 
 @dataclass(frozen=True, slots=True)
 class Memory:
-    """What outlives a run of the estimation on one device: its state after the result with this number."""
+    """State of the estimation on one device, after the result with the number `sequence`. It is kept for later runs."""
 
     sensor: str
     identity: str

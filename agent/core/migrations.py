@@ -1,4 +1,4 @@
-"""States of released versions of the program, brought up to date one version at a time.
+"""Converts states that an older version of the program wrote, one version at a time.
 
 A function `from_version_<n>` gets what `unpack` found in a state of version n (of a whole pipeline, or what is kept of
 one device) and changes it to what version n + 1 writes.
@@ -41,7 +41,7 @@ def _of_axes(name: str, kind: Kind) -> dict[str, Kind]:
     return {f"{name}_{axis}": kind for axis in "xyz"}
 
 
-# Version 1 had names alone. Every name that a running agent gave, without the position in brackets behind some.
+# Version 1 had names only. These are all names that an agent wrote, without the position in brackets that some have.
 _VERSION_1: Mapping[str, Kind] = {
     **dict.fromkeys(PARAMETERS[:9], SENSITIVITY),
     **dict.fromkeys(PARAMETERS[9:], OFFSET),
@@ -72,7 +72,7 @@ _VERSION_1_BY_POSITION: Mapping[str, Kind] = {
 
 
 def from_version_1(state: dict[str, Any]) -> None:
-    """Each unknown gets its kind. Raises KeyError for a name that version 1 did not have.
+    """Give each unknown its kind. Raises KeyError for a name that version 1 did not have.
 
     The summary of a window told which of its blocks is which window, a summary has one; noise is now by window. A
     stream had one clock, now each run between two restarts of a device has its own.
@@ -92,7 +92,7 @@ def from_version_1(state: dict[str, Any]) -> None:
 
 
 def _estimations(state: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    """Of all channels of a pipeline, or of the device whose state is kept."""
+    """The estimations of all channels of a pipeline, or the one of a device whose state was kept."""
     for holder in [state, *state.get("channels", {}).values()]:
         if holder.get("estimation"):
             yield holder["estimation"]

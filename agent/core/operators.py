@@ -1,4 +1,4 @@
-"""What an operator's commands do to an estimation."""
+"""Carries out the commands of an operator on an estimation."""
 
 from __future__ import annotations
 
@@ -19,13 +19,14 @@ from calib.model import Pose
 
 
 class CommandError(ValueError):
-    """A command that makes no sense; the message says why."""
+    """A command that cannot be carried out. The message says why."""
 
 
 def answer(command: Command, estimation: Estimation, identity: str) -> tuple[Answer, CalibrationUpdate | None]:
-    """The gate's answer to hold, accept or rollback, carried out. Raises CommandError on what no gate understands.
+    """Carry out hold, accept or rollback: the answer of the gate and, after a rollback, the update whose calibration is
+    in force again.
 
-    `identity` is the device's that is there now. With a rollback, the update whose calibration is in force again.
+    `identity` is the identity of the device that is connected now. Raises CommandError if the arguments are wrong.
     """
     arguments, key = _arguments(command), command.key_id
     if command.verb == "hold":
@@ -34,7 +35,7 @@ def answer(command: Command, estimation: Estimation, identity: str) -> tuple[Ans
     if command.verb == "accept":
         sequence = arguments.get("sequence")
         if not isinstance(sequence, int):
-            raise CommandError(f"accept needs the sequence of an estimate, not {sequence!r}")
+            raise CommandError(f"accept needs the sequence number of an estimate, not {sequence!r}")
         found = estimation.gate.accept(sequence, key)
     else:
         earlier = _earlier(command, identity)
@@ -45,26 +46,36 @@ def answer(command: Command, estimation: Estimation, identity: str) -> tuple[Ans
 
 
 def _earlier(command: Command, identity: str) -> CalibrationUpdate:
-    """The update that a rollback carries. Raises CommandError where it is none, or another device's."""
+    """The update in a rollback command. Raises CommandError if there is none, or if it belongs to another device."""
     try:
         update = msgspec.convert(_numbers(json.loads(command.calibration_json)), CalibrationUpdate)
         calibration = calibration_of(update)
     except ValueError as error:  # of json, of msgspec, and of numpy where rows differ in length
-        raise CommandError(f"rollback carries no calibration: {error}") from None
+        raise CommandError(f"the command holds no calibration that can be read: {error}") from None
     if update.identity != identity:
-        raise CommandError(f"calibration {update.sequence} belongs to {update.identity}, this is {identity}")
+        raise CommandError(f"calibration {update.sequence} belongs to {update.identity}, but this device is {identity}")
     shapes = (calibration.sensitivity.shape, calibration.offset.shape, calibration.covariance.shape)
     if shapes != ((3, 3), (3,), (12, 12)) or not np.isfinite(calibration.covariance).all():
-        raise CommandError(f"calibration {update.sequence} is not whole: S, Q and a finite covariance of both")
+        raise CommandError(
+            f"calibration {update.sequence} is not complete: it must hold S, Q and a finite covariance of both"
+        )
     return update
 
 
 def commanded_pose(command: Command, channel: Channel) -> Pose:
-    """How the sensor stands from now on. Raises CommandError where the arguments are none of a pose."""
+    """The new pose of the sensor.
+
+    Raises CommandError if the arguments do not describe a pose that the channel allows.
+    """
     if channel.rotation is not None:
-        raise CommandError("a sensor beside a tri-axial reference stands as rotation says; it takes no poses")
+        raise CommandError(
+            "the channel has a rotation to a tri-axial reference, so it takes no poses; change rotation instead"
+        )
     if channel.fixed_mount:
-        raise CommandError("the configuration states a single pose, so a mount that never turns; it takes no other")
+        raise CommandError(
+            "the configuration states a single pose, so the mount never turns; "
+            "state further poses there to allow this one"
+        )
     arguments = _arguments(command)
     position = arguments.pop("position", None)
     try:
@@ -73,9 +84,11 @@ def commanded_pose(command: Command, channel: Channel) -> Pose:
     except (ValidationError, ValueError, TypeError) as error:
         raise CommandError(f"not a pose: {str(error).splitlines()[0]}") from None
     if channel.reference is None and pose.direction.shape[1] != 0:
-        raise CommandError("a pose with a direction needs a reference, which this channel has not")
+        raise CommandError("a pose with a direction of motion needs a reference, but this channel has none")
     if channel.reference is not None and pose.direction.shape[1] == 0:
-        raise CommandError("a rest (gravity_mps2 alone) is for a channel without a reference")
+        raise CommandError(
+            "gravity_mps2 alone states a rest, which is for a channel without a reference; add the direction of motion"
+        )
     return pose if position is None else Pose(str(position), *_rest_of(pose))
 
 
@@ -87,14 +100,14 @@ def _arguments(command: Command) -> dict[str, Any]:
     try:
         held = json.loads(command.arguments_json)
     except ValueError as error:
-        raise CommandError(f"arguments are no JSON: {error}") from None
+        raise CommandError(f"the arguments are not JSON: {error}") from None
     if not isinstance(held, dict):
-        raise CommandError(f"arguments must be an object, not {type(held).__name__}")
+        raise CommandError(f"the arguments must be a JSON object, not {type(held).__name__}")
     return held
 
 
 def _numbers(value: Any) -> Any:
-    """JSON has null where a number is none."""
+    """Replaces null by NaN, which JSON cannot hold."""
     if isinstance(value, dict):
         return {key: _numbers(item) for key, item in value.items()}
     if isinstance(value, list):

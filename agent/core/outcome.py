@@ -1,4 +1,4 @@
-"""What an estimation found, as results."""
+"""Makes results from what an estimation found."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MOST_TEMPERATURE_ORDER = 2
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """Whose results these are, and when they are made; run and sequence are given by the pipeline."""
+    """The sensor of the results and the time at which they are made. The pipeline adds run and sequence."""
 
     sensor: str
     identity: str
@@ -28,7 +28,7 @@ class Source:
 
 
 def calibration_update(source: Source, calibration: Calibration, recursion: Recursion) -> CalibrationUpdate:
-    """S and Q with all that belongs to them: temperature, drift, how many windows."""
+    """S and Q with temperature coefficients, drift rates and the number of windows."""
     powers = [k for k in range(1, MOST_TEMPERATURE_ORDER + 1) if offset_temperature(k)[0] in recursion.names]
     by_power = [_both(recursion, offset_temperature(k)) for k in powers]
     S_temperature = _both(recursion, MAIN_TEMPERATURE) if MAIN_TEMPERATURE[0] in recursion.names else ([], [])
@@ -50,13 +50,16 @@ def calibration_update(source: Source, calibration: Calibration, recursion: Recu
 
 
 def again(update: CalibrationUpdate, before: CalibrationUpdate) -> CalibrationUpdate:
-    """An update by which a calibration comes into force that was in force `before`: it is still that one."""
+    """`update` for a calibration that comes into force again.
+
+    It keeps the identity and date that it has in `before`.
+    """
     run_id, sequence = before.made
     return msgspec.structs.replace(update, made_run_id=run_id, made_sequence=sequence, made_utc_ns=before.date_utc_ns)
 
 
 def calibration_of(update: CalibrationUpdate) -> Calibration:
-    """What `calibration_update` was made of."""
+    """The calibration in an update."""
     return Calibration(
         np.array(update.sensitivity), np.array(update.offset), np.array(update.covariance),
         np.array(update.determined, dtype=bool), np.inf, update.method,
@@ -64,14 +67,14 @@ def calibration_of(update: CalibrationUpdate) -> Calibration:
 
 
 def estimate(source: Source, reason: str, update: CalibrationUpdate) -> Estimate:
-    """A proposal that waits for an operator."""
+    """A proposal that an operator can accept."""
     return Estimate(
         run_id="", sequence=0, sensor=source.sensor, t_utc_ns=source.t_utc_ns, reason=reason, calibration=update
     )
 
 
 def drift_report(source: Source, verdict: DriftVerdict, false_alarms_a_year: float, origin_utc_ns: int) -> DriftReport:
-    """A verdict of the sequential test, its onset in UTC."""
+    """A verdict of the sequential test, with its onset in UTC."""
     onset = round(verdict.onset_s * 1e9) + origin_utc_ns if np.isfinite(verdict.onset_s) else 0
     return DriftReport(
         run_id="", sequence=0, sensor=source.sensor, t_utc_ns=source.t_utc_ns, parameter=verdict.parameter,
@@ -84,7 +87,7 @@ def drift_report(source: Source, verdict: DriftVerdict, false_alarms_a_year: flo
 def window_report(
     source: Source, window: Window, *, used: bool, reason: str, numbers: dict[str, float], fault: str = ""
 ) -> WindowReport:
-    """The verdict on a window, the gate's numbers after the excitation's."""
+    """The verdict on a window. Its numbers are those of the excitation, then those of the gate."""
     return WindowReport(
         run_id="", sequence=0, sensor=source.sensor, t_utc_ns=source.t_utc_ns, start_s=window.start_s,
         stop_s=window.stop_s, position=window.pose.position, used=used, reason=reason, points=window.points,
@@ -93,7 +96,7 @@ def window_report(
 
 
 def status_change(source: Source, status: str, before: str, reason: str) -> StatusChange:
-    """A change of status, or why a command changed nothing."""
+    """A change of status, or news while the status stays: for example why a command was refused."""
     return StatusChange(
         run_id="", sequence=0, sensor=source.sensor, t_utc_ns=source.t_utc_ns,
         status=status, before=before, reason=reason,  # type: ignore[arg-type]

@@ -1,6 +1,7 @@
 """The deterministic core: events in, results out. No I/O, no clock, no threads, no randomness.
 
-Live, devices feed it; in an audit, a recording does. `restore(snapshot())` equals going on, bit for bit.
+The events come from devices in a run and from a recording in an audit. A pipeline from `restore(config_json,
+snapshot())` gives the same further results as the original, bit for bit.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from hw.block import SampleBlock
 
 
 class Pipeline:
-    """All channels of one gateway, fed in one total order."""
+    """All channels of one gateway. Events come one at a time, in the order of the recording."""
 
     def __init__(self, config: Config) -> None:
         self._config = config
@@ -48,10 +49,11 @@ class Pipeline:
         last_sequence: int,
         kept: Mapping[str, Mapping[str, bytes]],
     ) -> Pipeline:
-        """The pipeline of a new run: results count on from `last_sequence`, seconds from `origin_ns` (monotonic).
+        """The pipeline of a new run. Results are numbered from `last_sequence` + 1, seconds count from `origin_ns`
+        (monotonic).
 
-        `kept` are the memories of runs before, by sensor and identity of the device: each is taken up again when its
-        very device opens.
+        `kept` are the memories of previous runs, by sensor and identity of the device. Each is used when this device
+        opens.
         """
         pipeline = cls(config)
         pipeline._run_id = run_id
@@ -62,7 +64,7 @@ class Pipeline:
 
     @classmethod
     def restore(cls, config_json: str, snapshot: bytes) -> Pipeline:
-        """The pipeline whose `snapshot` this is. Raises ValueError on what is none."""
+        """The pipeline from its `snapshot`. Raises ValueError if the bytes are no snapshot."""
         pipeline = cls(Config.model_validate_json(config_json))
         state = unpack(snapshot)
         pipeline._run_id = state["run_id"]
@@ -82,7 +84,7 @@ class Pipeline:
         )
 
     def step(self, event: Event) -> list[Output]:
-        """Take the next event; what follows from it, in order. Results are numbered, blocks of acceleration are not."""
+        """Take the next event and give its results, in order. Results get a number, blocks of acceleration get none."""
         if isinstance(event, RunStart):
             return []
         found: list[Output] = []
@@ -100,7 +102,7 @@ class Pipeline:
         return msgspec.structs.replace(item, run_id=self._run_id, sequence=self._next_sequence - 1)
 
     def memories(self, results: Sequence[Output]) -> list[Memory]:
-        """What must outlive the run, of every sensor whose state these results (of the step just made) have changed."""
+        """States for later runs, of every sensor whose state has changed by these results of the last step."""
         found = []
         for channel in self._channels:
             own = [r for r in results if r.sensor == channel.sensor and isinstance(r, Result) and changes_state(r)]
@@ -109,7 +111,7 @@ class Pipeline:
         return found
 
     def all_memories(self) -> list[Memory]:
-        """What must outlive the run, of every sensor and every device that it was, as it is after the last event."""
+        """States for later runs after the last event, of every sensor and every device that was used under its name."""
         last = self._next_sequence - 1
         return [
             Memory(c.sensor, identity, last, state) for c in self._channels for identity, state in c.memories().items()
@@ -125,11 +127,11 @@ class Pipeline:
             return channel.on_device(event)
         if isinstance(event, Command):
             return channel.on_command(event)
-        return []  # a Gap is visible in the blocks' own flags and indices; it is recorded for people
+        return []  # a Gap is recorded for people; the pipeline sees it in the flags and indices of the blocks
 
 
 def changes_state(result: Result) -> bool:
-    """Whether a result tells of a window taken, of a calibration put in force or proposed, or of an operator's word."""
+    """Whether a result means that a window was taken, a calibration put in force or proposed, or a command executed."""
     if isinstance(result, StatusChange):
-        return bool(result.before)  # the first status of a run is no news of the device
+        return bool(result.before)  # the first status of a run does not change the state
     return isinstance(result, CalibrationUpdate | Estimate) or (isinstance(result, WindowReport) and result.used)

@@ -59,14 +59,14 @@ class FoundPositions:
 
     @property
     def piece(self) -> Piece | None:
-        """The next one, None while it may still change."""
+        """The next piece; None while it may still change."""
         found = self._next()
         if found is None or (math.isinf(self._stretch_at(found.start_s).stop_s) and found.stop_s > self._cleared_s):
             return None
         return found
 
     def done(self, piece: Piece) -> None:
-        """This piece is through."""
+        """This piece is done."""
         self._after_s = piece.stop_s
         guard_s = self._channel.guard_s
         self._stretches = [s for s in self._stretches if s.stop_s - guard_s > self._after_s]
@@ -76,7 +76,7 @@ class FoundPositions:
 
     @property
     def keep_from_s(self) -> float:
-        """From when on samples are needed."""
+        """Samples before this time are not needed any more."""
         found = self._next()
         return self._oldest_s if found is None else min(found.start_s, self._oldest_s)
 
@@ -117,7 +117,7 @@ class FoundPositions:
         usable = cut is not None and cut.axes == 3 and cut.in_time
         mean = mean_output(cut.values, cut.clock.rate_hz) if cut is not None and usable else None
         if cut is None or mean is None:
-            return Placed(None, f"less than {SHORTEST_S:g} s of samples: too few to tell how it stands", {})
+            return Placed(None, f"less than {SHORTEST_S:g} s of samples, which is too short to find the position", {})
         knowledge, calibration = self._knowledge(known.scale), known.law(day).at(cut.temperature_degc)
         if self._stops:
             return nearest_stop(mean, self._stops, calibration, knowledge)

@@ -1,4 +1,4 @@
-"""When the sensor stands how: the poses of the configuration, repeated for ever if it says so."""
+"""The poses of the sensor over time, from the configuration or by command; with poses_repeat_s they repeat for ever."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from calib.model import Pose
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """One stretch of time in one pose, guards taken off; seconds since the sensor's first sample."""
+    """An interval of time in one pose, without the guards at its ends; seconds since the sensor's first sample."""
 
     start_s: float
     stop_s: float
@@ -25,7 +25,7 @@ class Piece:
 
 @dataclass(frozen=True, slots=True)
 class Stance:
-    """How the sensor stands between two times, guards not yet taken off; the last one has no end."""
+    """The pose of the sensor between two times, guards included; the last stance has no end."""
 
     start_s: float
     stop_s: float
@@ -43,12 +43,15 @@ class Stance:
 
 
 class ToldTimes:
-    """The pieces one after the other, their times told beforehand or by an operator. Seconds as in Piece."""
+    """Gives the pieces in order of time; their times come from the configuration or from commands.
+
+    Seconds as in Piece.
+    """
 
     def __init__(self, channel: Channel) -> None:
         self._channel = channel
-        self._after_s = 0.0  # done up to here
-        self._stances: list[Stance] = []  # by command; the configuration's before any
+        self._after_s = 0.0  # pieces up to this time are done
+        self._stances: list[Stance] = []  # by command; empty while the poses of the configuration apply
         self._plan()
 
     def _plan(self) -> None:
@@ -56,21 +59,21 @@ class ToldTimes:
         self.piece = next(self._upcoming, None)
 
     def done(self, piece: Piece) -> None:
-        """This piece is through; the next one becomes `piece`."""
+        """This piece is done; the next one becomes `piece`."""
         self._after_s = piece.stop_s
         self.piece = next(self._upcoming, None)
 
     @property
     def keep_from_s(self) -> float:
-        """From when on samples are needed."""
+        """Samples before this time are not needed any more."""
         return math.inf if self.piece is None else self.piece.start_s
 
     def turn(self, now_s: float, pose: Pose) -> None:
-        """An operator says how it stands from now on."""
+        """An operator states a new pose, which begins now."""
         stood = []
         if self.piece is not None and self.piece.start_s < now_s:
-            # The pose before holds until now: its window is closed here, a guard taken off as at every change. One that
-            # ended before, and waits for late samples, holds no longer than it did.
+            # The previous pose ends now, and its window with it, a guard earlier as at every change. If its piece has
+            # ended already and only waits for late samples, its end stays as it is.
             stop_s = min(now_s, self.piece.stop_s + self._channel.guard_s)
             stood = [Stance(self.piece.start_s - self._channel.guard_s, stop_s, self.piece.pose)]
         self._stances = [*stood, Stance(now_s, math.inf, pose)]
@@ -87,9 +90,9 @@ class ToldTimes:
 
 
 def pieces(channel: Channel, after_s: float, stances: Sequence[Stance] = ()) -> Iterator[Piece]:
-    """The pieces that lie after `after_s`, in order of time; without end where the schedule repeats.
+    """The pieces after `after_s`, in order of time; without end if the schedule repeats.
 
-    `stances`, where there are any, take the place of the configuration's poses.
+    If there are `stances`, they replace the poses of the configuration.
     """
     stretches = ((s.start_s, s.stop_s, s.pose) for s in stances) if stances else _stretches(channel, after_s)
     for start_s, stop_s, pose in stretches:
@@ -110,5 +113,5 @@ def _stretches(channel: Channel, after_s: float) -> Iterator[tuple[float, float,
 
 
 def pose_of(interval: PoseInterval, channel: Channel) -> Pose:
-    """The pose that a section of the configuration, or a command, states."""
+    """The pose that a section of the configuration or a command states."""
     return interval.pose(channel.gravity_mps2, channel.static_sign, feels_gravity=channel.coupling == "dc")

@@ -1,4 +1,4 @@
-"""State as bytes and back, every float bit for bit."""
+"""Converts state to bytes and back. Every float keeps its bits."""
 
 from __future__ import annotations
 
@@ -14,14 +14,17 @@ _ARRAY = 1  # msgpack extension code for a numpy array
 
 
 def pack(state: dict[str, Any]) -> bytes:
-    """Bytes of nested dicts and lists of str, int, float, bool, None and numpy arrays; equal state, equal bytes."""
+    """Bytes of nested dicts and lists of str, int, float, bool, None and numpy arrays.
+
+    Equal states give equal bytes.
+    """
     return _ENCODER.encode({"version": VERSION, "state": state})
 
 
 def unpack(data: bytes) -> dict[str, Any]:
-    """The state that `pack` took, of an older version brought up to date.
+    """The state in the bytes of `pack`. A state of an older version is converted to the present one.
 
-    Raises ValueError when the bytes are no snapshot, or of a version that this program does not know.
+    Raises ValueError if the bytes are no snapshot, or if this program does not know their version.
     """
     try:
         held = msgspec.msgpack.decode(data, ext_hook=_decode_array)
@@ -29,12 +32,16 @@ def unpack(data: bytes) -> dict[str, Any]:
     except (msgspec.DecodeError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"not a snapshot: {error}") from None
     if not isinstance(state, dict) or (version != VERSION and version not in MIGRATIONS):
-        raise ValueError(f"a snapshot of version {version}; this program reads {min(MIGRATIONS)} to {VERSION}")
+        raise ValueError(
+            f"the snapshot has version {version}, but this program reads versions {min(MIGRATIONS)} to {VERSION} only"
+        )
     try:
         for older in range(version, VERSION):
             MIGRATIONS[older](state)
     except (KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"a snapshot of version {version} that cannot be brought up to date: {error!r}") from None
+        raise ValueError(
+            f"the snapshot has version {version} and cannot be converted to version {VERSION}: {error!r}"
+        ) from None
     return state
 
 

@@ -1,4 +1,4 @@
-"""The newest samples of one device, with the clock that says when each was taken."""
+"""The newest samples of one device, and the clock model that gives the time of each sample."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from calib.signal.samples import Samples
 from calib.signal.timing import HORIZON_S, ClockFit, ClockModel
 from hw.block import BlockFlags, SampleBlock
 
-# Times its nominal rate, more than any clock is off: a count in microseconds, say, is none of samples, and the holes
-# in it would fill the memory.
+# Largest rate of sample numbers, as a multiple of the nominal rate. A faster count is no count of samples but, for
+# example, of microseconds; filling the gaps between its numbers would use up the memory.
 FASTEST = 10.0
 
 
@@ -80,14 +80,14 @@ class Run:
 
 
 class DeviceStream:
-    """Blocks of one device as they come, forgotten when `forget_before` says so.
+    """Holds the blocks of one device until `forget_before` drops them.
 
     Times are seconds since the run's origin on the gateway's monotonic clock. After a RESTART or an OVERRUN (nobody can
     count the samples on) a new `Run` begins, with a clock of its own; runs before are kept as long as they are needed.
     """
 
     def __init__(self, name: str, origin_ns: int, horizon_s: float = HORIZON_S) -> None:
-        """`horizon_s`: how far back the clock model must know the times."""
+        """`horizon_s`: the clock model must give times this far back."""
         self._name = name
         self._origin_ns = origin_ns
         self._horizon_s = horizon_s
@@ -225,7 +225,7 @@ class DeviceStream:
 
     @classmethod
     def restore(cls, name: str, origin_ns: int, state: dict[str, Any], horizon_s: float = HORIZON_S) -> DeviceStream:
-        """The stream whose `snapshot` this is."""
+        """The stream from its `snapshot`."""
         stream = cls(name, origin_ns, horizon_s)
         stream._runs = [Run.restore(run) for run in state["runs"]]
         stream.newest_arrival_s = state["newest_arrival_s"]

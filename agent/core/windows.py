@@ -48,7 +48,7 @@ def windows_in(piece: Piece, first_s: float, channel: Channel, streams: dict[str
     except Unusable as error:
         return Found([refused(piece, str(error))])
     if not found:
-        return Found([refused(piece, "the samples of sensor and reference do not meet")])
+        return Found([refused(piece, "the samples of sensor and reference do not overlap in time")])
     found = [replace(w, start_s=w.start_s - first_s, stop_s=w.stop_s - first_s) for w in found]
     return Found(found, sensor.temperature_degc)
 

@@ -45,11 +45,13 @@ def compare(
     tolerance: float,
     *,
     complete: bool = True,
+    reasons: bool = True,
 ) -> Difference | None:
     """The first difference between the results of one event, or None.
 
     `tolerance` 0 compares floats by their bits, so that NaN equals NaN and 0.0 differs from -0.0; above it is relative
-    to the largest of a list. Where `complete` is false the recording may end before the last results.
+    to the largest of a list. Where `complete` is false the recording may end before the last results. Where `reasons`
+    is false the text in `reason` is not compared: another version of the program may word it in another way.
     """
 
     def difference(what: str, field: str, before: Any, now: Any, *, decision: bool) -> Difference:
@@ -67,6 +69,8 @@ def compare(
         if type(before) is not type(now) or topic_of(before) != topic_of(now):
             return difference(topic_of(before), "kind", topic_of(before), topic_of(now), decision=True)
         pair = (_plain(before), _plain(now))
+        if not reasons:
+            pair = (pair[0] | {"reason": ""}, pair[1] | {"reason": ""})
         for field, a, b in differences(*pair, tolerance):
             return difference(topic_of(before), field, a, b, decision=not isinstance(a, float))
     if len(recorded) > len(computed) or (complete and len(recorded) < len(computed)):

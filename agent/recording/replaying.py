@@ -8,6 +8,7 @@ from typing import Protocol, cast
 
 import msgspec
 
+from agent import __version__
 from agent.core.events import CalibrationUpdate, Event, Output, Pruned, RunStart, WindowReport
 from agent.recording.comparison import Difference, compare
 from agent.recording.messages import decode, encode, recorded_ones, schema_of, topic_of
@@ -66,6 +67,7 @@ class Replay:
         self._elsewhere = elsewhere
         self._pipeline: PipelineLike | None = None  # as the last file left it, if the next file may continue with it
         self._next_event = 0
+        self._reasons = True  # compare the texts of reasons too; another version may word them in another way
         self.files: list[ReplayedFile] = []
         self.calibrations: list[CalibrationUpdate] = []
         self.windows: list[WindowReport] = []
@@ -101,6 +103,12 @@ class Replay:
         if other:
             file.tolerance = self._elsewhere
             file.notes.append(f"recorded with another {', '.join(other)} than on this machine: last bits may differ")
+        version = start.versions.get("fieldcal", __version__)
+        self._reasons = version == __version__
+        if not self._reasons:
+            file.notes.append(
+                f"recorded by fieldcal {version}, this is {__version__}: texts of reasons are not compared"
+            )
         before = self.files[-2] if len(self.files) > 1 else None
         follows = before is not None and before.run_id == start.run_id and start.continuation
         if follows and start.event_sequence > self._next_event:
@@ -130,8 +138,9 @@ class Replay:
         self.windows += [result for result in computed if isinstance(result, WindowReport)]
         if computed or step.results:
             found = compare(
-                file.path, step.event_sequence, step.results, computed, file.tolerance, complete=step.complete
-            )
+                file.path, step.event_sequence, step.results, computed, file.tolerance,
+                complete=step.complete, reasons=self._reasons,
+            )  # fmt: skip
             if found is not None:
                 self._differ(file, found)
 

@@ -1,4 +1,4 @@
-"""Figures of S itself: its rows in space (Figures 6 to 9, 13 to 15), its elements with their U (Figures 10 to 12)."""
+"""Figures of S: its rows in space (Figures 6 to 9, 13 to 15), and its elements with U (Figures 10 to 12)."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def rows_in_space(result: CalibrationResult) -> Figure | None:
     known = [i for i in range(3) if np.isfinite(S[i, i])]
     if not known:
         return None
-    drawn = Figure(figsize=(WIDTH_IN, 4.6))  # placed by hand: automatic layouts leave a diagram in space little room
+    drawn = Figure(figsize=(WIDTH_IN, 4.6))  # placed by numbers: an automatic layout makes a diagram in space too small
     axes: Any = drawn.add_axes((0.0, 0.16, 1.0, 0.84), projection="3d")
     reach = 1.15 * float(np.abs(S[known]).max())
     low = min(0.0, 1.15 * float(S[known].min()))
@@ -50,13 +50,13 @@ def rows_in_space(result: CalibrationResult) -> Figure | None:
 
 
 def _frame(axes: Any, low: float, reach: float) -> None:
-    """Three axes through the origin, each with its numbers along it."""
+    """Draw three axes through the origin, each with its numbers."""
     axes.set_axis_off()
     axes.set(xlim=(low, reach), ylim=(low, reach), zlim=(low, reach))
     axes.view_init(elev=22, azim=38)
     axes.set_box_aspect(None, zoom=1.15)
     ticks = [t for t in MaxNLocator(4).tick_values(low, reach) if 0.95 * low < t < 0.95 * reach and t != 0]
-    beside = -reach * np.array([[0, 0, 0.07], [0, 0, 0.07], [0, 0.13, 0]])  # of each axis: where its numbers stand
+    beside = -reach * np.array([[0, 0, 0.07], [0, 0, 0.07], [0, 0.13, 0]])  # position of the numbers of each axis
     for j, axis in enumerate(AXES):
         ends = np.outer((low, reach), np.eye(3)[j])
         axes.plot(*ends.T, color=INK, linewidth=0.8)
@@ -67,7 +67,7 @@ def _frame(axes: Any, low: float, reach: float) -> None:
 
 
 def main_sensitivities(results: Sequence[CalibrationResult]) -> Figure | None:
-    """S_xx, S_yy, S_zz of each result with their U; None where there is none."""
+    """S_xx, S_yy, S_zz of each result with U; None if there is none."""
     names = [f"$S_{{{axis}{axis}}}$" for axis in AXES]
     places = [PARAMETERS.index(f"S{axis}{axis}") for axis in AXES]
     values = [(r.values[places], r.expanded_uncertainty[places]) for r in results]
@@ -114,7 +114,7 @@ def transverse_sensitivities(results: Sequence[CalibrationResult]) -> Figure | N
 
 
 def _bar(axes: Axes, row: float, value: float, expanded: float, k: int, label: str | None = None) -> None:
-    """A value with its expanded uncertainty; one whose uncertainty is not known stands alone."""
+    """A value with its expanded uncertainty, or without if the uncertainty is not known."""
     axes.errorbar(
         value, row, xerr=expanded if np.isfinite(expanded) else None, label=label, capsize=4, markersize=6,
         fmt=RESULT_MARKERS[k % len(RESULT_MARKERS)], color=RESULT_COLOURS[k % len(RESULT_COLOURS)],
@@ -130,7 +130,7 @@ def _relative(result: CalibrationResult) -> tuple[Array, Array]:
 
 
 def _row(values: Array) -> str:
-    """Numbers to four digits of the largest; – where one is not known."""
+    """Numbers, all with the decimals that give the largest four digits; – for a number that is not known."""
     largest = float(np.nanmax(np.abs(values)))
     digits = max(0, 3 - int(np.floor(np.log10(largest)))) if largest > 0 else 3
     texts = [f"{v:.{digits}f}".replace("-", "−") if np.isfinite(v) else "–" for v in values]

@@ -1,4 +1,4 @@
-"""All figures of a report, made and saved: the one place that draws."""
+"""Makes and saves all figures of a report."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Drawn:
 
 
 def draw(material: Material, shown: Residuals | None, directory: Path) -> list[Drawn]:
-    """Save all figures that the material gives. Raises OSError."""
+    """Save all figures for which the material has data. Raises OSError."""
     directory.mkdir(parents=True, exist_ok=True)
     with style.drawing():
         return [
@@ -39,7 +39,7 @@ def _figures(material: Material, shown: Residuals | None) -> Iterator[tuple[str,
     for k, result in enumerate(results):
         about = f", {result.label}" if len(results) > 1 else ""
         number = f"-{k + 1}" if len(results) > 1 else ""
-        caption = f"Rows of S as points{about}; without transverse sensitivities each lies on its axis."
+        caption = f"Rows of S as points{about}; without transverse sensitivities each point is on its axis."
         yield f"rows{number}", caption, diagrams.rows_in_space(result)
     yield "main", "Main sensitivities with their expanded uncertainties.", diagrams.main_sensitivities(results)
     caption = "Transverse sensitivities in percent of the main one of their row, with expanded uncertainties."
@@ -49,17 +49,20 @@ def _figures(material: Material, shown: Residuals | None) -> Iterator[tuple[str,
         where = f"position {position_name(shown.position)}, {shown.time_s[0]:.1f} to {shown.time_s[-1]:.1f} s"
         caption = f"Indications (points) against S a + Q{model} (line): some cycles of the window in {where}."
         yield "indications", caption, signals.indications(shown, unit)
-        caption = f"What S a + Q{model} leaves of the indications, window in {where}."
+        caption = f"Residuals: indications minus S a + Q{model}, window in {where}."
         if results[0].fields.get("nuisances"):
-            caption += " Poses are taken as stated: what the adjustment gives to the nuisances is still in it."
+            caption += (
+                " Poses are taken as stated, so errors that the adjustment assigned "
+                "to nuisances are still in the residuals."
+            )
         if shown.frequency_hz:
             caption += f" Dotted: mean frequency of the motion, {shown.frequency_hz:.3g} Hz."
         yield "residuals", caption, signals.left_over(shown, unit)
     for k, result in enumerate(results):
         about = f", {result.label}" if len(results) > 1 else ""
         number = f"-{k + 1}" if len(results) > 1 else ""
-        caption = f"Where the uncertainty comes from: share of each source in the variance{about}."
+        caption = f"Uncertainty budget: share of each source in the variance{about}."
         yield f"budget{number}", caption, timelines.budget(result)
         yield f"windows{number}", f"Windows and their verdicts{about}.", timelines.windows(result.windows)
-    caption = "Calibrations one after the other, with expanded uncertainties."
+    caption = "History of the calibrations, with expanded uncertainties."
     yield "history", caption, timelines.history(material.history, unit)

@@ -1,4 +1,4 @@
-"""What a report is made of, gathered from results, recordings or a data directory."""
+"""Gathers the content of a report from results, recordings or a data directory."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from agent.report.retraced import retrace
 from agent.report.trace import Trace
 
 MOST_HISTORY = 1000  # newest calibrations and windows of a data directory
-MOST_RECORDINGS = 2  # newest files read for windows point by point: a second or so of work each
+MOST_RECORDINGS = 2  # newest files whose windows are computed again point by point; each takes about a second
 RECORDING_ENDINGS = (".mcap", ".mcap.active")
 
 
@@ -37,8 +37,11 @@ class MaterialError(Exception):
 
 @dataclass(slots=True)
 class Material:
-    """`results`: what the report is about, more than one where methods are compared. `history`: calibrations in order
-    of time. `traces`: windows point by point, by position. `facts`: who and what, by name. `notices`: what is missing.
+    """Content of a report.
+
+    `results`: the calibrations, several if methods are compared. `history`: earlier calibrations in order of time.
+    `traces`: windows point by point, by position. `facts`: sensor, devices and program, by name. `notices`: what is
+    missing in the report, and why.
     """
 
     sensor: str
@@ -54,7 +57,10 @@ def gather(inputs: Sequence[Path], sensor: str | None) -> Material:
     """Read results (JSON), recordings of one sensor, or one data directory. Raises MaterialError."""
     kinds = {_kind(path) for path in inputs}
     if len(kinds) > 1 or (kinds == {"directory"} and len(inputs) > 1):
-        raise MaterialError("give results (JSON), or recordings (.mcap), or one data directory, not a mixture")
+        raise MaterialError(
+            "the inputs are of several kinds; give only results (JSON), or only "
+            "recordings (.mcap), or one data directory"
+        )
     try:
         if kinds == {"directory"}:
             return _from_directory(inputs[0], sensor)
@@ -93,7 +99,7 @@ def _read_result(path: Path) -> CalibrationResult:
     except OSError as error:
         raise MaterialError(f"{path}: {error.strerror or error}") from None
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise MaterialError(f"{path}: no JSON object of a calibration: {error}") from None
+        raise MaterialError(f"{path}: the file is not a JSON object with a calibration: {error}") from None
     except ResultError as error:
         raise MaterialError(f"{path}: {error}") from None
 
@@ -125,38 +131,43 @@ def _from_directory(directory: Path, sensor: str | None) -> Material:
     material = _of(recorded, windows, newest)
     material.history = updates
     material.files = [source_file(path) for path in paths]
-    material.notices += [f"the recording {name} is not there any more" for name in lost]
+    material.notices += [
+        f"the recording {name} does not exist any more, so its windows are not shown point by point" for name in lost
+    ]
     return material
 
 
 def _run_of(history: History, sensor: str, in_force: Record | None) -> str:
-    """The run in which the calibration in force was made; without one, the run of the newest window."""
+    """The run in which the calibration in force was made. If none is in force, the run of the newest window."""
     if in_force is not None:
         return made(in_force)[0]
     return next((window.run_id for window in history.newest(sensor, "window", limit=1)), "")
 
 
 def _present(directory: Path, names: Sequence[str]) -> tuple[list[Path], list[str]]:
-    """The recordings of these names, finished or not, and the names of those that are gone."""
+    """Paths of the recordings with these names, finished or not, and the names of those that do not exist."""
     there = {path.name.removesuffix(".active"): path for _, path in recordings(directory)}
     names = [name.removesuffix(".active") for name in names]
     return [there[name] for name in names if name in there], [name for name in names if name not in there]
 
 
 def _of(recorded: Recorded, windows: list[WindowVerdict], calibrations: list[CalibrationUpdate]) -> Material:
-    """The material of a sensor's newest calibration, or of why there is none."""
+    """The material for the newest calibration of a sensor. If there is none, its reasons say why."""
     versions = recorded.starts[-1].versions if recorded.starts else {}
     if calibrations:
         fields = from_update(calibrations[-1], tuple(windows), versions)
     else:
-        reason = recorded.status.reason if recorded.status else "no calibration in the data"
+        reason = recorded.status.reason if recorded.status else "the data hold no calibration"
         refused = [f"window {w.start_s:.1f} to {w.stop_s:.1f} s: {w.reason}" for w in windows if not w.used]
         fields = undetermined((reason, *refused), tuple(windows))
     result = parse(fields, "no calibration")
     facts = _facts(recorded)
     if recorded.status:
         facts["status"] = f"{recorded.status.status}: {recorded.status.reason}"
-    notices = [f"{path}: ends early, at {fault}; what stands before it is used" for path, fault in recorded.faults]
+    notices = [
+        f"{path}: the recording ends early, at {fault}; only the data before this place are used"
+        for path, fault in recorded.faults
+    ]
     return Material(recorded.sensor, [result], traces=recorded.traces, facts=facts, notices=notices)
 
 
@@ -180,7 +191,9 @@ def _verdict(window: WindowReport) -> WindowVerdict:
 def _chosen(sensor: str | None, names: Sequence[str], where: str) -> str:
     if sensor is not None:
         if sensor not in names:
-            raise MaterialError(f"{where}: no sensor {sensor!r}; there are {', '.join(names) or 'none'}")
+            raise MaterialError(
+                f"{where}: there is no sensor {sensor!r}; the sensors are: {', '.join(names) or 'none'}"
+            )
         return sensor
     if len(names) != 1:
         held = f"the sensors {', '.join(names)}: choose one with --sensor" if names else "no results of any sensor"

@@ -1,4 +1,4 @@
-"""The report as one HTML page that needs nothing else: its style, its figures and all numbers are in it."""
+"""The report as one HTML page, which contains its style, its figures and all numbers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from agent.report.units import ACCELERATION, output_unit, sensitivity_unit
 
 
 def page(material: Material, figures: Sequence[Drawn], seen: Sequence[Residuals]) -> str:
-    """The whole page. `seen`: residuals of the windows at hand, for the first result."""
+    """The whole page. `seen`: residuals of the traced windows for the first result."""
     style = files("agent.report").joinpath("page.css").read_text(encoding="utf-8")
     title = f"Calibration of {material.sensor}" if material.sensor else "Calibration"
     body = "\n".join([*_head(title, material), *_figures(figures), *_numbers(material, seen), *_origin(material)])
@@ -46,7 +46,7 @@ def _summary(result: CalibrationResult, *, several: bool) -> Iterator[str]:
         yield f'<p class="soft">of {escape(str(identity))}</p>'
     if result.reasons:
         reasons = "".join(f"<li>{escape(reason)}</li>" for reason in result.reasons)
-        yield f'<div class="box">{"Refused, because" if result.refused else "To know"}<ul>{reasons}</ul></div>'
+        yield f'<div class="box">{"Refused, because" if result.refused else "Please note"}<ul>{reasons}</ul></div>'
     if not result.determined.any():
         return
     yield tables.matrix(result)
@@ -97,4 +97,4 @@ def _origin(material: Material) -> Iterator[str]:
     rows = [[file.path, str(file.size_bytes), file.sha256] for file in material.files]
     if rows:
         yield tables.table(["made from", "bytes", "SHA-256"], rows, "words", frozenset({2}))
-    yield f'<p class="soft">Written by fieldcal {escape(__version__)}. The numbers are in report.json too.</p>'
+    yield f'<p class="soft">Written by fieldcal {escape(__version__)}. report.json contains all numbers too.</p>'

@@ -1,4 +1,4 @@
-"""A recording read for a report: its results, who was there, and its windows rebuilt from the raw blocks."""
+"""Reads a recording for a report: results, devices, and windows that are computed again from the raw blocks."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from calib.excitation.front_end import aligned, most_margin_s
 from calib.model import Pose
 from hw.block import SampleBlock
 
-MOST_TRACES = 24  # windows kept point by point: the newest of as many positions
+MOST_TRACES = 24  # windows kept point by point: the newest window of each of so many positions
 
 
 @dataclass(slots=True)
 class Recorded:
-    """What recordings hold of one sensor; `traces` by position, the newest last."""
+    """The content of recordings for one sensor; `traces` by position, the newest last."""
 
     sensor: str
     calibrations: list[CalibrationUpdate] = field(default_factory=list)
@@ -49,24 +49,24 @@ def sensors_of(path: Path) -> list[str]:
 
 
 def read_recordings(paths: list[Path], sensor: str) -> Recorded:
-    """Read files in the order given; each stands alone. Raises RecordingError where one is damaged or not readable."""
+    """Read files in the given order, each by itself. Raises RecordingError if one is damaged or cannot be read."""
     out = Recorded(sensor)
     for path in paths:
         channel = next((c for c in _config(_start(path)).channels if c.sensor == sensor), None)
         if channel is None:
-            raise RecordingError(f"{path}: no channel of a sensor {sensor!r}")
+            raise RecordingError(f"{path}: the recording has no channel with the sensor {sensor!r}")
         reader = RecordingReader(path)
         windows: _Windows | None = None
         for step in reader.steps():
             if isinstance(step.event, RunStart):
                 out.starts.append(step.event)
                 windows = _Windows(channel, step.event)
-            assert windows is not None  # a recording begins with RunStart, or has no step
+            assert windows is not None  # a recording with any step begins with RunStart
             windows.update(step.event)
             _take(out, step.event, step.results, windows)
         if reader.fault is not None:
             if reader.fault.kind == "corrupt":
-                raise RecordingError(f"{path}: damaged at {reader.fault}")
+                raise RecordingError(f"{path}: the recording is damaged at {reader.fault}; see `fieldcal audit`")
             out.faults.append((path, reader.fault))
     return out
 
@@ -100,7 +100,7 @@ def _start(path: Path) -> RunStart:
     except OSError as error:
         raise RecordingError(f"{path}: {error.strerror or error}") from None
     if step is None or not isinstance(step.event, RunStart):
-        raise RecordingError(f"{path}: {reader.fault or 'no recording of fieldcal'}")
+        raise RecordingError(f"{path}: {reader.fault or 'the file is not a recording of fieldcal'}")
     return step.event
 
 
@@ -109,7 +109,7 @@ def _config(start: RunStart) -> Config:
 
 
 class _Windows:
-    """The streams of a channel as they were when a window was judged."""
+    """The streams of a channel as they were when the pipeline judged a window."""
 
     def __init__(self, channel: Channel, start: RunStart) -> None:
         self._channel = channel
@@ -124,7 +124,7 @@ class _Windows:
             stream.forget_before((stream.newest_arrival_s or 0.0) - self._keep_s)
 
     def trace(self, window: WindowReport) -> Trace | None:
-        """The points of a window; None where its pose or its samples are not to be found."""
+        """The points of a window; None if its pose or its samples cannot be found."""
         first_s = self._streams[self._channel.sensor].first_sample_s
         pose = self._pose(window)
         if first_s is None or pose is None:
@@ -148,7 +148,7 @@ class _Windows:
         return Trace(points.time_s - first_s, points.V, points.u, points.du, pose)
 
     def _pose(self, window: WindowReport) -> Pose | None:
-        """How the sensor stood in the middle of the window."""
+        """The pose of the sensor in the middle of the window."""
         middle_s = 0.5 * (window.start_s + window.stop_s)
         schedule: Iterator[Pose] = (
             piece.pose

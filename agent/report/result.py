@@ -1,4 +1,4 @@
-"""One calibration as the report shows it: the object `fieldcal calibrate --json -` prints, or a recorded result."""
+"""One calibration in a report: the object that `fieldcal calibrate --json -` prints, or a recorded result."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from calib.model import PARAMETERS, Array
 Item = TypeVar("Item")
 
 PLACES = {"sensitivity": (3, 3), "offset": (3,)}
-# What the report has a place of its own for; any further member of the object stands in a table of its own.
+# Members with their own place in the report. All further members of the object are shown in one more table.
 SHOWN = frozenset(
     {
         "sensitivity", "offset", "standard_uncertainty", "expanded_uncertainty", "covariance", "determined",
@@ -28,11 +28,11 @@ SHOWN = frozenset(
 
 
 class ResultError(ValueError):
-    """The object is no calibration result. The message names the field and what is wrong with it."""
+    """The object is not a calibration result. The message names the field and what is wrong with it."""
 
 
 class WindowVerdict(msgspec.Struct, frozen=True):
-    """One window: seconds since the first sample, used or why not."""
+    """One window: its times in seconds since the first sample, and whether it was used or why not."""
 
     start_s: float
     stop_s: float
@@ -46,7 +46,7 @@ class WindowVerdict(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationResult:
-    """S, Q and what is known of them. Arrays of 12 are in the order of PARAMETERS; NaN where nothing is determined.
+    """S and Q with their uncertainties. Arrays of 12 are in the order of PARAMETERS; NaN: not determined.
 
     `unit` is that of the indications, "" where the result does not say it. `degrees_of_freedom` (12,), NaN where they
     are not stated or without end. `budget` {source: (12,) standard uncertainty}. `files`: what the result was made
@@ -61,7 +61,7 @@ class CalibrationResult:
     covariance: Array
     determined: NDArray[np.bool_]
     degrees_of_freedom: Array
-    lag_s: Array  # (3,), 0 where it is not known
+    lag_s: Array  # (3,), 0 if it is not known
     refused: bool
     reasons: tuple[str, ...]
     windows: tuple[WindowVerdict, ...]
@@ -87,12 +87,12 @@ class CalibrationResult:
 
 
 def parse(fields: Mapping[str, Any], name: str) -> CalibrationResult:
-    """The result in an object of the shape that the contract lays down. Raises ResultError.
+    """The result from an object with the members that docs/calibrate.md describes. Raises ResultError.
 
     It is labelled by its method, by `name` where it does not say one.
     """
     if "sensitivity" not in fields or "status" not in fields:
-        raise ResultError("is no calibration result: it has no sensitivity and status")
+        raise ResultError("the file is not a calibration result: its fields sensitivity and status are missing")
     values, u, expanded = (
         np.append(*_parts(part, where))
         for part, where in (
@@ -126,7 +126,7 @@ def parse(fields: Mapping[str, Any], name: str) -> CalibrationResult:
 def from_update(
     update: CalibrationUpdate, windows: tuple[WindowVerdict, ...], versions: Mapping[str, str]
 ) -> dict[str, Any]:
-    """A recorded calibration as an object of the contract's shape."""
+    """A recorded calibration as an object with the members of `fieldcal calibrate --json -`."""
     u = np.array(update.standard_uncertainty)
     found = np.array(update.determined, dtype=bool)
     values = np.where(found, np.append(np.array(update.sensitivity), update.offset), np.nan)
@@ -159,7 +159,7 @@ def from_update(
 
 
 def undetermined(reasons: tuple[str, ...], windows: tuple[WindowVerdict, ...]) -> dict[str, Any]:
-    """The object of data that were understood and gave no calibration."""
+    """The object for data that could be read but gave no calibration."""
     nothing = {"sensitivity": None, "offset": None}
     return {
         **nothing,
@@ -174,7 +174,7 @@ def undetermined(reasons: tuple[str, ...], windows: tuple[WindowVerdict, ...]) -
 
 
 def plain(value: Any) -> Any:
-    """JSON's own types; what is no finite number is null."""
+    """Converts to types that JSON has. A number that is not finite becomes null."""
     if isinstance(value, Mapping):
         return {key: plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):
@@ -195,7 +195,7 @@ def _parts(part: Any, where: str) -> tuple[Array, Array]:
 
 
 def _array(value: Any, shape: tuple[int, ...], where: str) -> Array:
-    """Numbers of this shape, one standing for all; null, anywhere in it, is NaN. Raises ResultError."""
+    """Numbers as an array of this shape. A single number fills the array, null becomes NaN. Raises ResultError."""
     try:
         array = np.array(np.nan if value is None else value, dtype=object)
         array = np.where(array == None, np.nan, array).astype(float)  # noqa: E711 - elementwise
@@ -203,7 +203,7 @@ def _array(value: Any, shape: tuple[int, ...], where: str) -> Array:
             raise ValueError
     except (TypeError, ValueError):
         size = " x ".join(str(n) for n in shape)
-        raise ResultError(f"field {where}: expected {size} numbers or null, not {_short(value)}") from None
+        raise ResultError(f"field {where}: must be {size} numbers or null, not {_short(value)}") from None
     return np.broadcast_to(array, shape).copy()
 
 
@@ -214,7 +214,7 @@ def _freedom(value: Any) -> Array:
 
 
 def _source(value: Any, where: str) -> Array:
-    """Twelve numbers, in order or by name."""
+    """Twelve numbers, from a list in the order of PARAMETERS or from an object with their names."""
     return _array([value.get(p) for p in PARAMETERS] if isinstance(value, Mapping) else value, (12,), where)
 
 

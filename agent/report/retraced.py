@@ -1,4 +1,4 @@
-"""The windows of a result of `fieldcal calibrate` point by point, from the very files that it names."""
+"""Computes the windows of a result of `fieldcal calibrate` again, point by point, from the files that it names."""
 
 from __future__ import annotations
 
@@ -14,32 +14,35 @@ from agent.calibrate.tables import TableError
 from agent.report.result import CalibrationResult, WindowVerdict
 from agent.report.trace import Trace
 
-MOST_TRACES = 24  # windows shown in numbers: the newest of as many positions
+MOST_TRACES = 24  # windows with numbers: the newest window of each of so many positions
 
 
 def retrace(result: CalibrationResult, directory: Path) -> tuple[dict[str, Trace], list[str]]:
-    """Traces by position, and what hinders them. Files that were moved are looked for in `directory`, the result's."""
+    """Traces by position, and reasons why there are none. A file that was moved is looked for in `directory`, where the
+    result is."""
     options = result.fields.get("options")
     if not isinstance(options, dict) or not (options.get("poses") or options.get("rotation")):
         return {}, []
     found, hindrances = _found(result.files, directory)
     if hindrances:
-        return {}, [f"{hindrance}: indications and residuals are not shown" for hindrance in hindrances]
+        return {}, [f"{hindrance}, so indications and residuals are not shown" for hindrance in hindrances]
     try:
         read = read_files(options | {name: found.get(options.get(name)) for name in ("sensor", "reference", "poses")})
     except (TableError, click.UsageError, KeyError, TypeError, ValueError) as error:
-        return {}, [f"the files cannot be read with the options that the result names: {error}"]
+        return {}, [
+            f"indications and residuals are not shown: the files cannot be read with the options in the result: {error}"
+        ]
     return _traces(read, result), []
 
 
 def _found(files: tuple[SourceFile, ...], directory: Path) -> tuple[dict[Any, Path], list[str]]:
-    """Where each file is now, by the path it had, and which ones are gone or changed."""
+    """The present path of each file, by its path in the result, and the files that are missing or changed."""
     found: dict[Any, Path] = {}
     hindrances = []
     for file in files:
         path = next((p for p in (Path(file.path), directory / Path(file.path).name) if p.is_file()), None)
         if path is None:
-            hindrances.append(f"{file.path} is not there any more")
+            hindrances.append(f"{file.path} does not exist any more")
         elif source_file(path).sha256 != file.sha256:
             hindrances.append(f"{path} has changed since the calibration")
         else:

@@ -1,4 +1,4 @@
-"""Figures of one window point by point: indications against S a + Q, and what is left."""
+"""Figures of one window point by point: indications against S a + Q, and residuals."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from agent.report.units import output_unit
 from calib.model import Array
 
 AXES = "xyz"
-CYCLES_SHOWN = 4.0  # of the motion's mean frequency; more cannot be told apart
+CYCLES_SHOWN = 4.0  # of the mean frequency of the motion; more cannot be distinguished in the figure
 REST_SHOWN_S = 2.0
-COLUMNS = 300  # stretches that a plot of this width can tell apart
+COLUMNS = 300  # intervals of time that a plot of this width can show
 
 
 def indications(seen: Residuals, unit: str) -> Figure:
@@ -39,7 +39,7 @@ def indications(seen: Residuals, unit: str) -> Figure:
 
 
 def left_over(seen: Residuals, unit: str) -> Figure:
-    """V - (S a + Q) over time, an axis a strip, over the phase of the motion, and its spectrum."""
+    """V - (S a + Q): over time with a strip for each axis, over the phase of the motion, and as a spectrum."""
     ways = [_over_phase, _spectrum] if seen.phase_rad is not None else [_spectrum]
     drawn = figure(3.3 + 2.0 * len(ways))
     heights = [0.9] * 3 + [2.0] * len(ways)
@@ -58,7 +58,7 @@ def _over_time(strips: Sequence[Axes], seen: Residuals, unit: str) -> None:
         axes.fill_between(middle, low[:, k], high[:, k], color=AXIS_COLOURS[k], linewidth=0)
         axes.locator_params(axis="y", nbins=3)
         axes.tick_params(labelbottom=k == 2)
-    strips[0].set_title("over time: least to largest")
+    strips[0].set_title("over time: smallest to largest")
     strips[1].set_ylabel(unit)
     strips[2].set_xlabel("time in s")
 
@@ -70,7 +70,7 @@ def _over_phase(axes: Axes, seen: Residuals, unit: str) -> None:
         _with_band(axes, np.degrees(middle), mean[:, k], 2 * error[:, k], AXIS_COLOURS[k])
     axes.axhline(0, color=INK, linewidth=0.6)
     axes.set(title="over phase: mean with twice its standard error", ylabel=unit, xlim=(0, 360))
-    axes.set_xlabel("phase of the reference in degrees, 0 at its crest")
+    axes.set_xlabel("phase of the reference in degrees, 0 at its maximum")
     axes.set_xticks(range(0, 361, 60))
 
 
@@ -84,7 +84,7 @@ def _spectrum(axes: Axes, seen: Residuals, unit: str) -> None:
     for k in range(3):
         axes.loglog(frequency_hz, density[:, k], color=AXIS_COLOURS[k], linewidth=0.8)
     known = density[density > 0]
-    if known.size:  # whole decades: numbers at their ends at least
+    if known.size:  # limits are whole decades, so that at least their ends have numbers
         axes.set_ylim(10 ** np.floor(np.log10(np.quantile(known, 0.001))), 10 ** np.ceil(np.log10(known.max())))
     if seen.frequency_hz:
         axes.axvline(seen.frequency_hz, color=INK, linewidth=0.8, linestyle=":")

@@ -1,4 +1,4 @@
-"""How figures look: narrow enough for a phone, the same colours on screen (light and dark) and on paper."""
+"""Style of the figures: narrow enough for a phone, with the same colours on screen (light and dark) and on paper."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from matplotlib.figure import Figure
 WIDTH_IN = 5.0  # 480 px: on a phone of 360 px the 10 pt letters are still 9 px high
 INK, PALE, PAPER = "#1b1e23", "#c9ced6", "#ffffff"
 USED, REFUSED = "#2a7f62", "#b3431b"
-AXIS_COLOURS = ("#0068b5", "#c2500a", "#00805e")  # x, y, z: told apart by colour-blind eyes too
+AXIS_COLOURS = ("#0068b5", "#c2500a", "#00805e")  # x, y, z; colour-blind people can distinguish them too
 RESULT_COLOURS = ("#0068b5", "#c2500a", "#00805e", "#8f4f9f", "#7a6a00", "#5a6472")
 RESULT_MARKERS = "osD^vP"
 SHADES = ("#0068b5", "#c2500a", "#00805e", "#8f4f9f", "#b58b00", "#4aa3d8", "#d87a9b", "#7a8796")
 _SETTINGS: Any = {
-    "font.family": "DejaVu Sans",  # comes with matplotlib
+    "font.family": "DejaVu Sans",  # part of matplotlib
     "font.size": 10,
     "axes.titlesize": 10,
     "axes.labelsize": 10,
@@ -49,7 +49,7 @@ _SETTINGS: Any = {
     "savefig.facecolor": PAPER,
     "svg.hashsalt": "fieldcal",  # the same report gives the same bytes
 }
-# Colours that a page may set anew for dark screens, by the name of its CSS property.
+# Colours that the page changes for dark screens, with the name of their CSS property.
 _VARIABLES = {INK: "--ink", PALE: "--pale", PAPER: "--paper"} | {
     colour: f"--series-{i}" for i, colour in enumerate((*SHADES, USED, REFUSED))
 }
@@ -57,7 +57,7 @@ _VARIABLES = {INK: "--ink", PALE: "--pale", PAPER: "--paper"} | {
 
 @contextmanager
 def drawing() -> Iterator[None]:
-    """Figures made and saved within look as here."""
+    """Context in which figures are made and saved with this style."""
     with matplotlib.rc_context(_SETTINGS):
         yield
 
@@ -68,9 +68,9 @@ def figure(height_in: float) -> Figure:
 
 
 def save(drawn: Figure, directory: Path, name: str) -> str:
-    """Write NAME.svg, .png and .pdf; returns the SVG for a page: its colours and names its own. Raises OSError."""
+    """Write NAME.svg, .png and .pdf; gives the SVG for the page, with its own ids. Raises OSError."""
     drawn.draw_without_rendering()
-    drawn.set_layout_engine("none")  # laid out once, not again for each format
+    drawn.set_layout_engine("none")  # the layout is computed once, not for each format
     buffer = io.StringIO()
     drawn.savefig(buffer, format="svg", metadata={"Date": None})
     (directory / f"{name}.svg").write_text(buffer.getvalue(), encoding="utf-8")
@@ -80,7 +80,7 @@ def save(drawn: Figure, directory: Path, name: str) -> str:
 
 
 def _inline(svg: str, name: str) -> str:
-    """The svg element alone, coloured by the page, with ids that no other figure of the page has."""
+    """The svg element only, with colours from the page and with ids that no other figure of the page has."""
     svg = svg[svg.index("<svg") :]
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
     svg = re.sub(r"<svg [^>]*?>", lambda m: re.sub(r' (width|height)="[^"]*"', "", m[0]), svg, count=1)
@@ -91,6 +91,6 @@ def _inline(svg: str, name: str) -> str:
 
 
 def bare(axes: Axes) -> None:
-    """No grid along y, where rows are names."""
+    """Switch off the grid along y, because the rows are names."""
     axes.grid(visible=False, axis="y")
     axes.tick_params(axis="y", length=0)

@@ -16,14 +16,14 @@ from agent.terminal.quantity import plus_minus
 from calib.model import PARAMETERS
 
 AXES = "xyz"
-MOST_ROWS = 200  # of windows: more is for the JSON
+MOST_ROWS = 200  # of windows; report.json has all
 NOT_KNOWN = "not determined"
 
 
 def table(
     heads: Sequence[str], rows: Iterable[Sequence[str]], style: str = "", text: frozenset[int] = frozenset()
 ) -> str:
-    """An HTML table of escaped cells; columns `text` stand to the left and may break into lines."""
+    """An HTML table of escaped cells. Columns in `text` are aligned to the left and may wrap."""
 
     def cell(tag: str, k: int, content: str) -> str:
         return f"<{tag}{' class=text' if k in text else ''}>{escape(content)}</{tag}>"
@@ -34,21 +34,21 @@ def table(
 
 
 def number(value: float | None, digits: int = 4) -> str:
-    """A number in few digits; `–` where there is none, `∞` where it is not finite."""
+    """A number with few digits; `–` if there is none, `∞` if it is infinite."""
     if value is None or math.isnan(value):
         return "–"
     return ("∞" if value > 0 else "−∞") if math.isinf(value) else f"{value:.{digits}g}".replace("-", "−")
 
 
 def matrix(result: CalibrationResult) -> str:
-    """S and Q, each ± U."""
+    """S and Q, each with ± U."""
     cells = [_cell(result, k) for k in range(12)]
     rows = [[axis, *cells[3 * i : 3 * i + 3], cells[9 + i]] for i, axis in enumerate(AXES)]
     return table(["", "S along x", "S along y", "S along z", "Q"], rows, "matrix")
 
 
 def parameters(result: CalibrationResult) -> str:
-    """All twelve with u, U, k and degrees of freedom."""
+    """All twelve parameters with u, U, k and degrees of freedom."""
     units = [sensitivity_unit(result.unit)] * 9 + [output_unit(result.unit)] * 3
     rows = [
         [
@@ -67,13 +67,13 @@ def parameters(result: CalibrationResult) -> str:
 
 
 def covariance(result: CalibrationResult) -> str:
-    """12 x 12, in the units of the parameters."""
+    """The covariance, 12 x 12, in the units of the parameters."""
     rows = [[name, *(number(v, 3) for v in row)] for name, row in zip(PARAMETERS, result.covariance, strict=True)]
     return table(["", *PARAMETERS], rows, "small")
 
 
 def nuisances(result: CalibrationResult) -> str:
-    """What was estimated or assumed beside S and Q."""
+    """The nuisances, which were estimated together with S and Q."""
     rows = []
     for name, held in (result.fields.get("nuisances") or {}).items():
         held = held if isinstance(held, Mapping) else {"value": held}
@@ -83,14 +83,14 @@ def nuisances(result: CalibrationResult) -> str:
 
 
 def budget(result: CalibrationResult) -> str:
-    """Standard uncertainty that each source gives to each parameter."""
+    """The standard uncertainty of each parameter from each source."""
     rows = [[name, *(number(u, 3) for u in values)] for name, values in result.budget.items()]
     rows.append(["all", *(number(u, 3) for u in result.standard_uncertainty)])
     return table(["source", *PARAMETERS], rows, "small")
 
 
 def windows(result: CalibrationResult) -> str:
-    """Each window with its verdict; the newest where there are very many."""
+    """Each window with its verdict; only the newest MOST_ROWS if there are more."""
     rows = [
         [
             f"{w.start_s:.2f}",
@@ -109,7 +109,7 @@ def windows(result: CalibrationResult) -> str:
 
 
 def statistics(held: Mapping[str, Any]) -> str:
-    """Appendix A: a row a parameter and run; what has no runs stands below."""
+    """Appendix A: a row for each parameter and run, and below the statistics without runs."""
     runs = {name: value for name, value in held.items() if isinstance(value, list) and _are_runs(value)}
     rest = facts({name: value for name, value in held.items() if name not in runs})
     if not runs:
@@ -128,7 +128,7 @@ def _are_runs(value: list[Any]) -> bool:
 
 
 def left_over(seen: Sequence[Residuals], result: CalibrationResult) -> str:
-    """Root mean square of the residual, by window, in the output unit and as acceleration."""
+    """Root mean square of the residual of each window, in the output unit and as acceleration."""
     unit = output_unit(result.unit)
     main = np.abs(np.diag(result.sensitivity))
     with_acceleration = unit != ACCELERATION
@@ -152,7 +152,7 @@ def facts(pairs: Mapping[str, Any]) -> str:
 
 
 def _cell(result: CalibrationResult, k: int) -> str:
-    """Value ± U, which may break before ± only."""
+    """Value ± U, which may wrap before ± only."""
     if not result.determined[k]:
         return NOT_KNOWN
     text = plus_minus(float(result.values[k]), float(result.expanded_uncertainty[k])).replace("-", "−")
@@ -160,7 +160,7 @@ def _cell(result: CalibrationResult, k: int) -> str:
 
 
 def _words(value: Any) -> str:
-    """A value from JSON in words, nests in brackets."""
+    """A value from JSON as text; lists and objects inside it are in brackets."""
     if isinstance(value, Mapping):
         held = {name: item for name, item in value.items() if item not in (None, "", [], {})}
         nests = {name for name, item in held.items() if isinstance(item, Mapping | list)}

@@ -16,14 +16,14 @@ from agent.report.units import output_unit, position_name
 from calib.model import PARAMETERS
 
 AXES = "xyz"
-LANES = 16  # positions that a figure has room for; more share lanes by verdict
+LANES = 16  # a figure has room for so many positions; if there are more, windows are arranged by verdict
 MAIN = [0, 4, 8]
-SOURCES = 7  # largest ones named; the rest is summed up
+SOURCES = 7  # so many of the largest sources are named; the others are added up
 CALM = "the reference is calm here"
 
 
 def windows(verdicts: Sequence[WindowVerdict]) -> Figure | None:
-    """When which window was, a lane a position, and whether it was used; None without windows."""
+    """The windows over time, one lane for each position, coloured by verdict; None without windows."""
     if not verdicts:
         return None
     names = list(dict.fromkeys(w.position for w in verdicts))
@@ -60,7 +60,7 @@ def _short(name: str) -> str:
 
 
 def history(updates: Sequence[CalibrationUpdate], unit: str) -> Figure | None:
-    """Main sensitivities, in % off their newest value, and offsets over time, with U; None with fewer than two."""
+    """Main sensitivities (difference from the newest in %) and offsets over time, with U; None with fewer than two."""
     if len(updates) < 2:
         return None
     when = [dt.datetime.fromtimestamp(u.date_utc_ns / 1e9, dt.UTC) for u in updates]
@@ -73,7 +73,7 @@ def history(updates: Sequence[CalibrationUpdate], unit: str) -> Figure | None:
         style = {"color": AXIS_COLOURS[k], "marker": "osD"[k], "markersize": 4, "capsize": 3, "label": AXES[k]}
         upper.errorbar(when, 100 * (S[:, k] / S[-1, k] - 1), 100 * U[:, MAIN[k]] / abs(S[-1, k]), **style)
         lower.errorbar(when, Q[:, k], U[:, 9 + k], **style)
-    upper.set(title="main sensitivities", ylabel="% off the newest")
+    upper.set(title="main sensitivities", ylabel="% difference from the newest")
     lower.set(title="offsets", ylabel=f"Q in {output_unit(unit)}", xlabel="UTC")
     handles, labels = upper.get_legend_handles_labels()
     drawn.legend(handles, labels, loc="outside upper right", ncols=3)
@@ -81,7 +81,7 @@ def history(updates: Sequence[CalibrationUpdate], unit: str) -> Figure | None:
 
 
 def budget(result: CalibrationResult) -> Figure | None:
-    """Share of each source in the variance of each parameter; None where the result has no budget."""
+    """Share of each source in the variance of each parameter; None if the result has no budget."""
     names, shares = variance_shares(result)
     if not names:
         return None

@@ -1,4 +1,4 @@
-"""One window point by point: what the sensor indicated, what S a + Q says, and what is left between them."""
+"""One window point by point: the indications, the model S a + Q, and the residual between them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SPECTRUM_POINTS = 2048  # a segment; 0.5 Hz lines at 1 kHz
 @dataclass(frozen=True, slots=True, eq=False)
 class Trace:
     """Points of a used window: times (n,) in s since the sensor's first sample, V (n, 3) in the output unit, the
-    reference u and du/dt (n, m) in m/s2 and m/s3 (m = 0 at rest), and how the sensor stood."""
+    reference u and du/dt (n, m) in m/s2 and m/s3 (m = 0 at rest), and the pose."""
 
     time_s: Array
     indications: Array
@@ -54,7 +54,7 @@ class Residuals:
 
 
 def residuals(trace: Trace, result: CalibrationResult) -> Residuals:
-    """V against S a(t - lag) + Q (Eq. 8). The lag goes by the derivative: it is milliseconds."""
+    """V against S a(t - lag) + Q (Eq. 8). The lag is corrected with the derivative, because it is only milliseconds."""
     pose = trace.pose
     felt = trace.reference[:, :, None] - trace.reference_rate[:, :, None] * result.lag_s  # (n, m, 3): by output axis
     a = np.einsum("jm,nmi->nij", pose.direction, felt)
@@ -75,7 +75,8 @@ def residuals(trace: Trace, result: CalibrationResult) -> Residuals:
 
 
 def _phase(trace: Trace) -> tuple[float | None, Array | None]:
-    """Mean frequency in Hz, and phase (n,) in rad, of the liveliest channel of the reference; 0 rad is its crest.
+    """Mean frequency in Hz, and phase (n,) in rad, of the channel of the reference with the most motion; 0 rad is at
+    its maximum.
 
     The angle in the plane of u and du/dt: the phase of a sine, and for any other motion where in its swing it is.
     """
@@ -117,7 +118,8 @@ def spectrum(residual: Array, rate_hz: float) -> tuple[Array, Array]:
 
 
 def spans(time_s: Array, values: Array, columns: int) -> tuple[Array, Array, Array]:
-    """Middles (B,), least and largest of values (n, 3) in at most `columns` stretches of time: what a plot can show."""
+    """Middles (B,), smallest and largest of values (n, 3) in at most `columns` intervals of time, as a plot shows
+    them."""
     edges = np.linspace(0, len(time_s), min(columns, len(time_s)) + 1).astype(int)[:-1]
     count = np.diff(np.append(edges, len(time_s)))
     middle = np.add.reduceat(time_s, edges) / count

@@ -6,18 +6,18 @@ ACCELERATION = "m/s²"
 
 
 def output_unit(stated: str) -> str:
-    """Of V and Q; a result does not always say it."""
+    """The unit of V and Q; "output unit" if the result does not state it."""
     return {"m/s2": ACCELERATION, "m/s^2": ACCELERATION, "": "output unit"}.get(stated, stated)
 
 
 def sensitivity_unit(stated: str) -> str:
-    """Of S. An output in m/s² has a dimensionless one (section 3 of the paper)."""
+    """The unit of S. If the output is in m/s², S is dimensionless (section 3 of the paper)."""
     unit = output_unit(stated)
     return "1" if unit == ACCELERATION else f"{unit}/({ACCELERATION})"
 
 
 def labelled(quantity: str, unit: str) -> str:
-    """`S in mV/(m/s²)`; a dimensionless quantity stands alone."""
+    """`S in mV/(m/s²)`; for a dimensionless quantity only its name."""
     return quantity if unit == "1" else f"{quantity} in {unit}"
 
 
@@ -34,7 +34,10 @@ _SUFFIXES = {
 
 
 def said(name: str) -> str:
-    """A field's name in words, its suffix as the unit: `rate_hz` is `rate in Hz`. Registers' names stay."""
+    """A field's name in words, its suffix as the unit: `rate_hz` is `rate in Hz`.
+
+    Names of registers are not changed.
+    """
     if not name.islower():
         return name
     for suffix, unit in _SUFFIXES.items():
@@ -44,5 +47,5 @@ def said(name: str) -> str:
 
 
 def position_name(position: str) -> str:
-    """The name of a position, shorter where it is one of the clamp."""
+    """The name of a position, shortened for positions of the clamp."""
     return position.replace("theta", "θ").replace("alpha", "α").replace(" deg", "°") or "–"

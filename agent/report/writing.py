@@ -18,7 +18,7 @@ from agent.report.trace import Residuals, residuals
 
 
 def write(material: Material, output: Path) -> None:
-    """Write report.html, report.json and figures/ into `output`, made if need be. Raises OSError."""
+    """Write report.html, report.json and figures/ into `output`, which is created if needed. Raises OSError."""
     seen = left_over(material)
     figures = draw(material, seen[-1] if seen else None, output / "figures")
     (output / "report.html").write_text(page(material, figures, seen), encoding="utf-8")
@@ -27,13 +27,13 @@ def write(material: Material, output: Path) -> None:
 
 
 def left_over(material: Material) -> list[Residuals]:
-    """Residuals of the windows at hand, for the first result; those of which it covers no axis are left out."""
+    """Residuals of the traced windows for the first result, without windows of which it determines no axis."""
     seen = [residuals(trace, material.results[0]) for trace in material.traces.values()]
     return [r for r in seen if np.isfinite(r.rms).any()]
 
 
 def as_object(material: Material, seen: list[Residuals], figures: list[str]) -> dict[str, Any]:
-    """What report.json holds: results as in `fieldcal calibrate --json -`, with their unit."""
+    """The content of report.json: results as in `fieldcal calibrate --json -`, with their unit."""
     return {
         "version": __version__,
         "sensor": material.sensor,

@@ -1,1 +1,1 @@
-"""What a run shows to a person."""
+"""Shows a run to a person: live on a terminal, or as lines of text."""

@@ -1,4 +1,4 @@
-"""How a value and its uncertainty are written for people."""
+"""Writes values with their uncertainties, durations and sizes for people."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 
 
 def plus_minus(value: float | None, expanded: float | None) -> str:
-    """`value ± U`, both to the decimal that holds U's second digit; `–` where there is no value."""
+    """`value ± U`, both rounded to the second digit of U; `–` if there is no value."""
     if value is None or not math.isfinite(value):
         return "–"
     if expanded is None or not math.isfinite(expanded) or expanded <= 0:
@@ -16,7 +16,7 @@ def plus_minus(value: float | None, expanded: float | None) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Hours, minutes and seconds, or days and hours."""
+    """A duration as hours, minutes and seconds, or as days and hours."""
     whole = int(seconds)
     if whole >= 86400:
         return f"{whole // 86400} d {whole % 86400 // 3600:02d} h"
@@ -24,7 +24,7 @@ def duration(seconds: float) -> str:
 
 
 def size(octets: int) -> str:
-    """A file's size in the decimal unit that fits."""
+    """The size of a file in B, kB, MB, GB or TB."""
     value = float(octets)
     for unit in ("B", "kB", "MB", "GB"):
         if value < 1000:

@@ -1,4 +1,4 @@
-"""The live screen of a run, drawn with rich: made of plain text lines, which cost a third of rich's tables."""
+"""The live screen of a run, drawn with rich from lines of text, which need a third of the time of rich's tables."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from agent.terminal.wording import (
     window_span,
 )
 
-REFRESH_S = 0.5  # news comes a few times a minute, the clock once a second
+REFRESH_S = 0.5  # results come a few times a minute, the clock changes once a second
 
 
 class Screen:
-    """Redraws in place; leaves the last picture on the terminal when closed."""
+    """Draws again in the same place. When it is closed, the last picture stays on the terminal."""
 
     def __init__(self, state: ViewState, stream: TextIO) -> None:
         self._live = Live(
@@ -44,14 +44,14 @@ class Screen:
             self._live.start(refresh=True)
 
     def refresh(self, *, now: bool = False) -> None:
-        """Draw, unless it was drawn less than REFRESH_S ago."""
+        """Draw the state, but not within REFRESH_S after the last time."""
         if now or time.monotonic() - self._drawn_s >= REFRESH_S:
             self._drawn_s = time.monotonic()
-            with suppress(OSError):  # whoever watched went away with the terminal; the agent goes on
+            with suppress(OSError):  # the terminal was closed; the agent goes on
                 self._live.refresh()
 
     def close(self) -> None:
-        """Draw a last time and let go of the terminal."""
+        """Draw a last time and release the terminal."""
         if self._open:
             self._open = False
             with suppress(OSError):
@@ -59,13 +59,13 @@ class Screen:
 
 
 class Picture:
-    """The state as lines for a console of any width and height; windows and messages share the room that is left."""
+    """The state as lines for a console of any width and height; windows and messages share the lines that are left."""
 
     def __init__(self, state: ViewState) -> None:
         self._state = state
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Text]:
-        height = (options.height or options.size.height) - 1  # the cursor's line
+        height = (options.height or options.size.height) - 1  # one line is for the cursor
         top, bottom = self._top(), self._bottom()
         room = max(0, height - len(top) - len(bottom))
         messages = list(self._state.messages)[-max(1, room // 3) :] if self._state.messages else []
@@ -135,7 +135,8 @@ class Picture:
         return lines
 
 
-# Widths of columns, negative to the right, 0 for the rest of the line; every row but the verdict fits 80.
+# Widths of columns; negative: aligned to the right; 0: the rest of the line. Rows without the verdict fit into 80
+# columns.
 _DEVICE = (16, 28, 9, -10, -9, -6)
 _PARAMETERS = (3, -18, -18, -18, -18)
 _WINDOW = (8, 29, 22, 0)

@@ -1,4 +1,4 @@
-"""What a run shows to the person at the terminal: the state that the views draw."""
+"""The state of a run that the views draw on a terminal."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class Truth(Protocol):
-    """What a virtual sensor really has: S (3, 3) in output unit per m/s2, Q (3,) in output unit."""
+    """True values of a virtual sensor: S (3, 3) in output unit per m/s2, Q (3,) in output unit."""
 
     @property
     def sensitivity(self) -> Array: ...
@@ -25,7 +25,7 @@ class Truth(Protocol):
 
 @dataclass
 class DeviceState:
-    """A device as it is now. `gaps` counts the times samples were lost."""
+    """Present state of a device. `gaps` counts how often samples were lost."""
 
     kind: str
     state: Literal["opening", "open", "lost"] = "opening"
@@ -36,16 +36,16 @@ class DeviceState:
 
 @dataclass
 class RecordingState:
-    """The file being written."""
+    """The file that is being written."""
 
     path: str
     size_bytes: int
-    recording: bool  # false where the disk refuses
+    recording: bool  # False after a write to the disk has failed
 
 
 @dataclass
 class ViewState:
-    """All that is shown. The agent's main loop changes it and refreshes the view from the same thread."""
+    """All values that are shown. The main loop of the agent changes them and refreshes the view in the same thread."""
 
     title: str
     gateway: str
@@ -63,7 +63,7 @@ class ViewState:
     messages_said: int = 0
 
     def take(self, results: Iterable[Result]) -> None:
-        """What the pipeline found."""
+        """Take results of the pipeline."""
         for result in results:
             match result:
                 case WindowReport():
@@ -76,6 +76,6 @@ class ViewState:
                     self.statuses[result.sensor] = result
 
     def say(self, message: str) -> None:
-        """A line for the person who watches."""
+        """Add a message line."""
         self.messages.append(message)
         self.messages_said += 1

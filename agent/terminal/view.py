@@ -1,4 +1,4 @@
-"""The views of a run: a live screen on a terminal, lines where there is none, or nothing."""
+"""The views of a run: a live screen on a terminal, lines of text without a terminal, or nothing."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from agent.terminal.wording import publication_line, result_lines
 
 
 class View(Protocol):
-    """Shows a ViewState. Neither method raises because of the terminal."""
+    """Shows a ViewState. The methods raise no error if the terminal fails."""
 
     def refresh(self, *, now: bool = False) -> None:
-        """Show what changed, at most a few times a second unless `now`; may be called at any rate."""
+        """Show changes: at once if `now`, otherwise at most a few times a second. It may be called at any rate."""
 
     def close(self) -> None:
-        """Show the end state and leave the terminal as it was. May be called twice."""
+        """Show the last state and reset the terminal. It may be called twice."""
 
 
 def open_view(state: ViewState, stream: TextIO, *, lines: bool = True) -> View:
-    """A live screen where `stream` is a terminal; elsewhere plain lines, or nothing."""
+    """A live screen if `stream` is a terminal; otherwise plain lines, or nothing."""
     if stream.isatty():
         from agent.terminal.screen import Screen
 
@@ -29,29 +29,29 @@ def open_view(state: ViewState, stream: TextIO, *, lines: bool = True) -> View:
 
 
 class Nothing:
-    """Shows nothing: the log tells it."""
+    """Shows nothing, because the log has all messages."""
 
     def refresh(self, *, now: bool = False) -> None:
-        """Nothing."""
+        """Do nothing."""
 
     def close(self) -> None:
-        """Nothing."""
+        """Do nothing."""
 
 
 class Lines:
-    """One line for each thing that happens: for logs, pipes and journals."""
+    """Writes one line for each event: for logs, pipes and journals."""
 
     def __init__(self, state: ViewState, stream: TextIO) -> None:
         self._state = state
         self._stream = stream
-        self._shown = 0  # sequence of the last result
+        self._shown = 0  # sequence number of the last result that was shown
         self._said = 0
-        self._known: dict[str, str] = {}  # topic: last line
+        self._known: dict[str, str] = {}  # key: topic; value: its last line
         self._write(f"{state.title}, gateway {state.gateway}")
 
     def refresh(self, *, now: bool = False) -> None:
-        """Write what is new."""
-        del now  # lines come when things happen, however often
+        """Write lines for everything that has changed."""
+        del now  # each line is written at once
         state = self._state
         new = state.messages_said - self._said
         for message in list(state.messages)[-new:] if new else []:
@@ -60,7 +60,10 @@ class Lines:
         for name, device in state.devices.items():
             self._tell(f"device {name}", f"{device.kind}, {device.state}")
         if state.recording:
-            self._tell("recording", state.recording.path if state.recording.recording else "stopped, the disk refuses")
+            self._tell(
+                "recording",
+                state.recording.path if state.recording.recording else "stopped: writing to the disk failed",
+            )
         if state.publication:
             self._tell("publishing", publication_line(state.publication))
         results: list[Result] = [*state.windows, *state.calibrations.values(), *state.statuses.values()]
@@ -71,7 +74,7 @@ class Lines:
                     self._write(line)
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write the lines that are not yet written."""
         self.refresh()
 
     def _tell(self, topic: str, line: str) -> None:
@@ -83,4 +86,4 @@ class Lines:
         try:
             print(line, file=self._stream, flush=True)
         except (OSError, ValueError):
-            return  # whoever read the lines went away; the agent goes on
+            return  # the reader of the lines was closed; the agent goes on

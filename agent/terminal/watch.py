@@ -1,4 +1,4 @@
-"""Turns what passes through the service into what the terminal shows."""
+"""Converts events, results and log records of the service to the state that the terminal shows."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ from agent.terminal.view import open_view
 from hw.block import BlockFlags, SampleBlock
 
 _log = logging.getLogger(__name__)
-RATE_OVER_BLOCKS = 20  # the rate shown is over this many blocks, ten seconds
+RATE_OVER_BLOCKS = 20  # the shown rate is a mean over this many blocks, ten seconds
 
 
 class Watch(logging.Handler):
-    """The view of a run. `update` and `health` are the main loop's; `say` and log records may come from any thread.
+    """The view of a run. Only the main loop calls `update` and `health`; `say` and log records may come from any
+    thread.
 
     `lines`: whether what happens is written where there is no terminal; a log that tells it makes them superfluous.
     """
@@ -51,16 +52,16 @@ class Watch(logging.Handler):
         self._view.close()
 
     def emit(self, record: logging.LogRecord) -> None:
-        """A log record of ours becomes a line."""
+        """Show a log record of this program as a line."""
         self._said.put(record.getMessage())
 
     def say(self, line: str) -> None:
-        """A line for whoever watches, and for the log."""
+        """Show a line and write it to the log."""
         _log.info("%s", line)
         self._said.put(line)
 
     def update(self, event: Event, results: list[Result]) -> None:
-        """An event and what came of it."""
+        """Take an event and its results."""
         if isinstance(event, SampleBlock):
             self._take_block(event)
         elif isinstance(event, DeviceChange):
@@ -73,7 +74,7 @@ class Watch(logging.Handler):
         self._view.refresh(now=bool(results))
 
     def health(self, recorder: Recorder, publication: PublicationState | None) -> None:
-        """Once a second: what is recorded and published."""
+        """Take the state of recording and publication, once a second."""
         self.state.uptime_s = time.monotonic() - self._began_s
         self.state.publication = publication
         path = recorder.path

@@ -1,4 +1,4 @@
-"""Results, and what becomes of them, in words for people."""
+"""Describes results and their publication in words for people."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ if TYPE_CHECKING:
     from agent.delivery.publication import PublicationState
     from agent.terminal.state import RecordingState, Truth
 
-COVERAGE_FACTOR = 2.0  # of U in words, for about 95 % coverage
+COVERAGE_FACTOR = 2.0  # of U in texts, for about 95 % coverage
 STATUS_STYLES = {"VALID": "bold green", "HELD": "yellow", "RECALIBRATING": "yellow", "INVALID": "bold red"}
 
 
 def result_lines(result: Result, truth: Truth | None) -> list[str]:
-    """A result in words."""
+    """A result as lines of text."""
     match result:
         case WindowReport():
             return [f"{result.sensor}: window {window_span(result)} at {result.position}: {verdict(result)}"]
@@ -40,7 +40,7 @@ def result_lines(result: Result, truth: Truth | None) -> list[str]:
 
 
 def _fields(result: Result) -> list[str]:
-    """Name and value of each field of a kind of result that has no words of its own; `u_x` stands behind `x`, as U."""
+    """Name and value of each field, for results without a text of their own. `u_x` is shown as U after `x`."""
     common = Result.__struct_fields__
     values = {name: value for name, value in msgspec.structs.asdict(result).items() if name not in common}
     words = []
@@ -53,18 +53,18 @@ def _fields(result: Result) -> list[str]:
 
 
 def verdict(window: WindowReport) -> str:
-    """Used, with its points, or why not."""
+    """Whether the window was used, with its number of points, or why not."""
     left_out = f", {window.left_out} left out" if window.left_out else ""
     return f"used, {window.points} points{left_out}" if window.used else f"refused: {window.reason}"
 
 
 def window_span(window: WindowReport) -> str:
-    """When the window was, in seconds since the sensor's first sample."""
+    """Start and stop of the window in seconds since the sensor's first sample."""
     return f"{window.start_s:.1f} to {window.stop_s:.1f} s"
 
 
 def uncertainty_words(calibration: CalibrationUpdate) -> str:
-    """What the number after ± is."""
+    """The meaning of the number after ±."""
     return f"U with k = {calibration.coverage_factor:.3g}, {calibration.uncertainty_kind}"
 
 
@@ -80,7 +80,7 @@ def calibration_cells(calibration: CalibrationUpdate) -> list[list[str]]:
 
 
 def calibration_rows(calibration: CalibrationUpdate) -> list[str]:
-    """The cells as text, one line an axis."""
+    """The cells as text, one line for each axis."""
     names = [(f"S{axis}x", f"S{axis}y", f"S{axis}z", f"Q{axis}") for axis in "xyz"]
     return [
         "  ".join(f"{name} {cell}" for name, cell in zip(row_names, cells, strict=True))
@@ -89,7 +89,8 @@ def calibration_rows(calibration: CalibrationUpdate) -> list[str]:
 
 
 def truth_line(calibration: CalibrationUpdate, truth: Truth) -> str:
-    """How far S and Q are from the virtual sensor's, S in percent of the row's main sensitivity, Q in m/s2."""
+    """Largest errors of S and Q against a virtual sensor; S in percent of the main sensitivity of its row, Q in
+    m/s2."""
     main = np.diag(truth.sensitivity)
     error = 100 * (np.array(calibration.sensitivity) - truth.sensitivity) / main[:, None]
     found = np.array(calibration.determined)
@@ -97,21 +98,22 @@ def truth_line(calibration: CalibrationUpdate, truth: Truth) -> str:
     q = np.where(found[9:], (np.array(calibration.offset) - truth.offset) / main, np.nan)
     main_error, transverse = np.diag(error), error[~np.eye(3, dtype=bool)]
     return (
-        f"off the truth by at most: S main {_largest(main_error, 3)} %, transverse {_largest(transverse, 3)} %,"
+        f"largest errors: S main {_largest(main_error, 3)} "
+        f"%, transverse {_largest(transverse, 3)} %,"
         f" Q {_largest(q, 4)} m/s²"
     )
 
 
 def publication_line(publication: PublicationState) -> str:
-    """What is published where."""
+    """What is published, and to which routers."""
     where = ", ".join(publication.endpoints) or "nowhere"
-    link = "connected" if publication.connected else "no router yet, results wait in the store"
+    link = "connected" if publication.connected else "no connection to a router, results are stored until then"
     return f"{publication.key}/** to {where} ({publication.fault or link})"
 
 
 def recording_line(recording: RecordingState) -> str:
-    """Where the raw data go."""
-    refused = "" if recording.recording else " (the disk refuses: NOT recording)"
+    """The recording of the raw data."""
+    refused = "" if recording.recording else " (NOT recording: writing to the disk failed)"
     return f"{recording.path}, {size(recording.size_bytes)}{refused}"
 
 

@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from agent import __version__
 from agent.cli.replay import run_replay
 from agent.core.events import CalibrationUpdate, Event, Result, RunStart, StatusChange, WindowReport
 from agent.recording.comparison import OTHER_CPU
@@ -201,6 +202,20 @@ def test_a_recording_from_elsewhere_is_compared_within_the_tolerance(tmp_path: P
         replay = Replay(StandIn.restore, fingerprint(), elsewhere=tolerance)
         assert replay.run(path).equal == equal
         assert "another blas_kernel" in replay.files[0].notes[0]
+
+
+@pytest.mark.parametrize(("version", "equal"), [("0.0.9", True), (__version__, False)])
+def test_reasons_that_another_version_worded_are_not_compared(tmp_path: Path, version: str, equal: bool) -> None:
+    def older(entry: Recorded) -> Recorded:
+        number, event, results = entry
+        if isinstance(event, RunStart):
+            event = msgspec.structs.replace(event, versions={"fieldcal": version})
+        said = [r for r in results if isinstance(r, WindowReport)]
+        return number, event, [msgspec.structs.replace(r, reason="so") if r in said else r for r in results]
+
+    path = record_again(tmp_path / "again", record_run(tmp_path, blocks=BLOCKS), older)
+    [file] = replayed([path]).files
+    assert (file.equal, len(file.notes)) == (equal, int(equal))
 
 
 def test_after_an_undecidable_decision_the_next_snapshot_leads_back(tmp_path: Path) -> None:

@@ -171,7 +171,7 @@ def test_a_dead_reference_is_refused(
     assert status == 3
     (reason,) = found["reasons"]
     assert reason.startswith(
-        "no window can be used, of 4, the first (theta 35 deg, alpha 0 deg): the reference is silent"
+        "none of the 4 windows can be used; the first of them (theta 35 deg, alpha 0 deg): the reference is silent"
     )
     assert all("silent" in w["reason"] for w in found["windows"])
 
@@ -218,15 +218,19 @@ def no_number(path: Path) -> None:
     [
         (later, [], r"reference.csv from 1000\.\d+ s to 100\d\.\d+ s"),
         (no_number, [], "reference.csv, line 4322, column a: '?' is not a finite number"),
-        (None, ["--reference-quantity", "velocity"], "reference.csv, line 1: column a is no velocity"),
-        (None, ["--rotation", "1,2,3"], "'1,2,3' is not nine numbers"),
-        (None, ["--rotation", "1,0,0,0,1,0,0,0,1"], "--rotation turns a tri-axial --reference"),
+        (
+            None,
+            ["--reference-quantity", "velocity"],
+            "reference.csv, line 1: column a holds acceleration, but --reference-quantity says velocity",
+        ),
+        (None, ["--rotation", "1,2,3"], "'1,2,3' must be nine numbers"),
+        (None, ["--rotation", "1,0,0,0,1,0,0,0,1"], "--rotation is for a tri-axial --reference"),
         (None, ["--u-angle-deg", "nan"], "'--u-angle-deg': 'nan' is not a finite number"),
         (None, ["--u-offset-mps2", "inf"], "'--u-offset-mps2': 'inf' is not a finite number"),
         (None, ["--nominal", "nan", "--u-nominal-pct", "5"], "'--nominal': 'nan' is not a finite number"),
-        (None, ["--nominal", "1"], "--nominal and --u-nominal-pct go together"),
+        (None, ["--nominal", "1"], "--nominal and --u-nominal-pct must be given together"),
         (None, ["--u-angle-deg", "-1"], "--u-angle-deg"),
-        (None, ["--prior", "x.json", "--nominal", "1", "--u-nominal-pct", "2"], "give one of --nominal and --prior"),
+        (None, ["--prior", "x.json", "--nominal", "1", "--u-nominal-pct", "2"], "give --nominal or --prior, not both"),
     ],
 )
 def test_bad_input_is_one_clear_line_and_status_2(
@@ -260,11 +264,11 @@ def test_poses_that_nobody_recorded_are_told(
     (tmp_path / "poses.csv").write_text(poses + "5000,5010,35,300\n")
     status, found, _ = run(capsys, *arguments(tmp_path))
     assert status == 0
-    assert found["windows"][-1]["reason"] == "no samples of sensor and reference in this pose"
+    assert found["windows"][-1]["reason"] == "no samples of the sensor, or none of the reference, in this pose"
     (tmp_path / "poses.csv").write_text(poses.splitlines()[0] + "\n5000,5010,35,300\n")
     status, _, said = run(capsys, *arguments(tmp_path))
     assert status == 2
-    assert "no overlap in time" in said
+    assert "do not overlap in time" in said
 
 
 def test_plain_too_is_refused_where_what_was_known_contradicts_it(

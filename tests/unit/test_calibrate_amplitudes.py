@@ -92,9 +92,9 @@ def test_what_the_methods_cannot_use_is_refused(tmp_path: Path, capsys: pytest.C
     status, found, said = run(tmp_path, capsys, 2, "--nominal", "20000", "--u-nominal-pct", "5")
     assert status == 3
     assert "Sxx is" in said
-    assert "from 2e+04 (u 1e+03) as known before" in said
+    assert "from the prior value 2e+04 (u 1e+03)" in said
     status, _, said = run(tmp_path, capsys, 2, "--plain")
-    assert (status, "--plain belongs to Method 3" in said) == (2, True)
+    assert (status, "--plain is for Method 3 only" in said) == (2, True)
 
     files(tmp_path / "broad", ON_CLAMP, motion=multisine(np.random.default_rng(1), peak_mps2=6.0))
     status, _, said = run(tmp_path / "broad", capsys, 2)
@@ -103,7 +103,7 @@ def test_what_the_methods_cannot_use_is_refused(tmp_path: Path, capsys: pytest.C
 
     files(tmp_path / "dead", ON_CLAMP, reference=ReferenceParameters(sensitivity=0.0, resolution=1e-5, noise=1e-3))
     status, _, said = run(tmp_path / "dead", capsys, 2)
-    assert (status, "no window can be used" in said) == (3, True)
+    assert (status, "windows can be used" in said) == (3, True)
 
 
 def test_an_earlier_result_is_a_prior(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

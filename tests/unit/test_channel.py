@@ -57,7 +57,7 @@ def test_a_device_that_comes_back_goes_on_with_the_next_window() -> None:
     assert said(site.results)[-1][0] == "INVALID"
     site.open("s", "A")
     assert any(w.used for w in windows(site.play(3)))
-    assert ("VALID", "s speaks again") in said(site.results)
+    assert ("VALID", "s sends data again") in said(site.results)
 
 
 def test_another_reference_is_told_and_taken_by_its_own_certificate() -> None:
@@ -65,7 +65,7 @@ def test_another_reference_is_told_and_taken_by_its_own_certificate() -> None:
     site.play(4)
     assert said(site.open("r", "A")) == []
     [(_, reason)] = said(site.open("r", "C"))
-    assert reason.startswith("the reference is now serial-csv C ")
+    assert reason.startswith("the reference is another device now: serial-csv C ")
     assert [w.used for w in windows(site.play(3))][-2:] == [True, True]
     assert abs(updates(site.results)[-1].sensitivity[1][1] - S_TRUE[1, 1]) < 3e-3
 
@@ -75,8 +75,8 @@ def test_a_reference_that_is_not_the_certificates_is_not_used() -> None:
     site = Site(config)
     site.open("s", "A")
     told = [reason for _, reason in said(site.open("r", "C"))]
-    reason = "the certificate is of serial number A, the reference is C"
-    assert told == [f"nothing is updated: {reason}"]
+    reason = "the certificate is of serial number A, but the reference has serial number C"
+    assert told == [f"S and Q are not updated: {reason}"]
     assert {(w.used, w.reason) for w in windows(site.play(3))} == {(False, reason)}
     restored = Pipeline.restore(config.model_dump_json(), site.pipeline.snapshot())
     assert restored.snapshot() == site.pipeline.snapshot()
@@ -125,7 +125,7 @@ def test_another_reference_after_a_restart_is_not_taken_for_the_one_before(
         for device in order:
             again.open(device, serial_number if device == "r" else "A")
         assert len(forgotten) == times
-        assert said(again.results)[0] == ("VALID", "restored from the run before")
+        assert said(again.results)[0] == ("VALID", "restored from the previous run")
 
 
 def test_restored_after_a_kill_it_is_the_calibration_of_before() -> None:
@@ -136,7 +136,7 @@ def test_restored_after_a_kill_it_is_the_calibration_of_before() -> None:
     assert (update.sensitivity, update.offset, update.covariance) == (
         before.sensitivity, before.offset, before.covariance,
     )  # fmt: skip
-    assert said(again.results) == [("VALID", "restored from the run before")]
+    assert said(again.results) == [("VALID", "restored from the previous run")]
     # A month of wandering is in it: S may have gone 0.03 %, Q 11 mm/s2 and what the drift rate leaves.
     later = updates(again.play(3))[0]
     assert later.windows == before.windows + 1
@@ -161,7 +161,7 @@ def test_a_state_made_with_another_configuration_is_not_gone_on_with() -> None:
     assert said(again.results) == [
         (
             "VALID",
-            "begun anew from the calibration in force: these settings have changed: temperature, uncertainty",
+            "begun again from the calibration in force: these settings have changed: temperature, uncertainty",
         )
     ]
     [update] = updates(again.results)
@@ -177,7 +177,7 @@ def test_how_fast_things_may_change_is_no_other_state() -> None:
     site = begun(site_config())
     site.play(3)
     again = begun(site_config(process={"offset_mps2": 0.01}, gate={"confirm_windows": 7}), kept=site.kept(), day=1.0)
-    assert said(again.results) == [("VALID", "restored from the run before")]
+    assert said(again.results) == [("VALID", "restored from the previous run")]
 
 
 def test_a_new_prior_is_an_operators_word() -> None:
@@ -185,16 +185,24 @@ def test_a_new_prior_is_an_operators_word() -> None:
     site.play(3)
     again = begun(site_config(prior={"sensitivity": 1.01}), kept=site.kept(), day=1.0)
     assert updates(again.results) == []
-    assert said(again.results) == [("UNCALIBRATED", "begun anew from the prior: these settings have changed: prior")]
+    assert said(again.results) == [("UNCALIBRATED", "begun again from the prior: these settings have changed: prior")]
 
 
 @pytest.mark.parametrize(
     ("spoil", "status", "reason"),
     [
-        (lambda state: state[:-1], "UNCALIBRATED", "begun anew: what was kept cannot be read: "),
-        (lambda state: pack({"estimation": unpack(state)["estimation"]}), "UNCALIBRATED", "begun anew: what was kept "),
-        (lambda state: without(state, "recursion"), "VALID", "begun anew from the calibration in force: its state "),
-        (lambda state: without(state, "gate"), "VALID", "begun anew from the calibration in force: its state "),
+        (lambda state: state[:-1], "UNCALIBRATED", "begun again from the prior: the stored state cannot be read: "),
+        (
+            lambda state: pack({"estimation": unpack(state)["estimation"]}),
+            "UNCALIBRATED",
+            "begun again from the prior: the stored state ",
+        ),
+        (
+            lambda state: without(state, "recursion"),
+            "VALID",
+            "begun again from the calibration in force: the stored state ",
+        ),
+        (lambda state: without(state, "gate"), "VALID", "begun again from the calibration in force: the stored state "),
     ],
 )
 def test_a_state_that_cannot_be_read_is_said_and_not_the_end(
@@ -221,4 +229,6 @@ def test_windows_refused_for_ever_are_told() -> None:
     site = begun(site_config())
     site.play(5, devices="s")
     site.wait(2 * WINDOW_S)
-    assert [reason for _, reason in said(site.results)].count("nothing is updated: no samples of the reference r") == 1
+    assert [reason for _, reason in said(site.results)].count(
+        "S and Q are not updated: no samples of the reference r"
+    ) == 1

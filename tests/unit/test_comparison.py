@@ -59,6 +59,13 @@ def test_one_bit_is_a_difference_and_its_place_is_told(results: list[Result]) ->
     assert compare("f", 7, results, changed(results, 1, sensitivity=rows), OTHER_CPU) is None
 
 
+def test_only_the_text_of_a_reason_is_left_out_of_the_comparison(results: list[Result]) -> None:
+    recorded = changed(results, 0, reason="the same in other words")
+    assert compare("f", 1, recorded, results, 0.0) is not None
+    assert compare("f", 1, recorded, results, 0.0, reasons=False) is None
+    assert compare("f", 1, recorded, changed(results, 0, used=False), 0.0, reasons=False) is not None
+
+
 @pytest.mark.parametrize(
     ("a", "b", "exact", "close"),
     [

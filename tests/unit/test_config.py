@@ -101,16 +101,16 @@ def test_a_file_that_is_none_is_a_fault(tmp_path: Path, content: bytes | None) -
         ("a = " + "9" * 100_000, "not TOML: "),
         (CHANNEL + "windows = 0x" + "f" * 100_000, "channels.0.windows: .*a number of 400000 bits"),
         ("k" * 1_000_000 + " = 1", "kkk"),
-        (".".join(["a"] * 1_000_000) + " = 1", "line 1: a key of more than 16 parts"),
-        ("\n[" + " . ".join(["'a'"] * 300_000) + "]", "line 2: a key of more than 16 parts"),
+        (".".join(["a"] * 1_000_000) + " = 1", "line 1: a key has more than 16 parts"),
+        ("\n[" + " . ".join(["'a'"] * 300_000) + "]", "line 2: a key has more than 16 parts"),
         ('x = "' + "y" * 1_000_000 + '"', "x: there is no such setting"),
         (
             CHANNEL + "poses = [" + "1, " * 100_000 + "]",
-            f"channels.0.poses: a list of 100000, more than {LONGEST_LIST}",
+            f"channels.0.poses: has 100000 entries, at most {LONGEST_LIST} are allowed",
         ),
         ('devices = [{ name = "a" }, ' + '{ name = "a" }, ' * 10_000 + "]", "devices.0.driver"),
         (DEVICES * 1000 + '[[channels]]\nsensor = "imu"', "at most 100 items"),
-        ("".join(f"k{i} = 1\n" for i in range(10_000)), f"and {10_002 - SHOWN_FAULTS} faults more"),
+        ("".join(f"k{i} = 1\n" for i in range(10_000)), f"and {10_002 - SHOWN_FAULTS} more faults"),
     ],
 )
 def test_a_hostile_file_is_refused_soon_and_in_few_words(tmp_path: Path, text: str, said: str) -> None:

@@ -129,7 +129,7 @@ def test_a_reference_wrong_by_more_than_max_change_is_held_and_proposed_and_ends
     wrong = hours(found, [building_window(random, S=S_TRUE * 1.6) for _ in range(30)], first=10)
     assert actions(wrong) == ["hold"] * 30
     assert wrong[-1].decision.status == "HELD"
-    assert wrong[-1].decision.reason.startswith("beyond max_change: ")
+    assert wrong[-1].decision.reason.startswith("S or Q changed by more than max_change: ")
     assert wrong[-1].decision.proposal is not None
     assert found.in_force is before
     right = hours(found, [building_window(random) for _ in range(3)], first=40)

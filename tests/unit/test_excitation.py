@@ -244,9 +244,6 @@ def test_vibration_above_the_slow_band_is_motion_too() -> None:
     assert window.numbers["reference_rms_mps2"] == pytest.approx(5 / np.sqrt(2), rel=0.01)
 
 
-# --- rests
-
-
 def resting(hands: bool, noise: float = 0.02, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     n = int(6 * RATE_HZ)

@@ -81,8 +81,8 @@ def test_a_fault_of_the_program_is_told_with_its_place_and_the_agent_goes_on(
         assert (at, name) == (" at ", file)
         assert 0 < int(line) <= len((ROOT / name).read_text().splitlines())
         assert window.fault == f"ValueError at {place}: operands <array> could not be broadcast together"
-        assert window.reason == f"a fault of the program, please report it: {window.fault}"
-        assert ("VALID", f"nothing is updated: {window.reason}") in said(found)
+        assert window.reason == f"a fault of the program, not of the data; please report it: {window.fault}"
+        assert ("VALID", f"S and Q are not updated: {window.reason}") in said(found)
         assert decode("fieldcal.v1.Window", encode(7, window)) == (7, window)
     assert [w.used for w in windows(site.play(3))][-2:] == [True, True]
 

@@ -47,7 +47,7 @@ def test_observe_neither_changes_nor_proposes_and_tells_what_it_sees() -> None:
     assert [d.action for d in (taken, adopted, beyond)] == ["take", "adopt", "hold"]
     assert not any(d.in_force or d.propose for d in (taken, adopted, beyond))
     assert [d.status for d in (taken, adopted, beyond)] == ["VALID", "RECALIBRATING", "HELD"]
-    assert taken.reason == "consistent with what was known; only observed"
+    assert taken.reason == "consistent with the calibration so far; not put in force (policy observe)"
     assert beyond.numbers["change_main_pct"] == pytest.approx(6.0)
 
 
@@ -67,7 +67,7 @@ def test_rolled_back_it_stays_so_until_released() -> None:
     g, before = valid(), scaled(0.9)
     answer = g.rollback(before, "key-2")
     assert answer.calibration is before
-    assert (answer.status, answer.reason) == ("VALID", "rolled back by key-2; on hold until released")
+    assert (answer.status, answer.reason) == ("VALID", "rolled back by key-2; on hold until an operator releases it")
     assert g.judge(consistent(), NEAR).action == "refuse"
     g.release("key-2")
     assert g.judge(consistent(), NEAR).action == "hold"  # 11 % from the anchor now
@@ -77,10 +77,10 @@ def test_rolled_back_it_stays_so_until_released() -> None:
 @pytest.mark.parametrize(
     ("command", "why"),
     [
-        (lambda g: g.accept(3, "k"), "no estimate 3 waits to be accepted; waiting: 70, 71"),
-        (lambda g: g.accept(0, "k"), "no estimate 0 waits"),
+        (lambda g: g.accept(3, "k"), "estimate 3 cannot be accepted; estimates that can be: 70, 71"),
+        (lambda g: g.accept(0, "k"), "estimate 0 cannot be accepted"),
         (lambda g: g.release("k"), "not on hold"),
-        (lambda g: g.rollback(calibration(NOMINAL * np.nan), "k"), "needs finite S and Q"),
+        (lambda g: g.rollback(calibration(NOMINAL * np.nan), "k"), "S and Q must be finite"),
     ],
 )
 def test_commands_without_sense_are_refused_and_change_nothing(command: Callable[[Gate], Answer], why: str) -> None:
@@ -100,7 +100,7 @@ def test_a_second_hold_is_refused() -> None:
     g = valid()
     g.hold("first")
     before = g.snapshot()
-    assert g.hold("second").refused == "it is on hold already"
+    assert g.hold("second").refused == "the calibration is on hold already"
     assert pack(g.snapshot()) == pack(before)
 
 

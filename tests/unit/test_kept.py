@@ -17,7 +17,7 @@ G = 9.80665
 UP = {"direction": [1.0, 0.0, 0.0], "gravity_mps2": [0.0, 0.0, G]}
 UPSIDE_DOWN = {"direction": [1.0, 0.0, 0.0], "gravity_mps2": [0.0, 0.0, -G]}
 SIDEWAYS = {"direction": [0.0, 1.0, 0.0], "gravity_mps2": [0.0, 0.0, G]}
-RESTORED = "restored from the run before"
+RESTORED = "restored from the previous run"
 
 
 def channel(*stances: dict[str, Any], **more: Any) -> Channel:
@@ -56,7 +56,7 @@ def after(before: Channel, now: Channel) -> Kept:
 )
 def test_a_state_made_at_another_mount_is_not_gone_on_with(before: Channel, now: Channel, named: str) -> None:
     found = after(before, now)
-    assert found.reason == f"begun anew from the calibration in force: these settings have changed: {named}"
+    assert found.reason == f"begun again from the calibration in force: these settings have changed: {named}"
     assert found.in_force is not None
     assert found.estimation.recursion.windows == 0
 

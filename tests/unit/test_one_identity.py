@@ -61,7 +61,7 @@ def test_after_restarts_it_is_the_calibration_that_was_made() -> None:
     for day in (1.0, 2.0):
         site = begun(site_config(), kept=memories(site), day=day, last=made.sequence + 100)
         [restored] = updates(site.results)
-        assert said(site.results)[0] == ("VALID", "restored from the run before")
+        assert said(site.results)[0] == ("VALID", "restored from the previous run")
         assert restored.run_id == f"run {day}"
         assert restored.t_utc_ns > made.t_utc_ns
         assert (restored.made, restored.date_utc_ns) == (made.made, made.t_utc_ns)

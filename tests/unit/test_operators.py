@@ -18,11 +18,13 @@ FAR = S_TRUE * np.array([1.0, 1.3, 1.0])  # beyond max_change
 def test_on_hold_nothing_changes_until_it_is_released() -> None:
     site = begun(site_config())
     before = updates(site.play(3))[-1]
-    assert said(site.command("hold")) == [("HELD", "on hold by k")]
+    assert said(site.command("hold")) == [("HELD", "put on hold by k")]
     held = site.play(2)
-    assert {(w.used, w.reason) for w in windows(held)} == {(False, "on hold until an operator releases it")}
+    assert {(w.used, w.reason) for w in windows(held)} == {
+        (False, "an operator put the calibration on hold; no window is used until an operator releases it")
+    }
     assert updates(held) == []
-    assert said(site.command("hold"))[0][1] == "hold refused: it is on hold already"
+    assert said(site.command("hold"))[0][1] == "hold refused: the calibration is on hold already"
     assert said(site.command("hold", release=True)) == [("VALID", "released by k")]
     assert updates(site.play(2))[-1].windows > before.windows
 
@@ -32,7 +34,7 @@ def test_a_hold_outlives_a_kill() -> None:
     site.play(3)
     site.command("hold")
     again = begun(site_config(), kept=site.kept(), day=1.0)
-    assert said(again.results)[-1] == ("HELD", "restored from the run before")
+    assert said(again.results)[-1] == ("HELD", "restored from the previous run")
     assert not any(w.used for w in windows(again.play(2)))
 
 
@@ -42,7 +44,7 @@ def test_a_release_outlives_a_kill() -> None:
     site.command("hold")
     site.command("hold", release=True)
     again = begun(site_config(), kept=site.kept(), day=1.0)
-    assert said(again.results)[-1] == ("VALID", "restored from the run before")
+    assert said(again.results)[-1] == ("VALID", "restored from the previous run")
 
 
 def proposing() -> Site:
@@ -60,9 +62,12 @@ def test_what_was_proposed_comes_in_force_when_it_is_accepted() -> None:
     assert said(site.results)[-1][0] == "VALID"
     refused = said(site.command("accept", sequence=proposed[-1].sequence))
     assert refused == [
-        ("VALID", f"accept refused: no estimate {proposed[-1].sequence} waits to be accepted; waiting: none")
+        ("VALID", f"accept refused: estimate {proposed[-1].sequence} cannot be accepted; estimates that can be: none")
     ]
-    assert said(site.command("accept"))[0][1] == "accept refused: accept needs the sequence of an estimate, not None"
+    assert (
+        said(site.command("accept"))[0][1]
+        == "accept refused: accept needs the sequence number of an estimate, not None"
+    )
 
 
 def test_what_was_proposed_waits_through_a_kill() -> None:
@@ -82,7 +87,7 @@ def test_an_estimate_of_another_device_is_not_there_to_accept() -> None:
     waiting = [r for r in site.results if isinstance(r, Estimate)][-1]
     site.open("s", "B")
     [(_, reason)] = said(site.command("accept", sequence=waiting.sequence))
-    assert reason == f"accept refused: no estimate {waiting.sequence} waits to be accepted; waiting: none"
+    assert reason == f"accept refused: estimate {waiting.sequence} cannot be accepted; estimates that can be: none"
 
 
 def test_rolled_back_it_stays_so_until_released() -> None:
@@ -110,18 +115,20 @@ def test_a_rollback_to_another_devices_calibration_is_refused() -> None:
 def test_a_rollback_that_is_no_calibration_is_refused_and_changes_nothing() -> None:
     site = begun(site_config())
     good = updates(site.play(3))[-1]
-    whole = "is not whole: S, Q and a finite covariance of both"
+    whole = "is not complete: it must hold S, Q and a finite covariance of both"
     holes = [[float("nan")] * 12] * 12
     for bad in ({"covariance": holes}, {"covariance": [[0.0]]}, {"offset": [0.0]}):
         reasons = said(site.command("rollback", msgspec.structs.replace(good, **bad)))
         assert reasons == [("VALID", f"rollback refused: calibration {good.sequence} {whole}")]
-    assert said(site.command("rollback"))[0][1].startswith("rollback refused: rollback carries no calibration: ")
+    assert said(site.command("rollback"))[0][1].startswith(
+        "rollback refused: the command holds no calibration that can be read: "
+    )
     assert updates(site.play(2))  # it is not on hold
 
 
 def test_words_to_a_sensor_that_was_never_there_are_refused() -> None:
     site = Site(site_config())
-    assert said(site.command("hold")) == [("UNCALIBRATED", "hold refused: s was never there")]
+    assert said(site.command("hold")) == [("UNCALIBRATED", "hold refused: s has not been connected in this run")]
 
 
 def test_a_sensor_beside_a_tri_axial_reference_takes_no_pose() -> None:
@@ -129,7 +136,7 @@ def test_a_sensor_beside_a_tri_axial_reference_takes_no_pose() -> None:
     site = begun(site_config())
     site.play(2)
     [(_, reason)] = said(site.command("pose", theta_deg=35.0, alpha_deg=0.0))
-    assert reason == ("pose refused: a sensor beside a tri-axial reference stands as rotation says; it takes no poses")
+    assert reason.startswith("pose refused: the channel has a rotation to a tri-axial reference, so it takes no poses")
     assert {w.used for w in windows(site.play(2))} == {True}
 
 
@@ -144,7 +151,7 @@ def test_a_mount_that_never_turns_takes_no_pose() -> None:
             sensor="s", verb="pose", t_monotonic_ns=0, t_utc_ns=0, arguments_json='{"theta_deg": 35, "alpha_deg": 120}'
         )
         if count == 1:
-            with pytest.raises(CommandError, match="a single pose, so a mount that never turns"):
+            with pytest.raises(CommandError, match="a single pose, so the mount never turns"):
                 commanded_pose(command, channel)
         else:
             assert commanded_pose(command, channel).alpha_rad == pytest.approx(np.radians(120.0))

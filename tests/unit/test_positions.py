@@ -181,17 +181,17 @@ def test_an_operators_pose_holds_until_the_next_change() -> None:
 @pytest.mark.parametrize(
     ("keys", "words"),
     [
-        ({"coupling": "ac"}, "does not feel"),
-        ({"poses": [{"start_s": 0, "stop_s": 9, "gravity_mps2": [0, 0, 9.8]}]}, "take the place of poses"),
-        ({"positions": [{"gravity_mps2": [0, 0, 9.8]}]}, "one alone"),
+        ({"coupling": "ac"}, "does not measure"),
+        ({"poses": [{"start_s": 0, "stop_s": 9, "gravity_mps2": [0, 0, 9.8]}]}, "give only one of positions"),
+        ({"positions": [{"gravity_mps2": [0, 0, 9.8]}]}, "there is only one"),
         ({"positions": [{"gravity_mps2": [0, 0, 9.8]}, {"gravity_mps2": [0.1, 0, 9.8]}]}, "positions.0 and"),
         ({"positions": [{"gravity_mps2": [0, 0, 9.8]}, {"gravity_mps2": [0, 0, 0]}]}, "positions.1"),
         ({"positions": [{"theta_deg": 35, "alpha_deg": 0}, {"theta_deg": 35, "alpha_deg": 90}]}, "needs a reference"),
         ({"positions": [{"gravity_mps2": g} for g in FACES.tolist()], "reference": "r"}, "without a reference"),
         ({"positions": [{"direction": [1, 0, 0]}] * 2, "reference": "r"}, "needs gravity_mps2"),
         ({"positions": "free"}, "needs a reference"),
-        ({"positions": "free", "reference": "r", "clamp_theta_deg": 2}, "tells no alpha"),
-        ({"clamp_theta_deg": 35}, 'goes with positions = "free"'),
+        ({"positions": "free", "reference": "r", "clamp_theta_deg": 2}, "gravity cannot show alpha"),
+        ({"clamp_theta_deg": 35}, 'needs positions = "free"'),
         ({"positions": [{"start_s": 0, "gravity_mps2": [0, 0, 9.8]}] * 2}, "positions.0.start_s"),
     ],
 )  # fmt: skip

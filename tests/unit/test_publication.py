@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,10 +14,10 @@ from zenoh.ext import AdvancedSubscriber, HistoryConfig, declare_advanced_subscr
 
 from agent.delivery.history import Record, StoreError
 from agent.delivery.publication import Publisher
-from agent.delivery.session import EndpointError, session_config
+from agent.delivery.session import EndpointError
 from agent.delivery.store import Store
 from tests.unit.results import clock
-from tests.unit.zenoh_site import KEY, Site, record, router_process, sequence_of, wait_for
+from tests.unit.zenoh_site import KEY, Site, record, sequence_of, wait_for
 
 ALL = zenoh.ConsolidationMode.NONE
 
@@ -299,70 +295,3 @@ def test_an_endpoint_of_an_unknown_protocol_is_a_fault_that_is_told(store: Store
     publisher.start()
     wait_for(lambda: "carrier" in publisher.state().fault)
     publisher.close()
-
-
-_AGENT = """
-import os, sys, time
-from pathlib import Path
-from agent.delivery.history import StoreError
-from agent.delivery.publication import Publisher
-from agent.delivery.store import Store
-from tests.unit.zenoh_site import record, wait_for
-store = Store(Path(sys.argv[1]), 0)
-publisher = Publisher("site", "gw", [sys.argv[2]], store)
-publisher.start()
-wait_for(lambda: publisher.state().connected)
-store.commit([record(1)])
-publisher.publish(record(1))
-wait_for(lambda: store.published() == 1)
-print("ready", flush=True)
-sys.stdin.readline()
-if sys.argv[3] == "raise":
-    raise RuntimeError("an agent that fails")
-for n in range(2, 400):
-    big = record(n, text="x" * 60_000)
-    store.commit([big])
-    publisher.publish(big)
-begin = time.monotonic()
-closed = publisher.close()
-print(time.monotonic() - begin, closed, store.published() < 399, flush=True)
-os._exit(0)
-"""
-
-
-def agent_process(tmp_path: Path, endpoint: str, way: str) -> subprocess.Popen[str]:
-    process = subprocess.Popen(
-        [sys.executable, "-c", _AGENT, str(tmp_path), endpoint, way],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    assert process.stdout is not None
-    assert process.stdout.readline() == "ready\n"
-    return process
-
-
-def test_the_interpreter_exits_though_the_publisher_was_never_closed(site: Site, tmp_path: Path) -> None:
-    agent = agent_process(tmp_path, site.endpoint, "raise")
-    _, faults = agent.communicate("\n", timeout=5)
-    assert agent.returncode == 1
-    assert "RuntimeError: an agent that fails" in faults
-
-
-def test_close_is_bounded_while_a_frozen_router_holds_a_put_up(tmp_path: Path) -> None:
-    router = router_process("--listen", "tcp/127.0.0.1:0")
-    assert router.stdout is not None
-    endpoint = router.stdout.readline().split()[-1]
-    try:
-        with zenoh.open(session_config("client", connect=[endpoint])) as client:
-            subscriber = client.declare_subscriber("fieldcal/v1/**", zenoh.handlers.RingChannel(10))
-            agent = agent_process(tmp_path, endpoint, "close")
-            os.kill(router.pid, signal.SIGSTOP)
-            said, _ = agent.communicate("\n", timeout=20)
-            took_s, closed, held_up = said.split()
-            assert (closed, held_up) == ("False", "True")
-            assert float(took_s) < 1.5
-            assert agent.returncode == 0
-            router.kill()  # so that the client can close
-            subscriber.undeclare()
-    finally:
-        router.kill()
-        router.communicate()

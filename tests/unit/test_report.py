@@ -143,7 +143,7 @@ def test_a_recording_gives_the_same_calibration_and_a_torn_one_what_it_has(
     torn.write_bytes(source.read_bytes()[:-3000])
     status, said = run(capsys, torn, "-o", tmp_path / "torn")
     assert status == 0
-    assert said.startswith(f"fieldcal report: {torn}: ends early, at ")
+    assert said.startswith(f"fieldcal report: {torn}: the recording ends early, at ")
     assert said.count("\n") == 1
     assert "ends early" in Page(tmp_path / "torn" / "report.html").text
 
@@ -156,10 +156,10 @@ def test_a_recording_without_a_calibration_says_why_and_is_status_3(
     torn.write_bytes(source[: len(source) // 2])
     status, said = run(capsys, torn, "-o", tmp_path / "out")
     assert status == 3
-    assert "refused: not determined yet: Sxx" in said
+    assert "refused: not in force yet, parameters not determined: Sxx" in said
     seen = Page(tmp_path / "out" / "report.html")
     assert "REFUSED" in seen.text
-    assert "not determined yet" in seen.text
+    assert "not in force yet" in seen.text
     check_figures(tmp_path / "out", "windows")
 
 
@@ -250,16 +250,16 @@ def bad_inputs(recorded: Path, folder: Path) -> dict[str, tuple[list[str | Path]
     return {
         "missing": ([folder / "no.json"], "no.json: No such file or directory"),
         "missing recording": ([folder / "no.mcap"], "no.mcap: No such file or directory"),
-        "no JSON": ([folder / "broken.json"], "broken.json: no JSON object of a calibration: "),
-        "list": ([folder / "list.json"], "list.json: no JSON object of a calibration: "),
-        "other object": ([folder / "other.json"], "other.json: is no calibration result"),
-        "wrong field": ([wrong], "wrong.json: field sensitivity: expected 3 x 3 numbers"),
+        "no JSON": ([folder / "broken.json"], "broken.json: the file is not a JSON object with a calibration: "),
+        "list": ([folder / "list.json"], "list.json: the file is not a JSON object with a calibration: "),
+        "other object": ([folder / "other.json"], "other.json: the file is not a calibration result"),
+        "wrong field": ([wrong], "wrong.json: field sensitivity: must be 3 x 3 numbers"),
         "no store": ([folder / "empty"], "state.sqlite: there is no such file"),
         "empty recording": ([folder / "empty.mcap"], "empty.mcap: "),
-        "damaged recording": ([folder / "damaged.mcap"], "damaged.mcap: damaged at "),
-        "mixture": ([good, recorded], "not a mixture"),
-        "sensor": ([recorded, "--sensor", "other"], "no sensor 'other'; there are mems"),
-        "unit": ([good, "--unit", "count"], "one unit of the indications, here are count, mV"),
+        "damaged recording": ([folder / "damaged.mcap"], "damaged.mcap: the recording is damaged at "),
+        "mixture": ([good, recorded], "the inputs are of several kinds"),
+        "sensor": ([recorded, "--sensor", "other"], "there is no sensor 'other'; the sensors are: mems"),
+        "unit": ([good, "--unit", "count"], "must have one unit, but here are count, mV"),
     }
 
 
@@ -295,7 +295,7 @@ def test_without_matplotlib_the_extra_is_named(
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     status, said = run(capsys, write(tmp_path / "r.json"), "-o", tmp_path / "out")
     assert status == 1
-    assert said == "fieldcal report: figures need matplotlib: pip install 'fieldcal[report]'\n"
+    assert said == "fieldcal report: the figures need matplotlib; install it with: pip install 'fieldcal[report]'\n"
 
 
 def test_what_stands_in_the_data_cannot_break_the_page(tmp_path: Path) -> None:

@@ -62,14 +62,14 @@ def test_null_is_not_determined() -> None:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"sensitivity": [[1.0, 2.0], [3.0, 4.0]]}, r"field sensitivity: expected 3 x 3 numbers.*\[\[1.0, 2.0\]"),
-        ({"offset": ["a", 1, 2]}, "field offset: expected 3 numbers"),
-        ({"covariance": [[1.0] * 12] * 11}, "field covariance: expected 12 x 12"),
+        ({"sensitivity": [[1.0, 2.0], [3.0, 4.0]]}, r"field sensitivity: must be 3 x 3 numbers.*\[\[1.0, 2.0\]"),
+        ({"offset": ["a", 1, 2]}, "field offset: must be 3 numbers"),
+        ({"covariance": [[1.0] * 12] * 11}, "field covariance: must be 12 x 12"),
         ({"standard_uncertainty": {"offset": 7}}, None),  # one number stands for all three
         ({"windows": [{"start_s": 1.0}]}, "field windows: .*stop_s"),
         ({"windows": 3}, "field windows"),
         ({"files": [{"path": 3}]}, "field files"),
-        ({"budget": {"lag": [1.0]}}, "field budget.lag: expected 12 numbers"),
+        ({"budget": {"lag": [1.0]}}, "field budget.lag: must be 12 numbers"),
     ],
 )
 def test_a_field_that_is_wrong_is_named(changes: dict[str, Any], words: str | None) -> None:
@@ -81,7 +81,7 @@ def test_a_field_that_is_wrong_is_named(changes: dict[str, Any], words: str | No
 
 
 def test_what_is_no_result_is_refused() -> None:
-    with pytest.raises(ResultError, match="no calibration result"):
+    with pytest.raises(ResultError, match="not a calibration result"):
         parse({"a": 1}, "name")
 
 

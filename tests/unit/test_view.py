@@ -98,7 +98,7 @@ def test_the_error_against_the_truth_is_the_largest_of_each_kind() -> None:
     true[1, 1] -= 26.123  # 0.1 % of the main sensitivity
     true[0, 2] += 13.0
     truth = SimpleNamespace(sensitivity=true, offset=np.array(update.offset) - [0.0, 0.0, 263.0])
-    expected = "off the truth by at most: S main 0.100 %, transverse 0.050 %, Q 0.0100 m/s²"
+    expected = "largest errors: S main 0.100 %, transverse 0.050 %, Q 0.0100 m/s²"
     assert truth_line(update, truth) == expected
     state = full_state()
     state.truths["mems"] = truth
@@ -156,7 +156,8 @@ def test_lines_tell_each_thing_once() -> None:
         "one",
         "two",
         "device reference: serial-csv /dev/pts/4, open",
-        "publishing: fieldcal/v1/virtual/bench/** to tcp/127.0.0.1:7447 (no router yet, results wait in the store)",
+        "publishing: fieldcal/v1/virtual/bench/** to tcp/127.0.0.1:7447 (no connection "
+        "to a router, results are stored until then)",
         "mems: window 350.0 to 356.0 s at 30 deg: refused: clipped",
     ]
 
