@@ -1,7 +1,7 @@
-"""Windows of known excitation out of a stretch in which the sensor stands in one pose, each with its verdict.
+"""Windows of known excitation, each with its verdict, from samples during which the sensor stays in one pose.
 
-Motion is found from the reference itself; rests under a known gravity from the sensor. What a window must keep to be
-used is in calib.excitation.window_verdict.
+Motion is detected in the reference's samples, rests in the sensor's. calib.excitation.window_verdict has the limits
+that a window must meet to be used.
 """
 
 from __future__ import annotations
@@ -20,14 +20,17 @@ from calib.excitation.window_verdict import DEFAULT_LIMITS, Limits, Verdict, jud
 from calib.geometry import at_rest
 from calib.model import Array, Pose, Window, WindowSums
 
-SHORTEST_QUIET_S = 1.0  # shorter pauses tell nothing of the reference's noise
+SHORTEST_QUIET_S = 1.0  # a shorter pause makes no window of kind "quiet"
 
 
 Kind = Literal["motion", "rest", "quiet"]
 
 
 class Points(NamedTuple):
-    """Samples that all have a reference: times (n,), rising, V (n, 3), u and du (n, m)."""
+    """Samples of the sensor with the reference at the same times.
+
+    `time_s` (n,) rises; `V` (n, 3) in output unit; `u` (n, m) in m/s2 and its derivative `du` (n, m) in m/s3.
+    """
 
     time_s: Array
     V: Array
@@ -35,16 +38,16 @@ class Points(NamedTuple):
     du: Array
 
     def part(self, first: int, stop: int) -> Points:
-        """Samples [first, stop)."""
+        """The samples [first, stop)."""
         return Points(*(column[first:stop] for column in self))
 
 
 def motion_windows(
     pose: Pose, points: Points, limits: Limits = DEFAULT_LIMITS, *, leave_out: bool = True
 ) -> list[Window]:
-    """Windows in samples of one pose throughout, found from the reference itself; calm parts are of kind `quiet`.
+    """The windows in samples of one pose: kind "motion" where the reference moves, kind "quiet" where it hardly moves.
 
-    `leave_out` False keeps all points, knocks included (Method 3 as printed).
+    If `leave_out` is false, the sums hold all points, knocks included (Method 3 as printed).
     """
     return [
         window
@@ -54,7 +57,10 @@ def motion_windows(
 
 
 def motion_parts(u: Array, rate_hz: float) -> list[tuple[Kind, int, int]]:
-    """A reference's samples u (n, m) cut where it begins and ceases to move; short pauses at an end are left out."""
+    """Parts (kind, first, stop) of a reference's samples u (n, m), cut where it begins or stops to move.
+
+    Pauses shorter than SHORTEST_QUIET_S make no part.
+    """
     edges = [0, *itertools.chain(*detection.moving(u, rate_hz)), len(u)]
     parts: list[tuple[Kind, int, int]] = []
     for k, (first, stop) in enumerate(itertools.pairwise(edges)):
@@ -68,8 +74,10 @@ def motion_parts(u: Array, rate_hz: float) -> list[tuple[Kind, int, int]]:
 def judged(
     kind: Kind, pose: Pose, points: Points, limits: Limits = DEFAULT_LIMITS, *, leave_out: bool = True
 ) -> list[Window]:
-    """The windows, with their verdicts, of a part in which the reference moves (or is calm): cut where samples are
-    missing and where they would be longer than `limits.longest_s`."""
+    """The windows of one part (see `motion_parts`), with their verdicts.
+
+    The part is cut where samples are missing, and into windows not longer than `limits.longest_s`.
+    """
     windows = []
     for first, stop in _unbroken(points.time_s):
         longest = round(limits.longest_s * _rate(points.time_s[first:stop]))
@@ -87,10 +95,10 @@ def rest_window(
     floor: Array | None = None,
     leave_out: bool = True,
 ) -> Window:
-    """The window of all rests in samples (n,), n >= 2, of one static pose: times and V (n, 3).
+    """One window of all rests in the samples of one static pose: `time_s` (n,), `V` (n, 3), n >= 2.
 
-    Parts that move are not in it. `floor` (3,): SD that the sensor has at rest elsewhere (`rest_sd`), to tell a sensor
-    that shakes all the time from one at rest.
+    Samples during motion are left out. `floor` (3,) is the SD that the sensor has at rest in other positions
+    (`rest_sd`), in output unit: with it, a sensor that shakes all the time is not taken for one at rest.
     """
     rate_hz = _rate(time_s)
     rests = find_rests(V, rate_hz)
@@ -136,9 +144,10 @@ def still_window(pose: Pose, points: Points, limits: Limits = DEFAULT_LIMITS, *,
 
 
 def rests_anywhere(time_s: Array, V: Array, gravity_mps2: float, limits: Limits = DEFAULT_LIMITS) -> list[Window]:
-    """A window for each rest in samples (n,), in positions that nobody stated: only gravity's magnitude is known there.
+    """A window for each rest in samples of a sensor in unknown positions, for `calib.estimate.norm_fit.norm_fit`.
 
-    Their pose says gravity on z, which is not so: a norm fit does not look at it.
+    `time_s` (n,) in s, `V` (n, 3) in output unit, `gravity_mps2` the magnitude of gravity. The pose of each window has
+    gravity along z in place of its unknown direction; a norm fit does not use the pose.
     """
     rate_hz = _rate(time_s)
     windows = []
@@ -153,15 +162,15 @@ def rests_anywhere(time_s: Array, V: Array, gravity_mps2: float, limits: Limits 
 
 
 def rest_sd(V: Array, rate_hz: float) -> Array | None:
-    """SD (3,) of V (n, 3) within its rests, None where it never rests."""
+    """SD (3,) of V (n, 3) within a rest, the median over all rests; None if there is no rest."""
     rests = find_rests(V, rate_hz)
     return np.median([V[a:b].std(axis=0) for a, b in rests], axis=0) if rests else None
 
 
 def _motion(kind: Kind, pose: Pose, points: Points, limits: Limits, leave_out: bool) -> Window:
-    """One window. It is judged without the knocks, also where they stay in its sums."""
+    """One window. The verdict is made without the knocks, even if the sums hold them."""
     t, _, u, du = points
-    V = np.asfortranarray(points.V)  # medians and extremes of an axis are several times faster this way
+    V = np.asfortranarray(points.V)  # each axis contiguous: medians and extremes are several times faster
     rate_hz = _rate(t)
     if len(V) < max(limits.least_points, 2 * u.shape[1] + 2):
         sums = _sums(V, u, du, rate_hz, limits)
@@ -185,7 +194,10 @@ def _motion(kind: Kind, pose: Pose, points: Points, limits: Limits, leave_out: b
 
 
 def _motion_numbers(sums: WindowSums, basis: Array, V: Array, rate_hz: float) -> dict[str, float]:
-    """Level, noise and coherence in the band of the motion; drift of the mean. `basis` (n, 1 + 2 m) is [1, u, du]."""
+    """Statistics for the verdict: level, noise and coherence in the band of the motion, and drift of the mean.
+
+    `basis` (n, 1 + 2 m) is [1, u, du].
+    """
     m = sums.reference_channels
     u = basis[:, 1 : 1 + m]
     noise = detection.white_noise(u)
@@ -197,7 +209,7 @@ def _motion_numbers(sums: WindowSums, basis: Array, V: Array, rate_hz: float) ->
     scale = float(np.linalg.norm(solution[1 : 1 + m], 2))
     return {
         "reference_rms_mps2": float(np.sqrt(np.sum(np.var(slow[:, 1 : 1 + m], axis=0)))),
-        # Of a constant channel rounding alone is left of both; it is silent.
+        # A constant channel has only rounding errors as level and as noise: it must count as silent.
         "reference_noise_mps2": float(np.sqrt(np.sum(noise**2) / width) + 1e-12 * np.abs(u).max()),
         "coherence": 1.0 - rest / total if total > 0 else 0.0,
         "drift_mps2": _drift(sums) / scale if scale > 0 else np.inf,
@@ -209,7 +221,7 @@ def _never(numbers: Mapping[str, float]) -> Verdict:
 
 
 def _drift(sums: WindowSums) -> float:
-    """How far a segment's mean strays from what the window's own regression foretells, worst axis, output unit."""
+    """Largest difference between a segment's mean and its value by the window's own regression, in output unit."""
     m = sums.reference_channels
     part = factor(sums, derivative=True)
     solution, *_ = np.linalg.lstsq(part.r, part.rhs, rcond=1e-12)
@@ -219,7 +231,7 @@ def _drift(sums: WindowSums) -> float:
 
 
 def _sums(V: Array, u: Array, du: Array, rate_hz: float, limits: Limits) -> WindowSums:
-    """Sums by segments of `segment_s`; what is left over at the end goes into the last one."""
+    """Sums by segments of `segment_s`; a remainder shorter than half a segment is added to the last one."""
     size = max(1, round(limits.segment_s * rate_hz))
     edges = np.arange(0, max(len(V) - size // 2, 1), size)
     return window_sums(u, du, V, np.append(edges, len(V)))
@@ -230,7 +242,7 @@ def _rest_sums(V: Array, rate_hz: float, limits: Limits) -> WindowSums:
 
 
 def _within_sd(sums: WindowSums) -> Array:
-    """(3,) SD of V within segments."""
+    """(3,) pooled SD of V within segments, in output unit."""
     return np.asarray(np.sqrt(np.diagonal(sums.scatter[:, -3:, -3:].sum(axis=0)) / sums.count.sum()))
 
 
@@ -248,7 +260,7 @@ def _window(
 
 
 def _unbroken(time_s: Array) -> Iterator[tuple[int, int]]:
-    """Stretches without missing samples: steps beyond two and a half usual ones cut."""
+    """[first, stop) of each stretch without missing samples: a time step above 2.5 times the median ends a stretch."""
     if len(time_s) < 2:
         return
     steps = np.diff(time_s)
@@ -257,7 +269,7 @@ def _unbroken(time_s: Array) -> Iterator[tuple[int, int]]:
 
 
 def _pieces(first: int, stop: int, longest: int) -> Iterator[tuple[int, int]]:
-    """Equal pieces no longer than `longest`, none of a single sample."""
+    """[first, stop) of equal pieces of at most `longest` samples; a piece has at least two samples."""
     if stop - first > 1:
         count = min(-(-(stop - first) // max(longest, 2)), (stop - first) // 2)
         yield from itertools.pairwise(np.linspace(first, stop, count + 1).round().astype(int).tolist())
