@@ -1,4 +1,4 @@
-"""The mathematics: model, geometry, clocks, excitation, sums and the estimators. Pure: no I/O, no threads, no clock.
+"""The mathematics: model, geometry, clocks, excitation, sums and estimators. It uses no files, threads or system clock.
 
 The names below are what a notebook needs (docs/api.md shows each with an example). Each is imported when it is first
 used, so that `import calib` alone loads neither numpy nor scipy.

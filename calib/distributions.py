@@ -1,4 +1,4 @@
-"""Quantiles that uncertainties and tests need, without scipy (its import costs 0.4 s and 75 MB)."""
+"""Quantiles of Student's t and chi-squared without scipy, whose import takes 0.4 s and 75 MB."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def student_quantile(probability: float, degrees_of_freedom: float) -> float:
 
 
 def coverage_factor(degrees_of_freedom: float) -> float:
-    """k that covers 95.45 %: 2 with many degrees of freedom (GUM G.4)."""
+    """Coverage factor k for a coverage probability of 95.45 %; 2 for many degrees of freedom (GUM G.4)."""
     return student_quantile(NORMAL.cdf(2.0), degrees_of_freedom)
 
 

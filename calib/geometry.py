@@ -1,7 +1,7 @@
-"""Poses: what the ideal sensor feels for every unit of the reference, Eqs. (5)-(7) and (9)-(11), and without a clamp.
+"""Poses: the input acceleration of a sensor on the clamp (Eqs. 5-7 and 9-11), along any direction, or at rest.
 
-Every function gives a `Pose`: `a(t) = direction @ u(t) + gravity_mps2` in the sensor's frame. They raise ValueError
-with the value that is wrong; none of them guesses.
+Every function returns a `Pose`: `a(t) = direction @ u(t) + gravity_mps2` in the sensor's frame. Every function raises
+ValueError, with the wrong value in the message, if an argument has the wrong shape, is not finite or is out of range.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from calib.model import Array, Pose
 
 STANDARD_GRAVITY_MPS2 = 9.80665
-# A direction written with three decimals is off a unit length by up to 1e-3; what is further off was not meant as one.
+# A unit vector written with three decimals has a length that is off by up to 1e-3. A larger error is a mistake.
 UNIT_TOLERANCE = 2e-3
 AXES = ("x", "y", "z")
 UNKNOWN_GRAVITY = (float("nan"),) * 3
@@ -29,13 +29,14 @@ def clamp(
 ) -> Pose:
     """The sensor on the inclined clamp: inclination theta, rotation alpha on its surface (Eqs. 5-7 and 9-11).
 
-    `a = a_ref d + g e` with d = (-sin a cos t, -cos a cos t, sin t), e = (-sin t sin a, -sin t cos a, -cos t).
-    `gravity_mps2` 0 is the AC-coupled sensor (Eqs. 5-7). `static_sign` is +1 as printed (z points into the clamp), -1
-    for z outward.
+    `a = a_ref d + g e` with d = (-sin a cos t, -cos a cos t, sin t), e = (-sin t sin a, -sin t cos a, -cos t), where t
+    is theta and a is alpha. `gravity_mps2` is g in m/s2; 0 for an AC-coupled sensor (Eqs. 5-7). `static_sign` is +1 as
+    in the paper (z points into the clamp), -1 if z points out of the clamp. `position` names the pose; by default the
+    angles do. Raises ValueError if a value is not finite or the sign is not +1 or -1.
     """
     _finite("theta, alpha, gravity", [theta_rad, alpha_rad, gravity_mps2])
     if static_sign not in (1, -1):
-        raise ValueError(f"static sign must be +1 or -1, is {static_sign}")
+        raise ValueError(f"static sign must be +1 or -1, is {static_sign}: +1 means z points into the clamp")
     sin_t, cos_t = np.sin(theta_rad), np.cos(theta_rad)
     sin_a, cos_a = np.sin(alpha_rad), np.cos(alpha_rad)
     direction = np.array([[-sin_a * cos_t], [-cos_a * cos_t], [sin_t]])
@@ -47,15 +48,17 @@ def clamp(
 def along(
     direction: Sequence[float] | Array, gravity_mps2: Sequence[float] | Array | None = None, position: str | None = None
 ) -> Pose:
-    """A uniaxial reference along a unit vector of the sensor's frame (3,).
+    """The pose of a sensor whose uniaxial reference moves along `direction` (3,), a unit vector of the sensor's frame.
 
-    `gravity_mps2` (3,) is what an ideal sensor reads at rest there; None where nobody stated it: the offset then stays
-    unknown. Zeros for an AC-coupled sensor.
+    `gravity_mps2` (3,) is what an ideal sensor reads at rest in this pose; zeros for an AC-coupled sensor; None if it
+    is not known: the offset is then not determined. Raises ValueError if `direction` has not the length 1.
     """
     d = _vector("direction", direction)
     length = float(np.linalg.norm(d))
     if abs(length - 1.0) > UNIT_TOLERANCE:
-        raise ValueError(f"direction must be a unit vector, {_text(d)} has length {length:.6g}")
+        raise ValueError(
+            f"direction must be a unit vector, {_text(d)} has length {length:.6g}: divide it by its length"
+        )
     gravity = np.array(UNKNOWN_GRAVITY) if gravity_mps2 is None else _vector("gravity", gravity_mps2)
     return Pose(position or f"direction {_text(d)}", (d / length)[:, None], gravity)
 
@@ -63,14 +66,17 @@ def along(
 def on_axis(
     axis: Literal["x", "y", "z"] | str, gravity_mps2: Sequence[float] | Array | None = None, position: str | None = None
 ) -> Pose:
-    """One axis of the sensor along the motion (Method 1, Eqs. 2-4)."""
+    """The pose of a sensor with one of its axes along the motion (Method 1, Eqs. 2-4); see `along`."""
     if axis not in AXES:
         raise ValueError(f"axis must be x, y or z, is {axis!r}")
     return along(np.eye(3)[AXES.index(axis)], gravity_mps2, position or f"axis {axis}")
 
 
 def at_rest(gravity_mps2: Sequence[float] | Array, position: str | None = None) -> Pose:
-    """No reference: gravity alone, (3,), as an ideal sensor reads it at rest (+g on the axis that points up)."""
+    """The pose of a sensor at rest, without a reference: gravity is the excitation.
+
+    `gravity_mps2` (3,) is what an ideal sensor reads in this pose: +g on an axis that points up.
+    """
     gravity = _vector("gravity", gravity_mps2)
     return Pose(position or f"rest {_text(gravity)}", np.zeros((3, 0)), gravity)
 
@@ -80,10 +86,11 @@ def beside(
     gravity_mps2: Sequence[float] | Array | None = None,
     position: str = "beside the reference",
 ) -> Pose:
-    """A tri-axial reference beside the sensor: a = R a_ref (+ gravity), R (3, 3) a rotation.
+    """The pose of a sensor beside a tri-axial reference: a = R a_ref + gravity, with the rotation matrix R (3, 3).
 
-    `gravity_mps2` zeros where the reference feels gravity itself; what the sensor reads at rest where the reference is
-    AC-coupled; None where nobody stated it.
+    `gravity_mps2` (3,): zeros if the reference is DC-coupled (it measures gravity itself). If the reference is
+    AC-coupled, what an ideal sensor reads at rest in this pose, or None if that is not known. Raises ValueError if R is
+    not a rotation.
     """
     r = np.asarray(rotation, dtype=float)
     if r.shape != (3, 3):
@@ -92,9 +99,10 @@ def beside(
     off = float(np.abs(r @ r.T - np.eye(3)).max())
     if off > UNIT_TOLERANCE or np.linalg.det(r) < 0:
         raise ValueError(
-            f"rotation is not one: R R' differs from 1 by {off:.3g}, its determinant is {np.linalg.det(r):.6g}"
+            f"rotation must be a rotation matrix: R R' differs from the identity by {off:.3g} (limit "
+            f"{UNIT_TOLERANCE:g}), and the determinant is {np.linalg.det(r):.6g} (must be +1)"
         )
-    left, _, right = np.linalg.svd(r)  # the nearest rotation: rounding of the nine numbers must not scale S
+    left, _, right = np.linalg.svd(r)  # left @ right is the nearest rotation: rounded numbers must not scale S
     gravity = np.array(UNKNOWN_GRAVITY) if gravity_mps2 is None else _vector("gravity", gravity_mps2)
     return Pose(position, left @ right, gravity)
 

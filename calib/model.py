@@ -1,7 +1,9 @@
-"""The model V = S a + Q (Eq. 8), what a window of data is, and what a calibration says.
+"""The model V = S a + Q (Eq. 8 of D'Emilia et al. 2018) and the types for poses, windows and calibrations.
 
 Units: accelerations in m/s2; outputs V in the sensor's own output unit; S in output unit per m/s2; Q in the output
-unit. S has a row an output axis and a column a direction, so S[0, 1] is S_xy: output x, excited along y.
+unit. Each row of S belongs to an output axis, each column to a direction of the acceleration: S[0, 1] is S_xy, the
+sensitivity of output x to an acceleration along y. Equation and section numbers in `calib` are those of that paper
+(docs/paper.md) unless another source is named.
 """
 
 from __future__ import annotations
@@ -19,16 +21,17 @@ PARAMETERS = ("Sxx", "Sxy", "Sxz", "Syx", "Syy", "Syz", "Szx", "Szy", "Szz", "Qx
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pose:
-    """How the sensor stands: what its ideal twin would read.
+    """How the sensor stands: the directions of the motion and of gravity in the sensor's frame.
 
-    The input acceleration in the sensor's frame is `a(t) = direction @ u(t) + gravity_mps2`, u being the reference's
-    m channels in m/s2 (m = 0 at rest, 1 for a uniaxial reference, 3 for a tri-axial one).
-    `direction` is (3, m); `gravity_mps2` (3,) is what an ideal sensor reads at rest there (zeros where the sensor or
-    the equation does not feel it; NaN where a sensor feels a gravity that nobody stated: such a window's mean then says
-    nothing). `theta_rad`, `alpha_rad` are kept where the pose came from the clamp (Eqs. 9-11).
-    `position` names the pose: windows of one position share its angle and offset errors. `u_alpha_rad`, `u_theta_rad`
-    are standard uncertainties of angles that were found, by position; 0 where they were stated. `along` (m, m) where
-    some channels only move along with others: the motion is then `direction @ along @ u`, their columns zero.
+    The input acceleration in the sensor's frame is `a(t) = direction @ u(t) + gravity_mps2`, where u are the m channels
+    of the reference in m/s2 (m = 0 at rest, 1 for a uniaxial reference, 3 for a tri-axial one).
+    `position` names the pose: windows of one position share the errors of its angles and of its offset.
+    `direction` is (3, m). `gravity_mps2` (3,) is what an ideal sensor reads at rest in this pose: zeros if the sensor
+    does not measure gravity, NaN if it does but the gravity is not known; the mean of such a window is not used.
+    `theta_rad`, `alpha_rad` are the angles of the clamp (Eqs. 9-11), None without a clamp. `u_alpha_rad`, `u_theta_rad`
+    are the standard uncertainties of angles that were found from data; 0 for stated angles. `along` (m, m) is given
+    when some channels were not excited by themselves (calib.excitation.excited): the motion is then
+    `direction @ along @ u`, and the columns of those channels in `along` are zero.
     """
 
     position: str
@@ -43,11 +46,12 @@ class Pose:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WindowSums:
-    """Additive summary of a window on the reference's own basis, one entry a segment (a cycle, or a second).
+    """Counts, means and centred sums of products of a window, one entry for each segment (half a second by default).
 
     Columns of z, q = 2 m + 3: the reference's m channels u, their m time derivatives du/dt, then V_x, V_y, V_z.
-    `count` (K,) samples; `mean` (K, q); `scatter` (K, q, q) = sum (z - mean)(z - mean)'. Centred, so that nothing is
-    lost to cancellation; merged by Chan's formula (calib.excitation.sums).
+    `reference_channels` is m; `count` (K,) the number of samples of each segment; `mean` (K, q);
+    `scatter` (K, q, q) = sum (z - mean)(z - mean)'. The sums are centred, so that no digits are lost to cancellation.
+    Segments are merged by the formula of Chan, Golub and LeVeque (calib.excitation.sums).
     """
 
     reference_channels: int
@@ -58,12 +62,14 @@ class WindowSums:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Window:
-    """One window of known excitation: where the sensor stood, its sums, and the verdict on it.
+    """One window of known excitation: its pose, its sums, and the verdict whether it is used.
 
-    `kind`: the reference moved, the sensor rested under a known gravity, or the reference was calm (not used by itself;
-    it measures the noise of the reference). `numbers` are the statistics behind the verdict, unit in the name.
-    `u_lag_s`: by how much this window's lag may differ from the others', as the two clocks tell. `independent`: the
-    share of its points that are, less than 1 where both signals were limited to a band.
+    `start_s`, `stop_s` are the times of its first and last sample; `points` the number of samples in the sums,
+    `left_out` the number of samples that were left out as knocks.
+    `kind`: "motion" (the reference moved), "rest" (the sensor rested under a known gravity) or "quiet" (the reference
+    hardly moved; the window is not used). `numbers` are the statistics behind the verdict, each with its unit in its
+    name. `u_lag_s` is the standard uncertainty of this window's own lag, as far as the two clocks show it.
+    `independent` is the share of statistically independent points: below 1 after both signals were limited to a band.
     """
 
     start_s: float
@@ -83,11 +89,13 @@ class Window:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
-    """S and Q with what is known of them.
+    """S and Q with their uncertainty.
 
-    `covariance` (12, 12) in the order of PARAMETERS (S row by row, then Q); `determined` (12,) tells which of the
-    parameters the data support; the others carry NaN in files' estimates, the prior's value in an agent.
-    `degrees_of_freedom` of the type A part, inf where it does not matter.
+    `sensitivity` (3, 3) in output unit per m/s2; `offset` (3,) in output unit; `covariance` (12, 12) in the order of
+    PARAMETERS (S row by row, then Q). `determined` (12,) is true for each parameter that the data determine
+    (calib.estimate.determined). The others are NaN in an estimate from files, and have the prior's value in an agent.
+    `degrees_of_freedom` are those of the type A part; inf if that part does not limit the coverage factor. `method`
+    names the method for people.
     """
 
     sensitivity: Array
@@ -99,10 +107,11 @@ class Calibration:
 
     @property
     def standard_uncertainty(self) -> Array:
-        """(12,) square roots of the covariance's diagonal."""
+        """(12,) standard uncertainties: the square roots of the diagonal of the covariance."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
 
 def own_channels(channels: int) -> int:
-    """Channels of a reference itself: 1 or 3, where their integrals follow them (2 or 6) as well."""
+    """Number of a reference's own channels: 0, 1 or 3. `channels` is 2 or 6 if their integrals follow them as well
+    (calib.signal.corner)."""
     return {0: 0, 1: 1, 2: 1, 3: 3, 6: 3}[channels]

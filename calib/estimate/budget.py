@@ -1,7 +1,8 @@
-"""Where the uncertainty of S and Q comes from: one standard uncertainty a source, and the degrees of freedom of all.
+"""The uncertainty budget of S and Q: a standard uncertainty for each source, and the effective degrees of freedom.
 
-The covariance is that of the estimate, H^-1 (J' C J + P) H^-1 with C the scatter that the windows show and P the
-priors; a term of C or P is a source. It stays true where residuals are coloured, though they are weighted as white.
+The covariance of the estimate is H^-1 (J' C J + P) H^-1, where H is the information, J the Jacobian, C the scatter that
+the windows show, and P the precision of the priors. Each term of C or P is a source. The covariance is right for
+coloured residuals too, although they are weighted as if they were white.
 """
 
 from __future__ import annotations
@@ -18,10 +19,12 @@ from calib.model import Array
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Budget:
-    """`covariance` (N, N) of [S, Q, nuisances]; `contributions` {source: (12,)}, whose squares sum to its diagonal.
+    """The uncertainty budget.
 
-    `degrees_of_freedom` (12,) effective (Welch-Satterthwaite, GUM G.2b). `offset_scatter_mps2` between windows as
-    estimated, `slope_scatter` relative; both 0 where noise and priors explain all.
+    `covariance` (N, N) of [S, Q, nuisances]; `contributions` {source: (12,)} are standard uncertainties whose squares
+    add up to its diagonal. `degrees_of_freedom` (12,) are the effective ones (Welch-Satterthwaite, GUM G.2b).
+    `offset_scatter_mps2` and `slope_scatter` (relative) are the scatter between windows as estimated; both are 0 if
+    noise and priors explain all of it.
     """
 
     covariance: Array
@@ -29,11 +32,11 @@ class Budget:
     degrees_of_freedom: Array
     offset_scatter_mps2: float
     slope_scatter: float
-    consistency: tuple[float, float]  # chi-squared of the window equations against what was stated, and its mean
+    consistency: tuple[float, float]  # chi-squared of the windows against noise and stated scatter, and its expectation
 
 
 def budget(solution: Solution, stated_offset_scatter_mps2: float) -> Budget:
-    """Sources of the covariance at a solution."""
+    """The budget of a solution. `stated_offset_scatter_mps2` is the prior scatter of the offset between windows."""
     seen = between_windows(solution)
     noise = _type_a(solution)
     sources = {"type A": (noise, solution.equations.data.type_a.degrees_of_freedom)}
@@ -66,12 +69,12 @@ def budget(solution: Solution, stated_offset_scatter_mps2: float) -> Budget:
 
 
 def _variances(half: Array, middle: Array) -> Array:
-    """Diagonal of half middle half'."""
+    """Diagonal of half middle half', not below 0."""
     return np.asarray(np.maximum(np.einsum("in,in->i", half @ middle, half), 0.0))
 
 
 def _type_a(solution: Solution) -> Array:
-    """Scatter within windows, (J half)' C (J half), (N, N)."""
+    """(N, N) part of the scatter within windows: (J half)' C (J half)."""
     equations = solution.equations
     _, mean_rows = equations.split(solution.jacobian)
     type_a = equations.data.type_a

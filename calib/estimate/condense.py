@@ -1,8 +1,8 @@
-"""What the adjustment needs of the windows: whitened slopes, means, and how noisy both are.
+"""The data of the adjustment: whitened slopes and means of each window, and their noise.
 
-Within a window V is regressed on the reference's basis x = [u, du/dt] and 1. The slopes b are kept as R b, R'R being
-the centred scatter of x: never inverted, so what was not excited is a row of zeros, and the conditioning of the whole
-is that of the geometry alone.
+Within a window, V is regressed on the reference's basis x = [u, du/dt] and 1. The slopes b are stored as R b, where R'R
+is the centred scatter of x. R is never inverted: a direction without excitation is a row of zeros, and the condition of
+the problem depends on the geometry alone.
 """
 
 from __future__ import annotations
@@ -15,18 +15,19 @@ import numpy as np
 from calib.estimate.type_a import FEWEST_FREEDOM, LEAST_INFLATION, Segments, TypeA, pooled
 from calib.model import Array, Window, own_channels
 
-PIVOT_FLOOR = 1e-9  # of a channel's own power; what is left after the channels before it is rounding below that
-# Part of the strongest channel's power below which a direction counts as not excited: 1 % of its amplitude, where the
-# noise of a reference would else be taken for motion that the sensor does not feel.
+PIVOT_FLOOR = 1e-9  # of a channel's power: a smaller remainder, after the channels before it, is a rounding error
+# Least power of an excited direction, relative to that of the strongest channel: 1 % of its amplitude. In a weaker
+# direction the noise of the reference would be taken for a motion that the sensor does not follow.
 EXCITED = 1e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Condensed:
-    """Slopes and means of W windows.
+    """Slopes and means of W windows with M = `channels` reference channels.
 
-    `root` (W, 2M, 2M) is R, `slopes` (W, 2M, 3) is R b, `omega2` (W,) in rad2/s2 the power ratio of du/dt to u,
-    `mean_x` (W, 2M), `mean_v` (W, 3), `count` (W,).
+    `root` (W, 2M, 2M) is R; `slopes` (W, 2M, 3) is R b; `omega2` (W,) in rad2/s2 is the power of du/dt over that of u;
+    `mean_x` (W, 2M) and `mean_v` (W, 3) are the means of the basis and of V; `count` (W,) is the number of samples;
+    `type_a` is their noise.
     """
 
     channels: int
@@ -60,10 +61,11 @@ def condense(windows: Sequence[Window], *, alike: bool = False) -> Condensed:
 
 
 def effective(data: Condensed, independent: float) -> Condensed:
-    """The same in units in which slopes and means scatter by one on average, as what segments show.
+    """The same data, scaled so that the noise of slopes and means has the variance 1 on average.
 
-    Coloured or filtered noise leaves fewer independent points, and so less weight against priors. Where segments tell
-    little, the filter's share of `independent` points stands for them.
+    Coloured or filtered noise leaves fewer independent points, so the data must have less weight compared with the
+    priors. The scatter between segments shows how much less; with few segments, `independent`, the share of independent
+    points that the filter leaves, is used in its place.
     """
     type_a, live = data.type_a, np.repeat(np.any(np.diagonal(data.root, axis1=1, axis2=2) > 0.0, axis=0), 3)
     freedom = type_a.degrees_of_freedom if np.isfinite(type_a.degrees_of_freedom) else 0.0
@@ -80,7 +82,7 @@ def effective(data: Condensed, independent: float) -> Condensed:
 
 
 def _segments(window: Window, channels: int) -> Segments:
-    """Sums of one window by segment, centred on the window's mean, with missing reference channels as zeros."""
+    """Sums of one window by segment, centred on the window's mean; channels that it does not have are zeros."""
     own = window.sums.reference_channels
     keep = [*range(own), *range(channels, channels + own), *range(2 * channels, 2 * channels + 3)]
     size = 2 * channels + 3
@@ -103,12 +105,15 @@ def _segments(window: Window, channels: int) -> Segments:
 
 
 def _root(power: Array) -> tuple[Array, Array]:
-    """R (2M, 2M) upper with R'R = power and T with T power = R; rows of zeros where there is no power of its own."""
+    """R (2M, 2M), upper triangular with R'R = power, and T with T power = R.
+
+    A channel without power of its own has rows of zeros.
+    """
     size = len(power)
     half = size // 2
     strongest = np.repeat([power.diagonal()[:half].max(initial=0.0), power.diagonal()[half:].max(initial=0.0)], half)
     limit = np.maximum(PIVOT_FLOOR * power.diagonal(), EXCITED * strongest)
-    moved = power.diagonal() > limit  # a channel of noise alone must not tie its unknown column to the known ones
+    moved = power.diagonal() > limit  # noise in a silent channel must not correlate its column of S with the others
     power = np.where(np.outer(moved, moved), power, 0.0)
     work = np.hstack([power, np.eye(size)])
     rows = np.zeros_like(work)

@@ -1,7 +1,8 @@
-"""Corrected acceleration a = S^-1 (V - Q) with its uncertainty, S and Q at the temperature of the data.
+"""Corrected acceleration a = S^-1 (V - Q) (Eq. 8 solved for a) with its uncertainty; S and Q may depend on temperature.
 
-The calibration's part of the covariance is S^-1 J Sigma J' S^-T with J = [a' (x) I, I] and the full Sigma of [S, Q]: at
-rest its diagonal alone would give 63 where 1 mm/s2 is right. The noise of single samples is apart.
+The covariance due to the calibration is S^-1 J Sigma J' S^-T, with J = [a' (x) I, I] and the full covariance Sigma of
+[S, Q]. The correlations matter: at rest the diagonal of Sigma alone would give 63 mm/s2 where 1 mm/s2 is right. The
+noise of single samples is stated separately.
 """
 
 from __future__ import annotations
@@ -16,12 +17,13 @@ from calib.model import Array, Calibration
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Law:
-    """S and Q over temperature T, with one joint covariance; `determined` (12,) as in calib.model.Calibration.
+    """S and Q as functions of the temperature T, with their joint covariance.
 
-    Q(T) = Q + sum_k c_k (T - T0)^k; row i of S is multiplied by 1 + d_i (T - T0). `mean` is [S row by row, Q, c_1 (3),
-    .. c_K (3), d (3) if modelled], `covariance` of the same; T0 = `reference_degc`. Seen from `low_degc` to `high_degc`
-    (NaN: never): beyond, `u_beyond` (output unit per K2) times the distance squared is added to u(Q): the power that
-    nobody looked for.
+    Q(T) = Q + sum_k c_k (T - T0)^k; row i of S is multiplied by 1 + d_i (T - T0); T0 = `reference_degc`. `mean` is
+    [S row by row, Q, c_1 (3), .. c_K (3), d (3) if `rows`], `covariance` its covariance, K = `order`. The data cover
+    the range from `low_degc` to `high_degc` (NaN if there are none). Outside the range, `u_beyond` (output unit per K2)
+    times the squared distance from the range is combined with u(Q), for a power that the data cannot show.
+    `determined` (12,) as in calib.model.Calibration.
     """
 
     mean: Array
@@ -35,7 +37,8 @@ class Law:
     determined: Flags = field(default_factory=lambda: np.ones(12, dtype=bool))
 
     def at(self, degc: float) -> Calibration:
-        """S and Q at a temperature; without one (NaN), at the reference temperature and as uncertain as the range."""
+        """S and Q at a temperature in deg C. If it is NaN (not known), S and Q at the reference temperature, with an
+        uncertainty that covers the range of the data."""
         if np.isnan(degc):
             return self._anywhere()
         map_, base = self._map(degc)
@@ -46,7 +49,7 @@ class Law:
         return self._calibration(base, covariance)
 
     def _anywhere(self) -> Calibration:
-        """At the reference temperature, as uncertain as if it were as often at one end of the range as at the other."""
+        """S and Q at the reference temperature; the temperature is either end of the range with equal probability."""
         map_, base = self._map(self.reference_degc)
         covariance = map_ @ self.covariance @ map_.T
         if np.isfinite(self.low_degc):
@@ -59,7 +62,7 @@ class Law:
         return Calibration(base[:9].reshape(3, 3), base[9:], covariance, self.determined, np.inf, "corrected")
 
     def _map(self, degc: float) -> tuple[Array, Array]:
-        """Derivative (12, n) of S and Q there by `mean`, and their values (12,)."""
+        """Derivative (12, n) of S and Q at this temperature with respect to `mean` (n,), and their values (12,)."""
         above = degc - self.reference_degc
         map_ = np.zeros((12, len(self.mean)))
         map_[range(12), range(12)] = 1.0
@@ -78,8 +81,11 @@ class Law:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Corrected:
-    """`acceleration` (N, 3) in m/s2; `covariance` (3, 3) of the calibration's part at the mean, `noise` (3,) SD of one
-    sample."""
+    """Corrected accelerations (N, 3) in m/s2.
+
+    `covariance` (3, 3) in m2/s4 is the part of the calibration, at the mean acceleration; `noise` (3,) in m/s2 is the
+    SD of a single sample.
+    """
 
     acceleration: Array
     covariance: Array
@@ -87,9 +93,10 @@ class Corrected:
 
 
 def corrected(indications: Array, calibration: Calibration, residual_sd: Array) -> Corrected:
-    """Indications (N, 3) in output units as accelerations; `residual_sd` (3,) of single samples, output unit.
+    """Corrected accelerations from indications (N, 3) in output unit: a = S^-1 (V - Q).
 
-    Raises numpy.linalg.LinAlgError where S has no inverse.
+    `residual_sd` (3,) is the SD of the noise of a single sample, in output unit. Raises numpy.linalg.LinAlgError if S
+    has no inverse.
     """
     inverse = np.linalg.inv(calibration.sensitivity)
     acceleration = (indications - calibration.offset) @ inverse.T
@@ -99,7 +106,7 @@ def corrected(indications: Array, calibration: Calibration, residual_sd: Array) 
 
 
 def calibration_part(acceleration: Array, calibration: Calibration) -> Array:
-    """Covariance (3, 3) in m2/s4 that S and Q put into one acceleration (3,)."""
+    """Covariance (3, 3) in m2/s4 of one corrected acceleration (3,) due to the uncertainty of S and Q."""
     J = np.zeros((3, 12))
     for i in range(3):
         J[i, 3 * i : 3 * i + 3] = acceleration

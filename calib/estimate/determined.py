@@ -1,4 +1,4 @@
-"""Which parameters the data determine: one decision for files and for the agent."""
+"""The decision which parameters the data determine; `fieldcal calibrate` and the agent share it."""
 
 from __future__ import annotations
 
@@ -8,16 +8,18 @@ from numpy.typing import NDArray
 from calib.model import Array
 
 Flags = NDArray[np.bool_]
-DETERMINED_SHARE = 0.5  # of the prior's standard uncertainty, which the data must halve (contract)
-DETERMINED_U = 0.1  # of the largest main sensitivity, where there is no prior (contract)
+# Both numbers are part of the definition of "determined" in docs/vocabulary.md.
+DETERMINED_SHARE = 0.5  # of the prior's standard uncertainty
+DETERMINED_U = 0.1  # largest u of a parameter without a prior, relative to the largest main sensitivity
 
 
 def determined(values: Array, u: Array, prior_u: Array, seen: Flags) -> Flags:
-    """(12,) of S row by row and Q: the data halve the prior's standard uncertainty.
+    """(12,) flags of the determined parameters, S row by row, then Q.
 
-    `values`, `u` (12,) of the estimate; `prior_u` (12,) before any data, inf where nothing was known: there the data
-    must leave less than a tenth of the largest main sensitivity, and have excited what the parameter responds to
-    (`seen`).
+    `values`, `u` (12,) are the estimate and its standard uncertainty; `prior_u` (12,) is the standard uncertainty
+    before any data, inf without a prior; `seen` (12,) is true if the direction that a parameter responds to was
+    excited. A parameter with a prior is determined if u is below half of `prior_u`. A parameter without a prior is
+    determined if it was seen and u is at most a tenth of the largest main sensitivity.
     """
     limit = DETERMINED_U * float(np.abs(values[[0, 4, 8]]).max())
     return np.asarray(np.where(np.isfinite(prior_u), u < DETERMINED_SHARE * prior_u, seen & (u <= limit)))

@@ -1,9 +1,9 @@
-"""Sequential test for drift: has a parameter stepped, is it drifting, and since when?
+"""Sequential test for drift: whether a parameter has stepped or is drifting, by how much, and since when.
 
 Each window gives a score for each parameter (the normalised innovation, docs/online.md). The test is a generalised
-likelihood ratio over all onsets (onsets.py); its threshold follows from a false-alarm rate stated for a year
-(false_alarms.py). A change of the sensor and one of the reference give the same scores: every verdict that is not
-"stable" says so.
+likelihood ratio over all onsets (calib.estimate.onsets); its threshold follows from the stated number of false alarms
+per year (calib.estimate.false_alarms). A change of the sensor and a change of the reference give the same scores; the
+reason of every verdict other than "stable" says so.
 """
 
 from __future__ import annotations
@@ -19,16 +19,17 @@ from calib.estimate.onsets import FEWEST, LEAST_THRESHOLD, SPAN, Change, Onsets
 from calib.model import PARAMETERS, Array
 
 YEAR_S = 365.25 * 86400.0
-SHORTEST_S = 1.0  # of all windows together: a pace must not be infinite
+SHORTEST_S = 1.0  # least time span of all windows, so that the number of windows per year stays finite
 NAN = float("nan")
-# A verdict "stepped" becomes "drifting", or back, where the other fits better by 20 to 1.
+# Natural logarithm of the likelihood ratio at which "stepped" becomes "drifting" or the reverse: 20 to 1.
 OTHER_SHAPE = 3.0
-QUIET = 0.5  # of the threshold: below, what was not stable is stable again
+QUIET = 0.5  # of the threshold: below it a parameter becomes "stable" again
 
 
 @dataclass(frozen=True, slots=True)
 class DriftSettings:
-    """`false_alarms_a_year` of one sensor, its 12 parameters together; `windows_a_year` None: as they have come."""
+    """`false_alarms_a_year`: of all 12 parameters of a sensor together. `windows_a_year`: None means that the number
+    follows from the times of the windows."""
 
     false_alarms_a_year: float = 0.1
     windows_a_year: float | None = None
@@ -36,11 +37,12 @@ class DriftSettings:
 
 @dataclass(frozen=True, slots=True)
 class DriftVerdict:
-    """What is said of one parameter of calib.model.PARAMETERS.
+    """The verdict on one parameter of calib.model.PARAMETERS.
 
-    `change`, `u_change` where it stepped, in the parameter's unit; `rate`, `u_rate` a day where it drifts; `onset_s` of
-    either; NaN where they do not apply. They are what the state of the recursion has not followed yet. `reason` is
-    empty where it is stable.
+    `change`, `u_change`: size of a step, in the parameter's unit; `rate`, `u_rate`: rate of a drift per day; both are
+    the part that the state of the recursion has not followed yet. `onset_s` is the time at which the step or the drift
+    began. A value that does not apply is NaN. `statistic` and `threshold` are those of the test. `reason` is empty if
+    the parameter is stable.
     """
 
     parameter: str
@@ -56,7 +58,7 @@ class DriftVerdict:
 
 
 class DriftTest:
-    """The test on the windows of one sensor; `update` changes, `result` reads."""
+    """The test on the windows of one sensor: `update` takes a window, `result` gives the verdicts."""
 
     def __init__(self, settings: DriftSettings | None = None) -> None:
         self._settings = settings or DriftSettings()
@@ -66,10 +68,11 @@ class DriftTest:
         self._verdicts = tuple(DriftVerdict(parameter) for parameter in PARAMETERS)
 
     def update(self, t_s: float, score: Array, information: Array) -> list[DriftVerdict]:
-        """Take a window's scores; the verdicts that are now another kind than before.
+        """Take the scores of a window. Returns the verdicts whose kind has changed.
 
-        `score` (12,): standard normal and independent from window to window while nothing changes, NaN where the window
-        tells nothing of the parameter; a change d moves it by d sqrt(information). `t_s` grows.
+        `score` (12,) is standard normal and independent between windows as long as nothing changes; it is NaN if the
+        window has no information on the parameter. A change d of a parameter changes the mean of its score by
+        d sqrt(information); `information` (12,). `t_s` is the time of the window in s; it must rise.
         """
         self._first_s = t_s if self._windows == 0 else self._first_s
         self._windows, self._newest_s = self._windows + 1, t_s
@@ -81,18 +84,18 @@ class DriftTest:
         return [new for old, new in zip(before, self._verdicts, strict=True) if new.verdict != old.verdict]
 
     def result(self) -> tuple[DriftVerdict, ...]:
-        """The 12 verdicts as they stand."""
+        """The present verdicts on the 12 parameters."""
         return self._verdicts
 
     def restart(self, parameters: NDArray[np.bool_]) -> None:
-        """Forget the evidence on these (12,) flags: what the state held of them was replaced.
+        """Forget the evidence on the flagged parameters (12,), because their values in the state were replaced.
 
-        A verdict that is not stable stands until `FEWEST` new windows found nothing.
+        A verdict other than "stable" stays until `FEWEST` new windows have shown no change.
         """
         self._onsets.restart(parameters)
 
     def threshold(self) -> float:
-        """What the statistic is held against, at the pace of the windows so far."""
+        """The threshold of the statistic, for the number of windows per year so far."""
         pace = self._settings.windows_a_year
         if pace is None:
             pace = self._windows * YEAR_S / max(self._newest_s - self._first_s, SHORTEST_S)
@@ -116,7 +119,7 @@ class DriftTest:
         return _drifting(base, ramp) if for_ramp > margin else _stepped(base, step)
 
     def snapshot(self) -> dict[str, Any]:
-        """State for `load`, bit-exact."""
+        """The complete state, for `load`; bit for bit."""
         return {
             "onsets": self._onsets.snapshot(),
             "windows": self._windows,
@@ -126,7 +129,7 @@ class DriftTest:
         }
 
     def load(self, state: dict[str, Any]) -> None:
-        """Take the state that `snapshot` gave."""
+        """Continue from the state that `snapshot` returned."""
         self._onsets.load(state["onsets"])
         self._windows = state["windows"]
         self._first_s, self._newest_s = state["first_s"], state["newest_s"]
@@ -157,4 +160,5 @@ def _drifting(base: DriftVerdict, ramp: Change) -> DriftVerdict:
 
 
 def _reason(text: str, base: DriftVerdict) -> str:
-    return f"{text}; statistic {base.statistic:.1f} beyond {base.threshold:.1f}; sensor or reference, data cannot tell"
+    statistic = f"the statistic {base.statistic:.1f} is above its threshold {base.threshold:.1f}"
+    return f"{text}; {statistic}; cause: sensor or reference (the data cannot tell which)"

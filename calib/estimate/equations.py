@@ -1,13 +1,14 @@
-"""The window equations of the adjustment: what slopes and means should be, and how they move with every unknown.
+"""The window equations of the adjustment: the predicted slopes and means, and their derivatives by every unknown.
 
-For output axis i, with D and G of the pose (calib.estimate.nuisances) and S_i a row of S,
+They follow from V = S a + Q (Eq. 8). For output axis i, with D and G of the pose (calib.estimate.nuisances) and the row
+S_i of S,
 
     slope on u      S_i D (1 - lag_i^2 omega^2 / 2)
     slope on du/dt  -S_i D lag_i + S_i D' / omega
     mean of V       S_i (D mean(u) + G) + Q_i + S_i (D' / omega - lag_i D) mean(du/dt) + offset of the position
 
-The term in omega^2 = <du^2> / <u^2> is the projection of d2u/dt2 on u: exact for a sine, and for any motion once the
-front end has taken out the lag that was found.
+The term in omega^2 = <du^2> / <u^2> is the projection of d2u/dt2 on u. It is exact for a sine, and for any motion after
+the front end has removed the lag that was found, because the remaining lag is then negligible.
 """
 
 from __future__ import annotations
@@ -22,19 +23,21 @@ from calib.estimate.nuisances import Inputs, Nuisances
 from calib.estimate.slope_scatter import SlopeScatter
 from calib.model import Array
 
-# Below this part of the largest singular value (columns scaled to one) a direction was not excited: positions 0/1/2 deg
-# stand at 3e-6, what rounding leaves of an unseen direction at 1e-15.
+# Least singular value of an excited direction, relative to the largest (columns scaled to one). It is 3e-6 for clamp
+# positions of 0, 1 and 2 deg; rounding errors alone give 1e-15.
 RANK_TOLERANCE = 1e-10
-# Of an unseen direction that a parameter may have and still count as seen: what a silent channel shows of another's
-# motion (calib.excitation.excited) is up to 1 % of it; what nobody excited is held at its scale, so u says as much.
+# Largest component of a parameter along a direction without excitation for which the parameter still counts as seen. A
+# silent channel shares up to 1 % of another channel's motion (calib.excitation.excited). A direction without excitation
+# is held at its scale, so u contains that component.
 UNSEEN_SHARE = 0.02
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rows:
-    """Whitened residuals (observed less predicted) and Jacobian with respect to [S row by row, Q, nuisances].
+    """Whitened residuals (observed minus predicted), and the derivatives of the predictions.
 
-    Slopes: `slope` (W, 2M, 3) and `d_slope` (W, 2M, 3, N); means: `mean` (W, 3) and `d_mean` (W, 3, N).
+    Slopes: `slope` (W, 2M, 3) and `d_slope` (W, 2M, 3, N); means: `mean` (W, 3) and `d_mean` (W, 3, N). The N unknowns
+    are [S row by row, Q, nuisances].
     """
 
     slope: Array
@@ -43,14 +46,14 @@ class Rows:
     d_mean: Array
 
     def stacked(self) -> tuple[Array, Array]:
-        """Residuals (rows,) and Jacobian (rows, N): slopes first."""
+        """Residuals (rows,) and Jacobian (rows, N), the slopes first, then the means."""
         n = self.d_mean.shape[-1]
         residual = np.concatenate([self.slope.ravel(), self.mean.ravel()])
         return residual, np.vstack([self.d_slope.reshape(-1, n), self.d_mean.reshape(-1, n)])
 
 
 class Equations:
-    """Condensed windows, the pose of each, and the weights: the functions that Gauss-Newton needs."""
+    """The window equations of W condensed windows, with their poses and weights, as functions for Gauss-Newton."""
 
     def __init__(
         self,
@@ -61,8 +64,9 @@ class Equations:
         scatter: SlopeScatter,
         output_per_mps2: float | None = None,
     ) -> None:
-        """`pose_of` (W,) the nuisances' pose of a window; `offset_scatter_mps2` and `scatter` between windows;
-        `output_per_mps2` the sensor's scale, None: as the data show."""
+        """`pose_of` (W,) is the number of each window's pose in `nuisances`. `offset_scatter_mps2` is the SD of the
+        offset between windows, `scatter` that of the slopes. `output_per_mps2` is the sensor's scale in output unit per
+        m/s2; None takes it from the data."""
         self.data, self.nuisances, self.scatter = data, nuisances, scatter
         self.pose_of_window = np.array(pose_of)
         known = np.isfinite(nuisances.gravity).all(axis=1)[self.pose_of_window]
@@ -73,12 +77,13 @@ class Equations:
         self.seen = self._seen()
         noise2 = data.type_a.noise**2 / data.count[:, None]
         variance = noise2 + (offset_scatter_mps2 * self.output_per_mps2) ** 2
-        # A mean whose gravity nobody stated says nothing: no weight.
+        # If gravity is not known in a pose, the mean has no information and gets no weight.
         self.mean_weight = np.where(known[:, None], 1.0 / np.sqrt(variance), 0.0)
         self.white_share = np.where(known[:, None], noise2 / variance, 0.0)
 
     def _unseen_inputs(self) -> Array:
-        """Directions (k, 4) of (a_x, a_y, a_z, 1) square to every input vector, angles as stated; 4 - k is the rank."""
+        """Directions (k, 4) of (a_x, a_y, a_z, 1) normal to every input vector, with angles as stated. The rank is
+        4 - k."""
         data, nuisances, m = self.data, self.nuisances, self.data.channels
         moved = np.einsum("brc,bkc->brk", data.root[:, :m, :m], nuisances.direction[self.pose_of_window])
         held = np.einsum("wkm,wm->wk", nuisances.mean_direction[self.pose_of_window], data.mean_x[:, :m])
@@ -92,13 +97,13 @@ class Equations:
         return np.asarray(ways[singular <= RANK_TOLERANCE * singular[0]] / scale)
 
     def _seen(self) -> NDArray[np.bool_]:
-        """(12,) which of S row by row and Q have no part in a direction that nobody excited."""
+        """(12,) flags of the parameters (S row by row, then Q) that have no component in a direction of `unseen`."""
         parts = np.abs(self.unseen) / np.linalg.norm(self.unseen, axis=1, keepdims=True)
         free = parts.max(axis=0, initial=0.0) > UNSEEN_SHARE
         return ~np.concatenate([np.tile(free[:3], 3), np.repeat(free[3], 3)])
 
     def _output_per_mps2(self) -> float:
-        """The sensor's scale: root mean square of output over input, of all slopes and means."""
+        """The sensor's scale in output unit per m/s2: rms of the outputs over rms of the inputs, slopes and means."""
         data, m = self.data, self.data.channels
         moved = np.einsum("brc,bkc->brk", data.root[:, :m, :m], self.nuisances.direction[self.pose_of_window])
         felt = np.einsum("wkm,wm->wk", self.nuisances.mean_direction[self.pose_of_window], data.mean_x[:, :m])
@@ -112,7 +117,7 @@ class Equations:
         return float(np.sqrt(outputs / inputs)) if inputs > 0.0 and outputs > 0.0 else 1.0
 
     def at(self, x: Array) -> Rows:
-        """Rows at x = [S row by row, Q, nuisances]."""
+        """Residuals and derivatives at x = [S row by row, Q, nuisances] (N,)."""
         S, Q, z = x[:9].reshape(3, 3), x[9:12], x[12:]
         inputs = self.nuisances.at(z)
         return Rows(*self._slopes(S, inputs), *self._means(S, Q, z, inputs))
@@ -159,7 +164,7 @@ class Equations:
         return self._whitened(residual / noise), self._whitened(jacobian / noise[..., None])
 
     def _whitened(self, slopes: Array) -> Array:
-        """Rows (W, 2M, 3, ...) with the scatter between windows taken into their weight."""
+        """Rows (W, 2M, 3, ...) weighted for the scatter between windows as well."""
         flat = slopes.reshape(len(slopes), -1, *slopes.shape[3:])
         return self.scatter.whiten(flat).reshape(slopes.shape)
 
@@ -169,7 +174,7 @@ class Equations:
         moved = np.einsum("wkm,wm->wk", D, data.mean_x[:, :m])
         rate = np.einsum("wkm,wm->wk", D, data.mean_x[:, m:])
         G = np.nan_to_num(inputs.gravity[self.pose_of_window])
-        # A window of no whole number of cycles has a mean of du/dt, which lag and quadrature pass on.
+        # If a window is no whole number of cycles, the mean of du/dt is not 0, and lag and quadrature add to the mean.
         per_omega = np.divide(1.0, np.sqrt(data.omega2), out=np.zeros_like(data.count), where=data.omega2 > 0.0)
         share = (data.mean_x[:, m] if m else 0.0 * data.count) * per_omega
         across = inputs.quadrature[self.pose_of_window] * share[:, None]

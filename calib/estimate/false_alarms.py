@@ -1,6 +1,6 @@
-"""How often the sequential test of calib.estimate.onsets speaks though nothing changed.
+"""Rate of false alarms of the sequential test in calib.estimate.onsets, and the threshold for a given rate.
 
-The test asks after every window whether max over onsets of Z^2 / 2 is beyond a threshold, Z being the standard normal
+After every window the test compares the largest Z^2 / 2 over all onsets with a threshold. Z is the standard normal
 sum of all scores since the onset. For independent scores the mean number of windows between false alarms is, with
 b = sqrt(2 threshold) (Siegmund and Venkatraman, Annals of Statistics 23 (1995) 255, Theorem 1, both signs):
 
@@ -21,16 +21,16 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
 
 
 def false_alarm_rate(threshold: float, fewest: int, most: int) -> float:
-    """False alarms a window of one parameter; onsets lie `fewest` to `most` windows back."""
+    """False alarms per window of one parameter; onsets lie `fewest` to `most` windows back."""
     b = math.sqrt(2.0 * threshold)
     return b * math.exp(-threshold) / math.sqrt(2.0 * math.pi) * _overshoots(b, fewest, most)
 
 
 @lru_cache(maxsize=64)
 def false_alarm_threshold(rate: float, fewest: int, most: int) -> float:
-    """The threshold whose `false_alarm_rate` (a window, one parameter, below 1e-2) is this."""
+    """The threshold that has this `false_alarm_rate` (per window, for one parameter; below 1e-2)."""
     b = 5.0
-    for _ in range(12):  # each step divides what is left by about b^2
+    for _ in range(12):  # each iteration divides the error by about b^2
         b = math.sqrt(2.0 * math.log(b * _overshoots(b, fewest, most) / (math.sqrt(2.0 * math.pi) * rate)))
     return b * b / 2.0
 
@@ -43,7 +43,7 @@ def _overshoots(b: float, fewest: int, most: int) -> float:
 
 
 def _nu(x: float) -> float:
-    """Within 1 % (Siegmund and Yakir, The Statistics of Gene Mapping, 2007, section 5.1)."""
+    """The function nu(x) to within 1 % (Siegmund and Yakir, The Statistics of Gene Mapping, 2007, section 5.1)."""
     half = math.erf(x / math.sqrt(8.0)) / 2.0  # Phi(x / 2) - 1 / 2
     density = math.exp(-x * x / 8.0) / math.sqrt(2.0 * math.pi)
     return (2.0 / x) * half / ((x / 2.0) * (half + 0.5) + density)

@@ -1,4 +1,4 @@
-"""Weighted least squares of the window equations with priors, by Gauss-Newton on stacked factors (never squared)."""
+"""Weighted least squares of the window equations with priors: Gauss-Newton by QR factors, without normal equations."""
 
 from __future__ import annotations
 
@@ -14,22 +14,23 @@ from calib.model import Array
 Flags = NDArray[np.bool_]
 MAX_STEPS = 30
 MAX_HALVINGS = 8
-CONVERGED = 1e-3  # of a standard uncertainty: the step after it, still taken, is smaller by about as much again
-ROUNDING = 1e-13  # of the scale: a step below it is rounding
-# What nothing is known of beforehand is held by this many times its scale: weak enough to move what is known to 1 % by
-# 1e-12 of it, strong enough that a direction nobody excited leaves nothing singular.
+CONVERGED = 1e-3  # of a standard uncertainty. The step is still taken; the one after it would be 1000 times smaller
+ROUNDING = 1e-13  # of the scale: a smaller step is a rounding error
+# Standard uncertainty, relative to its scale, of a parameter without a prior. It is so large that it changes a
+# parameter known to 1 % by 1e-12 only, and small enough that a direction without excitation is not singular.
 UNBOUNDED = 1e4
-OFFSET_SCALE_MPS2 = 10.0
+OFFSET_SCALE_MPS2 = 10.0  # scale of Q
 PARAMETER_ROWS = [[3 * i, 3 * i + 1, 3 * i + 2, 9 + i] for i in range(3)]  # S_ix, S_iy, S_iz, Q_i
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """Where it ended: x = [S row by row, Q, nuisances] (N,), and the whitened residuals (rows,) there.
+    """The solution x = [S row by row, Q, nuisances] (N,), and the whitened residuals (rows,) there.
 
-    `half` (N, N): half half' = H^-1. `jacobian` (rows, N) is J half, in coordinates in which H is the identity: only
-    there can sums over a direction that nobody excited be taken without losing all digits. `prior_mean` (N,),
-    `prior_precision` (N, N); `bounded` (12,) tells which of S, Q had a prior of their own.
+    H = J'J with the rows of the windows and of the priors. `half` (N, N): half half' = H^-1. `jacobian` (rows, N) is
+    J half, for the rows of the windows: in these coordinates H is the identity, so that sums over a direction without
+    excitation do not lose all digits. `prior_mean` (N,) and `prior_precision` (N, N) are the priors; `bounded` (12,) is
+    true for each parameter of S and Q that had a prior.
     """
 
     equations: Equations
@@ -43,18 +44,18 @@ class Solution:
 
     @property
     def chi2(self) -> float:
-        """Sum of squares of the whitened residuals and of what moved against its prior."""
+        """Sum of squares of the whitened residuals and of the deviations from the priors."""
         pull = self.x - self.prior_mean
         return float(self.residual @ self.residual + pull @ self.prior_precision @ pull)
 
     @property
     def leverage(self) -> Array:
-        """(rows,) how much of each row's own scatter the fit takes up, 0 to 1."""
+        """(rows,) leverage of each row, 0 to 1: the part of its own scatter that the fit absorbs."""
         return np.asarray(np.einsum("rn,rn->r", self.jacobian, self.jacobian))
 
 
 def solve(equations: Equations, priors: Priors) -> Solution:
-    """Minimise chi2 from the priors' means; the first step alone solves S and Q where every nuisance is fixed."""
+    """Minimise chi2, starting at the priors' means. If every nuisance is fixed, the first step is the solution."""
     scale, mean, precision, bounded = _priors(equations, priors)
     root: Array = np.asarray(np.linalg.cholesky(precision * np.outer(scale, scale)).T, dtype=np.float64)
     x = mean.copy()
@@ -65,18 +66,18 @@ def solve(equations: Equations, priors: Priors) -> Solution:
             break
         x, residual, jacobian = _shortened(equations, x, step, mean, scale, root, float(residual @ residual))
     x = x + step * scale
-    # Where the noise is small the equations bend by more than that within the last step: half is taken at its end.
+    # If the noise is small, the equations are not linear enough within the last step: `half` is computed at its end.
     residual, jacobian = _stacked(equations, x, mean, scale, root)
     half, _ = _step(jacobian, residual)
-    rows = len(residual) - len(x)  # the others are the priors'
+    rows = len(residual) - len(x)  # the rows behind these belong to the priors
     return Solution(
         equations, x, half * scale[:, None], residual[:rows], jacobian[:rows] @ half, mean, precision, bounded
     )
 
 
 def _step(jacobian: Array, residual: Array) -> tuple[Array, Array]:
-    """half with half half' = (J'J)^-1, and the step (N,), of scaled unknowns."""
-    # The factor of [J, r] holds that of J and Q'r: Q itself is never needed.
+    """`half` with half half' = (J'J)^-1, and the step (N,), both for scaled unknowns."""
+    # The R factor of [J, r] contains that of J, and Q'r: Q itself is not needed.
     n = jacobian.shape[1]
     factor = np.asarray(np.linalg.qr(np.column_stack([jacobian, residual]), mode="r"), dtype=np.float64)
     half = np.asarray(np.linalg.inv(factor[:n, :n]), dtype=np.float64)
@@ -91,7 +92,7 @@ def slope_residuals(solution: Solution) -> tuple[Array, Array]:
 
 
 def _stacked(equations: Equations, x: Array, mean: Array, scale: Array, root: Array) -> tuple[Array, Array]:
-    """Residuals and scaled Jacobian of the window equations and of the priors below them."""
+    """Residuals and scaled Jacobian: the rows of the window equations first, then those of the priors."""
     residual, jacobian = equations.at(x).stacked()
     return np.concatenate([residual, root @ ((mean - x) / scale)]), np.vstack([jacobian * scale, root])
 
@@ -99,7 +100,7 @@ def _stacked(equations: Equations, x: Array, mean: Array, scale: Array, root: Ar
 def _shortened(
     equations: Equations, x: Array, step: Array, mean: Array, scale: Array, root: Array, before: float
 ) -> tuple[Array, Array, Array]:
-    """The full step, or the first halving of it that does not make chi2 larger; with residuals and Jacobian there."""
+    """x after the full step, or after the first halved step that does not increase chi2; its residuals and Jacobian."""
     for halving in range(MAX_HALVINGS):
         tried = x + step * scale * 0.5**halving
         residual, jacobian = _stacked(equations, tried, mean, scale, root)
@@ -109,7 +110,7 @@ def _shortened(
 
 
 def _priors(equations: Equations, priors: Priors) -> tuple[Array, Array, Array, Flags]:
-    """Scale (N,), mean (N,), precision (N, N) of all unknowns, and which of S, Q (12,) are bounded by a prior."""
+    """Scale (N,), mean (N,) and precision (N, N) of all unknowns, and flags (12,) of S and Q that have a prior."""
     nuisances, s = equations.nuisances, equations.output_per_mps2
     scale = np.concatenate([np.full(9, s), np.full(3, OFFSET_SCALE_MPS2 * s), nuisances.uncertainty])
     mean = np.concatenate([np.zeros(12), [t.expected - t.applied for t in nuisances.terms]])
@@ -122,7 +123,8 @@ def _priors(equations: Equations, priors: Priors) -> tuple[Array, Array, Array, 
         mean[known] = priors.parameters[known]
         precision[np.ix_(known, known)] = np.linalg.inv(priors.covariance[np.ix_(known, known)])
     if not bounded[:9].all():
-        # What nobody excited is held at its scale: nuisances times a wandering column would else explain noise.
+        # A column of S that was not excited is held at its scale. If it were free, it could take large values, and a
+        # nuisance multiplied by it would then explain noise.
         for way in equations.unseen * np.array([1.0, 1.0, 1.0, 1.0 / OFFSET_SCALE_MPS2]):
             for row in PARAMETER_ROWS:
                 held = way / np.linalg.norm(way) / scale[row]

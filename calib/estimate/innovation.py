@@ -1,4 +1,4 @@
-"""What a window says against a state before it is taken: a test of consistency, and a score for each parameter."""
+"""The innovation: the difference between a window and the prediction of the state, before the window is taken."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ from calib.estimate.joint_state import JointState
 from calib.estimate.window_rows import Rows
 from calib.model import Array
 
-TELLS = 1e-6  # of the prior's own information on a parameter, that a window must bring to say anything of it
+TELLS = 1e-6  # least information of a window on a parameter, relative to that of the state
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Innovation:
-    """What a window says against the state, before it is taken.
+    """The statistics of the innovation of one window.
 
-    `statistic` is chi-squared with `degrees_of_freedom` if the state and its uncertainty are true. `score` (12,) is the
-    innovation projected on each parameter, standard normal likewise, NaN where the window says nothing of it; a change
-    d of the parameter moves it by d sqrt(`information`).
+    If the state and its uncertainty are right, `statistic` is chi-squared with `degrees_of_freedom`, and `score` (12,),
+    the innovation projected on each parameter of S and Q, is standard normal. A score is NaN if the window has no
+    information on the parameter. A change d of a parameter changes the mean of its score by d sqrt(`information`);
+    `information` (12,).
     """
 
     statistic: float

@@ -1,4 +1,4 @@
-"""The one search for the lag: windows are made, what lag they still have is found, taken out, looked for again."""
+"""Iterative search for the lag: make windows, estimate their remaining lag, remove it, and make the windows again."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 
 from calib.model import Window
 
-TURNS = 4  # each turn leaves a thousandth of the lag
-# Of a lag that windows still have: (omega lag)^3 / 6 is what the equations' own second order leaves of it.
+TURNS = 4  # each iteration leaves about a thousandth of the lag
+# Limit of (omega lag)^3 / 6, the error of the window equations, which are of second order in the remaining lag.
 PHASE_LEFT = 1e-8
 Made = TypeVar("Made")
 
@@ -21,10 +21,11 @@ def without_lag(
     used: Callable[[Made], Sequence[Window]],
     lag_of: Callable[[Made, float], float],
 ) -> tuple[Made, float]:
-    """Windows in which no lag is left that matters, and the lag that was taken out of them, in s.
+    """Windows whose remaining lag is negligible, and the lag in s that was removed from them.
 
-    `make(lag_s)` makes windows with a lag taken out; `used` gives those of them that are used; `lag_of(made, lag_s)`
-    estimates the whole lag from them. The search begins at `lag_s` and ends where no window is used.
+    `make(lag_s)` makes windows from which this lag is removed; `used(made)` gives those of them that are used;
+    `lag_of(made, lag_s)` estimates the whole lag from them, in s. The search begins at `lag_s`. It ends when the
+    remaining lag is small enough, after TURNS iterations, or when no window is used.
     """
     for turn in range(TURNS):
         made = make(lag_s)
@@ -39,7 +40,7 @@ def without_lag(
 
 
 def largest_omega(windows: Sequence[Window]) -> float:
-    """Largest angular frequency (rad/s) that any window's power stands for; 0 at rest."""
+    """Largest mean angular frequency (rad/s) of any window: the rms of du/dt over that of u; 0 at rest."""
     largest = 0.0
     for window in windows:
         m, power = window.sums.reference_channels, np.diag(window.sums.scatter.sum(axis=0))

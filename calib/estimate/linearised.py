@@ -1,4 +1,4 @@
-"""A joint state of which all recent windows are linearised at one point (see calib.estimate.recursion)."""
+"""A joint state with its recent windows, which are all linearised at the same point (see calib.estimate.recursion)."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from calib.estimate.window_rows import Summary
 
 
 class Linearised:
-    """The state with all windows, the base without the recent ones, and the point: always of the same quantities.
+    """A state that contains all windows, a base that contains all but the recent ones, and the point of linearisation.
 
-    `base_day` is the day of the base, None before any window; `point` (N,) the values at which the recent windows are
-    linearised; `bound` (N,) the variance that wandering may not exceed.
+    All three have the same N quantities. `base_day` is the day of the base, None before the first window; `recent` are
+    the recent windows; `point` (N,) are the values at which they are linearised; `bound` (N,) is the largest variance
+    that random walks may reach.
     """
 
     def __init__(self, state: JointState) -> None:
@@ -27,24 +28,24 @@ class Linearised:
         self.bound = state.variance.copy()
 
     def append(self, terms: Sequence[Term]) -> list[str]:
-        """Nuisances that are not in the state yet come in with their priors; their names."""
+        """Add each nuisance that the state does not have yet, with its prior. Returns the names of those added."""
         new = [term for term in terms if term.name not in self.state.names]
         for term in new:
             for state in (self.state, self.base):
                 state.append(term.quantity, term.expected, term.uncertainty)
             self.point = np.append(self.point, term.expected)
-            # A mount may come to lean by more than anybody stated of the day it was made.
+            # Twice the stated u: later the mount may lean by more than its prior says of the day of mounting.
             self.bound = np.append(self.bound, (2.0 * term.uncertainty) ** 2)
         return [term.name for term in new]
 
     def keep(self, kept: Sequence[bool]) -> None:
-        """Forget the other quantities; the recent windows must be in the base."""
+        """Remove all other quantities. Before the call, the recent windows must have been moved to the base."""
         self.bound, self.point = self.bound[np.array(kept)], self.point[np.array(kept)]
         self.state.keep(kept)
         self.base = self.state.copy()
 
     def moved(self, scale: float) -> bool:
-        """Whether an unknown has left the point by more than its product with S counts as straight.
+        """Whether an unknown is so far from the point that the windows must be linearised again (see `Kind.straight`).
 
         `scale` is the sensor's output unit per m/s2.
         """
@@ -60,7 +61,7 @@ class Linearised:
         return other
 
     def snapshot(self) -> dict[str, Any]:
-        """All of it, exactly."""
+        """The complete state, for `load`; bit for bit."""
         return {
             "state": self.state.snapshot(),
             "base": self.base.snapshot(),
@@ -72,7 +73,7 @@ class Linearised:
 
     @classmethod
     def load(cls, state: Mapping[str, Any]) -> Linearised:
-        """Of a snapshot."""
+        """The object whose snapshot this is."""
         loaded = cls(JointState.load(state["state"]))
         loaded.base, loaded.base_day = JointState.load(state["base"]), state["base_day"]
         loaded.recent = [Summary.load(summary) for summary in state["recent"]]

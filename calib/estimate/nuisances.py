@@ -1,13 +1,14 @@
-"""What is not S or Q but moves the data: angles, offsets, the reference, gravity, time. Each with a stated prior.
+"""The nuisances: unknowns other than S and Q (angles, offsets, the reference, gravity, lag), each with a stated prior.
 
-What each of them moves is in calib.estimate.terms. The input acceleration in the sensor's frame is, P poses and M
-reference channels,
+calib.estimate.terms has the effect of each nuisance. For P poses and M reference channels the input acceleration in the
+sensor's frame is
 
     a(t) = D u(t - lag) + D' u'(t) / omega + G
     D = R(turn) (D0 + t L) / (1 + r)        D' = R(turn) q L        G = R(turn') G0 (1 + dg / |G0|)
 
-t and q being motion along L that a uniaxial reference does not see, in phase with the motion and 90 deg ahead of it (a
-table that rocks does both), and r the reference's relative error.
+D0, G0 are the stated direction and gravity (Eqs. 9-11 on the clamp), R rotations, r the relative error of the
+reference, dg the error of gravity. t and q are relative motion along L, transverse to a uniaxial reference, which does
+not measure it: t in phase with the motion, q 90 deg ahead of it. A table that rocks causes both.
 """
 
 from __future__ import annotations
@@ -25,12 +26,12 @@ from calib.model import Array, Pose, own_channels
 
 @dataclass(frozen=True, init=False)
 class Priors(Stated):
-    """What is known before the data: a standard uncertainty (GUM type B) of each nuisance, and some means.
+    """The priors: a standard uncertainty (GUM type B) for each nuisance, and for some of them a mean.
 
-    The numbers are attributes, their names and defaults are in calib.estimate.quantities; an uncertainty of 0 fixes the
-    nuisance at its mean. With `Priors.none()` all are fixed, and the adjustment is plain Method 3.
-    `parameters` (12,) and `covariance` (12, 12): what was known of S, Q in the order of
-    calib.model.PARAMETERS, inf on the diagonal where nothing was.
+    Each number is an attribute; calib.estimate.quantities has the names, units and defaults. A standard uncertainty of
+    0 fixes the nuisance at its mean. With `Priors.none()` all are fixed, and the adjustment is plain Method 3 (section
+    2.3). `parameters` (12,) and `covariance` (12, 12) are the prior of S and Q in the order of calib.model.PARAMETERS;
+    the diagonal is inf for each parameter without a prior.
     """
 
     table: ClassVar[Mapping[str, Statement]] = PRIORS
@@ -44,7 +45,7 @@ class Priors(Stated):
         covariance: Array | None = None,
         **stated: float,
     ) -> None:
-        """`stated` counts before `values`, and these before the defaults. Raises TypeError for an unknown name."""
+        """`stated` overrides `values`, and `values` override the defaults. Raises TypeError for an unknown name."""
         super().__init__(values, **stated)
         object.__setattr__(self, "parameters", parameters)
         object.__setattr__(self, "covariance", covariance)
@@ -52,7 +53,7 @@ class Priors(Stated):
 
 @dataclass(frozen=True, slots=True)
 class Applied:
-    """What the front end has already taken out of the data; nuisances are reported in total, with it."""
+    """The values that the front end has already removed from the data. Reported values of nuisances contain them."""
 
     lag_s: float = 0.0
     reference_corner_hz: float = 0.0
@@ -60,22 +61,23 @@ class Applied:
 
     @classmethod
     def of(cls, priors: Priors, lag_s: float) -> Applied:
-        """This lag, and corners as they are expected: no search finds those."""
+        """This lag, and the corners at the means of their priors, because no search finds the corners."""
         return cls(lag_s, priors.reference_corner_at_hz, priors.sensor_corner_at_hz)
 
     @property
     def by_kind(self) -> dict[Kind, float]:
-        """The same, by the kind of the unknown."""
+        """The same values by the kind of the unknown."""
         return {LAG: self.lag_s, REFERENCE_CORNER: self.reference_corner_hz, SENSOR_CORNER: self.sensor_corner_hz}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Inputs:
-    """Input accelerations at one value of the J nuisances and their derivatives with respect to each.
+    """The inputs at given values of the J nuisances, and their derivatives with respect to each nuisance.
 
-    `direction` (P, 3, M) of the motion, `mean_direction` (P, 3, M) of the reference's means: they differ where channels
-    are silent, whose means are felt all the same. `quadrature` (P, 3), `gravity` (P, 3), `lag_s` (3,),
-    `reference_corner` and `sensor_corner` in rad/s; `d_...` the same with J in front.
+    `direction` (P, 3, M) applies to the motion, `mean_direction` (P, 3, M) to the means of the reference. They differ
+    for silent channels, which have no motion, but whose means act on the sensor. `quadrature` (P, 3) is relative motion
+    90 deg ahead; `gravity` (P, 3) in m/s2; `lag_s` (3,); `reference_corner` and `sensor_corner` in rad/s. The
+    derivatives `d_...` have the same shapes with J in front.
     """
 
     direction: Array
@@ -92,7 +94,7 @@ class Inputs:
 
 
 class Nuisances:
-    """All nuisances that P poses have, as linear maps onto what they move, stacked: (J, ...)."""
+    """The J nuisances of P poses whose uncertainty is not 0, with their effects stacked as arrays (J, ...)."""
 
     def __init__(self, poses: Sequence[Pose], channels: int, priors: Priors, applied: Applied) -> None:
         self.terms = [t for t in terms(poses, channels, priors, applied.by_kind) if t.uncertainty > 0.0]
@@ -133,7 +135,7 @@ class Nuisances:
         return np.array([np.zeros(shape) if m is None else m for m in maps]).reshape(len(self.terms), *shape)
 
     def at(self, z: Array) -> Inputs:
-        """Inputs where the nuisances have the values `z` (J,)."""
+        """The inputs when the nuisances have the values `z` (J,)."""
         turn = rotations(np.einsum("j,jpk->pk", z, self._turn_direction))
         scale = 1.0 + np.einsum("j,jm->m", z, self._reference)
         sideways = self._stated.copy()
@@ -141,7 +143,7 @@ class Nuisances:
             sideways[:, :, 0] += np.einsum("j,jpk->pk", z, self._transverse)
         real = self._real
         felt = turn @ sideways[:, :, :real]
-        # A corner of c Hz took c times the integral, which has channels of its own (calib.signal.corner).
+        # A corner of c Hz removed c times the integral; the integrals are channels of their own (calib.signal.corner).
         direction = np.concatenate([felt, float(z @ self._corner_hz) * felt], axis=2)[:, :, : sideways.shape[2]] / scale
         d_direction = np.cross(self._turn_direction[..., None], direction, axisa=2, axisb=1, axisc=2)
         d_direction -= direction * (self._reference / scale)[:, None, None, :]
@@ -150,7 +152,7 @@ class Nuisances:
             d_direction[..., real:] += (
                 self._corner_hz[:, None, None, None] * (felt / scale[:real])[..., : sideways.shape[2] - real]
             )
-        # Second order in the turn and the quadrature is left out: 1 % of 0.2 deg.
+        # The product of turn and quadrature is neglected: at most 1 % of 0.2 deg.
         d_quadrature = np.einsum("pik,jpk->jpi", turn, self._quadrature)
         stretch = 1.0 + np.einsum("j,jo->o", z, self._gravity) / self._magnitude
         unstretched = np.einsum("pik,pk->pi", rotations(np.einsum("j,jpk->pk", z, self._turn_gravity)), self.gravity)
@@ -174,7 +176,7 @@ class Nuisances:
 
 
 def rotations(vectors: Array) -> Array:
-    """Rotation matrices (P, 3, 3) of rotation vectors (P, 3) in rad (Rodrigues)."""
+    """Rotation matrices (P, 3, 3) of rotation vectors (P, 3) in rad, by Rodrigues' formula."""
     angle = np.linalg.norm(vectors, axis=1)[:, None, None]
     cross = np.zeros((len(vectors), 3, 3))
     cross[:, [2, 0, 1], [1, 2, 0]] = vectors

@@ -1,7 +1,7 @@
-"""The table of unknowns: what each quantity of a joint state is, and all that the estimators need to know of it.
+"""The table of unknowns: each kind of quantity that can be estimated, with all that the estimators need to know of it.
 
-A new unknown is one `Kind` in this file and, in calib.estimate.terms, the geometry of what it moves. No other file
-decides anything by the name of an unknown: a name is for people and for looking up.
+A new unknown needs one `Kind` in this file and, in calib.estimate.terms, its effect on the inputs. No other file
+decides anything by the name of an unknown: names are for people and for looking up.
 """
 
 from __future__ import annotations
@@ -14,11 +14,12 @@ import numpy as np
 
 from calib.model import PARAMETERS
 
-# Change up to which the products of S with an unknown count as straight, so that nothing is linearised anew: relative
-# of S, or rad of an angle. The product with an angle's 0.3 deg is 5e-6 of S.
+# The window equations contain products of S with other unknowns. Up to this change of an unknown (relative for S, rad
+# for an angle) the products count as linear, and the windows need not be linearised again. The error is then 5e-6 of S
+# if an angle is off by 0.3 deg.
 STRAIGHT = 1e-3
-STRAIGHT_LAG_S = 5e-5  # (omega lag)^2 / 2 of it at 10 Hz is as much
-LINEAR = np.inf  # S does not multiply it
+STRAIGHT_LAG_S = 5e-5  # at 10 Hz (omega lag)^2 / 2 is 5e-6 as well
+LINEAR = np.inf  # for an unknown that is not multiplied by S
 
 
 def _deg(value: float) -> float:
@@ -35,12 +36,13 @@ def _percent(value: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Statement:
-    """A number that is stated before any data: a standard uncertainty, a mean or the step of a random walk.
+    """A number that is stated before any data: a standard uncertainty, a mean, or the SD of a random walk.
 
-    `name` in `calib.estimate.nuisances.Priors` or `calib.estimate.wander.Wander`, with its unit. `default` where nobody
-    states it. `configuration`: its places in a channel of the configuration as "section.field"; several are combined as
-    the root of their sum of squares. `at_fixed_mount`: the places that count instead where the sensor never turns.
-    `option`: its name among the options of `fieldcal calibrate`. `convert` turns the unit of both into that of `name`.
+    `name`: the attribute of `calib.estimate.nuisances.Priors` or `calib.estimate.wander.Wander`, with its unit.
+    `default`: its value if it is not stated. `configuration`: its fields in a channel of the configuration, as
+    "section.field"; several are combined as the root of the sum of their squares. `at_fixed_mount`: the fields that are
+    used in their place if the sensor is never turned. `option`: the option of `fieldcal calibrate`. `convert` converts
+    the unit of the field and of the option to the unit of `name`.
     """
 
     name: str
@@ -56,20 +58,20 @@ Loosening = Literal["", "jump", "lean", "line"]
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """What unknowns of one kind have in common.
+    """The properties that all unknowns of one kind have in common.
 
-    `name`: under it a snapshot stores the kind; another name needs a migration (agent.core.migrations).
-    `unit`: of the value; "" for S and Q and what belongs to them, which are in the sensor's output unit.
-    `source`: the line of an uncertainty budget that its prior belongs to.
-    `prior`, `mean`: its standard uncertainty and its value before any data; without `mean` the value is 0. Where
-    `prior` is None, calib.estimate.recursion gets the uncertainty as an argument (S, Q, coefficients of temperature).
-    `walk`: its random walk, standard deviation after one day; None for a constant.
-    `in_output_unit`: `walk` and `straight` are relative to the sensor's output unit per m/s2.
-    `loosened_by`: what may have changed it at once: a "jump" of the sensor that further windows confirmed, a "lean" of
-    a mount that does not turn, a new "line" (a device or its wiring that began anew).
-    `of_reference`: it belongs to the reference, and is dropped when another reference stands there.
-    `straight`: change up to which its product with S counts as straight; LINEAR where S does not multiply it.
-    `stated`: the prior is a statement that the data may contradict; of the others the data alone tell.
+    `name`: identifies the kind in a snapshot; a changed name needs a migration (agent.core.migrations).
+    `unit`: unit of the value; "" for S, Q and their coefficients, whose unit contains the sensor's output unit.
+    `source`: the line of the uncertainty budget that its prior belongs to.
+    `prior`, `mean`: standard uncertainty and value before any data; without `mean` the value is 0. If `prior` is None,
+    calib.estimate.recursion gets the uncertainty as an argument (S, Q, coefficients of temperature).
+    `walk`: SD of its random walk after one day; None for a constant.
+    `in_output_unit`: `walk` and `straight` must be multiplied by the sensor's output unit per m/s2.
+    `loosened_by`: the event that may change it at once, so that its uncertainty is enlarged: a "jump" of the sensor
+    that further windows confirmed, a "lean" of a fixed mount, a new "line" (a device or its wiring was started again).
+    `of_reference`: it belongs to the reference, and is removed when the reference is replaced.
+    `straight`: the change up to which its product with S counts as linear; LINEAR if it is not multiplied by S.
+    `stated`: the prior is a statement that the data may contradict; if false, only the data determine the value.
     """
 
     name: str
@@ -86,13 +88,13 @@ class Kind:
 
     @property
     def statements(self) -> list[Statement]:
-        """What is stated of its value before any data."""
+        """The statements on its value before any data: standard uncertainty and mean."""
         return [s for s in (self.prior, self.mean) if s is not None]
 
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """One unknown: its name, its kind, and the position that it belongs to ("" where it belongs to all)."""
+    """One unknown: its name, its kind, and its position ("" if it is common to all positions)."""
 
     name: str
     kind: Kind
@@ -101,13 +103,13 @@ class Quantity:
 
 @dataclass(frozen=True, init=False)
 class Stated:
-    """Values of a table of statements, as attributes by their names."""
+    """Values for a table of statements; each value is an attribute with the name of its statement."""
 
     table: ClassVar[Mapping[str, Statement]] = {}
     values: Mapping[str, float]
 
     def __init__(self, values: Mapping[str, float] | None = None, **stated: float) -> None:
-        """`stated` counts before `values`, and these before the defaults. Raises TypeError for an unknown name."""
+        """`stated` overrides `values`, and `values` override the defaults. Raises TypeError for an unknown name."""
         told = {**(values or {}), **stated}
         unknown = [name for name in told if name not in self.table]
         if unknown:
@@ -116,7 +118,7 @@ class Stated:
 
     @classmethod
     def none(cls) -> Self:
-        """All of them 0."""
+        """All values 0."""
         return cls(dict.fromkeys(cls.table, 0.0))
 
     def __getattr__(self, name: str) -> float:
@@ -126,12 +128,12 @@ class Stated:
         return values[name]
 
     def of(self, statement: Statement | None) -> float:
-        """The value of a statement; 0 where there is none."""
+        """The value of a statement; 0 for None."""
         return 0.0 if statement is None else self.values[statement.name]
 
 
 def by_name(statements: Iterable[Statement]) -> dict[str, Statement]:
-    """A table of statements."""
+    """The table of these statements, by name."""
     return {s.name: s for s in statements}
 
 
@@ -167,20 +169,20 @@ SENSOR_CORNER = Kind(
 )  # fmt: skip
 LAG = Kind(
     "lag", "s", "lag",
-    # A sensor's own low-pass filter and what a clock fit leaves: 0.5 to 15 ms are seen. The sensor's own lag and the
-    # reference's are one unknown: by how much the sensor's indications come after the reference's.
+    # Low-pass filters of sensors and errors of clock fits cause lags of 0.5 to 15 ms. The lags of sensor and reference
+    # are one unknown: the time by which the sensor's indications come after the reference's.
     prior=Statement("lag_s", 0.02, ("uncertainty.lag_s", "certificate.u_lag_s")),
     mean=Statement("lag_at_s", 0.0, ("certificate.lag_s",), convert=_minus),
     loosened_by="line", of_reference=True, straight=STRAIGHT_LAG_S, stated=False,
 )  # fmt: skip
 LAG_OF_AXIS = Kind(
     "lag of axis", "s", "lag",
-    # Axes share filter and clock; multiplexed converters differ by 0.1 ms.
+    # All axes share filter and clock, but a multiplexed converter samples them 0.1 ms apart.
     prior=Statement("lag_axis_s", 2e-4),
     of_reference=True, straight=STRAIGHT_LAG_S, stated=False,
 )  # fmt: skip
 
-# --- how it stands
+# --- the position of the sensor
 
 THETA = Kind(
     "theta", "rad", "theta common",
@@ -201,7 +203,7 @@ ALPHA_BY_POSITION = Kind("alpha by position", "rad", "alpha by position", prior=
 DIRECTION = Kind("direction", "rad", "direction common", prior=ALPHA_COMMON)
 DIRECTION_BY_POSITION = Kind("direction by position", "rad", "direction by position", prior=ANGLE)
 GRAVITY_DIRECTION = Kind(
-    # Beside a tri-axial reference, whose mounting turns by itself.
+    # Only beside a tri-axial reference, whose rotation is an unknown of its own.
     "gravity direction by position", "rad", "direction by position",
     prior=Statement(
         "gravity_direction_rad", _deg(0.2), ("uncertainty.angle_deg",), ("uncertainty.tilt_deg",),
@@ -210,7 +212,7 @@ GRAVITY_DIRECTION = Kind(
     walk=TILT_WALK, loosened_by="lean",
 )  # fmt: skip
 LEAN = Kind(
-    # Of a mount that does not turn, with the sensor and its reference on it: gravity turns, the direction does not.
+    # Of a fixed mount with the sensor and its reference on it: gravity turns, the direction of motion does not.
     "lean", "rad", "tilt",
     prior=Statement("lean_rad", at_fixed_mount=("uncertainty.tilt_deg",), convert=_deg),
     walk=TILT_WALK, loosened_by="lean",
@@ -262,10 +264,10 @@ TRANSVERSE = Kind(
 # --- the tables
 
 KINDS: Mapping[str, Kind] = {kind.name: kind for kind in list(vars().values()) if isinstance(kind, Kind)}
-# Not unknowns of a state, but what differs from window to window: it is in the weight of the windows' rows.
+# Scatter between windows is no unknown of a state: it is part of the weights of the windows.
 BETWEEN_WINDOWS = (
     Statement("offset_mps2", 0.05, ("uncertainty.offset_mps2",), option="u_offset_mps2"),
-    Statement("lag_window_s", 0.0, ("uncertainty.lag_window_s",)),  # what clock models leave, beyond what data show
+    Statement("lag_window_s", 0.0, ("uncertainty.lag_window_s",)),  # least value; the data may show a larger one
 )
 OF_SENSOR = (SENSITIVITY, OFFSET, OFFSET_RATE, SENSITIVITY_TEMPERATURE, OFFSET_TEMPERATURE)
 PRIORS = by_name([s for k in KINDS.values() if k not in OF_SENSOR for s in k.statements] + list(BETWEEN_WINDOWS))

@@ -1,7 +1,7 @@
-"""What windows differ by beyond their own noise and what was stated: of their means (offset) and of their slopes.
+"""Estimates of the scatter between windows beyond their noise: of the means (offset) and of the slopes.
 
-By moments: the variance of a residual is (1 - leverage) times that of its row, and what is more than the noise says
-is scatter between windows.
+Both are estimated by moments: the variance of a residual is (1 - leverage) times that of its row, and the excess of the
+residuals over the noise is attributed to scatter between windows.
 """
 
 from __future__ import annotations
@@ -14,15 +14,18 @@ from calib.distributions import chi2_quantile
 from calib.estimate.gauss_newton import Solution
 from calib.model import Array
 
-# Slopes have no stated scatter, so theirs must be beyond what noise alone shows once in a hundred recordings.
+# No scatter of the slopes is stated. It counts only if noise alone would show as much once in a hundred recordings.
 SLOPE_PROBABILITY = 0.99
-OFFSET_PROBABILITY = 0.5  # the offset's is compared with the stated one anyway, the larger counts
-LEAST_FREEDOM = 0.5  # degrees of freedom below which rounding, not data, is left over
+OFFSET_PROBABILITY = 0.5  # the scatter of the offset is compared with the stated one, and the larger one counts
+LEAST_FREEDOM = 0.5  # with fewer degrees of freedom the residuals are only rounding errors
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scatter:
-    """`scatter` in m/s2 (offset) or relative (slopes); `term` (N, N) is (J half)' C (J half) for a scatter of one."""
+    """An SD between windows: `scatter` in m/s2 (offset) or relative (slopes), and its degrees of freedom.
+
+    `term` (N, N) is (J half)' C (J half) for a scatter of one.
+    """
 
     scatter: float
     degrees_of_freedom: float
@@ -31,7 +34,7 @@ class Scatter:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BetweenWindows:
-    """Scatter of means and slopes; `consistency`: chi-squared against noise and stated scatter, and its mean."""
+    """Scatter of means and slopes; `consistency`: chi-squared against noise and stated scatter, and its expectation."""
 
     offset: Scatter
     slope: Scatter
@@ -39,7 +42,7 @@ class BetweenWindows:
 
 
 def between_windows(solution: Solution) -> BetweenWindows:
-    """Estimate both scatters from what the solution leaves."""
+    """Both scatters, estimated from the residuals of the solution."""
     equations, data = solution.equations, solution.equations.data
     slope, mean = equations.split(solution.residual)
     slope_free, mean_free = equations.split(np.clip(1.0 - solution.leverage, 0.0, 1.0))
@@ -68,7 +71,11 @@ def between_windows(solution: Solution) -> BetweenWindows:
 
 
 def _excess(square: Array, free: Array, noise: Array, unit: Array, probability: float) -> tuple[float, float]:
-    """Scatter beyond `noise` of rows that a scatter of one gives the variance `unit`, and its degrees of freedom."""
+    """Scatter of rows beyond their `noise`, and its degrees of freedom.
+
+    `square` are the squared residuals, `free` is 1 - leverage, `unit` the variance that a scatter of one gives a row.
+    The scatter is 0 unless chi-squared is above its quantile of this `probability`.
+    """
     live = unit > 0.0
     freedom = float(free[live].sum())
     if freedom < LEAST_FREEDOM:
@@ -80,7 +87,7 @@ def _excess(square: Array, free: Array, noise: Array, unit: Array, probability: 
 
 
 def _statistic(square: Array, free: Array, variance: Array) -> float:
-    """Chi-squared: observed over expected, times the degrees of freedom."""
+    """Chi-squared: the observed sum of squares over the expected one, times the degrees of freedom."""
     live = variance > 0.0
     freedom = float(free[live].sum())
     if freedom < LEAST_FREEDOM:

@@ -1,10 +1,11 @@
-"""What slopes differ by from window to window beyond their noise: a lag of their own, and the noise correction's error.
+"""Scatter of the slopes between windows beyond their noise: each window's own lag, and the noise correction's error.
 
-A lag of d puts -d b into the coefficients on du/dt, b being those on u. Clock models leave some 10 us of it. Those
-coefficients are known to a microsecond where the motion is strong, and no common lag explains them: weighed as if they
-were exact they would bend S instead (35 us of scatter at 8 Hz put 0.4 % into S_xz, three times its u). The correction
-for the reference's noise (calib.excitation.excited) leaves a relative error in all slopes of a window. So both
-directions are given the variance that they have, in files and live alike.
+A lag d adds -d b to the coefficients on du/dt, where b are the coefficients on u. Clock models leave a lag of some
+10 us, which differs between windows. With strong motion those coefficients are known to a microsecond, and no common
+lag explains their differences. If they were weighted as exact, S would be wrong instead: a scatter of 35 us at 8 Hz
+changed S_xz by 0.4 %, three times its u. The correction for the reference's noise (calib.excitation.excited) leaves a
+relative error in all slopes of a window. Both effects are therefore part of the covariance of the slopes, for files and
+for live data.
 """
 
 from __future__ import annotations
@@ -18,16 +19,16 @@ from calib.distributions import chi2_quantile
 from calib.estimate.condense import Condensed
 from calib.model import Array
 
-PROBABILITY = 0.99  # what noise alone shows once in a hundred recordings is no scatter
-LEAST_FREEDOM = 0.5  # degrees of freedom below which rounding, not data, is left over
+PROBABILITY = 0.99  # confidence of the test for scatter: noise alone passes it once in a hundred recordings
+LEAST_FREEDOM = 0.5  # with fewer degrees of freedom the residuals are only rounding errors
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlopeScatter:
-    """Scatter of the slopes of B windows; loadings (B, 6M) are the slopes' derivatives, whitened by the noise.
+    """Scatter of the slopes of B windows. A loading (B, 6M) is the derivative of the slopes, whitened by the noise.
 
-    `lag_s` (B,) SD of a window's own lag, `lag` its loading; `attenuation` (B,) relative SD that the noise correction
-    leaves, `signal` its loading. `degrees_of_freedom` of the lag's scatter: inf where it was stated.
+    `lag_s` (B,) is the SD of a window's own lag, `lag` its loading; `attenuation` (B,) is the relative SD that the
+    noise correction leaves, `signal` its loading. `degrees_of_freedom` of the lag's scatter: inf if it was stated.
     """
 
     lag_s: Array
@@ -38,7 +39,7 @@ class SlopeScatter:
 
     @staticmethod
     def of(data: Condensed, lag_s: ArrayLike = 0.0, attenuation: ArrayLike = 0.0) -> SlopeScatter:
-        """The loadings of condensed windows; `lag_s` and `attenuation` (B,) or one for all."""
+        """The scatter of condensed windows; `lag_s` and `attenuation` are (B,), or one number for all windows."""
         m, blocks = data.channels, len(data.slopes)
         own = np.linalg.pinv(data.root, rcond=1e-9) @ data.slopes  # zero rows of an unexcited channel stay zero
         lag = -np.einsum("brc,bci->bri", data.root[:, :, m:], own[:, :m]) / data.type_a.noise[:, None]
@@ -51,16 +52,16 @@ class SlopeScatter:
 
     @property
     def loaded(self) -> Array:
-        """(B, 2, 6M) both loadings, each times its SD."""
+        """(B, 2, 6M) both loadings, each multiplied by its SD."""
         return np.stack([self.lag_s[:, None] * self.lag, self.attenuation[:, None] * self.signal], axis=1)
 
     def covariance(self) -> Array:
-        """(B, 6M, 6M) of the whitened slopes, beside their noise."""
+        """(B, 6M, 6M) covariance of the whitened slopes due to the scatter, without their noise."""
         loaded = self.loaded
         return np.asarray(np.einsum("bkd,bke->bde", loaded, loaded))
 
     def whiten(self, rows: Array) -> Array:
-        """(1 + covariance)^-1/2 of slope rows (B, 6M, ...)."""
+        """Slope rows (B, 6M, ...) multiplied by (1 + covariance)^-1/2."""
         if not (self.lag_s.any() or self.attenuation.any()):
             return rows
         _, size, ways = np.linalg.svd(self.loaded, full_matrices=False)
@@ -69,7 +70,10 @@ class SlopeScatter:
         return np.asarray(rows - np.einsum("bk,bkd,bk...->bd...", less, ways, along))
 
     def terms(self, rows: Array) -> dict[str, tuple[Array, float]]:
-        """{source: (sum over windows of rows' g g' rows (N, N), degrees of freedom)} of whitened rows (B, 6M, N)."""
+        """Contributions to the budget: {source: (sum over windows of rows' g g' rows (N, N), degrees of freedom)}.
+
+        `rows` (B, 6M, N) are the whitened rows of J half, g the whitened loading times its SD.
+        """
         found: dict[str, tuple[Array, float]] = {}
         loaded = self.whiten(np.moveaxis(self.loaded, 1, 2))
         parts = np.einsum("bdk,bdn->kbn", loaded, rows)
@@ -81,9 +85,10 @@ class SlopeScatter:
 
 
 def estimated(stated: SlopeScatter, residual: Array, rows: Array, covariance: Array) -> SlopeScatter:
-    """The lag's scatter that slope residuals (B, 6M) show beyond `covariance` (6M, 6M), where it is above the stated.
+    """The scatter with the lag's SD that the residuals show, if that is larger than the stated one; else `stated`.
 
-    By moments along each window's loading; `rows` (B, 6M, N) are the whitened Jacobian's (their squares the leverage).
+    `residual` (B, 6M) are the slope residuals, `covariance` (6M, 6M) their noise, `rows` (B, 6M, N) the whitened rows
+    of J half, whose squares are the leverage. The SD is estimated by moments along the loading of each window.
     """
     size2 = np.einsum("bd,bd->b", stated.lag, stated.lag)
     live = size2 > 0.0

@@ -1,8 +1,8 @@
-"""The nuisances of some poses, and per unit of each what it moves: the geometry of the unknowns.
+"""The nuisances of a set of poses, and the effect of one unit of each nuisance on the inputs (their geometry).
 
-An error of a pose is a small rotation of the sensor's whole surroundings: direction of motion and gravity stay a rigid
-pair. Alpha turns it about the sensor's z axis, theta about the horizontal normal of the motion (Eqs. 9-11). A mount
-that leans with all that is on it turns gravity alone.
+An error of a pose is a small rotation of the sensor relative to its surroundings: the direction of motion and gravity
+turn together, as a rigid pair. An error of alpha turns both about the sensor's z axis, an error of theta about the
+horizontal normal of the motion (Eqs. 9-11). If the mount leans, with sensor and reference on it, gravity alone turns.
 """
 
 from __future__ import annotations
@@ -17,17 +17,19 @@ from calib.estimate import quantities as kinds
 from calib.estimate.quantities import Kind, Quantity, Stated
 from calib.model import Array, Pose, own_channels
 
-PARALLEL = 1e-3  # rad; motion and gravity closer to one line than this leave the horizontal normal open
+PARALLEL = 1e-3  # rad; if motion and gravity are parallel within this angle, there is no horizontal normal
 AXES = "xyz"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Term:
-    """One nuisance: which quantity it is, its standard uncertainty beforehand, and per unit of it what it moves.
+    """One nuisance: its quantity, its prior standard uncertainty, and the effect of one unit of it.
 
-    Turns (P, 3) in rad, `transverse` and `quadrature` (P, 3), `reference` (M,), `gravity` in m/s2, `offset` (P, 3) in
-    m/s2, `lag` (3,) in s, corners in rad/s. None moves nothing. `expected` is the prior's mean, `applied` what the
-    front end took out: the unknown is what is left.
+    Effects: `turn_direction`, `turn_gravity` (P, 3) rotation in rad; `transverse`, `quadrature` (P, 3) transverse
+    motion in phase and 90 deg ahead, relative to the motion; `reference` (M,) relative error of the reference;
+    `gravity` (1,) in m/s2; `offset` (P, 3) in m/s2; `lag` (3,) in s; `reference_corner`, `sensor_corner` (1,) in rad/s.
+    None means no effect. `expected` is the prior's mean. `applied` is the part that the front end has already removed
+    from the data; the remaining part is estimated.
     """
 
     quantity: Quantity
@@ -46,7 +48,7 @@ class Term:
     applied: float = 0.0
 
     def with_(self, other: Term) -> Term:
-        """The same nuisance, moving what `other` moves as well."""
+        """The same nuisance with the effects of `other` added; the larger standard uncertainty counts."""
         moves: dict[str, Any] = {}
         for f in fields(self):
             own, more = getattr(self, f.name), getattr(other, f.name)
@@ -56,29 +58,30 @@ class Term:
 
     @property
     def name(self) -> str:
-        """For people."""
+        """The name for people and for looking up."""
         return self.quantity.name
 
     @property
     def kind(self) -> Kind:
-        """Its nature."""
+        """The kind of its quantity."""
         return self.quantity.kind
 
     @property
     def source(self) -> str:
-        """The line of a budget that it belongs to."""
+        """The line of the uncertainty budget that it belongs to."""
         return self.kind.source
 
     @property
     def unit(self) -> str:
-        """Of its value."""
+        """The unit of its value."""
         return self.kind.unit
 
 
 def terms(poses: Sequence[Pose], channels: int, priors: Stated, applied: Mapping[Kind, float]) -> list[Term]:
-    """All nuisances of P poses and so many channels of the reference, those of no uncertainty too.
+    """All nuisances of P poses and a reference with this number of channels; also those whose uncertainty is 0.
 
-    `applied`: what the front end has already taken out, by kind. Poses of one position share the nuisances of it.
+    `applied` are the values, by kind, that the front end has already removed from the data. Poses of one position share
+    the nuisances of that position.
     """
     found: dict[str, Term] = {}
     for term in _terms(poses, channels, priors, applied):
@@ -112,7 +115,7 @@ def _terms(poses: Sequence[Pose], channels: int, priors: Stated, applied: Mappin
 
 
 def _clamp_terms(poses: Sequence[Pose], priors: Stated) -> Iterator[Term]:
-    """Theta and alpha, common and by position."""
+    """Errors of theta and alpha: common to all positions, and by position."""
     clamped = [p for p, pose in enumerate(poses) if pose.theta_rad is not None]
     if not clamped:
         return
@@ -131,7 +134,7 @@ def _clamp_terms(poses: Sequence[Pose], priors: Stated) -> Iterator[Term]:
 
 
 def _pose_terms(poses: Sequence[Pose], priors: Stated) -> Iterator[Term]:
-    """Stated directions, common and by position, and the mounting of a tri-axial reference."""
+    """Errors of stated directions, common and by position, and of the rotation of a tri-axial reference."""
     stated = [p for p, pose in enumerate(poses) if pose.theta_rad is None and own_channels(pose.direction.shape[1]) < 3]
     beside = [p for p, pose in enumerate(poses) if own_channels(pose.direction.shape[1]) == 3]
     for axis, k in zip(AXES, np.eye(3), strict=True):
@@ -151,7 +154,7 @@ def _pose_terms(poses: Sequence[Pose], priors: Stated) -> Iterator[Term]:
 
 
 def _lean_terms(poses: Sequence[Pose], priors: Stated) -> Iterator[Term]:
-    """Gravity in other directions than stated, the direction of motion as stated: a mount with all on it leans."""
+    """Lean of the mount with sensor and reference on it: gravity turns, the direction of motion does not."""
     for p, pose in enumerate(poses):
         if own_channels(pose.direction.shape[1]) < 3 and np.any(pose.gravity_mps2):
             for axis, k in zip(AXES, np.eye(3), strict=True):
@@ -160,7 +163,7 @@ def _lean_terms(poses: Sequence[Pose], priors: Stated) -> Iterator[Term]:
 
 
 def _slide_terms(poses: Sequence[Pose], priors: Stated) -> Iterator[Term]:
-    """Motion across a uniaxial reference, and gravity not square to the motion as stated."""
+    """Motion transverse to a uniaxial reference, and errors of the angle between gravity and the motion."""
     lateral, vertical, along = (np.zeros((len(poses), 3)) for _ in range(3))
     free = []
     for p, pose in enumerate(poses):
@@ -188,7 +191,10 @@ def _across(name: str, position: str, priors: Stated, way: Array) -> Iterator[Te
 
 
 def _slide_frame(pose: Pose) -> tuple[Array, Array, Array] | None:
-    """Unit vectors along the motion, along gravity's part square to it, and across both; None where they are open."""
+    """Unit vectors along the motion, along the component of gravity normal to it, and normal to both.
+
+    None if they are not defined: motion parallel to gravity, gravity not known, or no uniaxial reference.
+    """
     if pose.theta_rad is not None:
         motion, gravity = _clamp_frame(pose)
         return motion, gravity, np.cross(gravity, motion)
@@ -204,7 +210,7 @@ def _slide_frame(pose: Pose) -> tuple[Array, Array, Array] | None:
 
 
 def _clamp_frame(pose: Pose) -> tuple[Array, Array]:
-    """d and e of Eqs. (9)-(11), whichever of them the pose's sensor feels."""
+    """The vectors d (motion) and e (gravity) of Eqs. (9)-(11), as in calib.geometry.clamp, with static sign +1."""
     theta, alpha = pose.theta_rad or 0.0, pose.alpha_rad or 0.0
     sin_t, cos_t, sin_a, cos_a = np.sin(theta), np.cos(theta), np.sin(alpha), np.cos(alpha)
     return (
@@ -218,7 +224,7 @@ def _at(name: str, kind: Kind, pose: Pose) -> Quantity:
 
 
 def _term(name: str, kind: Kind, priors: Stated, applied: Mapping[Kind, float] | None = None, **moves: Array) -> Term:
-    """A nuisance that all positions have in common; `moves` are fields of Term."""
+    """A nuisance that is common to all positions; `moves` are its effects, as fields of Term."""
     taken, expected = (applied or {}).get(kind, 0.0), priors.of(kind.mean)
     return Term(Quantity(name, kind), priors.of(kind.prior), expected=expected, applied=taken, **moves)
 

@@ -1,4 +1,4 @@
-"""Whether an adjustment may be used: rank, contradictions with what was known, signs that fit better turned, misfit."""
+"""Checks of an adjustment: rank, contradictions of priors and stated values, reversed signs, misfit, dead outputs."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from calib.estimate.gauss_newton import Flags, Solution
 from calib.estimate.quantities import LAG
 from calib.model import PARAMETERS, Array, Window
 
-CONTRADICTED = 0.999  # probability: one sound calibration in a thousand is refused as contradicting what was known
-PRIOR_SHARE = 0.01  # of a direction's prior variance that the data must have removed for it to be a test of the prior
-# A turned sign "fits decisively better": the likelihood ratio exp(25 / 2) is 3e5 to 1, and it explains most of the
-# misfit, so that no residual systematic effect of a right sign is taken for a wrong one.
+CONTRADICTED = 0.999  # probability: one sound calibration in a thousand is refused as a contradiction of its priors
+PRIOR_SHARE = 0.01  # a prior is tested only in directions in which the data reduce its variance by this part
+# A reversed sign fits "decisively better" if the likelihood ratio is above exp(25 / 2) = 3e5 to 1 and it also removes
+# most of chi-squared. So a systematic effect under the right sign is not taken for a wrong sign.
 DECISIVE_CHI2 = 25.0
 DECISIVE_RATIO = 0.25
-MISFIT_LIMIT = 0.1  # of the signal; the worst geometry met with right signs leaves 0.01
-# What was stated of the nuisances is contradicted where it is so even with every stated uncertainty doubled: a clamp
-# twice as bad as its default says is still used.
+MISFIT_LIMIT = 0.1  # of the signal; with right signs, 0.01 was left in the worst geometry
+# A stated value is contradicted only if the data contradict it even with every stated standard uncertainty doubled: a
+# clamp whose errors are twice its default uncertainty is still used.
 STATED_TIMES = 2.0
-LEAST_FELT = 0.1  # of the largest sensitivity, that an output which works has in some direction
-CONFOUNDED_LAG = 0.01  # of the largest sensitivity, that an undetermined lag puts into one of the others
+LEAST_FELT = 0.1  # least sensitivity of a working output in its best direction, relative to the largest sensitivity
+CONFOUNDED_LAG = 0.01  # largest error of S due to an undetermined lag, relative to the scale of S
 
 
 def reasons(
@@ -34,9 +34,10 @@ def reasons(
     determined: Flags,
     turned: Callable[[int, int], Solution],
 ) -> list[str]:
-    """Why the adjustment is refused, each with its numbers; empty where it is not.
+    """The reasons why the adjustment is refused, each with its numbers; empty if it is accepted.
 
-    `turned(static, polarity)` solves again with gravity times `static` and the reference times `polarity`.
+    `turned(static, polarity)` solves again with gravity multiplied by the sign `static` and the reference by the sign
+    `polarity`.
     """
     return (
         _rank_reasons(windows, solution)
@@ -56,8 +57,8 @@ def _rank_reasons(windows: Sequence[Window], solution: Solution) -> list[str]:
     if clamped and static and found < full:
         angles = len({(w.pose.theta_rad, w.pose.alpha_rad) for w in windows})
         return [
-            f"rank {found} of {full}: {angles} clamp positions leave a direction unseen; three or more distinct alphas "
-            "and a motion are needed"
+            f"rank {found} of {full}: {angles} clamp positions leave a direction without excitation; measure with at "
+            "least three different alphas, and with motion"
         ]
     return []
 
@@ -66,8 +67,14 @@ def _nothing_determined(solution: Solution, determined: Flags) -> list[str]:
     if determined.any():
         return []
     if solution.bounded.any() and solution.equations.rank == 4:
-        return ["the data add too little to what was known: no parameter's uncertainty is halved"]
-    return [f"rank {solution.equations.rank} of 4: the data determine none of the 12 parameters"]
+        return [
+            "the data add too little to the priors: they halve the standard uncertainty of no parameter; "
+            "measure longer, with more motion or in more positions"
+        ]
+    return [
+        f"rank {solution.equations.rank} of 4: the data determine none of the 12 parameters; "
+        "measure with more motion or in more positions"
+    ]
 
 
 def _lag_reasons(solution: Solution, shares: Budget) -> list[str]:
@@ -81,14 +88,15 @@ def _lag_reasons(solution: Solution, shares: Budget) -> list[str]:
     if after <= 0.5 * before or moved <= CONFOUNDED_LAG:
         return []
     return [
-        f"rank {solution.equations.rank} of 4 with the lag fixed, one less with it: the motion cannot tell the lag "
-        f"(u {after * 1e3:.3g} ms of {before * 1e3:.3g} ms before) from a rotation; it puts {moved:.1%} into S. "
-        "Motion in a plane at one frequency does that: excite another frequency or direction"
+        f"rank {solution.equations.rank} of 4 with the lag fixed, one less with a free lag: the data cannot "
+        f"distinguish the lag from a rotation (u(lag) is {after * 1e3:.3g} ms, {before * 1e3:.3g} ms before the data), "
+        f"and u(lag) alone gives S a standard uncertainty of {moved:.1%}, limit {CONFOUNDED_LAG:.0%}. This happens "
+        "with motion in a plane at one frequency: excite another frequency or direction"
     ]
 
 
 def _sign_reasons(solution: Solution, turned: Callable[[int, int], Solution]) -> list[str]:
-    # A poor fit turned may end anywhere; what it is judged by is its chi2 alone, over the rows that it has.
+    # With reversed signs a poor fit may end anywhere, so only its chi2 is compared.
     if solution.chi2 <= chi2_quantile(CONTRADICTED, solution.residual.size) and not _prior_reasons(solution):
         return []
     tried = {
@@ -100,16 +108,20 @@ def _sign_reasons(solution: Solution, turned: Callable[[int, int], Solution]) ->
     if not tried:
         return []
     best = min(other.chi2 for other in tried.values())
-    # Where nothing was known of S, turning gravity and turning the reference fit alike; one of them leaves S positive.
+    # Without a prior of S, reversing gravity and reversing the reference fit equally well; one of them makes the
+    # diagonal of S positive, and that one is reported.
     alike = [name for name, other in tried.items() if other.chi2 <= best + DECISIVE_CHI2]
     name = max(alike, key=lambda n: float(tried[n].x[[0, 4, 8]].sum()))
     if best > solution.chi2 - DECISIVE_CHI2 or best > DECISIVE_RATIO * solution.chi2:
         return []
-    return [f"the data fit decisively better with {name} turned: chi-squared {best:.4g}, as stated {solution.chi2:.4g}"]
+    return [
+        f"the data fit decisively better with {name} reversed: chi-squared {best:.4g}, as stated {solution.chi2:.4g}; "
+        "check these signs and the directions of the axes"
+    ]
 
 
 def _prior_reasons(solution: Solution) -> list[str]:
-    """Does the estimate lie where what was known of S and Q allows? Tested where the data outweigh the prior."""
+    """Whether the estimate contradicts the prior of S and Q; tested in the directions that the data determine."""
     known = np.flatnonzero(solution.bounded)
     if not known.size:
         return []
@@ -127,16 +139,18 @@ def _prior_reasons(solution: Solution) -> list[str]:
     worst = int(np.argmax(np.abs(solution.x[known] - solution.prior_mean[known]) / u))
     p = known[worst]
     return [
-        f"the data contradict what was known: chi-squared {statistic:.4g}, limit {limit:.4g} (of {int(tested.sum())}); "
-        f"{PARAMETERS[p]} is {solution.x[p]:.5g}, {solution.prior_mean[p]:.5g} with u {u[worst]:.3g} was expected"
+        f"the data contradict the prior of S and Q: chi-squared {statistic:.4g}, limit {limit:.4g} "
+        f"({int(tested.sum())} degrees of freedom); {PARAMETERS[p]} is {solution.x[p]:.5g}, "
+        f"{solution.prior_mean[p]:.5g} with u {u[worst]:.3g} was expected; check the prior and how the axes are mounted"
     ]
 
 
 def nuisance_pull(solution: Solution, covariance: Array) -> tuple[float, float, str]:
-    """How far the nuisances moved from what was stated, in the worst direction: in the standard deviations that they
-    have beforehand, the limit, and the one that moved most. A lag is left out: the data alone tell it.
+    """The largest deviation of the nuisances from their stated values, its limit, and a sentence on the worst nuisance.
 
-    With H the information and C the `covariance` (N, N), an estimate strays from its prior's mean by P^-1 - 2 H^-1 + C.
+    The deviation is in standard deviations, in the worst direction. A lag is not tested, because nobody states it; only
+    the data determine it. With P the precision of the priors, H the information and C the `covariance` (N, N), the
+    covariance of an estimate's deviation from its prior's mean is P^-1 - 2 H^-1 + C.
     """
     terms = solution.equations.nuisances.terms
     stated = [j for j, t in enumerate(terms) if t.kind.stated]
@@ -160,20 +174,25 @@ def _nuisance_reasons(solution: Solution, covariance: Array) -> list[str]:
     found, limit, told = nuisance_pull(solution, covariance)
     if found <= limit:
         return []
-    return [f"the data contradict what was stated: {told} ({found:.3g} standard deviations, limit {limit:.3g})"]
+    return [
+        f"the data contradict the stated values: {told} ({found:.3g} standard deviations, limit {limit:.3g}); "
+        "check the stated value, or state a larger uncertainty"
+    ]
 
 
 def dead_reasons(sensitivity: Array) -> list[str]:
-    """Outputs (rows of S) that hardly feel anything. NaN where not determined.
+    """A reason for each output (row of S) that responds to almost nothing.
 
-    Axes that are exchanged are no fault by themselves: S says so, and only what was known beforehand contradicts it.
+    `sensitivity` (3, 3), NaN for elements that are not determined. Exchanged axes are not refused here: S shows them,
+    and only a prior of S can contradict them.
     """
     size = np.abs(sensitivity)
     largest = float(np.nanmax(size, initial=0.0))
     felt = np.nanmax(size, axis=1, initial=0.0)
     told = [bool(np.isfinite(row).all()) for row in size]
     return [
-        f"output {axis} is dead: its largest sensitivity is {felt[i]:.4g}, that of the others {largest:.4g}"
+        f"output {axis} is dead: its largest sensitivity is {felt[i]:.4g}, that of the others is {largest:.4g} "
+        f"(limit {LEAST_FELT:.0%}); check the wiring of this output"
         for i, axis in enumerate("xyz")
         if told[i] and felt[i] < LEAST_FELT * largest
     ]
@@ -183,11 +202,14 @@ def _misfit_reasons(solution: Solution) -> list[str]:
     found = misfit(solution)
     if found <= MISFIT_LIMIT:
         return []
-    return [f"S a + Q leaves {found:.1%} of the signal between windows unexplained (limit {MISFIT_LIMIT:.0%})"]
+    return [
+        f"S a + Q leaves {found:.1%} of the signal between windows unexplained (limit {MISFIT_LIMIT:.0%}); "
+        "check that each position was stated as it was"
+    ]
 
 
 def misfit(solution: Solution) -> float:
-    """Root mean square of what the solution leaves of slopes and means over that of the signal, beyond noise."""
+    """Rms of the residuals of slopes or means beyond their noise, relative to the rms of the signal; the larger one."""
     equations = solution.equations
     data, noise = equations.data, equations.data.type_a.noise
     slope, mean = equations.split(solution.residual)
@@ -207,7 +229,7 @@ def misfit(solution: Solution) -> float:
 
 
 def turned_windows(windows: Sequence[Window], static: int, polarity: int) -> list[Window]:
-    """The same windows with gravity and the reference's direction in every pose multiplied by these signs."""
+    """The same windows with gravity multiplied by the sign `static` and the direction of motion by `polarity`."""
     return [
         replace(
             w,

@@ -1,4 +1,4 @@
-"""How S, Q and what moves the data may change between windows: random walks, a steady drift, temperature."""
+"""Changes of S, Q and the nuisances between windows: random walks, a steady drift of Q, and temperature."""
 
 from __future__ import annotations
 
@@ -27,18 +27,21 @@ from calib.model import Array
 
 @dataclass(frozen=True, init=False)
 class Wander(Stated):
-    """Standard deviations of random walks after one day (they grow with the square root of time).
+    """Standard deviations of random walks after one day; they grow with the square root of time.
 
-    The numbers are attributes, their names and defaults are in calib.estimate.quantities. `offset_rate_mps2` (a day) is
-    the first uncertainty of the steady drift of Q, `offset_rate_walk_mps2` how that rate wanders. Wandering never makes
-    a parameter less known than it was before any data.
+    Each number is an attribute; calib.estimate.quantities has the names and defaults. `offset_rate_mps2` (per day) is
+    the standard uncertainty of the steady drift of Q before any data, `offset_rate_walk_mps2` the random walk of that
+    rate. A random walk never makes the uncertainty of a parameter larger than it was before any data.
     """
 
     table: ClassVar[Mapping[str, Statement]] = WALKS
 
     def variance_a_day(self, quantities: Sequence[Quantity], scale: float, tilted_mps2: float) -> Array:
-        """(N,) of quantities; `scale` is the sensor's output unit per m/s2, `tilted_mps2` the gravity of which a tilt
-        of the mount moves the mean output: 0 where Q itself is meant."""
+        """(N,) variance per day of the random walk of each quantity, in the square of its unit.
+
+        `scale` is the sensor's output unit per m/s2. `tilted_mps2` is the gravity by which a tilt of the mount changes
+        the mean output; 0 if the walk of Q alone is wanted.
+        """
         found = np.zeros(len(quantities))
         for k, quantity in enumerate(quantities):
             kind = quantity.kind
@@ -51,9 +54,9 @@ class Wander(Stated):
 
 
 def wandered(state: JointState, days: float, variance_a_day: Array, bound: Array) -> JointState:
-    """A copy of the state so many days later: Q has drifted by its rate, and all that wanders is less known.
+    """A copy of the state `days` later: Q has drifted by its rate, and random walks have increased the variances.
 
-    `variance_a_day` (N,); no variance grows beyond `bound` (N,).
+    `variance_a_day` (N,) is the variance per day of each random walk; no variance grows beyond `bound` (N,).
     """
     state = state.copy()
     if days > 0.0:
@@ -67,10 +70,10 @@ def wandered(state: JointState, days: float, variance_a_day: Array, bound: Array
 
 @dataclass(frozen=True, slots=True)
 class TemperatureModel:
-    """Polynomial of Q, and if the order is 1 of S, about a reference temperature, with first uncertainties.
+    """Dependence of S and Q on the temperature T, with the standard uncertainties of the coefficients before any data.
 
-    Q(T) = Q + sum_k c_k (T - T0)^k, k = 1 .. `offset_order` (0: Q is constant); row i of S is multiplied by
-    1 + d_i (T - T0).
+    Q(T) = Q + sum_k c_k (T - T0)^k, k = 1 .. `offset_order` (0: Q does not depend on T). If `sensitivity_order` is 1,
+    row i of S is multiplied by 1 + d_i (T - T0). T0 is `reference_degc`.
     """
 
     offset_order: int = 0
@@ -80,7 +83,7 @@ class TemperatureModel:
     u_sensitivity: float = 2e-4  # per K
 
     def terms(self, scale: float) -> list[tuple[Quantity, float]]:
-        """Its coefficients, each with its first standard uncertainty."""
+        """Its coefficients, each with its standard uncertainty before any data; `scale` is output unit per m/s2."""
         found = [
             (Quantity(name, OFFSET_TEMPERATURE), u * scale)
             for power, u in enumerate(self.u_offset_mps2[: self.offset_order], start=1)

@@ -1,1 +1,1 @@
-"""Where a sensor moves or rests, windows of known excitation and their sums."""
+"""Detection of motion and rest, windows of known excitation, and the sums of their samples."""

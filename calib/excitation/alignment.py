@@ -1,7 +1,8 @@
-"""How far the sensor lags behind the reference in the course of a recording: two clocks that nobody disciplined drift.
+"""The sensor's lag behind the reference over the time of a recording: it changes if the two clocks run apart.
 
-Stamps of a recorder's own clock are a perfect grid and still 10 to 50 ppm off; a minute of that is a millisecond. The
-lag shows in every segment of motion as the coefficient on the reference's derivative, V(t) = S a(t - lag).
+Stamps from a recorder's own clock are evenly spaced, but the rate of that clock may be wrong by 10 to 50 ppm: the lag
+then changes by about a millisecond per minute. Since V(t) = S a(t - lag), each segment of motion shows the lag in the
+coefficient on the reference's derivative.
 """
 
 from __future__ import annotations
@@ -14,15 +15,15 @@ import numpy as np
 from calib.excitation.sums import NOISE_FLOOR, factor
 from calib.model import Array, Window, WindowSums
 
-LEAST_SEGMENTS = 6  # two unknowns, and a scatter of some weight
-SIGNIFICANT = 5.0  # standard uncertainties: else nothing is gained by taking the drift out
-UNSEEN = 1e-6  # of the strongest direction of motion: weaker ones are rounding
-LEAST_RATE = 1e-6  # clocks fitted to the same gateway's stamps leave 0.2 ppm, quartz of its own is some ppm off
+LEAST_SEGMENTS = 6  # two unknowns, and four degrees of freedom for the scatter
+SIGNIFICANT = 5.0  # standard uncertainties; to correct a smaller drift would improve nothing
+UNSEEN = 1e-6  # relative to the strongest direction of motion: weaker directions are rounding errors
+LEAST_RATE = 1e-6  # clocks fitted to stamps of one gateway differ by 0.2 ppm, two quartz clocks by several ppm
 
 
 @dataclass(frozen=True, slots=True)
 class Drift:
-    """Lag over time: `lag_s` at `time_s`, changing by `rate` seconds a second; `u_rate` its standard uncertainty."""
+    """Lag over time: `lag_s` at `time_s`; it changes by `rate` (s/s), whose standard uncertainty is `u_rate`."""
 
     time_s: float
     lag_s: float
@@ -31,12 +32,15 @@ class Drift:
 
     @property
     def significant(self) -> bool:
-        """Whether the two clocks run apart, as far as the data tell."""
+        """Whether the data show that the two clocks run apart."""
         return abs(self.rate) > max(SIGNIFICANT * self.u_rate, LEAST_RATE)
 
 
 def drift(windows: Sequence[Window]) -> Drift | None:
-    """The straight line through the lags of all segments of used motion; None where there are too few."""
+    """The straight line through the lags of all segments of the used windows of kind "motion".
+
+    None if there are fewer than LEAST_SEGMENTS.
+    """
     moving = [w for w in windows if w.used and w.kind == "motion"]
     found = [part for part in map(segment_lags, moving) if len(part)]
     lags = np.concatenate(found) if found else np.empty((0, 3))
@@ -53,10 +57,10 @@ def drift(windows: Sequence[Window]) -> Drift | None:
 
 
 def segment_lags(window: Window) -> Array:
-    """(K, 3) for each segment of motion: its middle, the lag, and the lag's standard uncertainty (white noise), in s.
+    """(K, 3) for each segment of a window: its middle, the lag, and u(lag) for white noise, all in s.
 
-    With the sensitivities b of the whole window (m, 3), a segment has one unknown: V - b'u = -lag b'du/dt. A window
-    that does not move has none.
+    b (m, 3) are the sensitivities of the whole window; each segment then has one unknown: V - b'u = -lag b'du/dt. A
+    segment without motion has no row.
     """
     sums = window.sums
     m = sums.reference_channels
@@ -73,7 +77,7 @@ def segment_lags(window: Window) -> Array:
 
 
 def _of_window(sums: WindowSums) -> tuple[Array, Array]:
-    """Coefficients (m, 3) on u beside its derivative, and the variance (3,) of what both leave, of a whole window."""
+    """Coefficients (m, 3) on u from the regression of a whole window on u and du/dt, and its residual variance (3,)."""
     m = sums.reference_channels
     part = factor(sums, derivative=True)
     slopes, *_ = np.linalg.lstsq(part.r[1:, 1:], part.rhs[1:], rcond=UNSEEN)

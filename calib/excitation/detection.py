@@ -1,4 +1,4 @@
-"""Where the reference moves, and which points were struck or clipped, found from the data (rests: rests.py)."""
+"""Detection of the reference's motion, of knocks and of clipped points (calib.excitation.rests finds rests)."""
 
 from __future__ import annotations
 
@@ -13,24 +13,25 @@ from calib.signal.band import hanning
 Mask = NDArray[np.bool_]
 Stretch = tuple[int, int]  # [first, stop) of samples
 
-FRAME_S = 0.25  # resolution with which motion begins and ends; three quarters of a cycle at 3 Hz
-BRIDGE_S = 1.0  # motion that pauses for less is one stretch
-# Of the level in the liveliest tenth of the frames: a random motion's slow spells stay above, a pause falls below.
+FRAME_S = 0.25  # time resolution of the begin and end of motion; three quarters of a cycle at 3 Hz
+BRIDGE_S = 1.0  # a shorter pause does not end a stretch of motion
+# Relative to the level that a tenth of the frames exceed: slow parts of a random motion are above it, pauses below.
 MOVING_LEVEL = 0.4
-KNOCK_SD = 5.0  # robust SDs: one white-noise point in 1.7 million
+KNOCK_SD = 5.0  # robust SDs: white noise exceeds them at one point in 1.7 million
 KNOCK_PASSES = 8
-# Least eigenvalue of the columns' cosines: normal equations are right to 1e-10 then, and ten times as fast.
+# Least eigenvalue of the matrix of the columns' cosines: above it the normal equations are accurate to 1e-10, and ten
+# times as fast as a factorisation.
 INDEPENDENT = 1e-6
-SLOW_BAND_HZ = 50.0  # first band tried for the motion; widened until it holds most of the motion's power
-MOST_POWER = 0.7
+SLOW_BAND_HZ = 50.0  # first band tried for the motion; it is widened until it holds most of the motion's power
+MOST_POWER = 0.7  # part of the motion's power
 SPECTRUM_SAMPLES, SPECTRA, FEWEST_FOR_SPECTRUM = 4096, 4, 16
-CLIPPED_POINTS = 3  # as many points at the very same extreme, and beyond it by the motion, are no chance
-DISTINCT = 0.99  # of the points within the range differ: then three at an extreme are no chance either
-ROUNDING = 1e-9  # of the range: what is less is no noise
+CLIPPED_POINTS = 3  # fewer points with the same extreme value may occur by chance
+DISTINCT = 0.99  # if this part of the points within the range differ, three points at an extreme are no chance
+ROUNDING = 1e-9  # of the range: smaller residuals are rounding errors, not noise
 
 
 def moving(u: Array, rate_hz: float) -> list[Stretch]:
-    """Stretches in which the reference u (n, m) moves, relative to the liveliest part of it."""
+    """Stretches in which the reference u (n, m) moves: its level is high enough compared with its strongest part."""
     width = band_width(u, rate_hz, white_noise(u))
     slow = averaged(u - np.median(u, axis=0), width) if len(u) else u
     size = max(1, round(FRAME_S * rate_hz / width))
@@ -43,9 +44,10 @@ def moving(u: Array, rate_hz: float) -> list[Stretch]:
 
 
 def knocked(V: Array, basis: Array, finest: Array) -> tuple[Mask, Array]:
-    """Points (n,) whose residual about the regression of V (n, 3) on `basis` (n, p) is beyond five robust SDs.
+    """Flags (n,) of knocks: points whose residual from the regression of V (n, 3) on `basis` (n, p) is above five
+    robust SDs; and the residuals (n, 3) of all points from the regression of the other points.
 
-    Also the residuals (n, 3) about the regression of the others. `finest` (3,): the resolution of V (`least_step`).
+    `finest` (3,) is the resolution of V (`least_step`).
     """
     columns, outputs = np.ascontiguousarray(basis.T), np.ascontiguousarray(V.T)
     struck: Mask = np.zeros(len(V), dtype=bool)
@@ -62,7 +64,10 @@ def knocked(V: Array, basis: Array, finest: Array) -> tuple[Mask, Array]:
 
 
 def _regression(columns: Array, outputs: Array) -> Array:
-    """(3, p) least squares of outputs (3, n) on columns (p, n); by a factorisation of all points where they must."""
+    """(3, p) least squares of outputs (3, n) on columns (p, n).
+
+    By normal equations, or by a factorisation if the columns are almost dependent (see INDEPENDENT).
+    """
     norm = np.linalg.norm(columns, axis=1)
     norm[norm == 0.0] = 1.0
     gram = columns @ columns.T / np.outer(norm, norm)
@@ -73,10 +78,10 @@ def _regression(columns: Array, outputs: Array) -> Array:
 
 
 def clipped(V: Array, residual: Array, finest: Array) -> int:
-    """Points of V (n, 3) held at an end of the range: several at the very same extreme while the motion goes beyond, or
-    where no two points within the range are alike.
+    """Number of points of V (n, 3) that are clipped: several points have the same extreme value, and either the motion
+    goes beyond that value, or hardly any two points within the range have the same value.
 
-    `residual` (n, 3) of V about the motion, `finest` (3,) the resolution of V.
+    `residual` (n, 3) of V from its regression on the motion, `finest` (3,) the resolution of V.
     """
     points = 0
     for axis in range(V.shape[1]):
@@ -92,14 +97,16 @@ def clipped(V: Array, residual: Array, finest: Array) -> int:
 
 
 def _all_differ(v: Array, noise: float) -> bool:
-    """Whether the resolution of v (n,) is so fine that points within its range hardly ever agree."""
+    """Whether the resolution of v (n,) is so fine that points within its range hardly ever have the same value."""
     inside = v[(v > v.min()) & (v < v.max())]
     return noise > ROUNDING * float(np.ptp(v)) and len(np.unique(inside)) >= DISTINCT * len(inside) > 0
 
 
 def band_width(u: Array, rate_hz: float, noise: Array) -> int:
-    """How many samples of u (n, m), `white_noise` (m,), may be averaged and leave most of the motion's power; the noise
-    falls."""
+    """Number of samples of u (n, m) that can be averaged, to reduce noise, without losing most of the motion's power.
+
+    `noise` (m,) is the SD of its white noise (`white_noise`).
+    """
     power = _power(u) - float(np.sum(noise**2)) if len(u) else 0.0
     width = max(1, min(int(rate_hz / SLOW_BAND_HZ), len(u)))
     while width > 1 and _power(averaged(u, width)) < MOST_POWER * power:
@@ -108,9 +115,9 @@ def band_width(u: Array, rate_hz: float, noise: Array) -> int:
 
 
 def averaged(x: Array, width: int) -> Array:
-    """Means of every `width` samples of x (n, m); what is left over at the end is dropped."""
+    """Means of each `width` consecutive samples of x (n, m); an incomplete group at the end is dropped."""
     n = len(x) // width
-    # A channel a row: numpy sums along what lies together several times faster.
+    # One channel per row: numpy adds contiguous values several times faster.
     rows = np.ascontiguousarray(x[: n * width].T)
     return np.asarray(rows.reshape(x.shape[1], n, width).mean(axis=2).T)
 
@@ -121,7 +128,10 @@ def _power(x: Array) -> float:
 
 
 def white_noise(x: Array) -> Array:
-    """SD (m,) of white noise in x (n, m), by the median of its spectrum: motion in under half the band leaves it."""
+    """SD (m,) of the white noise in x (n, m), from the median of its spectrum.
+
+    Motion does not change the median if it occupies less than half of the spectrum. Zero if x is too short.
+    """
     size = min(SPECTRUM_SAMPLES, 1 << max(len(x).bit_length() - 1, 0))
     if size < FEWEST_FOR_SPECTRUM:
         return np.zeros(x.shape[1])
@@ -130,19 +140,19 @@ def white_noise(x: Array) -> Array:
     window = hanning(size)[:, None]
     lines = np.fft.rfft((parts - parts.mean(axis=1, keepdims=True)) * window, axis=1)[:, 1:-1]
     power = np.median(np.abs(lines) ** 2, axis=(0, 1)) / np.sum(window**2)
-    # The power of a line of white noise is exponentially distributed: its mean is the median over ln 2.
+    # The power of a line of white noise is exponentially distributed: its mean is its median divided by ln 2.
     return np.asarray(np.sqrt(power / np.log(2.0)))
 
 
 def least_step(V: Array) -> Array:
-    """(3,) the smallest change between neighbouring samples: the resolution of counts, next to nothing of decimals."""
+    """(3,) the smallest change between neighbouring samples: the resolution of V if V is in counts, else almost 0."""
     steps = np.abs(np.diff(V, axis=0))
     least = np.min(steps, axis=0, where=steps > 0, initial=np.inf)
     return np.where(np.isfinite(least), least, 0.0)
 
 
 def _bridged(on: Mask, longest: int) -> Mask:
-    """Pauses shorter than `longest` frames between two moving ones count as moving."""
+    """The flags with each pause shorter than `longest` frames between two moving frames set to moving."""
     out = on.copy()
     edges = np.flatnonzero(on)
     for a, b in itertools.pairwise(edges):
@@ -152,7 +162,7 @@ def _bridged(on: Mask, longest: int) -> Mask:
 
 
 def _stretches(on: Mask, size: int, n: int) -> list[Stretch]:
-    """Frames to samples; what is left after the last whole frame goes with it."""
+    """Stretches of samples from flags of frames; samples after the last whole frame belong to that frame."""
     change = np.flatnonzero(np.diff(np.concatenate([[False], on, [False]]).astype(np.int8)))
     pairs = [(int(a) * size, int(b) * size) for a, b in zip(change[::2], change[1::2], strict=True)]
     if pairs and pairs[-1][1] == len(on) * size:

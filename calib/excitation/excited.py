@@ -1,8 +1,9 @@
-"""Which channels of a reference were excited in a window, and what its own noise did to the sums.
+"""The channels of a reference that were excited in a window, and the correction of the sums for the reference's noise.
 
-A channel that holds noise alone, or noise beside what it has in common with a stronger one, would be taken for a motion
-that the sensor does not feel, and pull its column of S to zero; what moves along with another adds to what the sensor
-feels. So silent channels leave the basis, and the directions of the others take up what of them moved along.
+A silent channel holds only noise, or noise beside a signal that it shares with a stronger channel (its motion is not
+exactly along one axis). Least squares would take the noise for a motion that the sensor does not follow, and find too
+small values in that column of S. So silent channels are removed from the basis, and the shared part of their motion is
+added to the directions of the other channels.
 """
 
 from __future__ import annotations
@@ -14,18 +15,21 @@ from numpy.typing import NDArray
 
 from calib.model import Array, Window, WindowSums, own_channels
 
-# Power over that of the channel's own noise: with less, what is left of the noise's attenuation after its correction
-# (a tenth of it) is above 1 %.
+# Least power of an excited channel, relative to its noise. Noise reduces the slopes; the correction for it leaves a
+# tenth of that error, which is then at most 1 %.
 OVER_NOISE = 10.0
-OF_STRONGEST = 1e-4  # of the strongest channel's power: 1 % of its amplitude
-MOST_NOISE = 0.5  # of a segment's power, that may be taken for noise
-CORRECTION_SHARE = 0.1  # to which the noise's power is known: a spectrum of some hundred lines
+OF_STRONGEST = 1e-4  # least power relative to that of the strongest channel: 1 % of its amplitude
+MOST_NOISE = 0.5  # largest part of a segment's power that the correction may subtract
+CORRECTION_SHARE = 0.1  # relative standard uncertainty of the noise's power, from a spectrum of some hundred lines
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Excitation:
-    """`window` with silent channels taken out and the noise's power out of the others; `directions` (3, k) orthonormal,
-    of what was excited, in the sensor's frame; `attenuation` relative uncertainty that the correction leaves."""
+    """A window after the correction: silent channels are removed, and the noise's power is subtracted from the others.
+
+    `directions` (3, k) are orthonormal vectors that span the excited directions, in the sensor's frame. `attenuation`
+    is the relative standard uncertainty of all slopes of the window that the correction leaves.
+    """
 
     window: Window
     directions: Array
@@ -33,7 +37,10 @@ class Excitation:
 
 
 def excited(window: Window) -> Excitation:
-    """See the module. A window at rest, or of a uniaxial reference without known noise, is as it was."""
+    """The window with its silent channels removed and the noise's power subtracted.
+
+    A window at rest, or of a uniaxial reference whose noise is not known, is not changed.
+    """
     m = own_channels(window.sums.reference_channels)
     if m == 0:
         return Excitation(window, np.zeros((3, 0)), 0.0)
@@ -43,7 +50,7 @@ def excited(window: Window) -> Excitation:
     live = own > 0.0
     share = float(np.max(noise[0][live] / own[live], initial=0.0))
     along = _along(power, live)
-    # What a silent channel shows of another's motion turns the direction where it is more than noise and trifles.
+    # The shared motion of a silent channel turns the excited direction if it is more than noise and more than 1 %.
     shown = along**2 @ np.where(live, power.diagonal(), 0.0)
     askew = shown > np.maximum(OF_STRONGEST * power.diagonal().max(initial=0.0), OVER_NOISE * noise[0])
     direction = window.pose.direction[:, :m]
@@ -53,10 +60,11 @@ def excited(window: Window) -> Excitation:
 
 
 def _own_power(power: Array, noise: Array) -> Array:
-    """(m,) of each channel what the stronger ones do not tell, 0 of a silent one; of the (m, m) power of all.
+    """(m,) power of each channel that the stronger channels do not explain; 0 for a silent channel.
 
-    A motion in one direction askew to the channels is on all of them, yet it is one: the strongest channel stands for
-    it, and what the others show beside it is their noise (m,).
+    `power` (m, m) is the covariance of all channels, `noise` (m,) the power of their noise. A motion in one direction
+    that is oblique to the channels appears in all of them, but it excites one direction only: the strongest channel
+    represents it, and the remainder in the other channels is noise.
     """
     own, rest, strongest = np.zeros(len(power)), power.copy(), power.diagonal().max(initial=0.0)
     for _ in own:
@@ -70,7 +78,7 @@ def _own_power(power: Array, noise: Array) -> Array:
 
 
 def _along(power: Array, live: NDArray[np.bool_]) -> Array:
-    """(m, m) how much of each live channel (column) every silent one (row) moves along with."""
+    """(m, m) regression of each silent channel (row) on the live channels (columns); other elements are 0."""
     along = np.zeros_like(power)
     if live.any():
         along[np.ix_(~live, live)] = np.linalg.solve(power[np.ix_(live, live)], power[np.ix_(live, ~live)]).T
@@ -79,7 +87,7 @@ def _along(power: Array, live: NDArray[np.bool_]) -> Array:
 
 def _reduced(window: Window, live: NDArray[np.bool_], along: Array, noise: Array) -> Window:
     sums, pose, m = window.sums, window.pose, len(live)
-    channels = sums.reference_channels  # of the reference; where a corner is to be found, their integrals behind them
+    channels = sums.reference_channels  # m, or 2 m if the integrals follow (see calib.signal.corner)
     every = np.tile(live, channels // m)
     both = np.concatenate([every, every, [True] * 3])
     scatter = np.where(np.outer(both, both), sums.scatter, 0.0)
@@ -90,12 +98,12 @@ def _reduced(window: Window, live: NDArray[np.bool_], along: Array, noise: Array
     if live.all():
         return replace(window, sums=replace(sums, scatter=scatter))
     moving = np.asarray(np.kron(np.eye(channels // m), np.diag(live.astype(float)) + along), dtype=np.float64)
-    # What silent channels did from segment to segment must not come back as scatter between them; their mean over the
-    # window (gravity, where the reference feels it) is still felt.
+    # Each segment gets the window's mean of a silent channel: differences between segments would count as motion again.
+    # The mean itself is kept, because the sensor is subject to it too (gravity, if the reference is DC-coupled).
     mean = sums.count @ sums.mean / sums.count.sum()
     return replace(
         window,
-        # Stated directions stay: what moved along with a live channel was measured by the silent one, with its error.
+        # The stated directions stay: the silent channel measured the shared motion, and its error is in `along`.
         pose=replace(pose, along=moving),
         sums=WindowSums(channels, sums.count, np.where(both, sums.mean, mean), scatter),
     )

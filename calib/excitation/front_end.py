@@ -14,7 +14,7 @@ import numpy as np
 from calib.excitation import detection
 from calib.excitation.turning import feels_gravity, standing_parts
 from calib.excitation.window_verdict import DEFAULT_LIMITS, Limits
-from calib.excitation.windows import Points, motion_windows, rest_window, still_window
+from calib.excitation.windows import LEAST_MOTION_MPS2, Points, at_rest, motion_windows, rest_window, still_window
 from calib.model import Array, Pose, Window, WindowSums
 from calib.signal.band import STOP_BAND, band_above_noise, lowpass, noise_in_band
 from calib.signal.corner import integral, with_integral, without_corner
@@ -36,7 +36,6 @@ LEAST_MARGIN_S = 1.0
 MOST_MARGIN_S = 5.0  # a second derivative at 10 Hz takes 4.2 s
 # Of many holes pieces of a second are left: too short for the reference's noise, and for type A by segments.
 MOST_MISSING_PCT = 5.0
-MOST_NOISE_MPS2 = 0.1  # 1 % of gravity: a reference that moves more beside a sensor that does not is no rest
 NOISE_MATTERS = 1e-5  # of the motion's power: a filter against less of it would cost its ends for nothing
 FILTER_BAND = 1.197  # times its band: the noise-equivalent bandwidth of calib.signal.band.lowpass
 RESAMPLED_BAND = 0.35  # of the reference's rate, to which interpolation itself passes noise
@@ -221,21 +220,23 @@ def _beside(pose: Pose, found: Aligned, settings: Settings) -> list[Window]:
         return motion_windows(pose, points, limits, leave_out=leave_out)
     rate_hz = (len(points.time_s) - 1) / (points.time_s[-1] - points.time_s[0])
     standing = standing_parts(points.u, rate_hz)
-    if standing == [(0, len(points.u))]:
-        made = motion_windows(pose, points, limits, leave_out=leave_out)
-        calm = made and all(_silent(window) for window in made)
-        return [still_window(pose, points, limits, leave_out=leave_out)] if calm else made
-    if not standing:
-        return motion_windows(pose, points, limits, leave_out=leave_out)
-    # Where hands turn both, gravity is the excitation; what hands shake between two turns is left out.
-    return [still_window(pose, points.part(a, b), limits, leave_out=leave_out) for a, b in standing]
+    # Between two turns by hand, gravity is the excitation, and what hands shake is left out.
+    turned = bool(standing) and standing != [(0, len(points.u))]
+    windows: list[Window] = []
+    for part in [points.part(a, b) for a, b in standing] or [points]:
+        still = still_window(pose, part, limits, leave_out=leave_out) if turned and at_rest(part) else None
+        made = [still] if still else motion_windows(pose, part, limits, leave_out=leave_out)
+        if standing and made and all(_silent(window) for window in made):
+            made = [still_window(pose, part, limits, leave_out=leave_out)]
+        windows += made
+    return windows
 
 
 def _silent(window: Window) -> bool:
     """Whether the reference did not move in a window: what it shows is its noise, or so little that it may be."""
     numbers = window.numbers
     level, coherence = numbers.get("reference_rms_mps2", np.inf), numbers.get("coherence", 0.0)
-    if window.used or numbers.get("stuck_axes", 0.0) or level > MOST_NOISE_MPS2:
+    if window.used or numbers.get("stuck_axes", 0.0) or level > LEAST_MOTION_MPS2:
         return False
     noisy = coherence < DEFAULT_LIMITS.least_coherence or level <= numbers["reference_rms_mps2_threshold"]
     return noisy or window.kind == "quiet"

@@ -1,20 +1,20 @@
-"""How a stretch of time in one position is cut into pieces, of each of which windows are made."""
+"""The pieces into which a stretch of time in one position is cut; windows are made from each piece."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-ROUNDING_S = 1e-6  # of ends that were added up
+ROUNDING_S = 1e-6  # rounding error of sums of times
 
 
 def pieces_of(
     start_s: float, stop_s: float, window_s: float, guard_s: float, every_s: float = 0.0, after_s: float = -float("inf")
 ) -> Iterator[tuple[float, float]]:
-    """(start, stop) of the pieces of a stretch, in order; without end where the stretch has none.
+    """(start, stop) in s of the pieces of the stretch from `start_s` to `stop_s`, in order; no end if `stop_s` is inf.
 
-    `guard_s` is left out at both ends of the stretch, where the sensor is being turned. A piece is `window_s` long, the
-    last one shorter; one begins each `every_s` (0: one after the other). Pieces that begin before `after_s` are left
-    out: they were made already. All times in s.
+    `guard_s` is left out at both ends of the stretch, where the sensor is being turned. A piece is `window_s` long; the
+    last piece may be shorter. A piece begins every `every_s`; 0 means that each begins where the one before ends.
+    Pieces that begin before `after_s` are left out, because they were made already. All times in s.
     """
     first_s, last_s = start_s + guard_s, stop_s - guard_s
     apart_s = every_s or window_s

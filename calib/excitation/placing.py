@@ -1,8 +1,8 @@
-"""How a sensor stands, from its mean output under gravity: which of several known stops, or a clamp's angles.
+"""The position of a sensor from its mean output under gravity: one of several known stops, or the angles of a clamp.
 
-At rest, and in the mean while it shakes, V = S G + Q, G being what an ideal sensor reads there. What is known of S and
-Q (12 values with their covariance), of the angles, of gravity and of the offset's scatter says how near the mean must
-be to S G + Q, and how well stops can be told apart.
+At rest, and in the mean during vibration, V = S G + Q, where G is what an ideal sensor reads at rest in that position.
+The covariance of S and Q, and the standard uncertainties of the angles, of gravity and of the offset between windows,
+give the uncertainty of S G + Q. Chi-squared compares the measured mean with it; the likelihood ratio compares stops.
 """
 
 from __future__ import annotations
@@ -17,21 +17,22 @@ from calib.excitation.standing import MEAN_S, hann
 from calib.geometry import clamp
 from calib.model import Array, Calibration, Pose
 
-SHORTEST_S = 4.0  # of data: what Hann's window leaves of a vibration of 2 s period is then 2.7 %
-SLOWEST_HZ = 0.5
-FALSE_REFUSALS = 1e-4  # sound windows refused
-# Natural logarithm of the likelihood ratio to the next best stop. Of normal errors at most one in 10,000 leads to a
-# wrong stop, whatever their distance: sqrt(2 ln 1000) = 3.7 standard uncertainties.
+SHORTEST_S = 4.0  # of data: Hann's window then leaves 2.7 % of a vibration with a period of 2 s in the mean
+SLOWEST_HZ = 0.5  # lowest frequency of a vibration
+FALSE_REFUSALS = 1e-4  # part of sound windows that is refused
+# Natural logarithm of the likelihood ratio to the next best stop. With normally distributed errors at most one window
+# in 10,000 gets a wrong stop, whatever the distance of the stops: sqrt(2 ln 1000) = 3.7 standard uncertainties.
 DECISIVE = float(np.log(1000.0))
-# An angle found from the mean and Q must not count as told a second time beside the same mean and Q in the equations.
-# The angle's prior in the adjustment is wider than what was found by this: one part in 100 is counted twice.
+# The angle is found from the same mean and Q that the window equations use again. So that the information is not
+# counted twice, the angle's prior in the adjustment gets its standard uncertainty times this factor: only one part in
+# 100 of the information is then counted twice.
 WIDER = 10.0
-WIDEST_RAD = float(np.deg2rad(10.0))  # standard uncertainty of an angle; beyond, sines are no angles
+WIDEST_RAD = float(np.deg2rad(10.0))  # standard uncertainty of an angle; above it, sin(x) = x is too inaccurate
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeanOutput:
-    """Mean indication (3,) and the covariance (3, 3) of what vibration leaves in it, output unit."""
+    """Mean indication `value` (3,) in output unit, and the covariance (3, 3) of its error that vibration causes."""
 
     value: Array
     covariance: Array
@@ -39,8 +40,8 @@ class MeanOutput:
 
 @dataclass(frozen=True, slots=True)
 class Knowledge:
-    """Standard uncertainties beside S and Q: of a stated angle (rad), of gravity (m/s2), of the offset (output unit)
-    between windows."""
+    """Standard uncertainties of a stated angle (rad), of gravity (m/s2), and of the offset between windows (output
+    unit)."""
 
     angle_rad: float
     gravity_mps2: float
@@ -49,7 +50,7 @@ class Knowledge:
 
 @dataclass(frozen=True, slots=True)
 class Placed:
-    """The pose found, or None with the reason; `numbers` are the statistics behind it, unit in the name."""
+    """The pose that was found, or None with the reason; `numbers` are the statistics, each named with its unit."""
 
     pose: Pose | None
     reason: str
@@ -57,7 +58,10 @@ class Placed:
 
 
 def mean_output(indications: Array, rate_hz: float) -> MeanOutput | None:
-    """Mean of indications (n, 3), Hann's weights; rows with NaN are left out. None for less than SHORTEST_S of them."""
+    """Mean of indications (n, 3), weighted by Hann's window; rows with NaN are left out.
+
+    None if the other rows cover less than SHORTEST_S.
+    """
     whole = np.isfinite(indications.sum(axis=1))
     duration_s = float(whole.sum()) / rate_hz
     if duration_s < SHORTEST_S:
@@ -69,29 +73,33 @@ def mean_output(indications: Array, rate_hz: float) -> MeanOutput | None:
     step = max(round(MEAN_S * rate_hz), 1)
     full = len(clean) // step * step
     blocks = np.where(whole[:, None], indications - value, 0.0)[:full].reshape(-1, step, 3).mean(axis=1)
-    # Hann's window passes at most 1 / (pi x (x^2 - 1)) of an amplitude with x periods in it, at x = 2 a sidelobe more.
+    # Hann's window passes at most 1 / (pi x (x^2 - 1)) of the amplitude of a vibration with x periods in the window;
+    # the lower limit of x also covers the first sidelobe.
     x = max(SLOWEST_HZ * duration_s, 2.4)
     leakage = 1.0 / (np.pi * x * (x**2 - 1.0))
     return MeanOutput(value, leakage**2 * 2.0 * blocks.T @ blocks / len(blocks))
 
 
 def nearest_stop(mean: MeanOutput, stops: Sequence[Pose], calibration: Calibration, knowledge: Knowledge) -> Placed:
-    """The stop whose gravity the mean agrees with, decisively better than with any other one."""
+    """The stop of `stops` at which V = S G + Q agrees with the mean, and decisively better than at any other stop.
+
+    The pose is None if the mean agrees with no stop, or with two stops almost equally well.
+    """
     statistic = np.array([_statistic(mean, stop, calibration, knowledge) for stop in stops])
     order = np.argsort(statistic[:, 1], kind="stable")
     best = int(order[0])
     numbers = {"position_chi2": float(statistic[best, 0])}
     limit = chi2_quantile(1.0 - FALSE_REFUSALS, 3.0)
     if statistic[best, 0] > limit:
-        reason = f"stands at none of the stated positions: nearest is {stops[best].position},"
-        return Placed(None, f"{reason} chi-squared {statistic[best, 0]:.3g} where {limit:.3g} is the limit", numbers)
+        reason = f"the sensor stands at none of the stated positions: the nearest is {stops[best].position}, with"
+        return Placed(None, f"{reason} chi-squared {statistic[best, 0]:.3g}, the limit is {limit:.3g}", numbers)
     if len(order) > 1:
         second = int(order[1])
         numbers["position_log_odds"] = float(0.5 * (statistic[second, 1] - statistic[best, 1]))
         if numbers["position_log_odds"] < DECISIVE:
             odds = float(np.exp(numbers["position_log_odds"]))
-            reason = f"stands at {stops[best].position} or at {stops[second].position}, odds {odds:.3g} to 1"
-            return Placed(None, f"{reason} where {np.exp(DECISIVE):.0f} to 1 are needed", numbers)
+            reason = f"the sensor stands at {stops[best].position} or at {stops[second].position}: the odds are"
+            return Placed(None, f"{reason} {odds:.3g} to 1, {np.exp(DECISIVE):.0f} to 1 are needed", numbers)
     return Placed(stops[best], "", numbers)
 
 
@@ -103,11 +111,11 @@ def clamp_angles(
     theta_rad: float | None,
     position: str,
 ) -> Placed:
-    """Alpha, and theta where `theta_rad` does not state it, by the direction of gravity (Eqs. 9-11 at rest).
+    """Alpha, and theta if `theta_rad` is None, from the direction of gravity (Eqs. 9-11 with a_ref = 0).
 
-    `gravity` is (m/s2, static sign). Theta comes out from 0 to 90 deg: gravity does not tell which way the motion goes.
-    The pose carries ten times the standard uncertainties found, see WIDER. Raises numpy.linalg.LinAlgError where S has
-    no inverse.
+    `gravity` is (magnitude in m/s2, static sign as in calib.geometry.clamp). Theta is found between 0 and 90 deg: the
+    direction of gravity does not depend on the sense of the motion. The pose gets ten times the standard uncertainties
+    that were found (see WIDER). Raises numpy.linalg.LinAlgError if S has no inverse.
     """
     g, sign = gravity
     inverse = np.linalg.inv(calibration.sensitivity)
@@ -118,8 +126,10 @@ def clamp_angles(
     along = a / max(size, np.finfo(float).tiny)
     numbers = {"found_gravity_mps2": size}
     variance = float(along @ covariance @ along) + knowledge.gravity_mps2**2
-    if (size - g) ** 2 > chi2_quantile(1.0 - FALSE_REFUSALS, 1.0) * variance:
-        return Placed(None, f"reads {size:.4g} m/s2 in the mean where gravity is {g:.5g}", numbers)
+    limit = chi2_quantile(1.0 - FALSE_REFUSALS, 1.0) * variance
+    if (size - g) ** 2 > limit:
+        reason = f"the mean acceleration is {size:.4g} m/s2, gravity is {g:.5g} m/s2"
+        return Placed(None, f"{reason}: they may differ by {np.sqrt(limit):.2g} m/s2 at most", numbers)
     e = sign * along
     found_theta, alpha = float(np.arctan2(np.hypot(e[0], e[1]), -e[2])), float(np.arctan2(-e[0], -e[1]))
     sin_a, cos_a, sin_t, cos_t = np.sin(alpha), np.cos(alpha), np.sin(found_theta), np.cos(found_theta)
@@ -130,16 +140,18 @@ def clamp_angles(
         "found_alpha_deg": float(np.degrees(alpha)), "u_found_alpha_deg": float(np.degrees(u_alpha)),
     }  # fmt: skip
     if cos_t <= 0.0:
-        return Placed(None, f"the clamp leans by {np.degrees(found_theta):.4g} deg: static_sign is the other", numbers)
+        reason = f"gravity shows theta = {np.degrees(found_theta):.4g} deg, more than 90 deg"
+        return Placed(None, f"{reason}: change the sign of static_sign", numbers)
     if max(u_alpha, u_theta) > WIDEST_RAD:
-        told = f"alpha to {np.degrees(u_alpha):.3g} deg, theta to {np.degrees(u_theta):.3g} deg"
-        return Placed(None, f"gravity tells {told}; {np.degrees(WIDEST_RAD):.0f} deg are needed", numbers)
+        told = f"u(alpha) = {np.degrees(u_alpha):.3g} deg and u(theta) = {np.degrees(u_theta):.3g} deg"
+        return Placed(None, f"gravity gives only {told}; {np.degrees(WIDEST_RAD):.0f} deg is the limit", numbers)
     if theta_rad is None:
         return Placed(_found(found_theta, alpha, gravity, position, u_alpha, u_theta), "", numbers)
     limit = chi2_quantile(1.0 - FALSE_REFUSALS, 1.0) * (u_theta**2 + knowledge.angle_rad**2)
     if (abs(theta_rad) - found_theta) ** 2 > limit:
-        told = f"gravity leans by {np.degrees(found_theta):.4g} deg"
-        return Placed(None, f"{told} where theta is {np.degrees(theta_rad):.4g} deg", numbers)
+        told = f"gravity shows theta = {np.degrees(found_theta):.4g} deg, {np.degrees(theta_rad):.4g} deg is stated"
+        most = np.degrees(np.sqrt(limit))
+        return Placed(None, f"{told}: they may differ by {most:.2g} deg at most", numbers)
     alpha += np.pi if theta_rad < 0.0 else 0.0
     return Placed(_found(theta_rad, alpha, gravity, position, u_alpha, 0.0), "", numbers)
 
@@ -152,7 +164,7 @@ def _found(
 
 
 def _statistic(mean: MeanOutput, stop: Pose, calibration: Calibration, knowledge: Knowledge) -> tuple[float, float]:
-    """Chi-squared of the mean at a stop, and -2 ln likelihood."""
+    """Chi-squared of the mean at a stop, and -2 ln of its likelihood (without the constant)."""
     S, G = calibration.sensitivity, stop.gravity_mps2
     size2 = float(G @ G)
     turned = knowledge.angle_rad**2 * (size2 * np.eye(3) - np.outer(G, G))
@@ -165,7 +177,7 @@ def _statistic(mean: MeanOutput, stop: Pose, calibration: Calibration, knowledge
 
 
 def _calibration_part(acceleration: Array, calibration: Calibration) -> Array:
-    """Covariance (3, 3) that S and Q put into the output under an acceleration (3,)."""
+    """Covariance (3, 3) of S a + Q that is due to the uncertainty of S and Q, for an acceleration a (3,) in m/s2."""
     J = np.hstack([np.kron(np.eye(3), acceleration), np.eye(3)])
     return np.asarray(J @ calibration.covariance @ J.T)
 

@@ -1,4 +1,4 @@
-"""Rests of a sensor that was put down again and again: found from its own indications, with no reference at all."""
+"""Detection of rests in the indications of a sensor that is put down repeatedly; no reference is needed."""
 
 from __future__ import annotations
 
@@ -6,21 +6,24 @@ import numpy as np
 
 from calib.model import Array
 
-BLOCK_S = 0.25  # long enough to tell noise from turning, short against a rest
+BLOCK_S = 0.25  # long enough to distinguish noise from a rotation, short compared with a rest
 LEAST_REST_S = 1.0
-GUARD_S = 0.25  # left out at both ends: hands leaving and taking the sensor
-# A quarter of the blocks at the least are still (else nothing is found), so this quantile of what blocks do is noise.
+GUARD_S = 0.25  # left out at both ends of a rest, where hands release and take the sensor
+# The method needs a sensor that rests during at least a quarter of the blocks: this quantile then shows the noise.
 STILL_QUANTILE = 0.25
-# Times that noise which a still block may show: noise alone passes 4 in 3e-5 of the blocks, a turn of 1 deg/s does not.
+# Limit for a block at rest, relative to that noise: noise alone exceeds it in 3e-5 of the blocks; a rotation of 1 deg/s
+# always exceeds it.
 STILL_FACTOR = 4.0
-# The quantile of a dozen steps is poorly known; steps as white noise makes them (times this, passed by 3e-4) are still.
+# The quantile of a dozen steps is uncertain. So a step is also accepted up to this factor times the SD of a step of
+# white noise, which white noise exceeds in 3e-4 of the blocks.
 WHITE_FACTOR = 2.6
 
 
 def find_rests(V: Array, rate_hz: float) -> list[tuple[int, int]]:
     """Rests in indications V (n, 3) at `rate_hz`: [first, stop) sample numbers, in order.
 
-    A block is still where its SD and the step of its mean from both neighbours are those of the noise.
+    A block of 0.25 s is at rest if its SD, and the differences between its mean and the means of both neighbours, are
+    not larger than noise explains.
     """
     size = max(round(BLOCK_S * rate_hz), 2)
     blocks = len(V) // size

@@ -1,10 +1,10 @@
-"""Whether a sensor keeps its place against gravity: a sequential test on short means of its own output.
+"""Sequential test whether a sensor keeps its position relative to gravity, on short means of its own output.
 
-Gravity is felt all the time, so a sensor that is turned shows it in the mean of what it reads, while vibration and
-blows have none. Means of 0.25 s are smoothed over 4 s by Hann's window, which leaves 2.7 % of a vibration of 2 s period
-and less of quicker ones; where that departs from what was read since the place was taken, the place was left. When, is
-read from the shortest smoothing under which the stretch before was quiet: 0.25 s at rest, up to 4 s while it shakes.
-A false alarm costs a few seconds of data: the place is found again.
+A rotation of the sensor changes the mean of its output, because gravity acts all the time; vibration and blows hardly
+change it. Means over 0.25 s are smoothed over 4 s by Hann's window, which leaves 2.7 % of a vibration with a period of
+2 s, and less of faster ones. When the smoothed mean differs from the mean since the position began, the position has
+ended. The time of the end is found with the shortest smoothing under which the stretch before shows no departure:
+0.25 s at rest, up to 4 s during vibration. A false alarm costs only a few seconds of data: the position is found again.
 """
 
 from __future__ import annotations
@@ -16,21 +16,22 @@ import numpy as np
 
 from calib.model import Array
 
-MEAN_S = 0.25  # one mean, number by number
-SMOOTHINGS = (1, 2, 4, 8, 16)  # means
+MEAN_S = 0.25  # length of one mean
+SMOOTHINGS = (1, 2, 4, 8, 16)  # numbers of means
 LONGEST = SMOOTHINGS[-1]
-STEADY = LONGEST + LONGEST // 2  # means without a change that make a place: 6 s
-KEPT = 2 * STEADY  # means
-# A departure of the mean that counts, m/s2: 0.7 deg of gravity; a blow of 8 m/s2 and 20 ms, smoothed, makes 0.05.
+STEADY = LONGEST + LONGEST // 2  # number of means without a change after which a position begins: 6 s
+KEPT = 2 * STEADY  # number of means in memory
+# Least change of the mean that counts, m/s2: gravity turned by 0.7 deg. A blow of 8 m/s2 and 20 ms, smoothed, is 0.05.
 DEPARTURE_MPS2 = 0.12
-# Of the means' own rms that a smoothed mean may be off by: 2.7 % of an amplitude is 3.8 % of its rms.
+# Error of a smoothed mean, relative to the rms of the means: 2.7 % of an amplitude is 3.8 % of its rms.
 LEAKAGE = 0.05
 
 
 class Standing:
-    """The place where the sensor stands now, if it does. `update` and `interrupt` change it.
+    """The present position of the sensor, if there is one; `update` and `interrupt` change the state.
 
-    Numbers count means; a stretch is from `first` on up to, and without, the number that `update` gives when it ended.
+    The means are numbered. A stretch in one position holds the means from number `first` up to, but not including, the
+    number that `update` or `interrupt` returns when the stretch has ended.
     """
 
     def __init__(self) -> None:
@@ -38,25 +39,25 @@ class Standing:
         self._next = 0
         self._centre = np.zeros(3)
         self._rms = 0.0
-        self.first: int | None = None  # None: it moves, or nobody can tell yet
+        self.first: int | None = None  # None: the sensor is being turned, or there are too few means so far
 
     @property
     def next(self) -> int:
-        """Number of the mean that is awaited."""
+        """Number of the next mean."""
         return self._next
 
     @property
     def oldest(self) -> int:
-        """Number from which on a place may still begin."""
+        """Number of the oldest mean at which a stretch may still begin."""
         return self._next - len(self._means)
 
     @property
     def cleared(self) -> int:
-        """Number up to which, and without, no change will be found any more."""
+        """Number before which no end of the stretch will be found any more."""
         return max(self._next - STEADY, self.first or 0)
 
     def update(self, mean: Array) -> int | None:
-        """Take the next mean (3,), m/s2; where it shows that the stretch ended, the number at which."""
+        """Take the next mean (3,) in m/s2. Returns the number at which the stretch ended, None if it goes on."""
         self._means = np.vstack([self._means, mean])[-KEPT:]
         self._next += 1
         if self.first is None:
@@ -69,7 +70,10 @@ class Standing:
         return self._end(self._departed(limit))
 
     def interrupt(self) -> int | None:
-        """Means are missing here: nobody knows what happened. The number at which a stretch ended, if there was one."""
+        """Take note that means are missing here, so that the stretch cannot go on.
+
+        Returns the number at which the stretch ended, None if there was no stretch.
+        """
         if self.first is None:
             self._means = self._means[:0]
             return None
@@ -77,7 +81,10 @@ class Standing:
         return self._end(self._next - n // 2, keep=False)
 
     def _begin(self) -> None:
-        """A place is taken where nothing departed for as long as STEADY; it began where that holds back to."""
+        """Begin a stretch if no smoothed mean has departed during the last STEADY means.
+
+        The stretch begins at the earliest mean in memory since which there was no departure.
+        """
         if len(self._means) < STEADY:
             return
         newest = self._means[-STEADY:]
@@ -91,11 +98,11 @@ class Standing:
         n = self._quiet(newest, limit)
         off = _length(_smoothed(self._means, n) - centre) > limit
         begin = int(np.flatnonzero(off)[-1]) + 1 if off.any() else 0
-        # Half of the smoothing may hide a departure of twice the limit; where nothing was before, nothing is hidden.
+        # Half of the smoothing may hide a departure of twice the limit, but only if there was a departure before.
         self.first = self.oldest + min(begin + (n // 2 if off.any() else 0), len(self._means) - LONGEST)
 
     def _departed(self, limit: float) -> int:
-        """Number of the first mean that may not belong to the stretch."""
+        """Number of the first mean that may no longer belong to the stretch."""
         own = self._means[max((self.first or 0) - self.oldest, 0) :]
         before = own[max(len(own) - LONGEST - STEADY, 0) : max(len(own) - LONGEST, 0)]
         n = self._quiet(before, limit)
@@ -105,7 +112,7 @@ class Standing:
         return self._next - len(own) + last - n // 2
 
     def _quiet(self, means: Array, limit: float) -> int:
-        """The shortest smoothing under which these means never depart."""
+        """The shortest smoothing (number of means) under which none of these means departs by more than `limit`."""
         for n in SMOOTHINGS:
             if len(means) >= n and _length(_smoothed(means, n) - self._centre).max() <= limit:
                 return n
@@ -118,7 +125,7 @@ class Standing:
         return at
 
     def snapshot(self) -> dict[str, Any]:
-        """State for `load`, bit-exact."""
+        """The complete state, for `load`; bit for bit."""
         return {
             "means": self._means.copy(),
             "next": self._next,
@@ -128,19 +135,19 @@ class Standing:
         }
 
     def load(self, state: Mapping[str, Any]) -> None:
-        """Take the state that `snapshot` gave."""
+        """Continue from the state that `snapshot` returned."""
         self._means, self._centre = np.array(state["means"]), np.array(state["centre"])
         self._next, self._rms, self.first = state["next"], state["rms"], state["first"]
 
 
 def hann(n: int) -> Array:
-    """(n,) weights, sum 1; none is zero."""
+    """(n,) weights of Hann's window, with the sum 1; no weight is zero."""
     weights = np.sin(np.pi * (np.arange(n) + 0.5) / n) ** 2
     return np.asarray(weights / weights.sum())
 
 
 def _smoothed(means: Array, n: int) -> Array:
-    """(len - n + 1, 3), in order of time."""
+    """(len - n + 1, 3) means smoothed over n by Hann's window, in order of time."""
     return np.asarray(np.lib.stride_tricks.sliding_window_view(means, n, axis=0) @ hann(n))
 
 

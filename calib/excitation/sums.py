@@ -1,7 +1,8 @@
-"""Additive window sums on the reference's own basis: what streams, merges, and still gives the point-by-point solution.
+"""Sums of a window's samples from which the least-squares problem over all its points is solved exactly.
 
-Input accelerations are linear in the reference's channels for any geometry, so the sums of a window are taken before
-anything is known of S, and the least-squares problem over all points is solved from them exactly (section 2.3).
+The sums are additive: they are made block by block and merged. For any geometry the input accelerations are linear in
+the reference's channels, so the sums need no knowledge of S, Q or the pose. The solution is that of Method 3 over all
+points (section 2.3).
 """
 
 from __future__ import annotations
@@ -17,19 +18,21 @@ from calib.model import Array, WindowSums
 
 # A block of this many samples stays in the second-level cache of a small gateway (8 columns: 256 kB).
 BLOCK_SAMPLES = 4096
-# A basis direction with less than this part of the largest carries rounding, not motion (float64 sums of 1e7 samples).
+# A basis direction with a smaller eigenvalue, relative to the largest one, holds only rounding errors (float64 sums of
+# 1e7 samples).
 SINGULAR = 1e-13
-# Of the signal: exact data would have no noise to weigh by. Sums of squares round at 1e-15, their roots at 3e-8.
+# Least noise, relative to the signal: exact data would have none, and weights would be infinite. Sums of squares are
+# rounded at 1e-15, their square roots at 3e-8.
 NOISE_FLOOR = 1e-7
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Factor:
-    """Triangular-like factor of a window: |r X - rhs|^2 + trace(residual) is the sum of squares over all its points.
+    """Factor of a window's least-squares problem: its sum of squares over all points is |r X - rhs|^2 + tr(residual).
 
-    Basis order: 1, the m channels of u, then (with the derivative) the m channels of du/dt; X has a row each and a
-    column an output axis. `r` (p, p), row 0 belongs to the means; `rhs` (p, 3); `residual` (3, 3) scatter of V about
-    the window's own regression; `count` samples.
+    X (p, 3) are the coefficients of V on the basis 1, u (m channels) and, with the derivative, du/dt (m channels): a
+    row for each function of the basis, a column for each output axis. `r` (p, p), its row 0 belongs to the means; `rhs`
+    (p, 3) in output unit; `residual` (3, 3) scatter of V about the window's own regression; `count` of samples.
     """
 
     r: Array
@@ -39,10 +42,12 @@ class Factor:
 
 
 def window_sums(u: ArrayLike, du: ArrayLike, V: ArrayLike, segment_edges: ArrayLike) -> WindowSums:
-    """Sums of a window: u, du (n, m) reference in m/s2 and m/s3, V (n, 3) indications, at the same instants.
+    """Sums of a window of n samples, segment by segment.
 
-    `segment_edges` (K + 1,) rising sample numbers: segment k is [edges[k], edges[k + 1]); an empty one is dropped.
-    Raises ValueError on shapes that do not fit and on values that are not finite.
+    `u` (n, m) is the reference in m/s2, `du` (n, m) its derivative in m/s3, `V` (n, 3) the indications in output unit,
+    all at the same times. `segment_edges` (K + 1,) are rising sample numbers: segment k holds the samples
+    [edges[k], edges[k + 1]); an empty segment is dropped. Raises ValueError if shapes do not fit, a value is not
+    finite, or there is no sample.
     """
     channels, rates, indications = (np.asarray(x, dtype=float) for x in (u, du, V))
     n, m = channels.shape
@@ -50,19 +55,19 @@ def window_sums(u: ArrayLike, du: ArrayLike, V: ArrayLike, segment_edges: ArrayL
         raise ValueError(f"shapes do not fit: u {channels.shape}, du {rates.shape}, V {indications.shape}")
     edges = np.asarray(segment_edges, dtype=np.int64)
     if edges.size < 2 or np.any(np.diff(edges) < 0) or edges[0] < 0 or edges[-1] > n:
-        raise ValueError(f"segment edges must rise within 0..{n}")
+        raise ValueError(f"segment edges must rise within 0..{n} (two or more sample numbers), are {edges.tolist()}")
     bounds = [(int(a), int(b)) for a, b in itertools.pairwise(edges) if b > a]
     if not bounds:
         raise ValueError("a window needs at least one sample")
     parts = [_segment(channels[a:b], rates[a:b], indications[a:b]) for a, b in bounds]
     mean, scatter = np.array([p[0] for p in parts]), np.array([p[1] for p in parts])
     if not (np.isfinite(mean).all() and np.isfinite(scatter).all()):
-        raise ValueError("a window's samples must be finite")
+        raise ValueError("a window's samples must be finite: leave out samples that are missing (NaN)")
     return WindowSums(m, np.array([float(b - a) for a, b in bounds]), mean, scatter)
 
 
 def merge(parts: Sequence[WindowSums]) -> WindowSums:
-    """The segments of all parts, in the order given. Raises ValueError where the numbers of channels differ."""
+    """The segments of all parts, in the order given. Raises ValueError if their numbers of channels differ."""
     channels = {p.reference_channels for p in parts}
     if len(channels) != 1:
         raise ValueError(f"sums on different bases cannot be merged: {sorted(channels)} reference channels")
@@ -75,15 +80,15 @@ def merge(parts: Sequence[WindowSums]) -> WindowSums:
 
 
 def pool(sums: WindowSums) -> WindowSums:
-    """All segments as one (Chan, Golub and LeVeque 1983, many parts at once): the same sums as over all its points."""
+    """All segments merged into one, with the sums over all points (Chan, Golub and LeVeque 1983, for many parts)."""
     mean, scatter = _pool(sums.count, sums.mean, sums.scatter)
     return WindowSums(sums.reference_channels, np.array([sums.count.sum()]), mean[None], scatter[None])
 
 
 def factor(sums: WindowSums, *, derivative: bool = False) -> Factor:
-    """The window's factor on [1, u] or [1, u, du/dt], from its centred scatter: only within the window's own basis.
+    """The factor of a window on the basis [1, u], or with `derivative` on [1, u, du/dt], from its centred sums.
 
-    Directions that the window does not excite give rows of zeros.
+    Rows of directions that the window does not excite are zero.
     """
     whole = pool(sums)
     n, mean, scatter = float(whole.count[0]), whole.mean[0], whole.scatter[0]
@@ -106,13 +111,13 @@ def factor(sums: WindowSums, *, derivative: bool = False) -> Factor:
 
 
 def _segment(u: Array, du: Array, V: Array) -> tuple[Array, Array]:
-    """Mean (q,) and centred scatter (q, q) of consecutive samples, block by block in cache, two passes each."""
+    """Mean (q,) and centred scatter (q, q) of consecutive samples; each block fits the cache and is read twice."""
     m = u.shape[1]
     blocks = []
     for start in range(0, len(u), BLOCK_SAMPLES):
         part = slice(start, start + BLOCK_SAMPLES)
         n = len(u[part])
-        z = np.empty((2 * m + 3, n))  # a channel a row: 1.6 times as fast as a sample a row
+        z = np.empty((2 * m + 3, n))  # one channel per row: 1.6 times as fast as one sample per row
         z[:m], z[m : 2 * m], z[2 * m :] = u[part].T, du[part].T, V[part].T
         centre = z @ np.ones(n) / n
         z -= centre[:, None]

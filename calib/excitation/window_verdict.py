@@ -1,4 +1,4 @@
-"""What a window must keep to be used, and the verdict that says so with its numbers."""
+"""The limits that a window must meet to be used, and the verdict with its statistics."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from calib.model import WindowSums
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What a window must keep to be used. Every default says why."""
+    """The limits that a window must meet to be used; the comment beside each default gives its reason."""
 
-    least_points: int = 30  # four unknowns an axis and a residual to judge them by
-    segment_s: float = 0.5  # five correlation times of AR(1) 0.99 at 1 kHz; the sums can be pooled to longer ones
-    longest_s: float = 60.0  # the clock model's horizon; an offset may creep within a longer one
-    most_restless: float = 4.0  # SD at rest over that of the other rests; a hand or a machine is ten times above it
-    least_level: float = 3.0  # motion over the reference's noise, in band: 10 % of attenuation is then the worst
-    least_coherence: float = 0.5  # in band, part of the sensor's power; a working pair shows above 0.95
-    most_left_out_pct: float = 5.0  # knocks of 20 ms twice a second; more is no knock
-    # Of a segment, in a window beyond the limit above: more, and the whole segment is left out. Where 8 % are knocked
-    # out here and there, one segment in 500 of 25 points has as many.
+    least_points: int = 30  # four unknowns per axis, and enough residuals to estimate the noise
+    segment_s: float = 0.5  # five correlation times of AR(1) noise with 0.99 at 1 kHz; segments can be merged
+    longest_s: float = 60.0  # the horizon of the clock model; in a longer window an offset may drift
+    most_restless: float = 4.0  # SD at rest over that of the other rests; hands or machines cause ten times as much
+    least_level: float = 3.0  # reference's motion over its noise, in band: the noise then reduces S by 10 % at most
+    least_coherence: float = 0.5  # part of the sensor's power that the reference explains, in band; 0.95 is usual
+    most_left_out_pct: float = 5.0  # two knocks of 20 ms per second leave out 4 %
+    # Of a segment, in a window beyond the limit above: more, and the whole segment is left out. If 8 % of the points are
+    # knocks at random places, one segment in 500 of 25 points has as many.
     most_left_out_of_segment_pct: float = 25.0
-    most_drift_mps2: float = 0.2  # of the mean within a window: offsets creep by 0.05, a turned clamp by metres
-    most_drift_pct: float = 10.0  # or of the motion's own size, where that is more
+    most_drift_mps2: float = 0.2  # of the mean within a window: offsets drift by 0.05
+    most_drift_pct: float = 10.0  # the same relative to the motion's rms; the larger limit counts
 
 
 DEFAULT_LIMITS = Limits()
@@ -34,7 +34,7 @@ DEFAULT_LIMITS = Limits()
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Whether a window is used, why not, and the statistics behind it."""
+    """Whether a window is used, the reason if it is not, and the statistics, each with its unit in its name."""
 
     used: bool
     reason: str
@@ -42,11 +42,12 @@ class Verdict:
 
 
 def judge(sums: WindowSums, struck: NDArray[np.bool_], numbers: Mapping[str, float], limits: Limits) -> Verdict:
-    """Verdict on a window of these sums, of which the points `struck` were left out.
+    """The verdict on a window with these sums.
 
-    `numbers`: for motion reference_rms_mps2, reference_noise_mps2, coherence, drift_mps2, stuck_axes and
-    clipped_points; for a rest sd_over_floor where other rests are known. The verdict carries each with its threshold
-    (`<name>_threshold`).
+    `struck` (n,) flags the points that were found to be knocks. `numbers` are the statistics: for motion
+    reference_rms_mps2, reference_noise_mps2, coherence, drift_mps2, stuck_axes and clipped_points; for a rest
+    sd_over_floor, if there are other rests to compare with. The verdict's numbers hold the limit of each statistic
+    beside it, as `<name>_threshold`.
     """
     points = float(sums.count.sum())
     left_out = 100.0 * float(struck.mean()) if len(struck) else 0.0
@@ -56,7 +57,7 @@ def judge(sums: WindowSums, struck: NDArray[np.bool_], numbers: Mapping[str, flo
 
 
 def _thresholds(n: Mapping[str, float], limits: Limits) -> dict[str, float]:
-    """What each number is held against; recorded with it, so that who checks can tell a close decision."""
+    """The limit of each statistic. It is recorded beside the statistic: a reader sees how close a decision was."""
     limit = {"points": float(limits.least_points), "left_out_pct": limits.most_left_out_pct}
     if "reference_rms_mps2" in n:
         limit["reference_rms_mps2"] = limits.least_level * n["reference_noise_mps2"]
@@ -70,29 +71,35 @@ def _thresholds(n: Mapping[str, float], limits: Limits) -> dict[str, float]:
 
 
 def _reason(n: Mapping[str, float]) -> str:
-    """The first thing that is wrong with a window of these numbers, "" where nothing is."""
+    """The first limit that these numbers do not meet, as a sentence; "" if they meet all limits."""
     limit = {name: n[f"{name}_threshold"] for name in n if f"{name}_threshold" in n}
     if n["points"] < limit["points"]:
         return f"too few points: {n['points']:.0f}, {limit['points']:.0f} needed"
     if "reference_rms_mps2" in n:
         if n["reference_rms_mps2"] <= limit["reference_rms_mps2"]:
             return (
-                f"the reference is silent: {n['reference_rms_mps2']:.3g} m/s2 in band, "
-                f"its noise is {n['reference_noise_mps2']:.3g} m/s2"
+                f"the reference is silent: {n['reference_rms_mps2']:.3g} m/s2 rms in band, "
+                f"{limit['reference_rms_mps2']:.3g} m/s2 needed (its noise is {n['reference_noise_mps2']:.3g} m/s2)"
             )
         if n["stuck_axes"] > limit["stuck_axes"]:
-            return f"dead: {n['stuck_axes']:.0f} of the sensor's axes do not change at all"
+            return f"dead: the output of {n['stuck_axes']:.0f} of the sensor's axes does not change at all"
         if n["clipped_points"] > limit["clipped_points"]:
             return f"clipped: {n['clipped_points']:.0f} points at the end of the sensor's range"
         if n["coherence"] < limit["coherence"]:
-            return f"the sensor does not follow the reference: coherence {n['coherence']:.3f}"
+            return (
+                f"the sensor does not follow the reference: coherence {n['coherence']:.3f}, "
+                f"{limit['coherence']:g} needed"
+            )
         if n["drift_mps2"] > limit["drift_mps2"]:
             return (
-                f"the sensor's mean moves by {n['drift_mps2']:.3g} m/s2 within the window, "
-                f"{limit['drift_mps2']:.3g} at most"
+                f"the sensor's mean changes by {n['drift_mps2']:.3g} m/s2 within the window, "
+                f"{limit['drift_mps2']:.3g} m/s2 at most"
             )
     if "sd_over_floor" in n and n["sd_over_floor"] > limit["sd_over_floor"]:
-        return f"the sensor is not at rest: {n['sd_over_floor']:.1f} times the noise it has in other positions"
+        return (
+            f"the sensor is not at rest: its noise is {n['sd_over_floor']:.1f} times that in other positions, "
+            f"{limit['sd_over_floor']:g} times at most"
+        )
     if n["left_out_pct"] > limit["left_out_pct"]:
-        return f"{n['left_out_pct']:.1f} % of the points are knocked out, {limit['left_out_pct']:g} % at most"
+        return f"{n['left_out_pct']:.1f} % of the points are knocks, {limit['left_out_pct']:g} % at most"
     return ""

@@ -1,7 +1,7 @@
-"""Windows of known excitation out of a stretch in which the sensor stands in one pose, each with its verdict.
+"""Windows of known excitation, each with its verdict, from samples during which the sensor stays in one pose.
 
-Motion is found from the reference itself; rests under a known gravity from the sensor. What a window must keep to be
-used is in calib.excitation.window_verdict.
+Motion is detected in the reference's samples, rests in the sensor's. calib.excitation.window_verdict has the limits
+that a window must meet to be used.
 """
 
 from __future__ import annotations
@@ -14,21 +14,26 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from calib import geometry
 from calib.excitation import detection
 from calib.excitation.rests import find_rests
 from calib.excitation.sums import factor, pool, window_sums
 from calib.excitation.window_verdict import DEFAULT_LIMITS, Limits, Verdict, judge
-from calib.geometry import at_rest
 from calib.model import Array, Pose, Window, WindowSums
 
-SHORTEST_QUIET_S = 1.0  # shorter pauses tell nothing of the reference's noise
+# 1 % of gravity. A reference that moves by more beside a sensor does not rest.
+LEAST_MOTION_MPS2 = 0.1
+SHORTEST_QUIET_S = 1.0  # a shorter pause makes no window of kind "quiet"
 
 
 Kind = Literal["motion", "rest", "quiet"]
 
 
 class Points(NamedTuple):
-    """Samples that all have a reference: times (n,), rising, V (n, 3), u and du (n, m)."""
+    """Samples of the sensor with the reference at the same times.
+
+    `time_s` (n,) rises; `V` (n, 3) in output unit; `u` (n, m) in m/s2 and its derivative `du` (n, m) in m/s3.
+    """
 
     time_s: Array
     V: Array
@@ -36,16 +41,16 @@ class Points(NamedTuple):
     du: Array
 
     def part(self, first: int, stop: int) -> Points:
-        """Samples [first, stop)."""
+        """The samples [first, stop)."""
         return Points(*(column[first:stop] for column in self))
 
 
 def motion_windows(
     pose: Pose, points: Points, limits: Limits = DEFAULT_LIMITS, *, leave_out: bool = True
 ) -> list[Window]:
-    """Windows in samples of one pose throughout, found from the reference itself; calm parts are of kind `quiet`.
+    """The windows in samples of one pose: kind "motion" where the reference moves, kind "quiet" where it hardly moves.
 
-    `leave_out` False keeps all points, knocks included (Method 3 as printed).
+    If `leave_out` is false, the sums hold all points, knocks included (Method 3 as printed).
     """
     return [
         window
@@ -55,7 +60,10 @@ def motion_windows(
 
 
 def motion_parts(u: Array, rate_hz: float) -> list[tuple[Kind, int, int]]:
-    """A reference's samples u (n, m) cut where it begins and ceases to move; short pauses at an end are left out."""
+    """Parts (kind, first, stop) of a reference's samples u (n, m), cut where it begins or stops to move.
+
+    Pauses shorter than SHORTEST_QUIET_S make no part.
+    """
     edges = [0, *itertools.chain(*detection.moving(u, rate_hz)), len(u)]
     parts: list[tuple[Kind, int, int]] = []
     for k, (first, stop) in enumerate(itertools.pairwise(edges)):
@@ -69,8 +77,10 @@ def motion_parts(u: Array, rate_hz: float) -> list[tuple[Kind, int, int]]:
 def judged(
     kind: Kind, pose: Pose, points: Points, limits: Limits = DEFAULT_LIMITS, *, leave_out: bool = True
 ) -> list[Window]:
-    """The windows, with their verdicts, of a part in which the reference moves (or is calm): cut where samples are
-    missing and where they would be longer than `limits.longest_s`."""
+    """The windows of one part (see `motion_parts`), with their verdicts.
+
+    The part is cut where samples are missing, and into windows not longer than `limits.longest_s`.
+    """
     windows = []
     for first, stop in _unbroken(points.time_s):
         longest = round(limits.longest_s * _rate(points.time_s[first:stop]))
@@ -89,18 +99,18 @@ def rest_window(
     floor: Array | None = None,
     leave_out: bool = True,
 ) -> Window:
-    """The window of all rests in samples (n,), n >= 2, of one static pose: times and V (n, 3).
+    """One window of all rests in the samples of one static pose: `time_s` (n,), `V` (n, 3), n >= 2.
 
-    Parts that move are not in it. `floor` (3,): SD that the sensor has at rest elsewhere (`rest_sd`), to tell a sensor
-    that shakes all the time from one at rest.
+    Samples during motion are left out. `floor` (3,) is the SD that the sensor has at rest in other positions
+    (`rest_sd`), in output unit: with it, a sensor that shakes all the time is not taken for one at rest.
     """
     rate_hz = _rate(time_s)
     rests = find_rests(V, rate_hz)
     if not rests:
         numbers = {"points": float(len(V)), "left_out_pct": 0.0}
         return _window("rest", pose, time_s, _rest_sums(V, rate_hz, limits), _never(numbers), 0)
-    at_rest = np.concatenate([np.arange(a, b) for a, b in rests])
-    t, v = time_s[at_rest], V[at_rest]
+    resting = np.concatenate([np.arange(a, b) for a, b in rests])
+    t, v = time_s[resting], V[resting]
     finest = detection.least_step(v)
     struck, _ = detection.knocked(v, np.ones((len(v), 1)), finest)
     clean = sums = _rest_sums(v[~struck], rate_hz, limits)
@@ -114,6 +124,14 @@ def rest_window(
     return _window("rest", pose, t, sums, judge(sums, struck, numbers, limits), left_out)
 
 
+def at_rest(points: Points) -> bool:
+    """Whether a sensor and a reference that feels gravity rest for at least half of these samples."""
+    rests = find_rests(points.V, _rate(points.time_s))
+    resting = sum(b - a for a, b in rests)
+    power = sum(float((b - a) * np.var(points.u[a:b], axis=0).sum()) for a, b in rests)
+    return 2 * resting >= len(points.V) and power <= resting * LEAST_MOTION_MPS2**2
+
+
 def still_window(pose: Pose, points: Points, limits: Limits = DEFAULT_LIMITS, *, leave_out: bool = True) -> Window:
     """The window of all rests in samples, n >= 2, of a sensor and the reference beside it.
 
@@ -124,8 +142,8 @@ def still_window(pose: Pose, points: Points, limits: Limits = DEFAULT_LIMITS, *,
         sums = _sums(*points[1:], _rate(points.time_s), limits)
         numbers = {"points": float(len(points.V)), "left_out_pct": 0.0}
         return _window("rest", pose, points.time_s, sums, _never(numbers), 0)
-    at_rest = np.concatenate([np.arange(a, b) for a, b in rests])
-    t, V, u, du = (column[at_rest] for column in points)
+    resting = np.concatenate([np.arange(a, b) for a, b in rests])
+    t, V, u, du = (column[resting] for column in points)
     struck, _ = detection.knocked(np.asfortranarray(V), np.ones((len(V), 1)), detection.least_step(V))
     kept = ~struck if leave_out else np.ones(len(V), dtype=bool)
     sums = _sums(V[kept], u[kept], du[kept], _rate(points.time_s), limits)
@@ -138,14 +156,15 @@ def still_window(pose: Pose, points: Points, limits: Limits = DEFAULT_LIMITS, *,
 
 
 def rests_anywhere(time_s: Array, V: Array, gravity_mps2: float, limits: Limits = DEFAULT_LIMITS) -> list[Window]:
-    """A window for each rest in samples (n,), in positions that nobody stated: only gravity's magnitude is known there.
+    """A window for each rest in samples of a sensor in unknown positions, for `calib.estimate.norm_fit.norm_fit`.
 
-    Their pose says gravity on z, which is not so: a norm fit does not look at it.
+    `time_s` (n,) in s, `V` (n, 3) in output unit, `gravity_mps2` the magnitude of gravity. The pose of each window has
+    gravity along z in place of its unknown direction; a norm fit does not use the pose.
     """
     rate_hz = _rate(time_s)
     windows = []
     for k, (first, stop) in enumerate(find_rests(V, rate_hz)):
-        pose = at_rest([0.0, 0.0, gravity_mps2], position=f"rest {k + 1}")
+        pose = geometry.at_rest([0.0, 0.0, gravity_mps2], position=f"rest {k + 1}")
         v = V[first:stop]
         struck, _ = detection.knocked(v, np.ones((len(v), 1)), detection.least_step(v))
         sums = _rest_sums(v[~struck], rate_hz, limits)
@@ -155,7 +174,7 @@ def rests_anywhere(time_s: Array, V: Array, gravity_mps2: float, limits: Limits 
 
 
 def rest_sd(V: Array, rate_hz: float) -> Array | None:
-    """SD (3,) of V (n, 3) within its rests, None where it never rests."""
+    """SD (3,) of V (n, 3) within a rest, the median over all rests; None if there is no rest."""
     rests = find_rests(V, rate_hz)
     return np.median([V[a:b].std(axis=0) for a, b in rests], axis=0) if rests else None
 
@@ -211,7 +230,10 @@ def _without_segments(window: Window, points: int) -> Window:
 
 
 def _motion_numbers(sums: WindowSums, basis: Array, V: Array, rate_hz: float) -> dict[str, float]:
-    """Level, noise and coherence in the band of the motion; drift of the mean. `basis` (n, 1 + 2 m) is [1, u, du]."""
+    """Statistics for the verdict: level, noise and coherence in the band of the motion, and drift of the mean.
+
+    `basis` (n, 1 + 2 m) is [1, u, du].
+    """
     m = sums.reference_channels
     u = basis[:, 1 : 1 + m]
     noise = detection.white_noise(u)
@@ -223,7 +245,7 @@ def _motion_numbers(sums: WindowSums, basis: Array, V: Array, rate_hz: float) ->
     scale = float(np.linalg.norm(solution[1 : 1 + m], 2))
     return {
         "reference_rms_mps2": float(np.sqrt(np.sum(np.var(slow[:, 1 : 1 + m], axis=0)))),
-        # Of a constant channel rounding alone is left of both; it is silent.
+        # A constant channel has only rounding errors as level and as noise: it must count as silent.
         "reference_noise_mps2": float(np.sqrt(np.sum(noise**2) / width) + 1e-12 * np.abs(u).max()),
         "coherence": 1.0 - rest / total if total > 0 else 0.0,
         "drift_mps2": _drift(sums) / scale if scale > 0 else np.inf,
@@ -235,7 +257,7 @@ def _never(numbers: Mapping[str, float]) -> Verdict:
 
 
 def _drift(sums: WindowSums) -> float:
-    """How far a segment's mean strays from what the window's own regression foretells, worst axis, output unit."""
+    """Largest difference between a segment's mean and its value by the window's own regression, in output unit."""
     m = sums.reference_channels
     part = factor(sums, derivative=True)
     solution, *_ = np.linalg.lstsq(part.r, part.rhs, rcond=1e-12)
@@ -260,7 +282,7 @@ def _rest_sums(V: Array, rate_hz: float, limits: Limits) -> WindowSums:
 
 
 def _within_sd(sums: WindowSums) -> Array:
-    """(3,) SD of V within segments."""
+    """(3,) pooled SD of V within segments, in output unit."""
     return np.asarray(np.sqrt(np.diagonal(sums.scatter[:, -3:, -3:].sum(axis=0)) / sums.count.sum()))
 
 
@@ -278,7 +300,7 @@ def _window(
 
 
 def _unbroken(time_s: Array) -> Iterator[tuple[int, int]]:
-    """Stretches without missing samples: steps beyond two and a half usual ones cut."""
+    """[first, stop) of each stretch without missing samples: a time step above 2.5 times the median ends a stretch."""
     if len(time_s) < 2:
         return
     steps = np.diff(time_s)
@@ -287,7 +309,7 @@ def _unbroken(time_s: Array) -> Iterator[tuple[int, int]]:
 
 
 def _pieces(first: int, stop: int, longest: int) -> Iterator[tuple[int, int]]:
-    """Equal pieces no longer than `longest`, none of a single sample."""
+    """[first, stop) of equal pieces of at most `longest` samples; a piece has at least two samples."""
     if stop - first > 1:
         count = min(-(-(stop - first) // max(longest, 2)), (stop - first) // 2)
         yield from itertools.pairwise(np.linspace(first, stop, count + 1).round().astype(int).tolist())

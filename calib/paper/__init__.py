@@ -1,1 +1,1 @@
-"""Methods 1 to 3 as D'Emilia et al. (2018) print them, and the statistics of their Appendix A."""
+"""Methods 1 to 3 exactly as in D'Emilia et al. (2018), and the statistics of the paper's Appendix A."""

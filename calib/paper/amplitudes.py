@@ -1,4 +1,4 @@
-"""What Methods 1 and 2 share: amplitudes of outputs over amplitude of the reference, cycle by cycle (section 2.7)."""
+"""The common part of Methods 1 and 2: for each cycle, amplitude of an output over that of the reference (Eqs. 1-4)."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from calib.paper.propagation import Contribution, Response, Statement, propagate
 from calib.paper.sine_fit import ComplexArray, acceleration, cycle_edges, four_parameter, three_parameter
 from calib.paper.statistics import Repeatability, repeatability
 
-# Without a prior a parameter counts as determined up to this u, as a part of the largest main sensitivity (contract).
+# Largest u of a determined parameter, relative to the largest main sensitivity (docs/vocabulary.md).
 DETERMINED_U = 0.1
-# A reference whose residual is above this part of its amplitude is no sine: Methods 1 and 2 do not apply. Tables of
-# this kind keep distortion below 5 %; a second line of equal size leaves 100 %.
+# If the residual of the reference is above this part of its amplitude, the reference is no sine, and Methods 1 and 2 do
+# not apply. Vibrating tables keep distortion below 5 %; a second sine of equal amplitude gives 100 %.
 NOT_A_SINE = 0.2
-# Closer than this to a quarter turn, output and reference do not tell the sign of a sensitivity.
+# If the phase between output and reference is closer than this to 90 deg, the sign of the sensitivity is not known.
 NEAREST_QUADRATURE_RAD = np.deg2rad(30)
-LEAST_CYCLES = 2  # one value a cycle: no SD from fewer
+LEAST_CYCLES = 2  # each cycle gives one value, and an SD needs two
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Run:
-    """One run at one frequency in one position: n samples of reference and sensor at the same instants.
+    """One run at one frequency in one position: n samples of reference and sensor at the same times `time_s` (n,).
 
-    `reference` (n,) in m/s2, or in m/s where `quantity` is velocity; `indications` (n, 3) in output unit. `pose` is
-    uniaxial. Runs whose poses have the same position are repetitions.
+    `reference` (n,) is in m/s2, or in m/s if `quantity` is "velocity"; `indications` (n, 3) are in output unit. `pose`
+    is that of a uniaxial reference. Runs whose poses have the same position are repetitions.
     """
 
     time_s: Array
@@ -42,9 +42,9 @@ class Run:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ratios:
-    """Output over reference acceleration of one run: `ratio` (K, 3) complex, one row a cycle, output unit per m/s2.
+    """Output over reference acceleration of one run: `ratio` (K, 3) complex, one row per cycle, output unit per m/s2.
 
-    `u_frequency_hz` is 0 where the reference measures acceleration: its amplitude then does not depend on frequency.
+    `u_frequency_hz` is 0 if the reference measures acceleration, because Eq. (12) is then not needed.
     """
 
     pose: Pose
@@ -57,9 +57,10 @@ class Ratios:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reading:
-    """S_ij as one run gives it: a value a cycle (K,), signed by its phase; `magnitude` without the sign (Eqs. 1-4).
+    """S_ij from one run: `values` (K,), one per cycle, with the sign of the phase; `magnitude` without sign (Eqs. 1-4).
 
-    `phase_rad` of output i behind (negative) or ahead of the reference along direction j, the sign taken out.
+    `i` is the output, `j` the direction, `run` the number of the run. `phase_rad` is the phase of output i relative to
+    the reference along direction j: negative if the output is behind. A reversed sign (180 deg) is removed from it.
     """
 
     i: int
@@ -72,9 +73,10 @@ class Reading:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AmplitudeCalibration:
-    """Result of Method 1 or 2. Q is not seen by amplitudes: NaN.
+    """Result of Method 1 or 2. Q is NaN, because amplitudes do not depend on it.
 
-    `magnitude`, `phase_rad` (3, 3) NaN where not had. `reasons`: why it is refused, empty if it is not.
+    `magnitude`, `phase_rad` (3, 3) are NaN for elements that no run gives. `reasons` says why the result is refused;
+    empty if it is accepted.
     """
 
     calibration: Calibration
@@ -89,7 +91,7 @@ class AmplitudeCalibration:
 
     @property
     def repeatability(self) -> dict[tuple[int, int], list[Repeatability]]:
-        """Appendix A: {(i, j): one entry a run} of S_ij's values by cycle."""
+        """Statistics of the values of S_ij by cycle (Table A1): {(i, j): one entry per run}."""
         found: dict[tuple[int, int], list[Repeatability]] = {}
         for reading in self.readings:
             found.setdefault((reading.i, reading.j), []).append(repeatability(reading.values))
@@ -97,9 +99,10 @@ class AmplitudeCalibration:
 
 
 def ratios(run: Run) -> Ratios:
-    """Ratios of a run, its frequency found from the reference (four parameters), amplitudes by cycle (three).
+    """The ratios of a run: frequency by a four-parameter fit of the reference, amplitudes by three-parameter fits of
+    each cycle.
 
-    Raises ValueError where the reference carries no sine or fewer than two whole cycles, naming the position.
+    Raises ValueError, with the position, if the reference has no sine or fewer than two whole cycles.
     """
     try:
         whole = four_parameter(run.time_s, run.reference)
@@ -107,7 +110,9 @@ def ratios(run: Run) -> Ratios:
     except ValueError as error:
         raise ValueError(f"position {run.pose.position}: {error}") from None
     if len(edges) <= LEAST_CYCLES:
-        raise ValueError(f"position {run.pose.position}: {len(edges) - 1} whole cycle, {LEAST_CYCLES} are needed")
+        raise ValueError(
+            f"position {run.pose.position}: {len(edges) - 1} whole cycle, {LEAST_CYCLES} are needed; record longer"
+        )
     signals = np.column_stack([run.reference, run.indications])
     phasors = np.array(
         [
@@ -129,7 +134,7 @@ def ratios(run: Run) -> Ratios:
 
 
 def read(ratio: Ratios, run: int, i: int, j: int, phase_of: int) -> Reading:
-    """S_ij of a run: V_i over a_ref d_j. `phase_of` is the output whose phase counts as none (the main one)."""
+    """S_ij of a run: V_i / (a_ref d_j) (Eqs. 2-4). Phases are relative to the main output `phase_of`."""
     values = ratio.ratio[:, i] / ratio.pose.direction[j, 0]
     main = (ratio.ratio[:, phase_of] / ratio.pose.direction[phase_of, 0]).mean()
     lag = np.angle(main * np.sign(main.real or 1.0))
@@ -148,7 +153,10 @@ def combine(
     priors: Priors,
     unseen: Mapping[str, Contribution] | None = None,
 ) -> AmplitudeCalibration:
-    """Mean over cycles and repetitions, type A from both, type B by propagation; `unseen` adds contributions."""
+    """The result: means over cycles and repetitions, type A uncertainty from both, type B by propagation.
+
+    `found` are the ratios of all runs, `readings` the values of S_ij; `unseen` adds contributions of type B.
+    """
     S, u_a, freedom = (np.full((3, 3), np.nan) for _ in range(3))
     magnitude, phase = np.full((3, 3), np.nan), np.full((3, 3), np.nan)
     for i, j in sorted({(r.i, r.j) for r in readings}):
@@ -180,9 +188,9 @@ def combine(
 
 
 def _type_a(runs: Sequence[tuple[str, Array]]) -> tuple[float, float]:
-    """u of the mean of all runs and its degrees of freedom: by scatter of cycles or of repetitions, the larger.
+    """u of the mean of all runs and its degrees of freedom: from cycles or from repetitions, whichever is larger.
 
-    `runs`: position and values by cycle. What differs between positions is no repetition; the budget has it.
+    `runs`: position and values by cycle. Differences between positions are no repetitions; the budget contains them.
     """
     cycles = sum(len(values) for _, values in runs)
     within = sum(float(((v - v.mean()) ** 2).sum()) for _, v in runs) / (cycles - len(runs)) / cycles
@@ -198,7 +206,7 @@ def _type_a(runs: Sequence[tuple[str, Array]]) -> tuple[float, float]:
 
 
 def _response(S: Array, found: Sequence[Ratios], readings: Sequence[Reading]) -> Response:
-    """What the readings would say of a sensor with sensitivity S where the true inputs are moved."""
+    """The function that gives the readings of a sensor with sensitivity S for changed true inputs."""
     _, pose_of = _positions(found)
     omega = 2 * np.pi * float(np.mean([r.frequency_hz for r in found]))
 
@@ -215,14 +223,14 @@ def _response(S: Array, found: Sequence[Ratios], readings: Sequence[Reading]) ->
 
 
 def _positions(found: Sequence[Ratios]) -> tuple[list[Pose], list[int]]:
-    """Distinct poses by position, and which of them each run has: repetitions share their angle errors."""
+    """The different poses by position, and the number of the pose of each run; repetitions share their angle errors."""
     names = list(dict.fromkeys(r.pose.position for r in found))
     first = {r.pose.position: r.pose for r in reversed(found)}
     return [first[name] for name in names], [names.index(r.pose.position) for r in found]
 
 
 def _filled(S: Array) -> Array:
-    """S with what is not known replaced: no transverse sensitivity, the mean main one."""
+    """S with unknown elements replaced: transverse sensitivities by 0, main ones by the mean main sensitivity."""
     filled = np.where(np.isnan(S), 0.0, S)
     unknown = np.flatnonzero(np.isnan(np.diag(S)))
     filled[unknown, unknown] = np.nanmean(np.diag(S))
@@ -237,7 +245,7 @@ def _padded(S: Array) -> Array:
 def _reasons(found: Sequence[Ratios], readings: Sequence[Reading]) -> list[str]:
     reasons = [
         f"position {r.pose.position}: the reference is no sine, its residual is {100 * r.distortion:.3g} % of the "
-        f"amplitude at {r.frequency_hz:.4g} Hz (limit {100 * NOT_A_SINE:g} %)"
+        f"amplitude at {r.frequency_hz:.4g} Hz (limit {100 * NOT_A_SINE:g} %); use Method 3"
         for r in found
         if r.distortion > NOT_A_SINE
     ]
@@ -245,7 +253,7 @@ def _reasons(found: Sequence[Ratios], readings: Sequence[Reading]) -> list[str]:
         if r.i == r.j and abs(r.phase_rad) > np.pi / 2 - NEAREST_QUADRATURE_RAD:
             axis, phase = "xyz"[r.i], np.rad2deg(r.phase_rad)
             reasons.append(
-                f"position {found[r.run].pose.position}: output {axis} is {phase:.3g} deg from the reference, its sign "
-                "cannot be told"
+                f"position {found[r.run].pose.position}: the phase of output {axis} is {phase:.3g} deg from the "
+                f"reference, its sign cannot be told (limit {np.rad2deg(np.pi / 2 - NEAREST_QUADRATURE_RAD):.0f} deg)"
             )
     return reasons

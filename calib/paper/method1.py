@@ -10,17 +10,17 @@ from calib.estimate.nuisances import Priors
 from calib.model import Pose
 from calib.paper.amplitudes import AmplitudeCalibration, Run, combine, ratios, read
 
-ON_AXIS = 1 - 1e-6  # cos of 0.08 deg, below what any mounting is known to: a stated direction that close is the axis
+ON_AXIS = 1 - 1e-6  # cosine of 0.08 deg, smaller than the uncertainty of any mounting
 
 
 def solve(runs: Sequence[Run], priors: Priors | None = None) -> AmplitudeCalibration:
-    """A column of S for each axis that was along the motion, the mean over its runs and their cycles.
+    """A column of S for each axis that was along the motion: the mean over its runs and their cycles.
 
-    Eq. (2) main, S_jj = V_j / a_j; Eqs. (1), (3), (4) transverse, S_ij = V_i / a_j, signed by its phase against the
-    main output (in phase: positive), its part in quadrature left out of S but not out of `magnitude`. S in output unit
-    per m/s2. Columns that no run excited are NaN. Budget: reference, frequency, mounting (`angle` by position and
-    `alpha_common`: first order in the transverse sensitivities, second in the main ones), motion across the axis.
-    Raises ValueError where a pose has no axis along the motion or a run carries no sine.
+    Main sensitivities by Eq. (2), S_jj = V_j / a_j; transverse ones by Eqs. (1), (3) and (4), S_ij = V_i / a_j. Their
+    sign is positive if output i is in phase with the main output; the part in quadrature counts in `magnitude` only. S
+    is in output unit per m/s2; columns that no run excited are NaN. The budget has the reference, the frequency, the
+    mounting (`angle` by position and `alpha_common`: first order in the transverse sensitivities, second order in the
+    main ones) and transverse motion. Raises ValueError if a pose has no axis along the motion or a run has no sine.
     """
     if not runs:
         raise ValueError("Method 1 needs at least one run")
@@ -33,7 +33,7 @@ def solve(runs: Sequence[Run], priors: Priors | None = None) -> AmplitudeCalibra
 
 
 def excited_axis(pose: Pose) -> int:
-    """0, 1 or 2: the sensor's axis along the motion, either way round. Raises ValueError where none is."""
+    """The sensor's axis along the motion, in either sense: 0, 1 or 2. Raises ValueError if there is none."""
     if pose.direction.shape != (3, 1):
         raise ValueError(f"position {pose.position}: Method 1 needs a uniaxial reference")
     axis = int(np.argmax(np.abs(pose.direction)))

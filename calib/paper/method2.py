@@ -12,7 +12,8 @@ from calib.paper.amplitudes import AmplitudeCalibration, Ratios, Run, combine, r
 from calib.paper.propagation import Contribution
 from calib.paper.statistics import AXES, TRANSVERSE_LIMIT_PCT
 
-# Along an axis with less of the motion than this, a transverse sensitivity counts five times: no main sensitivity then.
+# Least component of the motion along an axis. With a smaller one, a transverse sensitivity would change the main
+# sensitivity of this axis by five times its own value or more.
 LEAST_SHARE = 0.2
 
 
@@ -21,11 +22,12 @@ def solve(
 ) -> AmplitudeCalibration:
     """S_xx, S_yy, S_zz in output unit per m/s2: Eq. (2) with the reference accelerations of Eqs. (5)-(7).
 
-    S_ii = V_i / (a_ref d_i), d the pose's direction, the mean over runs and their cycles; axes with less than
-    `LEAST_SHARE` of the motion in a run are not taken from it. Transverse sensitivities are not seen: each is taken to
-    lie anywhere within +- `transverse_limit_pct` of the main one of its row (what the paper has verified by Method 1,
-    see `calib.paper.statistics.transverse_excess`), and is in the uncertainty with that. Of the mean of two alphas,
-    45 and 135 deg, only S_xz and S_zx are left. Raises ValueError where a run carries no sine or no axis is excited.
+    S_ii = V_i / (a_ref d_i), where d is the direction of the pose; the mean over runs and their cycles. A run gives no
+    value for an axis with less than `LEAST_SHARE` of the motion. Method 2 cannot measure transverse sensitivities. Each
+    of them is assumed to lie within +- `transverse_limit_pct` of the main sensitivity of its row (rectangular
+    distribution) and contributes to the uncertainty; Method 1 verifies this assumption (section 2.2, see
+    `calib.paper.statistics.transverse_excess`). With the mean of alpha = 45 and 135 deg, only S_xz and S_zx contribute.
+    Raises ValueError if a run has no sine or no axis is excited.
     """
     if not runs:
         raise ValueError("Method 2 needs at least one run")
@@ -45,9 +47,10 @@ def solve(
 
 
 def unseen_transverse(main: Array, found: Sequence[Ratios], limit_pct: float) -> dict[str, Contribution]:
-    """What transverse sensitivities at one standard uncertainty, limit / sqrt(3), put into the main ones.
+    """Contributions of the transverse sensitivities to the uncertainty of the main ones.
 
-    `main` (3,). S_ij enters S_ii by the mean of d_j / d_i over the runs that S_ii comes from.
+    The standard uncertainty of each is limit / sqrt(3) (rectangular, GUM 4.3.7). `main` (3,) are the main
+    sensitivities. S_ij changes S_ii by the mean of d_j / d_i over the runs that give S_ii.
     """
     directions = np.array([ratio.pose.direction[:, 0] for ratio in found])
     contributions = {}

@@ -1,4 +1,4 @@
-"""Method 3 as printed (section 2.3): linear least squares of Eq. (8) over all points of the windows, by their sums."""
+"""Method 3 as in the paper (section 2.3): linear least squares of Eq. (8) over all points, from the windows' sums."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from numpy.typing import NDArray
 from calib.excitation.sums import factor
 from calib.model import PARAMETERS, Array, Calibration, Pose, Window
 
-# Below this part of the largest singular value (columns scaled to one) a direction was not excited: positions 0/1/2 deg
-# stand at 3e-6, what rounding alone leaves of an unseen direction at 1e-15.
+# Least singular value of an excited direction, relative to the largest (columns scaled to one). It is 3e-6 for clamp
+# positions of 0, 1 and 2 deg; rounding errors alone give 1e-15.
 RANK_TOLERANCE = 1e-10
-PLAIN = "3 (plain)"  # what a calibration says of its method
-# Without a prior a parameter counts as determined up to this u, as a part of the largest main sensitivity (contract).
+PLAIN = "3 (plain)"  # the method's name in a calibration
+# Largest u of a determined parameter, relative to the largest main sensitivity (docs/vocabulary.md).
 DETERMINED_U = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """A plain Method 3 solution with what its refusal needs.
+    """A solution of plain Method 3 and the numbers that decide whether it is refused.
 
-    `residual_sd` (3,) in output units; `rank` of the points on (a_x, a_y, a_z, 1), 4 where all 12 parameters can
-    be had; `condition` of the same with its columns scaled to one; `points` used.
+    `residual_sd` (3,) in output unit; `rank` of the matrix of all (a_x, a_y, a_z, 1): 4 if all 12 parameters can be
+    determined; `condition` of the same matrix with its columns scaled to one; `points` used.
     """
 
     calibration: Calibration
@@ -40,12 +40,12 @@ def solve(windows: Sequence[Window]) -> Calibration:
 
 
 def fit(windows: Sequence[Window]) -> Fit:
-    """Least squares over all points of the used windows, one of `np.linalg.lstsq` on the points to 1e-10.
+    """Least squares of Eq. (8) over all points of the used windows; agrees with `np.linalg.lstsq` to 1e-10.
 
-    The covariance is type A for white residuals: residual covariance of the outputs (x) (A'A)^-1. A window whose
-    gravity is not known gives its motion only. Parameters that the points do not determine are NaN, in S, Q and
-    covariance; so are all where no point is left over to measure the residual.
-    Raises ValueError where no window is used.
+    The covariance is type A for white residuals: the Kronecker product of the residual covariance of the outputs and
+    (A'A)^-1. If the gravity of a window is not known, only its motion is used. Parameters that the points do not
+    determine are NaN in S, Q and the covariance; all are NaN if there are no more points than unknowns. Raises
+    ValueError if no window is used.
     """
     used = [w for w in windows if w.used]
     if not used:
@@ -61,7 +61,7 @@ def fit(windows: Sequence[Window]) -> Fit:
     rest = rhs - design @ solution
     dof = free - rank
     residual = (scatter + rest.T @ rest) / dof if dof > 0 else np.full((3, 3), np.nan)
-    np.fill_diagonal(residual, np.maximum(np.diag(residual), 0.0))  # of exact data rounding may leave less than nothing
+    np.fill_diagonal(residual, np.maximum(np.diag(residual), 0.0))  # rounding may make it negative for exact data
     spread = whitened @ whitened.T
     seen = _seen(right[kept])
     calibration = _calibration(solution, residual, spread, seen, float(dof))
@@ -70,19 +70,24 @@ def fit(windows: Sequence[Window]) -> Fit:
 
 
 def refusal(found: Fit, windows: Sequence[Window]) -> list[str]:
-    """Why the points cannot be used, empty where they can: nothing determined, or a clamp's positions that leave a
-    direction unseen (with one theta any two alphas do, section 2.3)."""
+    """The reasons why a solution is refused; empty if it is accepted.
+
+    Either no parameter is determined, or the positions of the clamp leave a direction without excitation, as any two
+    alphas with one theta do (section 2.3 requires four different input vectors).
+    """
     if not found.calibration.determined.any():
-        return [f"rank {found.rank} of 4: no parameter is determined by these windows"]
+        return [f"rank {found.rank} of 4: these windows determine no parameter; add positions or motion"]
     if found.rank < 4 and any(w.used and w.pose.alpha_rad is not None for w in windows):
         return [
-            f"rank {found.rank} of 4: the clamp's positions leave a direction unseen; three alphas or more are needed"
+            f"rank {found.rank} of 4: the clamp positions leave a direction without excitation; measure with at least "
+            "three different alphas"
         ]
     return []
 
 
 def _stack(windows: Sequence[Window]) -> tuple[Array, Array, Array, int, int]:
-    """Rows R_w M_w of all windows, their right-hand sides, the scatter within windows, points, and rows that count."""
+    """Stacked least-squares rows of all windows, their right-hand sides, the residual scatter (3, 3) within windows,
+    the number of points, and the number of points less the means that are not used."""
     rows, rhs, scatter, points, free = [], [], np.zeros((3, 3)), 0, 0
     for window in windows:
         part = factor(window.sums)
@@ -103,12 +108,12 @@ def _to_parameters(pose: Pose) -> Array:
 
 
 def _seen(rows: Array) -> NDArray[np.bool_]:
-    """(4,) which of (a_x, a_y, a_z, 1) lie wholly in the row space; the others are free along the null space."""
+    """(4,) flags of the columns of (a_x, a_y, a_z, 1) that lie in the row space, so that they are determined."""
     return np.asarray(np.einsum("ij,ij->j", rows, rows) > 1.0 - 1e-9)
 
 
 def _calibration(solution: Array, residual: Array, spread: Array, seen: NDArray[np.bool_], dof: float) -> Calibration:
-    """Arrange (4, 3) coefficients and their covariance in the order of PARAMETERS; NaN what is not determined."""
+    """The coefficients (4, 3) and their covariance in the order of PARAMETERS; NaN if not determined."""
     order = [(i, j) for i in range(3) for j in range(3)] + [(i, 3) for i in range(3)]
     output, column = np.array(order).T
     covariance = residual[np.ix_(output, output)] * spread[np.ix_(column, column)]

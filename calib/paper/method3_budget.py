@@ -1,7 +1,7 @@
-"""Uncertainty of plain Method 3 by GUM: what the nuisances do to a least-squares solution that does not know of them.
+"""Uncertainty of plain Method 3 by the GUM: the effect of each nuisance on a least-squares solution without nuisances.
 
-The adjustment (calib.estimate) estimates the nuisances and is more certain; this is the budget of the method as the
-paper has it.
+The adjustment (calib.estimate) estimates the nuisances and has smaller uncertainties. This is the budget of the method
+as it is in the paper.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from calib.paper.propagation import Contribution, Statement, propagate
 def statement(fit: Fit, windows: Sequence[Window], priors: Priors) -> Statement:
     """Contributions of all nuisances to `fit`, the plain solution of the used windows; type A for white residuals.
 
-    Raises ValueError where the windows do not determine all of S: nothing says then what a missing direction would do.
+    Raises ValueError if the windows do not determine all of S, because the effect of an unknown element is not known.
     """
     used = [w for w in windows if w.used]
     model = _Model(fit, used)
@@ -34,7 +34,7 @@ def statement(fit: Fit, windows: Sequence[Window], priors: Priors) -> Statement:
 
 
 class _Model:
-    """The least-squares problem of the windows, and the indications that moved inputs would give."""
+    """The least-squares problem of the windows, and the indications that changed inputs would cause."""
 
     def __init__(self, fit: Fit, windows: Sequence[Window]) -> None:
         S = fit.calibration.sensitivity
@@ -62,7 +62,7 @@ class _Model:
         )
 
     def solution(self, inputs: Inputs, offset: Array) -> Array:
-        """(12,) of the plain method where the true inputs are these and windows have an `offset` (W, 3) in m/s2."""
+        """(12,) result of plain Method 3 for the true `inputs` and an `offset` (W, 3) of each window in m/s2."""
         direction, gravity = inputs.direction[self.pose_of], inputs.gravity[self.pose_of]
         rows = self._rows(direction, gravity)
         passed = self._in_phase(inputs)  # (W, 3)
@@ -76,21 +76,21 @@ class _Model:
         return np.asarray(np.append(x[:3].T.ravel(), x[3]) * self._given)
 
     def _rows(self, direction: Array, gravity: Array) -> Array:
-        """Least-squares rows on (a_x, a_y, a_z, 1): the windows' means, then their motion."""
+        """Least-squares rows on (a_x, a_y, a_z, 1): first the means of the windows, then their motion."""
         steady = np.einsum("wkm,wm->wk", direction, self._mean_u) + np.nan_to_num(gravity)
         means = np.column_stack([steady, np.ones(len(steady))]) * (self._root_count * self._known)[:, None]
         moving = np.einsum("wrm,wkm->wrk", self._root_u, direction).reshape(-1, 3)
         return np.vstack([means, np.column_stack([moving, np.zeros(len(moving))])])
 
     def _in_phase(self, inputs: Inputs) -> Array:
-        """(W, 3) the part of the indications in phase with the reference: all that a point-by-point fit sees."""
+        """(W, 3) the part of the indications in phase with the reference; Method 3 uses only this part."""
         omega = self._omega[:, None]
         sensor, reference = (1 - 1j * c / omega for c in (inputs.sensor_corner, inputs.reference_corner))
         return np.asarray((np.exp(-1j * omega * inputs.lag_s) * reference / sensor).real)
 
 
 def _offsets_between_windows(model: _Model, u_mps2: float) -> dict[str, Contribution]:
-    """A new offset in each window and axis, independent."""
+    """Contributions of an independent offset of each window and axis, with the standard uncertainty `u_mps2`."""
     if u_mps2 == 0.0:
         return {}
     still = Nuisances(model.poses, model.windows[0].sums.reference_channels, Priors.none(), Applied()).at(np.zeros(0))

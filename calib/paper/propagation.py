@@ -1,7 +1,8 @@
-"""GUM propagation for methods that solve nothing for their nuisances: what each one would do to the result.
+"""GUM propagation for methods that do not estimate their nuisances: the effect of each nuisance on the result.
 
-A method is described by its response: what it would give on a sensor of known S and Q where the inputs are moved by a
-nuisance and the method does not know. The nuisances and their priors are those of the adjustment (calib.estimate).
+A method is described by its response: the result that it gives for a sensor with known S and Q if a nuisance changes
+the inputs and the method does not know of it. The nuisances and their priors are those of the adjustment
+(calib.estimate).
 """
 
 from __future__ import annotations
@@ -16,12 +17,12 @@ from calib.estimate.nuisances import Inputs, Nuisances
 from calib.model import Array
 
 Response = Callable[[Inputs, Array], Array]
-"""(inputs, offset (P, 3) in m/s2) -> (12,) as calib.model.PARAMETERS, NaN what the method does not give."""
+"""(inputs, offset (P, 3) in m/s2) -> (12,) as calib.model.PARAMETERS; NaN for parameters the method does not give."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contribution:
-    """What one standard uncertainty of a nuisance does to the 12 parameters, signed, in their units."""
+    """Change (12,) of the parameters, in their units, if a nuisance changes by its standard uncertainty."""
 
     source: str
     change: Array
@@ -29,9 +30,9 @@ class Contribution:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Statement:
-    """The uncertainty of one method's result: type B contributions by nuisance, and the type A part.
+    """The uncertainty of the result of one method: type B contributions by nuisance, and the type A part.
 
-    `u_type_a` and `freedom_type_a` (12,). NaN marks parameters that the method does not give.
+    `u_type_a` (12,) and its degrees of freedom `freedom_type_a` (12,); NaN for parameters the method does not give.
     """
 
     contributions: Mapping[str, Contribution]
@@ -40,12 +41,12 @@ class Statement:
 
     @property
     def covariance(self) -> Array:
-        """(12, 12) combined."""
+        """(12, 12) covariance of all sources together."""
         return joint_covariance([self])
 
     @property
     def by_source(self) -> dict[str, Array]:
-        """{source: (12,) standard uncertainty}, type A included; their squares add up to the combined one's."""
+        """{source: (12,) standard uncertainty}, with type A; the squares add up to that of the combined uncertainty."""
         squares = {"type A": self.u_type_a**2}
         for contribution in self.contributions.values():
             squares[contribution.source] = squares.get(contribution.source, 0.0) + contribution.change**2
@@ -53,7 +54,8 @@ class Statement:
 
     @property
     def coverage_factor(self) -> float:
-        """k for 95.45 %, by the parameter with the fewest effective degrees of freedom (Welch-Satterthwaite)."""
+        """k for 95.45 %, for the parameter with the fewest effective degrees of freedom (Welch-Satterthwaite, GUM
+        G.2b)."""
         with np.errstate(divide="ignore", invalid="ignore"):
             effective = np.diag(self.covariance) ** 2 / (self.u_type_a**4 / self.freedom_type_a)
         return coverage_factor(float(np.nanmin(effective, initial=np.inf)))
@@ -64,7 +66,7 @@ def propagate(response: Response, nuisances: Nuisances) -> dict[str, Contributio
 
     The second order is a contribution of its own: for a normal nuisance z of variance u2 the term f'' z2 / 2 has mean
     f'' u2 / 2, which the methods do not correct, and SD f'' u2 / sqrt(2) (GUM 5.1.2, note): together sqrt(3)/2 f'' u2.
-    It is all there is where a direction is met squarely, as in Method 1.
+    The first order is 0 for main sensitivities if an axis is exactly along the motion, as in Method 1.
     """
     none = np.zeros(len(nuisances))
     before = response(nuisances.at(none), _offset(nuisances, none))
@@ -77,9 +79,9 @@ def propagate(response: Response, nuisances: Nuisances) -> dict[str, Contributio
 
 
 def joint_covariance(statements: Sequence[Statement]) -> Array:
-    """(12 M, 12 M) covariance of the results of M methods: of their differences, what they share cancels.
+    """(12 M, 12 M) joint covariance of the results of M methods; common errors cancel in their differences.
 
-    Nuisances of one name are one quantity (one reference, one clamp, one mounting: names carry the position).
+    Nuisances with the same name are one quantity (one reference, one clamp, one mounting); the name has the position.
     """
     none = np.zeros(12)
     names = list(dict.fromkeys(name for s in statements for name in s.contributions))

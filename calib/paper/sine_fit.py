@@ -1,9 +1,9 @@
-"""Sine approximation of ISO 16063 (three and four parameters): amplitude and phase where an FFT line would leak.
+"""Sine approximation of ISO 16063 (three and four parameters): amplitude and phase without the leakage of an FFT.
 
     y(t) = Re(phasor exp(j 2 pi f (t - origin))) + constant
 
-The phase belongs to `origin_s`, the mean of the record's times: there it is known best and does not depend on what is
-known of the frequency.
+The phase is that at `origin_s`, the mean of the times: there its uncertainty is smallest, and independent of the
+uncertainty of the frequency.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from calib.model import Array
 
 ComplexArray = NDArray[np.complex128]
 
-# Frequencies tried about the highest FFT line, in lines: at one cycle the line is off by up to one (constant and
-# negative frequency leak into it); from an eighth of a line away Gauss-Newton finds the bottom.
+# Frequencies tried near the highest FFT line, in lines. With one cycle in the record that line is off by up to one line
+# (the constant and the negative frequency leak into it). Gauss-Newton converges from an eighth of a line away.
 SCAN_LINES = np.arange(-4, 5) / 4
-LEAST_LINES = 0.3  # below a third of a cycle a sine is a parabola, its amplitude is anybody's guess
+LEAST_LINES = 0.3  # less than a third of a cycle looks like a parabola, and its amplitude cannot be estimated
 MAX_STEPS = 50
 LONGEST_STEP_LINES = 0.25
-CONVERGED_RAD = 1e-9  # change of the phase over the record, far below what any noise leaves
-# Six cycles of 3 Hz as six times 333 samples at 1 kHz (Figure 2) lack 2 ms, 0.6 % of a cycle; they are six.
+CONVERGED_RAD = 1e-9  # change of the phase over the record, far below any noise
+# Six cycles of 3 Hz as six times 333 samples at 1 kHz (Fig. 2) are 2 ms too short, 0.6 % of a cycle: they count as six.
 CYCLE_TOLERANCE = 0.01
 
 
@@ -79,10 +79,10 @@ def three_parameter(time_s: ArrayLike, signals: ArrayLike, frequency_hz: float) 
 
 
 def four_parameter(time_s: ArrayLike, signal: ArrayLike, frequency_hz: float | None = None) -> SineFit:
-    """The same with the frequency unknown, of one signal (n,), by Gauss-Newton (IEEE 1057, ISO 16063-41).
+    """Frequency, amplitude, phase and constant of one `signal` (n,) by Gauss-Newton (IEEE 1057, ISO 16063-41).
 
-    Begins at `frequency_hz`, or, where that is None, at the best of the frequencies about the highest FFT line.
-    Raises ValueError as `three_parameter` does, and where no sine of one frequency is found.
+    The iteration starts at `frequency_hz`; if that is None, at the best frequency near the highest FFT line. Raises
+    ValueError as `three_parameter` does, and if no sine of one frequency is found.
     """
     t, y = _checked(time_s, signal)
     if y.shape[1] != 1:
@@ -109,7 +109,7 @@ def four_parameter(time_s: ArrayLike, signal: ArrayLike, frequency_hz: float | N
 
 
 def acceleration(velocity: ArrayLike, frequency_hz: float) -> ComplexArray:
-    """Phasor of the acceleration from that of the velocity: Eq. (12), and 90 deg ahead of it."""
+    """Phasor of the acceleration from that of the velocity: its amplitude by Eq. (12), its phase 90 deg ahead."""
     return np.asarray(2j * np.pi * frequency_hz * np.asarray(velocity), dtype=np.complex128)
 
 
@@ -158,7 +158,7 @@ def _least_squares(design: Array, y: Array) -> tuple[Array, Array, Array]:
 
 
 def _coarse(tau: Array, y: Array, line_hz: float) -> float:
-    """The frequency about the highest line of the spectrum whose sine leaves least."""
+    """The frequency near the highest line of the spectrum whose sine has the smallest residual."""
     spectrum = np.abs(np.fft.rfft(y[:, 0] - y.mean()))
     if not spectrum.any():
         raise ValueError("the signal does not move")

@@ -49,9 +49,9 @@ def d_rel_pct(s_m: ArrayLike, s_n: ArrayLike) -> Array:
 
 
 def d_rel_32_pct(d_31_pct: ArrayLike, d_21_pct: ArrayLike) -> Array:
-    """d_rel of methods 3 and 2 that follows from the two others, exactly: tables can be checked against themselves.
+    """d_rel of methods 3 and 2, which follows exactly from d_rel of 3 and 1 and of 2 and 1: it checks a table.
 
-    With x = d / 200, S_M / S_1 = (1 + x) / (1 - x), so the x compose as velocities do.
+    With x = d_rel / 200, S_M / S_1 = (1 + x) / (1 - x), so x_32 = (x_31 - x_21) / (1 - x_31 x_21).
     """
     x31, x21 = np.asarray(d_31_pct, dtype=float) / 200, np.asarray(d_21_pct, dtype=float) / 200
     return np.asarray(200 * (x31 - x21) / (1 - x31 * x21))
@@ -72,10 +72,10 @@ def rel_s_pct(sensitivity: ArrayLike) -> Array:
 
 
 def transverse_excess(sensitivity: ArrayLike, limit_pct: float = TRANSVERSE_LIMIT_PCT) -> dict[str, float]:
-    """The periodic verification of Method 2 (section 2.2): {rel_S's name: its value in %} of those beyond the limit.
+    """The periodic verification for Method 2 (section 2.2): {name of rel_S: its value in %} of those above the limit.
 
-    `sensitivity` (3, 3) from Method 1 or 3. A transverse sensitivity that is not known (NaN) is beyond it as well:
-    nothing verified it.
+    `sensitivity` (3, 3) is from Method 1 or 3. A transverse sensitivity that is not known (NaN) counts as above the
+    limit, because it is not verified.
     """
     relative = rel_s_pct(sensitivity)
     return {

@@ -1,1 +1,1 @@
-"""Sample times, resampling, bands and filters."""
+"""Times of samples, resampling, frequency bands and filters."""

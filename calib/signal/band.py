@@ -1,8 +1,8 @@
-"""The band in which a reference moves more than it is noisy, and a low-pass filter for sensor and reference alike.
+"""The frequency band in which the reference's motion exceeds its noise, and one low-pass filter for both signals.
 
-At the level of a structure's own motion a reference's noise, differentiated, hides the coefficient on du/dt and with it
-the lag. Outside the band of the motion there is nothing to be had but noise, so both signals are limited to it alike:
-V = S a + Q stays true, whatever the filter.
+When a structure moves weakly, the derivative of the reference's noise masks the coefficient on du/dt, and with it the
+lag. Outside the band of the motion the signals contain only noise. Sensor and reference are therefore filtered to that
+band by the same filter: V = S a + Q holds for the filtered signals as well, whatever the filter is.
 """
 
 from __future__ import annotations
@@ -14,31 +14,33 @@ import numpy as np
 
 from calib.model import Array
 
-SEGMENT_S = 4.0  # of a spectrum: lines 0.25 Hz apart, and still many segments in some minutes
-LEAST_SEGMENTS = 8  # of each kind, else the spectra are known too poorly to choose by
-SIGNIFICANT = 6.0  # standard deviations of a smoothed line, of a hundred of them
-SMOOTHED = 5  # lines
-MARGIN = 1.25  # the filter passes all of the band and a quarter more
-FEWEST_LINES = 64
+SEGMENT_S = 4.0  # length of a segment of a spectrum: lines 0.25 Hz apart, and many segments in a few minutes
+LEAST_SEGMENTS = 8  # fewer segments give spectra that are too uncertain to choose a band
+SIGNIFICANT = 6.0  # standard deviations by which a smoothed line must exceed the noise to count as motion
+SMOOTHED = 5  # spectral lines in a moving average
+MARGIN = 1.25  # the band ends a quarter above the highest line that holds motion
+FEWEST_LINES = 64  # samples in a segment
 TINY = 1e-300
-SHORT_HOLE = 2  # samples; a straight line over them leaves 3 % of a motion at a twelfth of the rate
-WIDEST = 0.35  # of the sampling rate: beyond, a filter has nothing left to take away
+# Samples. A straight line across such a gap has an error of 3 % of a motion at a twelfth of the sampling rate.
+SHORT_HOLE = 2
+WIDEST = 0.35  # of the sampling rate: above this a filter would remove hardly any noise
 STOP_BAND_DB = 66.0
 STOP_BAND = 1.5  # times the band that the filter passes
 
 
 def band_above_noise(x: Array, rate_hz: float) -> tuple[float | None, Array]:
-    """Upper end in Hz of where x (n, m) has more power than the white noise in it, and that noise (m,) per root Hz.
+    """Upper end (Hz) of the band in which x (n, m) has more power than its white noise, and that noise (m,).
 
-    Motion must leave more than half of the spectrum free. None where it does not, where nothing stands out, or where
-    too little is known; the noise is zero then. NaN where samples are missing.
+    Rows of x with missing samples are NaN. The noise is an amplitude density in the unit of x per root Hz. The motion
+    must occupy less than half of the spectrum. The band is None, and the noise zero, if the motion is wider than that,
+    if no line exceeds the noise, or if x is too short.
     """
     m = x.shape[1]
     size = min(int(SEGMENT_S * rate_hz), len(x) // LEAST_SEGMENTS)
     if size < FEWEST_LINES:
         return None, np.zeros(m)
     x, segments = _bridged(x), 0
-    while 2 * segments < LEAST_SEGMENTS:  # of shorter ones more are without a hole
+    while 2 * segments < LEAST_SEGMENTS:  # more of the shorter segments are free of missing samples
         spectra = [_spectrum([x[:, k : k + 1]], size) for k in range(m)]
         powers, segments = np.stack([power for power, _ in spectra]), spectra[0][1]
         if 2 * segments < LEAST_SEGMENTS and (size := size // 2) < FEWEST_LINES:
@@ -54,21 +56,24 @@ def band_above_noise(x: Array, rate_hz: float) -> tuple[float | None, Array]:
     band_hz = MARGIN * float(moving[-1] + SMOOTHED) * rate_hz / size
     if band_hz >= WIDEST * rate_hz:
         return None, np.zeros(m)
-    # The median over all lines holds those of the motion: in a fifth of them it is 8 % above the noise alone.
+    # The first median included the lines of the motion: if they are a fifth of all, it is 8 % above the noise alone.
     floor = _floor(powers[:, int(np.ceil(band_hz * size / rate_hz)) : -1], segments)
     return band_hz, np.sqrt(floor / (0.5 * rate_hz * np.sum(window**2)))
 
 
 def _floor(powers: Array, segments: int) -> Array:
-    """(m,) mean power of the noise in lines (m, k), a few of which may hold more than noise.
+    """(m,) mean power of the noise in spectral lines (m, k); fewer than half of the lines may hold motion as well.
 
-    A line's power is a mean of `segments` exponentials: its median is the mean but for one part in 3 segments.
+    A line's power is the mean of `segments` exponential variables: its median is its mean times 1 - 1 / (3 segments).
     """
     return np.asarray(np.median(powers, axis=1) / (1.0 - 1.0 / (3.0 * segments)))
 
 
 def _bridged(x: Array) -> Array:
-    """x (n, m) with a straight line over holes of a sample or two, which spectra hardly see; longer ones all NaN."""
+    """x (n, m) with gaps of up to SHORT_HOLE samples interpolated linearly, which changes a spectrum very little.
+
+    In longer gaps all channels are NaN.
+    """
     missing = np.isnan(x).any(axis=1)
     if not missing.any() or missing.all():
         return x
@@ -82,10 +87,10 @@ def _bridged(x: Array) -> Array:
 
 
 def noise_in_band(density: Array, band_hz: float, derivatives: int) -> Array:
-    """(2, m) rms of white noise of `density` (m,) per root Hz in the acceleration limited to `band_hz`, and in its
-    derivative.
+    """(2, m) rms of a reference's white noise within `band_hz`: in the acceleration (m/s2), in its derivative (m/s3).
 
-    `derivatives`: how many times what is so noisy was differentiated to give the acceleration.
+    `density` (m,) is the noise of the measured quantity per root Hz; `derivatives` is how often that quantity was
+    differentiated to give the acceleration: 0 for acceleration, 1 for velocity, 2 for displacement.
     """
     turn = 2.0 * np.pi
     powers = [turn ** (2 * k) * band_hz ** (2 * k + 1) / (2 * k + 1) for k in (derivatives, derivatives + 1)]
@@ -93,9 +98,10 @@ def noise_in_band(density: Array, band_hz: float, derivatives: int) -> Array:
 
 
 def lowpass(x: Array, rate_hz: float, band_hz: float) -> Array:
-    """x (n, k), one sample a row, limited to `band_hz`: flat to 0.1 % up to it, 66 dB down from STOP_BAND times it on.
+    """x (n, k), one sample per row, through a low-pass filter without phase shift (FIR, Kaiser's window).
 
-    No phase. Rows within `lowpass_lost` of an end, or of a NaN, are NaN.
+    Its gain is 1 to 0.1 % up to `band_hz`, and at most -66 dB from 1.5 `band_hz` on. Rows closer than `lowpass_lost` to
+    an end of x, or to a NaN, are NaN.
     """
     half = lowpass_lost(rate_hz, band_hz)
     n = np.arange(-half, half + 1)
@@ -117,33 +123,37 @@ def lowpass(x: Array, rate_hz: float, band_hz: float) -> Array:
 
 
 def _fast_length(least: int) -> int:
-    """Smallest 2^a 3^b 5^c not below `least`: a length with a large prime in it takes several times as long."""
+    """Smallest 2^a 3^b 5^c not below `least`: an FFT whose length has a large prime factor is several times slower."""
     odd = (3**b * 5**c for b in range(4) for c in range(4))
     return min(int(k) << max(-(-least // int(k)) - 1, 0).bit_length() for k in odd)
 
 
 def lowpass_lost(rate_hz: float, band_hz: float) -> int:
-    """Samples at each end for which the filter has no full support (Kaiser's length for a transition of band / 2)."""
+    """Number of samples that the filter loses at each end: half its length, by Kaiser's formula for a transition
+    width of band_hz / 2."""
     return int(np.ceil((STOP_BAND_DB - 8.0) / (2.285 * np.pi * band_hz / rate_hz) / 2.0))
 
 
 @lru_cache(maxsize=4)
 def hanning(size: int) -> Array:
-    """Hann's window (size,), not to be written to: every window of data asks for the same one."""
+    """Hann's window (size,). It is cached and read-only, because every window of data needs the same one."""
     window = np.hanning(size)
     window.flags.writeable = False
     return window
 
 
 def _spectrum(stretches: Sequence[Array], size: int) -> tuple[Array, int]:
-    """Mean power (size // 2 + 1,) over channels, Hann-windowed whole segments of `size`, and their number."""
+    """Power spectrum (size // 2 + 1,) averaged over whole Hann-windowed segments of `size`, and their number.
+
+    The powers of several channels are added. Segments with missing samples are left out.
+    """
     window = hanning(size)[:, None]
     total, count = np.zeros(size // 2 + 1), 0
     for x in stretches:
         for start in range(0, len(x) - size + 1, size):
             part = x[start : start + size]
             if np.isnan(part).any():
-                continue  # what lies on both sides of a hole, put together, would be a jump and no noise
+                continue  # samples from both sides of a gap, joined, would show a jump that is no noise
             total += np.sum(np.abs(np.fft.rfft((part - part.mean(axis=0)) * window, axis=0)) ** 2, axis=1)
             count += 1
     return total / max(count, 1), count

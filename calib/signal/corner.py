@@ -1,9 +1,10 @@
-"""What a first-order high-pass filter (an AC-coupled instrument) took out of a recording, put back in.
+"""Correction for the first-order high-pass filter of an AC-coupled instrument.
 
-With the corner c in rad/s, the filter's inverse is exact: true = x + c * integral of x. A corner of 0.16 Hz costs
-0.56 % between 0.5 and 8 Hz and is no lag: it leads, and less at higher frequencies. Where a corner is to be found from
-the data, the integral of what was recorded (not of what a correction made of it) goes into the windows as channels
-of its own behind the reference's: the equation stays exact, whatever was taken out before.
+The inverse of the filter is exact: true = x + c * integral of x, with the corner c in rad/s. A corner of 0.16 Hz that
+is left uncorrected causes an error of 0.56 % between 0.5 and 8 Hz. A lag cannot describe it: the filter's output leads,
+and by less time at higher frequencies. If the corner is to be estimated from the data, the windows hold the integral of
+the recorded signal (before any correction) as further channels behind the reference's own. The window equations are
+then exact, whatever corner was corrected before.
 """
 
 from __future__ import annotations
@@ -16,10 +17,11 @@ from calib.model import Array, Pose
 
 
 def integral(x: Array, rate_hz: float) -> Array:
-    """2 pi times the integral of samples x (n, m) in m/s2 s: as large as x itself at 1 Hz.
+    """2 pi times the time integral of samples x (n, m) in m/s2; the result is in m/s2 s and as large as x at 1 Hz.
 
-    Each run of samples without a hole has an integral of its own, NaN in the holes: its constant is lost in the
-    window's own. It is held to no mean and no trend: an instrument's own zero would else run away in it.
+    Each stretch between missing samples (NaN) is integrated by itself; the result is NaN where samples are missing. The
+    constant of integration does not matter, because a window has a constant of its own. Mean and linear trend are
+    removed: otherwise the zero error of the instrument would make the integral grow without limit.
     """
     out = np.full(x.shape, np.nan)
     whole = np.isfinite(x).all(axis=1)
@@ -37,10 +39,13 @@ def _integral(x: Array, rate_hz: float) -> Array:
 
 
 def without_corner(x: Array, rate_hz: float, corner_hz: float) -> Array:
-    """Samples x (n, m) of a whole recording before the filter."""
+    """Samples x (n, m) of a whole recording as they were before a high-pass filter with the corner `corner_hz`."""
     return x + corner_hz * integral(x, rate_hz) if corner_hz else x
 
 
 def with_integral(pose: Pose) -> Pose:
-    """Of windows whose channels are the reference's, then their integrals, which of themselves move nothing."""
+    """The pose for windows whose channels are those of the reference followed by their integrals.
+
+    The columns of the integrals in `direction` are zero: they act only through an error of the corner.
+    """
     return replace(pose, direction=np.hstack([pose.direction, np.zeros_like(pose.direction)]))

@@ -1,4 +1,4 @@
-"""Samples of one device between two times, with the clock that says when each was taken."""
+"""Consecutive samples of one device, with the clock that gives the time of each sample."""
 
 from __future__ import annotations
 
@@ -13,12 +13,13 @@ from calib.signal.timing import ClockFit
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Samples:
-    """Samples of a device one after the other; a missing sample is a row of NaN.
+    """Consecutive samples of a device; a missing sample is a row of NaN.
 
-    `device` names it in messages. `values` (n, C) in the device's own unit, the first of them has the number
-    `first_index`; `clock` says when each was taken. `in_time`: the times rise and lie where they were asked for (a
-    device whose count jumps at will has no clock). `saturated`: a sample was at the end of the device's range.
-    `temperature_degc` is the mean, NaN where the device tells none.
+    `device` is the name for messages. `values` (n, C) are in the device's own unit; the first row has the sample number
+    `first_index`. `clock` gives the time of each sample. `saturated`: at least one sample was at the end of the
+    device's range. `in_time`: the times rise and lie in the interval that was asked for; false if the device's sample
+    count jumps, so that no clock can be fitted. `temperature_degc` is the mean temperature, NaN if the device measures
+    none.
     """
 
     device: str
@@ -31,17 +32,17 @@ class Samples:
 
     @property
     def axes(self) -> int:
-        """Axes of the device."""
+        """Number of the device's axes."""
         return int(self.values.shape[1])
 
     @property
     def time_s(self) -> Array:
-        """(n,) when each sample was taken, in s of the clock."""
+        """(n,) time of each sample in s, by `clock`."""
         return self.clock.time_of(self.first_index + np.arange(len(self.values)))
 
 
 class Stream(Protocol):
-    """Samples of one device, from a file or as they come."""
+    """All samples of one device, read from a file or received live."""
 
     def cut(self, start_s: float, stop_s: float) -> Samples | None:
-        """The samples taken from `start_s` to before `stop_s`; None where there is none."""
+        """The samples taken in the interval [start_s, stop_s), in s; None if there are none."""

@@ -1,9 +1,10 @@
-"""Sample times of a device from when its samples arrived: a clock model, since stamps are arrivals, not truth.
+"""Clock model of a device: the times of its samples, estimated from the times at which its bursts arrived.
 
-The newest sample of a burst was taken before the burst arrived, never after it: lateness is one-sided, and so are a
-poll's phase, a transport's delay and a stall. So the model follows the *earliest* arrivals: a parabola under the last
-minute's points (arrival over sample number), at the edge that the two earliest of every group of bursts point to. The
-constant part of the lateness (a bus transfer, say) shows in no arrival; it is part of the lag the adjustment estimates.
+A burst arrives after its newest sample was taken, never before. The delay is therefore one-sided, whether it comes from
+the phase of a poll, from the transport or from a stall of the program. So the model follows the *earliest* arrivals: it
+is a parabola below the points of the last minute (arrival time over sample number). The two earliest arrivals of each
+group of bursts give the group's point of that lower edge. The constant part of the delay (for example of a bus
+transfer) cannot be seen in the arrivals; it is part of the lag that the adjustment estimates.
 """
 
 from __future__ import annotations
@@ -18,24 +19,26 @@ from numpy.typing import ArrayLike, NDArray
 from calib.model import Array
 
 IntArray = NDArray[np.int64]
-# A minute holds 3000 bursts of a usual driver; a thermal swing of 250 ppm in 30 min is a parabola within it to 1 us.
+# A typical driver sends 3000 bursts in a minute. If the temperature changes the rate by 250 ppm in 30 min, a parabola
+# follows the clock within a minute to 1 us.
 HORIZON_S = 60.0
-MAX_BURSTS = 8192  # bounds memory and work for a device that sends a burst a sample
-# Bursts in a group whose earliest two are used: fewer follow them less closely, more leave too few groups.
+MAX_BURSTS = 8192  # limits memory and time for a device that sends each sample as a burst
+# Bursts in a group. The earliest two of a small group are later on average; large groups are too few for a fit.
 GROUPS, SMALLEST_GROUP, LARGEST_GROUP = 16, 8, 64
-CURVED_FROM_S = 20.0  # before, a straight line is nearer: the curvature's own uncertainty costs more than it brings
-FEWEST_FOR_RATE = 20  # bursts; before, the nominal rate is the better guess
+CURVED_FROM_S = 20.0  # over a shorter time a straight line is more accurate: the curvature is too uncertain
+FEWEST_FOR_RATE = 20  # bursts; with fewer, the nominal rate is more accurate than an estimate
 
 Edge = Literal["early", "mean"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ClockFit:
-    """Sample times of a device: cubic pieces between knots (K,), straight on beyond the ends.
+    """Time of each sample of a device over its number: cubic pieces between K knots, straight lines beyond the ends.
 
-    `rate_hz` and `offset_s` (the time of sample `index`) are those at the newest sample, with standard uncertainties;
-    these do not contain the constant part of the lateness. `gaps` are the sample numbers before which samples are
-    missing.
+    `knot_index`, `knot_time_s`, `knot_period_s` (K,): sample number, time (s) and sample period (s) at the knots.
+    `index` is the newest sample; `rate_hz` is the rate and `offset_s` the time at that sample, `u_rate_hz`
+    and `u_offset_s` their standard uncertainties, without the constant part of the delay. `gaps` are the sample numbers
+    before which samples are missing.
     """
 
     knot_index: Array
@@ -49,7 +52,7 @@ class ClockFit:
     gaps: IntArray
 
     def time_of(self, index: ArrayLike) -> Array:
-        """When the samples of these numbers (n,) were taken, in s; fractions of a number are allowed."""
+        """Times in s at which the samples with these numbers (n,) were taken; a number may have a fraction."""
         i = np.asarray(index, dtype=float)
         if len(self.knot_index) == 1:
             return np.asarray(self.knot_time_s[0] + (i - self.knot_index[0]) * self.knot_period_s[0])
@@ -64,20 +67,19 @@ class ClockFit:
         return np.asarray(cubic + (x - inside) * np.where(x < 0.0, d0, d1))
 
     def index_of(self, time_s: ArrayLike) -> Array:
-        """Sample number (with fraction) at these times (n,): the inverse of `time_of`."""
+        """Sample numbers (with fraction) at these times (n,) in s: the inverse of `time_of`."""
         t = np.asarray(time_s, dtype=float)
         if len(self.knot_index) == 1:
             return np.asarray(self.knot_index[0] + (t - self.knot_time_s[0]) / self.knot_period_s[0])
         k = self._piece(self.knot_time_s, t)
         slope = (self.knot_time_s[k + 1] - self.knot_time_s[k]) / (self.knot_index[k + 1] - self.knot_index[k])
         index = self.knot_index[k] + (t - self.knot_time_s[k]) / slope
-        for _ in range(3):  # periods differ by less than 1e-2 within a piece: each turn gains two digits or more
+        for _ in range(3):  # the period changes by less than 1 % within a piece: each iteration gains two digits
             index = index + (t - self.time_of(index)) / slope
         return np.asarray(index)
 
     def stretched(self, rate: float, at_s: float) -> ClockFit:
-        """The clock as it is on a time scale that runs faster by `rate` (s a second) and agrees with this one at
-        `at_s`."""
+        """The same clock on another time scale: it runs faster by `rate` (s/s) and agrees with this one at `at_s`."""
         return replace(
             self,
             knot_time_s=self.knot_time_s + rate * (self.knot_time_s - at_s),
@@ -88,29 +90,29 @@ class ClockFit:
 
     @staticmethod
     def _piece(knots: Array, at: Array) -> IntArray | int:
-        """In which piece these are; of a live clock there is one, and nothing need be looked up for each sample."""
+        """Number of the piece in which each of `at` lies. A live clock has one piece, so no search is needed."""
         if len(knots) == 2:
             return 0
         return np.clip(np.searchsorted(knots, at, side="right") - 1, 0, len(knots) - 2)
 
 
 class ClockModel:
-    """Clock of one device, fed with its bursts as they come. Deterministic; `result` reads, `update` changes."""
+    """Clock model of one device. `update` takes the arrivals of its bursts, `result` gives the clock. Deterministic."""
 
     def __init__(self, nominal_rate_hz: float, horizon_s: float = HORIZON_S) -> None:
         if not nominal_rate_hz > 0:
-            raise ValueError(f"nominal rate must be above 0 Hz, is {nominal_rate_hz}")
+            raise ValueError(f"nominal rate must be above 0 Hz, is {nominal_rate_hz} Hz")
         self._nominal_rate_hz = nominal_rate_hz
         self._horizon_s = horizon_s
         self.restart()
 
     def restart(self) -> None:
-        """Forget everything: the sample numbers do not go on in time."""
+        """Forget all bursts, because the sample numbers before and after this moment are not comparable."""
         self._index = np.empty(0, dtype=np.int64)
         self._arrival_s = np.empty(0)
 
     def update(self, sample_index_after_burst: ArrayLike, arrival_s: ArrayLike) -> None:
-        """Take bursts (B,): the number of the newest sample in each, and when the burst arrived, both rising."""
+        """Take B bursts: the number of the newest sample in each (B,), and its arrival time in s (B,); both rise."""
         self._index = np.concatenate([self._index, np.asarray(sample_index_after_burst, dtype=np.int64)])
         self._arrival_s = np.concatenate([self._arrival_s, np.asarray(arrival_s, dtype=float)])
         if len(self._index):
@@ -119,9 +121,9 @@ class ClockModel:
             self._index, self._arrival_s = self._index[first:], self._arrival_s[first:]
 
     def result(self) -> ClockFit:
-        """The clock as the bursts of the last minute show it. Raises ValueError before the first burst."""
+        """The clock, estimated from the bursts of the last minute. Raises ValueError before the first burst."""
         if not len(self._index):
-            raise ValueError("no burst yet")
+            raise ValueError("no burst yet: call update() with at least one burst before result()")
         return parabola(self._index, self._arrival_s, self._nominal_rate_hz).clock(self._index[0], self._index[-1])
 
     def nominal(self) -> ClockFit:
@@ -132,12 +134,12 @@ class ClockModel:
         return line.clock(newest, newest)
 
     def lateness_s(self, clock: ClockFit) -> Array:
-        """How late each burst of the last minute arrived (B,): its arrival less the time that `clock` gives its newest
-        sample, in s."""
+        """(B,) delay in s of each burst of the last minute: its arrival time less the time of its newest sample by
+        `clock`."""
         return np.asarray(self._arrival_s - clock.time_of(self._index))
 
     def snapshot(self) -> dict[str, float | IntArray | Array]:
-        """All of the state, exactly."""
+        """The complete state, for `restore`; bit for bit."""
         return {
             "nominal_rate_hz": self._nominal_rate_hz,
             "horizon_s": self._horizon_s,
@@ -147,7 +149,7 @@ class ClockModel:
 
     @classmethod
     def restore(cls, snapshot: Mapping[str, float | IntArray | Array]) -> ClockModel:
-        """A model that goes on as the one whose snapshot this is, bit for bit."""
+        """A model that gives the same results, bit for bit, as the model that made the snapshot."""
         model = cls(float(snapshot["nominal_rate_hz"]), float(snapshot["horizon_s"]))
         model._index = np.array(snapshot["index"], dtype=np.int64)
         model._arrival_s = np.array(snapshot["arrival_s"], dtype=np.float64)
@@ -156,7 +158,7 @@ class ClockModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Parabola:
-    """Time over sample number near `index`: `time_s + c0 + c1 x + c2 x^2`, x = sample number - `index`."""
+    """Time of a sample over its number: `time_s + c0 + c1 x + c2 x^2`, where x = sample number - `index`."""
 
     index: int
     time_s: float
@@ -164,18 +166,18 @@ class Parabola:
     covariance: Array  # (3, 3)
 
     def at(self, index: ArrayLike) -> Array:
-        """Time in s."""
+        """Time in s of these sample numbers (n,)."""
         x = np.asarray(index, dtype=float) - self.index
         c = self.coefficients
         return np.asarray(self.time_s + (c[0] + x * (c[1] + x * c[2])))
 
     def period_at(self, index: ArrayLike) -> Array:
-        """Sample period in s."""
+        """Sample period in s at these sample numbers (n,)."""
         x = np.asarray(index, dtype=float) - self.index
         return np.asarray(self.coefficients[1] + 2 * x * self.coefficients[2])
 
     def clock(self, first: int, last: int) -> ClockFit:
-        """As a clock from sample `first` to sample `last`."""
+        """The parabola as a clock with knots at the samples `first` and `last`."""
         knots = np.unique(np.array([first, last], dtype=float))
         period = float(self.period_at(last))
         at_last = np.array([1.0, last - self.index, (last - self.index) ** 2])
@@ -194,9 +196,11 @@ class Parabola:
 
 
 def parabola(index: IntArray, arrival_s: Array, nominal_rate_hz: float, edge: Edge = "early") -> Parabola:
-    """The parabola under the bursts' arrivals (`early`), or through them where they scatter both ways (`mean`).
+    """The parabola below the arrivals of the bursts (`edge` "early"), or through them if they scatter to both sides
+    ("mean").
 
-    `index`, `arrival_s` (B,) rising, B >= 1; a straight line where they span less than `CURVED_FROM_S`.
+    `index` (B,) is the number of the newest sample of each burst, `arrival_s` (B,) its arrival in s; both rise, B >= 1.
+    The curvature is 0 if the arrivals span less than `CURVED_FROM_S`.
     """
     x, y = (index - index[-1]).astype(float), arrival_s - arrival_s[-1]
     size = int(np.clip(len(x) // GROUPS, SMALLEST_GROUP, LARGEST_GROUP))
@@ -207,14 +211,13 @@ def parabola(index: IntArray, arrival_s: Array, nominal_rate_hz: float, edge: Ed
     if groups < 3 or not known:
         late = y - c[1] * x
         c[0] = late.min()
-        # Until the groups show more: anywhere within the spread of the arrivals, and the rate 1 % off.
+        # Too few groups for a fit: u(offset) is the spread of the arrivals, u(rate) is 1 %.
         u = np.array([np.ptp(late) + 1.0 / nominal_rate_hz, 0.01 / nominal_rate_hz, 0.0])
         return Parabola(int(index[-1]), float(arrival_s[-1]), c, np.diag(u**2))
     scale = np.array([1.0, -x[0], x[0] ** 2])[:order]
     covariance = np.zeros((3, 3))
-    for _ in range(
-        1 if edge == "mean" else 3
-    ):  # the groups' edges depend on the slope taken out first: settles to some us
+    # The points of the lower edge depend on the slope that is subtracted first; three iterations settle to a few us.
+    for _ in range(1 if edge == "mean" else 3):
         late = y - (c[0] + x * (c[1] + x * c[2]))
         at, value = _edges(
             x[-groups * size :].reshape(groups, size), late[-groups * size :].reshape(groups, size), edge
@@ -226,9 +229,10 @@ def parabola(index: IntArray, arrival_s: Array, nominal_rate_hz: float, edge: Ed
 
 
 def _edges(x: Array, late: Array, edge: Edge) -> tuple[Array, Array]:
-    """For each group (G, n): where its edge stands and how late it is (G,).
+    """For each group of bursts (G, n): the sample number of its lower edge, and the lateness in s there (G,).
 
-    The gap between the earliest two is as large, on average, as the one before the earliest (Robson and Whitlock 1964).
+    The lower edge lies below the earliest arrival by as much, on average, as the second earliest lies above it (Robson
+    and Whitlock 1964).
     """
     if edge == "mean":
         return x.mean(axis=1), late.mean(axis=1)
@@ -239,7 +243,7 @@ def _edges(x: Array, late: Array, edge: Edge) -> tuple[Array, Array]:
 
 
 def _robust_line(design: Array, value: Array) -> tuple[Array, Array]:
-    """Least squares that late groups do not pull: coefficients and their covariance."""
+    """Coefficients and their covariance by least squares in which late groups have little weight."""
     weight = np.ones(len(value))
     for _ in range(3):
         weighted = design * weight[:, None]

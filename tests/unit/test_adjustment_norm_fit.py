@@ -79,5 +79,5 @@ def test_a_rest_that_was_none_is_named():
 
 def test_nine_rests_are_too_few():
     random = np.random.default_rng(74)
-    with pytest.raises(ValueError, match="10 rests or more"):
+    with pytest.raises(ValueError, match="at least 10 rests"):
         norm_fit(_rests(random, random.normal(size=(9, 3)), 0.002), G_MPS2)

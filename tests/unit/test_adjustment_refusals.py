@@ -55,12 +55,12 @@ def test_one_alpha_is_refused_with_the_rank():
 @pytest.mark.parametrize("priors", [Priors(), Priors.none(), _nominal()])
 def test_z_outward_with_the_printed_signs_names_the_sign(priors):
     windows = _turned(clamp_points(np.random.default_rng(3), ORDINARY).windows, static=-1.0)
-    assert "the static sign (gravity) turned" in _only_reason(adjust(windows, priors))
+    assert "the static sign (gravity) reversed" in _only_reason(adjust(windows, priors))
 
 
 def test_a_reference_with_turned_polarity_is_named_where_the_sensor_is_known():
     windows = _turned(clamp_points(np.random.default_rng(4), ORDINARY).windows, polarity=-1.0)
-    assert "the polarity of the reference turned" in _only_reason(adjust(windows, _nominal()))
+    assert "the polarity of the reference reversed" in _only_reason(adjust(windows, _nominal()))
 
 
 def test_both_turned_are_named_where_the_sensor_is_known():
@@ -157,7 +157,7 @@ def _reference_times(windows: list[Window], factor: float) -> list[Window]:
 def test_a_reference_that_gravity_contradicts_is_refused_without_a_nominal(factor):
     windows = _reference_times(clamp_points(np.random.default_rng(20), ORDINARY).windows, factor)
     reason = _only_reason(adjust(windows))
-    assert "the data contradict what was stated: " in reason
+    assert "the data contradict the stated values: " in reason
     assert "its standard uncertainty was stated as" in reason
     assert not adjust(windows, replace(Priors(), reference=0.5)).reasons
 

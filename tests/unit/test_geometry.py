@@ -73,7 +73,7 @@ def test_rotation_with_few_decimals_is_made_a_rotation() -> None:
         (lambda: clamp(0.6, 0.0, static_sign=0), r"\+1 or -1, is 0"),
         (lambda: beside(np.eye(2)), "3 x 3, is 2 x 2"),
         (lambda: beside(-np.eye(3)), "determinant is -1"),
-        (lambda: beside(1.01 * np.eye(3)), "not one"),
+        (lambda: beside(1.01 * np.eye(3)), "must be a rotation matrix"),
         (lambda: beside(np.full((3, 3), math.nan)), "rotation must be finite"),
     ],
 )

@@ -60,7 +60,7 @@ def test_a_stop_that_nobody_stated_is_refused_with_the_numbers(scale: float) -> 
     mean = MeanOutput(scale * leaning(15.0).gravity_mps2, NOTHING)
     found = nearest_stop(mean, stops, known, knowledge)
     assert found.pose is None
-    assert found.reason.startswith("stands at none of the stated positions")
+    assert found.reason.startswith("the sensor stands at none of the stated positions")
     # 15 deg are 2.6 m/s2, u is 0.09: 0.03 of Q, 0.03 of S, 0.05 of the offset, 0.05 of the angle.
     assert 400.0 < found.numbers["position_chi2"] < 2000.0
     assert nearest_stop(MeanOutput(scale * stops[1].gravity_mps2, NOTHING), stops, known, knowledge).pose is stops[1]
@@ -145,7 +145,7 @@ def test_what_no_clamp_can_be_is_refused_with_the_numbers() -> None:
     assert "8.8" in angles(0.9 * G_MPS2 * e)
     assert "static_sign" in angles(-G_MPS2 * e)
     assert "35" in angles(G_MPS2 * e, 40.0 * DEGREE)
-    assert "10 deg are needed" in angles(G_MPS2 * e, None, knowing((0.05, 0.03, 20.0)))
+    assert "10 deg is the limit" in angles(G_MPS2 * e, None, knowing((0.05, 0.03, 20.0)))
     flat = frame(0.5 * DEGREE, 0.0)[1]
     assert "alpha" in angles(G_MPS2 * flat)
 
