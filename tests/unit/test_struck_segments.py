@@ -55,4 +55,4 @@ def test_knocks_spread_all_over_refuse_the_window_at_a_low_rate_too(seed: int) -
     out = np.random.default_rng(seed).random(len(slow.V)) < 0.08
     window = only(motion_windows(POSE, slow._replace(V=slow.V + np.where(out, 5.0, 0.0)[:, None])))
     assert not window.used
-    assert "of the points are knocked out" in window.reason
+    assert "of the points are knocks" in window.reason
