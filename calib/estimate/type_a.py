@@ -52,9 +52,8 @@ class TypeA:
     degrees_of_freedom: float
 
     def slope_ratio(self, live: Flags) -> float:
-        """Variance of the slopes on u over that of white noise, mean over those with data (`live`, 6M)."""
-        on_u = live & (np.arange(len(live)) < len(live) // 2)  # S rests on these; the others tell the lag
-        return float(np.diag(self.slopes)[on_u if on_u.any() else live].mean())
+        """Variance of the slopes over that of white noise, mean over those with data (`live`, 6M)."""
+        return float(np.diag(self.slopes)[live].mean())
 
 
 def pooled(

@@ -22,8 +22,8 @@ class Limits:
     least_level: float = 3.0  # reference's motion over its noise, in band: the noise then reduces S by 10 % at most
     least_coherence: float = 0.5  # part of the sensor's power that the reference explains, in band; 0.95 is usual
     most_left_out_pct: float = 5.0  # two knocks of 20 ms per second leave out 4 %
-    # Of a segment, in a window beyond the limit above: more, and the whole segment is left out. If 8 % of the points are
-    # knocks at random places, one segment in 500 of 25 points has as many.
+    # Of a segment, in a window beyond the limit above: with more, the whole segment is left out. If 8 % of the points
+    # are knocks at random places, one segment in 500 of 25 points has as many.
     most_left_out_of_segment_pct: float = 25.0
     most_drift_mps2: float = 0.2  # of the mean within a window: offsets drift by 0.05
     most_drift_pct: float = 10.0  # the same relative to the motion's rms; the larger limit counts

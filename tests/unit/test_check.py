@@ -176,7 +176,7 @@ def key_of(kind: str, path: Path) -> None:
         ("a directory", "cannot be read: Is a directory"),
         ("no PEM", "not a private key in PEM without a password"),
         ("public", "not a private key in PEM without a password"),
-        ("of another kind", "a private key, but not of Ed25519"),
+        ("of another kind", "a private key, but not an Ed25519 key"),
     ],
 )
 def test_a_signing_key_that_cannot_sign_is_a_fault(

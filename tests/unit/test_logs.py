@@ -220,4 +220,4 @@ def test_faults_of_a_configuration_are_json_too(tmp_path: Path) -> None:
     ended = fieldcal("run", config, "--log", "json")
     assert (ended.returncode, ended.stdout) == (2, "")
     messages = [json.loads(line)["message"] for line in ended.stderr.splitlines()]
-    assert f"{config}: speed: Extra inputs are not permitted, not 1" in messages
+    assert f"{config}: line 1: speed: there is no such setting; remove it or correct its name, not 1" in messages
