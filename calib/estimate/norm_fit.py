@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.distributions import coverage_factor
+from calib.estimate.determined import DETERMINED_U
 from calib.model import Array, Calibration, Window
 
 UNKNOWNS = 9  # six elements of S, three of Q
@@ -24,7 +25,6 @@ ROUNDING = 1e-12  # of the scale: a smaller step is a rounding error
 # Least singular value of the scaled problem relative to the largest. It is 1e-17 for rests in one plane, 0.01 to 0.14
 # for ten random positions, and 0.1 to 0.4 for twenty-two.
 RANK_TOLERANCE = 1e-3
-DETERMINED_U = 0.1  # largest u of a determined parameter, relative to the largest main sensitivity (docs/vocabulary.md)
 RESIDUAL_LIMIT = 0.02  # of g; real rests leave 2e-4, a stretch that was no rest or a clipped axis leaves more
 
 
