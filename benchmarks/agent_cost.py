@@ -1,7 +1,7 @@
-"""Cost of the live agent: CPU relative to a bare loop that only reads and records, start time, memory.
+"""Cost of the live agent: CPU relative to a bare loop that only reads and records, start time, memory, its screen.
 
-Another process serves the sensor (1 kHz, three axes) and the reference (1 kHz) on pseudo-terminals. Agent and bare loop
-run one after the other on the same ports, twice.
+Another process serves the sensor (1 kHz, three axes) and the reference (1 kHz) on pseudo-terminals. The agent,
+the agent with its screen on a terminal, and the bare loop run one after the other on the same ports, twice.
 """
 
 from __future__ import annotations
@@ -10,7 +10,10 @@ import os
 import subprocess
 import sys
 import tempfile
+import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from agent.recording.reading import RecordingReader
@@ -56,9 +59,30 @@ def peak_mb(pid: int) -> float:
     return int(line.split()[1]) / 1024
 
 
-def measure(command: list[str]) -> tuple[float, float]:
+@contextmanager
+def terminal() -> Iterator[int]:
+    """A terminal for a process to draw on, which a thread reads; the descriptor of the process's side."""
+    reading, drawing = os.openpty()
+    reader = threading.Thread(target=read_all, args=(reading,), daemon=True)
+    reader.start()
+    try:
+        yield drawing
+    finally:
+        os.close(drawing)
+        reader.join(5)
+        os.close(reading)
+
+
+def read_all(descriptor: int) -> None:
+    """Read until the other side is closed."""
+    with suppress(OSError):
+        while os.read(descriptor, 65_536):
+            pass
+
+
+def measure(command: list[str], stdout: int = subprocess.DEVNULL) -> tuple[float, float]:
     """CPU time per s after the warm-up, and peak memory in MB."""
-    process = subprocess.Popen([sys.executable, *command], stdout=subprocess.DEVNULL)
+    process = subprocess.Popen([sys.executable, *command], stdout=stdout, env=os.environ | {"TERM": "xterm-256color"})
     try:
         time.sleep(WARM_UP_S)
         before, began = cpu_s(process.pid), time.monotonic()
@@ -95,31 +119,37 @@ def main() -> None:
             while not (directory / "port-sensor").exists():
                 time.sleep(0.05)
             starts = sorted(first_block_s(config, directory / f"start{i}") for i in range(5))
-            shares, peaks = {"agent": [], "bare": []}, []
+            shares, peaks = {"agent": [], "screen": [], "bare": []}, []
             for turn in range(2):
                 data = str(directory / f"data{turn}")
-                share, peak = measure(["-m", "agent", "run", str(config), "--data-dir", data])
+                running = ["-m", "agent", "run", str(config), "--data-dir"]
+                share, peak = measure([*running, data])
                 shares["agent"].append(share)
                 peaks.append(peak)
+                with terminal() as drawing:
+                    share, _ = measure([*running, data + "-screen"], stdout=drawing)
+                shares["screen"].append(share)
                 share, _ = measure(["-m", "benchmarks.bare_loop", str(config), data + "-bare", "600"])
                 shares["bare"].append(share)
         finally:
             for process in (twins, router):
                 process.terminate()
                 process.wait(10)
-    agent, bare = (sum(shares[k]) / len(shares[k]) for k in ("agent", "bare"))
+    agent, screen, bare = (sum(shares[k]) / len(shares[k]) for k in ("agent", "screen", "bare"))
     cost = f"{agent / bare:.2f} ({agent:.1%} against {bare:.1%} of a core)"
+    drawn = f"{screen / agent:.2f} ({screen:.1%} of a core)"
     start = f"{starts[len(starts) // 2]:.2f} s"
     write_part(
         "agent_cost",
         f"""
 `python -m benchmarks agent_cost` on {machine()}; sensor 1 kHz x 3 and reference 1 kHz on two serial ports (served by
 another process). The agent records them, finds windows, and publishes to a router. {MEASURED_S:g} s are measured after
-a warm-up of {WARM_UP_S:g} s; agent and bare loop are measured in turn, twice.
+a warm-up of {WARM_UP_S:g} s; all three processes are measured in turn, twice.
 
 | figure | measured | goal |
 | --- | --- | --- |
 | CPU of the agent, divided by that of a bare loop that only reads and records | {cost} | 1.3 |
+| CPU of the agent with its screen on a terminal, divided by that of the agent without | {drawn} | |
 | time from the start to the first recorded block, median of {len(starts)} | {start} | 1.5 s |
 | peak memory of the agent (VmHWM) | {max(peaks):.0f} MB | 130 MB |
 """,
