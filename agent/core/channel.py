@@ -18,6 +18,7 @@ from agent.core.identity import identity_of, nominal_of, not_certified
 from agent.core.kept import keep, plain, shelved, take_up, update_of
 from agent.core.operators import CommandError, answer, commanded_pose
 from agent.core.outcome import Source, again, calibration_update, drift_report, estimate, status_change, window_report
+from agent.core.run_time import RunTime
 from agent.core.streams import Streams, Verdict
 from agent.core.windows import refused
 from calib.model import Pose, Window
@@ -39,7 +40,6 @@ class ChannelState:
         self._channel = channel
         self.sensor = channel.sensor
         self.identity = ""
-        self._origin_ns = 0
         self._streams = Streams(channel)
         self._unit = ""
         self._nominal: float | None = None  # sensitivity by the data sheet of the device
@@ -52,13 +52,11 @@ class ChannelState:
         self._status = ""  # no status was published yet
         self._refused = 0  # how many windows in a row were refused
         self._clocks = Clocks()
-        self._now_ns = 0  # monotonic and UTC of the newest event that carried both
-        self._utc_minus_monotonic_ns = 0
+        self._time = RunTime()
 
     def begin(self, origin_ns: int, kept: Mapping[str, bytes]) -> None:
         """Begin a new run. Seconds count from `origin_ns`. `kept`: a state (`memory`) for each identity of a sensor."""
-        self._origin_ns = origin_ns
-        self._now_ns = origin_ns
+        self._time = RunTime(origin_ns)
         self._kept = dict(kept)
         self._streams.begin(origin_ns)
 
@@ -68,7 +66,7 @@ class ChannelState:
         """A block of the sensor or of its reference. Blocks of other devices do not concern this channel."""
         if block.device not in self._streams.by_device:
             return []
-        self._clock(block.t_monotonic_ns, block.t_utc_ns)
+        self._time.update(block.t_monotonic_ns, block.t_utc_ns)
         self._streams.by_device[block.device].update(block)
         results: list[Output] = []
         if block.device == self.sensor and self._estimation is not None:
@@ -82,14 +80,14 @@ class ChannelState:
     def on_tick(self, tick: Tick) -> list[Result]:
         """Time passed: windows whose samples come too late are refused; a sensor without data gets the status
         INVALID."""
-        self._clock(tick.t_monotonic_ns, tick.t_utc_ns)
+        self._time.update(tick.t_monotonic_ns, tick.t_utc_ns)
         return list(self._close_windows()) + self._watch_silence() + self._clock_reports()
 
     def on_device(self, change: DeviceChange) -> list[Result]:
         """A device of this channel was opened or lost."""
         if change.device not in self._streams.by_device:
             return []
-        self._clock(change.t_monotonic_ns, change.t_utc_ns)
+        self._time.update(change.t_monotonic_ns, change.t_utc_ns)
         if change.state == "lost":
             if change.device != self.sensor:
                 return [
@@ -104,7 +102,7 @@ class ChannelState:
         """A command of an operator. A command that was refused before changes nothing."""
         if command.sensor != self.sensor or command.refused:
             return []
-        self._clock(command.t_monotonic_ns, command.t_utc_ns)
+        self._time.update(command.t_monotonic_ns, command.t_utc_ns)
         if self._estimation is None:
             return [self._told(f"{command.verb} refused: {self.sensor} has not been connected in this run")]
         try:
@@ -120,21 +118,8 @@ class ChannelState:
 
     # --- time and identity
 
-    def _clock(self, t_monotonic_ns: int, t_utc_ns: int) -> None:
-        # Blocks of two devices may arrive in the wrong order, by up to one read. The time of the channel never
-        # decreases.
-        if t_monotonic_ns >= self._now_ns:
-            self._now_ns = t_monotonic_ns
-            self._utc_minus_monotonic_ns = t_utc_ns - t_monotonic_ns
-
-    def _utc_ns(self) -> int:
-        return self._now_ns + self._utc_minus_monotonic_ns
-
-    def _now_s(self) -> float:
-        return (self._now_ns - self._origin_ns) * 1e-9
-
     def _source(self) -> Source:
-        return Source(self.sensor, self.identity, self._unit, self._utc_ns())
+        return Source(self.sensor, self.identity, self._unit, self._time.utc_ns)
 
     def _identify(self, info_json: str) -> list[Result]:
         info, identity = json.loads(info_json), identity_of(info_json)
@@ -159,6 +144,7 @@ class ChannelState:
                 return self._change("INVALID", str(error))
             if identity in self._kept:
                 results, reason = self._remember(self._kept.pop(identity))
+            results += self._meet_reference()
         if self._status == "INVALID":
             # An open port does not prove that the sensor sends data: the status stays INVALID until a block comes.
             self._estimation.gate.lose("")
@@ -167,17 +153,25 @@ class ChannelState:
     def _identify_reference(self, info_json: str) -> list[Result]:
         before, self._reference = self._reference, identity_of(info_json)
         self._not_certified = not_certified(info_json, self._channel.certificate)
+        results = self._meet_reference()
         if not before or before == self._reference:
-            return [self._told(f"S and Q are not updated: {self._not_certified}")] if self._not_certified else []
+            told = f"S and Q are not updated: {self._not_certified}"
+            return results + ([self._told(told)] if self._not_certified else [])
         assert self._channel.reference is not None
         self._streams.by_device[self._channel.reference].clear()
-        if self._estimation is not None:
-            self._estimation.forget_reference()
         reason = self._not_certified or f"the reference is another device now: {self._reference} instead of {before}"
-        return self._say_status(reason) or [self._told(reason)]
+        return results + (self._say_status(reason) or [self._told(reason)])
+
+    def _meet_reference(self) -> list[Result]:
+        """Tell the estimation which reference is connected, and what its certificate states now."""
+        if self._estimation is None or not self._reference or self._not_certified:
+            return []
+        certificate = self._channel.certificate
+        changed = self._estimation.meet(self._reference, certificate.calibrated, certificate.sensitivity)
+        return [self._put_in_force()] if changed else []
 
     def _clock_reports(self) -> list[Result]:
-        return self._clocks.reports(self._source(), self._now_s(), self._streams.by_device, self._estimation)
+        return self._clocks.reports(self._source(), self._time.now_s, self._streams.by_device, self._estimation)
 
     def _lose(self, reason: str) -> list[Result]:
         if self._estimation is not None:
@@ -186,7 +180,7 @@ class ChannelState:
 
     def _watch_silence(self) -> list[Result]:
         newest_s = self._streams.by_device[self.sensor].newest_arrival_s
-        silent_s = self._now_s() - (newest_s if newest_s is not None else 0.0)
+        silent_s = self._time.now_s - (newest_s if newest_s is not None else 0.0)
         if silent_s <= self._channel.silence_s:
             return []
         return self._lose(f"no block of {self.sensor} for more than {self._channel.silence_s:g} s")
@@ -207,7 +201,7 @@ class ChannelState:
         if self._channel.acceleration == "off":
             return []
         found = acceleration_block(
-            block, self._streams.by_device[self.sensor], self._origin_ns + self._utc_minus_monotonic_ns,
+            block, self._streams.by_device[self.sensor], self._time.origin_utc_ns,
             estimation.law, estimation.residual_sd, self._in_force,
             dynamic_only=self._channel.coupling == "ac", recorded=self._channel.acceleration == "record",
         )  # fmt: skip
@@ -216,12 +210,12 @@ class ChannelState:
     # --- windows
 
     def _turn(self, pose: Pose) -> list[Result]:
-        self._streams.turn(self._now_s(), pose)
+        self._streams.turn(self._time.now_s, pose)
         return [self._told(f"an operator set the position: {pose.position}")]
 
     def _close_windows(self) -> Iterator[Result]:
         """The results of all windows that are due. After a fault of the program its window is reported and not used."""
-        for piece in self._streams.due(self._now_s()):
+        for piece in self._streams.due(self._time.now_s):
             try:
                 for verdict in self._streams.verdicts(piece, self._first_day, self._estimation, self._not_certified):
                     yield from self._results(verdict)
@@ -250,7 +244,7 @@ class ChannelState:
         used = decision.action in ("take", "adopt")
         numbers = {**decision.numbers, "lag_applied_s": verdict.lag_s}
         yield window_report(source, window, used=used, reason="" if used else decision.reason, numbers=numbers)
-        origin_utc_ns = self._utc_ns() - round((self._first_day * DAY_S + self._now_s()) * 1e9)
+        origin_utc_ns = self._time.utc_ns - round((self._first_day * DAY_S + self._time.now_s) * 1e9)
         for drift in judged.drift:
             yield drift_report(source, drift, self._channel.drift.false_alarms_a_year, origin_utc_ns)
         if decision.proposal is not None:
@@ -286,8 +280,8 @@ class ChannelState:
     def memory(self) -> bytes:
         """State of the device that is connected now, for later runs."""
         assert self._estimation is not None
-        day = self._first_day + self._now_s() / DAY_S
-        return keep(self._channel, self._estimation, self._in_force, self._reference, day, self._utc_ns())
+        day = self._first_day + self._time.now_s / DAY_S
+        return keep(self._channel, self._estimation, self._in_force, self._reference, day, self._time.utc_ns)
 
     def memories(self) -> dict[str, bytes]:
         """`memory` by identity: of the device that is connected now and of those that were connected before."""
@@ -298,21 +292,20 @@ class ChannelState:
         kept = take_up(memory, self._channel, self._nominal)
         self._estimation = kept.estimation
         self._estimation.gate.regain("")
-        if self._reference and kept.reference and kept.reference != self._reference:
-            self._estimation.forget_reference()
-        self._reference = self._reference or kept.reference
-        pause_days = (self._utc_ns() - kept.t_utc_ns) * 1e-9 / DAY_S
+        pause_days = (self._time.utc_ns - kept.t_utc_ns) * 1e-9 / DAY_S
         pause_days = pause_days if 0.0 <= pause_days <= LONGEST_PAUSE_DAYS else 0.0
-        self._first_day = kept.day + pause_days - self._now_s() / DAY_S
+        self._first_day = kept.day + pause_days - self._time.now_s / DAY_S
         if kept.in_force is None:
             return [], kept.reason
-        self._in_force = again(msgspec.structs.replace(kept.in_force, t_utc_ns=self._utc_ns()), kept.in_force)
+        if kept.moved:
+            return [self._put_in_force()], kept.reason
+        self._in_force = again(msgspec.structs.replace(kept.in_force, t_utc_ns=self._time.utc_ns), kept.in_force)
         return [self._in_force], kept.reason
 
     def snapshot(self) -> dict[str, Any]:
         """State for `load`, bit-exact."""
         return {
-            "origin_ns": self._origin_ns,
+            **self._time.snapshot(),
             **self._streams.snapshot(),
             "unit": self._unit,
             "identity": self.identity,
@@ -325,15 +318,13 @@ class ChannelState:
             "first_day": self._first_day,
             "status": self._status,
             "refused": self._refused,
-            "now_ns": self._now_ns,
-            "utc_minus_monotonic_ns": self._utc_minus_monotonic_ns,
             **self._clocks.snapshot(),
         }
 
     def load(self, state: Mapping[str, Any]) -> None:
         """Take the state that `snapshot` gave."""
-        self._origin_ns = state["origin_ns"]
-        self._streams.load(self._origin_ns, state)
+        self._time.load(state)
+        self._streams.load(self._time.origin_ns, state)
         self._unit, self.identity, self._reference = state["unit"], state["identity"], state["reference"]
         self._not_certified = state["not_certified"]
         self._nominal, self._estimation = state["nominal"], None
@@ -345,5 +336,3 @@ class ChannelState:
         self._first_day, self._status = state["first_day"], state["status"]
         self._refused = state["refused"]
         self._clocks.load(state)
-        self._now_ns = state["now_ns"]
-        self._utc_minus_monotonic_ns = state["utc_minus_monotonic_ns"]

@@ -10,7 +10,7 @@ import numpy as np
 
 from agent.config import Channel
 from agent.config.gate import GateSettings
-from agent.core.gate import Decision, Evidence, Gate
+from agent.core.gate import PROPOSALS_KEPT, Decision, Evidence, Gate
 from calib.distributions import chi2_quantile
 from calib.estimate.correction import Law
 from calib.estimate.drift import DriftTest, DriftVerdict
@@ -68,6 +68,7 @@ class Estimation:
         self.gate = Gate(_limits(channel, self.recursion.scale), self.in_force)
         self.drift = DriftTest(channel.drift.settings())
         self._held: list[Summary] = []
+        self._proposed: list[tuple[Calibration, Recursion]] = []  # proposals whose windows the state did not take
         self._tried: Tried | None = None  # what `lag_after` did, for `judge` right after it
 
     @property
@@ -75,12 +76,15 @@ class Estimation:
         """By which the sensor's indications come after the reference's, as far as known."""
         return self.recursion.lag_s
 
+    def _summary(self, window: Window, day: float, lag_s: float, temperature_degc: float) -> Summary:
+        return Summary.of(window, day, lag_s, temperature_degc, self.recursion.reference)
+
     def lag_after(self, windows: Sequence[Window], day: float, lag_s: float, temperature_degc: float) -> float:
         """The lag once these windows, made with `lag_s` taken out, were taken."""
         self._tried = self._try(windows[0], day, lag_s, temperature_degc)
         trial = self._tried.after
         for window in windows[1:]:
-            _, trial = trial.with_window(Summary.of(window, day, lag_s, temperature_degc))
+            _, trial = trial.with_window(self._summary(window, day, lag_s, temperature_degc))
         return trial.lag_s
 
     def judge(self, window: Window, day: float, lag_s: float, temperature_degc: float) -> Judged:
@@ -112,30 +116,77 @@ class Estimation:
             self.in_force, self.law = self.recursion.result(), self.recursion.law()
             self.residual_sd = self.recursion.residual_sd
         if decision.action == "hold":
+            if decision.proposal is not None:
+                made = trial if decision.proposal is candidate else adopted
+                assert made is not None  # a proposal is one of the two
+                self._proposed = [*self._proposed, (decision.proposal, made.settled())][-PROPOSALS_KEPT:]
             decision = replace(decision, reason=f"{decision.reason}; {_most(innovation, self.recursion.scale)}")
         return Judged(decision, innovation, drift)
 
     def _try(self, window: Window, day: float, lag_s: float, temperature_degc: float) -> Tried:
-        summary = Summary.of(window, day, lag_s, temperature_degc)
+        summary = self._summary(window, day, lag_s, temperature_degc)
         return Tried(window.sums, summary, *self.recursion.with_window(summary))
 
-    def put(self, calibration: Calibration) -> None:
-        """An operator put this calibration in force: the state continues from it, if it differs from the state."""
+    def accept(self, calibration: Calibration) -> None:
+        """An operator put a proposal in force. The state continues from the one that made the proposal."""
+        proposed = next((r for c, r in self._proposed if np.array_equal(c.covariance, calibration.covariance)), None)
+        if proposed is not None:  # else the state has taken the windows of the proposal already
+            self.recursion = proposed
+            self.drift.restart(np.ones(12, dtype=bool))
+        self._put_in_force(calibration)
+
+    def roll_back(self, calibration: Calibration) -> None:
+        """An operator put an earlier calibration in force. The state continues from it, if it differs from the state.
+
+        How its errors depend on the references is not known any more, so that the state is less certain than it.
+        """
         now = self.recursion.result()
         if not (
             np.array_equal(now.sensitivity, calibration.sensitivity) and np.array_equal(now.offset, calibration.offset)
         ):
             self.recursion.put(calibration)
             self.drift.restart(np.ones(12, dtype=bool))
-        # How S and Q go with temperature is the state's as before.
-        self.in_force, self.law = calibration, replace(self.recursion.law(), determined=calibration.determined)
-        self._held = []
+        self._put_in_force(calibration)
 
-    def forget_reference(self) -> None:
-        """The reference was replaced: drop the estimate of its error and the held windows."""
-        self.recursion.forget_reference()
-        self.gate.dismiss()
-        self._held = []
+    def _put_in_force(self, calibration: Calibration) -> None:
+        law = self.recursion.law()  # the dependence of S and Q on the temperature is that of the state
+        mean, covariance = law.mean.copy(), law.covariance.copy()
+        mean[:12] = np.append(calibration.sensitivity.ravel(), calibration.offset)
+        covariance[:12, :12] = calibration.covariance
+        self.in_force = calibration
+        self.law = replace(law, mean=mean, covariance=covariance, determined=calibration.determined)
+        self._held, self._proposed = [], []
+
+    def meet(self, reference: str, calibrated: str, sensitivity: float) -> bool:
+        """The reference that is connected now, and its certificate (see Recursion.meet).
+
+        Held windows of another reference are dropped. Returns whether the calibration in force changed.
+        """
+        before, follows = self.recursion.reference, self._follows_state()
+        changed = self.recursion.meet(reference, calibrated, sensitivity)
+        if before not in ("", self.recursion.reference):
+            self.gate.dismiss()
+            self._held, self._proposed = [], []
+        return changed and follows and self._update_in_force()
+
+    def restate(self, gravity_mps2: tuple[float, float] | None, *, remounted: bool) -> bool:
+        """After `load` of a state that was made with another configuration: see Recursion.restate.
+
+        `remounted`: the stated poses changed. Returns whether the calibration in force changed.
+        """
+        follows = self._follows_state()
+        if remounted:
+            self.recursion.remount(of_reference=False)
+            self._held = []
+        return self.recursion.restate(gravity_mps2) and follows and self._update_in_force()
+
+    def _follows_state(self) -> bool:
+        """Whether the calibration in force is that of the state."""
+        return self.gate.calibrated and np.array_equal(self.recursion.result().covariance, self.in_force.covariance)
+
+    def _update_in_force(self) -> bool:
+        self.in_force, self.law = self.recursion.result(), self.recursion.law()
+        return True
 
     def _follow(self) -> None:
         """A step so small that each window alone was consistent: the state may follow it."""
@@ -182,6 +233,11 @@ class Estimation:
 
     # --- state
 
+    def _loaded(self, state: dict[str, Any]) -> Recursion:
+        loaded = self.recursion.copy()
+        loaded.load(state)
+        return loaded
+
     def snapshot(self) -> dict[str, Any]:
         """State for `load`, bit-exact."""
         return {
@@ -189,7 +245,8 @@ class Estimation:
             "gate": self.gate.snapshot(),
             "drift": self.drift.snapshot(),
             "held": [summary.snapshot() for summary in self._held],
-            "in_force": {name: getattr(self.in_force, name) for name in Calibration.__slots__},
+            "proposed": [{"calibration": _plain(c), "recursion": r.snapshot()} for c, r in self._proposed],
+            "in_force": _plain(self.in_force),
             "law": {name: getattr(self.law, name) for name in Law.__slots__},
             "residual_sd": self.residual_sd,
         }
@@ -200,8 +257,13 @@ class Estimation:
         self.gate.load(state["gate"])
         self.drift.load(state["drift"])
         self._held = [Summary.load(summary) for summary in state["held"]]
+        self._proposed = [(Calibration(**p["calibration"]), self._loaded(p["recursion"])) for p in state["proposed"]]
         self.in_force, self.law = Calibration(**state["in_force"]), Law(**state["law"])
         self.residual_sd = np.array(state["residual_sd"])
+
+
+def _plain(calibration: Calibration) -> dict[str, Any]:
+    return {name: getattr(calibration, name) for name in Calibration.__slots__}
 
 
 def _limits(channel: Channel, scale: float) -> GateSettings:

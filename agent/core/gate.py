@@ -95,6 +95,11 @@ class Gate:
         self._proposals: list[tuple[int, Calibration]] = []  # oldest first; number 0: not yet published
 
     @property
+    def calibrated(self) -> bool:
+        """Whether a calibration is in force."""
+        return self._calibrated
+
+    @property
     def status(self) -> Status:
         """CalibrationStatus that follows from the state of the gate."""
         if self._lost:
@@ -221,6 +226,19 @@ class Gate:
         k = next(k for k, (number, _) in enumerate(self._proposals) if not number)
         self._proposals[k] = (sequence, self._proposals[k][1])
         self._proposals = self._proposals[-PROPOSALS_KEPT:]
+
+    def anchor_at(self, accepted: Calibration, in_force: Calibration) -> str:
+        """Count changes from another calibration, which the configuration states now. Returns "" if that is done.
+
+        If the calibration in force is beyond a limit of it, nothing is done, and the return value says which limit.
+        """
+        anchor = Anchor(self._settings, accepted)
+        if self._calibrated:
+            if beyond := anchor.change(in_force).reason:
+                return beyond
+            anchor.learn(in_force)
+        self._anchor = anchor
+        return ""
 
     # --- events and operators
 

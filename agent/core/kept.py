@@ -1,11 +1,11 @@
 """The state of a device that is kept for later runs, and what a later run does with it.
 
-A state is valid only for the settings under which it was made. If these settings have changed in the configuration, or
-if the state cannot be read, the estimation begins again: from the calibration in force, or from the prior if the prior
-has changed.
-
-S and Q belong to the sensor and stay valid when it is mounted elsewhere. The rest of the state does not: it holds the
-mean output at a fixed mount, the errors of the angles of a clamp, and the error of the reference.
+S and Q owe their values to the reference, the mount and the stated uncertainties. So the state is kept as a whole when
+the configuration changes: a changed prior is exchanged for the one before, a sensor that was mounted in another way may
+have other angles, and what is known of the reference stays with that reference. Only a changed setting by which the
+windows themselves were made makes the state invalid; the estimation then begins again from the prior. If the state
+cannot be read, it begins again from the calibration in force, with a larger uncertainty because the covariance with the
+reference is lost.
 """
 
 from __future__ import annotations
@@ -28,10 +28,9 @@ from agent.core.snapshot import pack, unpack
 from calib.model import Pose
 
 # Settings on which the meaning of a state depends. Walks (process), gate and drift settings may change at any time.
-BASIS = frozenset(
-    {"prior", "certificate", "uncertainty", "temperature", "coupling", "gravity_mps2", "static_sign", "reference"}
-    | {"rotation", "rotation_gravity_mps2", "clamp_theta_deg"}
-)
+STATED = frozenset({"prior", "certificate", "uncertainty", "temperature", "gravity_mps2"})  # exchanged in the state
+MOUNT = frozenset({"rotation", "rotation_gravity_mps2", "clamp_theta_deg", "poses", "positions", "fixed_mount"})
+WINDOWS = frozenset({"coupling", "static_sign"})  # by which windows are made, as is certificate.quantity
 MALFORMED = (ValueError, KeyError, TypeError, AttributeError, IndexError)  # a state of other fields or shapes
 
 
@@ -41,6 +40,7 @@ class Kept:
     how much of the kept state is used.
 
     `reference` is the identity of the reference in the kept state, `day` the days that its estimation had counted.
+    `moved`: the calibration in force is another one now, because a changed setting changed S, Q or their uncertainty.
     """
 
     estimation: Estimation
@@ -49,6 +49,7 @@ class Kept:
     day: float
     t_utc_ns: int
     reason: str
+    moved: bool = False
 
 
 def keep(
@@ -84,32 +85,47 @@ def take_up(kept: bytes, channel: Channel, nominal: float | None) -> Kept:
         )
     try:
         changed = _changed(state["basis"], channel)
-        reference = str(state["reference"])
-        if not changed:
-            fresh.load(state["estimation"])
-            return Kept(fresh, in_force, reference, day, t_utc_ns, "restored from the previous run")
-        why = f"these settings have changed: {', '.join(changed)}"
+        if wrong := _made_otherwise(changed, state["basis"], channel):
+            reason = f"begun again from the prior: windows were made with other settings: {', '.join(wrong)}"
+            return Kept(fresh, None, "", day, t_utc_ns, reason)
+        stated = fresh.recursion.result()
+        fresh.load(state["estimation"])
+        if "prior" in changed and (beyond := fresh.gate.anchor_at(stated, fresh.in_force)):
+            reason = f"begun again from the prior: the calibration in force contradicts the changed prior: {beyond}"
+            return Kept(Estimation(channel, nominal), None, "", day, t_utc_ns, reason)
+        moved = fresh.restate(_gravity(changed, state["basis"], channel), remounted=bool(MOUNT & changed))
     except MALFORMED as error:
-        changed, reference, why = [], "", f"the stored state cannot be read: {_said(error)}"
+        return _from_in_force(state, in_force, channel, nominal, day, t_utc_ns, _said(error))
+    reason = "restored from the previous run"
+    if changed:
+        reason += f"; these settings have changed and were exchanged in the state: {', '.join(sorted(changed))}"
+    return Kept(fresh, in_force, str(state["reference"]), day, t_utc_ns, reason, moved)
+
+
+def _from_in_force(
+    state: Mapping[str, Any],
+    in_force: CalibrationUpdate | None,
+    channel: Channel,
+    nominal: float | None,
+    day: float,
+    t_utc_ns: int,
+    why: str,
+) -> Kept:
+    """The estimation begun from the calibration in force, because the rest of the state cannot be read."""
+    why = f"the stored state cannot be read: {why}"
     fresh = Estimation(channel, nominal)
-    if in_force is None or "prior" in changed:
-        return Kept(fresh, None, reference, day, t_utc_ns, f"begun again from the prior: {why}")
+    if in_force is None:
+        return Kept(fresh, None, "", day, t_utc_ns, f"begun again from the prior: {why}")
     try:
         fresh.gate.load(state["estimation"]["gate"])  # an operator's hold and the anchor stay
     except MALFORMED:
         refused = fresh.gate.rollback(calibration_of(in_force), "").refused
         fresh.gate.release("")
         if refused:
-            return Kept(
-                Estimation(channel, nominal),
-                None,
-                reference,
-                day,
-                t_utc_ns,
-                f"begun again from the prior: {why}; {refused}",
-            )
-    fresh.put(calibration_of(in_force))
-    return Kept(fresh, in_force, reference, day, t_utc_ns, f"begun again from the calibration in force: {why}")
+            reason = f"begun again from the prior: {why}; {refused}"
+            return Kept(Estimation(channel, nominal), None, "", day, t_utc_ns, reason)
+    fresh.roll_back(calibration_of(in_force))
+    return Kept(fresh, in_force, "", day, t_utc_ns, f"begun again from the calibration in force: {why}")
 
 
 def shelved(kept: Mapping[str, bytes], identity: str, memory: bytes) -> dict[str, bytes]:
@@ -129,11 +145,26 @@ def update_of(state: dict[str, Any] | None) -> CalibrationUpdate | None:
 
 
 def _basis(channel: Channel) -> dict[str, str]:
-    whole: dict[str, Any] = channel.model_dump(mode="json", include=set(BASIS)) | {"fixed_mount": channel.fixed_mount}
+    included = set(STATED | MOUNT | WINDOWS) - {"poses", "positions", "fixed_mount"}
+    whole: dict[str, Any] = channel.model_dump(mode="json", include=included) | {"fixed_mount": channel.fixed_mount}
     whole["poses"] = _by_position((pose_of(pose, channel), pose) for pose in channel.poses)
     stops = () if channel.positions == "free" else channel.positions
     whole["positions"] = _by_position(zip(channel.stops, stops, strict=True))
     return {name: msgspec.json.encode(value, order="deterministic").decode() for name, value in whole.items()}
+
+
+def _made_otherwise(changed: Iterable[str], before: Mapping[str, str], channel: Channel) -> list[str]:
+    """Changed settings by which windows are made: windows that were made with the old ones tell nothing now."""
+    found = sorted(WINDOWS.intersection(changed))
+    quantity = msgspec.json.decode(before["certificate"]).get("quantity", channel.certificate.quantity)
+    return found if quantity == channel.certificate.quantity else [*found, "certificate.quantity"]
+
+
+def _gravity(changed: Iterable[str], before: Mapping[str, str], channel: Channel) -> tuple[float, float] | None:
+    """The stated local gravity before and now, if it changed."""
+    if "gravity_mps2" not in changed:
+        return None
+    return float(msgspec.json.decode(before["gravity_mps2"])), channel.gravity_mps2
 
 
 def _by_position(stances: Iterable[tuple[Pose, Stop]]) -> dict[str, list[str]]:
@@ -144,16 +175,16 @@ def _by_position(stances: Iterable[tuple[Pose, Stop]]) -> dict[str, list[str]]:
     return {name: sorted(stated) for name, stated in found.items()}
 
 
-def _changed(before: dict[str, str], channel: Channel) -> list[str]:
+def _changed(before: dict[str, str], channel: Channel) -> set[str]:
     """Settings that are not as they were. What a state of an earlier version does not name is taken as unchanged."""
     now = _basis(channel)
-    return sorted(
+    return {
         name
-        for name in before
-        if before[name] != now.get(name)
+        for name in before.keys() & now.keys()
+        if before[name] != now[name]
         and not _same_mount(name, before, now)
         and not _same_section(before[name], getattr(channel, name, None))
-    )
+    }
 
 
 def _same_section(before: str, section: object) -> bool:

@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
+import numpy as np
+
 from calib.estimate.quantities import (
     ALPHA,
     ALPHA_BY_POSITION,
@@ -16,6 +18,7 @@ from calib.estimate.quantities import (
     DIRECTION_BY_POSITION,
     GRAVITY,
     GRAVITY_DIRECTION,
+    KINDS,
     LAG,
     LAG_OF_AXIS,
     MAIN_TEMPERATURE,
@@ -23,6 +26,7 @@ from calib.estimate.quantities import (
     OFFSET_BY_POSITION,
     OFFSET_RATE,
     OFFSET_TEMPERATURE,
+    PRIORS,
     RATES,
     REFERENCE,
     ROTATION,
@@ -32,6 +36,7 @@ from calib.estimate.quantities import (
     THETA_BY_POSITION,
     TRANSVERSE,
     Kind,
+    Quantity,
     offset_temperature,
 )
 from calib.model import PARAMETERS
@@ -106,4 +111,46 @@ def _quantity_of_version_1(name: str) -> list[str]:
     return [name, _VERSION_1_BY_POSITION[stem].name, rest.rpartition("]")[0]]
 
 
-MIGRATIONS: Mapping[int, Callable[[dict[str, Any]], None]] = {1: from_version_1}
+def from_version_2(state: dict[str, Any]) -> None:
+    """Give the unknowns of the reference its identity, and each unknown its prior.
+
+    Version 2 kept the standard uncertainty of each prior and no mean: the estimate stands for the mean, and the
+    configuration of this run for what was stated. The reference whose errors the state had is the one in the state.
+    """
+    for holder in [state, *state.get("channels", {}).values()]:
+        if holder.get("estimation"):
+            _own(holder["estimation"], holder.get("reference") or "")
+
+
+def _own(estimation: dict[str, Any], reference: str) -> None:
+    estimation["proposed"] = []
+    recursion = estimation["recursion"]
+    bound = recursion.pop("bound")
+    for joint in (recursion["state"], recursion["base"]):
+        kinds = [KINDS[kind] for _, kind, _ in joint["quantities"]]
+        nuisance = np.array([kind.prior is not None and kind.prior.name in PRIORS for kind in kinds])
+        joint["quantities"] = [
+            [*quantity, reference if kind.of_reference else ""]
+            for quantity, kind in zip(joint["quantities"], kinds, strict=True)
+        ]
+        joint["stated_u"] = np.sqrt(bound) / np.where(nuisance, 2.0, 1.0)
+        joint["stated_mean"] = np.full(len(kinds), np.nan)  # as stated now
+        joint["walked"] = np.zeros(len(kinds))
+        joint["doubt"] = 1.0
+    for summary in (*recursion["recent"], *estimation["held"]):
+        summary["reference"] = reference
+    recursion["reference"], recursion["sensitivity"] = reference, None
+    recursion["references"] = {reference: None} if recursion["windows"] else {}
+    recursion["stated"] = {"mean": None, "u": recursion.pop("prior_u"), "priors": None}
+    if recursion["held"] is not None:
+        by = recursion["held"]["by"]
+        keys = {quantity[0]: Quantity(*_with_kind(quantity)).key for quantity in recursion["state"]["quantities"]}
+        recursion["held"]["by"] = {keys[name]: moves for name, moves in by.items()}
+
+
+def _with_kind(quantity: list[str]) -> tuple[str, Kind, str, str]:
+    name, kind, position, owner = quantity
+    return name, KINDS[kind], position, owner
+
+
+MIGRATIONS: Mapping[int, Callable[[dict[str, Any]], None]] = {1: from_version_1, 2: from_version_2}

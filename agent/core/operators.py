@@ -41,7 +41,7 @@ def answer(command: Command, estimation: Estimation, identity: str) -> tuple[Ans
         earlier = _earlier(command, identity)
         found = estimation.gate.rollback(calibration_of(earlier), key)
     if found.calibration is not None:
-        estimation.put(found.calibration)
+        (estimation.accept if earlier is None else estimation.roll_back)(found.calibration)
     return found, earlier
 
 

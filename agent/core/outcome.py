@@ -45,7 +45,7 @@ def calibration_update(source: Source, calibration: Calibration, recursion: Recu
         temperature_low_degc=low, temperature_high_degc=high,
         offset_temperature=[value for value, _ in by_power], u_offset_temperature=[u for _, u in by_power],
         sensitivity_temperature=S_temperature[0], u_sensitivity_temperature=S_temperature[1],
-        offset_rate=rate, u_offset_rate=u_rate,
+        offset_rate=rate, u_offset_rate=u_rate, references=[name for name in recursion.references if name],
     )  # fmt: skip
 
 

@@ -45,13 +45,15 @@ def compare(
     tolerance: float,
     *,
     complete: bool = True,
-    reasons: bool = True,
+    same_version: bool = True,
 ) -> Difference | None:
     """The first difference between the results of one event, or None.
 
     `tolerance` 0 compares floats by their bits, so that NaN equals NaN and 0.0 differs from -0.0; above it is relative
-    to the largest of a list. Where `complete` is false the recording may end before the last results. Where `reasons`
-    is false the text in `reason` is not compared: another version of the program may word it in another way.
+    to the largest of a list. Where `complete` is false the recording may end before the last results. Where
+    `same_version` is false another version of the program recorded: the text in `reason` is not compared, because that
+    version may word it in another way, and neither is a field that the recorded result leaves empty, because that
+    version may not have it.
     """
 
     def difference(what: str, field: str, before: Any, now: Any, *, decision: bool) -> Difference:
@@ -69,8 +71,11 @@ def compare(
         if type(before) is not type(now) or topic_of(before) != topic_of(now):
             return difference(topic_of(before), "kind", topic_of(before), topic_of(now), decision=True)
         pair = (_plain(before), _plain(now))
-        if not reasons:
-            pair = (pair[0] | {"reason": ""}, pair[1] | {"reason": ""})
+        if not same_version:
+            left_out = {"reason", *_empty(before)}
+            for side in pair:
+                for name in left_out & side.keys():
+                    del side[name]
         for field, a, b in differences(*pair, tolerance):
             return difference(topic_of(before), field, a, b, decision=not isinstance(a, float))
     if len(recorded) > len(computed) or (complete and len(recorded) < len(computed)):
@@ -117,6 +122,13 @@ def _on_the_edge(results: Sequence[Output]) -> bool:
                 if abs(statistic - threshold) <= OTHER_CPU * abs(threshold):
                     return True
     return False
+
+
+def _empty(item: Output) -> set[str]:
+    """Fields of a result that have their default values."""
+    fields = msgspec.structs.fields(item) if isinstance(item, msgspec.Struct) else ()
+    defaults = {f.name: f.default if f.default_factory is msgspec.NODEFAULT else f.default_factory() for f in fields}
+    return {name for name, default in defaults.items() if getattr(item, name) == default}
 
 
 def _plain(item: Output) -> Any:

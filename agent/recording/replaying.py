@@ -67,7 +67,7 @@ class Replay:
         self._elsewhere = elsewhere
         self._pipeline: PipelineLike | None = None  # as the last file left it, if the next file may continue with it
         self._next_event = 0
-        self._reasons = True  # compare the texts of reasons too; another version may word them in another way
+        self._same_version = True  # of the program that recorded
         self.files: list[ReplayedFile] = []
         self.calibrations: list[CalibrationUpdate] = []
         self.windows: list[WindowReport] = []
@@ -104,8 +104,8 @@ class Replay:
             file.tolerance = self._elsewhere
             file.notes.append(f"recorded with another {', '.join(other)} than on this machine: last bits may differ")
         version = start.versions.get("fieldcal", __version__)
-        self._reasons = version == __version__
-        if not self._reasons:
+        self._same_version = version == __version__
+        if not self._same_version:
             file.notes.append(
                 f"recorded by fieldcal {version}, this is {__version__}: texts of reasons are not compared"
             )
@@ -139,7 +139,7 @@ class Replay:
         if computed or step.results:
             found = compare(
                 file.path, step.event_sequence, step.results, computed, file.tolerance,
-                complete=step.complete, reasons=self._reasons,
+                complete=step.complete, same_version=self._same_version,
             )  # fmt: skip
             if found is not None:
                 self._differ(file, found)

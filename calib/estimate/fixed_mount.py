@@ -35,7 +35,7 @@ def never_turned(inputs: Array) -> bool:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Held:
-    """The constant input acceleration (3,) at a fixed mount, as stated, and how nuisances move it, by name (3,)."""
+    """The constant input acceleration (3,) at a fixed mount, as stated, and how nuisances move it, by key (3,)."""
 
     mps2: Array
     by: Mapping[str, Array]
@@ -44,51 +44,55 @@ class Held:
         """S and Q (12,) and a factor (12, N) of their covariance, of a state with the mean output in the place of Q."""
         mean, factor = state.mean[:12].copy(), state.factor[:12].copy()
         S, felt = mean[:9].reshape(3, 3), self.mps2.copy()
-        for name, moves in self.by.items():
-            felt += state.mean[state.index(name)] * moves
+        for key, moves in self.by.items():
+            felt += state.mean[state.index(key)] * moves
         mean[9:] -= S @ felt
         factor[9:] -= np.einsum("k,ikn->in", felt, factor[:9].reshape(3, 3, -1))
-        for name, moves in self.by.items():
-            factor[9:] -= np.outer(S @ moves, state.factor[state.index(name)])
+        for key, moves in self.by.items():
+            factor[9:] -= np.outer(S @ moves, state.factor[state.index(key)])
         return mean, factor
 
     def mean_output_u(self, state: JointState, u_terms: Mapping[str, float]) -> Array:
         """(3,) standard uncertainty of the mean output before any data: of Q, S and what moves the input acceleration.
 
-        `state` has Q itself; `u_terms` are standard uncertainties by name.
+        `state` has Q itself; `u_terms` are standard uncertainties by key.
         """
         variance, S = state.variance, state.mean[:9].reshape(3, 3)
         felt = variance[9:12] + variance[:9].reshape(3, 3) @ self.mps2**2
-        tilted = sum((S @ moves * u_terms[name]) ** 2 for name, moves in self.by.items())
+        tilted = sum((S @ moves * u_terms[key]) ** 2 for key, moves in self.by.items())
         return np.sqrt(felt + tilted)
 
     def mount(self, joint: Linearised, terms: Sequence[Term]) -> None:
         """The mean output takes the place of Q in a joint state; nuisances of the mount (`terms`) come in."""
-        u = self.mean_output_u(joint.state, {term.name: term.uncertainty for term in terms})
+        u = self.mean_output_u(joint.state, {term.key: term.uncertainty for term in terms})
         for state in (joint.state, joint.base):
             S = state.mean[:9].reshape(3, 3)
-            state.replace(slice(9, 12), state.mean[9:12] + S @ self.mps2, np.diag(u**2))
+            state.replace(slice(9, 12), state.mean[9:12] + S @ self.mps2, u)
         joint.point[9:12] = joint.state.mean[9:12]
-        joint.bound[9:12] = u**2
         joint.append(terms)
 
     def unmount(self, joint: Linearised) -> None:
         """Q takes its place back; all windows must be in the base."""
         for state in (joint.state, joint.base):
             state.mean[:12], state.factor[:12] = self.parameters(state)
+            state.stated_mean[9:12], state.stated_u[9:12] = state.mean[9:12], np.sqrt(state.variance[9:12])
+            state.walked[9:12] = 0.0
         joint.point = joint.state.mean.copy()
-        joint.bound[9:12] = joint.state.variance[9:12]
 
-    def moved_by(self, other: Held, names: Sequence[str]) -> Held:
-        """The same acceleration, which nuisances of these names move as `other` says."""
-        return Held(self.mps2, {**self.by, **{name: other.by[name] for name in names if name in other.by}})
+    def with_gravity(self, ratio: float) -> Held:
+        """The same mount with the stated gravity multiplied by `ratio`."""
+        return Held(self.mps2 * ratio, self.by)
+
+    def moved_by(self, other: Held, keys: Sequence[str]) -> Held:
+        """The same acceleration, which nuisances with these keys move as `other` says."""
+        return Held(self.mps2, {**self.by, **{key: other.by[key] for key in keys if key in other.by}})
 
 
 def held_at(summary: Summary, priors: Priors) -> tuple[Held, Sequence[Term]]:
     """What a window's pose and its reference's mean tell of it; with all nuisances of that pose."""
-    nuisances = Nuisances([summary.pose], summary.data.channels, priors, Applied())
+    nuisances = Nuisances([summary.pose], summary.data.channels, priors, Applied(), summary.reference)
     inputs = nuisances.at(np.zeros(len(nuisances)))
     mean = summary.data.mean_x[0][: inputs.direction.shape[2]]
     moves = inputs.d_gravity[:, 0] + inputs.d_direction[:, 0] @ mean
-    by = {t.name: m for t, m in zip(nuisances.terms, moves, strict=True) if np.any(m)}
+    by = {t.key: m for t, m in zip(nuisances.terms, moves, strict=True) if np.any(m)}
     return Held(summary.held_mps2.copy(), by), nuisances.terms

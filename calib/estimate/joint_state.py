@@ -7,6 +7,7 @@ form of the Kalman filter; Bierman 1977, ch. V).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,20 +15,36 @@ import numpy as np
 from calib.estimate.quantities import KINDS, Quantity
 from calib.model import Array
 
-ALIKE = 1e-10  # unit vectors of the factor that differ by less than this count as the same direction
+UNKNOWN_CORRELATION = 2.0  # by which variances grow where a correlation was lost
 
 
 class JointState:
-    """Named quantities with their mean (N,) and joint covariance. The methods change the object in place."""
+    """Quantities with their mean (N,) and joint covariance. The methods change the object in place.
+
+    `stated_mean`, `stated_u` (N,): the prior of each quantity, with which it came into the state; `exchange` replaces
+    it. `walked` (N,): the variance that random walks and loosening have added to the quantity since then. `doubt`: the
+    factor by which the variance of a new quantity is larger than its prior, because a correlation was lost before.
+    """
 
     def __init__(self, quantities: Sequence[Quantity], mean: Array, standard_uncertainty: Array) -> None:
         self.quantities = list(quantities)
-        self.names = [quantity.name for quantity in quantities]
         self.mean = np.array(mean, dtype=np.float64)
         self.factor = np.diag(np.asarray(standard_uncertainty, dtype=np.float64))
+        self.stated_mean = self.mean.copy()
+        self.stated_u = np.array(standard_uncertainty, dtype=np.float64)
+        self.walked = np.zeros(len(self.mean))
+        self.doubt = 1.0
+        self._rename()
+
+    def _rename(self) -> None:
+        self.keys = [quantity.key for quantity in self.quantities]
+        self._at = {key: k for k, key in enumerate(self.keys)}
 
     def __len__(self) -> int:
-        return len(self.names)
+        return len(self.quantities)
+
+    def __contains__(self, key: str) -> bool:
+        return key in self._at
 
     @property
     def covariance(self) -> Array:
@@ -39,25 +56,35 @@ class JointState:
         """(N,) the diagonal of the covariance."""
         return np.asarray(np.einsum("ij,ij->i", self.factor, self.factor))
 
-    def index(self, name: str) -> int:
-        """Position of a quantity in the mean and the covariance. Raises ValueError if there is none of this name."""
-        return self.names.index(name)
+    def index(self, key: str) -> int:
+        """Position of a quantity in the mean and the covariance. Raises KeyError if there is none with this key."""
+        return self._at[key]
 
     def append(self, quantity: Quantity, mean: float, standard_uncertainty: float) -> None:
-        """Add a quantity that is independent of all others."""
-        n = len(self.names)
+        """Add a quantity that is independent of all others, with its prior."""
+        n = len(self)
         grown = np.zeros((n + 1, n + 1))
-        grown[:n, :n], grown[n, n] = self.factor, standard_uncertainty
+        grown[:n, :n], grown[n, n] = self.factor, standard_uncertainty * np.sqrt(self.doubt)
         self.quantities.append(quantity)
-        self.names.append(quantity.name)
         self.mean, self.factor = np.append(self.mean, mean), grown
+        self.stated_mean = np.append(self.stated_mean, mean)
+        self.stated_u = np.append(self.stated_u, standard_uncertainty)
+        self.walked = np.append(self.walked, (self.doubt - 1.0) * standard_uncertainty**2)
+        self._rename()
 
     def keep(self, kept: Sequence[bool]) -> None:
         """Remove the other quantities (marginalise them): mean and covariance of those kept do not change."""
         keep = np.flatnonzero(kept)
         self.quantities = [self.quantities[k] for k in keep]
-        self.names = [quantity.name for quantity in self.quantities]
         self.mean, self.factor = self.mean[keep], _square(self.factor[keep])
+        self.stated_mean, self.stated_u = self.stated_mean[keep], self.stated_u[keep]
+        self.walked = self.walked[keep]
+        self._rename()
+
+    def hand_over(self, owner: str, new_owner: str) -> None:
+        """Give the quantities of an owner another name of the same owner."""
+        self.quantities = [replace(q, owner=new_owner) if q.owner == owner else q for q in self.quantities]
+        self._rename()
 
     def transform(self, matrix: Array) -> None:
         """Replace x by M x, and the covariance P by M P M'."""
@@ -65,35 +92,68 @@ class JointState:
 
     def spread(self, variance: Array) -> None:
         """Add independent variances (N,) to those of the quantities."""
+        self.walked = self.walked + variance
         live = np.flatnonzero(variance > 0.0)
         if live.size:
             noise = np.zeros((len(self), live.size))
             noise[live, range(live.size)] = np.sqrt(variance[live])
             self.factor = _square(np.hstack([self.factor, noise]))
 
-    def replace(self, where: slice, mean: Array, covariance: Array) -> None:
-        """Give the quantities `where` this mean (k,) and covariance (k, k), independent of all other quantities."""
-        self._replace(where, mean, np.zeros((len(mean), len(self))), covariance)
+    def replace(self, where: slice, mean: Array, standard_uncertainty: Array) -> None:
+        """Give the quantities `where` this prior (k,), (k,), independent of all other quantities."""
+        own = np.zeros((len(self), len(mean)))
+        own[where] = np.diag(standard_uncertainty)
+        self.mean[where], self.factor[where] = mean, 0.0
+        self.factor = _square(np.hstack([self.factor, own]))
+        self.stated_mean[where], self.stated_u[where], self.walked[where] = mean, standard_uncertainty, 0.0
 
-    def restate(self, where: slice, mean: Array, covariance: Array) -> None:
-        """Give the quantities `where` this mean (k,) and covariance (k, k), and keep their covariance with the others.
+    def intersect(self, where: slice, mean: Array, covariance: Array) -> None:
+        """Give the quantities `where` this mean (k,) and covariance (k, k), whose correlation with the other quantities
+        is not known.
 
-        Without that covariance an error of the reference would count as a new, independent error, and average out. If
-        the common part is larger than `covariance` allows, the common part stays and the covariance becomes larger.
+        Both blocks of the covariance are doubled, and those of later quantities. That is covariance intersection with
+        equal weights (Julier and Uhlmann 1997): the joint covariance is not too small, whatever the correlation is.
         """
-        others = np.delete(self.factor, where, axis=0)
-        length = np.linalg.norm(others, axis=1)
-        others = others[length > 0.0] / length[length > 0.0, None]
-        shared = self.factor[where] @ np.linalg.pinv(others, rcond=ALIKE) @ others
-        self._replace(where, mean, shared, covariance - shared @ shared.T)
-
-    def _replace(self, where: slice, mean: Array, shared: Array, covariance: Array) -> None:
-        """`shared` (k, N) replaces the rows of the factor; `covariance` (k, k) is added to it as independent."""
+        self.walked = self.walked + (UNKNOWN_CORRELATION - 1.0) * self.variance
+        self.doubt = UNKNOWN_CORRELATION
         values, ways = np.linalg.eigh(covariance)
         own = np.zeros((len(self), len(mean)))
         own[where] = ways * np.sqrt(np.maximum(values, 0.0))
-        self.mean[where], self.factor[where] = mean, shared
-        self.factor = _square(np.hstack([self.factor, own]))
+        self.mean[where], self.factor[where] = mean, 0.0
+        self.factor = np.sqrt(UNKNOWN_CORRELATION) * _square(np.hstack([self.factor, own]))
+
+    def shift(self, k: int, factor: float, amount: float) -> None:
+        """State a quantity against another zero: factor x + amount replaces x, in its prior too."""
+        for values in (self.mean, self.stated_mean):
+            values[k] = factor * values[k] + amount
+        self.factor[k] *= factor
+        self.stated_u[k] *= factor
+        self.walked[k] *= factor**2
+
+    def exchange(self, k: int, mean: float, standard_uncertainty: float) -> None:
+        """Replace the prior of one quantity, with which it came into the state, by another prior.
+
+        In information form this adds 1/u1^2 - 1/u0^2, and the matching vector. For a constant quantity that is exact.
+        A quantity x that has walked by the variance W since then equals its first value b plus the walk. The prior is
+        one of b, and b given x has the mean m0 + c (x - m0) and the variance c W, c = u0^2 / (u0^2 + W). Raises
+        ValueError if the quantity had no uncertainty, because then the state does not have its effect.
+        """
+        m0, p0, p1 = self.stated_mean[k], self.stated_u[k] ** 2, standard_uncertainty**2
+        if p0 == 0.0:
+            raise ValueError(f"{self.keys[k]} had no uncertainty, so the state does not have its effect")
+        share = p0 / (p0 + self.walked[k])
+        row = share * self.factor[k]
+        length2 = float(row @ row)
+        # All is multiplied by u1^2, so that u1 may be 0.
+        gained = 1.0 - p1 / p0
+        spread = p1 + gained * (length2 + share * self.walked[k])
+        told = mean - m0 * p1 / p0 - gained * (m0 + share * (self.mean[k] - m0))
+        along = self.factor @ row
+        if length2 > 0.0:
+            self.mean = self.mean + along * (told / spread)
+            part = min(gained * length2 / spread, 1.0)
+            self.factor = self.factor - np.outer(along, row) * ((1.0 - np.sqrt(1.0 - part)) / length2)
+        self.stated_mean[k], self.stated_u[k] = mean, standard_uncertainty
 
     def correct(self, step: Array, gain: Array, jacobian: Array) -> None:
         """Measurement update: x + step replaces x, and (1 - K H) P (1 - K H)' + K K' replaces P.
@@ -110,16 +170,24 @@ class JointState:
 
     def snapshot(self) -> dict[str, Any]:
         """The complete state, for `load`; bit for bit."""
-        quantities = [[q.name, q.kind.name, q.position] for q in self.quantities]
-        return {"quantities": quantities, "mean": self.mean.copy(), "factor": self.factor.copy()}
+        quantities = [[q.name, q.kind.name, q.position, q.owner] for q in self.quantities]
+        arrays = {name: getattr(self, name).copy() for name in _ARRAYS}
+        return {"quantities": quantities, "doubt": self.doubt} | arrays
 
     @classmethod
     def load(cls, state: Mapping[str, Any]) -> JointState:
         """The state whose snapshot this is. Raises KeyError if the table of unknowns does not have one of its kinds."""
-        quantities = [Quantity(name, KINDS[kind], position) for name, kind, position in state["quantities"]]
+        quantities = [
+            Quantity(name, KINDS[kind], position, owner) for name, kind, position, owner in state["quantities"]
+        ]
         loaded = cls(quantities, np.array(state["mean"]), np.zeros(len(quantities)))
-        loaded.factor = np.array(state["factor"])
+        for name in _ARRAYS:
+            setattr(loaded, name, np.array(state[name]))
+        loaded.doubt = state["doubt"]
         return loaded
+
+
+_ARRAYS = ("mean", "factor", "stated_mean", "stated_u", "walked")
 
 
 def _square(wide: Array) -> Array:

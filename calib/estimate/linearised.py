@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from calib.estimate.joint_state import JointState
+from calib.estimate.quantities import PRIORS, Kind
 from calib.estimate.terms import Term
 from calib.estimate.window_rows import Summary
+from calib.model import Array
 
 
 class Linearised:
     """A state that contains all windows, a base that contains all but the recent ones, and the point of linearisation.
 
     All three have the same N quantities. `base_day` is the day of the base, None before the first window; `recent` are
-    the recent windows; `point` (N,) are the values at which they are linearised; `bound` (N,) is the largest variance
-    that random walks may reach.
+    the recent windows; `point` (N,) are the values at which they are linearised.
     """
 
     def __init__(self, state: JointState) -> None:
@@ -25,24 +27,55 @@ class Linearised:
         self.base_day: float | None = None
         self.recent: list[Summary] = []
         self.point = state.mean.copy()
-        self.bound = state.variance.copy()
+
+    @property
+    def bound(self) -> Array:
+        """(N,) the largest variance that random walks may reach: that of the prior, for a nuisance four times that.
+
+        Later the mount may lean by more than its prior says of the day of mounting.
+        """
+        nuisance = np.array([q.kind.prior is not None and q.kind.prior.name in PRIORS for q in self.state.quantities])
+        return np.asarray(np.where(nuisance, 4.0, 1.0) * self.state.stated_u**2)
 
     def append(self, terms: Sequence[Term]) -> list[str]:
-        """Add each nuisance that the state does not have yet, with its prior. Returns the names of those added."""
-        new = [term for term in terms if term.name not in self.state.names]
+        """Add each nuisance that the state does not have yet, with its prior. Returns the keys of those added."""
+        new = [term for term in terms if term.key not in self.state]
         for term in new:
             for state in (self.state, self.base):
                 state.append(term.quantity, term.expected, term.uncertainty)
             self.point = np.append(self.point, term.expected)
-            # Twice the stated u: later the mount may lean by more than its prior says of the day of mounting.
-            self.bound = np.append(self.bound, (2.0 * term.uncertainty) ** 2)
-        return [term.name for term in new]
+        return [term.key for term in new]
 
     def keep(self, kept: Sequence[bool]) -> None:
         """Remove all other quantities. Before the call, the recent windows must have been moved to the base."""
-        self.bound, self.point = self.bound[np.array(kept)], self.point[np.array(kept)]
+        self.point = self.point[np.array(kept)]
         self.state.keep(kept)
         self.base = self.state.copy()
+
+    def keep_in_base(self, kept: Sequence[bool]) -> None:
+        """Remove all other quantities from the base. The recent windows must be taken again."""
+        self.base.keep(kept)
+        self.begin_with(self.base, self.base_day)
+
+    def begin_with(self, base: JointState, day: float | None = None) -> None:
+        """Replace the base. The recent windows must be taken again."""
+        points = dict(zip(self.state.keys, self.point, strict=True))
+        self.base, self.base_day, self.state = base, day, base.copy()
+        self.point = np.array([points.get(key, mean) for key, mean in zip(base.keys, base.mean, strict=True)])
+
+    def shift(self, kind: Kind, owner: str, factor: float, amount: float) -> None:
+        """State all unknowns of a kind and an owner against another zero (see JointState.shift)."""
+        for state in (self.state, self.base):
+            for k, quantity in enumerate(state.quantities):
+                if (quantity.kind, quantity.owner) == (kind, owner):
+                    state.shift(k, factor, amount)
+        self.point = self.state.mean.copy()
+
+    def hand_over(self, owner: str, new_owner: str) -> None:
+        """Give the quantities and the recent windows of a reference another name of the same reference."""
+        for state in (self.state, self.base):
+            state.hand_over(owner, new_owner)
+        self.recent = [replace(w, reference=new_owner) if w.reference == owner else w for w in self.recent]
 
     def moved(self, scale: float) -> bool:
         """Whether an unknown is so far from the point that the windows must be linearised again (see `Kind.straight`).
@@ -57,7 +90,7 @@ class Linearised:
         """An independent copy."""
         other = Linearised(self.state.copy())
         other.base, other.base_day, other.recent = self.base.copy(), self.base_day, list(self.recent)
-        other.point, other.bound = self.point.copy(), self.bound.copy()
+        other.point = self.point.copy()
         return other
 
     def snapshot(self) -> dict[str, Any]:
@@ -68,7 +101,6 @@ class Linearised:
             "base_day": self.base_day,
             "recent": [summary.snapshot() for summary in self.recent],
             "point": self.point.copy(),
-            "bound": self.bound.copy(),
         }
 
     @classmethod
@@ -77,5 +109,5 @@ class Linearised:
         loaded = cls(JointState.load(state["state"]))
         loaded.base, loaded.base_day = JointState.load(state["base"]), state["base_day"]
         loaded.recent = [Summary.load(summary) for summary in state["recent"]]
-        loaded.point, loaded.bound = np.array(state["point"]), np.array(state["bound"])
+        loaded.point = np.array(state["point"])
         return loaded

@@ -96,8 +96,11 @@ class Inputs:
 class Nuisances:
     """The J nuisances of P poses whose uncertainty is not 0, with their effects stacked as arrays (J, ...)."""
 
-    def __init__(self, poses: Sequence[Pose], channels: int, priors: Priors, applied: Applied) -> None:
-        self.terms = [t for t in terms(poses, channels, priors, applied.by_kind) if t.uncertainty > 0.0]
+    def __init__(
+        self, poses: Sequence[Pose], channels: int, priors: Priors, applied: Applied, reference: str = ""
+    ) -> None:
+        """`reference` is the identity of the reference; see calib.estimate.terms."""
+        self.terms = [t for t in terms(poses, channels, priors, applied.by_kind, reference) if t.uncertainty > 0.0]
         n = len(poses)
         self._stated = np.zeros((n, 3, channels))
         self._along = np.tile(np.eye(channels), (n, 1, 1))

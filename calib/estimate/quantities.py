@@ -53,7 +53,7 @@ class Statement:
     convert: Callable[[float], float] = float
 
 
-Loosening = Literal["", "jump", "lean", "line"]
+Loosening = Literal["jump", "lean", "line", "remount"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,9 +67,11 @@ class Kind:
     calib.estimate.recursion gets the uncertainty as an argument (S, Q, coefficients of temperature).
     `walk`: SD of its random walk after one day; None for a constant.
     `in_output_unit`: `walk` and `straight` must be multiplied by the sensor's output unit per m/s2.
-    `loosened_by`: the event that may change it at once, so that its uncertainty is enlarged: a "jump" of the sensor
-    that further windows confirmed, a "lean" of a fixed mount, a new "line" (a device or its wiring was started again).
-    `of_reference`: it belongs to the reference, and is removed when the reference is replaced.
+    `loosened_by`: the events that may change it at once, so that its uncertainty is enlarged: a "jump" of the sensor
+    that further windows confirmed, a "lean" of a fixed mount, a new "line" (a device or its wiring was started again),
+    a "remount" (the sensor or the reference was mounted again, or the stated poses changed).
+    `of_reference`: it belongs to the reference. It stays in the state when another reference takes its place, and is
+    used again when that reference comes back.
     `straight`: the change up to which its product with S counts as linear; LINEAR if it is not multiplied by S.
     `stated`: the prior is a statement that the data may contradict; if false, only the data determine the value.
     """
@@ -81,7 +83,7 @@ class Kind:
     mean: Statement | None = None
     walk: Statement | None = None
     in_output_unit: bool = False
-    loosened_by: Loosening = ""
+    loosened_by: tuple[Loosening, ...] = ()
     of_reference: bool = False
     straight: float = STRAIGHT
     stated: bool = True
@@ -94,11 +96,21 @@ class Kind:
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """One unknown: its name, its kind, and its position ("" if it is common to all positions)."""
+    """One unknown: its name, its kind, its position ("" if it is common to all positions), and its owner.
+
+    The owner is the identity of the reference to which the unknown belongs, "" for all other unknowns. Two references
+    have unknowns of the same name; `key` tells them apart in a joint state.
+    """
 
     name: str
     kind: Kind
     position: str = ""
+    owner: str = ""
+
+    @property
+    def key(self) -> str:
+        """Identifies the unknown in a joint state."""
+        return f"{self.name} of {self.owner}" if self.owner else self.name
 
 
 @dataclass(frozen=True, init=False)
@@ -143,14 +155,14 @@ SENSITIVITY = Kind(
     "sensitivity",
     walk=Statement("sensitivity", 5e-5, ("process.sensitivity_pct",), convert=_percent),
     in_output_unit=True,
-    loosened_by="jump",
+    loosened_by=("jump",),
 )
 TILT_WALK = Statement("tilt_rad", 3.5e-5, ("process.tilt_deg",), convert=_deg)
 OFFSET = Kind(
     "offset",
     walk=Statement("offset_mps2", 0.002, ("process.offset_mps2",)),
     in_output_unit=True,
-    loosened_by="jump",
+    loosened_by=("jump",),
     straight=LINEAR,
 )
 OFFSET_RATE = Kind(
@@ -173,7 +185,7 @@ LAG = Kind(
     # are one unknown: the time by which the sensor's indications come after the reference's.
     prior=Statement("lag_s", 0.02, ("uncertainty.lag_s", "certificate.u_lag_s")),
     mean=Statement("lag_at_s", 0.0, ("certificate.lag_s",), convert=_minus),
-    loosened_by="line", of_reference=True, straight=STRAIGHT_LAG_S, stated=False,
+    loosened_by=("line", "remount"), of_reference=True, straight=STRAIGHT_LAG_S, stated=False,
 )  # fmt: skip
 LAG_OF_AXIS = Kind(
     "lag of axis", "s", "lag",
@@ -187,21 +199,25 @@ LAG_OF_AXIS = Kind(
 THETA = Kind(
     "theta", "rad", "theta common",
     prior=Statement("theta_rad", _deg(0.2), ("uncertainty.theta_deg",), option="u_theta_deg", convert=_deg),
+    loosened_by=("remount",),
 )  # fmt: skip
 THETA_BY_POSITION = Kind(
     "theta by position", "rad", "theta by position",
     prior=Statement(
         "theta_position_rad", 0.0, ("uncertainty.theta_position_deg",), option="u_theta_position_deg", convert=_deg
     ),
+    loosened_by=("remount",),
 )  # fmt: skip
 ALPHA_COMMON = Statement(
     "alpha_common_rad", _deg(0.1), ("uncertainty.alpha_common_deg",), option="u_alpha_common_deg", convert=_deg
 )
 ANGLE = Statement("angle_rad", _deg(0.2), ("uncertainty.angle_deg",), option="u_angle_deg", convert=_deg)
-ALPHA = Kind("alpha", "rad", "alpha common", prior=ALPHA_COMMON)
-ALPHA_BY_POSITION = Kind("alpha by position", "rad", "alpha by position", prior=ANGLE)
-DIRECTION = Kind("direction", "rad", "direction common", prior=ALPHA_COMMON)
-DIRECTION_BY_POSITION = Kind("direction by position", "rad", "direction by position", prior=ANGLE)
+ALPHA = Kind("alpha", "rad", "alpha common", prior=ALPHA_COMMON, loosened_by=("remount",))
+ALPHA_BY_POSITION = Kind("alpha by position", "rad", "alpha by position", prior=ANGLE, loosened_by=("remount",))
+DIRECTION = Kind("direction", "rad", "direction common", prior=ALPHA_COMMON, loosened_by=("remount",))
+DIRECTION_BY_POSITION = Kind(
+    "direction by position", "rad", "direction by position", prior=ANGLE, loosened_by=("remount",)
+)
 GRAVITY_DIRECTION = Kind(
     # Only beside a tri-axial reference, whose rotation is an unknown of its own.
     "gravity direction by position", "rad", "direction by position",
@@ -209,18 +225,19 @@ GRAVITY_DIRECTION = Kind(
         "gravity_direction_rad", _deg(0.2), ("uncertainty.angle_deg",), ("uncertainty.tilt_deg",),
         option="u_angle_deg", convert=_deg,
     ),
-    walk=TILT_WALK, loosened_by="lean",
+    walk=TILT_WALK, loosened_by=("lean", "remount"),
 )  # fmt: skip
 LEAN = Kind(
     # Of a fixed mount with the sensor and its reference on it: gravity turns, the direction of motion does not.
     "lean", "rad", "tilt",
     prior=Statement("lean_rad", at_fixed_mount=("uncertainty.tilt_deg",), convert=_deg),
-    walk=TILT_WALK, loosened_by="lean",
+    walk=TILT_WALK, loosened_by=("lean", "remount"),
 )  # fmt: skip
 TILT = Kind(
     "tilt", "rad", "tilt",
     prior=Statement("tilt_rad", option="u_tilt_deg", convert=_deg),
     walk=TILT_WALK,
+    loosened_by=("remount",),
 )  # fmt: skip
 OFFSET_BY_POSITION = Kind(
     "offset by position", "m/s2", "offset by position",
@@ -228,6 +245,7 @@ OFFSET_BY_POSITION = Kind(
         "offset_position_mps2", 0.0, ("uncertainty.offset_position_mps2",), option="u_offset_position_mps2"
     ),
     straight=LINEAR,
+    loosened_by=("remount",),
 )  # fmt: skip
 GRAVITY = Kind(
     "gravity", "m/s2", "gravity",
@@ -253,12 +271,14 @@ ROTATION = Kind(
     "mounting rotation", "rad", "mounting rotation",
     prior=Statement("rotation_rad", _deg(0.2), ("uncertainty.rotation_deg",), option="u_rotation_deg", convert=_deg),
     of_reference=True,
+    loosened_by=("remount",),
 )  # fmt: skip
 TRANSVERSE = Kind(
     "transverse motion", "1", "transverse motion",
     prior=Statement(
         "transverse", 1e-2, ("uncertainty.transverse_motion_pct",), option="u_transverse_motion_pct", convert=_percent
     ),
+    loosened_by=("remount",),
 )  # fmt: skip
 
 # --- the tables

@@ -1,19 +1,10 @@
 """Method 3 by adjustment, window by window: S, Q and every persistent nuisance as one state with its joint covariance.
 
-The priors enter once, when the state begins and when a window brings a nuisance of its own (a position never seen);
-what belongs to a window alone (its offset, its lag's scatter) is in the weight of its rows. Each window is one
-least-squares correction of the state, so that the cost does not depend on how long it has run.
+Each window is one least-squares correction of the state (calib.estimate.window_state), so that the cost does not depend
+on how long it has run. With no wandering the result is that of calib.estimate.adjustment for all windows at once.
 
-All windows are linearised at one point. At points of their own the same unseen direction (an inclination against the
-main sensitivities, say) would be another in each, and a little of it would seem seen: after twelve windows on a clamp u
-came out a third too small. So the newest windows are kept in summary, and are taken anew where the estimate has moved
-away from the point; a window that leaves them is part of the base for good. With no wandering the result is that of
-calib.estimate.adjustment for all windows at once.
-
-At a fixed mount the mean of V is m = Q + S (G + tilt x G) under a gravity that never changes, so that the data tell m
-and no part of it. The state then has m in the place of Q; Q = m - S (G + tilt x G) is made of it when it is read, with
-the uncertainties of S, G and tilt. Were Q in the state, a mean that drifts would move the column of S along gravity
-(by 1.9 % where it drifted by 0.24 m/s2).
+What is known of a reference or a mount belongs to it: its unknowns stay in the state, with their covariance with S and
+Q, through swaps, restarts and changes of the configuration.
 """
 
 from __future__ import annotations
@@ -25,58 +16,25 @@ from typing import Any
 import numpy as np
 
 from calib.distributions import coverage_factor
+from calib.estimate.beforehand import Before
 from calib.estimate.correction import Law
 from calib.estimate.determined import determined
-from calib.estimate.fixed_mount import Held, held_at, never_turned
+from calib.estimate.fixed_mount import Held
 from calib.estimate.gauss_newton import Flags
 from calib.estimate.innovation import Innovation, innovation
-from calib.estimate.joint_state import JointState, gain_of
+from calib.estimate.joint_state import JointState
 from calib.estimate.linearised import Linearised
-from calib.estimate.nuisances import Priors
-from calib.estimate.quantities import LAG, OFFSET_RATE, RATES, S_AND_Q, Quantity
-from calib.estimate.wander import TemperatureModel, Wander, wandered
+from calib.estimate.quantities import GRAVITY, LAG, REFERENCE, Quantity
 from calib.estimate.window_rows import Noise, Summary, WindowRows
+from calib.estimate.window_state import WindowState
 from calib.model import Array, Calibration
 
-MOST_RECENT = 48  # windows: four times round twelve positions
-ITERATIONS = 6
-MOST_POSITIONS = 48  # whose own nuisances are kept; of the oldest ones nothing but their effect on S and Q remains
+DATED = ", calibrated "  # in the identity of a reference whose certificate states its date
 METHOD = "3 (recursive adjustment)"
 
 
-class Recursion:
-    """The state of one sensor. `predict`, `update` and `loosen` change it; `innovation` and `result` read.
-
-    `mean` and `standard_uncertainty` (12,) are what was known of S, Q beforehand, in output units; `fixed` mounts do
-    not turn. Days count from any origin.
-    """
-
-    def __init__(
-        self,
-        mean: Array,
-        standard_uncertainty: Array,
-        priors: Priors,
-        wander: Wander,
-        temperature: TemperatureModel,
-        *,
-        fixed: bool,
-    ) -> None:
-        self._priors, self._wander, self._temperature, self._fixed = priors, wander, temperature, fixed
-        self.scale = float(np.sqrt(np.mean(mean[[0, 4, 8]] ** 2)))
-        state = JointState(S_AND_Q, mean, standard_uncertainty)
-        for name in RATES:
-            state.append(Quantity(name, OFFSET_RATE), 0.0, wander.of(OFFSET_RATE.prior) * self.scale)
-        for quantity, u in temperature.terms(self.scale):
-            state.append(quantity, 0.0, u)
-        self._prior_u = np.array(standard_uncertainty, dtype=np.float64)
-        self._joint = Linearised(state)
-        self._positions: list[str] = []
-        self._noise = Noise()
-        self._day: float | None = None
-        self._temperature_range = (np.inf, -np.inf)
-        self._residual_sd = np.full(3, np.nan)
-        self._held: Held | None = None  # at a fixed mount, from the first window on
-        self.windows = 0
+class Recursion(WindowState):
+    """The state of one sensor. The methods under "reading" do not change it, those under "changing" do."""
 
     # --- reading
 
@@ -99,14 +57,16 @@ class Recursion:
     @property
     def lag_s(self) -> float:
         """By how much the sensor's indications come after the reference's; as stated before any window told."""
-        told = (m for q, m in zip(self._joint.state.quantities, self._joint.state.mean, strict=True) if q.kind is LAG)
-        return float(next(told, self._priors.of(LAG.mean)))
+        state, key = self._joint.state, Quantity("lag", LAG, owner=self.reference).key
+        return float(state.mean[state.index(key)]) if key in state else self._stated.priors.of(LAG.mean)
 
     @property
     def determined(self) -> Flags:
         """(12,) see calib.estimate.determined."""
         mean, covariance = self._parameters()
-        return determined(mean, np.sqrt(np.diag(covariance)), self._prior_u, np.ones(12, dtype=bool))
+        return determined(
+            mean, np.sqrt(np.diag(covariance)), self._stated.standard_uncertainty, np.ones(12, dtype=bool)
+        )
 
     def result(self) -> Calibration:
         """S and Q as they are; where a parameter is not determined, still what was known beforehand of it."""
@@ -135,20 +95,25 @@ class Recursion:
             waited = self.copy()
             waited._joint.state = self._wandered(self._joint.state, self._day, day)
             return waited.law()
-        order, rows = self._temperature.offset_order, self._temperature.sensitivity_order > 0
+        temperature = self._stated.temperature
+        order, rows = temperature.offset_order, temperature.sensitivity_order > 0
         state = self._joint.state
-        more = [state.index(quantity.name) for quantity, _ in self._temperature.terms(self.scale)]
+        more = [state.index(quantity.name) for quantity, _ in temperature.terms(self.scale)]
         mean, factor = self._parameters_factor()
         mean, factor = np.append(mean, state.mean[more]), np.vstack([factor, state.factor[more]])
         low, high = self.temperature_range_degc
-        u_beyond = self._temperature.u_offset_mps2[1] * self.scale
+        u_beyond = temperature.u_offset_mps2[1] * self.scale
         return Law(
             mean, factor @ factor.T, order, rows, self.reference_temperature_degc, low, high, u_beyond, self.determined
         )
 
     def quantity(self, name: str) -> tuple[float, float]:
-        """(value, standard uncertainty) of anything in the state. Raises ValueError where it is not in it."""
-        k = self._joint.state.index(name)
+        """(value, standard uncertainty) of an unknown of the sensor, its mount or its present reference.
+
+        Raises KeyError where the state does not have it.
+        """
+        state = self._joint.state
+        k = state.index(name if name in state else f"{name} of {self.reference}")
         return float(self._joint.state.mean[k]), float(np.sqrt(self._joint.state.variance[k]))
 
     @property
@@ -159,18 +124,22 @@ class Recursion:
     @property
     def reference_temperature_degc(self) -> float:
         """To which S and Q refer."""
-        return self._temperature.reference_degc
+        return self._stated.temperature.reference_degc
 
     @property
     def names(self) -> list[str]:
-        """Of all quantities in the state."""
-        return list(self._joint.state.names)
+        """Of all quantities of the sensor, its mount and its present reference."""
+        return [q.name for q in self._joint.state.quantities if q.owner in ("", self.reference)]
+
+    @property
+    def references(self) -> list[str]:
+        """Identities of the references to whose errors S and Q owe their values, in the order of their first window."""
+        return list(self._references)
 
     @property
     def temperature_range_degc(self) -> tuple[float, float]:
         """Lowest and highest temperature of a window taken; NaN before any."""
-        low, high = self._temperature_range
-        return (low, high) if low <= high else (np.nan, np.nan)
+        return self._seen_degc
 
     # --- changing
 
@@ -178,22 +147,6 @@ class Recursion:
         """Take a window: one correction of everything."""
         rows = self._know(summary)
         self._take(rows, self._wandered(self._joint.state, self._day, summary.day))
-
-    def _take(self, rows: WindowRows, wandered: JointState) -> None:
-        summary = rows.summary
-        self._joint.state = self._corrected(wandered, rows)
-        self._day = _later(self._day, summary.day)
-        self._joint.recent.append(summary)
-        self._settle()
-        if len(self._joint.recent) > MOST_RECENT:
-            self._absorb(1)
-        self._noise = self._noise.pooled(rows.noise)
-        self._residual_sd = summary.data.type_a.noise[0].copy()
-        if np.isfinite(summary.temperature_degc):
-            low, high = self._temperature_range
-            self._temperature_range = (min(low, summary.temperature_degc), max(high, summary.temperature_degc))
-        self._keep_positions(summary.pose.position)
-        self.windows += 1
 
     def loosen(self, standard_uncertainty: Array, tilt_rad: float = 0.0, *, line: bool = False) -> None:
         """Something changed: S and Q (12,) may be off by as much more from now on, and a fixed mount be tilted.
@@ -204,117 +157,104 @@ class Recursion:
         u = np.zeros(len(self._joint.state))
         u[:12] = standard_uncertainty
         for k, quantity in enumerate(self._joint.state.quantities):
-            if quantity.kind.loosened_by == "lean" and self._fixed:
+            if "lean" in quantity.kind.loosened_by and self._fixed:
                 u[k] = tilt_rad
-            elif quantity.kind.loosened_by == "line" and line:
-                u[k] = self._priors.of(quantity.kind.prior)
+            elif "line" in quantity.kind.loosened_by and line and quantity.owner == self.reference:
+                u[k] = self._stated.priors.of(quantity.kind.prior)
         self._joint.state.spread(u**2)
         self._joint.base = self._joint.state.copy()
 
-    def forget_reference(self) -> None:
-        """Another reference: what is known of the old one's own sensitivity and lag holds no more."""
-        self.put(self.result())
-        self._joint.keep([not quantity.kind.of_reference for quantity in self._joint.state.quantities])
+    def remount(self, *, of_reference: bool) -> None:
+        """The sensor was mounted again, or the present reference was: what a mount decides may be another from now on.
+
+        The old value stays in the new one, which is a little too uncertain if all was mounted anew, and right if it was
+        not.
+        """
+        self._absorb(len(self._joint.recent))
+        if self._held is not None and not of_reference:
+            self._held.unmount(self._joint)
+            self._held = None
+        state = self._joint.state
+        u = np.zeros(len(state))
+        for k, quantity in enumerate(state.quantities):
+            concerned = quantity.owner == self.reference if of_reference else quantity.owner in ("", self.reference)
+            if "remount" in quantity.kind.loosened_by and concerned and quantity.kind.of_reference >= of_reference:
+                u[k] = state.stated_u[k]
+        state.spread(u**2)
+        self._joint.base = state.copy()
+
+    def meet(self, reference: str, calibrated: str = "", sensitivity: float = 1.0) -> bool:
+        """Another reference is used from now on. What is known of the reference before stays, and comes back with it.
+
+        `calibrated` is the date of its certificate, "" where none is stated: a reference that was calibrated again is
+        another one. `sensitivity` is that of its certificate. What the certificate states is exchanged for what was
+        stated of this reference before. Returns whether that changed S or Q.
+        """
+        owner = self._owner(reference, calibrated)
+        back = owner != self.reference and owner in self._references
+        before = self._references.get(owner) or sensitivity
+        if before != sensitivity or self._before.of_references_differ(self._stated):
+            self._absorb(len(self._joint.recent))  # these windows were made with other statements
+        if before != sensitivity:
+            self._joint.shift(REFERENCE, owner, before / sensitivity, before / sensitivity - 1.0)
+            self._references[owner] = sensitivity
+        self.reference, self._sensitivity = owner, sensitivity
+        changed = self._restate(owner)
+        if back:
+            self.remount(of_reference=True)
+        return changed
+
+    def _owner(self, reference: str, calibrated: str) -> str:
+        """The reference with the date of its certificate, as an owner of unknowns."""
+        dated = f"{reference}{DATED}{calibrated}"
+        if calibrated and dated not in self._references and reference in self._references:
+            self._joint.hand_over(reference, dated)  # the date of the same certificate was stated later
+            self._references = {(dated if of == reference else of): s for of, s in self._references.items()}
+        if calibrated:
+            return dated
+        return next((known for known in reversed(self._references) if known.startswith(reference + DATED)), reference)
+
+    def restate(self, gravity_mps2: tuple[float, float] | None = None) -> bool:
+        """After `load`: put what is stated now of sensor and mount in the place of what was stated before.
+
+        `gravity_mps2`: the local gravity as stated before and now, if that changed. What is stated of the reference
+        follows when it is known which one is connected (`meet`). Returns whether S or Q changed.
+        """
+        if gravity_mps2 is not None:
+            before, now = gravity_mps2
+            self._joint.recent = [summary.with_gravity(now / before) for summary in self._joint.recent]
+            self._joint.shift(GRAVITY, "", 1.0, before - now)
+            self._held = None if self._held is None else self._held.with_gravity(now / before)
+        return self._restate("")
+
+    def _restate(self, reference: str) -> bool:
+        changed = self._stated.restate(self._joint, self._before, self._held, reference)
+        if changed:
+            self._take_again()
+            self._settle()
+        self._before = self._before.now(self._stated, of_reference=bool(reference))
+        return changed
 
     def put(self, calibration: Calibration) -> None:
-        """S and Q as an operator wants them, with their covariance; what the nuisances are in them, they stay."""
+        """S and Q as an operator wants them. Their covariance with the nuisances is not known: see `intersect`."""
         self._absorb(len(self._joint.recent))
-        self._joint.state.mean[:12], self._joint.state.factor[:12] = self._parameters_factor()
+        state = self._joint.state
+        state.mean[:12], state.factor[:12] = self._parameters_factor()
         values = np.append(calibration.sensitivity.ravel(), calibration.offset)
-        self._joint.state.restate(slice(0, 12), values, calibration.covariance)
+        state.intersect(slice(0, 12), values, calibration.covariance)
         self._held = None  # Q itself is known again; the next window of a fixed mount makes the mean output of it
-        self._joint.base = self._joint.state.copy()
-        self._joint.point = self._joint.state.mean.copy()
-
-    def copy(self) -> Recursion:
-        """An independent copy, to try windows on."""
-        other = object.__new__(Recursion)
-        other.__dict__.update(self.__dict__)
-        other._joint, other._positions = self._joint.copy(), list(self._positions)
-        return other
-
-    # --- inside
-
-    def _rows(self, summary: Summary) -> WindowRows:
-        reference_degc = self._temperature.reference_degc
-        held = self._held.mps2 if self._held is not None else np.zeros(3) if self._fixed else None
-        return WindowRows(summary, self._priors, self.scale, reference_degc, held, self.temperature_range_degc)
-
-    def _wandered(self, state: JointState, since: float | None, day: float) -> JointState:
-        """A copy of the state, wandered on to `day`; earlier days are as now."""
-        elapsed = 0.0 if since is None else max(day - since, 0.0)
-        tilted = 0.0 if self._held is None else float(np.linalg.norm(self._held.mps2))
-        a_day = self._wander.variance_a_day(state.quantities, self.scale, tilted)
-        return wandered(state, elapsed, a_day, self._joint.bound)
-
-    def _mount(self, summary: Summary) -> None:
-        """At the first window of a fixed mount: Q gives its place to the mean output there."""
-        if self._fixed and self._held is None and np.isfinite(summary.held_mps2).all():
-            self._held, terms = held_at(summary, self._priors)
-            self._held.mount(self._joint, terms)
-
-    def _unmount(self, held: Held) -> None:
-        """The mount turned after all: from now on means tell Q and S alike."""
-        self._absorb(len(self._joint.recent))
-        held.unmount(self._joint)
-        self._held, self._fixed = None, False
-
-    def _know(self, summary: Summary) -> WindowRows:
-        """Nuisances that no window had before come in with their priors; the window's rows."""
-        if self._held is not None and not never_turned(np.array([self._held.mps2, summary.held_mps2])):
-            self._unmount(self._held)
-        self._mount(summary)
-        rows = self._rows(summary)
-        new = self._joint.append(rows.terms)
-        if new and self._held is not None:
-            self._held = self._held.moved_by(held_at(summary, self._priors)[0], new)
-        return rows
-
-    def _taken(self, before: JointState, since: float | None, rows: WindowRows) -> JointState:
-        return self._corrected(self._wandered(before, since, rows.summary.day), rows)
-
-    def _corrected(self, state: JointState, rows: WindowRows) -> JointState:
-        """The state, at its day already, after one window, linearised at the point."""
-        own = rows.at(state, self._joint.point, self._noise)
-        gain = gain_of(own.jacobian, state.factor)
-        step = gain @ (own.residual + own.jacobian @ (self._joint.point - state.mean))
-        state.correct(step, gain, own.jacobian)
-        return state
-
-    def _settle(self) -> None:
-        """Take the recent windows anew, from the base on, until the point is where the estimate is."""
-        for _ in range(ITERATIONS):
-            if not self._joint.moved(self.scale):
-                return
-            self._joint.point = self._joint.state.mean.copy()
-            state, since = self._joint.base, self._joint.base_day
-            for summary in self._joint.recent:
-                state = self._taken(state, since, self._rows(summary))
-                since = _later(since, summary.day)
-            self._joint.state = state
-
-    def _absorb(self, count: int) -> None:
-        """The oldest recent windows become part of the base, linearised as they are now."""
-        for summary in self._joint.recent[:count]:
-            self._joint.base = self._taken(self._joint.base, self._joint.base_day, self._rows(summary))
-            self._joint.base_day = _later(self._joint.base_day, summary.day)
-        del self._joint.recent[:count]
-
-    def _keep_positions(self, position: str) -> None:
-        if position in self._positions:
-            self._positions.remove(position)
-        self._positions.append(position)
-        while len(self._positions) > MOST_POSITIONS:
-            oldest = self._positions.pop(0)
-            self._absorb(len(self._joint.recent))
-            self._joint.keep([quantity.position != oldest for quantity in self._joint.state.quantities])
+        self._joint.base = state.copy()
+        self._joint.point = state.mean.copy()
 
     # --- state
 
     def snapshot(self) -> dict[str, Any]:
         """All that changes, exactly."""
         return self._joint.snapshot() | {
-            "prior_u": self._prior_u.copy(),
+            "stated": self._before.snapshot(),
+            "reference": self.reference,
+            "references": dict(self._references),
+            "sensitivity": self._sensitivity,
             "positions": list(self._positions),
             "noise": asdict(self._noise),
             "day": self._day,
@@ -327,12 +267,14 @@ class Recursion:
         }
 
     def load(self, state: Mapping[str, Any]) -> None:
-        """Go on from a snapshot of a recursion that was made with the same settings.
+        """Go on from a snapshot. Where it was made with other statements, `restate` and `meet` must follow.
 
         Unknowns that an older version of the program did not have come in with their priors.
         """
         self._joint = Linearised.load(state)
-        self._prior_u = np.array(state["prior_u"])
+        self._before = Before.load(state["stated"], self._stated)
+        self.reference, self._references = state["reference"], dict(state["references"])
+        self._sensitivity = state["sensitivity"]
         self._positions = list(state["positions"])
         self._noise = Noise(**state["noise"])
         self._day = state["day"]
@@ -344,7 +286,3 @@ class Recursion:
         self.windows, self.scale = state["windows"], state["scale"]
         for summary in self._joint.recent[-1:]:
             self._know(summary)
-
-
-def _later(day: float | None, other: float) -> float:
-    return other if day is None else max(day, other)

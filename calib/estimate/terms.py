@@ -58,8 +58,13 @@ class Term:
 
     @property
     def name(self) -> str:
-        """The name for people and for looking up."""
+        """The name for people."""
         return self.quantity.name
+
+    @property
+    def key(self) -> str:
+        """The name for looking up in a joint state."""
+        return self.quantity.key
 
     @property
     def kind(self) -> Kind:
@@ -77,15 +82,19 @@ class Term:
         return self.kind.unit
 
 
-def terms(poses: Sequence[Pose], channels: int, priors: Stated, applied: Mapping[Kind, float]) -> list[Term]:
+def terms(
+    poses: Sequence[Pose], channels: int, priors: Stated, applied: Mapping[Kind, float], reference: str = ""
+) -> list[Term]:
     """All nuisances of P poses and a reference with this number of channels; also those whose uncertainty is 0.
 
     `applied` are the values, by kind, that the front end has already removed from the data. Poses of one position share
-    the nuisances of that position.
+    the nuisances of that position. `reference` is the identity of the reference, which owns its own nuisances.
     """
     found: dict[str, Term] = {}
     for term in _terms(poses, channels, priors, applied):
-        found[term.name] = term if term.name not in found else found[term.name].with_(term)
+        if reference and term.kind.of_reference:
+            term = replace(term, quantity=replace(term.quantity, owner=reference))
+        found[term.key] = term if term.key not in found else found[term.key].with_(term)
     return list(found.values())
 
 

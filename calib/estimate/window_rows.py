@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -46,8 +46,8 @@ MOST_FREEDOM = 400.0  # degrees of freedom: beyond, the oldest windows' scatter 
 @dataclass(frozen=True, slots=True, eq=False)
 class Summary:
     """All that is kept of a window: its slopes and means, the directions (3, k) that were excited and what the
-    correction for noise leaves, its time in days, the lag that the front end took out, what the clocks leave of it, and
-    its temperature.
+    correction for noise leaves, its time in days, the lag that the front end took out, what the clocks leave of it, its
+    temperature, and the identity of its reference.
 
     `pose` as stated, `moved` as `excited` leaves it. `held_mps2` (3,) is the mean input acceleration by the pose
     as stated, NaN where nobody stated gravity.
@@ -64,9 +64,12 @@ class Summary:
     temperature_degc: float = np.nan
     u_lag_s: float = 0.0
     independent: float = 1.0
+    reference: str = ""
 
     @classmethod
-    def of(cls, window: Window, day: float, lag_s: float = 0.0, temperature_degc: float = np.nan) -> Summary:
+    def of(
+        cls, window: Window, day: float, lag_s: float = 0.0, temperature_degc: float = np.nan, reference: str = ""
+    ) -> Summary:
         """The summary of a window that is used."""
         found, sums, m = excited(window), window.sums, window.pose.direction.shape[1]
         mean = sums.count @ sums.mean[:, :m] / sums.count.sum()
@@ -75,8 +78,14 @@ class Summary:
         moved = found.window.pose
         return cls(
             window.pose, moved, held, data, found.directions, found.attenuation, day, lag_s, temperature_degc,
-            window.u_lag_s, window.independent,
+            window.u_lag_s, window.independent, reference,
         )  # fmt: skip
+
+    def with_gravity(self, ratio: float) -> Summary:
+        """The summary with the stated gravity multiplied by `ratio`."""
+        pose, moved = (replace(p, gravity_mps2=p.gravity_mps2 * ratio) for p in (self.pose, self.moved))
+        held_mps2 = self.held_mps2 + pose.gravity_mps2 - self.pose.gravity_mps2
+        return replace(self, pose=pose, moved=moved, held_mps2=held_mps2)
 
     def snapshot(self) -> dict[str, Any]:
         """Plain values and arrays."""
@@ -127,7 +136,8 @@ class WindowRows:
         seen_degc: tuple[float, float],
     ) -> None:
         self.summary, self.data = summary, summary.data
-        self.nuisances = Nuisances([summary.moved], self.data.channels, priors, Applied.of(priors, summary.lag_s))
+        applied = Applied.of(priors, summary.lag_s)
+        self.nuisances = Nuisances([summary.moved], self.data.channels, priors, applied, summary.reference)
         u_lag_s = max(priors.lag_window_s, summary.u_lag_s)
         self._scatter = SlopeScatter.of(self.data, u_lag_s, summary.attenuation)
         own = SlopeScatter.of(self.data)  # the scatter between windows is in the covariance of the rows, not before it
@@ -184,7 +194,7 @@ class WindowRows:
         x, chain = np.zeros(n), np.zeros((n, len(state)))
         stretch = np.ones(3)
         for i, name in enumerate(MAIN_TEMPERATURE):
-            if name in state.names:
+            if name in state:
                 k = state.index(name)
                 stretch[i] += at[k] * t
                 chain[3 * i : 3 * i + 3, k] = at[3 * i : 3 * i + 3] * t
@@ -194,12 +204,12 @@ class WindowRows:
         chain[range(9, 12), range(9, 12)] = 1.0
         for power in (1, 2):
             for i, name in enumerate(offset_temperature(power)):
-                if name in state.names:
+                if name in state:
                     k = state.index(name)
                     x[9 + i] += at[k] * t**power
                     chain[9 + i, k] = t**power
         for j, term in enumerate(self.nuisances.terms):
-            k = state.index(term.name)
+            k = state.index(term.key)
             x[12 + j], chain[12 + j, k] = at[k] - term.applied, 1.0
         return x, chain
 
@@ -210,7 +220,7 @@ class WindowRows:
             moved = np.zeros(3)
             for power in (1, 2):
                 for i, name in enumerate(offset_temperature(power)):
-                    if name in state.names:
+                    if name in state:
                         moved[i] += at[state.index(name)] * above**power * self.equations.mean_weight[0, i]
             found += np.outer(moved, moved) / len(self._perhaps_k)
         return found

@@ -62,8 +62,15 @@ def test_one_bit_is_a_difference_and_its_place_is_told(results: list[Result]) ->
 def test_only_the_text_of_a_reason_is_left_out_of_the_comparison(results: list[Result]) -> None:
     recorded = changed(results, 0, reason="the same in other words")
     assert compare("f", 1, recorded, results, 0.0) is not None
-    assert compare("f", 1, recorded, results, 0.0, reasons=False) is None
-    assert compare("f", 1, recorded, changed(results, 0, used=False), 0.0, reasons=False) is not None
+    assert compare("f", 1, recorded, results, 0.0, same_version=False) is None
+    assert compare("f", 1, recorded, changed(results, 0, used=False), 0.0, same_version=False) is not None
+
+
+def test_a_field_that_an_older_version_did_not_have_is_left_out_of_the_comparison(results: list[Result]) -> None:
+    now = changed(results, 1, references=["KB12 0042"])
+    assert compare("f", 1, results, now, 0.0) is not None
+    assert compare("f", 1, results, now, 0.0, same_version=False) is None
+    assert compare("f", 1, now, changed(now, 1, references=["KB12 0043"]), 0.0, same_version=False) is not None
 
 
 @pytest.mark.parametrize(

@@ -110,7 +110,7 @@ def test_another_reference_is_late_as_its_certificate_says_until_windows_tell() 
     random = np.random.default_rng(11)
     found = settled(random, certificate={"lag_s": 0.01, "u_lag_s": 0.001})
     assert abs(found.lag_s) < 1e-4
-    found.forget_reference()
+    found.meet("B", "", 1.0)
     assert found.lag_s == -0.01
 
 
@@ -158,9 +158,9 @@ def test_what_is_accepted_keeps_how_it_goes_with_temperature() -> None:
         [judged] = hours(found, [window], first=k, degc=degc)
         found.gate.published(k + 1)
     assert judged.decision.proposal is not None
-    answer = found.gate.accept(20, "key")  # not the newest: the state goes back to it
+    answer = found.gate.accept(20, "key")  # not the newest
     assert answer.calibration is not None
-    found.put(answer.calibration)
+    found.accept(answer.calibration)
     at = found.law.at(28.0)
     np.testing.assert_allclose(at.sensitivity, answer.calibration.sensitivity, rtol=0, atol=1e-12)
     np.testing.assert_allclose(at.offset - answer.calibration.offset, 0.16, rtol=0, atol=0.01)

@@ -51,7 +51,7 @@ def test_a_state_of_version_1_goes_on_whole(kept: bytes) -> None:
     assert taken.reason == "restored from the previous run"
     state = unpack(kept)["estimation"]["recursion"]["state"]
     names = raw(kept)["state"]["estimation"]["recursion"]["state"]["names"]
-    assert [name for name, _, _ in state["quantities"]] == names
+    assert [name for name, *_ in state["quantities"]] == names
     restored = taken.estimation.snapshot()["recursion"]
     assert np.array_equal(restored["state"]["factor"], state["factor"])
     assert np.array_equal(restored["state"]["mean"], state["mean"])
@@ -80,14 +80,15 @@ def test_a_state_of_version_1_goes_on_whole(kept: bytes) -> None:
     ],
 )
 def test_a_name_of_version_1_becomes_a_kind(name: str, kind: str, position: str) -> None:
-    assert brought_up([name])["quantities"] == [[name, kind, position]]
-    assert kind in KINDS
+    owner = "KB12 0042" if KINDS[kind].of_reference else ""
+    assert brought_up([name])["quantities"] == [[name, kind, position, owner]]
 
 
 def brought_up(names: list[str]) -> dict[str, Any]:
     joint = {"names": names, "mean": np.zeros(len(names)), "factor": np.eye(len(names))}
-    recursion = {"state": joint, "base": dict(joint), "recent": []}
-    state = raw(pack({"estimation": {"recursion": recursion, "held": []}}))
+    recursion = {"state": joint, "base": dict(joint), "recent": [], "bound": np.ones(len(names)), "windows": 3}
+    recursion |= {"held": None, "prior_u": np.ones(12)}
+    state = raw(pack({"estimation": {"recursion": recursion, "held": []}, "reference": "KB12 0042"}))
     old = msgspec.msgpack.encode({"version": 1, "state": state["state"]})
     found: dict[str, Any] = unpack(old)["estimation"]["recursion"]["state"]
     return found

@@ -140,11 +140,13 @@ def test_a_state_that_does_not_know_the_lean_learns_it_with_the_next_window() ->
     found, stated = settled(channel_of(UNIAXIAL), random)
     state = found.snapshot()
     recursion = state["recursion"]
-    kept = [not name.startswith("lean") for name, _, _ in recursion["state"]["quantities"]]
+    kept = [not name.startswith("lean") for name, *_ in recursion["state"]["quantities"]]
     for joint in (recursion["state"], recursion["base"]):
         joint["quantities"] = [q for q, keep in zip(joint["quantities"], kept, strict=True) if keep]
         joint["mean"], joint["factor"] = joint["mean"][kept], np.linalg.cholesky(_covariance(joint, kept))
-    recursion["point"], recursion["bound"] = recursion["point"][kept], recursion["bound"][kept]
+        for name in ("stated_mean", "stated_u", "walked"):
+            joint[name] = joint[name][kept]
+    recursion["point"] = recursion["point"][kept]
     recursion["held"]["by"] = {n: v for n, v in recursion["held"]["by"].items() if not n.startswith("lean")}
     again = Estimation(channel_of(UNIAXIAL), None)
     again.load(unpack(pack(state)))
@@ -160,7 +162,7 @@ def _covariance(joint: dict[str, Any], kept: list[bool]) -> np.ndarray:
 
 def test_of_positions_left_long_ago_nothing_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     """Along gravity a position has unknowns of motion across it, in phase and in quadrature."""
-    monkeypatch.setattr("calib.estimate.recursion.MOST_POSITIONS", 3)
+    monkeypatch.setattr("calib.estimate.window_state.MOST_POSITIONS", 3)
     channel, random = channel_of(MOUNTS["along gravity"]), np.random.default_rng(11)
     prior, stated = channel.prior, pose_of(channel)
     u = prior.standard_uncertainty(prior.mean(None))
@@ -169,6 +171,6 @@ def test_of_positions_left_long_ago_nothing_is_kept(monkeypatch: pytest.MonkeyPa
         one = window(random, replace(stated, position=f"p{k}"), stated.direction[:, 0], GRAVITY)
         found.update(Summary.of(one, k / 24.0))
     quantities = found.snapshot()["state"]["quantities"]
-    assert {position for _, _, position in quantities} == {"", "p2", "p3", "p4"}
+    assert {position for _, _, position, _ in quantities} == {"", "p2", "p3", "p4"}
     assert "transverse_a[p4]_quadrature" in found.names
     assert [name for name in found.names if "p1" in name] == []

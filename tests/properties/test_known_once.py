@@ -1,0 +1,197 @@
+"""Each error counts once: random lives of a state against a batch that knows each thing's error once.
+
+The batch is one normal matrix over all windows, with every increment of a random walk as an unknown of its own. It
+shares the equations of a window with the recursion, at the same values and weights, and nothing else.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+
+from calib.estimate.joint_state import JointState
+from calib.estimate.nuisances import Priors
+from calib.estimate.quantities import S_AND_Q, Quantity
+from calib.estimate.recursion import Recursion
+from calib.estimate.wander import TemperatureModel, Wander
+from calib.estimate.window_rows import Noise, Summary, WindowRows
+from tests.building_windows import building_window
+
+HOUR = 1.0 / 24.0
+S_AND_Q_KEYS = [quantity.key for quantity in S_AND_Q]
+MEAN = np.append(np.eye(3).ravel(), np.zeros(3))
+U = np.append(np.where(np.eye(3).ravel() > 0, 0.05, 0.03), np.full(3, 1.0))
+PRIORS = {"reference": 3e-3, "rotation_rad": 3e-3, "gravity_mps2": 0.03, "gravity_direction_rad": 2e-3, "lag_s": 0.005}
+WANDER = {"sensitivity": 5e-5, "offset_mps2": 1e-3}
+
+
+@dataclass
+class Life:
+    """A recursion, and what its batch needs: rows by window, priors by key, increments."""
+
+    recursion: Recursion
+    priors: dict[str, float]
+    seed: int
+    reference: str = "A"
+    hour: int = 0
+    rows: list[tuple[list[Quantity], np.ndarray, float]] = field(default_factory=list)
+    stated: dict[str, float] = field(default_factory=dict)
+    loosened: list[tuple[int, str, float]] = field(default_factory=list)  # before this window, key, variance
+
+    def window(self) -> None:
+        """A window of the present reference, without noise in the weights: they are the same whenever it is taken."""
+        random = np.random.default_rng([self.seed, self.hour])
+        made = building_window(random, level_mps2=(0.1, 0.1, 0.1), S=np.eye(3), Q=np.zeros(3), noise_mps2=1e-4)
+        summary = Summary.of(made, self.hour * HOUR, reference=self.recursion.reference)
+        type_a = replace(summary.data.type_a, degrees_of_freedom=0.0)
+        summary = replace(summary, data=replace(summary.data, type_a=type_a))
+        self.recursion.update(summary)
+        rows = WindowRows(summary, Priors(self._values()), 1.0, 20.0, None, (np.nan, np.nan))
+        state = JointState(S_AND_Q, MEAN, U)
+        for term in rows.terms:
+            state.append(term.quantity, term.expected, term.uncertainty)
+            self.stated[term.key] = term.uncertainty
+        self.rows.append((state.quantities, rows.at(state, state.mean, Noise()).jacobian, self.hour * HOUR))
+        self.hour += 1
+
+    def restart(self, **changed: float) -> None:
+        """The program starts again with a changed configuration, and the same reference is connected."""
+        self.priors |= changed
+        kept = self.recursion.snapshot()
+        self.recursion = fresh(self._values())
+        self.recursion.load(kept)
+        self.recursion.restate()
+        self.recursion.meet(self.reference)
+        names = {"reference": "reference_", "rotation_rad": "rotation_", "gravity_mps2": "gravity"}
+        for name, u in changed.items():
+            for key in self.stated:
+                present = key.endswith(f" of {self.reference}") or " of " not in key
+                if present and key.split(" of ")[0].rstrip("xyz") == names[name]:
+                    self.stated[key] = u
+
+    def swap(self, reference: str) -> None:
+        """Another reference is connected; its rotation and lag may be others when it comes back."""
+        back = reference != self.reference and f"lag of {reference}" in self.stated
+        self.reference = reference
+        self.recursion.meet(reference)
+        for key, u in self.stated.items() if back else ():
+            if key.endswith(f" of {reference}") and key.startswith(("rotation", "lag ")):
+                self.loosened.append((len(self.rows), key, u**2))
+
+    def _values(self) -> dict[str, float]:
+        return dict(Priors.none().values) | {"offset_mps2": 0.01} | self.priors
+
+    def batch(self) -> np.ndarray:
+        """(12, 12) covariance of S and Q after the last window."""
+        keys = S_AND_Q_KEYS + list(self.stated)
+        variance = list(U**2) + [u**2 for u in self.stated.values()]
+        parts = [{k: 1.0} for k in range(len(keys))]  # of each quantity now, in the unknowns of the batch
+        design, day = [], self.rows[0][2]
+        walks = [WANDER["sensitivity"]] * 9 + [WANDER["offset_mps2"]] * 3
+        walking = dict(zip(range(12), walks, strict=True))
+        for n, (quantities, jacobian, at_day) in enumerate(self.rows):
+            moved = [(k, sd**2 * (at_day - day)) for k, sd in walking.items()]
+            moved += [(keys.index(key), var) for before, key, var in self.loosened if before == n]
+            for k, var in moved:
+                if var > 0.0:
+                    parts[k][len(variance)] = 1.0
+                    variance.append(var)
+            day = at_day
+            columns = [keys.index(quantity.key) for quantity in quantities]
+            design.append([(jacobian[:, j], dict(parts[k])) for j, k in enumerate(columns)])
+        whole = []
+        for window in design:
+            block = np.zeros((len(window[0][0]), len(variance)))
+            for column, unknowns in window:
+                for unknown, weight in unknowns.items():
+                    block[:, unknown] += weight * column
+            whole.append(block)
+        H, prior = np.vstack(whole), np.array(variance)
+        root = np.linalg.qr(np.vstack([np.eye(len(prior)), H * np.sqrt(prior)]), mode="r")
+        chosen = np.zeros((len(prior), 12))
+        for k in range(12):
+            chosen[list(parts[k]), k] = np.sqrt(prior[list(parts[k])])
+        half = np.linalg.solve(root.T, chosen)
+        return np.asarray(half.T @ half)
+
+
+def fresh(values: dict[str, float]) -> Recursion:
+    none = dict.fromkeys(Wander.none().values, 0.0)
+    return Recursion(MEAN, U, Priors(values), Wander(none | WANDER), TemperatureModel(), fixed=False)
+
+
+def begun(seed: int) -> Life:
+    priors = dict(PRIORS)
+    life = Life(fresh(dict(Priors.none().values) | {"offset_mps2": 0.01} | priors), priors, seed)
+    life.recursion.meet("A")
+    return life
+
+
+def ratios(life: Life) -> np.ndarray:
+    """Generalised eigenvalues of the recursion's covariance and that of the batch."""
+    P, exact = life.recursion.result().covariance, life.batch()
+    root = np.linalg.cholesky(exact)
+    half = np.linalg.solve(root, P)
+    return np.linalg.eigvalsh(np.linalg.solve(root, half.T))
+
+
+HAPPENINGS = st.one_of(
+    st.tuples(st.just("windows"), st.integers(1, 3)),
+    st.tuples(st.just("swap"), st.sampled_from("ABC")),
+    st.tuples(st.just("reference"), st.floats(1e-3, 9e-3)),
+    st.tuples(st.just("rotation_rad"), st.floats(1e-3, 9e-3)),
+    st.tuples(st.just("gravity_mps2"), st.floats(0.005, 0.1)),
+)
+
+
+@settings(
+    max_examples=15,
+    deadline=None,
+    derandomize=True,
+    phases=[Phase.generate],
+    suppress_health_check=[HealthCheck.too_slow],
+)
+@given(happenings=st.lists(HAPPENINGS, min_size=3, max_size=12), seed=st.integers(0, 1000))
+def test_a_life_of_restarts_changed_priors_and_swaps_is_the_batch(happenings: list[tuple[str, Any]], seed: int) -> None:
+    life = begun(seed)
+    life.window()
+    for what, value in happenings:
+        if what == "windows":
+            for _ in range(value):
+                life.window()
+        elif what == "swap":
+            life.swap(value)
+        else:
+            life.restart(**{what: value})
+    life.window()
+    found = ratios(life)
+    assert found.min() >= 1.0 - 1e-9
+    assert found.max() <= 1.05
+
+
+@pytest.mark.parametrize("changes", [1, 2, 4, 8])
+def test_changed_uncertainties_of_one_reference_are_no_new_reference(changes: int) -> None:
+    life = begun(5)
+    for k in range(changes + 1):
+        for _ in range(4):
+            life.window()
+        life.restart(reference=3e-3 * (1.1 if k % 2 == 0 else 1.0))
+    life.restart(reference=3e-3)
+    life.window()
+    assert life.recursion.result().standard_uncertainty[0] > 2.99e-3
+
+
+def test_two_references_in_turn_are_two_and_not_eight() -> None:
+    life = begun(6)
+    for k in range(8):
+        life.swap("AB"[k % 2])
+        for _ in range(4):
+            life.window()
+    u = life.recursion.result().standard_uncertainty[0]
+    assert 0.999 * 3e-3 / np.sqrt(2.0) < u < 1.01 * 3e-3 / np.sqrt(2.0)
+    assert life.recursion.references == ["A", "B"]
