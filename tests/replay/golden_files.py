@@ -1,24 +1,33 @@
 """The golden recordings: their directories, and the results that a replay gives.
 
 `python -m tests.replay.golden_files` writes each expected.json anew. Run it only after a change that is meant to change
-results.
+results. Where the present format of the state has no directory yet, the command first makes one, with a recording and a
+store. Run it therefore once before the format changes, with the last version that writes the old format.
 """
 
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 
+from agent.core.events import DeviceChange, Event, Tick
 from agent.core.pipeline import Pipeline
+from agent.core.snapshot import VERSION
 from agent.recording.fingerprint import fingerprint
 from agent.recording.reading import RecordingReader
 from agent.recording.replaying import Replay
+from tests import golden_site
+from tests.unit.recorded_bench import EPOCH_NS, blocks, record_events
 
-FORMATS = sorted((Path(__file__).parent / "golden").iterdir())
+GOLDEN = Path(__file__).parent / "golden"
+FORMATS = sorted(GOLDEN.iterdir())
 RECORDING, STATE, EXPECTED = "fieldcal-000001.mcap", "state.sqlite", "expected.json"
+DURATION_S, SEED = 27.0, 1
 
 
 def results_of(path: Path) -> list[dict[str, Any]]:
@@ -37,8 +46,33 @@ def config_of(path: Path) -> str:
     return str(start.config_json)  # type: ignore[union-attr] - the reader ensures that the first event is a RunStart
 
 
+def make(directory: Path) -> None:
+    """Write a recording of the golden site, and the store with the state that a gateway keeps after it."""
+    record_events(directory, golden_site.golden_config(), _events(), "golden")
+    for path in directory.iterdir():
+        if path.name not in (RECORDING, STATE):
+            path.unlink()
+
+
+def _events() -> Iterator[Event]:
+    """Openings, then the blocks of both devices and the ticks in order of time."""
+    world, n = golden_site.World(SEED), round(DURATION_S * golden_site.RATE_HZ)
+    time_s = np.arange(n) / golden_site.RATE_HZ
+    events: list[Event] = [
+        Tick(t_monotonic_ns=s * 10**9, t_utc_ns=EPOCH_NS + s * 10**9) for s in range(1, int(DURATION_S))
+    ]
+    for device in (golden_site.SENSOR, golden_site.REFERENCE):
+        info = json.dumps(msgspec.to_builtins(golden_site.info(device)))
+        yield DeviceChange(device=device, state="open", t_monotonic_ns=0, t_utc_ns=EPOCH_NS, info_json=info)
+        events += blocks(device, time_s, world.values(device, 0, n), golden_site.RATE_HZ)
+    yield from sorted(events, key=lambda event: event.t_monotonic_ns)
+
+
 if __name__ == "__main__":
-    for directory in FORMATS:
+    newest = GOLDEN / f"format-{VERSION}"
+    if not newest.exists():
+        make(newest)
+    for directory in sorted(GOLDEN.iterdir()):
         results = results_of(directory / RECORDING)
         (directory / EXPECTED).write_text(json.dumps(results, indent=1) + "\n")
         print(directory / EXPECTED, len(results), "results")

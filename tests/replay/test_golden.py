@@ -52,15 +52,16 @@ def test_a_state_of_a_released_format_is_brought_up_to_date(directory: Path, tmp
     (tmp_path / STATE).write_bytes((directory / STATE).read_bytes())
     store = Store(tmp_path, 0)
     assert store.set_aside is None
+    config = Config.model_validate_json(config_of(directory / RECORDING))
+    (sensor,) = [channel.sensor for channel in config.channels]
     with History(store.path) as history:
-        kept = {identity: memory.state for identity, memory in history.memories("mems").items()}
-        in_force = history.in_force("mems")
+        kept = {identity: memory.state for identity, memory in history.memories(sensor).items()}
+        in_force = history.in_force(sensor)
     store.close()
     assert in_force is not None
-    config = Config.model_validate_json(config_of(directory / RECORDING))
-    pipeline = Pipeline.begin(config, "later", 0, store.last_sequence(), {"mems": kept})
+    pipeline = Pipeline.begin(config, "later", 0, store.last_sequence(), {sensor: kept})
     events = (step.event for step in RecordingReader(directory / RECORDING).steps())
-    opened = next(e for e in events if isinstance(e, DeviceChange) and e.device == "mems")
+    opened = next(e for e in events if isinstance(e, DeviceChange) and e.device == sensor)
     (again,) = [result for result in pipeline.step(opened) if isinstance(result, CalibrationUpdate)]
     assert again.sensitivity == in_force.fields["sensitivity"]
     assert again.offset == in_force.fields["offset"]

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 
+from agent import __version__
 from agent.config import Config, parse_config
 from agent.core.events import DeviceChange, Event, Result, RunStart, Tick
 from agent.core.pipeline import Pipeline
@@ -28,27 +29,32 @@ PRIOR = {"sensitivity": COUNTS_PER_MPS2}
 
 def record(data_dir: Path, duration_s: float, seed: int = 7, run_id: str = "run-1", **channel: Any) -> Truth:
     """Record the plain preset's first `duration_s` into a data directory with store and one recording."""
-    data_dir.mkdir(parents=True, exist_ok=True)
     bench = Bench(plain(seed), seed)
-    config = _config(bench, **channel)
+    record_events(data_dir, _config(bench, **channel), _events(bench, duration_s), run_id)
+    return bench.truth
+
+
+def record_events(data_dir: Path, config: Config, events: Iterable[Event], run_id: str) -> None:
+    """Feed a new pipeline with the events; write recording and store into a data directory."""
+    data_dir.mkdir(parents=True, exist_ok=True)
     pipeline = Pipeline.begin(config, run_id, 0, 0, {})
-    recorder, store = Recorder(data_dir, ["mems", "reference"], ["mems"]), Store(data_dir, 0)
+    devices, sensors = [d.name for d in config.devices], [c.sensor for c in config.channels]
+    recorder, store = Recorder(data_dir, devices, sensors), Store(data_dir, 0)
     start = RunStart(
-        run_id=run_id, site="virtual", gateway="bench", boot_id="boot", t_monotonic_ns=0, t_utc_ns=EPOCH_NS,
-        config_json=config.model_dump_json(), versions={"fieldcal": "0.1.0", **versions()}, fingerprint=fingerprint(),
-        snapshot=pipeline.snapshot(), file_sequence=1, event_sequence=0,
+        run_id=run_id, site=config.gateway.site, gateway=config.gateway.name, boot_id="boot", t_monotonic_ns=0,
+        t_utc_ns=EPOCH_NS, config_json=config.model_dump_json(), versions={"fieldcal": __version__, **versions()},
+        fingerprint=fingerprint(), snapshot=pipeline.snapshot(), file_sequence=1, event_sequence=0,
     )  # fmt: skip
     recorder.record(0, start, [])
     assert recorder.path is not None
     name = recorder.path.name.removesuffix(".active")
-    for number, event in enumerate(_events(bench, duration_s), start=1):
+    for number, event in enumerate(events, start=1):
         results = pipeline.step(event)
         assert recorder.record(number, event, results)
         kept = [r for r in results if isinstance(r, Result)]
         store.commit([Record.of(r, recorded=True, recording=name) for r in kept], pipeline.memories(results))
     recorder.close()
     store.close()
-    return bench.truth
 
 
 def _config(bench: Bench, **channel: Any) -> Config:
@@ -77,18 +83,19 @@ def _events(bench: Bench, duration_s: float) -> Iterator[Event]:
         held = json.dumps(msgspec.to_builtins(info))
         yield DeviceChange(device=device, state="open", t_monotonic_ns=0, t_utc_ns=EPOCH_NS, info_json=held)
     events: list[Event] = [
-        *_blocks("mems", recording.sensor_time_s, recording.v),
-        *_blocks("reference", recording.reference_time_s, recording.reference),
+        *blocks("mems", recording.sensor_time_s, recording.v, 1000.0),
+        *blocks("reference", recording.reference_time_s, recording.reference, 1000.0),
         *(Tick(t_monotonic_ns=s * 10**9, t_utc_ns=EPOCH_NS + s * 10**9) for s in range(1, int(duration_s))),
     ]
     yield from sorted(events, key=lambda event: event.t_monotonic_ns)
 
 
-def _blocks(device: str, time_s: np.ndarray, values: np.ndarray) -> Iterator[SampleBlock]:
+def blocks(device: str, time_s: np.ndarray, values: np.ndarray, rate_hz: float) -> Iterator[SampleBlock]:
+    """Blocks of BLOCK samples that arrive in bursts of BURST, without delay; what is left over is dropped."""
     for first in range(0, len(time_s) - BLOCK + 1, BLOCK):
         count = np.arange(BURST, BLOCK + 1, BURST, dtype=np.int32)
         arrival_ns = np.round(time_s[first + count - 1] * 1e9).astype(np.int64)
         yield SampleBlock(
-            device, "boot", EPOCH_NS + int(arrival_ns[-1]), first, 1000.0, arrival_ns, count,
+            device, "boot", EPOCH_NS + int(arrival_ns[-1]), first, rate_hz, arrival_ns, count,
             np.ascontiguousarray(values[first : first + BLOCK], dtype=np.float64),
         )  # fmt: skip
