@@ -8,6 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Protocol
 
+from agent import __version__
 from agent.config import Config
 from agent.core.events import Acceleration, DeviceChange, Event, Result, RunStart, Tick
 from agent.core.pipeline import Pipeline
@@ -44,7 +45,7 @@ class Run:
             start = RunStart(
                 run_id="run-1", site=config.gateway.site, gateway=config.gateway.name, boot_id="boot",
                 t_monotonic_ns=0, t_utc_ns=EPOCH_NS, config_json=config.model_dump_json(),
-                versions={"fieldcal": "0.1.0", **versions()}, fingerprint=fingerprint(),
+                versions={"fieldcal": __version__, **versions()}, fingerprint=fingerprint(),
                 snapshot=self.pipeline.snapshot(), file_sequence=1, event_sequence=0,
             )  # fmt: skip
             self._record(start, [])

@@ -8,11 +8,15 @@ store. Run it therefore once before the format changes, with the last version th
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import msgspec
+
+os.environ["OPENBLAS_NUM_THREADS"] = "1"  # as in every entry point of the product; must be set before numpy is loaded
+
 import numpy as np
 
 from agent.core.events import DeviceChange, Event, Tick

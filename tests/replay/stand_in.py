@@ -9,6 +9,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from agent import __version__
 from agent.core.events import (
     CalibrationUpdate,
     DeviceChange,
@@ -158,7 +159,7 @@ def run_start(pipeline: StandIn, event_sequence: int, file_sequence: int, now_ns
         t_monotonic_ns=now_ns,
         t_utc_ns=EPOCH_NS + now_ns,
         config_json=pipeline.config_json,
-        versions={"fieldcal": "0.1.0"},
+        versions={"fieldcal": __version__},
         fingerprint=fingerprint(),
         snapshot=pipeline.snapshot(),
         file_sequence=file_sequence,
