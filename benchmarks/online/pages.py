@@ -10,7 +10,7 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from benchmarks.online import agreement, bench, cost, coverage, day, harm, year
+from benchmarks.online import agreement, bench, cost, coverage, day, harm, touched, year
 from benchmarks.page import PAGE, machine, write_part
 from hw.virtual.building import Building
 from hw.virtual.harm import KINDS
@@ -27,7 +27,8 @@ def main() -> int:
     parser.add_argument(
         "--runs",
         type=int,
-        help="number of runs of harm (and as many without harm) or of coverage; number of windows of year or cost",
+        help="number of runs of harm (and as many without harm), of coverage, or of each line of touched; number of "
+        "windows of year or cost",
     )
     options = parser.parse_args()
     for name in options.names or PARTS:
@@ -67,6 +68,12 @@ def _one_harm(job: tuple[str, int]) -> harm.Outcome:
 def _coverage(workers: int, runs: int | None) -> tuple[Path, str]:
     seeds = range(coverage.SEED, coverage.SEED + (runs or coverage.RUNS))
     return ONLINE, coverage.table(spread(coverage.one, seeds, workers))
+
+
+def _touched(workers: int, runs: int | None) -> tuple[Path, str]:
+    seeds = range(runs or touched.SEEDS)
+    told = iter(spread(touched.one, [(line, seed) for line in range(len(touched.LINES)) for seed in seeds], workers))
+    return ONLINE, touched.table([[next(told) for _ in seeds] for _ in touched.LINES])
 
 
 def _year(workers: int, runs: int | None) -> tuple[Path, str]:
@@ -114,6 +121,7 @@ PARTS: dict[str, Callable[[int, int | None], tuple[Path, str]]] = {
     "year": _year,
     "harm": _harm,
     "coverage": _coverage,
+    "touched": _touched,
     "day": _day,
     "cost": _cost,
 }

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hw.block import BlockFlags, DeviceInfo, SampleBlock
-from hw.virtual.building_motion import Band, BuildingMotion
+from hw.virtual.building_motion import Band, BuildingMotion, ComplexArray
 from hw.virtual.harm import HARMLESS, Harm, Role, Visit
 from hw.virtual.noise import Stream, generator
 from hw.virtual.schedule import STANDARD_GRAVITY_MPS2, rotation
@@ -70,6 +70,7 @@ class BuildingParameters:
     - `steps`: (time in s, (3, 3) added to S from then on).
     - Direction of the motion: y of the reference; in the fraction `elsewhere` of the visits a random direction; with
       `all_axes` all three axes.
+    - `across`: with motion along y, the share of it on x and z; the imaginary part is a quarter of a period ahead.
     """
 
     window_s: float = 120.0
@@ -78,6 +79,7 @@ class BuildingParameters:
     band: Band = field(default_factory=Band)
     elsewhere: float = 0.0
     all_axes: bool = False
+    across: tuple[complex, complex] = (0.0, 0.0)
     sensitivity: Array = field(default_factory=lambda: np.eye(3))
     steps: tuple[tuple[float, Array], ...] = ()
     offset: Array = field(default_factory=lambda: np.zeros(3))  # at `weather.mean_degc`
@@ -176,10 +178,12 @@ class Building:
         p = self.parameters
         random = generator(self.seed, stream, visit)
         level = float(np.exp(random.uniform(*np.log(p.level_mps2))))
-        shape = np.eye(3) if p.all_axes else np.array([[0.0, 1.0, 0.0]])
+        shape: Array | ComplexArray = np.eye(3) if p.all_axes else np.array([[0.0, 1.0, 0.0]])
         if random.random() < p.elsewhere:
             direction = random.standard_normal(3)
             shape = direction[None] / np.linalg.norm(direction)
+        if any(p.across):
+            shape = np.array([[p.across[0], 1.0, p.across[1]]])
         return BuildingMotion(random, p.band, *self.span(visit), level, shape)
 
     def _device(

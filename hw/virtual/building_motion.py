@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 # Grid points per period of the upper end of the band: interpolation by cubic pieces is then accurate to 3e-6.
 POINTS_A_PERIOD = 32
 
@@ -36,7 +37,8 @@ class Band:
 class BuildingMotion:
     """Acceleration (m/s2) from `start_s` to `stop_s`; it fades in and out within `ramp_s` and is zero outside.
 
-    `shape` (C, 3): each of the C rows is a direction with its own random motion of `level_mps2` rms.
+    `shape` (C, 3): each of the C rows is a direction with its own random motion of `level_mps2` rms. The imaginary part
+    of a complex row moves a quarter of a period ahead of the real part.
     """
 
     def __init__(
@@ -46,11 +48,10 @@ class BuildingMotion:
         start_s: float,
         stop_s: float,
         level_mps2: float,
-        shape: Array,
+        shape: Array | ComplexArray,
         ramp_s: float = 0.4,
     ) -> None:
         self._start_s, self._stop_s, self._ramp_s = start_s, stop_s, ramp_s
-        self._shape = shape
         self._rate_hz = POINTS_A_PERIOD * band.high_hz
         points = _fast_length(int(np.ceil((stop_s - start_s) * self._rate_hz)) + 2)
         frequency_hz: Array = np.arange(points // 2 + 1) * np.float64(self._rate_hz / points)
@@ -59,6 +60,9 @@ class BuildingMotion:
             + 1j * random.standard_normal((len(frequency_hz), len(shape)))
         )
         lines *= level_mps2 * points / np.sqrt(2 * np.sum(np.abs(lines) ** 2, axis=0))
+        if np.iscomplexobj(shape):
+            lines, shape = np.hstack([lines, 1j * lines]), np.vstack([shape.real, shape.imag])
+        self._shape = np.asarray(shape, dtype=np.float64)
         self._value = np.fft.irfft(lines, points, axis=0)
         self._slope = np.fft.irfft(lines * (2j * np.pi * frequency_hz[:, None] / self._rate_hz), points, axis=0)
 

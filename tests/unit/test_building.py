@@ -221,3 +221,14 @@ def test_turned_swapped_and_far_away() -> None:
     whole, far = visited(FarAway("", 0.6), **quiet)
     a, b = values(whole, "reference")[:, 1], values(far, "reference")[:, 1]
     assert np.corrcoef(a, b)[0, 1] == pytest.approx(0.6, abs=0.3)  # narrow modes: few independent samples
+
+
+def test_an_imaginary_share_moves_a_quarter_of_a_period_ahead() -> None:
+    band = Band(3.9, 4.1, ((4.0, 0.001),), flat=0.0)
+    shape = np.array([[0.01j, 1.0, 0.02]])
+    motion = BuildingMotion(np.random.default_rng(1), band, 0.0, 60.0, 0.1, shape)
+    time_s = np.arange(5.0, 55.0, 0.01)
+    moved, ahead = motion.at(time_s), motion.at(time_s + 1 / 16.0)
+    np.testing.assert_allclose(moved[:, 2], 0.02 * moved[:, 1], atol=1e-12)
+    assert np.std(moved[:, 0] - 0.01 * ahead[:, 1]) < 0.03 * np.std(moved[:, 0])
+    assert 0.009 < np.std(moved[:, 0]) / np.std(moved[:, 1]) < 0.011
