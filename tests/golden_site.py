@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from agent.config import Config, parse_config
 from hw.block import DeviceInfo
 from hw.virtual.building_motion import Band, BuildingMotion
+from hw.virtual.timebase import Bursts
 
 Array = NDArray[np.float64]
 SENSOR, REFERENCE = "imu", "ref"
@@ -23,6 +24,9 @@ RATE_HZ = 100.0
 WINDOW_S, GUARD_S = 6.0, 0.5
 LEVEL_MPS2, NOISE_MPS2 = 0.6, {SENSOR: 0.005, REFERENCE: 0.001}
 LONGEST_S = 600.0  # of the motion
+BAND = Band(0.5, 4.0, flat=1.0)  # slow, because the stamps of a busy machine may be off by milliseconds
+LATE = Bursts(poll_s=0.018, mean_late_s=0.002, stall_probability=0.05, longest_stall_s=0.05)  # as on such a machine
+U_LAG_WINDOW_S = 0.002
 DECIMALS = 4
 U_REFERENCE_PCT = 0.3
 GRAVITY_MPS2 = np.array([0.0, 0.0, 9.80665])
@@ -38,7 +42,7 @@ class World:
     def __init__(self, seed: int) -> None:
         self._seed = seed
         random = np.random.default_rng([seed, 0])
-        self._motion = BuildingMotion(random, Band(0.5, 12.0), 0.0, LONGEST_S, LEVEL_MPS2, np.eye(3))
+        self._motion = BuildingMotion(random, BAND, 0.0, LONGEST_S, LEVEL_MPS2, np.eye(3))
 
     def values(self, device: str, first: int, n: int, reference: str = "A") -> Array:
         """Indications (n, 3) of samples first .. first + n - 1, m/s2; `reference` is the serial number of the
@@ -62,7 +66,7 @@ def info(device: str) -> DeviceInfo:
     """What the driver tells when it opens a device of the golden recording."""
     return DeviceInfo(
         "serial-csv", "serial-csv", serial_number(device), "m/s2", 3, RATE_HZ,
-        {"port": f"/dev/{device}", "baud_rate": "115200", "sequence": "True"},
+        settings={"port": f"/dev/{device}", "baud_rate": "115200", "sequence": "True"},
     )  # fmt: skip
 
 
@@ -94,6 +98,7 @@ def config(ports: Mapping[str, Path], reference: str = "A", **keys: Any) -> dict
         "certificate": {
             "u_sensitivity_pct": U_REFERENCE_PCT, "serial_number": reference, "calibrated": "2026-09-01"
         },
+        "uncertainty": {"lag_window_s": U_LAG_WINDOW_S},
         "temperature": {"offset_order": 0},
     }  # fmt: skip
     for name, value in keys.items():

@@ -24,10 +24,8 @@ SHIM = Path(__file__).with_name("clock_shim.c")
 def stepped(directory: Path) -> Outcome:
     """One run in which UTC makes all steps; then two runs with UTC 30 years earlier, the last without a state file."""
     directory.mkdir(exist_ok=True)
-    library, step = directory / "clock_shim.so", directory / "step"
-    subprocess.run(["gcc", "-O2", "-shared", "-fPIC", "-o", str(library), str(SHIM)], check=True)
-    variables = {"LD_PRELOAD": str(library), "FIELDCAL_CLOCK_STEP": str(step)}
-    step_clock(step, 0)
+    step = directory / "step"
+    variables = clock_shim(directory, step)
     with witnessed(directory, SEED) as (rig, witness):
         with rig.agent(variables=variables) as agent:
             lives = rig.run(agent, until=lambda: len(witness.received) > 20)
@@ -77,6 +75,15 @@ def stepped(directory: Path) -> Outcome:
         outcome.require(lives and status == 0, f"the agent ended with {status}: {rig.output[-300:]}")
         outcome.require("Traceback" not in rig.output, "a traceback was shown")
     return outcome
+
+
+def clock_shim(directory: Path, step: Path) -> dict[str, str]:
+    """Build the clock shim in `directory`. Returns the environment of processes whose UTC `step_clock(step, ...)` is to
+    shift. Needs gcc."""
+    library = directory / "clock_shim.so"
+    subprocess.run(["gcc", "-O2", "-shared", "-fPIC", "-o", str(library), str(SHIM)], check=True)
+    step_clock(step, 0)
+    return {"LD_PRELOAD": str(library), "FIELDCAL_CLOCK_STEP": str(step)}
 
 
 def step_clock(path: Path, seconds: int) -> None:

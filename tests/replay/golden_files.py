@@ -7,6 +7,7 @@ store. Run it therefore once before the format changes, with the last version th
 
 from __future__ import annotations
 
+import heapq
 import json
 import os
 from collections.abc import Iterator
@@ -17,16 +18,19 @@ import msgspec
 
 os.environ["OPENBLAS_NUM_THREADS"] = "1"  # as in every entry point of the product; must be set before numpy is loaded
 
-import numpy as np
-
-from agent.core.events import DeviceChange, Event, Tick
+from agent.core.events import DeviceChange, Event
 from agent.core.pipeline import Pipeline
 from agent.core.snapshot import VERSION
 from agent.recording.fingerprint import fingerprint
 from agent.recording.reading import RecordingReader
 from agent.recording.replaying import Replay
+from benchmarks.online.clamp import blocks
+from benchmarks.online.runner import ticked
+from hw.block import SampleBlock
+from hw.virtual.noise import Stream
+from hw.virtual.timebase import Clock
 from tests import golden_site
-from tests.unit.recorded_bench import EPOCH_NS, blocks, record_events
+from tests.unit.recorded_bench import EPOCH_NS, record_events
 
 GOLDEN = Path(__file__).parent / "golden"
 FORMATS = sorted(GOLDEN.iterdir())
@@ -60,16 +64,21 @@ def make(directory: Path) -> None:
 
 def _events() -> Iterator[Event]:
     """Openings, then the blocks of both devices and the ticks in order of time."""
-    world, n = golden_site.World(SEED), round(DURATION_S * golden_site.RATE_HZ)
-    time_s = np.arange(n) / golden_site.RATE_HZ
-    events: list[Event] = [
-        Tick(t_monotonic_ns=s * 10**9, t_utc_ns=EPOCH_NS + s * 10**9) for s in range(1, int(DURATION_S))
-    ]
-    for device in (golden_site.SENSOR, golden_site.REFERENCE):
+    streams = {golden_site.SENSOR: Stream.SENSOR_ARRIVAL, golden_site.REFERENCE: Stream.REFERENCE_ARRIVAL}
+    for device in streams:
         info = json.dumps(msgspec.to_builtins(golden_site.info(device)))
         yield DeviceChange(device=device, state="open", t_monotonic_ns=0, t_utc_ns=EPOCH_NS, info_json=info)
-        events += blocks(device, time_s, world.values(device, 0, n), golden_site.RATE_HZ)
-    yield from sorted(events, key=lambda event: event.t_monotonic_ns)
+    streams = [
+        _blocks(golden_site.SENSOR, Stream.SENSOR_ARRIVAL),
+        _blocks(golden_site.REFERENCE, Stream.REFERENCE_ARRIVAL),
+    ]
+    yield from ticked(heapq.merge(*streams, key=lambda block: block.t_monotonic_ns))
+
+
+def _blocks(device: str, stream: Stream) -> Iterator[SampleBlock]:
+    rate_hz, late = golden_site.RATE_HZ, golden_site.LATE
+    stamp_s = late.stamps(Clock(rate_hz), late.arrivals(SEED, stream, DURATION_S))
+    return blocks(device, stamp_s, golden_site.World(SEED).values(device, 0, len(stamp_s)), rate_hz)
 
 
 if __name__ == "__main__":

@@ -83,19 +83,18 @@ def _events(bench: Bench, duration_s: float) -> Iterator[Event]:
         held = json.dumps(msgspec.to_builtins(info))
         yield DeviceChange(device=device, state="open", t_monotonic_ns=0, t_utc_ns=EPOCH_NS, info_json=held)
     events: list[Event] = [
-        *blocks("mems", recording.sensor_time_s, recording.v, 1000.0),
-        *blocks("reference", recording.reference_time_s, recording.reference, 1000.0),
+        *_blocks("mems", recording.sensor_time_s, recording.v),
+        *_blocks("reference", recording.reference_time_s, recording.reference),
         *(Tick(t_monotonic_ns=s * 10**9, t_utc_ns=EPOCH_NS + s * 10**9) for s in range(1, int(duration_s))),
     ]
     yield from sorted(events, key=lambda event: event.t_monotonic_ns)
 
 
-def blocks(device: str, time_s: np.ndarray, values: np.ndarray, rate_hz: float) -> Iterator[SampleBlock]:
-    """Blocks of BLOCK samples that arrive in bursts of BURST, without delay; what is left over is dropped."""
+def _blocks(device: str, time_s: np.ndarray, values: np.ndarray) -> Iterator[SampleBlock]:
     for first in range(0, len(time_s) - BLOCK + 1, BLOCK):
         count = np.arange(BURST, BLOCK + 1, BURST, dtype=np.int32)
         arrival_ns = np.round(time_s[first + count - 1] * 1e9).astype(np.int64)
         yield SampleBlock(
-            device, "boot", EPOCH_NS + int(arrival_ns[-1]), first, rate_hz, arrival_ns, count,
+            device, "boot", EPOCH_NS + int(arrival_ns[-1]), first, 1000.0, arrival_ns, count,
             np.ascontiguousarray(values[first : first + BLOCK], dtype=np.float64),
         )  # fmt: skip
