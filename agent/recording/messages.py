@@ -192,7 +192,7 @@ def _decode_calibration(data: bytes) -> tuple[int, Result]:
     values["residual_sd"] = [values.pop(name) for name in _RESIDUALS]
     values["covariance"] = np.array(values["covariance"]).reshape(12, 12).tolist()
     values |= {name: np.reshape(values[name], (-1, 3)).tolist() for name in _BY_POWER}
-    values |= {name: list(values[name]) for name in ("determined", *_BY_AXIS)}
+    values |= {name: list(values[name]) for name in ("determined", "references", *_BY_AXIS)}
     return values.pop("event_sequence"), msgspec.convert(values, CalibrationUpdate)
 
 
