@@ -71,11 +71,16 @@ class Linearised:
                     state.shift(k, factor, amount)
         self.point = self.state.mean.copy()
 
-    def hand_over(self, owner: str, new_owner: str) -> None:
-        """Give the quantities and the recent windows of a reference another name of the same reference."""
+    def hand_over(self, owner: str, new_owner: str) -> dict[str, str]:
+        """Give the quantities and the recent windows of a reference another name of the same reference.
+
+        Returns the new key of each quantity by its old one.
+        """
+        before = list(self.state.keys)
         for state in (self.state, self.base):
             state.hand_over(owner, new_owner)
         self.recent = [replace(w, reference=new_owner) if w.reference == owner else w for w in self.recent]
+        return dict(zip(before, self.state.keys, strict=True))
 
     def moved(self, scale: float) -> bool:
         """Whether an unknown is so far from the point that the windows must be linearised again (see `Kind.straight`).

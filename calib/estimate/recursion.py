@@ -208,7 +208,9 @@ class Recursion(WindowState):
         """The reference with the date of its certificate, as an owner of unknowns."""
         dated = f"{reference}{DATED}{calibrated}"
         if calibrated and dated not in self._references and reference in self._references:
-            self._joint.hand_over(reference, dated)  # the date of the same certificate was stated later
+            keys = self._joint.hand_over(reference, dated)  # the date of the same certificate was stated later
+            if self._held is not None:
+                self._held = Held(self._held.mps2, {keys[key]: moves for key, moves in self._held.by.items()})
             self._references = {(dated if of == reference else of): s for of, s in self._references.items()}
         if calibrated:
             return dated
