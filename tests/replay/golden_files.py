@@ -1,8 +1,8 @@
 """The golden recordings: their directories, and the results that a replay gives.
 
 `python -m tests.replay.golden_files` writes each expected.json anew. Run it only after a change that is meant to change
-results. Where the present format of the state has no directory yet, the command first makes one, with a recording and a
-store. Run it therefore once before the format changes, with the last version that writes the old format.
+results. `python -m tests.replay.golden_files make` first makes the directory of the present format of the state, with a
+recording and a store. Do this once, with the last version that writes this format.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import heapq
 import json
 import os
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -82,9 +83,8 @@ def _blocks(device: str, stream: Stream) -> Iterator[SampleBlock]:
 
 
 if __name__ == "__main__":
-    newest = GOLDEN / f"format-{VERSION}"
-    if not newest.exists():
-        make(newest)
+    if sys.argv[1:] == ["make"]:
+        make(GOLDEN / f"format-{VERSION}")
     for directory in sorted(GOLDEN.iterdir()):
         results = results_of(directory / RECORDING)
         (directory / EXPECTED).write_text(json.dumps(results, indent=1) + "\n")

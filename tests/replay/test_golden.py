@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from agent.config import Config
-from agent.core.events import CalibrationUpdate, DeviceChange
+from agent.core.events import CalibrationUpdate, DeviceChange, WindowReport
 from agent.core.pipeline import Pipeline
 from agent.delivery.history import History
 from agent.delivery.store import Store
@@ -66,6 +66,10 @@ def test_a_state_of_a_released_format_is_brought_up_to_date(directory: Path, tmp
     assert again.sensitivity == in_force.fields["sensitivity"]
     assert again.offset == in_force.fields["offset"]
     assert again.covariance == in_force.fields["covariance"]
+    results = [result for event in events for result in pipeline.step(event)]
+    windows = [result for result in results if isinstance(result, WindowReport)]
+    assert [window.reason for window in windows if not window.used] == []  # the same windows as those before
+    assert len(windows) >= 1
 
 
 def test_a_difference_of_one_part_in_a_million_is_seen() -> None:
