@@ -94,6 +94,8 @@ class ChannelState:
                     self._told(f"the reference {change.device} is lost, S and Q stay as they are: {change.message}")
                 ]
             return self._lose(f"{self.sensor} is lost: {change.message}")
+        if self._estimation is not None:
+            self._estimation.lag_watch.began(self._estimation.recursion, change.device)
         if change.device == self.sensor:
             return self._identify(change.info_json)
         return self._identify_reference(change.info_json)
@@ -244,6 +246,8 @@ class ChannelState:
         used = decision.action in ("take", "adopt")
         numbers = {**decision.numbers, "lag_applied_s": verdict.lag_s}
         yield window_report(source, window, used=used, reason="" if used else decision.reason, numbers=numbers)
+        if judged.news:
+            yield self._told(judged.news)
         origin_utc_ns = self._time.utc_ns - round((self._first_day * DAY_S + self._time.now_s) * 1e9)
         for drift in judged.drift:
             yield drift_report(source, drift, self._channel.drift.false_alarms_a_year, origin_utc_ns)

@@ -11,7 +11,8 @@ import numpy as np
 from agent.config import Channel
 from agent.config.gate import GateSettings
 from agent.core.gate import PROPOSALS_KEPT, Decision, Evidence, Gate
-from calib.distributions import chi2_quantile
+from agent.core.time_shift import Anew, LagWatch
+from agent.core.windows import Found
 from calib.estimate.correction import Law
 from calib.estimate.drift import DriftTest, DriftVerdict
 from calib.estimate.innovation import Innovation
@@ -31,11 +32,15 @@ FIXED_MOUNT_LEAST = 4  # parameters: three of Q, and one of S; without turning, 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Judged:
-    """The result for a window: the decision of the gate, the innovation, and drift verdicts that changed."""
+    """The result for a window: the decision of the gate, the innovation, and drift verdicts that changed.
+
+    `news` for the operator: that the time between sensor and reference has shifted; otherwise "".
+    """
 
     decision: Decision
     innovation: Innovation
     drift: Sequence[DriftVerdict]
+    news: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,6 +75,7 @@ class Estimation:
         self._held: list[Summary] = []
         self._proposed: list[tuple[Calibration, Recursion]] = []  # proposals whose windows the state did not take
         self._tried: Tried | None = None  # what `lag_after` did, for `judge` right after it
+        self.lag_watch = LagWatch(channel, self.gate.limit)
 
     @property
     def lag_s(self) -> float:
@@ -87,16 +93,38 @@ class Estimation:
             _, trial = trial.with_window(self._summary(window, day, lag_s, temperature_degc))
         return trial.lag_s
 
-    def judge(self, window: Window, day: float, lag_s: float, temperature_degc: float) -> Judged:
-        """Take, hold or refuse one used window."""
-        tried, self._tried = self._tried, None
-        if tried is None or tried.window_sums is not window.sums or tried.summary.lag_s != lag_s:
-            tried = self._try(window, day, lag_s, temperature_degc)
+    def contradicted(self, found: Found, day: float, lag_s: float) -> bool:
+        """Whether a window, made with `lag_s` taken out, contradicts the state, or does not follow the reference."""
+        for window in found.windows:
+            if not window.used:
+                if window.numbers.get("coherence", 1.0) < window.numbers.get("coherence_threshold", 0.0):
+                    return True
+                continue
+            tried = self._tried_of(window, day, lag_s, found.temperature_degc)
+            if tried.innovation.statistic > self.gate.limit(tried.innovation.degrees_of_freedom):
+                return True
+        return False
+
+    def judge(
+        self, window: Window, day: float, lag_s: float, temperature_degc: float, anew: Anew | None = None
+    ) -> Judged:
+        """Take, hold or refuse one used window. `anew`: the search that found its lag, if there was one."""
+        if anew is None:
+            tried = self._tried_of(window, day, lag_s, temperature_degc)
+        else:
+            if anew.shifted:
+                self.lag_watch.shifted(self.recursion)
+                self.recursion = anew.base
+                self.gate.dismiss()  # windows held before were made with another lag
+                self._held = []
+            summary = self._summary(window, day, lag_s, temperature_degc)
+            tried = Tried(window.sums, summary, *self.recursion.with_window(summary, at_its_lag=True))
+        self._tried = None
         summary, innovation, trial = tried.summary, tried.innovation, tried.after
         candidate = trial.result()
         confirm = self._channel.gate.confirm_windows
         held = [*self._held, summary][-confirm:]
-        adopted = self._adopted(held) if len(held) == confirm else None
+        adopted = self._adopted(held) if len(held) == confirm and not self.lag_watch.beyond else None
         evidence = Evidence(day * DAY_S, innovation.statistic, innovation.degrees_of_freedom)
         decision = self.gate.judge(evidence, candidate, None if adopted is None else adopted.result())
         if decision.action == "take":
@@ -120,8 +148,17 @@ class Estimation:
                 made = trial if decision.proposal is candidate else adopted
                 assert made is not None  # a proposal is one of the two
                 self._proposed = [*self._proposed, (decision.proposal, made.settled())][-PROPOSALS_KEPT:]
-            decision = replace(decision, reason=f"{decision.reason}; {_most(innovation, self.recursion.scale)}")
-        return Judged(decision, innovation, drift)
+            why = self.lag_watch.beyond or _most(innovation, self.recursion.scale)
+            decision = replace(decision, reason=f"{decision.reason}; {why}")
+        news = self.lag_watch.taken(self.recursion) if decision.action in ("take", "adopt") else ""
+        return Judged(decision, innovation, drift, news)
+
+    def _tried_of(self, window: Window, day: float, lag_s: float, temperature_degc: float) -> Tried:
+        """The window tried on the state; what `lag_after` did is not done again."""
+        tried = self._tried
+        if tried is None or tried.window_sums is not window.sums or tried.summary.lag_s != lag_s:
+            return self._try(window, day, lag_s, temperature_degc)
+        return tried
 
     def _try(self, window: Window, day: float, lag_s: float, temperature_degc: float) -> Tried:
         summary = self._summary(window, day, lag_s, temperature_degc)
@@ -166,6 +203,7 @@ class Estimation:
         changed = self.recursion.meet(reference, calibrated, sensitivity)
         if before not in ("", self.recursion.reference):
             self.gate.dismiss()
+            self.lag_watch.forget()
             self._held, self._proposed = [], []
         return changed and follows and self._update_in_force()
 
@@ -214,8 +252,7 @@ class Estimation:
         trial.loosen(self._jump(held), tilt_rad, line=True)
         for k, summary in enumerate(held):
             told = trial.innovation(summary)
-            limit = chi2_quantile(1.0 - self._channel.gate.false_holds, told.degrees_of_freedom)
-            if k and told.statistic > limit:
+            if k and told.statistic > self.gate.limit(told.degrees_of_freedom):
                 return None
             trial.update(summary)
         return trial
@@ -249,6 +286,7 @@ class Estimation:
             "in_force": _plain(self.in_force),
             "law": {name: getattr(self.law, name) for name in Law.__slots__},
             "residual_sd": self.residual_sd,
+            "lag_watch": self.lag_watch.snapshot(),
         }
 
     def load(self, state: dict[str, Any]) -> None:
@@ -260,6 +298,8 @@ class Estimation:
         self._proposed = [(Calibration(**p["calibration"]), self._loaded(p["recursion"])) for p in state["proposed"]]
         self.in_force, self.law = Calibration(**state["in_force"]), Law(**state["law"])
         self.residual_sd = np.array(state["residual_sd"])
+        if "lag_watch" in state:  # states of earlier versions have none
+            self.lag_watch.load(state["lag_watch"])
 
 
 def _plain(calibration: Calibration) -> dict[str, Any]:

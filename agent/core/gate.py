@@ -127,6 +127,10 @@ class Gate:
 
     # --- windows
 
+    def limit(self, degrees_of_freedom: float) -> float:
+        """The largest chi-squared with which a window is consistent; `false_holds` of the sound windows have more."""
+        return chi2_quantile(1.0 - self._settings.false_holds, degrees_of_freedom)
+
     def judge(self, evidence: Evidence, candidate: Calibration, confirmed: Calibration | None = None) -> Decision:
         """Decide on one window. `candidate`: the calibration if the state takes the window. `confirmed`: the
         calibration if the state takes all held windows with this one; None if they do not agree with each other, or if
@@ -138,7 +142,7 @@ class Gate:
             return self._decision(
                 "refuse", "an operator put the calibration on hold; no window is used until an operator releases it"
             )
-        limit = chi2_quantile(1.0 - self._settings.false_holds, evidence.degrees_of_freedom)
+        limit = self.limit(evidence.degrees_of_freedom)
         numbers = {"innovation_chi2": evidence.statistic, "innovation_chi2_threshold": limit}
         consistent = evidence.degrees_of_freedom <= 0 or evidence.statistic <= limit
         change = self._anchor.change(candidate)

@@ -26,7 +26,9 @@ UNCOUNTED = BlockFlags.RESTART | BlockFlags.OVERRUN
 class Run:
     """Blocks whose samples are counted on from each other, with the clock of these samples."""
 
-    def __init__(self, clock: ClockModel) -> None:
+    def __init__(self, clock: ClockModel, number: int = 0) -> None:
+        """`number` counts the runs of a device."""
+        self.number = number
         self.blocks: deque[SampleBlock] = deque()
         self.model = clock
         self._fitted: ClockFit | None = None  # the clock model's result, until the next block
@@ -69,12 +71,16 @@ class Run:
 
     def snapshot(self) -> dict[str, Any]:
         """State for `restore`, bit-exact."""
-        return {"clock": self.model.snapshot(), "blocks": [_block_state(block) for block in self.blocks]}
+        return {
+            "number": self.number,
+            "clock": self.model.snapshot(),
+            "blocks": [_block_state(block) for block in self.blocks],
+        }
 
     @classmethod
     def restore(cls, state: Mapping[str, Any]) -> Run:
         """The run whose `snapshot` this is."""
-        run = cls(ClockModel.restore(state["clock"]))
+        run = cls(ClockModel.restore(state["clock"]), state.get("number", 0))
         run.blocks.extend(_block_of(s) for s in state["blocks"])
         return run
 
@@ -102,8 +108,9 @@ class DeviceStream:
         if self.first_sample_s is None:
             self.first_sample_s = first_arrival_s - int(block.burst_count[0]) / block.nominal_rate_hz
         if not self._runs or block.flags & UNCOUNTED:
+            number = self._runs[-1].number + 1 if self._runs else 0
             self._runs = [run for run in self._runs if run.blocks]
-            self._runs.append(Run(ClockModel(block.nominal_rate_hz, self._horizon_s)))
+            self._runs.append(Run(ClockModel(block.nominal_rate_hz, self._horizon_s), number))
         self._runs[-1].update(block, arrivals_s)
         self.newest_arrival_s = float(arrivals_s[-1])
 
@@ -147,6 +154,11 @@ class DeviceStream:
         spans = [run.span_s for run in self._runs if run.blocks]
         found = [(ended, max(ended, began)) for (_, ended), (began, _) in itertools.pairwise(spans)]
         return [(ended, began) for ended, began in found if ended < stop_s and began > start_s]
+
+    def run_number(self, start_s: float, stop_s: float) -> int | None:
+        """The number of the run that `cut` takes; None where there are no samples."""
+        run = self._run_of(start_s, stop_s)
+        return None if run is None else run.number
 
     def missing(self, start_s: float, stop_s: float) -> int:
         """How many samples are known to be missing in holes that reach between these times."""

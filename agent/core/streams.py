@@ -13,6 +13,7 @@ from agent.core.estimation import DAY_S, Estimation, Judged
 from agent.core.positions import FOUND_WITHIN_S, FoundPositions
 from agent.core.schedule import Piece, ToldTimes
 from agent.core.stream import DeviceStream
+from agent.core.time_shift import Anew
 from agent.core.windows import Found, margin_of, refused, windows_in
 from calib.estimate.lag_search import without_lag
 from calib.excitation.front_end import most_margin_s
@@ -53,6 +54,7 @@ class Streams:
         self.by_device: dict[str, DeviceStream] = {}
         self._finder = FoundPositions(channel) if channel.positions else None
         self._places = self._finder or ToldTimes(channel)
+        self._runs: dict[str, int] = {}  # of each device, the number of the run of which the last part was
 
     def begin(self, origin_ns: int) -> None:
         """A new run, nothing is there yet."""
@@ -131,27 +133,39 @@ class Streams:
         self, piece: Piece, first_s: float, first_day: float, estimation: Estimation | None, unusable: str
     ) -> Iterator[Verdict]:
         day = first_day + (first_s + piece.stop_s) / DAY_S
-        placed, lag_s = Placed(piece.pose, "", {}), 0.0
+        placed, lag_s, anew = Placed(piece.pose, "", {}), 0.0, None
         if unsound := self._unsound(first_s + piece.start_s, first_s + piece.stop_s):
             found = Found([refused(piece, unsound)])
         else:
+            self._look_for_restarts(first_s + piece.start_s, first_s + piece.stop_s, estimation)
             placed = self._placed(piece, first_s, day, estimation)
             if placed.pose is None or unusable:
                 found = Found([refused(piece, unusable or placed.reason)])
             else:
-                found, lag_s = self._found(replace(piece, pose=placed.pose), first_s, day, estimation)
+                found, lag_s, anew = self._found(replace(piece, pose=placed.pose), first_s, day, estimation)
         found = found.told(placed.numbers)
         for window in found.windows:
             judged = None
             if window.used and estimation is not None:
-                judged = estimation.judge(window, day, lag_s, found.temperature_degc)
+                judged = estimation.judge(window, day, lag_s, found.temperature_degc, anew)
+                anew = None  # the first window has set the lag in the state
             yield Verdict(window, judged, lag_s)
+
+    def _look_for_restarts(self, start_s: float, stop_s: float, estimation: Estimation | None) -> None:
+        """A device that began to count anew since the last part may be late by another time."""
+        for name, stream in self.by_device.items():
+            number = stream.run_number(start_s, stop_s)
+            if number is not None and number != self._runs.get(name):
+                self._runs[name] = number
+                if estimation is not None:
+                    estimation.lag_watch.began(estimation.recursion, name)
 
     def snapshot(self) -> dict[str, Any]:
         """State for `load`, bit-exact."""
         return {
             "streams": {name: stream.snapshot() for name, stream in self.by_device.items()},
             "places": self._places.snapshot(),
+            "run_numbers": dict(self._runs),
         }
 
     def load(self, origin_ns: int, state: Mapping[str, Any]) -> None:
@@ -160,6 +174,7 @@ class Streams:
             n: DeviceStream.restore(n, origin_ns, s, self._horizon_s) for n, s in state["streams"].items()
         }
         self._places.load(state["places"])
+        self._runs = dict(state.get("run_numbers", {}))
 
     @property
     def _sensor(self) -> DeviceStream:
@@ -201,16 +216,26 @@ class Streams:
         cut = self._sensor.cut(first_s + piece.start_s, first_s + piece.stop_s)
         return self._finder.place(piece, cut, estimation.recursion, day)
 
-    def _found(self, piece: Piece, first_s: float, day: float, estimation: Estimation | None) -> tuple[Found, float]:
-        """The windows, made again until no lag is left in them that matters."""
+    def _found(
+        self, piece: Piece, first_s: float, day: float, estimation: Estimation | None
+    ) -> tuple[Found, float, Anew | None]:
+        """The windows, made again until no lag is left in them that matters; what a search for another lag found."""
+
+        def make(lag_s: float) -> Found:
+            return windows_in(piece, first_s, self._channel, self.by_device, lag_s)
+
         if estimation is None or self._channel.reference is None:
             lag_s = 0.0 if estimation is None else estimation.lag_s
-            return windows_in(piece, first_s, self._channel, self.by_device, lag_s), lag_s
-        return without_lag(
+            return make(lag_s), lag_s, None
+        found, lag_s = without_lag(
             estimation.lag_s,
-            lambda lag_s: windows_in(piece, first_s, self._channel, self.by_device, lag_s),
-            lambda found: [w for w in found.windows if w.used],
-            lambda found, lag_s: estimation.lag_after(
-                [w for w in found.windows if w.used], day, lag_s, found.temperature_degc
-            ),
+            make,
+            lambda found: found.used,
+            lambda found, lag_s: estimation.lag_after(found.used, day, lag_s, found.temperature_degc),
         )
+        if not estimation.contradicted(found, day, lag_s):
+            return found, lag_s, None
+        anew = estimation.lag_watch.search(estimation.recursion, make, found.windows, day)
+        if anew is not None and not anew.beyond:
+            return anew.found, anew.lag_s, anew
+        return found.because(estimation.lag_watch.beyond), lag_s, None

@@ -20,6 +20,17 @@ class Found:
     windows: list[Window]
     temperature_degc: float = float("nan")
 
+    @property
+    def used(self) -> list[Window]:
+        """Those of the windows that are used."""
+        return [window for window in self.windows if window.used]
+
+    def because(self, why: str) -> Found:
+        """The same with `why` added to the reasons of the windows that are not used; "" adds nothing."""
+        if not why:
+            return self
+        return replace(self, windows=[w if w.used else replace(w, reason=f"{w.reason}; {why}") for w in self.windows])
+
     def told(self, numbers: Mapping[str, float]) -> Found:
         """The same with numbers more in each window."""
         return replace(self, windows=[replace(w, numbers={**w.numbers, **numbers}) for w in self.windows])

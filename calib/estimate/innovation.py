@@ -29,15 +29,16 @@ class Innovation:
     information: Array
 
 
-def innovation(rows: Rows, state: JointState) -> Innovation:
-    """The innovation of a window's rows, linearised at the state's mean."""
+def innovation(rows: Rows, state: JointState, at: Array) -> Innovation:
+    """The innovation of a window's rows against the state's mean; `at` (N,) are the values at which they are linear."""
+    residual = rows.residual + rows.jacobian @ (at - state.mean)
     a = rows.jacobian @ state.factor
     covariance = a @ a.T + np.eye(len(a))
     own = rows.jacobian[:, :12]
-    weighed = np.linalg.solve(covariance, np.column_stack([rows.residual, own]))
+    weighed = np.linalg.solve(covariance, np.column_stack([residual, own]))
     information = np.einsum("rp,rp->p", own, weighed[:, 1:])
     tells = information * state.variance[:12] > TELLS
     root = np.sqrt(np.where(tells, information, 1.0))
     score = np.where(tells, own.T @ weighed[:, 0] / root, np.nan)
-    statistic = float(rows.residual @ weighed[:, 0])
+    statistic = float(residual @ weighed[:, 0])
     return Innovation(statistic, len(a), score, np.where(tells, information, 0.0))

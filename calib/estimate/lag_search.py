@@ -10,6 +10,7 @@ import numpy as np
 from calib.model import Window
 
 TURNS = 4  # each iteration leaves about a thousandth of the lag
+BASIN_RAD = 0.5  # of the motion's mean phase: from a start that is so near, the iterations lead to the lag
 # Limit of (omega lag)^3 / 6, the error of the window equations, which are of second order in the remaining lag.
 PHASE_LEFT = 1e-8
 Made = TypeVar("Made")
@@ -37,6 +38,16 @@ def without_lag(
             break
         lag_s = better_s
     return made, lag_s
+
+
+def starts(low_s: float, high_s: float, windows: Sequence[Window]) -> list[float]:
+    """Lags in s from `low_s` to `high_s`, so dense that one of them is near enough to every lag between (BASIN_RAD).
+
+    The `windows`, used or not, tell how fast the motion is. `without_lag` leads from the best of them to the lag.
+    """
+    count = int(np.ceil((high_s - low_s) * max(largest_omega(windows), np.finfo(float).tiny) / (2.0 * BASIN_RAD)))
+    edges = np.linspace(low_s, high_s, max(count, 1) + 1)
+    return [float(lag_s) for lag_s in 0.5 * (edges[:-1] + edges[1:])]
 
 
 def largest_omega(windows: Sequence[Window]) -> float:

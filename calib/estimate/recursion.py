@@ -38,21 +38,27 @@ class Recursion(WindowState):
 
     # --- reading
 
-    def innovation(self, summary: Summary) -> Innovation:
-        """What the window says against the state at its time."""
-        return self._against(summary)[0]
+    def innovation(self, summary: Summary, *, at_its_lag: bool = False) -> Innovation:
+        """What the window says against the state at its time.
 
-    def with_window(self, summary: Summary) -> tuple[Innovation, Recursion]:
-        """What the window says against the state at its time, and a copy that has taken it."""
-        told, trial, rows, wandered = self._against(summary)
+        `at_its_lag`: linearised at the lag that was taken out of the window, not at the state's, which may be too far.
+        """
+        return self._against(summary, at_its_lag)[0]
+
+    def with_window(self, summary: Summary, *, at_its_lag: bool = False) -> tuple[Innovation, Recursion]:
+        """What the window says against the state at its time (see `innovation`), and a copy that has taken it."""
+        told, trial, rows, wandered = self._against(summary, at_its_lag)
         trial._take(rows, wandered)
         return told, trial
 
-    def _against(self, summary: Summary) -> tuple[Innovation, Recursion, WindowRows, JointState]:
+    def _against(self, summary: Summary, at_its_lag: bool) -> tuple[Innovation, Recursion, WindowRows, JointState]:
         trial = self.copy()
         rows = trial._know(summary)
         state = trial._wandered(trial._joint.state, trial._day, summary.day)
-        return innovation(rows.at(state, state.mean, trial._noise), state), trial, rows, state
+        at = state.mean
+        if at_its_lag:
+            at, trial._joint.point = (rows.with_its_lag(state, values) for values in (at, trial._joint.point))
+        return innovation(rows.at(state, at, trial._noise), state, at), trial, rows, state
 
     @property
     def lag_s(self) -> float:

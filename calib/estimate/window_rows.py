@@ -12,7 +12,7 @@ from calib.estimate.condense import Condensed, condense
 from calib.estimate.equations import Equations
 from calib.estimate.joint_state import JointState
 from calib.estimate.nuisances import Applied, Nuisances, Priors
-from calib.estimate.quantities import MAIN_TEMPERATURE, offset_temperature
+from calib.estimate.quantities import LAG, MAIN_TEMPERATURE, offset_temperature
 from calib.estimate.slope_scatter import SlopeScatter
 from calib.estimate.terms import Term
 from calib.estimate.type_a import FEWEST_FREEDOM, LEAST_INFLATION, TypeA
@@ -187,6 +187,11 @@ class WindowRows:
             return Rows(np.zeros(0), np.zeros((0, len(state))), 0)
         residual, jacobian = zip(*parts, strict=True)
         return Rows(np.concatenate(residual), np.vstack(jacobian) @ chain, slope.size)
+
+    def with_its_lag(self, state: JointState, values: Array) -> Array:
+        """The values (N,) of the state's quantities with the lag that was taken out of the window."""
+        own = np.array([q.kind is LAG and q.owner == self.summary.reference for q in state.quantities])
+        return np.where(own, self.summary.lag_s, values)
 
     def _own(self, state: JointState, at: Array) -> tuple[Array, Array]:
         """The equations' own unknowns [S, Q, nuisances] at this temperature, and their derivatives (n, N)."""
