@@ -36,6 +36,11 @@ class GateSettings(Section):
     settle_windows: Annotated[
         int, Field(ge=1, le=1000, description="number of windows with the status RECALIBRATING after a confirmed jump")
     ] = 5
+    # A jump is confirmed by five windows. With one window an hour, HELD that lasts longer does not end by itself.
+    explain_after_s: Annotated[
+        float,
+        Field(ge=60, le=3.2e7, description="after so long in HELD, and again, say what explains the held windows"),
+    ] = 21_600.0
     # If left out: all twelve; at a fixed mount, as many as its excitation can determine.
     least_determined: Annotated[
         int | None, Field(ge=1, le=12, description="determined parameters that the first calibration needs")

@@ -81,7 +81,7 @@ class ChannelState:
         """Time passed: windows whose samples come too late are refused; a sensor without data gets the status
         INVALID."""
         self._time.update(tick.t_monotonic_ns, tick.t_utc_ns)
-        return list(self._close_windows()) + self._watch_silence() + self._clock_reports()
+        return list(self._close_windows()) + self._watch_silence() + self._explain() + self._clock_reports()
 
     def on_device(self, change: DeviceChange) -> list[Result]:
         """A device of this channel was opened or lost."""
@@ -186,6 +186,10 @@ class ChannelState:
         if silent_s <= self._channel.silence_s:
             return []
         return self._lose(f"no block of {self.sensor} for more than {self._channel.silence_s:g} s")
+
+    def _explain(self) -> list[Result]:
+        found = "" if self._estimation is None else self._estimation.explain(self._first_day * DAY_S + self._time.now_s)
+        return [self._told(found)] if found else []
 
     def _say_status(self, reason: str) -> list[Result]:
         return [] if self._estimation is None else self._change(self._estimation.gate.status, reason)

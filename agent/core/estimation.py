@@ -10,6 +10,7 @@ import numpy as np
 
 from agent.config import Channel
 from agent.config.gate import GateSettings
+from agent.core.explaining import explained
 from agent.core.gate import PROPOSALS_KEPT, Decision, Evidence, Gate
 from agent.core.time_shift import Anew, LagWatch
 from agent.core.windows import Found
@@ -76,6 +77,7 @@ class Estimation:
         self._proposed: list[tuple[Calibration, Recursion]] = []  # proposals whose windows the state did not take
         self._tried: Tried | None = None  # what `lag_after` did, for `judge` right after it
         self.lag_watch = LagWatch(channel, self.gate.limit)
+        self._explain_s: float | None = None  # time of the next explanation of held windows; None where none are held
 
     @property
     def lag_s(self) -> float:
@@ -135,6 +137,8 @@ class Estimation:
             self.drift.restart(innovation.information > 0.0)
         kept = held if decision.action == "hold" else self._held
         self._held = kept[-self.gate.held :] if self.gate.held else []
+        if self._explain_s is None and self._held:
+            self._explain_s = evidence.t_s + self._channel.gate.explain_after_s
         drift: Sequence[DriftVerdict] = ()
         if decision.action in ("take", "hold"):
             drift = self.drift.update(day * DAY_S, innovation.score, innovation.information)
@@ -152,6 +156,21 @@ class Estimation:
             decision = replace(decision, reason=f"{decision.reason}; {why}")
         news = self.lag_watch.taken(self.recursion) if decision.action in ("take", "adopt") else ""
         return Judged(decision, innovation, drift, news)
+
+    def explain(self, now_s: float) -> str:
+        """What explains the held windows, once in each `explain_after_s` while there are any; else "".
+
+        `now_s` counts as the days of `judge`.
+        """
+        if not self.gate.held or not self._held:
+            self._explain_s = None
+        if self._explain_s is None or now_s < self._explain_s:
+            return ""
+        self._explain_s = now_s + self._channel.gate.explain_after_s
+        if self.lag_watch.beyond:
+            return f"the held windows show another lag: {self.lag_watch.beyond}"
+        jump, fixed = self._jump(self._held), self._channel.fixed_mount
+        return explained(self.recursion, self._held, jump, self.gate.limit, fixed_mount=fixed)
 
     def _tried_of(self, window: Window, day: float, lag_s: float, temperature_degc: float) -> Tried:
         """The window tried on the state; what `lag_after` did is not done again."""
@@ -287,6 +306,7 @@ class Estimation:
             "law": {name: getattr(self.law, name) for name in Law.__slots__},
             "residual_sd": self.residual_sd,
             "lag_watch": self.lag_watch.snapshot(),
+            "explain_s": self._explain_s,
         }
 
     def load(self, state: dict[str, Any]) -> None:
@@ -298,6 +318,7 @@ class Estimation:
         self._proposed = [(Calibration(**p["calibration"]), self._loaded(p["recursion"])) for p in state["proposed"]]
         self.in_force, self.law = Calibration(**state["in_force"]), Law(**state["law"])
         self.residual_sd = np.array(state["residual_sd"])
+        self._explain_s = state.get("explain_s")
         if "lag_watch" in state:  # states of earlier versions have none
             self.lag_watch.load(state["lag_watch"])
 

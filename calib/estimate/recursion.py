@@ -133,6 +133,11 @@ class Recursion(WindowState):
         return self._stated.temperature.reference_degc
 
     @property
+    def quantities(self) -> list[Quantity]:
+        """All quantities in the state, also those of references that are away."""
+        return list(self._joint.state.quantities)
+
+    @property
     def names(self) -> list[str]:
         """Of all quantities of the sensor, its mount and its present reference."""
         return [q.name for q in self._joint.state.quantities if q.owner in ("", self.reference)]
@@ -155,13 +160,14 @@ class Recursion(WindowState):
         self._take(rows, self._wandered(self._joint.state, self._day, summary.day))
 
     def loosen(self, standard_uncertainty: Array, tilt_rad: float = 0.0, *, line: bool = False) -> None:
-        """Something changed: S and Q (12,) may be off by as much more from now on, and a fixed mount be tilted.
+        """Something changed: S and Q (12,), or all `quantities` (N,), may be off by as much more from now on, and a
+        fixed mount be tilted.
 
         `line`: a device or its line may have begun anew, which makes the lag another.
         """
         self._absorb(len(self._joint.recent))
         u = np.zeros(len(self._joint.state))
-        u[:12] = standard_uncertainty
+        u[: len(standard_uncertainty)] = standard_uncertainty
         for k, quantity in enumerate(self._joint.state.quantities):
             if "lean" in quantity.kind.loosened_by and self._fixed:
                 u[k] = tilt_rad

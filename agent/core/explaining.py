@@ -1,0 +1,157 @@
+"""What explains the windows that stay held: each line of the uncertainty budget is set free in turn, in a copy.
+
+The held windows are then taken one after the other. The sum of their chi-squared tells how well they agree with the
+state if only this line is other than the state knows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from agent.core.time_shift import Limit
+from calib.estimate.quantities import OFFSET, Kind, Quantity
+from calib.estimate.recursion import Recursion
+from calib.estimate.window_rows import Summary
+from calib.geometry import STANDARD_GRAVITY_MPS2
+from calib.model import Array
+
+# Standard uncertainty with which an unknown is set free, by its unit: beyond what a mistake would hardly reach.
+FREE: Mapping[str, float] = {"rad": 0.2, "1": 0.2, "s": 0.02, "m/s2": 2.0, "Hz": 1.0}
+UNITS: Mapping[str, tuple[str, float]] = {"rad": ("deg", 180.0 / np.pi), "1": ("%", 100.0), "s": ("ms", 1e3)}
+AN_UNKNOWN = 2.0  # chi-squared that an unknown more must gain (Akaike 1974)
+WORTH = 3.0  # an explanation that makes chi-squared smaller by less explains nothing
+AS_WELL = 10.0  # explanations whose chi-squared differs by less cannot be told apart
+
+
+ACCEPT = (
+    "put the newest estimate in force: fieldcal command accept --sequence N (if there is none, the windows do not "
+    "agree on one change yet)"
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Explanation:
+    """One line of the budget set free: chi-squared of the held windows, and its unknowns by their place in the state.
+
+    `most` is the unknown of this line that changes most (over its uncertainty), `change` by how much.
+    """
+
+    line: str
+    chi2: float
+    members: frozenset[int]
+    most: Quantity
+    change: float
+
+    @property
+    def score(self) -> float:
+        """For comparison: the lowest is the best."""
+        return self.chi2 + AN_UNKNOWN * len(self.members)
+
+
+def explained(recursion: Recursion, held: Sequence[Summary], jump: Array, limit: Limit, *, fixed_mount: bool) -> str:
+    """The explanation that fits the held windows best, for an operator.
+
+    `jump` (12,) sets S and Q free, 0 where the windows tell nothing of them.
+    """
+    before, freedom, _ = _taken(recursion, held)
+    sound = limit(freedom)
+    said = (
+        f"{len(held)} held windows contradict the state: chi-squared {before:.0f}, {sound:.0f} at most if it is right."
+    )
+    found = sorted(
+        (_with(recursion, held, jump, line, members) for line, members in _lines(recursion, jump, fixed_mount).items()),
+        key=lambda e: e.score,
+    )
+    if not found or before < WORTH * found[0].chi2:
+        return f"{said} No known explanation fits them. Compare devices and mount with the configuration"
+    best = found[0]
+    fits = "Best fits" if best.chi2 <= sound else "Nearest, though not within what chance allows, is"
+    alike = [
+        _told(e, recursion.scale) for e in found[1:] if e.score < best.score + AS_WELL and not best.members < e.members
+    ]
+    others = f" As well fits: {'; '.join(alike)}." if alike else ""
+    return (
+        f"{said} {fits} {_told(best, recursion.scale)}: chi-squared {best.chi2:.0f}, {before / best.chi2:.3g} times "
+        f"smaller.{others} {_remedy(best, recursion.scale, fixed_mount)}"
+    )
+
+
+def _lines(recursion: Recursion, jump: Array, fixed_mount: bool) -> dict[str, list[int]]:
+    """S, Q, and each line of the budget that the configuration states: which unknowns it has.
+
+    At a fixed mount the mean output stands in the place of Q; the data cannot tell a lean of the mount from it.
+    """
+    quantities, lines = recursion.quantities, dict[str, list[int]]()
+    for k, quantity in enumerate(quantities):
+        kind = quantity.kind
+        if quantity.owner not in ("", recursion.reference):
+            continue
+        stated = kind.source and _settings(kind, fixed_mount) and not (fixed_mount and "lean" in kind.loosened_by)
+        if jump[k] > 0.0 if k < len(jump) else stated:
+            lines.setdefault(kind.source or kind.name, []).append(k)
+    if fixed_mount and OFFSET.name in lines:
+        # A sensor that was turned on its mount has another mean output, too.
+        turned = {line: members for line, members in lines.items() if quantities[members[0]].kind.unit == "rad"}
+        lines |= {f"{line}, with its mean output": [*m, *lines[OFFSET.name]] for line, m in turned.items()}
+    return lines
+
+
+def _with(recursion: Recursion, held: Sequence[Summary], jump: Array, line: str, members: Sequence[int]) -> Explanation:
+    quantities = recursion.quantities
+    u = np.zeros(len(quantities))
+    for k in members:
+        u[k] = jump[k] if k < len(jump) else FREE[quantities[k].kind.unit]
+    trial = recursion.copy()
+    trial.loosen(u)
+    chi2, _, after = _taken(trial, held)
+    own = [quantities[k] for k in members if quantities[k].kind is quantities[members[0]].kind]
+    moved = [_moved(recursion, after, quantity) for quantity in own]
+    most = int(np.argmax([abs(change) / u_after for change, u_after in moved]))
+    return Explanation(line, chi2, frozenset(members), own[most], moved[most][0])
+
+
+def _moved(before: Recursion, after: Recursion, quantity: Quantity) -> tuple[float, float]:
+    value, u = after.quantity(quantity.key)
+    return value - before.quantity(quantity.key)[0], max(u, np.finfo(float).tiny)
+
+
+def _taken(recursion: Recursion, held: Sequence[Summary]) -> tuple[float, int, Recursion]:
+    """Chi-squared of the windows, taken one after the other, their degrees of freedom, and the state after them."""
+    chi2, freedom = 0.0, 0
+    for summary in held:
+        told, recursion = recursion.with_window(summary)
+        chi2, freedom = chi2 + told.statistic, freedom + told.degrees_of_freedom
+    return chi2, freedom, recursion
+
+
+def _told(explanation: Explanation, scale: float) -> str:
+    kind, change = explanation.most.kind, explanation.change
+    if kind.in_output_unit:
+        size = f"{change / scale:+.3g} m/s2" if kind is OFFSET else f"{100.0 * change / scale:+.3g} %"
+    else:
+        unit, factor = UNITS.get(kind.unit, (kind.unit, 1.0))
+        size = f"{factor * change:+.3g} {unit}"
+    return f"another {explanation.line} ({explanation.most.name} {size})"
+
+
+def _remedy(best: Explanation, scale: float, fixed_mount: bool) -> str:
+    """What the operator can do."""
+    kind = best.most.kind
+    if kind is OFFSET and fixed_mount:
+        lean_deg = np.rad2deg(abs(best.change) / (scale * STANDARD_GRAVITY_MPS2))
+        return f"A mount that leans by {lean_deg:.2g} deg does the same: level it, or {ACCEPT}"
+    if "jump" in kind.loosened_by:
+        return f"If the reference is sound, {ACCEPT}"
+    assert kind.prior is not None  # see `_lines`
+    least = abs(best.change) / kind.prior.convert(1.0)
+    return f"Correct it in the configuration, or set {' or '.join(_settings(kind, fixed_mount))} to {least:.2g} or more"
+
+
+def _settings(kind: Kind, fixed_mount: bool) -> tuple[str, ...]:
+    """Where the configuration states the kind's uncertainty."""
+    if kind.prior is None:
+        return ()
+    return (kind.prior.at_fixed_mount if fixed_mount else ()) or kind.prior.configuration
