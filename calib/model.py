@@ -31,7 +31,7 @@ class Pose:
     `theta_rad`, `alpha_rad` are the angles of the clamp (Eqs. 9-11), None without a clamp. `u_alpha_rad`, `u_theta_rad`
     are the standard uncertainties of angles that were found from data; 0 for stated angles. `along` (m, m) is given
     when some channels were not excited by themselves (calib.excitation.excited): the motion is then
-    `direction @ along @ u`, and the columns of those channels in `along` are zero.
+    `direction @ (along @ u + along_rate_s @ du/dt)`, and the columns of those channels are zero in both matrices.
     """
 
     position: str
@@ -42,6 +42,7 @@ class Pose:
     u_alpha_rad: float = 0.0
     u_theta_rad: float = 0.0
     along: Array | None = None
+    along_rate_s: Array | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

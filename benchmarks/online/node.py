@@ -91,8 +91,13 @@ def node(
     harmed_from: int = 0,
     stated: Stated | None = None,
     timing: Timing | None = None,
+    transverse: tuple[complex, complex] = (0.0, 0.0),
 ) -> Node:
-    """Draw everything from `seed`, at 100 Hz."""
+    """Draw everything from `seed`, at 100 Hz.
+
+    The building moves along all axes independently, or along y. `transverse`: how much of the motion along y there is along
+    x and z, in phase (real part) and 90 deg ahead (imaginary part).
+    """
     stated, timing = stated or Stated(), timing or Timing()
     random = np.random.default_rng([seed, 5])
     main, across = stated.main_pct / 100, stated.transverse_pct / 100
@@ -102,6 +107,7 @@ def node(
         every_s=timing.every_s,
         band=Band(0.5, 12.0),
         all_axes=all_axes,
+        across=transverse,
         sensitivity=np.eye(3) + np.where(np.eye(3), main, across) * random.standard_normal((3, 3)),
         offset=stated.offset_mps2 * random.standard_normal(3),
         lag_s=stated.lag_s * float(random.standard_normal()),

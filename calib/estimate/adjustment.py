@@ -143,12 +143,12 @@ def _solution(
     windows: Sequence[Window], data: Condensed, priors: Priors, applied: Applied, scatter: SlopeScatter
 ) -> Solution:
     poses: list[Pose] = []
-    index: dict[tuple[str, bytes, bytes, bytes], int] = {}
+    index: dict[tuple[str | bytes, ...], int] = {}
     pose_of = []
     for window in windows:
         pose = window.pose
-        along = b"" if pose.along is None else pose.along.tobytes()
-        key = (pose.position, pose.direction.tobytes(), pose.gravity_mps2.tobytes(), along)
+        seen = [pose.direction, pose.gravity_mps2, pose.along, pose.along_rate_s]
+        key = (pose.position, *(b"" if matrix is None else matrix.tobytes() for matrix in seen))
         if key not in index:
             index[key] = len(poses)
             poses.append(pose)

@@ -131,14 +131,14 @@ class Equations:
         )
 
     def _slopes(self, S: Array, inputs: Inputs) -> tuple[Array, Array]:
-        data, D = self.data, inputs.direction[self.pose_of_window]
+        data, D, ahead = self.data, *(d[self.pose_of_window] for d in (inputs.direction, inputs.rate_direction))
         omega2 = data.omega2[:, None]
         on_u = 1.0 - 0.5 * inputs.lag_s**2 * omega2  # (W, 3)
         on_du = np.broadcast_to(-inputs.lag_s, on_u.shape)
         ideal = np.einsum("ik,bkm->bim", S, D)
         per_omega = np.divide(1.0, np.sqrt(omega2), out=np.zeros_like(omega2), where=omega2 > 0.0)
         across = inputs.quadrature[self.pose_of_window] * per_omega  # (W, 3), felt by the first channel's du/dt
-        on_rate = ideal * on_du[..., None]
+        on_rate = ideal * on_du[..., None] + np.einsum("ik,bkm->bim", S, ahead)
         on_rate[:, :, :1] += (across @ S.T)[..., None]
         slopes = np.concatenate([ideal * on_u[..., None], on_rate], axis=2)  # (W, 3, 2M)
         residual = data.slopes - np.einsum("brc,bic->bri", data.root, slopes)
@@ -148,6 +148,7 @@ class Equations:
         d_on_u = -inputs.lag_s[:, None] * omega2[..., None] * nuisances.lag.T
         d_on_du = np.broadcast_to(-nuisances.lag.T, d_on_u.shape)
         d_on_rate = d_ideal * on_du[..., None, None] + ideal[..., None] * d_on_du[:, :, None, :]
+        d_on_rate += np.einsum("ik,jbkm->bimj", S, inputs.d_rate_direction[:, self.pose_of_window])
         d_across = inputs.d_quadrature[:, self.pose_of_window] * per_omega
         d_on_rate[:, :, :1] += np.einsum("ik,jbk->bij", S, d_across)[:, :, None]
         d_z = np.concatenate(
@@ -156,6 +157,7 @@ class Equations:
         n = 12 + len(nuisances)
         jacobian = np.zeros((*data.slopes.shape, n))  # (W, 2M, 3, N)
         per_row = np.concatenate([D[:, None] * on_u[..., None, None], D[:, None] * on_du[..., None, None]], axis=3)
+        per_row[:, :, :, D.shape[2] :] += ahead[:, None]
         per_row[:, :, :, D.shape[2] : D.shape[2] + 1] += across[:, None, :, None]
         for i in range(3):
             jacobian[:, :, i, 3 * i : 3 * i + 3] = np.einsum("brc,bkc->brk", data.root, per_row[:, i])

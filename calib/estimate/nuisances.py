@@ -75,13 +75,16 @@ class Inputs:
     """The inputs at given values of the J nuisances, and their derivatives with respect to each nuisance.
 
     `direction` (P, 3, M) applies to the motion, `mean_direction` (P, 3, M) to the means of the reference. They differ
-    for silent channels, which have no motion, but whose means act on the sensor. `quadrature` (P, 3) is relative motion
-    90 deg ahead; `gravity` (P, 3) in m/s2; `lag_s` (3,); `reference_corner` and `sensor_corner` in rad/s. The
-    derivatives `d_...` have the same shapes with J in front.
+    for silent channels, which have no motion of their own, but whose means act on the sensor. `rate_direction` (P, 3, M)
+    in s applies to the motion's derivative: it is the part of the silent channels' motion that is 90 deg ahead.
+    `quadrature` (P, 3) is relative motion 90 deg ahead that the reference does not measure; `gravity` (P, 3) in m/s2;
+    `lag_s` (3,); `reference_corner` and `sensor_corner` in rad/s. The derivatives `d_...` have the same shapes with J
+    in front.
     """
 
     direction: Array
     mean_direction: Array
+    rate_direction: Array
     quadrature: Array
     gravity: Array
     lag_s: Array
@@ -89,6 +92,7 @@ class Inputs:
     sensor_corner: float
     d_direction: Array
     d_mean_direction: Array
+    d_rate_direction: Array
     d_quadrature: Array
     d_gravity: Array
 
@@ -103,12 +107,14 @@ class Nuisances:
         self.terms = [t for t in terms(poses, channels, priors, applied.by_kind, reference) if t.uncertainty > 0.0]
         n = len(poses)
         self._stated = np.zeros((n, 3, channels))
-        self._along = np.tile(np.eye(channels), (n, 1, 1))
+        self._along, self._along_rate = np.tile(np.eye(channels), (n, 1, 1)), np.zeros((n, channels, channels))
         for p, pose in enumerate(poses):
             m = pose.direction.shape[1]
             self._stated[p, :, :m] = pose.direction
             if pose.along is not None:
                 self._along[p, :m, :m] = pose.along
+            if pose.along_rate_s is not None:
+                self._along_rate[p, :m, :m] = pose.along_rate_s
         self.direction, self.mean_direction = self._stated @ self._along, self._stated
         self.gravity = np.array([pose.gravity_mps2 for pose in poses])
         self._real = own_channels(channels)
@@ -166,6 +172,7 @@ class Nuisances:
         return Inputs(
             direction @ self._along,
             direction,
+            direction @ self._along_rate,
             np.einsum("jpk,j->pk", d_quadrature, z),
             gravity,
             z @ self.lag,
@@ -173,6 +180,7 @@ class Nuisances:
             float(z @ self.sensor_corner),
             d_direction @ self._along,
             d_direction,
+            d_direction @ self._along_rate,
             d_quadrature,
             d_gravity,
         )

@@ -3,7 +3,7 @@
 A silent channel holds only noise, or noise beside a signal that it shares with a stronger channel (its motion is not
 exactly along one axis). Least squares would take the noise for a motion that the sensor does not follow, and find too
 small values in that column of S. So silent channels are removed from the basis, and the shared part of their motion is
-added to the directions of the other channels.
+added to the directions of the other channels: the part in phase to those of u, the part 90 deg ahead to those of du/dt.
 """
 
 from __future__ import annotations
@@ -49,14 +49,14 @@ def excited(window: Window) -> Excitation:
     own = _own_power(power, noise[0])
     live = own > 0.0
     share = float(np.max(noise[0][live] / own[live], initial=0.0))
-    along = _along(power, live)
+    along, ahead = _shared(window, live, noise)
     # The shared motion of a silent channel turns the excited direction if it is more than noise and more than 1 %.
     shown = along**2 @ np.where(live, power.diagonal(), 0.0)
     askew = shown > np.maximum(OF_STRONGEST * power.diagonal().max(initial=0.0), OVER_NOISE * noise[0])
     direction = window.pose.direction[:, :m]
     turned = direction + direction @ np.where(askew[:, None], along, 0.0)
     basis, _ = np.linalg.qr(turned[:, np.flatnonzero(live)])
-    return Excitation(_reduced(window, live, along, noise), basis, CORRECTION_SHARE * share)
+    return Excitation(_reduced(window, live, along, ahead, noise), basis, CORRECTION_SHARE * share)
 
 
 def _own_power(power: Array, noise: Array) -> Array:
@@ -77,15 +77,25 @@ def _own_power(power: Array, noise: Array) -> Array:
     return own
 
 
-def _along(power: Array, live: NDArray[np.bool_]) -> Array:
-    """(m, m) regression of each silent channel (row) on the live channels (columns); other elements are 0."""
-    along = np.zeros_like(power)
-    if live.any():
-        along[np.ix_(~live, live)] = np.linalg.solve(power[np.ix_(live, live)], power[np.ix_(live, ~live)]).T
-    return along
+def _shared(window: Window, live: NDArray[np.bool_], noise: Array) -> tuple[Array, Array]:
+    """The shared motion of the silent channels (rows): (m, m) on u of the live channels (columns), and (m, m) in s on
+    their du/dt. The elements of other rows and columns are 0. `noise` (2, m) is the power of the reference's noise.
+    """
+    m, channels = len(live), window.sums.reference_channels
+    columns = np.r_[0:m, channels : channels + m]
+    power = window.sums.scatter.sum(axis=0)[np.ix_(columns, columns)] / window.sums.count.sum()
+    found = np.zeros((m, 2 * m))
+    if live.any() and not live.all():
+        moving = np.flatnonzero(np.tile(live, 2))
+        own = power.diagonal()
+        clean = power - np.diag(np.minimum(noise.ravel(), MOST_NOISE * own))
+        unit = np.sqrt(own[moving])
+        solved = np.linalg.pinv(clean[np.ix_(moving, moving)] / np.outer(unit, unit), OF_STRONGEST, hermitian=True)
+        found[np.ix_(~live, np.tile(live, 2))] = power[np.ix_(np.flatnonzero(~live), moving)] / unit @ solved / unit
+    return found[:, :m], found[:, m:]
 
 
-def _reduced(window: Window, live: NDArray[np.bool_], along: Array, noise: Array) -> Window:
+def _reduced(window: Window, live: NDArray[np.bool_], along: Array, ahead: Array, noise: Array) -> Window:
     sums, pose, m = window.sums, window.pose, len(live)
     channels = sums.reference_channels  # m, or 2 m if the integrals follow (see calib.signal.corner)
     every = np.tile(live, channels // m)
@@ -97,13 +107,14 @@ def _reduced(window: Window, live: NDArray[np.bool_], along: Array, noise: Array
             scatter[:, at + k, at + k] = own - np.minimum(sums.count * power[k], MOST_NOISE * own)
     if live.all():
         return replace(window, sums=replace(sums, scatter=scatter))
-    moving = np.asarray(np.kron(np.eye(channels // m), np.diag(live.astype(float)) + along), dtype=np.float64)
+    pairs = np.eye(channels // m)
+    moving, rate = np.kron(pairs, np.diag(live.astype(float)) + along), np.kron(pairs, ahead)
     # Each segment gets the window's mean of a silent channel: differences between segments would count as motion again.
     # The mean itself is kept, because the sensor is subject to it too (gravity, if the reference is DC-coupled).
     mean = sums.count @ sums.mean / sums.count.sum()
     return replace(
         window,
         # The stated directions stay: the silent channel measured the shared motion, and its error is in `along`.
-        pose=replace(pose, along=moving),
+        pose=replace(pose, along=moving, along_rate_s=rate),
         sums=WindowSums(channels, sums.count, np.where(both, sums.mean, mean), scatter),
     )

@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 
 from calib.estimate.condense import condense
+from calib.estimate.equations import Equations
+from calib.estimate.nuisances import Applied, Nuisances, Priors
+from calib.estimate.slope_scatter import SlopeScatter
 from calib.excitation.excited import excited
 from calib.excitation.sums import window_sums
 from calib.geometry import beside
@@ -69,3 +72,27 @@ def test_independent_motions_are_as_many_channels(directions: np.ndarray, channe
 def test_noise_alone_is_no_motion() -> None:
     found = excited(window(np.array([[0.0, 1.0, 0.0]]), level_mps2=0.002))
     assert found.directions.shape[1] == 0
+
+
+def test_a_silent_channel_that_moves_ahead_of_the_others_turns_the_motion_s_derivative() -> None:
+    """0.8 % of the motion along y appears along x, 90 deg ahead of it at 3 Hz: as 0.8 % / omega of its derivative."""
+    n, ahead_s, random = 6000, 0.008 / (2 * np.pi * 3.0), np.random.default_rng(1)
+    omega = 2 * np.pi * np.array([2.7, 3.0, 3.4])
+    phase = np.arange(n)[:, None] / RATE_HZ * omega + random.uniform(0.0, 2 * np.pi, 3)
+    y, dy, ddy = np.sin(phase).sum(axis=1), np.cos(phase) @ omega, np.sin(phase) @ -(omega**2)
+    a, da = np.column_stack([ahead_s * dy, y, 0 * y]), np.column_stack([ahead_s * ddy, dy, 0 * y])
+    u, du = (x + 1e-4 * random.normal(size=x.shape) for x in (a, da))
+    V = a @ S.T + 1e-3 * random.normal(size=a.shape)
+    sums = window_sums(u, du, V, np.arange(0, n + 1, 50))
+    noise = np.full((2, 3), 1e-4)
+    found = excited(Window(0.0, 60.0, beside(np.eye(3)), sums, True, "", n, 0, reference_noise=noise)).window
+    assert found.pose.along is not None and found.pose.along_rate_s is not None
+    u_slope = 1e-3 / (np.sqrt(n) * y.std())  # of a slope of V on y; that on its derivative is omega times smaller
+    assert abs(found.pose.along_rate_s[0, 1] - ahead_s) < 4 * u_slope / omega.mean()
+    assert np.abs(found.pose.along[[0, 2], 1]).max() < 4 * u_slope
+    data = condense([found])
+    equations = Equations(data, Nuisances([found.pose], 3, Priors.none(), Applied()), [0], 0.0, SlopeScatter.of(data))
+    rows = equations.at(np.append(S.ravel(), np.zeros(3)))
+    live = np.diag(data.root[0]) > 0.0
+    # Four rows of three outputs at most; without the motion ahead the row of the derivative is 30 SDs off.
+    assert np.abs(rows.slope[0][live]).max() < 4.0
