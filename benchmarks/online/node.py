@@ -95,8 +95,8 @@ def node(
 ) -> Node:
     """Draw everything from `seed`, at 100 Hz.
 
-    The building moves along all axes independently, or along y. `transverse`: how much of the motion along y there is along
-    x and z, in phase (real part) and 90 deg ahead (imaginary part).
+    The building moves along all axes independently, or along y. `transverse`: how much of the motion along y there is
+    along x and z, in phase (real part) and 90 deg ahead (imaginary part).
     """
     stated, timing = stated or Stated(), timing or Timing()
     random = np.random.default_rng([seed, 5])

@@ -143,12 +143,12 @@ def _solution(
     windows: Sequence[Window], data: Condensed, priors: Priors, applied: Applied, scatter: SlopeScatter
 ) -> Solution:
     poses: list[Pose] = []
-    index: dict[tuple[str | bytes, ...], int] = {}
+    index: dict[tuple[str, bytes], int] = {}
     pose_of = []
     for window in windows:
         pose = window.pose
         seen = [pose.direction, pose.gravity_mps2, pose.along, pose.along_rate_s]
-        key = (pose.position, *(b"" if matrix is None else matrix.tobytes() for matrix in seen))
+        key = (pose.position, b"".join(b"-" if part is None else part.tobytes() for part in seen))
         if key not in index:
             index[key] = len(poses)
             poses.append(pose)

@@ -13,12 +13,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.estimate.type_a import FEWEST_FREEDOM, LEAST_INFLATION, Segments, TypeA, pooled
+from calib.excitation.excited import OF_STRONGEST
 from calib.model import Array, Window, own_channels
 
 PIVOT_FLOOR = 1e-9  # of a channel's power: a smaller remainder, after the channels before it, is a rounding error
-# Least power of an excited direction, relative to that of the strongest channel: 1 % of its amplitude. In a weaker
-# direction the noise of the reference would be taken for a motion that the sensor does not follow.
-EXCITED = 1e-4
+# Least power of an excited direction, relative to that of the strongest channel. In a weaker direction the noise of the
+# reference would be taken for a motion that the sensor does not follow. Half the limit of calib.excitation.excited: a
+# channel that it found to be excited stays so after the noise was subtracted, which is a tenth of its power at most.
+EXCITED = 0.5 * OF_STRONGEST
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -75,11 +75,11 @@ class Inputs:
     """The inputs at given values of the J nuisances, and their derivatives with respect to each nuisance.
 
     `direction` (P, 3, M) applies to the motion, `mean_direction` (P, 3, M) to the means of the reference. They differ
-    for silent channels, which have no motion of their own, but whose means act on the sensor. `rate_direction` (P, 3, M)
-    in s applies to the motion's derivative: it is the part of the silent channels' motion that is 90 deg ahead.
-    `quadrature` (P, 3) is relative motion 90 deg ahead that the reference does not measure; `gravity` (P, 3) in m/s2;
-    `lag_s` (3,); `reference_corner` and `sensor_corner` in rad/s. The derivatives `d_...` have the same shapes with J
-    in front.
+    for silent channels, which have no motion of their own, but whose means act on the sensor. `rate_direction`
+    (P, 3, M) in s applies to the motion's derivative: it is the part of the silent channels' motion that is 90 deg
+    ahead. `quadrature` (P, 3) is relative motion 90 deg ahead that the reference does not measure; `gravity` (P, 3) in
+    m/s2; `lag_s` (3,); `reference_corner` and `sensor_corner` in rad/s. The derivatives `d_...` have the same shapes
+    with J in front.
     """
 
     direction: Array

@@ -108,7 +108,9 @@ def _reduced(window: Window, live: NDArray[np.bool_], along: Array, ahead: Array
     if live.all():
         return replace(window, sums=replace(sums, scatter=scatter))
     pairs = np.eye(channels // m)
-    moving, rate = np.kron(pairs, np.diag(live.astype(float)) + along), np.kron(pairs, ahead)
+    moving, rate = (
+        np.asarray(np.kron(pairs, part), dtype=float) for part in (np.diag(live.astype(float)) + along, ahead)
+    )
     # Each segment gets the window's mean of a silent channel: differences between segments would count as motion again.
     # The mean itself is kept, because the sensor is subject to it too (gravity, if the reference is DC-coupled).
     mean = sums.count @ sums.mean / sums.count.sum()

@@ -74,6 +74,14 @@ def test_noise_alone_is_no_motion() -> None:
     assert found.directions.shape[1] == 0
 
 
+@pytest.mark.parametrize("share", [0.0094, 0.0097, 0.01, 0.0103, 0.0106])
+def test_what_is_excited_stays_so_in_the_equations(share: float) -> None:
+    """A weak motion of 1 % with ten times the power of its noise: subtracting that noise must not make it silent."""
+    found = excited(window(np.array([[0.0, 1.0, 0.0], [share, 0.0, 0.0]]), level_mps2=0.35))
+    rows = int(np.count_nonzero(np.diag(condense([found.window]).root[0])[:3]))
+    assert rows == found.directions.shape[1]
+
+
 def test_a_silent_channel_that_moves_ahead_of_the_others_turns_the_motion_s_derivative() -> None:
     """0.8 % of the motion along y appears along x, 90 deg ahead of it at 3 Hz: as 0.8 % / omega of its derivative."""
     n, ahead_s, random = 6000, 0.008 / (2 * np.pi * 3.0), np.random.default_rng(1)
@@ -86,7 +94,8 @@ def test_a_silent_channel_that_moves_ahead_of_the_others_turns_the_motion_s_deri
     sums = window_sums(u, du, V, np.arange(0, n + 1, 50))
     noise = np.full((2, 3), 1e-4)
     found = excited(Window(0.0, 60.0, beside(np.eye(3)), sums, True, "", n, 0, reference_noise=noise)).window
-    assert found.pose.along is not None and found.pose.along_rate_s is not None
+    assert found.pose.along is not None
+    assert found.pose.along_rate_s is not None
     u_slope = 1e-3 / (np.sqrt(n) * y.std())  # of a slope of V on y; that on its derivative is omega times smaller
     assert abs(found.pose.along_rate_s[0, 1] - ahead_s) < 4 * u_slope / omega.mean()
     assert np.abs(found.pose.along[[0, 2], 1]).max() < 4 * u_slope
