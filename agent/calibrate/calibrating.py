@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
@@ -20,6 +21,7 @@ from agent.calibrate.tables import ReferenceTable, TableError, read_reference, r
 from calib.estimate.nuisances import Priors
 from calib.estimate.verdict import dead_reasons
 from calib.excitation.front_end import Settings
+from calib.excitation.window_verdict import Limits
 from calib.geometry import STANDARD_GRAVITY_MPS2
 from calib.paper.method3 import PLAIN, fit, refusal
 from calib.signal.instrument import Instrument
@@ -56,7 +58,8 @@ def read_files(options: dict[str, Any], instrument: Instrument | None = None) ->
         _check_quantity(reference, instrument, options["reference_quantity"])
     poses = _poses(options, setting_of(options, reference), reference)
     plain = options["plain"]
-    settings = Settings(leave_out=not plain, limit_band=not plain)
+    limits = Limits.of(options["u_offset_mps2"], math.radians(options["u_angle_deg"]))
+    settings = Settings(Limits() if plain else limits, leave_out=not plain, limit_band=not plain)
     return Files(sensor, reference, poses, instrument, Options(settings, align=not plain))
 
 

@@ -52,7 +52,8 @@ def windows_in(piece: Piece, first_s: float, channel: Channel, streams: dict[str
         reference = streams[channel.reference].cut(start_s - around_s, stop_s + around_s)
         if reference is None:
             return Found([refused(piece, f"no samples of the reference {channel.reference}")])
-    settings = Settings(Limits(longest_s=channel.window_s))
+    known = channel.priors(fixed_mount=channel.fixed_mount)
+    settings = Settings(Limits.of(known.offset_mps2, known.angle_rad, channel.window_s))
     span_s = (start_s, stop_s)
     try:
         found = windows_of(piece.pose, sensor, reference, channel.instrument, span_s, lag_s, settings)

@@ -138,7 +138,7 @@ def _offline(channel: Channel, sensor: tuple[Array, Array, float], reference: tu
     mean = channel.prior.mean(1.0)
     u = channel.prior.standard_uncertainty(mean)
     priors = Priors(channel.priors(fixed_mount=channel.fixed_mount).values, mean, np.diag(u**2))
-    settings = Settings(Limits(longest_s=channel.window_s))
+    settings = Settings(Limits.of(priors.offset_mps2, priors.angle_rad, channel.window_s))
     files = Files(
         SensorTable(Path("sensor"), stamps, values, None),
         ReferenceTable(Path("reference"), reference[0], reference[1], "acceleration", "a"),

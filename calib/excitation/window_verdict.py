@@ -8,7 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.geometry import STANDARD_GRAVITY_MPS2
 from calib.model import WindowSums
+
+LEAST_STEP_MPS2 = 0.02  # 2 mg: a smaller change of the mean is possible whatever is stated
+STEP_SD = 5.0  # a step of the mean by so many of its standard uncertainties may be noise, wherever it is searched
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +31,16 @@ class Limits:
     most_left_out_of_segment_pct: float = 25.0
     most_drift_mps2: float = 0.2  # of the mean within a window: offsets drift by 0.05
     most_drift_pct: float = 10.0  # the same relative to the motion's rms; the larger limit counts
+    most_step_mps2: float = 0.12  # of the mean within a window, beyond its noise: `of` a stated 0.05 m/s2 and 0.2 deg
+
+    @classmethod
+    def of(cls, offset_mps2: float, angle_rad: float, longest_s: float = 60.0) -> Limits:
+        """The limits for stated standard uncertainties of the offset and of a position's angle.
+
+        A mean that changes by twice what is stated is one standard uncertainty off in the middle of the change.
+        """
+        stated = float(np.hypot(offset_mps2, STANDARD_GRAVITY_MPS2 * angle_rad))
+        return cls(longest_s=longest_s, most_step_mps2=max(2.0 * stated, LEAST_STEP_MPS2))
 
 
 DEFAULT_LIMITS = Limits()
@@ -46,8 +60,8 @@ def judge(sums: WindowSums, struck: NDArray[np.bool_], numbers: Mapping[str, flo
 
     `struck` (n,) flags the points that were found to be knocks. `numbers` are the statistics: for motion
     reference_rms_mps2, reference_noise_mps2, coherence, drift_mps2, stuck_axes and clipped_points; for a rest
-    sd_over_floor, if there are other rests to compare with. The verdict's numbers hold the limit of each statistic
-    beside it, as `<name>_threshold`.
+    sd_over_floor, if there are other rests to compare with; for both step_mps2 and u_step_mps2. The verdict's numbers
+    hold the limit of each statistic beside it, as `<name>_threshold`.
     """
     points = float(sums.count.sum())
     left_out = 100.0 * float(struck.mean()) if len(struck) else 0.0
@@ -65,6 +79,8 @@ def _thresholds(n: Mapping[str, float], limits: Limits) -> dict[str, float]:
         limit["stuck_axes"] = 0.0
         limit["coherence"] = limits.least_coherence
         limit["drift_mps2"] = max(limits.most_drift_mps2, limits.most_drift_pct / 100.0 * n["reference_rms_mps2"])
+    if "step_mps2" in n:
+        limit["step_mps2"] = float(np.hypot(limits.most_step_mps2, STEP_SD * n["u_step_mps2"]))
     if "sd_over_floor" in n:
         limit["sd_over_floor"] = limits.most_restless
     return limit
@@ -95,6 +111,11 @@ def _reason(n: Mapping[str, float]) -> str:
                 f"the sensor's mean changes by {n['drift_mps2']:.3g} m/s2 within the window, "
                 f"{limit['drift_mps2']:.3g} m/s2 at most"
             )
+    if "step_mps2" in n and n["step_mps2"] > limit["step_mps2"]:
+        return (
+            f"the sensor's mean changes by {n['step_mps2']:.3g} m/s2 from one part of the window to the other, "
+            f"{limit['step_mps2']:.3g} m/s2 at most by the stated uncertainties of angle and offset"
+        )
     if "sd_over_floor" in n and n["sd_over_floor"] > limit["sd_over_floor"]:
         return (
             f"the sensor is not at rest: its noise is {n['sd_over_floor']:.1f} times that in other positions, "

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from calib import geometry
 from calib.excitation import detection
 from calib.excitation.rests import find_rests
+from calib.excitation.steadiness import step
 from calib.excitation.sums import factor, pool, window_sums
 from calib.excitation.window_verdict import DEFAULT_LIMITS, Limits, Verdict, judge
 from calib.model import Array, Pose, Window, WindowSums
@@ -112,11 +113,15 @@ def rest_window(
     resting = np.concatenate([np.arange(a, b) for a, b in rests])
     t, v = time_s[resting], V[resting]
     finest = detection.least_step(v)
-    struck, _ = detection.knocked(v, np.ones((len(v), 1)), finest)
+    struck, residual = detection.knocked(v, np.ones((len(v), 1)), finest)
     clean = sums = _rest_sums(v[~struck], rate_hz, limits)
     if not leave_out:
         sums = _rest_sums(v, rate_hz, limits)
     numbers = {"at_rest_pct": 100.0 * len(v) / len(V)}
+    gravity_mps2, mean = float(np.linalg.norm(pose.gravity_mps2)), float(np.linalg.norm(v.mean(axis=0)))
+    if gravity_mps2 > 0.0 and mean > 0.0:
+        changed, u_changed = step(residual, rate_hz)
+        numbers |= {"step_mps2": changed * gravity_mps2 / mean, "u_step_mps2": u_changed * gravity_mps2 / mean}
     if floor is not None:
         least = np.maximum(np.maximum(floor, finest), np.finfo(float).tiny)
         numbers["sd_over_floor"] = float(np.max(_within_sd(clean) / least))
@@ -179,10 +184,19 @@ def rest_sd(V: Array, rate_hz: float) -> Array | None:
     return np.median([V[a:b].std(axis=0) for a, b in rests], axis=0) if rests else None
 
 
-def _motion(kind: Kind, pose: Pose, points: Points, rate_hz: float, limits: Limits, leave_out: bool) -> Window:
+def _motion(
+    kind: Kind,
+    pose: Pose,
+    points: Points,
+    rate_hz: float,
+    limits: Limits,
+    leave_out: bool,
+    stepped: tuple[float, float] | None = None,
+) -> Window:
     """One window. It is judged without the knocks, also where they stay in its sums.
 
-    Where knocks lie together, whole segments are left out; the limits are held against the other segments.
+    Where knocks lie together, whole segments are left out; the limits are held against the other segments. But after a
+    slip the shorter part of a window looks like knocks: `stepped` is the step of the mean over all segments.
     """
     t, _, u, du = points
     V = np.asfortranarray(points.V)  # medians and extremes of an axis are several times faster this way
@@ -192,9 +206,11 @@ def _motion(kind: Kind, pose: Pose, points: Points, rate_hz: float, limits: Limi
     basis = np.column_stack([np.ones(len(u)), u, du])
     finest = detection.least_step(V)
     struck, residual = detection.knocked(V, basis, finest)
+    stepped = stepped or step(residual, rate_hz)
     sound = _sound(struck, rate_hz, limits)
     if leave_out and not sound.all():
-        rest = _motion(kind, pose, Points(*(column[sound] for column in points)), rate_hz, limits, leave_out)
+        left = Points(*(column[sound] for column in points))
+        rest = _motion(kind, pose, left, rate_hz, limits, leave_out, stepped)
         return _without_segments(rest, int((~sound).sum()))
     clean = sums = _sums(V, u, du, rate_hz, limits)
     if struck.any():
@@ -202,7 +218,7 @@ def _motion(kind: Kind, pose: Pose, points: Points, rate_hz: float, limits: Limi
         clean = _sums(V[kept], u[kept], du[kept], rate_hz, limits)
         if leave_out:
             sums = clean
-    numbers = _motion_numbers(clean, basis[~struck], V[~struck], rate_hz)
+    numbers = _motion_numbers(clean, basis[~struck], V[~struck], rate_hz, stepped)
     numbers["stuck_axes"] = float(np.sum(np.ptp(V, axis=0) == 0.0))
     numbers["clipped_points"] = float(detection.clipped(V, residual, finest))
     verdict = judge(sums, struck, numbers, limits)
@@ -229,10 +245,12 @@ def _without_segments(window: Window, points: int) -> Window:
     return replace(window, left_out=window.left_out + points, numbers=numbers)
 
 
-def _motion_numbers(sums: WindowSums, basis: Array, V: Array, rate_hz: float) -> dict[str, float]:
-    """Statistics for the verdict: level, noise and coherence in the band of the motion, and drift of the mean.
+def _motion_numbers(
+    sums: WindowSums, basis: Array, V: Array, rate_hz: float, stepped: tuple[float, float]
+) -> dict[str, float]:
+    """Statistics for the verdict: level, noise and coherence in the band of the motion, drift and step of the mean.
 
-    `basis` (n, 1 + 2 m) is [1, u, du].
+    `basis` (n, 1 + 2 m) is [1, u, du]; `stepped` is a step and its standard uncertainty in output unit.
     """
     m = sums.reference_channels
     u = basis[:, 1 : 1 + m]
@@ -249,6 +267,8 @@ def _motion_numbers(sums: WindowSums, basis: Array, V: Array, rate_hz: float) ->
         "reference_noise_mps2": float(np.sqrt(np.sum(noise**2) / width) + 1e-12 * np.abs(u).max()),
         "coherence": 1.0 - rest / total if total > 0 else 0.0,
         "drift_mps2": _drift(sums) / scale if scale > 0 else np.inf,
+        "step_mps2": stepped[0] / scale if scale > 0 else np.inf,
+        "u_step_mps2": stepped[1] / scale if scale > 0 else np.inf,
     }
 
 

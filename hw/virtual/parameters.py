@@ -89,6 +89,15 @@ class ClampErrors:
 
 
 @dataclass(frozen=True, slots=True)
+class Slip:
+    """The clamp slips by these angles at `at_s`, s of the bench's clock, and stays so until it is turned next."""
+
+    at_s: float
+    theta_deg: float = 0.0
+    alpha_deg: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
 class Knocks:
     """Shocks at the sensor that the reference does not measure: half-sines at random times in random directions."""
 
@@ -129,5 +138,6 @@ class BenchParameters:
     static_sign: Literal[-1, 1] = 1  # -1: z of the sensor points out of the clamp; at rest the sensor indicates -e
     clamp: ClampErrors = field(default_factory=ClampErrors)
     knocks: Knocks = field(default_factory=Knocks)
+    slip: Slip | None = None
     temperature: Temperature = field(default_factory=Temperature)
     handling_mps2: float = 0.5  # amplitude of the vibration while a person turns the clamp

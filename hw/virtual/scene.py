@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -51,11 +53,21 @@ class Scene:
             stand = self._true.stand(span.window)
             if span.turning:
                 felt[span.part] = self._turning(t_s[span.part], span.window, motion[span.part], g)
-            else:
-                felt[span.part] = motion[span.part] @ stand.carrier.T + g * stand.frame[:, 2]
+                continue
+            for part, held in self._held(t_s, span, stand):
+                felt[part] = motion[part] @ held.carrier.T + g * held.frame[:, 2]
         if knocks and self._p.knocks.rate_hz:
             self._add_knocks(t_s, felt)
         return felt
+
+    def _held(self, t_s: Array, span: Span, stand: Stand) -> list[tuple[slice, Stand]]:
+        """A hold as one part, or as two if the clamp slips in it."""
+        slip = self._p.slip
+        if slip is None or self._true.window_at(slip.at_s) != span.window:
+            return [(span.part, stand)]
+        at = span.part.start + int(np.searchsorted(t_s[span.part], slip.at_s))
+        slipped = _displaced(stand, slip.theta_deg, slip.alpha_deg)
+        return [(slice(span.part.start, at), stand), (slice(at, span.part.stop), slipped)]
 
     def _level(self, t_s: Array) -> Array:
         """Level of the motion with its first and second derivative, (3, n)."""
@@ -122,8 +134,9 @@ def _displaced(stand: Stand, theta_error_deg: float, alpha_error_deg: float) -> 
         return stand
     if stand.theta_deg is None or stand.alpha_deg is None:
         raise ValueError("angle errors are only possible for positions on the clamp")
-    theta, alpha = np.deg2rad([stand.theta_deg + theta_error_deg, stand.alpha_deg + alpha_error_deg])
-    return Stand(stand.hold_s, clamp_frame(theta, alpha), stand.slide, stand.level)
+    theta_deg, alpha_deg = stand.theta_deg + theta_error_deg, stand.alpha_deg + alpha_error_deg
+    frame = clamp_frame(np.deg2rad(theta_deg), np.deg2rad(alpha_deg))
+    return replace(stand, frame=frame, theta_deg=theta_deg, alpha_deg=alpha_deg)
 
 
 def _fade(progress: Array, duration: float) -> Array:

@@ -1,0 +1,44 @@
+"""Whether the sensor's mean output stays the same within a window, apart from what the motion explains.
+
+Each stated uncertainty of an angle or an offset belongs to a whole window or position. If the sensor slips in the
+middle of a window, its mean changes, and no angle is right for the whole window.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calib.model import Array
+
+BLOCK_S = (
+    1.0  # the change of the mean is searched at the edges of such blocks; their scatter shows how well it is known
+)
+FEWEST_BLOCKS = 4  # fewer blocks have two differences at most, too few to know their scatter
+# The median of chi-squared with three degrees of freedom over its mean.
+MEDIAN_OF_THREE = 0.789
+
+
+def step(residual: Array, rate_hz: float) -> tuple[float, float]:
+    """The length of the change of the mean between two parts of a window, and the rms that noise gives it without a
+    change, both in output unit.
+
+    `residual` (n, 3) of V from its regression on the motion, knocks included: the medians of blocks leave them out, and
+    blocks that are full of them have less weight. The window is divided where one step explains most of the scatter of
+    the blocks. Their noise is known from the median of the squared differences between neighbours, which one step does
+    not change. Both results are 0 if the window has fewer than FEWEST_BLOCKS blocks.
+    """
+    size = max(round(BLOCK_S * rate_hz), 1)
+    blocks = len(residual) // size
+    if blocks < FEWEST_BLOCKS:
+        return 0.0, 0.0
+    samples = residual[: blocks * size].reshape(blocks, size, 3)
+    level = np.median(samples, axis=1)
+    spread = np.median(np.abs(samples - level[:, None]), axis=1).max(axis=1)
+    weight = 1.0 / np.clip(spread / max(float(np.median(spread)), np.finfo(float).tiny), 1.0, 1e3) ** 2
+    before, total = np.cumsum(weight)[:-1], float(weight.sum())
+    per_block = total / (before * (total - before))  # variance of a difference of two means, over that of one block
+    centred = weight[:, None] * (level - weight @ level / total)
+    change = np.linalg.norm(np.cumsum(centred, axis=0)[:-1], axis=1) * per_block
+    at = int(np.argmax(change**2 / per_block))
+    variance = 0.5 * np.median(np.sum(np.diff(level, axis=0) ** 2, axis=1)) / MEDIAN_OF_THREE
+    return float(change[at]), float(np.sqrt(variance * per_block[at]))
