@@ -29,11 +29,15 @@ OPEN = Pose("unknown", np.zeros((3, 0)), np.full(3, np.nan))
 
 @dataclass(slots=True)
 class Stretch:
-    """Between two changes of position; the newest one has no end yet. `serial` counts them."""
+    """Between two changes of position; the newest one has no end yet.
+
+    `serial` counts them. `smoothing_s` is how long the sensor's output must be averaged, because of slow motion.
+    """
 
     serial: int
     start_s: float
     stop_s: float
+    smoothing_s: float = SHORTEST_S  # states of version 0.1 have none
 
 
 class FoundPositions:
@@ -115,13 +119,15 @@ class FoundPositions:
         if piece.pose is not OPEN:
             return Placed(piece.pose, "", {})
         usable = cut is not None and cut.axes == 3 and cut.in_time
-        mean = mean_output(cut.values, cut.clock.rate_hz) if cut is not None and usable else None
+        stretch = self._stretch_at(piece.start_s)
+        shortest_s = stretch.smoothing_s
+        mean = mean_output(cut.values, cut.clock.rate_hz, shortest_s) if cut is not None and usable else None
         if cut is None or mean is None:
-            return Placed(None, f"less than {SHORTEST_S:g} s of samples, which is too short to find the position", {})
+            return Placed(None, f"less than {shortest_s:g} s of samples, which is too short to find the position", {})
         knowledge, calibration = self._knowledge(known.scale), known.law(day).at(cut.temperature_degc)
         if self._stops:
             return nearest_stop(mean, self._stops, calibration, knowledge)
-        serial = self._stretch_at(piece.start_s).serial
+        serial = stretch.serial
         if serial in self._angles:
             return Placed(self._angles[serial], "", {})
         theta_deg, gravity = self._channel.clamp_theta_deg, (self._channel.gravity_mps2, self._channel.static_sign)
@@ -190,7 +196,7 @@ class FoundPositions:
         if not stood and self._standing.first is not None:
             self._serial += 1
             start_s = self._time_of(self._standing.first, size, stream)
-            self._stretches.append(Stretch(self._serial, start_s, math.inf))
+            self._stretches.append(Stretch(self._serial, start_s, math.inf, self._standing.smoothing_s))
 
     def _end(self, number: int | None, size: int, stream: DeviceStream, *, before_restart: bool = False) -> None:
         """The stretch ends before the mean of this number, if any."""

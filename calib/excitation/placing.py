@@ -18,7 +18,7 @@ from calib.geometry import clamp
 from calib.model import Array, Calibration, Pose
 
 SHORTEST_S = 4.0  # of data: Hann's window then leaves 2.7 % of a vibration with a period of 2 s in the mean
-SLOWEST_HZ = 0.5  # lowest frequency of a vibration
+PERIODS = 2.0  # of the slowest vibration in the shortest data
 FALSE_REFUSALS = 1e-4  # part of sound windows that is refused
 # Natural logarithm of the likelihood ratio to the next best stop. With normally distributed errors at most one window
 # in 10,000 gets a wrong stop, whatever the distance of the stops: sqrt(2 ln 1000) = 3.7 standard uncertainties.
@@ -57,14 +57,14 @@ class Placed:
     numbers: dict[str, float]
 
 
-def mean_output(indications: Array, rate_hz: float) -> MeanOutput | None:
+def mean_output(indications: Array, rate_hz: float, shortest_s: float = SHORTEST_S) -> MeanOutput | None:
     """Mean of indications (n, 3), weighted by Hann's window; rows with NaN are left out.
 
-    None if the other rows cover less than SHORTEST_S.
+    None if the other rows cover less than `shortest_s`. Vibration has periods of half of that at most.
     """
     whole = np.isfinite(indications.sum(axis=1))
     duration_s = float(whole.sum()) / rate_hz
-    if duration_s < SHORTEST_S:
+    if duration_s < shortest_s:
         return None
     weights = np.where(whole, hann(len(indications)), 0.0)
     weights /= weights.sum()
@@ -75,7 +75,7 @@ def mean_output(indications: Array, rate_hz: float) -> MeanOutput | None:
     blocks = np.where(whole[:, None], indications - value, 0.0)[:full].reshape(-1, step, 3).mean(axis=1)
     # Hann's window passes at most 1 / (pi x (x^2 - 1)) of the amplitude of a vibration with x periods in the window;
     # the lower limit of x also covers the first sidelobe.
-    x = max(SLOWEST_HZ * duration_s, 2.4)
+    x = max(PERIODS * duration_s / shortest_s, 2.4)
     leakage = 1.0 / (np.pi * x * (x**2 - 1.0))
     return MeanOutput(value, leakage**2 * 2.0 * blocks.T @ blocks / len(blocks))
 

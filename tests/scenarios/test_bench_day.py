@@ -17,6 +17,7 @@ from benchmarks.online.clamp import bench_events
 from benchmarks.online.runner import Run
 from hw.block import SampleBlock
 from hw.virtual.bench import Bench
+from hw.virtual.motion import sine
 
 SEED = 1
 
@@ -83,6 +84,20 @@ def test_with_free_angles_s_and_q_are_within_their_uncertainty() -> None:
     stated = np.array([alpha_deg for _, alpha_deg in bench.STOPS])
     apart = np.abs((np.array(alphas)[:, None] - stated + 180.0) % 360.0 - 180.0).min(axis=1)
     assert apart.max() < 10.0
+
+
+def test_motion_with_a_period_of_five_seconds_is_taken_in_every_position() -> None:
+    world = bench.world(SEED, 200.0)
+    p = world.parameters
+    world = Bench(replace(p, motion=sine(0.2, 0.5)), SEED)
+    run = Run(bench.config(world))
+    recorded = world.recording(p.schedule.duration_s(1) + bench.AFTER_S)
+    results = [r for event in bench_events(world, recorded) for r in run.feed(event)]
+    used = [r for r in results if isinstance(r, WindowReport) and r.used]
+    stops = [f"theta {theta_deg:g} deg, alpha {alpha_deg:g} deg" for theta_deg, alpha_deg in bench.STOPS]
+    assert [r.position for r in used] == stops
+    # Of 25 s half of the smoothing, 6 s, may be lost at the end of a stay, and a guard.
+    assert all(r.stop_s - r.start_s > 15.0 for r in used)
 
 
 @pytest.mark.parametrize("positions", ["stops", "free"])

@@ -164,6 +164,20 @@ def test_the_mean_is_right_while_it_shakes(frequency_hz: float, duration_s: floa
         assert np.sqrt(mean.covariance[2, 2]) < (0.4 if duration_s == 4.0 else 0.05)
 
 
+@pytest.mark.parametrize("frequency_hz", [0.17, 0.2, 0.3])
+@pytest.mark.parametrize("duration_s", [12.0, 18.0, 30.0])
+def test_the_mean_of_slow_motion_needs_longer_data(frequency_hz: float, duration_s: float) -> None:
+    """As above with periods three times as long, and data three times as long."""
+    t = np.arange(round(duration_s * 100)) / 100
+    for phase in np.linspace(0.0, 2 * np.pi, 24):
+        slow = np.sin(2 * np.pi * frequency_hz * t + phase)[:, None] * np.array([0.0, 0.0, 1.0])
+        mean = mean_output(np.array([1.0, 2.0, 3.0]) + slow, 100.0, 12.0)
+        assert mean is not None
+        assert abs(mean.value[2] - 3.0) <= 1.5 * np.sqrt(mean.covariance[2, 2]) + 1e-9
+        assert np.sqrt(mean.covariance[2, 2]) < 0.04
+    assert mean_output(np.zeros((1100, 3)), 100.0, 12.0) is None
+
+
 def test_missing_samples_are_left_out_and_too_few_are_no_mean() -> None:
     values = np.tile([1.0, 2.0, 3.0], (600, 1))
     values[::7] = np.nan

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.excitation.standing import DEPARTURE_MPS2, KEPT, MEAN_S, STEADY, Standing
+from calib.excitation.standing import DEPARTURE_MPS2, KEPT, MEAN_S, USUAL, Standing, steady
 
 G_MPS2 = 9.80665
 RATE_HZ = 100
@@ -64,6 +64,21 @@ def test_vibration_is_no_turn(frequency_hz: float, phase: float) -> None:
     assert end is None
 
 
+@pytest.mark.parametrize("phase", np.linspace(0.0, np.pi, 5))
+@pytest.mark.parametrize("frequency_hz", [0.17, 0.2, 0.3])
+def test_slow_motion_is_no_turn(frequency_hz: float, phase: float) -> None:
+    """Periods of 3 to 6 s: after 18 s the sensor is seen to stand, and a turn of 30 deg ends that."""
+    t = times(100.0)
+    slow = np.sin(2 * np.pi * frequency_hz * t + phase)[:, None] * np.array([0.8, 0.0, 0.6])
+    [(first, end)] = stretches(leaning(np.zeros_like(t)) + slow)
+    assert (first, end) == (0.0, None)
+    before, after = stretches(leaning(np.interp(t, [50.0, 53.0], [0.0, 30.0])) + slow)
+    assert before[1] is not None
+    assert 44.0 <= before[1] <= 50.5  # half of the smoothing, 6 s, may be lost on both sides
+    assert 52.5 <= after[0] <= 59.0
+    assert after[1] is None
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_knocks_are_no_turn(seed: int) -> None:
     random, t = np.random.default_rng(seed), times(60.0)
@@ -115,15 +130,15 @@ def test_a_turn_while_it_shakes_leaves_no_stretch_that_holds_any_of_it(seed: int
 
 def test_missing_means_end_a_stretch() -> None:
     standing = Standing()
-    for _ in range(STEADY + 3):
+    for _ in range(steady(USUAL) + 3):
         standing.update(np.array([0.0, 0.0, G_MPS2]))
-    assert standing.interrupt() == STEADY + 3
+    assert standing.interrupt() == steady(USUAL) + 3
     assert standing.first is None
     assert standing.interrupt() is None
-    for _ in range(STEADY):
+    for _ in range(steady(USUAL)):
         assert standing.first is None
         standing.update(np.array([0.0, 0.0, G_MPS2 + 2.0 * DEPARTURE_MPS2]))
-    assert standing.first == STEADY + 3
+    assert standing.first == steady(USUAL) + 3
 
 
 def test_memory_is_bounded_and_the_state_is_all() -> None:
