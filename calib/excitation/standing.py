@@ -108,10 +108,12 @@ class Standing:
             return
         self._centre, self._rms, self._longest = centre, rms, longest
         n = self._quiet(newest, limit)
-        off = _length(_smoothed(self._means, n) - centre) > limit
-        begin = int(np.flatnonzero(off)[-1]) + 1 if off.any() else 0
-        # Half of the smoothing may hide a departure of twice the limit, but only if there was a departure before.
-        self.first = self.oldest + min(begin + (n // 2 if off.any() else 0), len(self._means) - longest)
+        off = np.flatnonzero(_length(_smoothed(self._means, n) - centre) > limit)
+        begin = int(off[-1]) + 1 if len(off) else 0
+        # Half of the smoothing may hide a departure of twice the limit, but only if there was a departure before. The
+        # smoothing for slow motion hides whole turns at the beginning of the memory.
+        hidden = n // 2 if len(off) or (longest == SLOW and self.oldest) else 0
+        self.first = self.oldest + min(begin + hidden, len(self._means) - longest)
 
     def _departed(self, limit: float) -> int:
         """Number of the first mean that may no longer belong to the stretch."""
