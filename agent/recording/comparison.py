@@ -52,8 +52,8 @@ def compare(
     `tolerance` 0 compares floats by their bits, so that NaN equals NaN and 0.0 differs from -0.0; above it is relative
     to the largest of a list. Where `complete` is false the recording may end before the last results. Where
     `same_version` is false another version of the program recorded: the text in `reason` is not compared, because that
-    version may word it in another way, and neither is a field that the recorded result leaves empty, because that
-    version may not have it.
+    version may word it in another way, and neither is a field that the recorded result leaves empty or a number of a
+    window that it does not have, because that version may not have it.
     """
 
     def difference(what: str, field: str, before: Any, now: Any, *, decision: bool) -> Difference:
@@ -76,6 +76,8 @@ def compare(
             for side in pair:
                 for name in left_out & side.keys():
                     del side[name]
+            if isinstance(before, WindowReport):
+                pair[1]["numbers"] = {n: v for n, v in pair[1]["numbers"].items() if n in before.numbers}
         for field, a, b in differences(*pair, tolerance):
             return difference(topic_of(before), field, a, b, decision=not isinstance(a, float))
     if len(recorded) > len(computed) or (complete and len(recorded) < len(computed)):

@@ -73,6 +73,15 @@ def test_a_field_that_an_older_version_did_not_have_is_left_out_of_the_compariso
     assert compare("f", 1, now, changed(now, 1, references=["KB12 0043"]), 0.0, same_version=False) is not None
 
 
+def test_a_number_of_a_window_that_an_older_version_did_not_have_is_left_out(results: list[Result]) -> None:
+    window = results[0]
+    assert isinstance(window, WindowReport)
+    now = changed(results, 0, numbers=window.numbers | {"step_mps2": 0.1})
+    assert compare("f", 1, results, now, 0.0) is not None
+    assert compare("f", 1, results, now, 0.0, same_version=False) is None
+    assert compare("f", 1, now, results, 0.0, same_version=False) is not None
+
+
 @pytest.mark.parametrize(
     ("a", "b", "exact", "close"),
     [
