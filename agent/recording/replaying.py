@@ -107,7 +107,8 @@ class Replay:
         self._same_version = version == __version__
         if not self._same_version:
             file.notes.append(
-                f"recorded by fieldcal {version}, this is {__version__}: texts of reasons, and fields that it did not have, are not compared"
+                f"recorded by fieldcal {version}, this is {__version__}: texts of reasons, and fields that the older "
+                "version did not have, are not compared"
             )
         before = self.files[-2] if len(self.files) > 1 else None
         follows = before is not None and before.run_id == start.run_id and start.continuation
