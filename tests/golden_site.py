@@ -22,7 +22,7 @@ SENSOR, REFERENCE = "imu", "ref"
 SITE, GATEWAY = "golden", "gateway"
 RATE_HZ = 100.0
 WINDOW_S, GUARD_S = 6.0, 0.5
-LEVEL_MPS2, NOISE_MPS2 = 0.6, {SENSOR: 0.005, REFERENCE: 0.001}
+LEVEL_MPS2, NOISE_MPS2 = 0.6, {SENSOR: 0.03, REFERENCE: 0.001}
 LONGEST_S = 600.0  # of the motion
 BAND = Band(0.5, 4.0, flat=1.0)  # slow, because the stamps of a busy machine may be off by milliseconds
 LATE = Bursts(poll_s=0.018, mean_late_s=0.002, stall_probability=0.05, longest_stall_s=0.05)  # as on such a machine

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from subprocess import Popen
@@ -74,11 +74,18 @@ class Site:
             *_, before, newest = results(self.data_dir, "calibration")
             return abs((newest["t_utc_ns"] - before["t_utc_ns"]) * 1e-9 - by_s) < NEARLY_S
 
-        wait_until(shifted, WINDOW_S, f"a calibration {by_s} s of UTC after the one before")
+        self.wait(shifted, WINDOW_S, f"a calibration {by_s} s of UTC after the one before")
 
     def count(self, what: str) -> int:
         """How many results of this kind are stored."""
         return len(results(self.data_dir, what))
+
+    def wait(self, condition: Callable[[], bool], timeout_s: float, what: str) -> None:
+        """As `wait_until`; a failure shows what the program has said last."""
+        try:
+            wait_until(condition, timeout_s, what)
+        except AssertionError as error:
+            raise AssertionError(f"{error}\n{self.output.read_text()[-2000:]}") from None
 
     @property
     def status(self) -> str:
@@ -88,7 +95,7 @@ class Site:
     def wait_for(self, what: str, more: int = 1) -> None:
         """Wait until so many more results of this kind are stored."""
         enough = self.count(what) + more
-        wait_until(lambda: self.count(what) >= enough, WINDOW_S * more, f"{more} more of {what}")
+        self.wait(lambda: self.count(what) >= enough, WINDOW_S * more, f"{more} more of {what}")
 
     @contextmanager
     def running(self, **channel: Any) -> Iterator[Popen[bytes]]:
@@ -99,7 +106,7 @@ class Site:
         config.write_text(_toml(golden_site.config(ports, self.fitted, **channel)) + self._commands)
         restored = self.count("calibration")
         with started("run", config, "--data-dir", self.data_dir, output=self.output) as process:
-            wait_until(lambda: self.count("calibration") > restored, WINDOW_S, "a calibration in force")
+            self.wait(lambda: self.count("calibration") > restored, WINDOW_S, "a calibration in force")
             yield process
 
     def close(self) -> None:
