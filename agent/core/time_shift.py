@@ -196,9 +196,9 @@ def _summaries(found: Found, day: float, lag_s: float, reference: str) -> list[S
 
 
 def _too_far(lag_s: float, mean_s: float, u_s: float) -> str:
-    least_s = abs(lag_s - mean_s) / FOUND_WITHIN_U
+    least_s = np.ceil(1e3 * abs(lag_s - mean_s) / FOUND_WITHIN_U) / 1e3
     return (
-        f"a lag of {1e3 * lag_s:.4g} ms explains the window, but the lag is stated as {1e3 * mean_s:g} ms with u = "
-        f"{1e3 * u_s:g} ms, and {FOUND_WITHIN_U:g} u is the limit. If the time stamps may be so far apart, set "
-        f"uncertainty.lag_s to {least_s:.2g} or more"
+        f"a lag of {1e3 * lag_s:.4g} ms explains the window, but the lag is stated as {1e3 * mean_s + 0.0:g} ms with u "
+        f"= {1e3 * u_s:g} ms, and {FOUND_WITHIN_U:g} u is the limit. If the time stamps may be so far apart, set "
+        f"uncertainty.lag_s to {least_s:g} or more"
     )
