@@ -25,6 +25,9 @@ def check(config: Path) -> int:
     stops = sum(len(channel.positions) for channel in loaded.channels if isinstance(channel.positions, tuple))
     if loaded.zenoh.tls and (warning := expiry_warning(loaded.zenoh.tls.files, datetime.now(UTC))):
         click.echo(f"{config}: zenoh.tls.{warning}", err=True)
+    for i, channel in enumerate(loaded.channels):
+        if overdue := channel.certificate.overdue(datetime.now(UTC)):
+            click.echo(f"{config}: channels.{i}.certificate.{overdue}", err=True)
     told = f"{poses} poses" + (f", {stops} positions that the agent finds" if stops else "")
     click.echo(f"{config}: good; {len(loaded.devices)} devices, {len(loaded.channels)} channels, {told}")
     return 0

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from datetime import UTC, date, datetime, timedelta
 from functools import reduce
 from typing import Annotated
 
 import numpy as np
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from agent.config.gate import DriftOptions, GateSettings
 from agent.config.section import Section, Vector
 from calib.estimate.nuisances import Priors
-from calib.estimate.quantities import PRIORS, WALKS, Statement
+from calib.estimate.quantities import PRIORS, WALKS, YEAR_DAYS, Statement
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import Array
 from calib.signal.instrument import QUANTITIES, Instrument
@@ -69,9 +70,26 @@ def _quantity(name: str) -> str:
     return name
 
 
+def _iso_date(value: object) -> str:
+    """A date in ISO form from the text, or from the date that TOML knows; "" is no date."""
+    if isinstance(value, datetime):
+        raise ValueError("must be a date without a time, as in 2026-03-01")
+    try:
+        return date.fromisoformat(str(value)).isoformat() if value != "" else ""
+    except ValueError:
+        raise ValueError("must be a date: year, month and day, as in 2026-03-01") from None
+
+
+IsoDate = Annotated[str, BeforeValidator(_iso_date)]
+
+
 class Certificate(Section):
-    """The reference's certificate. Where it states a `serial_number`, a reference that tells another one is not used;
-    `calibrated` is for the record."""
+    """The reference's certificate. Where it states a `serial_number`, a reference that tells another one is not used.
+
+    `u_sensitivity_pct` holds on the date `calibrated`. Since then the reference may have drifted: by a random walk
+    whose standard uncertainty after one year is `stability_pct`. `interval_years` is the time after which the reference
+    must be calibrated again; `fieldcal check` tells when it is over.
+    """
 
     quantity: Annotated[str, AfterValidator(_quantity)] = "acceleration"
     sensitivity: Annotated[float, Field(gt=0, description="indication per SI unit of the quantity")] = 1.0
@@ -82,7 +100,34 @@ class Certificate(Section):
     corner_hz: Annotated[float, Field(ge=0, description="of an AC-coupled reference, first order; 0: none")] = 0.0
     u_corner_hz: NotNegative = 0.0
     serial_number: str = ""
-    calibrated: str = ""
+    calibrated: IsoDate = ""
+    interval_years: Annotated[float | None, Field(gt=0, le=100)] = None
+    stability_pct: Annotated[float, Field(ge=0, le=50, description="standard uncertainty that a year adds")] = 0.5
+
+    @model_validator(mode="after")
+    def _interval(self) -> Certificate:
+        if self.interval_years is not None and not self.calibrated:
+            raise ValueError("interval_years: needs the date of the certificate; add calibrated, as in 2026-03-01")
+        return self
+
+    @property
+    def date(self) -> datetime | None:
+        """The date `calibrated`, midnight UTC; None where it is not stated."""
+        return datetime.fromisoformat(self.calibrated).replace(tzinfo=UTC) if self.calibrated else None
+
+    def overdue(self, now: datetime) -> str:
+        """Why the certificate does not hold at `now`, with the remedy; "" if it holds or states no date."""
+        if self.date is None:
+            return ""
+        if self.date > now:
+            return f"calibrated: {self.calibrated} is in the future; correct it, or the clock of this computer"
+        if self.interval_years is None or now <= self.date + timedelta(days=self.interval_years * YEAR_DAYS):
+            return ""
+        age = (now - self.date).days / YEAR_DAYS
+        return (
+            f"calibrated: {self.calibrated} is {age:.1f} years ago, more than interval_years {self.interval_years:g}; "
+            "have the reference calibrated, and state the new certificate"
+        )
 
 
 class Uncertainty(Section):
@@ -111,7 +156,6 @@ class Process(Section):
     offset_rate_mps2: NotNegative = 0.001  # a day: first uncertainty of the steady part
     offset_rate_walk_mps2: NotNegative = 2e-5  # a day, per square-root day
     tilt_deg: NotNegative = 0.002  # of a mount; 0.04 deg a year
-    reference_pct: NotNegative = 0.0
 
 
 class Temperature(Section):

@@ -90,9 +90,8 @@ class ChannelState:
         self._time.update(change.t_monotonic_ns, change.t_utc_ns)
         if change.state == "lost":
             if change.device != self.sensor:
-                return [
-                    self._told(f"the reference {change.device} is lost, S and Q stay as they are: {change.message}")
-                ]
+                reason = f"the reference {change.device} is lost, S and Q stay as they are: {change.message}"
+                return [self._told(reason)]
             return self._lose(f"{self.sensor} is lost: {change.message}")
         if self._estimation is not None:
             self._estimation.lag_watch.began(self._estimation.recursion, change.device)
@@ -222,6 +221,8 @@ class ChannelState:
     def _close_windows(self) -> Iterator[Result]:
         """The results of all windows that are due. After a fault of the program its window is reported and not used."""
         for piece in self._streams.due(self._time.now_s):
+            if self._estimation is not None:
+                self._estimation.date_certificate(self._first_day + self._time.now_s / DAY_S, self._time.utc_ns)
             try:
                 for verdict in self._streams.verdicts(piece, self._first_day, self._estimation, self._not_certified):
                     yield from self._results(verdict)

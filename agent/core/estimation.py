@@ -87,6 +87,12 @@ class Estimation:
     def _summary(self, window: Window, day: float, lag_s: float, temperature_degc: float) -> Summary:
         return Summary.of(window, day, lag_s, temperature_degc, self.recursion.reference)
 
+    def date_certificate(self, day: float, utc_ns: int) -> None:
+        """Tell the state the date of the reference's certificate. `utc_ns` is the UTC of `day`."""
+        dated = self._channel.certificate.date
+        if dated is not None:
+            self.recursion.date_certificate(day + (dated.timestamp() - utc_ns * 1e-9) / DAY_S)
+
     def lag_after(self, windows: Sequence[Window], day: float, lag_s: float, temperature_degc: float) -> float:
         """The lag once these windows, made with `lag_s` taken out, were taken."""
         self._tried = self._try(windows[0], day, lag_s, temperature_degc)

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 
 import msgspec
 
-from agent.config import Config
+from agent.config import Config, recorded_config
 from agent.core.channel import ChannelState
 from agent.core.events import (
     Acceleration,
@@ -65,7 +65,7 @@ class Pipeline:
     @classmethod
     def restore(cls, config_json: str, snapshot: bytes) -> Pipeline:
         """The pipeline from its `snapshot`. Raises ValueError if the bytes are no snapshot."""
-        pipeline = cls(Config.model_validate_json(config_json))
+        pipeline = cls(recorded_config(config_json))
         state = unpack(snapshot)
         pipeline._run_id = state["run_id"]
         pipeline._next_sequence = state["next_sequence"]

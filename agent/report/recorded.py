@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from agent.config import Channel, Config
+from agent.config import Channel, Config, recorded_config
 from agent.core.events import CalibrationUpdate, DeviceChange, Event, Output, RunStart, StatusChange, WindowReport
 from agent.core.schedule import pieces
 from agent.core.snapshot import unpack
@@ -105,7 +105,7 @@ def _start(path: Path) -> RunStart:
 
 
 def _config(start: RunStart) -> Config:
-    return Config.model_validate_json(start.config_json)
+    return recorded_config(start.config_json)
 
 
 class _Windows:

@@ -38,7 +38,7 @@ SEED, RUNS = 1, 20  # of each kind
 LIMIT_U = 0.05
 STILL: dict[str, Any] = {
     "sensitivity_pct": 0.0, "offset_mps2": 0.0, "offset_rate_mps2": 0.0, "offset_rate_walk_mps2": 0.0,
-    "tilt_deg": 0.0, "reference_pct": 0.0,
+    "tilt_deg": 0.0,
 }  # fmt: skip
 TIMING = Timing(20.0, 60.0, 12)
 

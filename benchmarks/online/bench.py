@@ -112,6 +112,7 @@ def config(bench: Bench, **keys: Any) -> Config:
         "sensor": "sensor",
         "reference": "reference",
         "prior": prior | {"u_transverse_pct": U_TRANSVERSE_PCT},
+        "certificate": {"stability_pct": 0.0},  # the virtual reference does not drift
         "uncertainty": {"theta_position_deg": KNOWN.theta_position_deg},
         "temperature": {"offset_order": 0},  # `fieldcal calibrate` has no temperature model
         "positions": [{"theta_deg": theta_deg, "alpha_deg": alpha_deg} for theta_deg, alpha_deg in STOPS],

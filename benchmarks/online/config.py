@@ -32,5 +32,6 @@ def building_config(building: Building, **keys: Any) -> Config:
         "every_s": p.every_s,
         "guard_s": p.lead_s if p.every_s else 0.5,
     }
-    raw = {"devices": devices, "channels": [channel | {"prior": {}} | keys], "zenoh": {"enabled": False}}
+    constant = {"prior": {}, "certificate": {"stability_pct": 0.0}}  # the virtual reference does not drift
+    raw = {"devices": devices, "channels": [channel | constant | keys], "zenoh": {"enabled": False}}
     return parse_config(raw, "building")

@@ -37,13 +37,13 @@ class Stated:
     offset_window_mps2: float = 0.002
 
     def keys(self) -> dict[str, Any]:
-        """Sections of the channel. All walks are zero, because nothing wanders in the building."""
+        """Sections of the channel. All walks are zero, because neither building nor reference wander."""
         return {
             "prior": {
                 "sensitivity": 1.0, "u_main_pct": self.main_pct, "u_transverse_pct": self.transverse_pct,
                 "u_offset_mps2": self.offset_mps2,
             },
-            "certificate": {"u_sensitivity_pct": self.reference_pct},
+            "certificate": {"u_sensitivity_pct": self.reference_pct, "stability_pct": 0.0},
             "uncertainty": {
                 "rotation_deg": self.rotation_deg, "tilt_deg": self.gravity_deg, "gravity_mps2": self.gravity_mps2,
                 "lag_s": self.lag_s, "offset_mps2": self.offset_window_mps2,

@@ -48,7 +48,7 @@ def config(building: Building, **keys: Any) -> Config:
     """The operator's configuration. `keys` are further keys of the channel, or replace its sections."""
     stated = {
         "prior": {"sensitivity": 1.0, "u_main_pct": 2.0, "u_transverse_pct": 1.0, "u_offset_mps2": 0.5},
-        "certificate": {"u_sensitivity_pct": 0.1, "noise_mps2": 0.001},
+        "certificate": {"u_sensitivity_pct": 0.1, "noise_mps2": 0.001, "stability_pct": 0.0},
         "uncertainty": {"offset_mps2": 0.002, "tilt_deg": 0.1, "gravity_mps2": 0.005},
         "temperature": {"offset_order": 1, "reference_degc": building.parameters.weather.mean_degc},
     }

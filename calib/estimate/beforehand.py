@@ -98,6 +98,9 @@ class Beforehand:
             if kind.prior is None or kind.prior.name not in PRIORS or quantity.owner not in ("", reference):
                 continue
             was, now, stated_u = before.of(kind.prior), self.priors.of(kind.prior), float(state.stated_u[k])
+            if kind.since_certificate:  # the time since the certificate stays
+                found[quantity.key] = 0.0, stated_u * (now / was if was not in (0.0, now) else 1.0)
+                continue
             own = quantity.position and stated_u > was * (1.0 + SAME)
             found[quantity.key] = self.priors.of(kind.mean), max(now, stated_u) if own else now
         return found

@@ -62,14 +62,14 @@ class Held:
         tilted = sum((S @ moves * u_terms[key]) ** 2 for key, moves in self.by.items())
         return np.sqrt(felt + tilted)
 
-    def mount(self, joint: Linearised, terms: Sequence[Term]) -> None:
-        """The mean output takes the place of Q in a joint state; nuisances of the mount (`terms`) come in."""
-        u = self.mean_output_u(joint.state, {term.key: term.uncertainty for term in terms})
+    def mount(self, joint: Linearised, terms: Sequence[Term], day: float) -> None:
+        """The mean output takes the place of Q in a joint state on `day`; nuisances of the mount (`terms`) come in."""
+        u = self.mean_output_u(joint.state, {term.key: joint.begun(term, day) for term in terms})
         for state in (joint.state, joint.base):
             S = state.mean[:9].reshape(3, 3)
             state.replace(slice(9, 12), state.mean[9:12] + S @ self.mps2, u)
         joint.point[9:12] = joint.state.mean[9:12]
-        joint.append(terms)
+        joint.append(terms, day)
 
     def unmount(self, joint: Linearised) -> None:
         """Q takes its place back; all windows must be in the base."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from calib.estimate.joint_state import JointState
-from calib.estimate.quantities import PRIORS, Kind
+from calib.estimate.quantities import PRIORS, YEAR_DAYS, Kind
 from calib.estimate.terms import Term
 from calib.estimate.window_rows import Summary
 from calib.model import Array
@@ -19,7 +19,8 @@ class Linearised:
     """A state that contains all windows, a base that contains all but the recent ones, and the point of linearisation.
 
     All three have the same N quantities. `base_day` is the day of the base, None before the first window; `recent` are
-    the recent windows; `point` (N,) are the values at which they are linearised.
+    the recent windows; `point` (N,) are the values at which they are linearised. `certified_day` is the date of the
+    certificate of the present reference, None if it is not stated.
     """
 
     def __init__(self, state: JointState) -> None:
@@ -27,22 +28,32 @@ class Linearised:
         self.base_day: float | None = None
         self.recent: list[Summary] = []
         self.point = state.mean.copy()
+        self.certified_day: float | None = None
 
     @property
     def bound(self) -> Array:
         """(N,) the largest variance that random walks may reach: that of the prior, for a nuisance four times that.
 
-        Later the mount may lean by more than its prior says of the day of mounting.
+        Later the mount may lean by more than its prior says of the day of mounting. A reference drifts without a limit.
         """
-        nuisance = np.array([q.kind.prior is not None and q.kind.prior.name in PRIORS for q in self.state.quantities])
-        return np.asarray(np.where(nuisance, 4.0, 1.0) * self.state.stated_u**2)
+        kinds = [quantity.kind for quantity in self.state.quantities]
+        nuisance = np.array([kind.prior is not None and kind.prior.name in PRIORS for kind in kinds])
+        most = np.where(nuisance, 4.0, 1.0) * self.state.stated_u**2
+        return np.where([kind.since_certificate for kind in kinds], np.inf, most)
 
-    def append(self, terms: Sequence[Term]) -> list[str]:
-        """Add each nuisance that the state does not have yet, with its prior. Returns the keys of those added."""
+    def begun(self, term: Term, day: float) -> float:
+        """Standard uncertainty with which a nuisance begins on `day`; see `Kind.since_certificate`."""
+        if not term.kind.since_certificate:
+            return term.uncertainty
+        years = 0.0 if self.certified_day is None else (day - self.certified_day) / YEAR_DAYS
+        return float(term.uncertainty * np.sqrt(max(years, 0.0)))
+
+    def append(self, terms: Sequence[Term], day: float) -> list[str]:
+        """Add each nuisance that the state does not have yet, with its prior on `day`. Returns their keys."""
         new = [term for term in terms if term.key not in self.state]
         for term in new:
             for state in (self.state, self.base):
-                state.append(term.quantity, term.expected, term.uncertainty)
+                state.append(term.quantity, term.expected, self.begun(term, day))
             self.point = np.append(self.point, term.expected)
         return [term.key for term in new]
 
@@ -95,7 +106,7 @@ class Linearised:
         """An independent copy."""
         other = Linearised(self.state.copy())
         other.base, other.base_day, other.recent = self.base.copy(), self.base_day, list(self.recent)
-        other.point = self.point.copy()
+        other.point, other.certified_day = self.point.copy(), self.certified_day
         return other
 
     def snapshot(self) -> dict[str, Any]:
@@ -106,6 +117,7 @@ class Linearised:
             "base_day": self.base_day,
             "recent": [summary.snapshot() for summary in self.recent],
             "point": self.point.copy(),
+            "certified_day": self.certified_day,
         }
 
     @classmethod
@@ -114,5 +126,5 @@ class Linearised:
         loaded = cls(JointState.load(state["state"]))
         loaded.base, loaded.base_day = JointState.load(state["base"]), state["base_day"]
         loaded.recent = [Summary.load(summary) for summary in state["recent"]]
-        loaded.point = np.array(state["point"])
+        loaded.point, loaded.certified_day = np.array(state["point"]), state.get("certified_day")
         return loaded

@@ -20,6 +20,7 @@ from calib.model import PARAMETERS
 STRAIGHT = 1e-3
 STRAIGHT_LAG_S = 5e-5  # at 10 Hz (omega lag)^2 / 2 is 5e-6 as well
 LINEAR = np.inf  # for an unknown that is not multiplied by S
+YEAR_DAYS = 365.25
 
 
 def _deg(value: float) -> float:
@@ -32,6 +33,10 @@ def _minus(value: float) -> float:
 
 def _percent(value: float) -> float:
     return value / 100.0
+
+
+def _percent_a_year(value: float) -> float:
+    return float(value / 100.0 / np.sqrt(YEAR_DAYS))
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +79,8 @@ class Kind:
     used again when that reference comes back.
     `straight`: the change up to which its product with S counts as linear; LINEAR if it is not multiplied by S.
     `stated`: the prior is a statement that the data may contradict; if false, only the data determine the value.
+    `since_certificate`: it grows from the date of the reference's certificate on, without a limit. `prior` is then its
+    standard uncertainty after one year; a state begins with that of the time since this date (Linearised.begun).
     """
 
     name: str
@@ -87,6 +94,7 @@ class Kind:
     of_reference: bool = False
     straight: float = STRAIGHT
     stated: bool = True
+    since_certificate: bool = False
 
     @property
     def statements(self) -> list[Statement]:
@@ -258,8 +266,14 @@ GRAVITY = Kind(
 REFERENCE = Kind(
     "reference sensitivity", "1", "reference sensitivity",
     prior=Statement("reference", 1e-3, ("certificate.u_sensitivity_pct",), option="u_reference_pct", convert=_percent),
-    walk=Statement("reference", 0.0, ("process.reference_pct",), convert=_percent),
     of_reference=True,
+)  # fmt: skip
+REFERENCE_DRIFT = Kind(
+    # Beside the constant error of the certificate, so that the prior of the constant can be exchanged exactly.
+    "reference drift", "1", "reference drift",
+    prior=Statement("reference_drift", 0.0, ("certificate.stability_pct",), convert=_percent),
+    walk=Statement("reference_drift", 0.0, ("certificate.stability_pct",), convert=_percent_a_year),
+    of_reference=True, since_certificate=True,
 )  # fmt: skip
 REFERENCE_CORNER = Kind(
     "reference corner", "Hz", "corner frequency",

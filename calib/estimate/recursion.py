@@ -195,6 +195,10 @@ class Recursion(WindowState):
         state.spread(u**2)
         self._joint.base = state.copy()
 
+    def date_certificate(self, day: float) -> None:
+        """The date of the certificate of the present reference. Its drift counts from there."""
+        self._joint.certified_day = day
+
     def meet(self, reference: str, calibrated: str = "", sensitivity: float = 1.0) -> bool:
         """Another reference is used from now on. What is known of the reference before stays, and comes back with it.
 

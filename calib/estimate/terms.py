@@ -113,8 +113,10 @@ def _terms(poses: Sequence[Pose], channels: int, priors: Stated, applied: Mappin
         return
     real = own_channels(channels)
     for m in range(real):
-        name = "reference" if real == 1 else f"reference_{AXES[m]}"
-        yield _term(name, kinds.REFERENCE, priors, reference=np.resize(np.eye(real)[m], channels))
+        of = "" if real == 1 else f"_{AXES[m]}"
+        own = np.resize(np.eye(real)[m], channels)
+        yield _term(f"reference{of}", kinds.REFERENCE, priors, reference=own)
+        yield _term(f"reference_drift{of}", kinds.REFERENCE_DRIFT, priors, reference=own)
     yield _term("lag", kinds.LAG, priors, applied, lag=np.ones(3))
     for name, k in zip(_axes("lag"), np.eye(3), strict=True):
         yield _term(name, kinds.LAG_OF_AXIS, priors, lag=k)

@@ -120,11 +120,11 @@ class WindowState:
         a_day = self._stated.wander.variance_a_day(state.quantities, self.scale, tilted)
         return wandered(state, elapsed, a_day, self._joint.bound)
 
-    def _mount(self, summary: Summary) -> None:
+    def _mount(self, summary: Summary, day: float) -> None:
         """At the first window of a fixed mount: Q gives its place to the mean output there."""
         if self._fixed and self._held is None and np.isfinite(summary.held_mps2).all():
             self._held, terms = held_at(summary, self._stated.priors)
-            self._held.mount(self._joint, terms)
+            self._held.mount(self._joint, terms, day)
 
     def _unmount(self, held: Held) -> None:
         """The mount turned after all: from now on means tell Q and S alike."""
@@ -136,9 +136,10 @@ class WindowState:
         """Nuisances that no window had before come in with their priors; the window's rows."""
         if self._held is not None and not never_turned(np.array([self._held.mps2, summary.held_mps2])):
             self._unmount(self._held)
-        self._mount(summary)
+        day = summary.day if self._day is None else self._day  # from which the state will wander on
+        self._mount(summary, day)
         rows = self._rows(summary)
-        new = self._joint.append(rows.terms)
+        new = self._joint.append(rows.terms, day)
         if new and self._held is not None:
             self._held = self._held.moved_by(held_at(summary, self._stated.priors)[0], new)
         return rows
@@ -165,7 +166,7 @@ class WindowState:
     def _take_again(self) -> None:
         """Make the state of the base and the recent windows."""
         for summary in self._joint.recent:
-            self._joint.append(self._rows(summary).terms)
+            self._joint.append(self._rows(summary).terms, summary.day)
         state, since = self._joint.base.copy(), self._joint.base_day
         for summary in self._joint.recent:
             state = self._taken(state, since, self._rows(summary))

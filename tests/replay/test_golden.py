@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from agent.config import Config
+from agent.config import recorded_config
 from agent.core.events import CalibrationUpdate, DeviceChange, WindowReport
 from agent.core.pipeline import Pipeline
 from agent.delivery.history import History
@@ -52,7 +52,7 @@ def test_a_state_of_a_released_format_is_brought_up_to_date(directory: Path, tmp
     (tmp_path / STATE).write_bytes((directory / STATE).read_bytes())
     store = Store(tmp_path, 0)
     assert store.set_aside is None
-    config = Config.model_validate_json(config_of(directory / RECORDING))
+    config = recorded_config(config_of(directory / RECORDING))
     (sensor,) = [channel.sensor for channel in config.channels]
     with History(store.path) as history:
         kept = {identity: memory.state for identity, memory in history.memories(sensor).items()}

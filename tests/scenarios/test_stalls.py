@@ -20,14 +20,14 @@ STEPS = """
 import json, sys
 from pathlib import Path
 import agent.acquisition.service
-from agent.config import Config
+from agent.config import recorded_config
 from agent.core.events import CalibrationUpdate, WindowReport
 from agent.core.pipeline import Pipeline
 from agent.recording.reading import RecordingReader
 from agent.recording.writer import Recorder
 
 start, *events = (step.event for step in RecordingReader(Path(sys.argv[1])).steps())
-pipeline = Pipeline.begin(Config.model_validate_json(start.config_json), "run", 0, 0, {})
+pipeline = Pipeline.begin(recorded_config(start.config_json), "run", 0, 0, {})
 recorder = Recorder(Path(sys.argv[2]), ["mems", "reference"], ["mems"])
 recorder.record(0, start, [])
 before = set(sys.modules)

@@ -73,6 +73,19 @@ def test_a_sound_configuration_is_good(tmp_path: Path, capsys: pytest.CaptureFix
     assert capsys.readouterr().out == f"{path}: good; 2 devices, 1 channels, 0 poses\n"
 
 
+@pytest.mark.parametrize("calibrated", ["2001-05-01", '"2001-05-01"'])
+def test_a_certificate_older_than_its_interval_is_told_and_is_no_fault(
+    calibrated: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "gateway.toml"
+    path.write_text(GOOD + f"[channels.certificate]\ncalibrated = {calibrated}\ninterval_years = 2\n")
+    assert run_cli(["check", str(path)]) == 0
+    shown = capsys.readouterr()
+    assert shown.err.startswith(f"{path}: channels.0.certificate.calibrated: 2001-05-01 is ")
+    assert "more than interval_years 2;" in shown.err
+    assert shown.out.startswith(f"{path}: good")
+
+
 @pytest.mark.parametrize(
     ("said", "instead", "told"),
     [

@@ -18,6 +18,7 @@ driver = "serial-csv"
 options = { port = "/dev/ttyUSB0", rate_hz = 100 }
 """
 CHANNEL = DEVICES + '[[channels]]\nsensor = "imu"\nprior = {}\n'
+CERTIFICATE = "[channels.certificate]\n"
 REST = "gravity_mps2 = [0, 0, 9.8]"
 
 
@@ -42,6 +43,14 @@ def faults(text: str) -> list[str]:
         (CHANNEL + f"poses = [{{ start_s = 0, stop_s = 1.05, {REST} }}]", ["channels.0.poses.0: ", "guard_s 0.5"]),
         (CHANNEL + f"poses = [{{ start_s = 2, stop_s = 1, {REST} }}]", ["channels.0.poses.0", "stop_s 1.0"]),
         (CHANNEL + "[recording]\nrotate_s = 1e308", ["recording.rotate_s", "not 1e+308"]),
+        (
+            CHANNEL + CERTIFICATE + 'calibrated = "May 2026"',
+            ["certificate.calibrated", "as in 2026-03-01", "'May 2026'"],
+        ),
+        (CHANNEL + CERTIFICATE + "calibrated = 2026-05-01T10:00:00", ["certificate.calibrated", "without a time"]),
+        (CHANNEL + CERTIFICATE + "interval_years = 1", ["certificate.interval_years", "add calibrated"]),
+        (CHANNEL + CERTIFICATE + "stability_pct = -1", ["certificate.stability_pct", "not -1"]),
+        (CHANNEL + "[channels.process]\nreference_pct = 1", ["process.reference_pct", "no such setting"]),
         (CHANNEL + "[recording]\nrotate_bytes = 1", ["recording.rotate_bytes", "not 1"]),
         (CHANNEL + '[zenoh]\nconnect = ["localhost:7447"]', ["zenoh.connect.0", "not 'localhost:7447'"]),
         (CHANNEL + '[zenoh]\nconnect = ["tls/h:7447"]', ["zenoh.connect: ", "zenoh.tls"]),

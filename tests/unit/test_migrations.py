@@ -9,7 +9,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from agent.config import Config
+from agent.config import recorded_config
+from agent.config.knowledge import Certificate
 from agent.core.events import DeviceChange
 from agent.core.kept import take_up
 from agent.core.snapshot import VERSION, pack, unpack
@@ -41,7 +42,8 @@ def raw(state: bytes) -> dict[str, Any]:
 
 def test_a_state_of_version_1_goes_on_whole(kept: bytes) -> None:
     assert raw(kept)["version"] == 1 < VERSION
-    channel = Config.model_validate_json(config_of(FORMAT_1 / RECORDING)).channels[0]
+    channel = recorded_config(config_of(FORMAT_1 / RECORDING)).channels[0]
+    channel = channel.model_copy(update={"certificate": Certificate()})  # whose reference drifts, as by default now
     nominal = next(
         msgspec.json.decode(s.event.info_json)
         for s in RecordingReader(FORMAT_1 / RECORDING).steps()
@@ -53,8 +55,11 @@ def test_a_state_of_version_1_goes_on_whole(kept: bytes) -> None:
     names = raw(kept)["state"]["estimation"]["recursion"]["state"]["names"]
     assert [name for name, *_ in state["quantities"]] == names
     restored = taken.estimation.snapshot()["recursion"]
-    assert np.array_equal(restored["state"]["factor"], state["factor"])
-    assert np.array_equal(restored["state"]["mean"], state["mean"])
+    n = len(names)
+    assert [name for name, *_ in restored["state"]["quantities"][n:]] == ["reference_drift"]
+    assert np.array_equal(restored["state"]["factor"][:n, :n], state["factor"])
+    assert not restored["state"]["factor"][n:].any()  # no date of the certificate: the drift begins now
+    assert np.array_equal(restored["state"]["mean"][:n], state["mean"])
     assert len(restored["recent"]) == len(raw(kept)["state"]["estimation"]["recursion"]["recent"]) > 0
     assert taken.estimation.recursion.windows == unpack(kept)["estimation"]["recursion"]["windows"] > 0
 

@@ -16,7 +16,9 @@ from calib.estimate.wander import Wander
 
 STATED = Knowledge(
     prior=Prior(sensitivity=1.0, corner_hz=0.2, u_corner_hz=0.03),
-    certificate=Certificate(u_sensitivity_pct=0.7, lag_s=0.003, u_lag_s=0.0003, corner_hz=0.1, u_corner_hz=0.02),
+    certificate=Certificate(
+        u_sensitivity_pct=0.7, lag_s=0.003, u_lag_s=0.0003, corner_hz=0.1, u_corner_hz=0.02, stability_pct=0.6
+    ),
     uncertainty=Uncertainty(
         angle_deg=1.0, theta_deg=2.0, theta_position_deg=3.0, alpha_common_deg=4.0, rotation_deg=5.0, tilt_deg=6.0,
         transverse_motion_pct=7.0, offset_mps2=0.08, offset_position_mps2=0.09, gravity_mps2=0.01, lag_s=0.0004,
@@ -24,7 +26,6 @@ STATED = Knowledge(
     ),
     process=Process(
         sensitivity_pct=0.02, offset_mps2=0.003, offset_rate_mps2=0.004, offset_rate_walk_mps2=5e-5, tilt_deg=0.006,
-        reference_pct=0.07,
     ),
 )  # fmt: skip
 DEG = 0.017453292519943295
@@ -32,7 +33,8 @@ OF_THE_CONFIGURATION = {
     "angle_rad": DEG, "theta_rad": 2 * DEG, "theta_position_rad": 3 * DEG, "alpha_common_rad": 4 * DEG,
     "rotation_rad": 5 * DEG, "transverse": 0.07, "offset_mps2": 0.08, "offset_position_mps2": 0.09,
     "gravity_mps2": 0.01, "lag_s": 0.0005, "lag_at_s": -0.003, "lag_window_s": 0.0011, "reference": 0.007,
-    "reference_corner_at_hz": 0.1, "reference_corner_hz": 0.02, "sensor_corner_at_hz": 0.2, "sensor_corner_hz": 0.03,
+    "reference_drift": 0.006, "reference_corner_at_hz": 0.1,
+    "reference_corner_hz": 0.02, "sensor_corner_at_hz": 0.2, "sensor_corner_hz": 0.03,
 }  # fmt: skip
 AT_A_FIXED_MOUNT = {"gravity_direction_rad": 6 * DEG, "lean_rad": 6 * DEG, "tilt_rad": 0.0}
 WHERE_IT_TURNS = {"gravity_direction_rad": DEG, "lean_rad": 0.0, "tilt_rad": 0.0}
@@ -64,7 +66,7 @@ def test_priors_of_a_channel(fixed: bool, more: dict[str, float]) -> None:
 def test_walks_of_a_channel() -> None:
     expected = {
         "sensitivity": 2e-4, "offset_mps2": 0.003, "offset_rate_mps2": 0.004, "offset_rate_walk_mps2": 5e-5,
-        "tilt_rad": 0.006 * DEG, "reference": 7e-4,
+        "tilt_rad": 0.006 * DEG, "reference_drift": 0.006 / 365.25**0.5,
     }  # fmt: skip
     assert STATED.wander().values == pytest.approx(expected)
 
@@ -103,10 +105,10 @@ def test_what_wanders_wanders_by_its_own_walk() -> None:
     quantities = [Quantity(name, kind) for name, kind in KINDS.items()]
     found = dict(zip(KINDS, np.sqrt(walks.variance_a_day(quantities, 10.0, 0.0)), strict=True))
     assert {name for name, u in found.items() if u > 0.0} == {
-        "sensitivity", "offset", "offset rate", "tilt", "lean", "gravity direction by position", "reference sensitivity"
+        "sensitivity", "offset", "offset rate", "tilt", "lean", "gravity direction by position", "reference drift"
     }  # fmt: skip
     assert found["sensitivity"] == pytest.approx(10.0 * walks.sensitivity)
-    assert found["reference sensitivity"] == pytest.approx(walks.reference)
+    assert found["reference drift"] == pytest.approx(walks.reference_drift)
 
 
 @pytest.mark.parametrize("statement", [*PRIORS.values(), *WALKS.values()], ids=lambda s: s.name)
