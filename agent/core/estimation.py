@@ -252,13 +252,19 @@ class Estimation:
         return True
 
     def _follow(self) -> None:
-        """A step so small that each window alone was consistent: the state may follow it."""
-        loose = np.zeros(12)
+        """Steps so small that each window alone was consistent, and drifts: the state may follow them.
+
+        A drift has made S or Q wrong since its onset. U covers this, and the rate becomes unknown.
+        """
+        loose, rate = np.zeros(12), np.zeros(12)
         for k, verdict in enumerate(self.drift.result()):
-            if verdict.verdict == "stepped" and verdict.statistic > verdict.threshold:
-                loose[k] = abs(verdict.change)
+            if verdict.verdict == "stable" or verdict.statistic <= verdict.threshold:
+                continue
+            if verdict.verdict == "drifting":
+                rate[k] = np.hypot(verdict.rate, verdict.u_rate)
+            loose[k] = np.hypot(verdict.change, verdict.u_change)
         if loose.any():
-            self.recursion.loosen(loose, self._tilt_rad(loose[9:]))
+            self.recursion.loosen(loose, self._tilt_rad(loose[9:]), u_rate=rate)
             self.drift.restart(loose > 0.0)
 
     def _adopted(self, held: Sequence[Summary]) -> Recursion | None:

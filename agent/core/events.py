@@ -208,11 +208,11 @@ class DriftReport(Result, frozen=True, kw_only=True):
 
     parameter: str  # of calib.model.PARAMETERS
     verdict: Literal["stable", "drifting", "stepped"]
-    change: float  # for "stepped": size of the step, output unit (per m/s2)
+    change: float  # size of the step, or how far the drift has come since its onset; output unit (per m/s2)
     u_change: float
     rate: float  # for "drifting": change per day
     u_rate: float
-    onset_utc_ns: int  # for "stepped": time of the step
+    onset_utc_ns: int  # when the step or the drift began
     statistic: float
     threshold: float
     false_alarms_a_year: float

@@ -10,7 +10,7 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from benchmarks.online import agreement, bench, cost, coverage, day, harm, touched, year
+from benchmarks.online import agreement, bench, cost, coverage, day, drifting, harm, touched, year
 from benchmarks.page import PAGE, machine, write_part
 from hw.virtual.building import Building
 from hw.virtual.harm import KINDS
@@ -111,6 +111,15 @@ def _agreement(workers: int, runs: int | None) -> tuple[Path, str]:
     return ONLINE, "\n".join([agreement.HEADER, *rows])
 
 
+def _drift(workers: int, runs: int | None) -> tuple[Path, str]:
+    seeds = range(drifting.SEED, drifting.SEED + (runs or drifting.RUNS))
+    rows = [
+        drifting.table(spread(functools.partial(drifting.one, rate_pct=rate_pct), seeds, workers), rate_pct)
+        for rate_pct in (drifting.RATE_PCT, 0.0)
+    ]
+    return ONLINE, "\n".join([drifting.HEADER, *rows])
+
+
 def _cost(_workers: int, runs: int | None) -> tuple[Path, str]:
     return PAGE, cost.table(cost.measure(runs or cost.TIMING.windows))
 
@@ -122,6 +131,7 @@ PARTS: dict[str, Callable[[int, int | None], tuple[Path, str]]] = {
     "harm": _harm,
     "coverage": _coverage,
     "touched": _touched,
+    "drift": _drift,
     "day": _day,
     "cost": _cost,
 }

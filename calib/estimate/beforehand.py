@@ -16,11 +16,22 @@ from calib.estimate.fixed_mount import Held
 from calib.estimate.joint_state import JointState
 from calib.estimate.linearised import Linearised
 from calib.estimate.nuisances import Priors
-from calib.estimate.quantities import KINDS, OFFSET_RATE, PRIORS, RATES, S_AND_Q, Quantity
+from calib.estimate.quantities import (
+    KINDS,
+    OFFSET,
+    OFFSET_RATE,
+    PRIORS,
+    RATES,
+    S_AND_Q,
+    SENSITIVITY,
+    SENSITIVITY_RATE,
+    Quantity,
+)
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import Array
 
 OF_REFERENCES = [s.name for kind in KINDS.values() if kind.of_reference for s in kind.statements if s.name in PRIORS]
+OF_DATA = (SENSITIVITY, OFFSET, SENSITIVITY_RATE)  # stated elsewhere, or not at all
 SAME = 1e-9  # relative: standard uncertainties that differ by less are the same
 
 
@@ -68,7 +79,7 @@ class Beforehand:
             prior == (base.stated_mean[known[key]], base.stated_u[known[key]]) for key, prior in now.items()
         )
         own = {quantity.key for quantity, _ in self._of_time_and_temperature()}
-        gone = [q.kind.prior is None and k >= len(S_AND_Q) and q.key not in own for k, q in enumerate(base.quantities)]
+        gone = [q.kind.prior is None and q.kind not in OF_DATA and q.key not in own for q in base.quantities]
         if same and not any(gone) and own <= known.keys():
             return False
         appeared = any(base.stated_u[known[key]] == 0.0 < u for key, (_, u) in now.items())

@@ -18,7 +18,8 @@ from calib.estimate.false_alarms import false_alarm_threshold
 from calib.estimate.onsets import FEWEST, LEAST_THRESHOLD, SPAN, Change, Onsets
 from calib.model import PARAMETERS, Array
 
-YEAR_S = 365.25 * 86400.0
+DAY_S = 86400.0
+YEAR_S = 365.25 * DAY_S
 SHORTEST_S = 1.0  # least time span of all windows, so that the number of windows per year stays finite
 NAN = float("nan")
 # Natural logarithm of the likelihood ratio at which "stepped" becomes "drifting" or the reverse: 20 to 1.
@@ -39,10 +40,10 @@ class DriftSettings:
 class DriftVerdict:
     """The verdict on one parameter of calib.model.PARAMETERS.
 
-    `change`, `u_change`: size of a step, in the parameter's unit; `rate`, `u_rate`: rate of a drift per day; both are
-    the part that the state of the recursion has not followed yet. `onset_s` is the time at which the step or the drift
-    began. A value that does not apply is NaN. `statistic` and `threshold` are those of the test. `reason` is empty if
-    the parameter is stable.
+    `change`, `u_change`: size of a step, or how far a drift has come since its onset, in the parameter's unit; `rate`,
+    `u_rate`: rate of a drift per day. All are the part that the state of the recursion has not followed yet. `onset_s`
+    is the time at which the step or the drift began. A value that does not apply is NaN. `statistic` and `threshold`
+    are those of the test. `reason` is empty if the parameter is stable.
     """
 
     parameter: str
@@ -116,7 +117,7 @@ class DriftTest:
         margin = {"stable": 0.0, "stepped": OTHER_SHAPE, "drifting": -OTHER_SHAPE}[before.verdict]
         self._onsets.pin(p, ramp.onset if for_ramp > margin else step.onset)
         base = DriftVerdict(held.parameter, statistic=statistic, threshold=threshold)
-        return _drifting(base, ramp) if for_ramp > margin else _stepped(base, step)
+        return _drifting(base, ramp, self._newest_s) if for_ramp > margin else _stepped(base, step)
 
     def snapshot(self) -> dict[str, Any]:
         """The complete state, for `load`; bit for bit."""
@@ -152,10 +153,22 @@ def _stepped(base: DriftVerdict, step: Change) -> DriftVerdict:
     )
 
 
-def _drifting(base: DriftVerdict, ramp: Change) -> DriftVerdict:
-    text = f"{base.parameter} drifts by {ramp.size:+.3g} (u {ramp.u_size:.2g}) a day since {ramp.onset_s:.0f} s"
+def _drifting(base: DriftVerdict, ramp: Change, t_s: float) -> DriftVerdict:
+    days = (t_s - ramp.onset_s) / DAY_S
+    change, u_change = ramp.size * days, ramp.u_size * days
+    text = (
+        f"{base.parameter} drifts by {ramp.size:+.3g} (u {ramp.u_size:.2g}) a day since {ramp.onset_s:.0f} s; in these "
+        f"{days:.1f} days it has drifted by {change:+.3g}"
+    )
     return replace(
-        base, verdict="drifting", rate=ramp.size, u_rate=ramp.u_size, onset_s=ramp.onset_s, reason=_reason(text, base)
+        base,
+        verdict="drifting",
+        change=change,
+        u_change=u_change,
+        rate=ramp.size,
+        u_rate=ramp.u_size,
+        onset_s=ramp.onset_s,
+        reason=_reason(text, base),
     )
 
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from calib.estimate.joint_state import JointState
-from calib.estimate.quantities import PRIORS, YEAR_DAYS, Kind
+from calib.estimate.quantities import ALL_RATES, PRIORS, SENSITIVITY_RATE, YEAR_DAYS, Kind, Quantity
 from calib.estimate.terms import Term
 from calib.estimate.window_rows import Summary
 from calib.model import Array
@@ -52,10 +52,19 @@ class Linearised:
         """Add each nuisance that the state does not have yet, with its prior on `day`. Returns their keys."""
         new = [term for term in terms if term.key not in self.state]
         for term in new:
-            for state in (self.state, self.base):
-                state.append(term.quantity, term.expected, self.begun(term, day))
-            self.point = np.append(self.point, term.expected)
+            self._add(term.quantity, term.expected, self.begun(term, day))
         return [term.key for term in new]
+
+    def add_rates(self, parameters: Iterable[int]) -> None:
+        """Add the rates of these parameters that the state does not have yet, with the value and uncertainty 0."""
+        for p in parameters:
+            if ALL_RATES[p] not in self.state:
+                self._add(Quantity(ALL_RATES[p], SENSITIVITY_RATE), 0.0, 0.0)
+
+    def _add(self, quantity: Quantity, mean: float, u: float) -> None:
+        for state in (self.state, self.base):
+            state.append(quantity, mean, u)
+        self.point = np.append(self.point, mean)
 
     def keep(self, kept: Sequence[bool]) -> None:
         """Remove all other quantities. Before the call, the recent windows must have been moved to the base."""

@@ -180,6 +180,8 @@ OFFSET_RATE = Kind(
     in_output_unit=True,
     straight=LINEAR,
 )
+# Comes into a state only when a drift of S was found, with the standard uncertainty that this drift has.
+SENSITIVITY_RATE = Kind("sensitivity rate", in_output_unit=True, straight=LINEAR)
 SENSITIVITY_TEMPERATURE = Kind("sensitivity over temperature")
 OFFSET_TEMPERATURE = Kind("offset over temperature", straight=LINEAR)
 SENSOR_CORNER = Kind(
@@ -303,12 +305,13 @@ BETWEEN_WINDOWS = (
     Statement("offset_mps2", 0.05, ("uncertainty.offset_mps2",), option="u_offset_mps2"),
     Statement("lag_window_s", 0.0, ("uncertainty.lag_window_s",)),  # least value; the data may show a larger one
 )
-OF_SENSOR = (SENSITIVITY, OFFSET, OFFSET_RATE, SENSITIVITY_TEMPERATURE, OFFSET_TEMPERATURE)
+OF_SENSOR = (SENSITIVITY, SENSITIVITY_RATE, OFFSET, OFFSET_RATE, SENSITIVITY_TEMPERATURE, OFFSET_TEMPERATURE)
 PRIORS = by_name([s for k in KINDS.values() if k not in OF_SENSOR for s in k.statements] + list(BETWEEN_WINDOWS))
 WALKS = by_name([s for k in OF_SENSOR for s in k.statements] + [k.walk for k in KINDS.values() if k.walk is not None])
 
 S_AND_Q = tuple(Quantity(name, SENSITIVITY if k < 9 else OFFSET) for k, name in enumerate(PARAMETERS))
-RATES = ("Qx_rate", "Qy_rate", "Qz_rate")  # output unit a day
+RATES = ("Qx_rate", "Qy_rate", "Qz_rate")  # output unit a day; every state has them
+ALL_RATES = (*(f"{name}_rate" for name in PARAMETERS[:9]), *RATES)  # of S and Q, in the order of PARAMETERS
 MAIN_TEMPERATURE = ("Sx_T1", "Sy_T1", "Sz_T1")  # of a row of S, relative per K
 
 

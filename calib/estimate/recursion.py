@@ -24,12 +24,13 @@ from calib.estimate.gauss_newton import Flags
 from calib.estimate.innovation import Innovation, innovation
 from calib.estimate.joint_state import JointState
 from calib.estimate.linearised import Linearised
-from calib.estimate.quantities import GRAVITY, LAG, REFERENCE, Quantity
+from calib.estimate.quantities import ALL_RATES, GRAVITY, LAG, REFERENCE, Quantity
 from calib.estimate.window_rows import Noise, Summary, WindowRows
 from calib.estimate.window_state import WindowState
 from calib.model import Array, Calibration
 
 DATED = ", calibrated "  # in the identity of a reference whose certificate states its date
+STEADY = np.zeros(12)  # rates of S and Q
 METHOD = "3 (recursive adjustment)"
 
 
@@ -159,15 +160,21 @@ class Recursion(WindowState):
         rows = self._know(summary)
         self._take(rows, self._wandered(self._joint.state, self._day, summary.day))
 
-    def loosen(self, standard_uncertainty: Array, tilt_rad: float = 0.0, *, line: bool = False) -> None:
+    def loosen(
+        self, standard_uncertainty: Array, tilt_rad: float = 0.0, *, u_rate: Array = STEADY, line: bool = False
+    ) -> None:
         """Something changed: S and Q (12,), or all `quantities` (N,), may be off by as much more from now on, and a
         fixed mount be tilted.
 
-        `line`: a device or its line may have begun anew, which makes the lag another.
+        `u_rate` (12,): S and Q may drift by as much more a day. `line`: a device or its line may have begun anew, which
+        makes the lag another.
         """
         self._absorb(len(self._joint.recent))
+        drifting = np.flatnonzero(u_rate)
+        self._joint.add_rates(drifting)
         u = np.zeros(len(self._joint.state))
         u[: len(standard_uncertainty)] = standard_uncertainty
+        u[[self._joint.state.index(ALL_RATES[p]) for p in drifting]] = u_rate[drifting]
         for k, quantity in enumerate(self._joint.state.quantities):
             if "lean" in quantity.kind.loosened_by and self._fixed:
                 u[k] = tilt_rad

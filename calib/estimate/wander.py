@@ -10,10 +10,10 @@ import numpy as np
 
 from calib.estimate.joint_state import JointState
 from calib.estimate.quantities import (
+    ALL_RATES,
     MAIN_TEMPERATURE,
     OFFSET,
     OFFSET_TEMPERATURE,
-    RATES,
     SENSITIVITY_TEMPERATURE,
     TILT_WALK,
     WALKS,
@@ -54,15 +54,16 @@ class Wander(Stated):
 
 
 def wandered(state: JointState, days: float, variance_a_day: Array, bound: Array) -> JointState:
-    """A copy of the state `days` later: Q has drifted by its rate, and random walks have increased the variances.
+    """A copy of the state `days` later: S and Q have drifted by their rates, and walks have increased the variances.
 
     `variance_a_day` (N,) is the variance per day of each random walk; no variance grows beyond `bound` (N,).
     """
     state = state.copy()
     if days > 0.0:
         drift = np.eye(len(state))
-        for i, name in enumerate(RATES):
-            drift[9 + i, state.index(name)] = days
+        for p, name in enumerate(ALL_RATES):
+            if name in state:
+                drift[p, state.index(name)] = days
         state.transform(drift)
         state.spread(np.minimum(variance_a_day * days, np.maximum(bound - state.variance, 0.0)))
     return state

@@ -81,6 +81,7 @@ class BuildingParameters:
     all_axes: bool = False
     across: tuple[complex, complex] = (0.0, 0.0)
     sensitivity: Array = field(default_factory=lambda: np.eye(3))
+    sensitivity_a_day: Array = field(default_factory=lambda: np.zeros((3, 3)))
     steps: tuple[tuple[float, Array], ...] = ()
     offset: Array = field(default_factory=lambda: np.zeros(3))  # at `weather.mean_degc`
     offset_a_day: Array = field(default_factory=lambda: np.zeros(3))
@@ -152,9 +153,8 @@ class Building:
         """True values at `time_s`."""
         p = self.parameters
         days = time_s / DAY_S
-        sensitivity = p.sensitivity + sum(
-            (change for since_s, change in p.steps if time_s >= since_s), np.zeros((3, 3))
-        )
+        stepped = sum((change for since_s, change in p.steps if time_s >= since_s), np.zeros((3, 3)))
+        sensitivity = p.sensitivity + days * p.sensitivity_a_day + stepped
         at_mean = p.offset + days * p.offset_a_day
         degc = p.weather.at(time_s)
         offset = at_mean + (degc - p.weather.mean_degc) * p.offset_per_k
