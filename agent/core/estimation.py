@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,6 +18,7 @@ from calib.estimate.correction import Law
 from calib.estimate.drift import DriftTest, DriftVerdict
 from calib.estimate.innovation import Innovation
 from calib.estimate.recursion import Recursion
+from calib.estimate.reference_step import Alike
 from calib.estimate.window_rows import Summary
 from calib.model import PARAMETERS, Array, Calibration, Window, WindowSums
 
@@ -26,6 +27,9 @@ DAY_S = 86400.0
 # offset two m/s2, which is a mount that leans by 12 deg.
 JUMP_SENSITIVITY = 0.1
 JUMP_OFFSET_MPS2 = 2.0
+# The windows cannot tell whether the sensor or its reference made a step d, so S is wrong by 0 or by d. U = 2 u covers
+# both if u is d / 1.6.
+SURELY = 1.6
 STANDARD_GRAVITY_MPS2 = 9.80665
 MAX_CHANGE_OFFSET_MPS2 = 0.5  # as much as a mount that leans by 3 deg
 FIXED_MOUNT_LEAST = 4  # parameters: three of Q, and one of S; without turning, all twelve may never be
@@ -269,18 +273,31 @@ class Estimation:
 
     def _adopted(self, held: Sequence[Summary]) -> Recursion | None:
         """Where the windows kept aside lead if something jumped before them; None where they do not agree."""
-        first = self._jumped(held, 0.0)
+        first = self._jumped(held, 0.0, lambda _: JUMP_SENSITIVITY / SURELY)
         if first is None:
             return None
         before, after = self.recursion.result(), first.result()
         moved = np.abs(after.offset - before.offset)
         significant = moved > 3.0 * np.hypot(after.standard_uncertainty[9:], 0.0)
-        return self._jumped(held, self._tilt_rad(np.where(significant, moved, 0.0)))
+        tilt_rad = self._tilt_rad(np.where(significant, moved, 0.0))
+        S = after.sensitivity - before.sensitivity
+        return self._jumped(held, tilt_rad, lambda way: self._u_reference(way.step(S, self._drifted(way.name, first))))
 
-    def _jumped(self, held: Sequence[Summary], tilt_rad: float) -> Recursion | None:
+    def _drifted(self, name: str, after: Recursion) -> float:
+        return after.quantity(name)[0] - (self.recursion.quantity(name)[0] if name in self.recursion.names else 0.0)
+
+    def _u_reference(self, step: float) -> float:
+        """Standard uncertainty of the part that the reference has in a step of S, both relative."""
+        return max(self._channel.certificate.stability_pct / 100.0, abs(step) / SURELY) if step else 0.0
+
+    def _jumped(
+        self, held: Sequence[Summary], tilt_rad: float, u_reference: Callable[[Alike], float]
+    ) -> Recursion | None:
+        """The state with these windows; S, Q, the mount, and the reference by `u_reference`, may have changed."""
         trial = self.recursion.copy()
         # A line that was plugged anew may be late by another time; that is no change of S or Q.
         trial.loosen(self._jump(held), tilt_rad, line=True)
+        trial.suspect_reference(held, u_reference)
         for k, summary in enumerate(held):
             told = trial.innovation(summary)
             if k and told.statistic > self.gate.limit(told.degrees_of_freedom):

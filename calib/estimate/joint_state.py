@@ -99,6 +99,11 @@ class JointState:
             noise[live, range(live.size)] = np.sqrt(variance[live])
             self.factor = _square(np.hstack([self.factor, noise]))
 
+    def suspect(self, change: Array) -> None:
+        """Add the covariance of one change of all quantities together, whose standard deviation is `change` (N,)."""
+        self.walked = self.walked + change**2
+        self.factor = _square(np.hstack([self.factor, change[:, None]]))
+
     def replace(self, where: slice, mean: Array, standard_uncertainty: Array) -> None:
         """Give the quantities `where` this prior (k,), (k,), independent of all other quantities."""
         own = np.zeros((len(self), len(mean)))

@@ -9,7 +9,7 @@ Q, through swaps, restarts and changes of the configuration.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -25,6 +25,7 @@ from calib.estimate.innovation import Innovation, innovation
 from calib.estimate.joint_state import JointState
 from calib.estimate.linearised import Linearised
 from calib.estimate.quantities import ALL_RATES, GRAVITY, LAG, REFERENCE, Quantity
+from calib.estimate.reference_step import Alike, alike
 from calib.estimate.window_rows import Noise, Summary, WindowRows
 from calib.estimate.window_state import WindowState
 from calib.model import Array, Calibration
@@ -200,6 +201,13 @@ class Recursion(WindowState):
             if "remount" in quantity.kind.loosened_by and concerned and quantity.kind.of_reference >= of_reference:
                 u[k] = state.stated_u[k]
         state.spread(u**2)
+        self._joint.base = state.copy()
+
+    def suspect_reference(self, windows: Sequence[Summary], u: Callable[[Alike], float]) -> None:
+        """The reference may have stepped before these windows, each channel by `u` (relative). After `loosen` only."""
+        rows, state = [self._know(summary) for summary in windows], self._joint.state
+        for step in alike([own.at(state, state.mean, self._noise) for own in rows], state):
+            state.suspect(u(step) * step.change)
         self._joint.base = state.copy()
 
     def date_certificate(self, day: float) -> None:
