@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,25 +12,17 @@ from agent.config import Channel
 from agent.config.gate import GateSettings
 from agent.core.explaining import explained
 from agent.core.gate import PROPOSALS_KEPT, Decision, Evidence, Gate
+from agent.core.jump import jumped, possible_jump, tilt_rad
 from agent.core.time_shift import Anew, LagWatch
 from agent.core.windows import Found
 from calib.estimate.correction import Law
 from calib.estimate.drift import DriftTest, DriftVerdict
 from calib.estimate.innovation import Innovation
 from calib.estimate.recursion import Recursion
-from calib.estimate.reference_step import Alike
 from calib.estimate.window_rows import Summary
-from calib.model import PARAMETERS, Array, Calibration, Window, WindowSums
+from calib.model import PARAMETERS, Calibration, Window, WindowSums
 
 DAY_S = 86400.0
-# A jump that is being confirmed may be of any size up to what an operator would hardly accept: 10 % of S, and in the
-# offset two m/s2, which is a mount that leans by 12 deg.
-JUMP_SENSITIVITY = 0.1
-JUMP_OFFSET_MPS2 = 2.0
-# The windows cannot tell whether the sensor or its reference made a step d, so S is wrong by 0 or by d. U = 2 u covers
-# both if u is d / 1.6.
-SURELY = 1.6
-STANDARD_GRAVITY_MPS2 = 9.80665
 MAX_CHANGE_OFFSET_MPS2 = 0.5  # as much as a mount that leans by 3 deg
 FIXED_MOUNT_LEAST = 4  # parameters: three of Q, and one of S; without turning, all twelve may never be
 
@@ -136,7 +128,9 @@ class Estimation:
         candidate = trial.result()
         confirm = self._channel.gate.confirm_windows
         held = [*self._held, summary][-confirm:]
-        adopted = self._adopted(held) if len(held) == confirm and not self.lag_watch.beyond else None
+        agree = len(held) == confirm and not self.lag_watch.beyond
+        stability = self._channel.certificate.stability_pct / 100.0
+        adopted = jumped(self.recursion, held, stability, self.gate.limit) if agree else None
         evidence = Evidence(day * DAY_S, innovation.statistic, innovation.degrees_of_freedom)
         decision = self.gate.judge(evidence, candidate, None if adopted is None else adopted.result())
         if decision.action == "take":
@@ -179,7 +173,7 @@ class Estimation:
         self._explain_s = now_s + self._channel.gate.explain_after_s
         if self.lag_watch.beyond:
             return f"the held windows show another lag: {self.lag_watch.beyond}"
-        jump, fixed = self._jump(self._held), self._channel.fixed_mount
+        jump, fixed = possible_jump(self.recursion, self._held), self._channel.fixed_mount
         return explained(self.recursion, self._held, jump, self.gate.limit, fixed_mount=fixed)
 
     def _tried_of(self, window: Window, day: float, lag_s: float, temperature_degc: float) -> Tried:
@@ -268,53 +262,8 @@ class Estimation:
                 rate[k] = np.hypot(verdict.rate, verdict.u_rate)
             loose[k] = np.hypot(verdict.change, verdict.u_change)
         if loose.any():
-            self.recursion.loosen(loose, self._tilt_rad(loose[9:]), u_rate=rate)
+            self.recursion.loosen(loose, tilt_rad(loose[9:], self.recursion.scale), u_rate=rate)
             self.drift.restart(loose > 0.0)
-
-    def _adopted(self, held: Sequence[Summary]) -> Recursion | None:
-        """Where the windows kept aside lead if something jumped before them; None where they do not agree."""
-        first = self._jumped(held, 0.0, lambda _: JUMP_SENSITIVITY / SURELY)
-        if first is None:
-            return None
-        before, after = self.recursion.result(), first.result()
-        moved = np.abs(after.offset - before.offset)
-        significant = moved > 3.0 * np.hypot(after.standard_uncertainty[9:], 0.0)
-        tilt_rad = self._tilt_rad(np.where(significant, moved, 0.0))
-        S = after.sensitivity - before.sensitivity
-        return self._jumped(held, tilt_rad, lambda way: self._u_reference(way.step(S, self._drifted(way.name, first))))
-
-    def _drifted(self, name: str, after: Recursion) -> float:
-        return after.quantity(name)[0] - (self.recursion.quantity(name)[0] if name in self.recursion.names else 0.0)
-
-    def _u_reference(self, step: float) -> float:
-        """Standard uncertainty of the part that the reference has in a step of S, both relative."""
-        return max(self._channel.certificate.stability_pct / 100.0, abs(step) / SURELY) if step else 0.0
-
-    def _jumped(
-        self, held: Sequence[Summary], tilt_rad: float, u_reference: Callable[[Alike], float]
-    ) -> Recursion | None:
-        """The state with these windows; S, Q, the mount, and the reference by `u_reference`, may have changed."""
-        trial = self.recursion.copy()
-        # A line that was plugged anew may be late by another time; that is no change of S or Q.
-        trial.loosen(self._jump(held), tilt_rad, line=True)
-        trial.suspect_reference(held, u_reference)
-        for k, summary in enumerate(held):
-            told = trial.innovation(summary)
-            if k and told.statistic > self.gate.limit(told.degrees_of_freedom):
-                return None
-            trial.update(summary)
-        return trial
-
-    def _jump(self, held: Sequence[Summary]) -> Array:
-        """(12,) how far S and Q may have jumped: only what these windows tell of, so that no other column moves."""
-        scale = self.recursion.scale
-        told = np.any([self.recursion.innovation(summary).information > 0.0 for summary in held], axis=0)
-        size = np.append(np.full(9, JUMP_SENSITIVITY), np.full(3, JUMP_OFFSET_MPS2)) * scale
-        return np.where(told, size, 0.0)
-
-    def _tilt_rad(self, offset: Array) -> float:
-        """The tilt of the mount that would move the mean output as much: the data cannot tell it from an offset."""
-        return float(np.abs(offset).max(initial=0.0) / (self.recursion.scale * STANDARD_GRAVITY_MPS2))
 
     # --- state
 
@@ -347,9 +296,8 @@ class Estimation:
         self._proposed = [(Calibration(**p["calibration"]), self._loaded(p["recursion"])) for p in state["proposed"]]
         self.in_force, self.law = Calibration(**state["in_force"]), Law(**state["law"])
         self.residual_sd = np.array(state["residual_sd"])
-        self._explain_s = state.get("explain_s")
-        if "lag_watch" in state:  # states of earlier versions have none
-            self.lag_watch.load(state["lag_watch"])
+        self._explain_s = state["explain_s"]
+        self.lag_watch.load(state["lag_watch"])
 
 
 def _plain(calibration: Calibration) -> dict[str, Any]:

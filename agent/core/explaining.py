@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from agent.core.time_shift import Limit
+from agent.core.gate import Limit
 from calib.estimate.quantities import OFFSET, Kind, Quantity
 from calib.estimate.recursion import Recursion
 from calib.estimate.window_rows import Summary

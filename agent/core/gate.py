@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -12,6 +13,7 @@ from agent.core.anchor import Anchor, Change
 from calib.distributions import chi2_quantile
 from calib.model import PARAMETERS, Calibration
 
+Limit = Callable[[float], float]  # from the degrees of freedom: the largest chi-squared of a consistent window
 Status = Literal["UNCALIBRATED", "COLLECTING", "VALID", "HELD", "RECALIBRATING", "INVALID"]
 PROPOSALS_KEPT = 8  # so that an operator can accept an estimate after newer ones were published
 

@@ -39,6 +39,8 @@ from calib.estimate.quantities import (
     Quantity,
     offset_temperature,
 )
+from calib.excitation.placing import SHORTEST_S
+from calib.excitation.standing import USUAL
 from calib.model import PARAMETERS
 
 
@@ -116,14 +118,25 @@ def from_version_2(state: dict[str, Any]) -> None:
 
     Version 2 kept the standard uncertainty of each prior and no mean: the estimate stands for the mean, and the
     configuration of this run for what was stated. The reference whose errors the state had is the one in the state.
+    Positions were found with the usual smoothing alone, and runs of samples had no number.
     """
+    for channel in state.get("channels", {}).values():
+        channel["run_numbers"] = {}
+        for stream in channel["streams"].values():
+            for run in stream["runs"]:
+                run["number"] = 0
+        if "standing" in channel["places"]:
+            channel["places"]["standing"]["longest"] = USUAL
+            for stretch in channel["places"]["stretches"]:
+                stretch["smoothing_s"] = SHORTEST_S
     for holder in [state, *state.get("channels", {}).values()]:
         if holder.get("estimation"):
             _own(holder["estimation"], holder.get("reference") or "")
 
 
 def _own(estimation: dict[str, Any], reference: str) -> None:
-    estimation["proposed"] = []
+    estimation |= {"proposed": [], "explain_s": None}
+    estimation["lag_watch"] = {"line": None, "unexplained": 0, "beyond": ""}
     recursion = estimation["recursion"]
     bound = recursion.pop("bound")
     for joint in (recursion["state"], recursion["base"]):
@@ -141,6 +154,8 @@ def _own(estimation: dict[str, Any], reference: str) -> None:
         summary["reference"] = reference
     recursion["reference"], recursion["sensitivity"] = reference, None
     recursion["references"] = {reference: None} if recursion["windows"] else {}
+    recursion["certified_day"] = None
+    recursion.setdefault("fixed", True)
     recursion["stated"] = {"mean": None, "u": recursion.pop("prior_u"), "priors": None}
     if recursion["held"] is not None:
         by = recursion["held"]["by"]

@@ -13,7 +13,7 @@ from agent.config import Channel
 from agent.core.schedule import Piece, Stance, pieces
 from agent.core.stream import UNCOUNTED, DeviceStream
 from calib.estimate.recursion import Recursion
-from calib.excitation.placing import SHORTEST_S, Knowledge, Placed, clamp_angles, mean_output, nearest_stop
+from calib.excitation.placing import Knowledge, Placed, clamp_angles, mean_output, nearest_stop
 from calib.excitation.standing import KEPT, MEAN_S, Standing
 from calib.model import Array, Pose
 from calib.signal.samples import Samples
@@ -37,7 +37,7 @@ class Stretch:
     serial: int
     start_s: float
     stop_s: float
-    smoothing_s: float = SHORTEST_S  # states of version 0.1 have none
+    smoothing_s: float
 
 
 class FoundPositions:

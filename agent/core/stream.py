@@ -80,7 +80,7 @@ class Run:
     @classmethod
     def restore(cls, state: Mapping[str, Any]) -> Run:
         """The run whose `snapshot` this is."""
-        run = cls(ClockModel.restore(state["clock"]), state.get("number", 0))
+        run = cls(ClockModel.restore(state["clock"]), state["number"])
         run.blocks.extend(_block_of(s) for s in state["blocks"])
         return run
 

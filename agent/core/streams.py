@@ -174,7 +174,7 @@ class Streams:
             n: DeviceStream.restore(n, origin_ns, s, self._horizon_s) for n, s in state["streams"].items()
         }
         self._places.load(state["places"])
-        self._runs = dict(state.get("run_numbers", {}))
+        self._runs = dict(state["run_numbers"])
 
     @property
     def _sensor(self) -> DeviceStream:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from agent.config import Channel
+from agent.core.gate import Limit
 from agent.core.windows import Found
 from calib.estimate.lag_search import starts, without_lag
 from calib.estimate.nuisances import Priors
@@ -25,8 +26,6 @@ FOUND_WITHIN_U = 4.0  # stated standard uncertainties; one sound lag in 16,000 i
 # Beyond that range, a lag is looked for only to tell the operator: as far again, and at least as far as this.
 LOOKED_WITHIN_S = 0.1
 TOLD_FROM_U = 4.0  # a change of the lag by so many of its standard uncertainties is told
-
-Limit = Callable[[float], float]  # from the degrees of freedom: the largest chi-squared of a consistent window
 
 
 @dataclass(frozen=True, slots=True, eq=False)

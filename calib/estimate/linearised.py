@@ -135,5 +135,5 @@ class Linearised:
         loaded = cls(JointState.load(state["state"]))
         loaded.base, loaded.base_day = JointState.load(state["base"]), state["base_day"]
         loaded.recent = [Summary.load(summary) for summary in state["recent"]]
-        loaded.point, loaded.certified_day = np.array(state["point"]), state.get("certified_day")
+        loaded.point, loaded.certified_day = np.array(state["point"]), state["certified_day"]
         return loaded

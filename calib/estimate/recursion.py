@@ -314,7 +314,7 @@ class Recursion(WindowState):
         low, high = state["temperature_range"]
         self._temperature_range = (low, high)
         self._residual_sd = np.array(state["residual_sd"])
-        self._fixed = self._fixed and state.get("fixed", True)  # a mount that turned once is fixed no more
+        self._fixed = self._fixed and state["fixed"]  # a mount that turned once is fixed no more
         self._held = None if state["held"] is None else Held(**state["held"])
         self.windows, self.scale = state["windows"], state["scale"]
         for summary in self._joint.recent[-1:]:

@@ -156,7 +156,7 @@ class Standing:
         """Continue from the state that `snapshot` returned."""
         self._means, self._centre = np.array(state["means"]), np.array(state["centre"])
         self._next, self._rms, self.first = state["next"], state["rms"], state["first"]
-        self._longest = state.get("longest", USUAL)  # not in states of version 0.1
+        self._longest = state["longest"]
 
 
 def steady(longest: int) -> int:

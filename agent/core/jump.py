@@ -1,0 +1,84 @@
+"""A jump that held windows confirm: the state with these windows, if S, Q, the mount or the reference changed before.
+
+The windows cannot tell whether the sensor or its reference made a step d of the sensitivity, so S is wrong by 0 or by
+d. The state follows the step, and u(S) grows by what the reference may have done, until something else tells S:
+gravity, a second reference or an operator.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from agent.core.gate import Limit
+from calib.estimate.recursion import Recursion
+from calib.estimate.reference_step import Alike
+from calib.estimate.window_rows import Summary
+from calib.geometry import STANDARD_GRAVITY_MPS2
+from calib.model import Array
+
+# A jump that is being confirmed may be of any size up to what an operator would hardly accept: 10 % of S, and in the
+# offset two m/s2, which is a mount that leans by 12 deg.
+JUMP_SENSITIVITY = 0.1
+JUMP_OFFSET_MPS2 = 2.0
+SURELY = 1.6  # U = 2 u covers the errors 0 and d if u is d / 1.6
+SIGNIFICANT = 3.0  # standard uncertainties of a changed offset
+
+
+def jumped(recursion: Recursion, held: Sequence[Summary], stability: float, limit: Limit) -> Recursion | None:
+    """A copy of the state that has taken the held windows after a jump; None if they do not agree with each other.
+
+    `stability` is that of the reference in a year, relative. `limit` is that of the gate.
+    """
+    first = _with_jump(recursion, held, 0.0, lambda _: JUMP_SENSITIVITY / SURELY, limit)
+    if first is None:
+        return None
+    before, after = recursion.result(), first.result()
+    moved = np.abs(after.offset - before.offset)
+    significant = moved > SIGNIFICANT * after.standard_uncertainty[9:]
+    S = after.sensitivity - before.sensitivity
+
+    def u_reference(way: Alike) -> float:
+        """Standard uncertainty of the part that the reference has in the step, relative."""
+        step = way.step(S, _value(first, way.name) - _value(recursion, way.name))
+        return max(stability, abs(step) / SURELY) if step else 0.0
+
+    leaning = tilt_rad(np.where(significant, moved, 0.0), recursion.scale)
+    return _with_jump(recursion, held, leaning, u_reference, limit)
+
+
+def possible_jump(recursion: Recursion, held: Sequence[Summary]) -> Array:
+    """(12,) how far S and Q may have jumped: only what these windows tell of, so that no other column moves."""
+    told = np.any([recursion.innovation(summary).information > 0.0 for summary in held], axis=0)
+    size = np.append(np.full(9, JUMP_SENSITIVITY), np.full(3, JUMP_OFFSET_MPS2)) * recursion.scale
+    return np.where(told, size, 0.0)
+
+
+def tilt_rad(offset: Array, scale: float) -> float:
+    """The tilt of the mount that would move the mean output as much as an offset (3,), in output unit: the data cannot
+    tell one from the other. `scale` is the output unit per m/s2."""
+    return float(np.abs(offset).max(initial=0.0) / (scale * STANDARD_GRAVITY_MPS2))
+
+
+def _with_jump(
+    recursion: Recursion,
+    held: Sequence[Summary],
+    leaning_rad: float,
+    u_reference: Callable[[Alike], float],
+    limit: Limit,
+) -> Recursion | None:
+    trial = recursion.copy()
+    # A line that was plugged anew may be late by another time; that is no change of S or Q.
+    trial.loosen(possible_jump(recursion, held), leaning_rad, line=True)
+    trial.suspect_reference(held, u_reference)
+    for k, summary in enumerate(held):
+        told = trial.innovation(summary)
+        if k and told.statistic > limit(told.degrees_of_freedom):
+            return None
+        trial.update(summary)
+    return trial
+
+
+def _value(recursion: Recursion, name: str) -> float:
+    return recursion.quantity(name)[0] if name in recursion.names else 0.0
