@@ -197,8 +197,8 @@ class Recursion(WindowState):
         state = self._joint.state
         u = np.zeros(len(state))
         for k, quantity in enumerate(state.quantities):
-            concerned = quantity.owner == self.reference if of_reference else quantity.owner in ("", self.reference)
-            if "remount" in quantity.kind.loosened_by and concerned and quantity.kind.of_reference >= of_reference:
+            there = quantity.owner in ("", self.reference) and (quantity.kind.of_reference or not of_reference)
+            if there and "remount" in quantity.kind.loosened_by:
                 u[k] = state.stated_u[k]
         state.spread(u**2)
         self._joint.base = state.copy()
@@ -243,6 +243,7 @@ class Recursion(WindowState):
             if self._held is not None:
                 self._held = Held(self._held.mps2, {keys[key]: moves for key, moves in self._held.by.items()})
             self._references = {(dated if of == reference else of): s for of, s in self._references.items()}
+            self.reference = dated if self.reference == reference else self.reference
         if calibrated:
             return dated
         return next((known for known in reversed(self._references) if known.startswith(reference + DATED)), reference)
@@ -271,11 +272,12 @@ class Recursion(WindowState):
     def put(self, calibration: Calibration) -> None:
         """S and Q as an operator wants them. Their covariance with the nuisances is not known: see `intersect`."""
         self._absorb(len(self._joint.recent))
+        if self._held is not None:
+            self._held.unmount(self._joint)
+            self._held = None  # Q itself is known again; the next window of a fixed mount makes the mean output of it
         state = self._joint.state
-        state.mean[:12], state.factor[:12] = self._parameters_factor()
         values = np.append(calibration.sensitivity.ravel(), calibration.offset)
         state.intersect(slice(0, 12), values, calibration.covariance)
-        self._held = None  # Q itself is known again; the next window of a fixed mount makes the mean output of it
         self._joint.base = state.copy()
         self._joint.point = state.mean.copy()
 
