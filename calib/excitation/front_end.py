@@ -7,7 +7,8 @@ band of the motion; the windows found in them get their verdicts.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from calib.excitation.windows import LEAST_MOTION_MPS2, Points, at_rest, motion_
 from calib.model import Array, Pose, Window, WindowSums
 from calib.signal.band import STOP_BAND, band_above_noise, lowpass, noise_in_band
 from calib.signal.corner import integral, with_integral, without_corner
+from calib.signal.holes import Mask, short_holes_filled
 from calib.signal.instrument import Instrument
 from calib.signal.resampling import (
     BAND,
@@ -67,7 +69,8 @@ class Aligned:
 
     `reference_noise` (2, m) as in calib.model.Window. `clipped_points`: samples at the end of the sensor's range,
     counted before the filter, which hides them. `independent`: the share of the points that the filter leaves
-    independent. `band_hz`: where the filter ends, None where there is none.
+    independent; filled samples are none. `band_hz`: where the filter ends, None where there is none. `filled`: how many
+    samples of a device were missing and filled, by the name that this number has in a window; empty where none was.
     """
 
     points: Points
@@ -75,6 +78,7 @@ class Aligned:
     clipped_points: int
     independent: float
     band_hz: float | None
+    filled: Mapping[str, float] = field(default_factory=dict)
 
 
 def margin_s(instrument: Instrument, rate_hz: float) -> float:
@@ -134,12 +138,13 @@ def aligned(
     """Samples within `span_s` that have a reference, in m/s2; None where there are fewer than two."""
     rate_hz = reference.clock.rate_hz
     raw = reference.values / instrument.sensitivity
-    u, lost = differentiate(raw, rate_hz, instrument.derivatives) if instrument.derivatives else (raw, 0)
-    m, V = u.shape[1], sensor.values
     time_s = sensor.time_s
     if len(time_s) < 2:
         return None
     sensor_rate_hz = float((len(time_s) - 1) / (time_s[-1] - time_s[0]))
+    raw, V, raw_filled, filled = _without_short_holes(raw, sensor.values, (rate_hz, sensor_rate_hz))
+    u, lost = differentiate(raw, rate_hz, instrument.derivatives) if instrument.derivatives else (raw, 0)
+    m, inside = u.shape[1], _within(time_s, span_s)
     if instrument.has_corner:
         u = np.hstack([without_corner(u, rate_hz, instrument.corner_hz), integral(u, rate_hz)])
         V = without_corner(V, sensor_rate_hz, instrument.sensor_corner_hz)
@@ -150,14 +155,37 @@ def aligned(
     clipped, independent, k = 0, 1.0, u.shape[1]
     if band_hz is not None and limit_band:
         independent = min(1.0, 2.0 * FILTER_BAND * band_hz / sensor_rate_hz)
-        clipped = _clipped(columns[np.isfinite(columns).all(axis=1) & _within(time_s, span_s)])
+        clipped = _clipped(columns[np.isfinite(columns).all(axis=1) & inside & ~filled])
         columns = lowpass(columns, sensor_rate_hz, band_hz)
-    usable = np.isfinite(columns).all(axis=1) & _within(time_s, span_s)
+    else:
+        columns[filled] = np.nan  # without a filter, a filled sample would only repeat what the others tell
+    usable = np.isfinite(columns).all(axis=1) & inside
     if usable.sum() < 2:
         return None
+    raw_inside = _within(reference.time_s, span_s)
+    independent *= (1.0 - _share(filled, usable)) * (1.0 - _share(raw_filled, raw_inside))
+    counts = {"filled_samples": (filled & usable).sum(), "reference_filled_samples": (raw_filled & raw_inside).sum()}
     kept = columns[usable]
     points = Points(time_s[usable], kept[:, :3], kept[:, 3 : 3 + k], kept[:, 3 + k :])
-    return Aligned(points, noise, clipped, independent, band_hz if limit_band else None)
+    told = {name: float(count) for name, count in counts.items() if count}
+    return Aligned(points, noise, clipped, independent, band_hz if limit_band else None, told)
+
+
+def _without_short_holes(raw: Array, V: Array, rates_hz: tuple[float, float]) -> tuple[Array, Array, Mask, Mask]:
+    """The reference's samples and the sensor's with their short holes filled, and which of each were.
+
+    Nothing is filled where the band of the motion is not known in both. The sensor may feel a wider band, and weak
+    motion that only the reference tells from noise.
+    """
+    signals, bands_hz = (raw, V), []
+    if any(np.isnan(x).any() for x in signals):
+        found_hz = (band_above_noise(x, rate_hz)[0] for x, rate_hz in zip(signals, rates_hz, strict=True))
+        bands_hz = [band_hz for band_hz in found_hz if band_hz is not None]
+    if len(bands_hz) < len(signals):
+        return raw, V, np.zeros(len(raw), dtype=bool), np.zeros(len(V), dtype=bool)
+    raw, raw_filled = short_holes_filled(raw, rates_hz[0], bands_hz[0])
+    V, filled = short_holes_filled(V, rates_hz[1], max(bands_hz))
+    return raw, V, raw_filled, filled
 
 
 def nothing_in(pose: Pose, start_s: float, stop_s: float, reason: str) -> Window:
@@ -244,7 +272,7 @@ def _silent(window: Window) -> bool:
 
 def _told(window: Window, found: Aligned) -> Window:
     """The window with what was known before the filter, and what the filter left."""
-    window = replace(window, independent=found.independent)
+    window = replace(window, independent=found.independent, numbers={**window.numbers, **found.filled})
     if window.kind == "rest":
         return window
     window = replace(window, reference_noise=found.reference_noise)
@@ -310,5 +338,10 @@ def _clipped(columns: Array) -> int:
     return detection.clipped(V, residual, finest)
 
 
-def _within(time_s: Array, span_s: tuple[float, float]) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+def _share(some: Mask, of: Mask) -> float:
+    """How much of the samples `of` are `some`."""
+    return float((some & of).sum() / max(of.sum(), 1))
+
+
+def _within(time_s: Array, span_s: tuple[float, float]) -> Mask:
     return np.asarray((time_s >= span_s[0]) & (time_s < span_s[1]))

@@ -13,6 +13,7 @@ from functools import lru_cache
 import numpy as np
 
 from calib.model import Array
+from calib.signal.holes import Mask, in_short_holes
 
 SEGMENT_S = 4.0  # length of a segment of a spectrum: lines 0.25 Hz apart, and many segments in a few minutes
 LEAST_SEGMENTS = 8  # fewer segments give spectra that are too uncertain to choose a band
@@ -21,8 +22,6 @@ SMOOTHED = 5  # spectral lines in a moving average
 MARGIN = 1.25  # the band ends a quarter above the highest line that holds motion
 FEWEST_LINES = 64  # samples in a segment
 TINY = 1e-300
-# Samples. A straight line across such a gap has an error of 3 % of a motion at a twelfth of the sampling rate.
-SHORT_HOLE = 2
 WIDEST = 0.35  # of the sampling rate: above this a filter would remove hardly any noise
 STOP_BAND_DB = 66.0
 STOP_BAND = 1.5  # times the band that the filter passes
@@ -70,19 +69,18 @@ def _floor(powers: Array, segments: int) -> Array:
 
 
 def _bridged(x: Array) -> Array:
-    """x (n, m) with gaps of up to SHORT_HOLE samples interpolated linearly, which changes a spectrum very little.
+    """x (n, m) with short holes interpolated linearly, which needs no band and changes a spectrum very little.
 
-    In longer gaps all channels are NaN.
+    A straight line across two samples has an error of 3 % of a motion at a twelfth of the sampling rate. In longer
+    holes all channels are NaN.
     """
-    missing = np.isnan(x).any(axis=1)
+    missing: Mask = np.asarray(np.isnan(x).any(axis=1))
     if not missing.any() or missing.all():
         return x
     out, index = x.copy(), np.arange(len(x))
     for k in range(x.shape[1]):
         out[missing, k] = np.interp(index[missing], index[~missing], x[~missing, k])
-    edges = np.flatnonzero(np.diff(missing.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
-    for first, stop in edges[edges[:, 1] - edges[:, 0] > SHORT_HOLE].tolist():
-        out[first:stop] = np.nan
+    out[missing & ~in_short_holes(missing)] = np.nan
     return out
 
 
