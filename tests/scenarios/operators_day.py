@@ -9,6 +9,7 @@ import json
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from itertools import pairwise
 from pathlib import Path
 from subprocess import Popen
 from typing import Any
@@ -40,7 +41,7 @@ class Site:
         self.fitted = "A"
         self._step = step
         self._base_s = EPOCH_NS // 10**9 + DAY_S - int(time.time())
-        self.shift_clock(0)
+        step_clock(step, self._base_s)
         self._world = golden_site.World(SEED)
         self._began_s = time.monotonic()
         self.ports = {device: self._port(device) for device in (SENSOR, REFERENCE)}
@@ -63,18 +64,16 @@ class Site:
         """The operator's private key."""
         return self.directory / "keys" / f"{OPERATOR}.command.key"
 
-    def shift_clock(self, seconds: int) -> None:
-        """Shift UTC of the gateway against that of the day."""
+    def shift_clock(self, seconds: int, by_s: int) -> None:
+        """Shift UTC of the gateway against that of the day; wait until two calibrations are about `by_s` apart."""
+        since = self.count("calibration") - 1
         step_clock(self._step, self._base_s + seconds)
 
-    def wait_for_shifted(self, by_s: int) -> None:
-        """Wait until the newest calibration has a UTC that differs by about `by_s` from that of the one before."""
+        def felt() -> bool:
+            utc_s = [c["t_utc_ns"] * 1e-9 for c in results(self.data_dir, "calibration")[since:]]
+            return any(abs(after - before - by_s) < NEARLY_S for before, after in pairwise(utc_s))
 
-        def shifted() -> bool:
-            *_, before, newest = results(self.data_dir, "calibration")
-            return abs((newest["t_utc_ns"] - before["t_utc_ns"]) * 1e-9 - by_s) < NEARLY_S
-
-        self.wait(shifted, WINDOW_S, f"a calibration {by_s} s of UTC after the one before")
+        self.wait(felt, WINDOW_S, f"two calibrations whose UTC is {by_s} s apart")
 
     def count(self, what: str) -> int:
         """How many results of this kind are stored."""
