@@ -165,9 +165,12 @@ def drifting(seed: int) -> Told:
 
 
 def reference_steps(seed: int) -> Told:
-    """In mid-life the reference begins to read 3 % too high."""
+    """In mid-life the reference begins to read 3 % too high; its stability is stated as 0.5 % a year, as by default."""
     harm = Transformed("reference + 3 %", "reference", 1.03 * np.eye(3))
-    return _through(drawn(seed, harm=harm, harmed_from=SOUND), 4 * SOUND)
+    installation = drawn(seed, harm=harm, harmed_from=SOUND)
+    keys = installation.stated.keys()
+    keys["certificate"]["stability_pct"] = 0.5
+    return _through(replace(installation, config=building_config(installation.building, **keys)), 4 * SOUND)
 
 
 def losing(seed: int) -> Told:
