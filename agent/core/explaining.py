@@ -87,7 +87,7 @@ def _lines(recursion: Recursion, jump: Array, fixed_mount: bool) -> dict[str, li
     quantities, lines = recursion.quantities, dict[str, list[int]]()
     for k, quantity in enumerate(quantities):
         kind = quantity.kind
-        if quantity.owner not in ("", recursion.reference):
+        if quantity.owner not in ("", recursion.reference) or quantity.first:
             continue
         stated = kind.source and _settings(kind, fixed_mount) and not (fixed_mount and "lean" in kind.loosened_by)
         if jump[k] > 0.0 if k < len(jump) else stated:

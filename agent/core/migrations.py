@@ -143,7 +143,7 @@ def _own(estimation: dict[str, Any], reference: str) -> None:
         kinds = [KINDS[kind] for _, kind, _ in joint["quantities"]]
         nuisance = np.array([kind.prior is not None and kind.prior.name in PRIORS for kind in kinds])
         joint["quantities"] = [
-            [*quantity, reference if kind.of_reference else ""]
+            [*quantity, reference if kind.of_reference else "", False]
             for quantity, kind in zip(joint["quantities"], kinds, strict=True)
         ]
         joint["stated_u"] = np.sqrt(bound) / np.where(nuisance, 2.0, 1.0)
@@ -163,8 +163,8 @@ def _own(estimation: dict[str, Any], reference: str) -> None:
         recursion["held"]["by"] = {keys[name]: moves for name, moves in by.items()}
 
 
-def _with_kind(quantity: list[str]) -> tuple[str, Kind, str, str]:
-    name, kind, position, owner = quantity
+def _with_kind(quantity: list[Any]) -> tuple[str, Kind, str, str]:
+    name, kind, position, owner, _ = quantity
     return name, KINDS[kind], position, owner
 
 

@@ -7,7 +7,7 @@ its value to a reference, would count the error of that reference again at each 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -88,7 +88,9 @@ class Beforehand:
             return True
         for key, prior in now.items():
             if prior != (base.stated_mean[known[key]], base.stated_u[known[key]]):
-                base.exchange(known[key], *prior)
+                first = replace(base.quantities[known[key]], first=True).key
+                base.exchange(known.get(first, known[key]), *prior)
+                base.stated_mean[known[key]], base.stated_u[known[key]] = prior
         for k in range(len(S_AND_Q) if held is None else len(S_AND_Q) - 3):
             if (before.mean[k], before.u[k]) != (self.mean[k], self.standard_uncertainty[k]):
                 base.exchange(k, float(self.mean[k]), float(self.standard_uncertainty[k]))
@@ -108,6 +110,8 @@ class Beforehand:
             kind = quantity.kind
             if kind.prior is None or kind.prior.name not in PRIORS or quantity.owner not in ("", reference):
                 continue
+            if quantity.first:  # it goes with the quantity itself
+                continue
             was, now, stated_u = before.of(kind.prior), self.priors.of(kind.prior), float(state.stated_u[k])
             if kind.since_certificate:  # the time since the certificate stays
                 found[quantity.key] = 0.0, stated_u * (now / was if was not in (0.0, now) else 1.0)
@@ -120,7 +124,7 @@ class Beforehand:
         """The base is the state before any window, with the nuisances that the joint state has."""
         fresh, old = self.state(), joint.base
         for k, quantity in enumerate(old.quantities):
-            if quantity.kind.prior is not None and quantity.key not in fresh:
+            if quantity.kind.prior is not None and quantity.key not in fresh and not quantity.first:
                 fresh.append(quantity, *now.get(quantity.key, (float(old.stated_mean[k]), float(old.stated_u[k]))))
         if held is not None:
             u = held.mean_output_u(fresh, {key: float(fresh.stated_u[fresh.index(key)]) for key in held.by})

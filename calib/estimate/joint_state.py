@@ -72,6 +72,18 @@ class JointState:
         self.walked = np.append(self.walked, (self.doubt - 1.0) * standard_uncertainty**2)
         self._rename()
 
+    def append_first(self, k: int) -> None:
+        """Add the value that quantity `k` has now, which stays when the quantity changes."""
+        n = len(self)
+        grown = np.zeros((n + 1, n + 1))
+        grown[:n, :n], grown[n, :n] = self.factor, self.factor[k]
+        self.quantities.append(replace(self.quantities[k], first=True))
+        self.mean, self.factor = np.append(self.mean, self.mean[k]), grown
+        self.stated_mean = np.append(self.stated_mean, self.stated_mean[k])
+        self.stated_u = np.append(self.stated_u, self.stated_u[k])
+        self.walked = np.append(self.walked, self.walked[k])
+        self._rename()
+
     def keep(self, kept: Sequence[bool]) -> None:
         """Remove the other quantities (marginalise them): mean and covariance of those kept do not change."""
         keep = np.flatnonzero(kept)
@@ -139,9 +151,10 @@ class JointState:
         """Replace the prior of one quantity, with which it came into the state, by another prior.
 
         In information form this adds 1/u1^2 - 1/u0^2, and the matching vector. For a constant quantity that is exact.
-        A quantity x that has walked by the variance W since then equals its first value b plus the walk. The prior is
-        one of b, and b given x has the mean m0 + c (x - m0) and the variance c W, c = u0^2 / (u0^2 + W). Raises
-        ValueError if the quantity had no uncertainty, because then the state does not have its effect.
+        Of a nuisance that walked or was loosened, the first value is exchanged (see `append_first`). S and Q have none:
+        if x has walked by the variance W, its first value b has, given x, the mean m0 + c (x - m0) and the variance
+        c W, c = u0^2 / (u0^2 + W); that is exact if the data are newer than the walk. Raises ValueError if the quantity
+        had no uncertainty, because then the state does not have its effect.
         """
         m0, p0, p1 = self.stated_mean[k], self.stated_u[k] ** 2, standard_uncertainty**2
         if p0 == 0.0:
@@ -175,16 +188,14 @@ class JointState:
 
     def snapshot(self) -> dict[str, Any]:
         """The complete state, for `load`; bit for bit."""
-        quantities = [[q.name, q.kind.name, q.position, q.owner] for q in self.quantities]
+        quantities = [[q.name, q.kind.name, q.position, q.owner, q.first] for q in self.quantities]
         arrays = {name: getattr(self, name).copy() for name in _ARRAYS}
         return {"quantities": quantities, "doubt": self.doubt} | arrays
 
     @classmethod
     def load(cls, state: Mapping[str, Any]) -> JointState:
         """The state whose snapshot this is. Raises KeyError if the table of unknowns does not have one of its kinds."""
-        quantities = [
-            Quantity(name, KINDS[kind], position, owner) for name, kind, position, owner in state["quantities"]
-        ]
+        quantities = [Quantity(name, KINDS[kind], *rest) for name, kind, *rest in state["quantities"]]
         loaded = cls(quantities, np.array(state["mean"]), np.zeros(len(quantities)))
         for name in _ARRAYS:
             setattr(loaded, name, np.array(state[name]))
@@ -197,7 +208,7 @@ _ARRAYS = ("mean", "factor", "stated_mean", "stated_u", "walked")
 
 def _square(wide: Array) -> Array:
     """The square factor with the same product L L' as `wide`."""
-    return np.asarray(np.linalg.qr(wide.T, mode="r"), dtype=np.float64).T
+    return np.ascontiguousarray(np.linalg.qr(wide.T, mode="r").T, dtype=np.float64)
 
 
 def gain_of(jacobian: Array, factor: Array) -> Array:

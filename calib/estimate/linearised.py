@@ -53,6 +53,8 @@ class Linearised:
         new = [term for term in terms if term.key not in self.state]
         for term in new:
             self._add(term.quantity, term.expected, self.begun(term, day))
+            if term.kind.walk is not None:
+                self.append_first([len(self.state) - 1])
         return [term.key for term in new]
 
     def add_rates(self, parameters: Iterable[int]) -> None:
@@ -60,6 +62,19 @@ class Linearised:
         for p in parameters:
             if ALL_RATES[p] not in self.state:
                 self._add(Quantity(ALL_RATES[p], SENSITIVITY_RATE), 0.0, 0.0)
+
+    def append_first(self, concerned: Iterable[int]) -> None:
+        """Add the first value of these nuisances, unless the state has it, before they change.
+
+        The base must have their present values: they are new, or no window is recent.
+        """
+        for k in concerned:
+            quantity = self.state.quantities[k]
+            nuisance = quantity.kind.prior is not None and quantity.kind.prior.name in PRIORS
+            if nuisance and not quantity.first and replace(quantity, first=True).key not in self.state:
+                for state in (self.state, self.base):
+                    state.append_first(k)
+                self.point = np.append(self.point, self.point[k])
 
     def _add(self, quantity: Quantity, mean: float, u: float) -> None:
         for state in (self.state, self.base):

@@ -107,18 +107,20 @@ class Quantity:
     """One unknown: its name, its kind, its position ("" if it is common to all positions), and its owner.
 
     The owner is the identity of the reference to which the unknown belongs, "" for all other unknowns. Two references
-    have unknowns of the same name; `key` tells them apart in a joint state.
+    have unknowns of the same name; `key` tells them apart in a joint state. `first`: it is the first value of an
+    unknown that walked or was loosened since then. The prior of the unknown is one of its first value.
     """
 
     name: str
     kind: Kind
     position: str = ""
     owner: str = ""
+    first: bool = False
 
     @property
     def key(self) -> str:
         """Identifies the unknown in a joint state."""
-        return f"{self.name} of {self.owner}" if self.owner else self.name
+        return (f"{self.name} of {self.owner}" if self.owner else self.name) + (", first" if self.first else "")
 
 
 @dataclass(frozen=True, init=False)

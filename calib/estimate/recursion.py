@@ -142,7 +142,7 @@ class Recursion(WindowState):
     @property
     def names(self) -> list[str]:
         """Of all quantities of the sensor, its mount and its present reference."""
-        return [q.name for q in self._joint.state.quantities if q.owner in ("", self.reference)]
+        return [q.name for q in self._joint.state.quantities if q.owner in ("", self.reference) and not q.first]
 
     @property
     def references(self) -> list[str]:
@@ -177,12 +177,21 @@ class Recursion(WindowState):
         u[: len(standard_uncertainty)] = standard_uncertainty
         u[[self._joint.state.index(ALL_RATES[p]) for p in drifting]] = u_rate[drifting]
         for k, quantity in enumerate(self._joint.state.quantities):
+            if quantity.first:
+                continue
             if "lean" in quantity.kind.loosened_by and self._fixed:
                 u[k] = tilt_rad
             elif "line" in quantity.kind.loosened_by and line and quantity.owner == self.reference:
                 u[k] = self._stated.priors.of(quantity.kind.prior)
-        self._joint.state.spread(u**2)
+        self._spread(u)
+
+    def _spread(self, u: Array) -> None:
+        """The quantities (N,) may be off by `u` more from now on; no window is recent."""
         self._joint.base = self._joint.state.copy()
+        self._joint.append_first(np.flatnonzero(u).tolist())
+        state = self._joint.state
+        state.spread(np.append(u, np.zeros(len(state) - len(u))) ** 2)
+        self._joint.base = state.copy()
 
     def remount(self, *, of_reference: bool) -> None:
         """The sensor was mounted again, or the present reference was: what a mount decides may be another from now on.
@@ -198,10 +207,9 @@ class Recursion(WindowState):
         u = np.zeros(len(state))
         for k, quantity in enumerate(state.quantities):
             there = quantity.owner in ("", self.reference) and (quantity.kind.of_reference or not of_reference)
-            if there and "remount" in quantity.kind.loosened_by:
+            if there and not quantity.first and "remount" in quantity.kind.loosened_by:
                 u[k] = state.stated_u[k]
-        state.spread(u**2)
-        self._joint.base = state.copy()
+        self._spread(u)
 
     def suspect_reference(self, windows: Sequence[Summary], u: Callable[[Alike], float]) -> None:
         """The reference may have stepped before these windows, each channel by `u` (relative). After `loosen` only."""

@@ -45,6 +45,8 @@ class Wander(Stated):
         found = np.zeros(len(quantities))
         for k, quantity in enumerate(quantities):
             kind = quantity.kind
+            if quantity.first:
+                continue
             if kind is OFFSET:
                 tilted = tilted_mps2 * self.of(TILT_WALK)
                 found[k] = (self.of(kind.walk) ** 2 + tilted**2) * scale**2

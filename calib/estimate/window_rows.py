@@ -190,7 +190,7 @@ class WindowRows:
 
     def with_its_lag(self, state: JointState, values: Array) -> Array:
         """The values (N,) of the state's quantities with the lag that was taken out of the window."""
-        own = np.array([q.kind is LAG and q.owner == self.summary.reference for q in state.quantities])
+        own = np.array([q.kind is LAG and q.owner == self.summary.reference and not q.first for q in state.quantities])
         return np.where(own, self.summary.lag_s, values)
 
     def _own(self, state: JointState, at: Array) -> tuple[Array, Array]:

@@ -56,7 +56,7 @@ def test_a_state_of_version_1_goes_on_whole(kept: bytes) -> None:
     assert [name for name, *_ in state["quantities"]] == names
     restored = taken.estimation.snapshot()["recursion"]
     n = len(names)
-    assert [name for name, *_ in restored["state"]["quantities"][n:]] == ["reference_drift"]
+    assert [name for name, *_ in restored["state"]["quantities"][n:]] == ["reference_drift"] * 2  # and its first value
     assert np.array_equal(restored["state"]["factor"][:n, :n], state["factor"])
     assert not restored["state"]["factor"][n:].any()  # no date of the certificate: the drift begins now
     assert np.array_equal(restored["state"]["mean"][:n], state["mean"])
@@ -86,7 +86,7 @@ def test_a_state_of_version_1_goes_on_whole(kept: bytes) -> None:
 )
 def test_a_name_of_version_1_becomes_a_kind(name: str, kind: str, position: str) -> None:
     owner = "KB12 0042" if KINDS[kind].of_reference else ""
-    assert brought_up([name])["quantities"] == [[name, kind, position, owner]]
+    assert brought_up([name])["quantities"] == [[name, kind, position, owner, False]]
 
 
 def brought_up(names: list[str]) -> dict[str, Any]:
