@@ -118,6 +118,25 @@ def test_restart_forgets_and_snapshot_goes_on_bit_for_bit() -> None:
     assert one.result().offset_s == 500.0
 
 
+def test_bursts_that_come_in_parts_give_the_same_clock() -> None:
+    """Bursts of 32 samples at 100 Hz for 26 s. 3 % of the samples are lost; the parts between arrive together.
+
+    Of 300 seeds, 2 gave an error of 10 ms and more as long as each part counted as a burst.
+    """
+    newest = np.arange(31, 2600, 32)
+    worst_s = []
+    for seed in range(300):
+        random = np.random.default_rng(seed)
+        arrival_s = newest / 100.0 + random.exponential(300e-6, len(newest))
+        before_hole = np.flatnonzero(random.random(newest[-1] + 1) < 0.03) - 1
+        index = np.union1d(before_hole[before_hole >= 0], newest)
+        model = ClockModel(100.0)
+        model.update(index, arrival_s[np.searchsorted(newest, index)])
+        every = np.arange(newest[-1])
+        worst_s.append(np.abs(model.result().time_of(every) - every / 100.0).max())
+    assert max(worst_s) < 0.5e-3
+
+
 def test_result_reads_only() -> None:
     _, index, arrival = polled(20.0, 1003.3, 0.02, seed=5)
     model = ClockModel(1000.0)
