@@ -208,7 +208,8 @@ _ARRAYS = ("mean", "factor", "stated_mean", "stated_u", "walked")
 
 def _square(wide: Array) -> Array:
     """The square factor with the same product L L' as `wide`."""
-    return np.ascontiguousarray(np.linalg.qr(wide.T, mode="r").T, dtype=np.float64)
+    factor = np.asarray(np.linalg.qr(wide.T, mode="r"), dtype=np.float64)
+    return np.ascontiguousarray(factor.T)
 
 
 def gain_of(jacobian: Array, factor: Array) -> Array:
