@@ -24,6 +24,7 @@ JUMP_SENSITIVITY = 0.1
 JUMP_OFFSET_MPS2 = 2.0
 SURELY = 1.6  # U = 2 u covers the errors 0 and d if u is d / 1.6
 SIGNIFICANT = 3.0  # standard uncertainties of a changed offset
+WIDER = 3.0  # the possible jump over the one that was found: else the reference would take the larger part of it
 
 
 def jumped(recursion: Recursion, held: Sequence[Summary], stability: float, limit: Limit) -> Recursion | None:
@@ -45,7 +46,9 @@ def jumped(recursion: Recursion, held: Sequence[Summary], stability: float, limi
         return max(stability, abs(step) / SURELY) if step else 0.0
 
     leaning = tilt_rad(np.where(significant, moved, 0.0), recursion.scale)
-    return _with_jump(recursion, held, leaning, u_reference, limit)
+    drifted = max((abs(after_drift - _value(recursion, name)) for name, after_drift in first.drifts), default=0.0)
+    found = float(np.abs(S).max()) / recursion.scale + drifted
+    return _with_jump(recursion, held, leaning, u_reference, limit, max(1.0, WIDER * found / JUMP_SENSITIVITY))
 
 
 def possible_jump(recursion: Recursion, held: Sequence[Summary]) -> Array:
@@ -67,10 +70,11 @@ def _with_jump(
     leaning_rad: float,
     u_reference: Callable[[Alike], float],
     limit: Limit,
+    wider: float = 1.0,
 ) -> Recursion | None:
     trial = recursion.copy()
     # A line that was plugged anew may be late by another time; that is no change of S or Q.
-    trial.loosen(possible_jump(recursion, held), leaning_rad, line=True)
+    trial.loosen(wider * possible_jump(recursion, held), leaning_rad, line=True)
     trial.suspect_reference(held, u_reference)
     for k, summary in enumerate(held):
         told = trial.innovation(summary)

@@ -24,7 +24,7 @@ from calib.estimate.gauss_newton import Flags
 from calib.estimate.innovation import Innovation, innovation
 from calib.estimate.joint_state import JointState
 from calib.estimate.linearised import Linearised
-from calib.estimate.quantities import ALL_RATES, GRAVITY, LAG, REFERENCE, Quantity
+from calib.estimate.quantities import ALL_RATES, GRAVITY, LAG, REFERENCE, REFERENCE_DRIFT, Quantity
 from calib.estimate.reference_step import Alike, alike
 from calib.estimate.window_rows import Noise, Summary, WindowRows
 from calib.estimate.window_state import WindowState
@@ -143,6 +143,16 @@ class Recursion(WindowState):
     def names(self) -> list[str]:
         """Of all quantities of the sensor, its mount and its present reference."""
         return [q.name for q in self._joint.state.quantities if q.owner in ("", self.reference) and not q.first]
+
+    @property
+    def drifts(self) -> list[tuple[str, float]]:
+        """(name, value) of the drift of each channel of the present reference, relative."""
+        state = self._joint.state
+        return [
+            (q.name, float(state.mean[k]))
+            for k, q in enumerate(state.quantities)
+            if q.kind is REFERENCE_DRIFT and q.owner == self.reference and not q.first
+        ]
 
     @property
     def references(self) -> list[str]:
