@@ -26,8 +26,9 @@ def check(config: Path) -> int:
     if loaded.zenoh.tls and (warning := expiry_warning(loaded.zenoh.tls.files, datetime.now(UTC))):
         click.echo(f"{config}: zenoh.tls.{warning}", err=True)
     for i, channel in enumerate(loaded.channels):
-        if overdue := channel.certificate.overdue(datetime.now(UTC)):
-            click.echo(f"{config}: channels.{i}.certificate.{overdue}", err=True)
+        for section, beside in zip(("", "check_reference."), channel.by_reference, strict=False):
+            if overdue := beside.certificate.overdue(datetime.now(UTC)):
+                click.echo(f"{config}: channels.{i}.{section}certificate.{overdue}", err=True)
     told = f"{poses} poses" + (f", {stops} positions that the agent finds" if stops else "")
     click.echo(f"{config}: good; {len(loaded.devices)} devices, {len(loaded.channels)} channels, {told}")
     return 0

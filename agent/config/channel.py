@@ -6,9 +6,9 @@ from typing import Annotated, Literal
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from agent.config.knowledge import Knowledge, Nine
+from agent.config.knowledge import Certificate, Knowledge, Nine
 from agent.config.pose import PoseInterval, Stop, tell_apart
-from agent.config.section import Name, Vector
+from agent.config.section import Name, Section, Vector
 from calib.geometry import beside
 from calib.model import Pose
 
@@ -18,11 +18,23 @@ SHORTEST_POSE_S = 0.1
 LEAST_LEANING_DEG = 5.0  # of a clamp, if alpha is found from gravity: 1 mg of offset is 0.7 deg of alpha there
 
 
+FEWEST_DISMISSING = 3  # of two references one may have two windows in a row
+
+
+class CheckReference(Section):
+    """A second reference: its device, its own certificate, and `rotation` if its axes are turned from the first's."""
+
+    device: Name
+    certificate: Certificate = Certificate()
+    rotation: Nine | None = None
+
+
 class Channel(Knowledge):
     """One sensor with its reference and its geometry."""
 
     sensor: Name
     reference: Name | None = None
+    check_reference: CheckReference | None = None
     coupling: Literal["dc", "ac"] = "dc"
     gravity_mps2: Annotated[float, Field(gt=9.7, lt=9.9)] = 9.80665
     static_sign: Literal[1, -1] = 1
@@ -62,6 +74,39 @@ class Channel(Knowledge):
     def fixed_mount(self) -> bool:
         """Whether the sensor is never turned against gravity. Its mean output then gives no information on S."""
         return self.rotation is not None or len(self.poses) == 1
+
+    @property
+    def by_reference(self) -> list[Channel]:
+        """The channel as it is beside each of its references: itself, then the one beside the second reference."""
+        check = self.check_reference
+        if check is None:
+            return [self]
+        other = {
+            "reference": check.device,
+            "certificate": check.certificate,
+            "rotation": check.rotation or self.rotation,
+        }
+        return [self, self.model_copy(update=other)]
+
+    @model_validator(mode="after")
+    def _second_reference(self) -> Channel:
+        check = self.check_reference
+        if check is None:
+            return self
+        if self.reference is None:
+            raise ValueError("check_reference is a second reference; name the first one in reference")
+        if check.rotation is not None and self.rotation is None:
+            raise ValueError("check_reference.rotation needs rotation of the first reference; add that, or remove it")
+        if check.rotation is not None:
+            beside([check.rotation[i : i + 3] for i in (0, 3, 6)])
+        if self.gate.dismiss_windows < FEWEST_DISMISSING:
+            raise ValueError(
+                f"gate.dismiss_windows {self.gate.dismiss_windows}: with check_reference it must be "
+                f"{FEWEST_DISMISSING} or more, so that sound windows of one reference do not dismiss those of the other"
+            )
+        if fault := self.by_reference[1].certificate_fault:
+            raise ValueError(f"check_reference: {fault}")
+        return self
 
     @model_validator(mode="after")
     def _schedule(self) -> Channel:

@@ -184,17 +184,20 @@ class Knowledge(Section):
     drift: DriftOptions = DriftOptions()
 
     @model_validator(mode="after")
-    def _certificate_lag(self) -> Knowledge:
-        if self.certificate.lag_s and not self.certificate.u_lag_s:
-            raise ValueError("certificate.lag_s needs certificate.u_lag_s")
+    def _agree(self) -> Knowledge:
+        if fault := self.certificate_fault:
+            raise ValueError(fault)
         return self
 
-    @model_validator(mode="after")
-    def _corners(self) -> Knowledge:
+    @property
+    def certificate_fault(self) -> str:
+        """What is wrong with the statements on the reference; "" if nothing is."""
+        if self.certificate.lag_s and not self.certificate.u_lag_s:
+            return "certificate.lag_s needs certificate.u_lag_s"
         if self.instrument.derivatives and self.instrument.has_corner:
             quantity = self.certificate.quantity
-            raise ValueError(f"a {quantity} reference has no corner frequency to undo; leave corner_hz and u_corner_hz")
-        return self
+            return f"a {quantity} reference has no corner frequency to undo; leave corner_hz and u_corner_hz"
+        return ""
 
     @property
     def instrument(self) -> Instrument:

@@ -18,11 +18,16 @@ def name_faults(raw: Mapping[str, Any]) -> Iterator[Told]:
     references = list(_each(raw, "channels", "reference"))
     yield from _twice(devices, "more than one device has the name {!r}; give each a name of its own")
     yield from _twice(sensors, "{!r} has more than one channel; leave one of them")
-    yield from _nowhere([*sensors, *references], [name for _, name in devices], "no device is called {!r}")
+    checks = list(_check_references(raw))
+    yield from _nowhere([*sensors, *references, *checks], [name for _, name in devices], "no device is called {!r}")
     own = {path[:2]: name for path, name in sensors}
-    for path, name in references:
+    first = {path[:2]: name for path, name in references}
+    for path, name in [*references, *checks]:
         if own.get(path[:2]) == name:
             yield path, "a sensor cannot be its own reference; name another device, or leave it out"
+    for path, name in checks:
+        if first.get(path[:2]) == name:
+            yield path, "the first reference cannot check itself; name another device, or remove check_reference"
     commands = raw.get("commands")
     keys = commands if isinstance(commands, Mapping) else {}
     yield from _twice(_within("commands", _each(keys, "keys", "id")), "the id {!r} is used more than once")
@@ -39,6 +44,16 @@ def _each(raw: Mapping[str, Any], section: str, field: str) -> Iterator[Told]:
             yield (section, i, field), found
         elif isinstance(found, list | tuple):
             yield from (((section, i, field, k), name) for k, name in enumerate(found) if isinstance(name, str))
+
+
+def _check_references(raw: Mapping[str, Any]) -> Iterator[Told]:
+    """The devices of the second references."""
+    entries = raw.get("channels")
+    for i, entry in enumerate(entries if isinstance(entries, list | tuple) else []):
+        check = entry.get("check_reference") if isinstance(entry, Mapping) else None
+        name = check.get("device") if isinstance(check, Mapping) else None
+        if isinstance(name, str):
+            yield ("channels", i, "check_reference", "device"), name
 
 
 def _within(section: str, told: Iterator[Told]) -> Iterator[Told]:

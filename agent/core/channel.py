@@ -14,10 +14,11 @@ from agent.core.corrected import acceleration_block
 from agent.core.estimation import DAY_S, Estimation
 from agent.core.events import Acceleration, CalibrationUpdate, Command, DeviceChange, Estimate, Output, Result, Tick
 from agent.core.fault import told
-from agent.core.identity import identity_of, nominal_of, not_certified
+from agent.core.identity import identity_of, nominal_of
 from agent.core.kept import keep, plain, shelved, take_up, update_of
 from agent.core.operators import CommandError, answer, commanded_pose
 from agent.core.outcome import Source, again, calibration_update, drift_report, estimate, status_change, window_report
+from agent.core.references import References
 from agent.core.run_time import RunTime
 from agent.core.streams import Streams, Verdict
 from agent.core.windows import refused
@@ -43,8 +44,7 @@ class ChannelState:
         self._streams = Streams(channel)
         self._unit = ""
         self._nominal: float | None = None  # sensitivity by the data sheet of the device
-        self._reference = ""  # identity
-        self._not_certified = ""  # why the certificate does not belong to the reference
+        self._references = References(channel)
         self._estimation: Estimation | None = None
         self._in_force: CalibrationUpdate | None = None
         self._kept: dict[str, bytes] = {}
@@ -94,10 +94,10 @@ class ChannelState:
                 return [self._told(reason)]
             return self._lose(f"{self.sensor} is lost: {change.message}")
         if self._estimation is not None:
-            self._estimation.lag_watch.began(self._estimation.recursion, change.device)
+            self._estimation.began(change.device)
         if change.device == self.sensor:
             return self._identify(change.info_json)
-        return self._identify_reference(change.info_json)
+        return self._identify_reference(change.device, change.info_json)
 
     def on_command(self, command: Command) -> list[Result]:
         """A command of an operator. A command that was refused before changes nothing."""
@@ -145,31 +145,24 @@ class ChannelState:
                 return self._change("INVALID", str(error))
             if identity in self._kept:
                 results, reason = self._remember(self._kept.pop(identity))
-            results += self._meet_reference()
+            results += self._meet_references()
         if self._status == "INVALID":
             # An open port does not prove that the sensor sends data: the status stays INVALID until a block comes.
             self._estimation.gate.lose("")
         return results + self._say_status(reason)
 
-    def _identify_reference(self, info_json: str) -> list[Result]:
-        before, self._reference = self._reference, identity_of(info_json)
-        self._not_certified = not_certified(info_json, self._channel.certificate)
-        results = self._meet_reference()
-        if not before or before == self._reference:
-            told = f"S and Q are not updated: {self._not_certified}"
-            return results + ([self._told(told)] if self._not_certified else [])
-        assert self._channel.reference is not None
-        self._streams.by_device[self._channel.reference].clear()
-        reason = self._not_certified or f"the reference is another device now: {self._reference} instead of {before}"
+    def _identify_reference(self, device: str, info_json: str) -> list[Result]:
+        place, before = self._references.identify(device, info_json)
+        now, not_certified = self._references.identities[place], self._references.not_certified[place]
+        results = self._meet_references()
+        if not before or before == now:
+            return results + ([self._told(f"S and Q are not updated: {not_certified}")] if not_certified else [])
+        self._streams.by_device[device].clear()
+        reason = not_certified or f"the reference is another device now: {now} instead of {before}"
         return results + (self._say_status(reason) or [self._told(reason)])
 
-    def _meet_reference(self) -> list[Result]:
-        """Tell the estimation which reference is connected, and what its certificate states now."""
-        if self._estimation is None or not self._reference or self._not_certified:
-            return []
-        certificate = self._channel.certificate
-        changed = self._estimation.meet(self._reference, certificate.calibrated, certificate.sensitivity)
-        return [self._put_in_force()] if changed else []
+    def _meet_references(self) -> list[Result]:
+        return [self._put_in_force()] if self._references.meet(self._estimation) else []
 
     def _clock_reports(self) -> list[Result]:
         return self._clocks.reports(self._source(), self._time.now_s, self._streams.by_device, self._estimation)
@@ -221,10 +214,13 @@ class ChannelState:
     def _close_windows(self) -> Iterator[Result]:
         """The results of all windows that are due. After a fault of the program its window is reported and not used."""
         for piece in self._streams.due(self._time.now_s):
+            place = self._streams.place
             if self._estimation is not None:
+                self._estimation.use(place)
                 self._estimation.date_certificate(self._first_day + self._time.now_s / DAY_S, self._time.utc_ns)
             try:
-                for verdict in self._streams.verdicts(piece, self._first_day, self._estimation, self._not_certified):
+                unusable = self._references.not_certified[place]
+                for verdict in self._streams.verdicts(piece, self._first_day, self._estimation, unusable):
                     yield from self._results(verdict)
             except MemoryError:
                 raise  # not caused by the data: a replay would not repeat it
@@ -232,6 +228,8 @@ class ChannelState:
                 fault = told(error)
                 reason = f"a fault of the program, not of the data; please report it: {fault}"
                 yield from self._refuse(refused(piece, reason), reason, fault)
+            if self._estimation is not None:
+                self._estimation.use(0)
 
     def _refuse(self, window: Window, reason: str, fault: str = "") -> Iterator[Result]:
         """Report a window that is not used. After a fault of the program, and after REFUSED_IN_A_ROW such windows,
@@ -290,7 +288,9 @@ class ChannelState:
         """State of the device that is connected now, for later runs."""
         assert self._estimation is not None
         day = self._first_day + self._time.now_s / DAY_S
-        return keep(self._channel, self._estimation, self._in_force, self._reference, day, self._time.utc_ns)
+        return keep(
+            self._channel, self._estimation, self._in_force, self._references.identities[0], day, self._time.utc_ns
+        )
 
     def memories(self) -> dict[str, bytes]:
         """`memory` by identity: of the device that is connected now and of those that were connected before."""
@@ -318,8 +318,7 @@ class ChannelState:
             **self._streams.snapshot(),
             "unit": self._unit,
             "identity": self.identity,
-            "reference": self._reference,
-            "not_certified": self._not_certified,
+            **self._references.snapshot(),
             "nominal": self._nominal,
             "estimation": None if self._estimation is None else self._estimation.snapshot(),
             "in_force": plain(self._in_force),
@@ -334,8 +333,8 @@ class ChannelState:
         """Take the state that `snapshot` gave."""
         self._time.load(state)
         self._streams.load(self._time.origin_ns, state)
-        self._unit, self.identity, self._reference = state["unit"], state["identity"], state["reference"]
-        self._not_certified = state["not_certified"]
+        self._unit, self.identity = state["unit"], state["identity"]
+        self._references.load(state)
         self._nominal, self._estimation = state["nominal"], None
         if state["estimation"] is not None:
             self._estimation = Estimation(self._channel, self._nominal)

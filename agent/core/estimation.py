@@ -10,11 +10,12 @@ import numpy as np
 
 from agent.config import Channel
 from agent.config.gate import GateSettings
-from agent.core.explaining import explained
+from agent.core.explaining import explained, most_likely
 from agent.core.gate import PROPOSALS_KEPT, Decision, Evidence, Gate
 from agent.core.jump import jumped, possible_jump, tilt_rad
 from agent.core.time_shift import Anew, LagWatch
 from agent.core.windows import Found
+from agent.core.witnesses import Witnesses
 from calib.estimate.correction import Law
 from calib.estimate.drift import DriftTest, DriftVerdict
 from calib.estimate.innovation import Innovation
@@ -59,21 +60,42 @@ class Estimation:
         Raises ValueError where nothing tells a sensitivity to begin with.
         """
         self._channel = channel
+        self._beside, self._place = channel.by_reference, 0
         mean = channel.prior.mean(nominal)
         u = channel.prior.standard_uncertainty(mean)
         fixed = channel.fixed_mount
-        self.recursion = Recursion(
-            mean, u, channel.priors(fixed_mount=fixed), channel.wander(), channel.temperature_model(), fixed=fixed
-        )
+        priors, *check = (beside.priors(fixed_mount=fixed) for beside in self._beside)
+        walks, temperature = channel.wander(), channel.temperature_model()
+        self.recursion = Recursion(mean, u, priors, walks, temperature, fixed=fixed, check=check)
         self.in_force, self.law = self.recursion.result(), self.recursion.law()
         self.residual_sd = self.recursion.residual_sd
         self.gate = Gate(_limits(channel, self.recursion.scale), self.in_force)
         self.drift = DriftTest(channel.drift.settings())
         self._held: list[Summary] = []
+        self._witnesses = Witnesses([beside.reference for beside in self._beside])
         self._proposed: list[tuple[Calibration, Recursion]] = []  # proposals whose windows the state did not take
         self._tried: Tried | None = None  # what `lag_after` did, for `judge` right after it
-        self.lag_watch = LagWatch(channel, self.gate.limit)
+        self._lag_watches = [LagWatch(beside, self.gate.limit) for beside in self._beside]
         self._explain_s: float | None = None  # time of the next explanation of held windows; None where none are held
+
+    def use(self, place: int) -> None:
+        """The next windows are of the reference at this place: 0 is the first one, 1 the second one."""
+        self._place = place
+        self.recursion.use(place)
+
+    @property
+    def lag_watch(self) -> LagWatch:
+        """The watch of the lag behind the reference in use."""
+        return self._lag_watches[self._place]
+
+    def began(self, device: str) -> None:
+        """A device or its line began anew: it may be late by another time from now on."""
+        present = self._place
+        for place, beside in enumerate(self._beside):
+            if device in (beside.sensor, beside.reference):
+                self.use(place)
+                self.lag_watch.began(self.recursion, device)
+        self.use(present)
 
     @property
     def lag_s(self) -> float:
@@ -84,10 +106,10 @@ class Estimation:
         return Summary.of(window, day, lag_s, temperature_degc, self.recursion.reference)
 
     def date_certificate(self, day: float, utc_ns: int) -> None:
-        """Tell the state the date of the reference's certificate. `utc_ns` is the UTC of `day`."""
-        dated = self._channel.certificate.date
-        if dated is not None:
-            self.recursion.date_certificate(day + (dated.timestamp() - utc_ns * 1e-9) / DAY_S)
+        """Tell the state the date of the certificate of the reference in use. `utc_ns` is the UTC of `day`."""
+        dated = self._beside[self._place].certificate.date
+        before_s = None if dated is None else utc_ns * 1e-9 - dated.timestamp()
+        self.recursion.date_certificate(None if before_s is None else day - before_s / DAY_S)
 
     def lag_after(self, windows: Sequence[Window], day: float, lag_s: float, temperature_degc: float) -> float:
         """The lag once these windows, made with `lag_s` taken out, were taken."""
@@ -129,8 +151,9 @@ class Estimation:
         confirm = self._channel.gate.confirm_windows
         held = [*self._held, summary][-confirm:]
         agree = len(held) == confirm and not self.lag_watch.beyond
-        stability = self._channel.certificate.stability_pct / 100.0
-        adopted = jumped(self.recursion, held, stability, self.gate.limit) if agree else None
+        stability = self._beside[self._place].certificate.stability_pct / 100.0
+        jump = jumped(self.recursion, held, stability, self.gate.limit) if agree else None
+        adopted, who = self._witnesses.judge(self.recursion, held, jump, self.gate.limit, self._place)
         evidence = Evidence(day * DAY_S, innovation.statistic, innovation.degrees_of_freedom)
         decision = self.gate.judge(evidence, candidate, None if adopted is None else adopted.result())
         if decision.action == "take":
@@ -139,8 +162,10 @@ class Estimation:
             assert adopted is not None
             self.recursion = adopted
             self.drift.restart(innovation.information > 0.0)
+            decision = replace(decision, reason=f"{decision.reason}{who}")
         kept = held if decision.action == "hold" else self._held
         self._held = kept[-self.gate.held :] if self.gate.held else []
+        self._witnesses.update(summary, taken=decision.action == "take", held=len(self._held))
         if self._explain_s is None and self._held:
             self._explain_s = evidence.t_s + self._channel.gate.explain_after_s
         drift: Sequence[DriftVerdict] = ()
@@ -156,7 +181,7 @@ class Estimation:
                 made = trial if decision.proposal is candidate else adopted
                 assert made is not None  # a proposal is one of the two
                 self._proposed = [*self._proposed, (decision.proposal, made.settled())][-PROPOSALS_KEPT:]
-            why = self.lag_watch.beyond or _most(innovation, self.recursion.scale)
+            why = self.lag_watch.beyond or most_likely(innovation, self.recursion.scale)
             decision = replace(decision, reason=f"{decision.reason}; {why}")
         news = self.lag_watch.taken(self.recursion) if decision.action in ("take", "adopt") else ""
         return Judged(decision, innovation, drift, news)
@@ -192,6 +217,7 @@ class Estimation:
         proposed = next((r for c, r in self._proposed if np.array_equal(c.covariance, calibration.covariance)), None)
         if proposed is not None:  # else the state has taken the windows of the proposal already
             self.recursion = proposed
+            self.use(self._place)
             self.drift.restart(np.ones(12, dtype=bool))
         self._put_in_force(calibration)
 
@@ -283,7 +309,8 @@ class Estimation:
             "in_force": _plain(self.in_force),
             "law": {name: getattr(self.law, name) for name in Law.__slots__},
             "residual_sd": self.residual_sd,
-            "lag_watch": self.lag_watch.snapshot(),
+            "lag_watches": [watch.snapshot() for watch in self._lag_watches],
+            "witnesses": self._witnesses.snapshot(),
             "explain_s": self._explain_s,
         }
 
@@ -297,7 +324,9 @@ class Estimation:
         self.in_force, self.law = Calibration(**state["in_force"]), Law(**state["law"])
         self.residual_sd = np.array(state["residual_sd"])
         self._explain_s = state["explain_s"]
-        self.lag_watch.load(state["lag_watch"])
+        self._witnesses.load(state["witnesses"])
+        for watch, kept in zip(self._lag_watches, state["lag_watches"], strict=False):
+            watch.load(kept)
 
 
 def _plain(calibration: Calibration) -> dict[str, Any]:
@@ -313,14 +342,3 @@ def _limits(channel: Channel, scale: float) -> GateSettings:
     if given.least_determined is None:
         filled["least_determined"] = FIXED_MOUNT_LEAST if channel.fixed_mount else len(PARAMETERS)
     return given.model_copy(update=filled)
-
-
-def _most(innovation: Innovation, scale: float) -> str:
-    """The parameter whose change alone explains a window best."""
-    size = np.abs(np.nan_to_num(innovation.score))
-    p = int(np.argmax(size))
-    if size[p] == 0.0:
-        return "no change of a single parameter explains the window"
-    change = innovation.score[p] / np.sqrt(innovation.information[p]) / scale
-    told = f"{change:+.3g} m/s2" if p >= 9 else f"{100.0 * change:+.3g} %"
-    return f"a change of {PARAMETERS[p]} by {told} explains it best ({size[p]:.1f} standard deviations)"

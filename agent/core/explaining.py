@@ -12,11 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from agent.core.gate import Limit
+from calib.estimate.innovation import Innovation
 from calib.estimate.quantities import OFFSET, Kind, Quantity
 from calib.estimate.recursion import Recursion
 from calib.estimate.window_rows import Summary
 from calib.geometry import STANDARD_GRAVITY_MPS2
-from calib.model import Array
+from calib.model import PARAMETERS, Array
 
 # Standard uncertainty with which an unknown is set free, by its unit: beyond what a mistake would hardly reach.
 FREE: Mapping[str, float] = {"rad": 0.2, "1": 0.2, "s": 0.02, "m/s2": 2.0, "Hz": 1.0}
@@ -155,3 +156,14 @@ def _settings(kind: Kind, fixed_mount: bool) -> tuple[str, ...]:
     if kind.prior is None:
         return ()
     return (kind.prior.at_fixed_mount if fixed_mount else ()) or kind.prior.configuration
+
+
+def most_likely(innovation: Innovation, scale: float) -> str:
+    """The parameter whose change alone explains a window best."""
+    size = np.abs(np.nan_to_num(innovation.score))
+    p = int(np.argmax(size))
+    if size[p] == 0.0:
+        return "no change of a single parameter explains the window"
+    change = innovation.score[p] / np.sqrt(innovation.information[p]) / scale
+    told = f"{change:+.3g} m/s2" if p >= 9 else f"{100.0 * change:+.3g} %"
+    return f"a change of {PARAMETERS[p]} by {told} explains it best ({size[p]:.1f} standard deviations)"

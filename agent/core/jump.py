@@ -32,7 +32,7 @@ def jumped(recursion: Recursion, held: Sequence[Summary], stability: float, limi
 
     `stability` is that of the reference in a year, relative. `limit` is that of the gate.
     """
-    first = _with_jump(recursion, held, 0.0, lambda _: JUMP_SENSITIVITY / SURELY, limit)
+    first = with_jump(recursion, held, 0.0, lambda _: JUMP_SENSITIVITY / SURELY, limit)
     if first is None:
         return None
     before, after = recursion.result(), first.result()
@@ -42,13 +42,13 @@ def jumped(recursion: Recursion, held: Sequence[Summary], stability: float, limi
 
     def u_reference(way: Alike) -> float:
         """Standard uncertainty of the part that the reference has in the step, relative."""
-        step = way.step(S, _value(first, way.name) - _value(recursion, way.name))
+        step = way.step(S, _value(first, way.key) - _value(recursion, way.key))
         return max(stability, abs(step) / SURELY) if step else 0.0
 
     leaning = tilt_rad(np.where(significant, moved, 0.0), recursion.scale)
     drifted = max((abs(after_drift - _value(recursion, name)) for name, after_drift in first.drifts), default=0.0)
     found = float(np.abs(S).max()) / recursion.scale + drifted
-    return _with_jump(recursion, held, leaning, u_reference, limit, max(1.0, WIDER * found / JUMP_SENSITIVITY))
+    return with_jump(recursion, held, leaning, u_reference, limit, max(1.0, WIDER * found / JUMP_SENSITIVITY))
 
 
 def possible_jump(recursion: Recursion, held: Sequence[Summary]) -> Array:
@@ -64,7 +64,7 @@ def tilt_rad(offset: Array, scale: float) -> float:
     return float(np.abs(offset).max(initial=0.0) / (scale * STANDARD_GRAVITY_MPS2))
 
 
-def _with_jump(
+def with_jump(
     recursion: Recursion,
     held: Sequence[Summary],
     leaning_rad: float,
@@ -72,6 +72,8 @@ def _with_jump(
     limit: Limit,
     wider: float = 1.0,
 ) -> Recursion | None:
+    """See `jumped`. `leaning_rad`: by how much a fixed mount may have leaned; `u_reference` by how much the reference
+    may have stepped, relative."""
     trial = recursion.copy()
     # A line that was plugged anew may be late by another time; that is no change of S or Q.
     trial.loosen(wider * possible_jump(recursion, held), leaning_rad, line=True)
@@ -84,5 +86,5 @@ def _with_jump(
     return trial
 
 
-def _value(recursion: Recursion, name: str) -> float:
-    return recursion.quantity(name)[0] if name in recursion.names else 0.0
+def _value(recursion: Recursion, key: str) -> float:
+    return recursion.quantity(key)[0] if key in [q.key for q in recursion.quantities] else 0.0

@@ -29,7 +29,9 @@ from calib.model import Pose
 
 # Settings on which the meaning of a state depends. Walks (process), gate and drift settings may change at any time.
 STATED = frozenset({"prior", "certificate", "uncertainty", "temperature", "gravity_mps2"})  # exchanged in the state
-MOUNT = frozenset({"rotation", "rotation_gravity_mps2", "clamp_theta_deg", "poses", "positions", "fixed_mount"})
+MOUNT = frozenset(
+    {"rotation", "rotation_gravity_mps2", "clamp_theta_deg", "poses", "positions", "fixed_mount", "check_rotation"}
+)
 WINDOWS = frozenset({"coupling", "static_sign"})  # by which windows are made, as is certificate.quantity
 MALFORMED = (ValueError, KeyError, TypeError, AttributeError, IndexError)  # a state of other fields or shapes
 
@@ -145,8 +147,10 @@ def update_of(state: dict[str, Any] | None) -> CalibrationUpdate | None:
 
 
 def _basis(channel: Channel) -> dict[str, str]:
-    included = set(STATED | MOUNT | WINDOWS) - {"poses", "positions", "fixed_mount"}
+    included = set(STATED | MOUNT | WINDOWS) - {"poses", "positions", "fixed_mount", "check_rotation"}
     whole: dict[str, Any] = channel.model_dump(mode="json", include=included) | {"fixed_mount": channel.fixed_mount}
+    if channel.check_reference is not None:
+        whole["check_rotation"] = channel.check_reference.rotation
     whole["poses"] = _by_position((pose_of(pose, channel), pose) for pose in channel.poses)
     stops = () if channel.positions == "free" else channel.positions
     whole["positions"] = _by_position(zip(channel.stops, stops, strict=True))

@@ -132,11 +132,14 @@ def from_version_2(state: dict[str, Any]) -> None:
     for holder in [state, *state.get("channels", {}).values()]:
         if holder.get("estimation"):
             _own(holder["estimation"], holder.get("reference") or "")
+    for channel in state.get("channels", {}).values():
+        channel["piece_number"] = 0
+        channel["references"], channel["not_certified"] = [channel.pop("reference")], [channel["not_certified"]]
 
 
 def _own(estimation: dict[str, Any], reference: str) -> None:
-    estimation |= {"proposed": [], "explain_s": None}
-    estimation["lag_watch"] = {"line": None, "unexplained": 0, "beyond": ""}
+    estimation |= {"proposed": [], "explain_s": None, "witnesses": []}
+    estimation["lag_watches"] = [{"line": None, "unexplained": 0, "beyond": ""}]
     recursion = estimation["recursion"]
     bound = recursion.pop("bound")
     for joint in (recursion["state"], recursion["base"]):
@@ -152,11 +155,11 @@ def _own(estimation: dict[str, Any], reference: str) -> None:
         joint["doubt"] = 1.0
     for summary in (*recursion["recent"], *estimation["held"]):
         summary["reference"] = reference
-    recursion["reference"], recursion["sensitivity"] = reference, None
+    recursion["mounted"], recursion["sensitivity"] = [reference], [None]
     recursion["references"] = {reference: None} if recursion["windows"] else {}
     recursion["certified_day"] = None
     recursion.setdefault("fixed", True)
-    recursion["stated"] = {"mean": None, "u": recursion.pop("prior_u"), "priors": None}
+    recursion["stated"] = [{"mean": None, "u": recursion.pop("prior_u"), "priors": None}]
     if recursion["held"] is not None:
         by = recursion["held"]["by"]
         keys = {quantity[0]: Quantity(*_with_kind(quantity)).key for quantity in recursion["state"]["quantities"]}

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from agent.config import Channel, PoseInterval
+from agent.config.knowledge import Nine
 from calib.excitation.pieces import pieces_of
 from calib.geometry import beside
 from calib.model import Pose
@@ -102,14 +103,18 @@ def pieces(channel: Channel, after_s: float, stances: Sequence[Stance] = ()) -> 
 
 def _stretches(channel: Channel, after_s: float) -> Iterator[tuple[float, float, Pose]]:
     if channel.rotation is not None:
-        rows = [channel.rotation[i : i + 3] for i in (0, 3, 6)]
-        yield 0.0, math.inf, beside(rows, channel.rotation_gravity_mps2)
+        yield 0.0, math.inf, pose_beside(channel.rotation, channel)
         return
     period_s = channel.poses_repeat_s
     for cycle in itertools.count(int(after_s // period_s)) if period_s and channel.poses else (0,):
         base_s = cycle * period_s if period_s else 0.0
         for interval in channel.poses:
             yield base_s + interval.start_s, base_s + interval.stop_s, pose_of(interval, channel)
+
+
+def pose_beside(rotation: Nine, channel: Channel) -> Pose:
+    """The pose beside a tri-axial reference with this rotation."""
+    return beside([rotation[i : i + 3] for i in (0, 3, 6)], channel.rotation_gravity_mps2)
 
 
 def pose_of(interval: PoseInterval, channel: Channel) -> Pose:

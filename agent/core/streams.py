@@ -11,7 +11,7 @@ import numpy as np
 from agent.config import Channel
 from agent.core.estimation import DAY_S, Estimation, Judged
 from agent.core.positions import FOUND_WITHIN_S, FoundPositions
-from agent.core.schedule import Piece, ToldTimes
+from agent.core.schedule import Piece, ToldTimes, pose_beside
 from agent.core.stream import DeviceStream
 from agent.core.time_shift import Anew
 from agent.core.windows import Found, margin_of, refused, windows_in
@@ -51,6 +51,8 @@ class Streams:
 
     def __init__(self, channel: Channel) -> None:
         self._channel = channel
+        self._beside = channel.by_reference
+        self._number = 0  # of the piece that is due next
         self.by_device: dict[str, DeviceStream] = {}
         self._finder = FoundPositions(channel) if channel.positions else None
         self._places = self._finder or ToldTimes(channel)
@@ -58,8 +60,24 @@ class Streams:
 
     def begin(self, origin_ns: int) -> None:
         """A new run, nothing is there yet."""
-        names = [self._channel.sensor] + ([self._channel.reference] if self._channel.reference else [])
-        self.by_device = {name: DeviceStream(name, origin_ns, self._horizon_s) for name in names}
+        names = [self._channel.sensor, *(beside.reference for beside in self._beside)]
+        self.by_device = {name: DeviceStream(name, origin_ns, self._horizon_s) for name in names if name}
+
+    @property
+    def place(self) -> int:
+        """The place of the reference of the piece that is due next.
+
+        Each piece has one reference, so that no sample of the sensor counts twice. The references take turns in the
+        order of Thue and Morse, A B B A B A A B and so on: in a round of positions that repeats, each position meets
+        both, and none has more than two pieces in a row.
+        """
+        return self._number.bit_count() % len(self._beside)
+
+    @property
+    def _in_use(self) -> dict[str, DeviceStream]:
+        """The streams of the sensor and of the reference of the piece that is due next."""
+        beside = self._beside[self.place]
+        return {name: self.by_device[name] for name in (beside.sensor, beside.reference) if name}
 
     def look_where(self, block: SampleBlock, estimation: Estimation) -> None:
         """Where nobody told how the sensor stands, gravity in its newest block may."""
@@ -83,6 +101,7 @@ class Streams:
         while (piece := self._places.piece) is not None and first_s is not None and self._due(piece, first_s, now_s):
             yield piece
             self._places.done(piece)
+            self._number += 1
         around_s = 2.0 * self._margin_s
         keep_from_s = now_s - around_s
         if first_s is not None:
@@ -101,6 +120,11 @@ class Streams:
         first_s = self._sensor.first_sample_s
         assert first_s is not None  # a piece was due
         missing = self._missing(piece, first_s)
+        beside = self._beside[self.place]
+        if self.place:
+            missing["check_reference"] = 1.0
+        if self.place and beside.rotation is not None:
+            piece = replace(piece, pose=pose_beside(beside.rotation, beside))
         for part in self._parts(piece, first_s):
             for verdict in self._of_part(part, first_s, first_day, estimation, unusable):
                 yield replace(verdict, window=told_in(verdict.window, missing))
@@ -108,7 +132,7 @@ class Streams:
     def _parts(self, piece: Piece, first_s: float) -> list[Piece]:
         """What lies between the breaks of both devices; the whole piece where no part of it is long enough."""
         start_s, stop_s = first_s + piece.start_s, first_s + piece.stop_s
-        breaks = [found for stream in self.by_device.values() for found in stream.breaks(start_s, stop_s)]
+        breaks = [found for stream in self._in_use.values() for found in stream.breaks(start_s, stop_s)]
         if not breaks:
             return [piece]
         parts, at_s = [], start_s
@@ -123,7 +147,7 @@ class Streams:
         beyond_s = self._channel.guard_s + FOUND_EDGE_S if self._finder else 0.0
         start_s, stop_s = first_s + piece.start_s - beyond_s, first_s + piece.stop_s + beyond_s
         numbers = {}
-        for name, stream in self.by_device.items():
+        for name, stream in self._in_use.items():
             of = "" if name == self._channel.sensor else "reference_"
             numbers[f"{of}missing_samples"] = stream.missing(start_s, stop_s)
             numbers[f"{of}restarts"] = len(stream.breaks(start_s, stop_s))
@@ -153,12 +177,12 @@ class Streams:
 
     def _look_for_restarts(self, start_s: float, stop_s: float, estimation: Estimation | None) -> None:
         """A device that began to count anew since the last part may be late by another time."""
-        for name, stream in self.by_device.items():
+        for name, stream in self._in_use.items():
             number = stream.run_number(start_s, stop_s)
             if number is not None and number != self._runs.get(name):
                 self._runs[name] = number
                 if estimation is not None:
-                    estimation.lag_watch.began(estimation.recursion, name)
+                    estimation.began(name)
 
     def snapshot(self) -> dict[str, Any]:
         """State for `load`, bit-exact."""
@@ -166,6 +190,7 @@ class Streams:
             "streams": {name: stream.snapshot() for name, stream in self.by_device.items()},
             "places": self._places.snapshot(),
             "run_numbers": dict(self._runs),
+            "piece_number": self._number,
         }
 
     def load(self, origin_ns: int, state: Mapping[str, Any]) -> None:
@@ -174,7 +199,7 @@ class Streams:
             n: DeviceStream.restore(n, origin_ns, s, self._horizon_s) for n, s in state["streams"].items()
         }
         self._places.load(state["places"])
-        self._runs = dict(state["run_numbers"])
+        self._runs, self._number = dict(state["run_numbers"]), state["piece_number"]
 
     @property
     def _sensor(self) -> DeviceStream:
@@ -182,20 +207,20 @@ class Streams:
 
     @property
     def _horizon_s(self) -> float:
-        around_s = 2.0 * most_margin_s(self._channel.instrument)
+        around_s = 2.0 * max(most_margin_s(beside.instrument) for beside in self._beside)
         return max(HORIZON_S, self._channel.window_s + around_s + (FOUND_WITHIN_S if self._finder else 0.0))
 
     @property
     def _margin_s(self) -> float:
-        return margin_of(self._channel, self.by_device)
+        return max(margin_of(beside, self.by_device) for beside in self._beside)
 
     def _due(self, piece: Piece, first_s: float, now_s: float) -> bool:
         end_s = first_s + piece.stop_s + self._margin_s
-        return now_s > end_s + self._channel.late_horizon_s or all(s.reaches(end_s) for s in self.by_device.values())
+        return now_s > end_s + self._channel.late_horizon_s or all(s.reaches(end_s) for s in self._in_use.values())
 
     def _unsound(self, start_s: float, stop_s: float) -> str:
         """Which device shows a number that nothing can be computed from, and which; "" where none does."""
-        for name, stream in self.by_device.items():
+        for name, stream in self._in_use.items():
             cut = stream.cut(start_s - self._margin_s, stop_s + self._margin_s)
             if cut is None:
                 continue
@@ -222,7 +247,7 @@ class Streams:
         """The windows, made again until no lag is left in them that matters; what a search for another lag found."""
 
         def make(lag_s: float) -> Found:
-            return windows_in(piece, first_s, self._channel, self.by_device, lag_s)
+            return windows_in(piece, first_s, self._beside[self.place], self.by_device, lag_s)
 
         if estimation is None or self._channel.reference is None:
             lag_s = 0.0 if estimation is None else estimation.lag_s

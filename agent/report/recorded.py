@@ -125,34 +125,37 @@ class _Windows:
 
     def trace(self, window: WindowReport) -> Trace | None:
         """The points of a window; None if its pose or its samples cannot be found."""
-        first_s = self._streams[self._channel.sensor].first_sample_s
-        pose = self._pose(window)
+        place = int(window.numbers.get("check_reference", 0.0))
+        channel = self._channel.by_reference[place]
+        first_s = self._streams[channel.sensor].first_sample_s
+        pose = _pose(channel, window)
         if first_s is None or pose is None:
             return None
         start_s, stop_s = first_s + window.start_s, first_s + window.stop_s
-        cut = self._streams[self._channel.sensor].cut(start_s, stop_s)
+        cut = self._streams[channel.sensor].cut(start_s, stop_s)
         if cut is None:
             return None
-        if self._channel.reference is None:
+        if channel.reference is None:
             whole = np.isfinite(cut.values).all(axis=1)
             nothing = np.empty((int(whole.sum()), 0))
             return Trace(cut.time_s[whole] - first_s, cut.values[whole], nothing, nothing, pose)
-        around_s = margin_of(self._channel, self._streams)
-        reference = self._streams[self._channel.reference].cut(start_s - around_s, stop_s + around_s)
+        around_s = margin_of(channel, self._streams)
+        reference = self._streams[channel.reference].cut(start_s - around_s, stop_s + around_s)
         lag_s = window.numbers.get("lag_applied_s", 0.0)
-        instrument, span_s = self._channel.instrument, (start_s, stop_s)
+        instrument, span_s = channel.instrument, (start_s, stop_s)
         found = None if reference is None else aligned(cut, reference, instrument, span_s, lag_s)
         if found is None:
             return None
         points = found.points
         return Trace(points.time_s - first_s, points.V, points.u, points.du, pose)
 
-    def _pose(self, window: WindowReport) -> Pose | None:
-        """The pose of the sensor in the middle of the window."""
-        middle_s = 0.5 * (window.start_s + window.stop_s)
-        schedule: Iterator[Pose] = (
-            piece.pose
-            for piece in itertools.takewhile(lambda p: p.start_s <= middle_s, pieces(self._channel, 0.0))
-            if middle_s <= piece.stop_s
-        )
-        return next(schedule, None)
+
+def _pose(channel: Channel, window: WindowReport) -> Pose | None:
+    """The pose of the sensor in the middle of the window."""
+    middle_s = 0.5 * (window.start_s + window.stop_s)
+    schedule: Iterator[Pose] = (
+        piece.pose
+        for piece in itertools.takewhile(lambda p: p.start_s <= middle_s, pieces(channel, 0.0))
+        if middle_s <= piece.stop_s
+    )
+    return next(schedule, None)

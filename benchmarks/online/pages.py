@@ -10,7 +10,7 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from benchmarks.online import agreement, bench, cost, coverage, day, drifting, harm, touched, year
+from benchmarks.online import agreement, bench, cost, coverage, day, drifting, harm, references, touched, year
 from benchmarks.page import PAGE, machine, write_part
 from hw.virtual.building import Building
 from hw.virtual.harm import KINDS
@@ -120,6 +120,12 @@ def _drift(workers: int, runs: int | None) -> tuple[Path, str]:
     return ONLINE, "\n".join([drifting.HEADER, *rows])
 
 
+def _references(workers: int, runs: int | None) -> tuple[Path, str]:
+    seeds = range(references.SEED, references.SEED + (runs or references.RUNS))
+    jobs = {name: [(role, seed, True) for seed in seeds] for name, role in references.KINDS.items()}
+    return ONLINE, references.table([(name, spread(references.one, own, workers)) for name, own in jobs.items()])
+
+
 def _cost(_workers: int, runs: int | None) -> tuple[Path, str]:
     return PAGE, cost.table(cost.measure(runs or cost.TIMING.windows))
 
@@ -132,6 +138,7 @@ PARTS: dict[str, Callable[[int, int | None], tuple[Path, str]]] = {
     "coverage": _coverage,
     "touched": _touched,
     "drift": _drift,
+    "references": _references,
     "day": _day,
     "cost": _cost,
 }

@@ -66,7 +66,7 @@ class Recursion(WindowState):
     def lag_s(self) -> float:
         """By how much the sensor's indications come after the reference's; as stated before any window told."""
         state, key = self._joint.state, Quantity("lag", LAG, owner=self.reference).key
-        return float(state.mean[state.index(key)]) if key in state else self._stated.priors.of(LAG.mean)
+        return float(state.mean[state.index(key)]) if key in state else self._beside[self._place].priors.of(LAG.mean)
 
     @property
     def determined(self) -> Flags:
@@ -192,7 +192,7 @@ class Recursion(WindowState):
             if "lean" in quantity.kind.loosened_by and self._fixed:
                 u[k] = tilt_rad
             elif "line" in quantity.kind.loosened_by and line and quantity.owner == self.reference:
-                u[k] = self._stated.priors.of(quantity.kind.prior)
+                u[k] = self._beside[self._place].priors.of(quantity.kind.prior)
         self._spread(u)
 
     def _spread(self, u: Array) -> None:
@@ -204,7 +204,7 @@ class Recursion(WindowState):
         self._joint.base = state.copy()
 
     def remount(self, *, of_reference: bool) -> None:
-        """The sensor was mounted again, or the present reference was: what a mount decides may be another from now on.
+        """The sensor was mounted again, or the reference in use was: what a mount decides may be another from now on.
 
         The old value stays in the new one, which is a little too uncertain if all was mounted anew, and right if it was
         not.
@@ -214,9 +214,10 @@ class Recursion(WindowState):
             self._held.unmount(self._joint)
             self._held = None
         state = self._joint.state
+        owners = [self.reference] if of_reference else ["", *self._mounted]
         u = np.zeros(len(state))
         for k, quantity in enumerate(state.quantities):
-            there = quantity.owner in ("", self.reference) and (quantity.kind.of_reference or not of_reference)
+            there = quantity.owner in owners and (quantity.kind.of_reference or not of_reference)
             if there and not quantity.first and "remount" in quantity.kind.loosened_by:
                 u[k] = state.stated_u[k]
         self._spread(u)
@@ -228,26 +229,30 @@ class Recursion(WindowState):
             state.suspect(u(step) * step.change)
         self._joint.base = state.copy()
 
-    def date_certificate(self, day: float) -> None:
-        """The date of the certificate of the present reference. Its drift counts from there."""
+    def date_certificate(self, day: float | None) -> None:
+        """The date of the certificate of the reference in use; its drift counts from there. None: no date is stated."""
         self._joint.certified_day = day
 
+    def use(self, place: int) -> None:
+        """The next windows are of the reference at this place. Both are mounted all the time: nothing is loosened."""
+        self._place = place
+
     def meet(self, reference: str, calibrated: str = "", sensitivity: float = 1.0) -> bool:
-        """Another reference is used from now on. What is known of the reference before stays, and comes back with it.
+        """Another reference takes the place of the one in use. What is known of that one stays, and comes back with it.
 
         `calibrated` is the date of its certificate, "" where none is stated: a reference that was calibrated again is
         another one. `sensitivity` is that of its certificate. What the certificate states is exchanged for what was
         stated of this reference before. Returns whether that changed S or Q.
         """
         owner = self._owner(reference, calibrated)
-        back = owner != self.reference and owner in self._references
-        before = self._references.get(owner) or sensitivity
-        if before != sensitivity or self._before.of_references_differ(self._stated):
+        back = owner not in self._mounted and owner in self._references
+        before, stated = self._references.get(owner) or sensitivity, self._beside[self._place]
+        if before != sensitivity or self._before[self._place].of_references_differ(stated):
             self._absorb(len(self._joint.recent))  # these windows were made with other statements
         if before != sensitivity:
             self._joint.shift(REFERENCE, owner, before / sensitivity, before / sensitivity - 1.0)
             self._references[owner] = sensitivity
-        self.reference, self._sensitivity = owner, sensitivity
+        self._mounted[self._place], self._sensitivity[self._place] = owner, sensitivity
         changed = self._restate(owner)
         if back:
             self.remount(of_reference=True)
@@ -261,7 +266,7 @@ class Recursion(WindowState):
             if self._held is not None:
                 self._held = Held(self._held.mps2, {keys[key]: moves for key, moves in self._held.by.items()})
             self._references = {(dated if of == reference else of): s for of, s in self._references.items()}
-            self.reference = dated if self.reference == reference else self.reference
+            self._mounted = [dated if of == reference else of for of in self._mounted]
         if calibrated:
             return dated
         return next((known for known in reversed(self._references) if known.startswith(reference + DATED)), reference)
@@ -280,11 +285,13 @@ class Recursion(WindowState):
         return self._restate("")
 
     def _restate(self, reference: str) -> bool:
-        changed = self._stated.restate(self._joint, self._before, self._held, reference)
+        place = self._place
+        changed = self._beside[place].restate(self._joint, self._before[place], self._held, reference)
         if changed:
             self._take_again()
             self._settle()
-        self._before = self._before.now(self._stated, of_reference=bool(reference))
+        for k, stated in enumerate(self._beside):
+            self._before[k] = self._before[k].now(stated, of_reference=bool(reference) and k == place)
         return changed
 
     def put(self, calibration: Calibration) -> None:
@@ -304,10 +311,10 @@ class Recursion(WindowState):
     def snapshot(self) -> dict[str, Any]:
         """All that changes, exactly."""
         return self._joint.snapshot() | {
-            "stated": self._before.snapshot(),
-            "reference": self.reference,
+            "stated": [before.snapshot() for before in self._before],
+            "mounted": list(self._mounted),
             "references": dict(self._references),
-            "sensitivity": self._sensitivity,
+            "sensitivity": list(self._sensitivity),
             "positions": list(self._positions),
             "noise": asdict(self._noise),
             "day": self._day,
@@ -325,9 +332,10 @@ class Recursion(WindowState):
         Unknowns that an older version of the program did not have come in with their priors.
         """
         self._joint = Linearised.load(state)
-        self._before = Before.load(state["stated"], self._stated)
-        self.reference, self._references = state["reference"], dict(state["references"])
-        self._sensitivity = state["sensitivity"]
+        self._place, self._references = 0, dict(state["references"])
+        for place, stated in enumerate(self._beside[: len(state["mounted"])]):
+            self._before[place] = Before.load(state["stated"][place], stated)
+            self._mounted[place], self._sensitivity[place] = state["mounted"][place], state["sensitivity"][place]
         self._positions = list(state["positions"])
         self._noise = Noise(**state["noise"])
         self._day = state["day"]

@@ -19,15 +19,16 @@ from calib.model import Array
 
 ALIKE = 1e-6  # relative: changes of S with smaller singular values were not excited
 SIGNIFICANT = 3.0  # standard uncertainties of a step
+SAME_SLOPES = 0.1  # of the effect of a step: if the change of S leaves more of it, the windows tell the two apart
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alike:
-    """A change (N,) of the state that does not change the slopes of the windows: 1 in the drift `name` of a channel of
-    the reference, and S as it must change with it. `u` is the standard uncertainty with which the windows tell S along
-    it, relative."""
+    """A change (N,) of the state that does not change the slopes of the windows: 1 in the drift with this key of a
+    channel of a reference, and S as it must change with it. `u` is the standard uncertainty with which the windows tell
+    S along it, relative."""
 
-    name: str
+    key: str
     change: Array
     u: float
 
@@ -40,7 +41,10 @@ class Alike:
 
 
 def alike(windows: Sequence[Rows], state: JointState) -> list[Alike]:
-    """One for each channel of the reference that drifts and moves in these windows; their rows, at the state."""
+    """One for each channel of a reference that drifts and moves in these windows; their rows, at the state.
+
+    None for a channel whose step these windows tell from a change of S, because another reference moves in them too.
+    """
     slopes = np.vstack([rows.jacobian[: rows.slopes] for rows in windows])
     found = []
     for k, quantity in enumerate(state.quantities):
@@ -48,6 +52,7 @@ def alike(windows: Sequence[Rows], state: JointState) -> list[Alike]:
             change = np.zeros(len(state))
             change[k] = 1.0
             change[:9] = np.linalg.lstsq(slopes[:, :9], -slopes[:, k], rcond=ALIKE)[0]
-            told = float(np.linalg.norm(slopes[:, :9] @ change[:9]))
-            found.append(Alike(quantity.name, change, 1.0 / told))
+            told, left = (float(np.linalg.norm(slopes[:, :n] @ change[:n])) for n in (9, len(state)))
+            if left < SAME_SLOPES * told:
+                found.append(Alike(quantity.key, change, 1.0 / told))
     return found

@@ -16,6 +16,8 @@ along gravity (by 1.9 % for a drift of 0.24 m/s2).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Self
 
 import numpy as np
@@ -39,7 +41,8 @@ class WindowState:
     """S, Q and all nuisances as one state, from the windows taken so far.
 
     `mean` and `standard_uncertainty` (12,) are what was known of S, Q beforehand, in output units; `fixed` mounts do
-    not turn. Days count from any origin.
+    not turn. Days count from any origin. `check` are the priors beside further references, which are mounted all the
+    time as the first one is. The first has place 0, the next one has place 1.
     """
 
     def __init__(
@@ -51,16 +54,18 @@ class WindowState:
         temperature: TemperatureModel,
         *,
         fixed: bool,
+        check: Sequence[Priors] = (),
     ) -> None:
         mean, standard_uncertainty = np.array(mean, dtype=float), np.array(standard_uncertainty, dtype=float)
         self._stated = Beforehand(mean, standard_uncertainty, priors, wander, temperature)
-        self._before = Before.of(
-            self._stated
-        )  # with what the state was made; differs only between `load` and `restate`
+        self._beside = [self._stated, *(replace(self._stated, priors=other) for other in check)]  # by place
+        # With what the state was made, by place; differs only between `load` and `restate`.
+        self._before = [Before.of(stated) for stated in self._beside]
         self._fixed = fixed
         self.scale = self._stated.scale
-        self.reference = ""
-        self._sensitivity = 1.0  # of the present reference, by its certificate
+        self._place = 0  # of the reference in use
+        self._mounted = [""] * len(self._beside)  # the references by place
+        self._sensitivity = [1.0] * len(self._beside)  # of these references, by their certificates
         self._references: dict[str, float] = {}  # the same of every reference whose unknowns are kept, last use last
         self._joint = Linearised(self._stated.state())
         self._positions: list[str] = []
@@ -70,6 +75,11 @@ class WindowState:
         self._residual_sd = np.full(3, np.nan)
         self._held: Held | None = None  # at a fixed mount, from the first window on
         self.windows = 0
+
+    @property
+    def reference(self) -> str:
+        """The reference in use: that of the next windows."""
+        return self._mounted[self._place]
 
     def settled(self) -> Self:
         """A copy in which all windows are in the base: it holds no summary of a window."""
@@ -83,7 +93,8 @@ class WindowState:
         other = object.__new__(type(self))
         other.__dict__.update(self.__dict__)
         other._joint, other._positions = self._joint.copy(), list(self._positions)
-        other._references = dict(self._references)
+        other._references, other._before = dict(self._references), list(self._before)
+        other._mounted, other._sensitivity = list(self._mounted), list(self._sensitivity)
         return other
 
     def _take(self, rows: WindowRows, wandered: JointState) -> None:
@@ -106,7 +117,12 @@ class WindowState:
     def _rows(self, summary: Summary) -> WindowRows:
         reference_degc = self._stated.temperature.reference_degc
         held = self._held.mps2 if self._held is not None else np.zeros(3) if self._fixed else None
-        return WindowRows(summary, self._stated.priors, self.scale, reference_degc, held, self._seen_degc)
+        priors = self._beside[self._place_of(summary.reference)].priors
+        return WindowRows(summary, priors, self.scale, reference_degc, held, self._seen_degc)
+
+    def _place_of(self, reference: str) -> int:
+        """The place of a reference; that of the first one if the reference is not mounted."""
+        return self._mounted.index(reference) if reference in self._mounted else 0
 
     @property
     def _seen_degc(self) -> tuple[float, float]:
@@ -123,7 +139,7 @@ class WindowState:
     def _mount(self, summary: Summary, day: float) -> None:
         """At the first window of a fixed mount: Q gives its place to the mean output there."""
         if self._fixed and self._held is None and np.isfinite(summary.held_mps2).all():
-            self._held, terms = held_at(summary, self._stated.priors)
+            self._held, terms = held_at(summary, self._beside[self._place_of(summary.reference)].priors)
             self._held.mount(self._joint, terms, day)
 
     def _unmount(self, held: Held) -> None:
@@ -141,7 +157,8 @@ class WindowState:
         rows = self._rows(summary)
         new = self._joint.append(rows.terms, day)
         if new and self._held is not None:
-            self._held = self._held.moved_by(held_at(summary, self._stated.priors)[0], new)
+            priors = self._beside[self._place_of(summary.reference)].priors
+            self._held = self._held.moved_by(held_at(summary, priors)[0], new)
         return rows
 
     def _taken(self, before: JointState, since: float | None, rows: WindowRows) -> JointState:
@@ -191,7 +208,7 @@ class WindowState:
 
     def _keep_references(self, reference: str) -> None:
         self._references.pop(reference, None)
-        self._references[reference] = self._sensitivity
+        self._references[reference] = self._sensitivity[self._place_of(reference)]
         while len(self._references) > MOST_REFERENCES:
             oldest = next(iter(self._references))
             del self._references[oldest]

@@ -1,4 +1,4 @@
-"""A sensor fixed in a building beside a tri-axial reference: blocks as a gateway receives them, and the truth.
+"""A sensor fixed in a building beside a tri-axial reference, or two: blocks as a gateway receives them, and the truth.
 
 Data are generated in visits, for years. In each visit the building moves for one window, with a level and a direction
 drawn for this visit. Between two visits nothing is generated, but clocks, sample numbers, temperature, tilt and drift
@@ -27,12 +27,13 @@ TEMPERATURE_STEP_K = 1 / 16  # resolution of the thermometer in a common chip
 STREAMS: dict[Role, tuple[Stream, Stream]] = {
     "sensor": (Stream.SENSOR, Stream.SENSOR_ARRIVAL),
     "reference": (Stream.REFERENCE, Stream.REFERENCE_ARRIVAL),
+    "check": (Stream.CHECK_REFERENCE, Stream.CHECK_REFERENCE_ARRIVAL),
 }
 
 
 @dataclass(frozen=True, slots=True)
 class Instrument:
-    """One of the two devices: its clock and its white noise.
+    """One of the devices: its clock and its white noise.
 
     It sends its samples in bursts of `burst`. `late` gives the delay of a burst after its newest sample.
     """
@@ -100,6 +101,11 @@ class BuildingParameters:
             0.001, Clock(200.0, rate_error=-0.6e-4, offset_s=0.0004, wander=10e-6, wander_period_s=2700.0)
         )
     )
+    check: Instrument | None = None  # a second reference
+    check_sensitivity: Array = field(default_factory=lambda: np.eye(3))  # as `reference_sensitivity`, of the second
+    reference_steps: tuple[
+        tuple[Role, float, float], ...
+    ] = ()  # (which, time in s, factor of its indication from then)
     lead_s: float = 3.0  # data before and after each window, for guards and filters
     block_s: float = 10.0
 
@@ -134,12 +140,16 @@ class Building:
         self.harmed_from = harmed_from
 
     def infos(self) -> dict[str, DeviceInfo]:
-        """The two devices by name, in the order in which they are opened."""
-        p = self.parameters
+        """The devices by name, in the order in which they are opened."""
         return {
             role: DeviceInfo("serial-csv", "virtual", f"building-{role}", "m/s2", 3, instrument.clock.nominal_rate_hz)
-            for role, instrument in (("sensor", p.sensor), ("reference", p.reference))
+            for role, instrument in self._instruments().items()
         }
+
+    def _instruments(self) -> dict[Role, Instrument]:
+        p = self.parameters
+        devices: dict[Role, Instrument | None] = {"sensor": p.sensor, "reference": p.reference, "check": p.check}
+        return {role: instrument for role, instrument in devices.items() if instrument is not None}
 
     def span(self, visit: int) -> tuple[float, float]:
         """Start and end of the data of a visit, s."""
@@ -167,11 +177,11 @@ class Building:
         return float(np.exp(generator(self.seed, Stream.BUILDING_MOTION, visit).uniform(low, high)))
 
     def visit(self, visit: int) -> list[SampleBlock]:
-        """All blocks of a visit, of both devices, in order of arrival."""
+        """All blocks of a visit, of all devices, in order of arrival."""
         harm = self.harm if visit >= self.harmed_from else HARMLESS
         motion = self._motion(visit, Stream.BUILDING_MOTION)
         elsewhere = self._motion(visit, Stream.BUILDING_HARM)
-        blocks = [block for role in STREAMS for block in self._device(role, visit, harm, motion, elsewhere)]
+        blocks = [block for role in self._instruments() for block in self._device(role, visit, harm, motion, elsewhere)]
         return sorted(blocks, key=lambda block: block.t_monotonic_ns)
 
     def _motion(self, visit: int, stream: Stream) -> BuildingMotion:
@@ -190,7 +200,7 @@ class Building:
         self, role: Role, visit: int, harm: Harm, motion: BuildingMotion, elsewhere: BuildingMotion
     ) -> list[SampleBlock]:
         p = self.parameters
-        instrument = p.sensor if role == "sensor" else p.reference
+        instrument = self._instruments()[role]
         start_s, stop_s = self.span(visit)
         begun, done = instrument.bursts(start_s), instrument.bursts(stop_s)
         first = begun * instrument.burst
@@ -215,7 +225,7 @@ class Building:
 
     def _arrivals(self, role: Role, visit: int, newest_s: Array) -> Array:
         """Arrival times (B,) of bursts with these newest samples (B,); they never decrease."""
-        late = (self.parameters.sensor if role == "sensor" else self.parameters.reference).late
+        late = self._instruments()[role].late
         random, n = generator(self.seed, STREAMS[role][1], visit), len(newest_s)
         by = late.least_late_s + random.exponential(late.mean_late_s, n)
         by += (random.random(n) < late.stall_probability) * random.uniform(0.3, 1.0, n) * late.longest_stall_s
@@ -224,8 +234,10 @@ class Building:
     def _shown(self, role: Role, time_s: float, moved: Array) -> Array:
         """Indications (n, 3) without noise: V = S (R a_ref + g) + Q for the sensor, S_ref a_ref for the reference."""
         p = self.parameters
-        if role == "reference":
-            return moved @ p.reference_sensitivity.T
+        if role != "sensor":
+            sensitivity = p.reference_sensitivity if role == "reference" else p.check_sensitivity
+            factors = [factor for which, since_s, factor in p.reference_steps if which == role and time_s >= since_s]
+            return moved @ sensitivity.T * float(np.prod(factors))
         truth = self.truth(time_s)
         return moved @ (truth.sensitivity @ p.rotation).T + truth.mean_output
 
@@ -233,7 +245,7 @@ class Building:
         p = self.parameters
         arrivals_ns = np.round(reads_s * 1e9).astype(np.int64)
         degc = round(p.weather.at(float(reads_s[-1])) / TEMPERATURE_STEP_K) * TEMPERATURE_STEP_K
-        clock = p.sensor.clock if role == "sensor" else p.reference.clock
+        clock = self._instruments()[role].clock
         return SampleBlock(
             role, "boot", EPOCH_NS + int(arrivals_ns[-1]), first, clock.nominal_rate_hz, arrivals_ns,
             (due - first).astype(np.int32), np.ascontiguousarray(values),

@@ -13,7 +13,7 @@ from hw.block import BlockFlags, SampleBlock
 from hw.virtual.schedule import rotation
 
 Array = NDArray[np.float64]
-Role = Literal["sensor", "reference"]
+Role = Literal["sensor", "reference", "check"]
 
 
 class Motion(Protocol):

@@ -25,6 +25,8 @@ class Stream(IntEnum):
     PRESET = 9
     BUILDING_MOTION = 10
     BUILDING_HARM = 11
+    CHECK_REFERENCE = 12
+    CHECK_REFERENCE_ARRIVAL = 13
 
 
 def generator(seed: int, stream: Stream, block: int = 0) -> np.random.Generator:

@@ -1,0 +1,51 @@
+"""The references of a channel that are connected: their identities, and whether their certificates belong to them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from agent.config import Channel
+from agent.core.estimation import Estimation
+from agent.core.identity import identity_of, not_certified
+
+
+class References:
+    """The first reference of a channel has place 0, the second one, if there is one, place 1.
+
+    `not_certified` says by place why a reference may not be used, "" if it may.
+    """
+
+    def __init__(self, channel: Channel) -> None:
+        self._beside = channel.by_reference
+        self.identities = [""] * len(self._beside)
+        self.not_certified = [""] * len(self._beside)
+
+    def identify(self, device: str, info_json: str) -> tuple[int, str]:
+        """A reference was opened. Returns its place, and the identity of the device that was there before."""
+        place = [beside.reference for beside in self._beside].index(device)
+        before, self.identities[place] = self.identities[place], identity_of(info_json)
+        self.not_certified[place] = not_certified(info_json, self._beside[place].certificate)
+        return place, before
+
+    def meet(self, estimation: Estimation | None) -> bool:
+        """Tell the estimation which references are connected, and what their certificates state now.
+
+        Returns whether the calibration in force changed.
+        """
+        changed = False
+        for place, beside in enumerate(self._beside):
+            if estimation is not None and self.identities[place] and not self.not_certified[place]:
+                certificate = beside.certificate
+                estimation.use(place)
+                changed |= estimation.meet(self.identities[place], certificate.calibrated, certificate.sensitivity)
+                estimation.use(0)
+        return changed
+
+    def snapshot(self) -> dict[str, Any]:
+        """State for `load`, bit-exact."""
+        return {"references": list(self.identities), "not_certified": list(self.not_certified)}
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        """Take the state that `snapshot` gave."""
+        self.identities, self.not_certified = list(state["references"]), list(state["not_certified"])

@@ -1,0 +1,224 @@
+"""Two references beside one sensor: each has its own unknowns, and two devices name the third one that made a step."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from agent.cli.main import run_cli
+from agent.config import parse_config
+from agent.core.estimation import Estimation, Judged
+from calib.estimate.quantities import ROTATION
+from tests.building_windows import GRAVITY, building_window
+from tests.clamp_windows import S_TRUE
+from tests.unit.test_check import GOOD
+
+SYY, STEP = 4, 0.03
+ALONG_Y = np.array([0.0, STEP, 0.0])
+FIRST, SECOND = 0, 1
+TURNS = (0, 1, 1, 0, 1, 0, 0, 1) * 4
+STEPPED = {"first": {FIRST: {"reference_error": ALONG_Y}}, "second": {SECOND: {"reference_error": ALONG_Y}}}
+SENSOR = {place: {"S": S_TRUE * (1 + ALONG_Y)} for place in (FIRST, SECOND)}
+
+
+def estimation(stability_pct: float = 0.5, **check: Any) -> Estimation:
+    """The second reference is less certain than the first one."""
+    certificate = {"u_sensitivity_pct": 0.1, "stability_pct": stability_pct}
+    devices = [
+        {"name": name, "driver": "serial-csv", "options": {"port": name, "rate_hz": 50.0, "axes": 3}} for name in "src"
+    ]
+    channel = {
+        "sensor": "s",
+        "reference": "r",
+        "check_reference": {"device": "c", "certificate": certificate | {"u_sensitivity_pct": 0.2}} | check,
+        "certificate": certificate,
+        "rotation": np.eye(3).ravel().tolist(),
+        "rotation_gravity_mps2": GRAVITY.tolist(),
+        "prior": {"sensitivity": S_TRUE.ravel().tolist(), "u_main_pct": 1.0, "u_transverse_pct": 0.5},
+        "uncertainty": {"offset_mps2": 0.002},
+        "temperature": {"offset_order": 0},
+    }
+    found = Estimation(parse_config({"devices": devices, "channels": [channel]}, "").channels[0], None)
+    for place, identity in enumerate("AB"):
+        found.use(place)
+        found.meet(identity, "", 1.0)
+    found.use(FIRST)
+    return found
+
+
+def judged(
+    found: Estimation,
+    seed: int,
+    first_day: int,
+    number: int,
+    more: dict[int, dict[str, Any]] | None = None,
+    turns: tuple[int, ...] = TURNS,
+) -> list[Judged]:
+    """A window a day; `more` by place is what has changed."""
+    random, results = np.random.default_rng(seed), []
+    for k, place in enumerate(turns[:number]):
+        found.use(place)
+        window = building_window(random, level_mps2=(0.1, 0.1, 0.1), **(more or {}).get(place, {}))
+        results.append(found.judge(window, float(first_day + k), 0.0, 20.0))
+        found.use(FIRST)
+    return results
+
+
+def actions(results: list[Judged]) -> list[str]:
+    return [result.decision.action for result in results]
+
+
+def sound(found: Estimation, seed: int = 1) -> Estimation:
+    assert set(actions(judged(found, seed, 0, 12))) == {"take"}
+    return found
+
+
+def adopted(results: list[Judged]) -> str:
+    """The reason of the only jump that was adopted."""
+    (reason,) = [result.decision.reason for result in results if result.decision.action == "adopt"]
+    return reason
+
+
+def test_each_reference_has_its_own_unknowns_and_priors() -> None:
+    found = sound(estimation(stability_pct=0.0))
+    for place, u in ((FIRST, 0.1), (SECOND, 0.2)):
+        found.use(place)
+        state = found.recursion.snapshot()["state"]
+        owners = [q[0] for q in state["quantities"] if q[3] == "AB"[place]]
+        assert {"lag", "rotation_x"} <= set(owners)
+        k = [q[0] == "reference_y" and q[3] == "AB"[place] for q in state["quantities"]].index(True)
+        assert state["stated_u"][k] == pytest.approx(u / 100)
+    assert sorted(found.recursion.references) == ["A", "B"]
+    with_first, with_both = (1 / np.sqrt(sum(1 / u**2 for u in us)) for us in ((0.1, 1.0), (0.1, 0.2, 1.0)))
+    assert 0.998 * with_both < 100 * found.in_force.standard_uncertainty[SYY] / S_TRUE[1, 1] < with_first
+
+
+@pytest.mark.parametrize(("which", "device", "other"), [("first", "r", "c"), ("second", "c", "r")])
+def test_the_reference_that_stepped_is_named_and_s_does_not_follow(which: str, device: str, other: str) -> None:
+    found, control = sound(estimation()), sound(estimation())
+    judged(control, 101, 12, 24)
+    before = found.in_force
+    results = judged(found, 101, 12, 24, STEPPED[which])
+    reason = adopted(results)
+    assert f"the reference {device} has changed by y +" in reason
+    assert f"windows with {other} still agree with S" in reason
+    assert float(reason.split("by y ")[1].split(" %")[0]) == pytest.approx(100 * STEP, abs=0.1)
+    last = actions(results).index("adopt")
+    assert set(actions(results)[last + 1 :]) == {"take"}
+    u = found.in_force.standard_uncertainty
+    assert np.all(u[:9] < 1.03 * control.in_force.standard_uncertainty[:9])
+    assert abs(found.in_force.sensitivity[1, 1] - before.sensitivity[1, 1]) < 0.5 * u[SYY]
+
+
+def test_a_reference_that_is_stated_not_to_drift_is_named_too() -> None:
+    results = judged(sound(estimation(stability_pct=0.0)), 101, 12, 24, STEPPED["first"])
+    assert "the reference r has changed by y +" in adopted(results)
+
+
+def test_if_both_see_the_step_it_is_the_sensor_and_u_does_not_grow() -> None:
+    found, control = sound(estimation()), sound(estimation())
+    judged(control, 102, 12, 12)
+    results = judged(found, 102, 12, 12, SENSOR)
+    assert actions(results) == ["hold"] * 4 + ["adopt"] + ["take"] * 7
+    assert "so the sensor has changed" in adopted(results)
+    u = found.in_force.standard_uncertainty
+    # Not as small as without a step: what S owes to the time when the references had drifted less is lost.
+    assert np.all(u[[0, 4, 8]] < 1.25 * control.in_force.standard_uncertainty[[0, 4, 8]])
+    assert abs(found.in_force.sensitivity[1, 1] - S_TRUE[1, 1] * (1 + STEP)) < 3 * u[SYY]
+
+
+def test_while_nobody_else_tells_u_covers_both_until_the_other_reference_does() -> None:
+    found = sound(estimation())
+    before = found.in_force
+    alone = judged(found, 103, 12, 5, STEPPED["first"], turns=(FIRST,) * 5)
+    assert "no window with c tells whether the sensor or the reference r has changed" in adopted(alone)
+    assert found.in_force.standard_uncertainty[SYY] == pytest.approx(S_TRUE[1, 1] * STEP / 1.6, rel=0.1)
+    judged(found, 104, 17, 12, STEPPED["first"])
+    u = found.in_force.standard_uncertainty[SYY]
+    assert u < 1.5 * before.standard_uncertainty[SYY]
+    assert abs(found.in_force.sensitivity[1, 1] - S_TRUE[1, 1]) < 3 * u
+
+
+def test_a_weak_window_of_the_other_reference_is_no_witness() -> None:
+    found = sound(estimation())
+    assert actions(judged(found, 105, 12, 3, STEPPED["first"], turns=(FIRST,) * 3)) == ["hold"] * 3
+    found.use(SECOND)
+    weak = building_window(np.random.default_rng(106), level_mps2=(0.0, 0.0, 0.1))  # nothing along y
+    assert found.judge(weak, 15.0, 0.0, 20.0).decision.action == "take"
+    found.use(FIRST)
+    reason = adopted(judged(found, 107, 16, 2, STEPPED["first"], turns=(FIRST,) * 2))
+    assert "no window with c tells" in reason
+
+
+def test_nothing_is_named_while_nothing_changes() -> None:
+    assert set(actions(judged(estimation(), 108, 0, 32))) == {"take"}
+
+
+def test_a_state_goes_on_bit_for_bit_while_windows_are_held() -> None:
+    found = sound(estimation())
+    judged(found, 101, 12, 7, STEPPED["first"])
+    assert found.gate.held
+    again = estimation()
+    again.load(found.snapshot())
+    told = [judged(one, 109, 19, 8, STEPPED["first"]) for one in (found, again)]
+    assert "adopt" in actions(told[0])
+    assert [t.decision.reason for t in told[0]] == [t.decision.reason for t in told[1]]
+    assert np.array_equal(found.in_force.covariance, again.in_force.covariance)
+
+
+def test_a_restarted_sensor_loosens_the_lag_behind_both_references() -> None:
+    found = sound(estimation())
+    before = u_lags(found)
+    found.began("c")
+    assert u_lags(found)[0] == before[0]
+    assert u_lags(found)[1] > 10 * before[1]
+    found.began("s")
+    assert u_lags(found)[0] > 10 * before[0]
+
+
+def u_lags(found: Estimation) -> list[float]:
+    return [found.recursion.quantity(f"lag of {identity}")[1] for identity in "AB"]
+
+
+def test_a_sensor_that_was_mounted_again_has_another_rotation_to_both() -> None:
+    found = sound(estimation())
+    found.recursion.remount(of_reference=False)
+    state = found.recursion.snapshot()["state"]
+    for k, (_, kind, _, _) in enumerate(state["quantities"]):
+        assert kind != ROTATION.name or state["walked"][k] >= state["stated_u"][k] ** 2
+
+
+SECTION = (
+    '[channels.check_reference]\ndevice = "laser2"\n[channels.check_reference.certificate]\nu_sensitivity_pct = 0.2\n'
+)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("", "", "good; 3 devices"),
+        ('device = "laser2"', 'device = "lasr2"', "check_reference.device: no device is called 'lasr2'; there is imu"),
+        ('device = "laser2"', 'device = "laser"', "check_reference.device: the first reference cannot check itself"),
+        ('device = "laser2"', 'device = "imu"', "check_reference.device: a sensor cannot be its own reference"),
+        ("u_sensitivity_pct = 0.2", "lag_s = 0.01", "check_reference: certificate.lag_s needs certificate.u_lag_s"),
+        ("u_sensitivity_pct = 0.2", "u_sensitivity = 1", "check_reference.certificate.u_sensitivity"),
+        ('reference = "laser"\n', "", "check_reference is a second reference; name the first one in reference"),
+        ("[channels.prior]", "[channels.gate]\ndismiss_windows = 2\n[channels.prior]", "gate.dismiss_windows 2: with"),
+    ],
+)
+def test_the_configuration_is_checked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, told: str
+) -> None:
+    laser = '[[devices]]\nname = "laser2"\ndriver = "serial-csv"\noptions = { port = "b", rate_hz = 100, axes = 1 }\n'
+    text = GOOD.replace("[[channels]]", f"{laser}[[channels]]").replace(
+        "[channels.prior]", f"{SECTION}[channels.prior]"
+    )
+    path = tmp_path / "gateway.toml"
+    path.write_text(text.replace(old, new, 1) if old else text)
+    status = run_cli(["check", str(path)])
+    shown = capsys.readouterr()
+    assert told in shown.out + shown.err
+    assert status == (2 if old else 0)
