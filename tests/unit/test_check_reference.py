@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from agent.cli.main import run_cli
-from agent.config import parse_config
+from agent.config import Channel, parse_config
 from agent.core.estimation import Estimation, Judged
+from agent.core.kept import keep, take_up
 from calib.estimate.quantities import ROTATION
 from tests.building_windows import GRAVITY, building_window
 from tests.clamp_windows import S_TRUE
@@ -24,13 +25,13 @@ STEPPED = {"first": {FIRST: {"reference_error": ALONG_Y}}, "second": {SECOND: {"
 SENSOR = {place: {"S": S_TRUE * (1 + ALONG_Y)} for place in (FIRST, SECOND)}
 
 
-def estimation(stability_pct: float = 0.5, **check: Any) -> Estimation:
+def configured(stability_pct: float = 0.5, *, both: bool = True, **check: Any) -> Channel:
     """The second reference is less certain than the first one."""
     certificate = {"u_sensitivity_pct": 0.1, "stability_pct": stability_pct}
     devices = [
         {"name": name, "driver": "serial-csv", "options": {"port": name, "rate_hz": 50.0, "axes": 3}} for name in "src"
     ]
-    channel = {
+    channel: dict[str, Any] = {
         "sensor": "s",
         "reference": "r",
         "check_reference": {"device": "c", "certificate": certificate | {"u_sensitivity_pct": 0.2}} | check,
@@ -41,7 +42,17 @@ def estimation(stability_pct: float = 0.5, **check: Any) -> Estimation:
         "uncertainty": {"offset_mps2": 0.002},
         "temperature": {"offset_order": 0},
     }
-    found = Estimation(parse_config({"devices": devices, "channels": [channel]}, "").channels[0], None)
+    if not both:
+        del channel["check_reference"]
+    return parse_config({"devices": devices, "channels": [channel]}, "").channels[0]
+
+
+def estimation(stability_pct: float = 0.5) -> Estimation:
+    return met(Estimation(configured(stability_pct), None))
+
+
+def met(found: Estimation) -> Estimation:
+    """Both references are connected."""
     for place, identity in enumerate("AB"):
         found.use(place)
         found.meet(identity, "", 1.0)
@@ -189,6 +200,26 @@ def test_a_sensor_that_was_mounted_again_has_another_rotation_to_both() -> None:
     state = found.recursion.snapshot()["state"]
     for k, (_, kind, _, _) in enumerate(state["quantities"]):
         assert kind != ROTATION.name or state["walked"][k] >= state["stated_u"][k] ** 2
+
+
+def test_a_second_reference_can_be_removed_and_added_again() -> None:
+    found = sound(estimation())
+    both, alone = configured(), configured(both=False)
+    single = take_up(keep(both, found, None, "A", 12.0, 0), alone, None).estimation
+    single.meet("A", "", 1.0)
+    assert set(actions(judged(single, 110, 12, 4, turns=(FIRST,) * 4))) == {"take"}
+    again = met(take_up(keep(alone, single, None, "A", 16.0, 0), both, None).estimation)
+    assert set(actions(judged(again, 111, 16, 8))) == {"take"}
+    value, u = again.recursion.quantity("reference_y of B")
+    assert (abs(value), u) < (0.003, 0.002)
+    assert again.in_force.standard_uncertainty[SYY] < 1.1 * found.in_force.standard_uncertainty[SYY]
+
+
+def test_a_changed_rotation_of_the_second_reference_loosens_the_mount() -> None:
+    kept = keep(configured(rotation=np.eye(3).ravel().tolist()), sound(estimation()), None, "A", 12.0, 0)
+    turned = take_up(kept, configured(rotation=[0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]), None)
+    assert "check_rotation" in turned.reason
+    assert turned.estimation.recursion.quantity("rotation_x of B")[1] > np.deg2rad(0.2)
 
 
 SECTION = (
