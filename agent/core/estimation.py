@@ -154,7 +154,8 @@ class Estimation:
         stability = self._beside[self._place].certificate.stability_pct / 100.0
         jump = jumped(self.recursion, held, stability, self.gate.limit) if agree else None
         adopted, who = self._witnesses.judge(self.recursion, held, jump, self.gate.limit, self._place)
-        evidence = Evidence(day * DAY_S, innovation.statistic, innovation.degrees_of_freedom)
+        same = not self._held or any(held_one.reference == summary.reference for held_one in self._held)
+        evidence = Evidence(day * DAY_S, innovation.statistic, innovation.degrees_of_freedom, dismisses=same)
         decision = self.gate.judge(evidence, candidate, None if adopted is None else adopted.result())
         if decision.action == "take":
             self.recursion = trial

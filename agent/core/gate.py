@@ -21,13 +21,14 @@ PROPOSALS_KEPT = 8  # so that an operator can accept an estimate after newer one
 @dataclass(frozen=True, slots=True)
 class Evidence:
     """What the gate needs of one window: chi-squared of its innovation, with the covariance of the state, and whether
-    its excitation supports an update; if not, `reason` says why."""
+    its excitation supports an update; if not, `reason` says why. `dismisses`: if it fits, it may dismiss held ones."""
 
     t_s: float
     statistic: float
     degrees_of_freedom: float
     supported: bool = True
     reason: str = ""
+    dismisses: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +150,7 @@ class Gate:
         consistent = evidence.degrees_of_freedom <= 0 or evidence.statistic <= limit
         change = self._anchor.change(candidate)
         if consistent and not change.reason:
-            return self._consistent(candidate, numbers | change.numbers)
+            return self._consistent(candidate, numbers | change.numbers, evidence.dismisses)
         self._held, self._agreeing = min(self._held + 1, self._settings.confirm_windows), 0
         if confirmed is not None and self._held >= self._settings.confirm_windows:
             return self._confirmed(confirmed, numbers)
@@ -159,10 +160,10 @@ class Gate:
             "hold", "the window contradicts the calibration; held until further windows confirm a jump", numbers
         )
 
-    def _consistent(self, candidate: Calibration, numbers: dict[str, float]) -> Decision:
+    def _consistent(self, candidate: Calibration, numbers: dict[str, float], dismisses: bool) -> Decision:
         self._taken = True
         if self._held:
-            self._agreeing += 1
+            self._agreeing += dismisses
             if self._agreeing >= self._settings.dismiss_windows:
                 self._held = self._agreeing = 0
         elif self._settling:

@@ -164,6 +164,14 @@ def test_a_weak_window_of_the_other_reference_is_no_witness() -> None:
     assert "no window with c tells" in reason
 
 
+def test_sound_windows_of_the_other_reference_do_not_dismiss_held_ones() -> None:
+    found = sound(estimation())
+    turns = (FIRST, FIRST, SECOND, SECOND, SECOND, SECOND, FIRST, FIRST, FIRST)
+    results = judged(found, 112, 12, len(turns), STEPPED["first"], turns=turns)
+    assert actions(results) == ["hold"] * 2 + ["take"] * 4 + ["hold"] * 2 + ["adopt"]
+    assert "the reference r has changed by y +" in adopted(results)
+
+
 def test_nothing_is_named_while_nothing_changes() -> None:
     assert set(actions(judged(estimation(), 108, 0, 32))) == {"take"}
 
