@@ -46,7 +46,7 @@ def jumped(recursion: Recursion, held: Sequence[Summary], stability: float, limi
         return max(stability, abs(step) / SURELY) if step else 0.0
 
     leaning = tilt_rad(np.where(significant, moved, 0.0), recursion.scale)
-    drifted = max((abs(after_drift - _value(recursion, name)) for name, after_drift in first.drifts), default=0.0)
+    drifted = max((abs(after_drift - _value(recursion, key)) for key, after_drift in first.drifts), default=0.0)
     found = float(np.abs(S).max()) / recursion.scale + drifted
     return with_jump(recursion, held, leaning, u_reference, limit, max(1.0, WIDER * found / JUMP_SENSITIVITY))
 

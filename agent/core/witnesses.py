@@ -81,7 +81,7 @@ def _reference_moved(recursion: Recursion, held: Sequence[Summary], limit: Limit
 
     None if another sensitivity of this reference does not explain the held windows.
     """
-    own = [q for q in recursion.quantities if q.owner == recursion.reference]
+    own = [q for q in recursion.quantities if q.owner == recursion.reference and not q.first]
     # A reference that is stated not to drift has no drift in the state.
     kind = REFERENCE_DRIFT if any(q.kind is REFERENCE_DRIFT for q in own) else REFERENCE
     channels = [q for q in own if q.kind is kind]

@@ -146,10 +146,10 @@ class Recursion(WindowState):
 
     @property
     def drifts(self) -> list[tuple[str, float]]:
-        """(name, value) of the drift of each channel of the present reference, relative."""
+        """(key, value) of the drift of each channel of the present reference, relative."""
         state = self._joint.state
         return [
-            (q.name, float(state.mean[k]))
+            (q.key, float(state.mean[k]))
             for k, q in enumerate(state.quantities)
             if q.kind is REFERENCE_DRIFT and q.owner == self.reference and not q.first
         ]

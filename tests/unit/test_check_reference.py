@@ -12,7 +12,6 @@ from agent.cli.main import run_cli
 from agent.config import Channel, parse_config
 from agent.core.estimation import Estimation, Judged
 from agent.core.kept import keep, take_up
-from calib.estimate.quantities import ROTATION
 from tests.building_windows import GRAVITY, building_window
 from tests.clamp_windows import S_TRUE
 from tests.unit.test_check import GOOD
@@ -205,9 +204,8 @@ def u_lags(found: Estimation) -> list[float]:
 def test_a_sensor_that_was_mounted_again_has_another_rotation_to_both() -> None:
     found = sound(estimation())
     found.recursion.remount(of_reference=False)
-    state = found.recursion.snapshot()["state"]
-    for k, (_, kind, _, _) in enumerate(state["quantities"]):
-        assert kind != ROTATION.name or state["walked"][k] >= state["stated_u"][k] ** 2
+    for identity in "AB":
+        assert found.recursion.quantity(f"rotation_x of {identity}")[1] >= np.deg2rad(0.2)
 
 
 def test_a_second_reference_can_be_removed_and_added_again() -> None:
