@@ -15,7 +15,7 @@ DATE = re.compile(r"\d{4}-\d{2}-\d{2}")
 def recorded_config(text: str) -> Config:
     """The configuration from its JSON text. Raises ValueError if it is none.
 
-    Up to version 0.2 the drift of the reference was `process.reference_pct`, per square-root day, and
+    Before version 0.2 the drift of the reference was `process.reference_pct`, per square-root day, and
     `certificate.calibrated` was any text: what is no date counts as not stated.
     """
     raw: dict[str, Any] = json.loads(text)

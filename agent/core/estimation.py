@@ -11,7 +11,7 @@ import numpy as np
 from agent.config import Channel
 from agent.config.gate import GateSettings
 from agent.core.explaining import explained, most_likely
-from agent.core.gate import PROPOSALS_KEPT, Decision, Evidence, Gate
+from agent.core.gate import PROPOSALS_KEPT, Decision, Evidence, Gate, fields_of
 from agent.core.jump import jumped, possible_jump, tilt_rad
 from agent.core.time_shift import Anew, LagWatch
 from agent.core.windows import Found
@@ -306,8 +306,8 @@ class Estimation:
             "gate": self.gate.snapshot(),
             "drift": self.drift.snapshot(),
             "held": [summary.snapshot() for summary in self._held],
-            "proposed": [{"calibration": _plain(c), "recursion": r.snapshot()} for c, r in self._proposed],
-            "in_force": _plain(self.in_force),
+            "proposed": [{"calibration": fields_of(c), "recursion": r.snapshot()} for c, r in self._proposed],
+            "in_force": fields_of(self.in_force),
             "law": {name: getattr(self.law, name) for name in Law.__slots__},
             "residual_sd": self.residual_sd,
             "lag_watches": [watch.snapshot() for watch in self._lag_watches],
@@ -328,10 +328,6 @@ class Estimation:
         self._witnesses.load(state["witnesses"])
         for watch, kept in zip(self._lag_watches, state["lag_watches"], strict=False):
             watch.load(kept)
-
-
-def _plain(calibration: Calibration) -> dict[str, Any]:
-    return {name: getattr(calibration, name) for name in Calibration.__slots__}
 
 
 def _limits(channel: Channel, scale: float) -> GateSettings:

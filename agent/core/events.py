@@ -165,7 +165,8 @@ class CalibrationUpdate(Result, frozen=True, kw_only=True):
     u_sensitivity_temperature: list[float] = []
     offset_rate: list[float] = []  # (3,) output unit per day
     u_offset_rate: list[float] = []
-    references: list[str] = []  # to whose errors S and Q owe their values, by identity; the present one is the last
+    # Identities of the references to whose errors S and Q owe their values; that of the newest window is the last.
+    references: list[str] = []
     # If the calibration comes into force again, after a restart or by a rollback: the result that first put it in
     # force.
     made_run_id: str = ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -322,7 +323,7 @@ class Gate:
             "held": self._held,
             "agreeing": self._agreeing,
             "settling": self._settling,
-            "proposals": [{"sequence": number, **_plain(calibration)} for number, calibration in self._proposals],
+            "proposals": [{"sequence": number, **fields_of(calibration)} for number, calibration in self._proposals],
         }
 
     def load(self, state: dict[str, Any]) -> None:
@@ -331,19 +332,10 @@ class Gate:
         self._calibrated, self._taken, self._lost = state["calibrated"], state["taken"], state["lost"]
         self._hold, self._held = state["hold"], state["held"]
         self._agreeing, self._settling = state["agreeing"], state["settling"]
-        self._proposals = [(proposal["sequence"], _calibration(proposal)) for proposal in state["proposals"]]
+        kept = [dict(proposal) for proposal in state["proposals"]]
+        self._proposals = [(proposal.pop("sequence"), Calibration(**proposal)) for proposal in kept]
 
 
-def _plain(calibration: Calibration) -> dict[str, Any]:
-    return {
-        "sensitivity": calibration.sensitivity.copy(),
-        "offset": calibration.offset.copy(),
-        "covariance": calibration.covariance.copy(),
-        "determined": calibration.determined.copy(),
-        "degrees_of_freedom": calibration.degrees_of_freedom,
-        "method": calibration.method,
-    }
-
-
-def _calibration(state: dict[str, Any]) -> Calibration:
-    return Calibration(**{name: state[name] for name in Calibration.__slots__})
+def fields_of(calibration: Calibration) -> dict[str, Any]:
+    """The fields of a calibration, for a snapshot; its arrays are copies."""
+    return {name: copy(getattr(calibration, name)) for name in Calibration.__slots__}

@@ -41,13 +41,12 @@ class Kept:
     """The estimation with which a later run begins. `in_force` is None if no calibration was in force. `reason` says
     how much of the kept state is used.
 
-    `reference` is the identity of the reference in the kept state, `day` the days that its estimation had counted.
+    `day`: the days that the estimation of the kept state had counted.
     `moved`: the calibration in force is another one now, because a changed setting changed S, Q or their uncertainty.
     """
 
     estimation: Estimation
     in_force: CalibrationUpdate | None
-    reference: str
     day: float
     t_utc_ns: int
     reason: str
@@ -58,7 +57,6 @@ def keep(
     channel: Channel,
     estimation: Estimation,
     in_force: CalibrationUpdate | None,
-    reference: str,
     day: float,
     t_utc_ns: int,
 ) -> bytes:
@@ -68,7 +66,6 @@ def keep(
             "in_force": plain(in_force),
             "basis": _basis(channel),
             "estimation": estimation.snapshot(),
-            "reference": reference,
             "day": day,
             "t_utc_ns": t_utc_ns,
         }
@@ -82,26 +79,24 @@ def take_up(kept: bytes, channel: Channel, nominal: float | None) -> Kept:
         state = unpack(kept)
         in_force, day, t_utc_ns = update_of(state["in_force"]), float(state["day"]), int(state["t_utc_ns"])
     except MALFORMED as error:
-        return Kept(
-            fresh, None, "", 0.0, 0, f"begun again from the prior: the stored state cannot be read: {_said(error)}"
-        )
+        return Kept(fresh, None, 0.0, 0, f"begun again from the prior: the stored state cannot be read: {_said(error)}")
     try:
         changed = _changed(state["basis"], channel)
         if wrong := _made_otherwise(changed, state["basis"], channel):
             reason = f"begun again from the prior: windows were made with other settings: {', '.join(wrong)}"
-            return Kept(fresh, None, "", day, t_utc_ns, reason)
+            return Kept(fresh, None, day, t_utc_ns, reason)
         stated = fresh.recursion.result()
         fresh.load(state["estimation"])
         if "prior" in changed and (beyond := fresh.gate.anchor_at(stated, fresh.in_force)):
             reason = f"begun again from the prior: the calibration in force contradicts the changed prior: {beyond}"
-            return Kept(Estimation(channel, nominal), None, "", day, t_utc_ns, reason)
+            return Kept(Estimation(channel, nominal), None, day, t_utc_ns, reason)
         moved = fresh.restate(_gravity(changed, state["basis"], channel), remounted=bool(MOUNT & changed))
     except MALFORMED as error:
         return _from_in_force(state, in_force, channel, nominal, day, t_utc_ns, _said(error))
     reason = "restored from the previous run"
     if changed:
         reason += f"; these settings have changed and were exchanged in the state: {', '.join(sorted(changed))}"
-    return Kept(fresh, in_force, str(state["reference"]), day, t_utc_ns, reason, moved)
+    return Kept(fresh, in_force, day, t_utc_ns, reason, moved)
 
 
 def _from_in_force(
@@ -117,7 +112,7 @@ def _from_in_force(
     why = f"the stored state cannot be read: {why}"
     fresh = Estimation(channel, nominal)
     if in_force is None:
-        return Kept(fresh, None, "", day, t_utc_ns, f"begun again from the prior: {why}")
+        return Kept(fresh, None, day, t_utc_ns, f"begun again from the prior: {why}")
     try:
         fresh.gate.load(state["estimation"]["gate"])  # an operator's hold and the anchor stay
     except MALFORMED:
@@ -125,9 +120,9 @@ def _from_in_force(
         fresh.gate.release("")
         if refused:
             reason = f"begun again from the prior: {why}; {refused}"
-            return Kept(Estimation(channel, nominal), None, "", day, t_utc_ns, reason)
+            return Kept(Estimation(channel, nominal), None, day, t_utc_ns, reason)
     fresh.roll_back(calibration_of(in_force))
-    return Kept(fresh, in_force, "", day, t_utc_ns, f"begun again from the calibration in force: {why}")
+    return Kept(fresh, in_force, day, t_utc_ns, f"begun again from the calibration in force: {why}")
 
 
 def shelved(kept: Mapping[str, bytes], identity: str, memory: bytes) -> dict[str, bytes]:

@@ -26,7 +26,6 @@ from calib.estimate.quantities import (
     OFFSET_BY_POSITION,
     OFFSET_RATE,
     OFFSET_TEMPERATURE,
-    PRIORS,
     RATES,
     REFERENCE,
     ROTATION,
@@ -120,8 +119,12 @@ def from_version_2(state: dict[str, Any]) -> None:
     configuration of this run for what was stated. The reference whose errors the state had is the one in the state.
     Positions were found with the usual smoothing alone, and runs of samples had no number.
     """
+    for holder in [state, *state.get("channels", {}).values()]:
+        if holder.get("estimation"):
+            _own(holder["estimation"], holder.get("reference") or "")
     for channel in state.get("channels", {}).values():
-        channel["run_numbers"] = {}
+        channel["run_numbers"], channel["piece_number"] = {}, 0
+        channel["references"], channel["not_certified"] = [channel.pop("reference")], [channel["not_certified"]]
         for stream in channel["streams"].values():
             for run in stream["runs"]:
                 run["number"] = 0
@@ -129,12 +132,6 @@ def from_version_2(state: dict[str, Any]) -> None:
             channel["places"]["standing"]["longest"] = USUAL
             for stretch in channel["places"]["stretches"]:
                 stretch["smoothing_s"] = SHORTEST_S
-    for holder in [state, *state.get("channels", {}).values()]:
-        if holder.get("estimation"):
-            _own(holder["estimation"], holder.get("reference") or "")
-    for channel in state.get("channels", {}).values():
-        channel["piece_number"] = 0
-        channel["references"], channel["not_certified"] = [channel.pop("reference")], [channel["not_certified"]]
 
 
 def _own(estimation: dict[str, Any], reference: str) -> None:
@@ -144,12 +141,11 @@ def _own(estimation: dict[str, Any], reference: str) -> None:
     bound = recursion.pop("bound")
     for joint in (recursion["state"], recursion["base"]):
         kinds = [KINDS[kind] for _, kind, _ in joint["quantities"]]
-        nuisance = np.array([kind.prior is not None and kind.prior.name in PRIORS for kind in kinds])
         joint["quantities"] = [
             [*quantity, reference if kind.of_reference else "", False]
             for quantity, kind in zip(joint["quantities"], kinds, strict=True)
         ]
-        joint["stated_u"] = np.sqrt(bound) / np.where(nuisance, 2.0, 1.0)
+        joint["stated_u"] = np.sqrt(bound) / np.where([kind.of_nuisance for kind in kinds], 2.0, 1.0)
         joint["stated_mean"] = np.full(len(kinds), np.nan)  # as stated now
         joint["walked"] = np.zeros(len(kinds))
         joint["doubt"] = 1.0

@@ -108,7 +108,7 @@ class Beforehand:
         found = {q.key: (0.0, u) for q, u in self._of_time_and_temperature() if q.key in state}
         for k, quantity in enumerate(state.quantities):
             kind = quantity.kind
-            if kind.prior is None or kind.prior.name not in PRIORS or quantity.owner not in ("", reference):
+            if not kind.of_nuisance or quantity.owner not in ("", reference):
                 continue
             if quantity.first:  # it goes with the quantity itself
                 continue
@@ -137,7 +137,7 @@ class Beforehand:
         owners = {owner for _, owner in there}
         for kind in KINDS.values():
             owner = reference if kind.of_reference else ""
-            if kind.prior is None or kind.prior.name not in PRIORS or (kind.of_reference and not reference):
+            if not kind.of_nuisance or (kind.of_reference and not reference):
                 continue
             missing = owner in owners and (kind.name, owner) not in there
             if missing and before.of(kind.prior) == 0.0 < self.priors.of(kind.prior):

@@ -62,26 +62,26 @@ class JointState:
 
     def append(self, quantity: Quantity, mean: float, standard_uncertainty: float) -> None:
         """Add a quantity that is independent of all others, with its prior."""
-        n = len(self)
-        grown = np.zeros((n + 1, n + 1))
-        grown[:n, :n], grown[n, n] = self.factor, standard_uncertainty * np.sqrt(self.doubt)
-        self.quantities.append(quantity)
-        self.mean, self.factor = np.append(self.mean, mean), grown
-        self.stated_mean = np.append(self.stated_mean, mean)
-        self.stated_u = np.append(self.stated_u, standard_uncertainty)
-        self.walked = np.append(self.walked, (self.doubt - 1.0) * standard_uncertainty**2)
-        self._rename()
+        row = np.append(np.zeros(len(self)), standard_uncertainty * np.sqrt(self.doubt))
+        self._grow(quantity, mean, row, mean, standard_uncertainty, (self.doubt - 1.0) * standard_uncertainty**2)
 
     def append_first(self, k: int) -> None:
         """Add the value that quantity `k` has now, which stays when the quantity changes."""
+        row = np.append(self.factor[k], 0.0)
+        first = replace(self.quantities[k], first=True)
+        self._grow(first, self.mean[k], row, self.stated_mean[k], self.stated_u[k], self.walked[k])
+
+    def _grow(
+        self, quantity: Quantity, mean: float, row: Array, stated_mean: float, stated_u: float, walked: float
+    ) -> None:
+        """Add a quantity; `row` (N + 1,) is its row of the factor."""
         n = len(self)
         grown = np.zeros((n + 1, n + 1))
-        grown[:n, :n], grown[n, :n] = self.factor, self.factor[k]
-        self.quantities.append(replace(self.quantities[k], first=True))
-        self.mean, self.factor = np.append(self.mean, self.mean[k]), grown
-        self.stated_mean = np.append(self.stated_mean, self.stated_mean[k])
-        self.stated_u = np.append(self.stated_u, self.stated_u[k])
-        self.walked = np.append(self.walked, self.walked[k])
+        grown[:n, :n], grown[n] = self.factor, row
+        self.quantities.append(quantity)
+        self.mean, self.factor = np.append(self.mean, mean), grown
+        self.stated_mean, self.stated_u = np.append(self.stated_mean, stated_mean), np.append(self.stated_u, stated_u)
+        self.walked = np.append(self.walked, walked)
         self._rename()
 
     def keep(self, kept: Sequence[bool]) -> None:

@@ -1,4 +1,4 @@
-"""A joint state with its recent windows, which are all linearised at the same point (see calib.estimate.recursion)."""
+"""A joint state with its recent windows, all linearised at the same point (see calib.estimate.window_state)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from calib.estimate.joint_state import JointState
-from calib.estimate.quantities import ALL_RATES, PRIORS, SENSITIVITY_RATE, YEAR_DAYS, Kind, Quantity
+from calib.estimate.quantities import ALL_RATES, SENSITIVITY_RATE, YEAR_DAYS, Kind, Quantity
 from calib.estimate.terms import Term
 from calib.estimate.window_rows import Summary
 from calib.model import Array
@@ -37,8 +37,7 @@ class Linearised:
         Later the mount may lean by more than its prior says of the day of mounting. A reference drifts without a limit.
         """
         kinds = [quantity.kind for quantity in self.state.quantities]
-        nuisance = np.array([kind.prior is not None and kind.prior.name in PRIORS for kind in kinds])
-        most = np.where(nuisance, 4.0, 1.0) * self.state.stated_u**2
+        most = np.where([kind.of_nuisance for kind in kinds], 4.0, 1.0) * self.state.stated_u**2
         return np.where([kind.since_certificate for kind in kinds], np.inf, most)
 
     def begun(self, term: Term, day: float) -> float:
@@ -70,8 +69,7 @@ class Linearised:
         """
         for k in concerned:
             quantity = self.state.quantities[k]
-            nuisance = quantity.kind.prior is not None and quantity.kind.prior.name in PRIORS
-            if nuisance and not quantity.first and replace(quantity, first=True).key not in self.state:
+            if quantity.kind.of_nuisance and not quantity.first and replace(quantity, first=True).key not in self.state:
                 for state in (self.state, self.base):
                     state.append_first(k)
                 self.point = np.append(self.point, self.point[k])

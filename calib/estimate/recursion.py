@@ -122,7 +122,7 @@ class Recursion(WindowState):
         """
         state = self._joint.state
         k = state.index(name if name in state else f"{name} of {self.reference}")
-        return float(self._joint.state.mean[k]), float(np.sqrt(self._joint.state.variance[k]))
+        return float(state.mean[k]), float(np.sqrt(state.variance[k]))
 
     @property
     def residual_sd(self) -> Array:
@@ -156,7 +156,7 @@ class Recursion(WindowState):
 
     @property
     def references(self) -> list[str]:
-        """Identities of the references to whose errors S and Q owe their values, in the order of their first window."""
+        """Identities of the references to whose errors S and Q owe their values; the newest window's is the last."""
         return list(self._references)
 
     @property

@@ -117,8 +117,11 @@ class WindowState:
     def _rows(self, summary: Summary) -> WindowRows:
         reference_degc = self._stated.temperature.reference_degc
         held = self._held.mps2 if self._held is not None else np.zeros(3) if self._fixed else None
-        priors = self._beside[self._place_of(summary.reference)].priors
-        return WindowRows(summary, priors, self.scale, reference_degc, held, self._seen_degc)
+        return WindowRows(summary, self._priors(summary), self.scale, reference_degc, held, self._seen_degc)
+
+    def _priors(self, summary: Summary) -> Priors:
+        """What is stated now beside the reference of a window."""
+        return self._beside[self._place_of(summary.reference)].priors
 
     def _place_of(self, reference: str) -> int:
         """The place of a reference; that of the first one if the reference is not mounted."""
@@ -139,7 +142,7 @@ class WindowState:
     def _mount(self, summary: Summary, day: float) -> None:
         """At the first window of a fixed mount: Q gives its place to the mean output there."""
         if self._fixed and self._held is None and np.isfinite(summary.held_mps2).all():
-            self._held, terms = held_at(summary, self._beside[self._place_of(summary.reference)].priors)
+            self._held, terms = held_at(summary, self._priors(summary))
             self._held.mount(self._joint, terms, day)
 
     def _unmount(self, held: Held) -> None:
@@ -157,8 +160,7 @@ class WindowState:
         rows = self._rows(summary)
         new = self._joint.append(rows.terms, day)
         if new and self._held is not None:
-            priors = self._beside[self._place_of(summary.reference)].priors
-            self._held = self._held.moved_by(held_at(summary, priors)[0], new)
+            self._held = self._held.moved_by(held_at(summary, self._priors(summary))[0], new)
         return rows
 
     def _taken(self, before: JointState, since: float | None, rows: WindowRows) -> JointState:

@@ -33,7 +33,7 @@ def state_of(made_with: Channel) -> bytes:
     """A state with a calibration in force."""
     estimation = Estimation(made_with, None)
     in_force = calibration_update(Source("s", "A", "m/s2", 5), estimation.in_force, estimation.recursion)
-    return keep(made_with, estimation, in_force, "", 0.0, 5)
+    return keep(made_with, estimation, in_force, 0.0, 5)
 
 
 def after(before: Channel, now: Channel) -> Kept:
