@@ -17,6 +17,9 @@ from functools import lru_cache
 
 import numpy as np
 
+# Each iteration for the threshold divides the error by about b^2.
+SETTLED, MOST_ITERATIONS = 1e-9, 12
+
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
 
 
@@ -30,8 +33,11 @@ def false_alarm_rate(threshold: float, fewest: int, most: int) -> float:
 def false_alarm_threshold(rate: float, fewest: int, most: int) -> float:
     """The threshold that has this `false_alarm_rate` (per window, for one parameter; below 1e-2)."""
     b = 5.0
-    for _ in range(12):  # each iteration divides the error by about b^2
+    for _ in range(MOST_ITERATIONS):
+        before = b
         b = math.sqrt(2.0 * math.log(b * _overshoots(b, fewest, most) / (math.sqrt(2.0 * math.pi) * rate)))
+        if abs(b - before) < SETTLED:
+            break
     return b * b / 2.0
 
 

@@ -43,13 +43,10 @@ class Held:
     def parameters(self, state: JointState) -> tuple[Array, Array]:
         """S and Q (12,) and a factor (12, N) of their covariance, of a state with the mean output in the place of Q."""
         mean, factor = state.mean[:12].copy(), state.factor[:12].copy()
-        S, felt = mean[:9].reshape(3, 3), self.mps2.copy()
-        for key, moves in self.by.items():
-            felt += state.mean[state.index(key)] * moves
+        moving, moves = [state.index(key) for key in self.by], np.array([*self.by.values()]).reshape(-1, 3)
+        S, felt = mean[:9].reshape(3, 3), self.mps2 + state.mean[moving] @ moves
         mean[9:] -= S @ felt
-        factor[9:] -= np.einsum("k,ikn->in", felt, factor[:9].reshape(3, 3, -1))
-        for key, moves in self.by.items():
-            factor[9:] -= np.outer(S @ moves, state.factor[state.index(key)])
+        factor[9:] -= felt @ factor[:9].reshape(3, 3, -1) + (S @ moves.T) @ state.factor[moving]
         return mean, factor
 
     def mean_output_u(self, state: JointState, u_terms: Mapping[str, float]) -> Array:

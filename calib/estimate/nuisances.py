@@ -121,6 +121,7 @@ class Nuisances:
         self._magnitude = np.maximum(np.linalg.norm(self.gravity, axis=1), np.finfo(float).tiny)
         self._turn_direction = self._stacked("turn_direction", (n, 3))
         self._turn_gravity = self._stacked("turn_gravity", (n, 3))
+        self._cross_direction = _cross(self._turn_direction)
         self._transverse = self._stacked("transverse", (n, 3))
         self._quadrature = self._stacked("quadrature", (n, 3))
         self._reference = self._stacked("reference", (channels,))
@@ -154,7 +155,7 @@ class Nuisances:
         felt = turn @ sideways[:, :, :real]
         # A corner of c Hz removed c times the integral; the integrals are channels of their own (calib.signal.corner).
         direction = np.concatenate([felt, float(z @ self._corner_hz) * felt], axis=2)[:, :, : sideways.shape[2]] / scale
-        d_direction = np.cross(self._turn_direction[..., None], direction, axisa=2, axisb=1, axisc=2)
+        d_direction = self._cross_direction @ direction
         d_direction -= direction * (self._reference / scale)[:, None, None, :]
         if real:
             d_direction[..., 0] += np.einsum("pik,jpk->jpi", turn, self._transverse) / scale[0]
@@ -166,7 +167,7 @@ class Nuisances:
         stretch = 1.0 + np.einsum("j,jo->o", z, self._gravity) / self._magnitude
         unstretched = np.einsum("pik,pk->pi", rotations(np.einsum("j,jpk->pk", z, self._turn_gravity)), self.gravity)
         gravity = unstretched * stretch[:, None]
-        d_gravity = np.cross(self._turn_gravity, gravity) + self._gravity[:, :, None] * (
+        d_gravity = (_cross(self._turn_gravity) @ gravity[..., None])[..., 0] + self._gravity[:, :, None] * (
             unstretched / self._magnitude[:, None]
         )
         return Inputs(
@@ -189,8 +190,14 @@ class Nuisances:
 def rotations(vectors: Array) -> Array:
     """Rotation matrices (P, 3, 3) of rotation vectors (P, 3) in rad, by Rodrigues' formula."""
     angle = np.linalg.norm(vectors, axis=1)[:, None, None]
-    cross = np.zeros((len(vectors), 3, 3))
-    cross[:, [2, 0, 1], [1, 2, 0]] = vectors
-    cross[:, [1, 2, 0], [2, 0, 1]] = -vectors
+    cross = _cross(vectors)
     linear, square = np.sinc(angle / np.pi), 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
     return np.asarray(np.eye(3) + linear * cross + square * (cross @ cross))
+
+
+def _cross(vectors: Array) -> Array:
+    """Matrices (..., 3, 3) that give the vector product of `vectors` (..., 3) with another vector."""
+    cross = np.zeros((*vectors.shape, 3))
+    cross[..., [2, 0, 1], [1, 2, 0]] = vectors
+    cross[..., [1, 2, 0], [2, 0, 1]] = -vectors
+    return cross

@@ -91,16 +91,16 @@ def terms(
     the nuisances of that position. `reference` is the identity of the reference, which owns its own nuisances.
     """
     found: dict[str, Term] = {}
-    for term in _terms(poses, channels, priors, applied):
-        if reference and term.kind.of_reference:
-            term = replace(term, quantity=replace(term.quantity, owner=reference))
+    for term in _terms(poses, channels, priors, applied, reference):
         found[term.key] = term if term.key not in found else found[term.key].with_(term)
     return list(found.values())
 
 
-def _terms(poses: Sequence[Pose], channels: int, priors: Stated, applied: Mapping[Kind, float]) -> Iterator[Term]:
+def _terms(
+    poses: Sequence[Pose], channels: int, priors: Stated, applied: Mapping[Kind, float], reference: str
+) -> Iterator[Term]:
     yield from _clamp_terms(poses, priors)
-    yield from _pose_terms(poses, priors)
+    yield from _pose_terms(poses, priors, reference)
     yield from _lean_terms(poses, priors)
     yield from _slide_terms(poses, priors)
     for name, k in zip(_axes("offset"), np.eye(3), strict=True):
@@ -115,13 +115,13 @@ def _terms(poses: Sequence[Pose], channels: int, priors: Stated, applied: Mappin
     for m in range(real):
         of = "" if real == 1 else f"_{AXES[m]}"
         own = np.resize(np.eye(real)[m], channels)
-        yield _term(f"reference{of}", kinds.REFERENCE, priors, reference=own)
-        yield _term(f"reference_drift{of}", kinds.REFERENCE_DRIFT, priors, reference=own)
-    yield _term("lag", kinds.LAG, priors, applied, lag=np.ones(3))
+        yield _term(f"reference{of}", kinds.REFERENCE, priors, owner=reference, reference=own)
+        yield _term(f"reference_drift{of}", kinds.REFERENCE_DRIFT, priors, owner=reference, reference=own)
+    yield _term("lag", kinds.LAG, priors, applied, reference, lag=np.ones(3))
     for name, k in zip(_axes("lag"), np.eye(3), strict=True):
-        yield _term(name, kinds.LAG_OF_AXIS, priors, lag=k)
+        yield _term(name, kinds.LAG_OF_AXIS, priors, owner=reference, lag=k)
     turn = np.full(1, 2.0 * np.pi)
-    yield _term("reference_corner", kinds.REFERENCE_CORNER, priors, applied, reference_corner=turn)
+    yield _term("reference_corner", kinds.REFERENCE_CORNER, priors, applied, reference, reference_corner=turn)
     yield _term("sensor_corner", kinds.SENSOR_CORNER, priors, applied, sensor_corner=turn)
 
 
@@ -144,7 +144,7 @@ def _clamp_terms(poses: Sequence[Pose], priors: Stated) -> Iterator[Term]:
             yield _turned(_at(name, single, poses[p]), max(priors.of(single.prior), u), _only(poses, p, axis[p]))
 
 
-def _pose_terms(poses: Sequence[Pose], priors: Stated) -> Iterator[Term]:
+def _pose_terms(poses: Sequence[Pose], priors: Stated, reference: str) -> Iterator[Term]:
     """Errors of stated directions, common and by position, and of the rotation of a tri-axial reference."""
     stated = [p for p, pose in enumerate(poses) if pose.theta_rad is None and own_channels(pose.direction.shape[1]) < 3]
     beside = [p for p, pose in enumerate(poses) if own_channels(pose.direction.shape[1]) == 3]
@@ -154,7 +154,7 @@ def _pose_terms(poses: Sequence[Pose], priors: Stated) -> Iterator[Term]:
             yield _term(f"direction_{axis}", kinds.DIRECTION, priors, turn_direction=turn, turn_gravity=turn)
         if beside:
             turn = _only(poses, beside, k)
-            yield _term(f"rotation_{axis}", kinds.ROTATION, priors, turn_direction=turn)
+            yield _term(f"rotation_{axis}", kinds.ROTATION, priors, owner=reference, turn_direction=turn)
         for p in stated:
             quantity = _at(f"direction_{axis}", kinds.DIRECTION_BY_POSITION, poses[p])
             yield _turned(quantity, priors.of(quantity.kind.prior), _only(poses, p, k))
@@ -234,10 +234,12 @@ def _at(name: str, kind: Kind, pose: Pose) -> Quantity:
     return Quantity(f"{name}[{pose.position}]", kind, pose.position)
 
 
-def _term(name: str, kind: Kind, priors: Stated, applied: Mapping[Kind, float] | None = None, **moves: Array) -> Term:
+def _term(
+    name: str, kind: Kind, priors: Stated, applied: Mapping[Kind, float] | None = None, owner: str = "", **moves: Array
+) -> Term:
     """A nuisance that is common to all positions; `moves` are its effects, as fields of Term."""
     taken, expected = (applied or {}).get(kind, 0.0), priors.of(kind.mean)
-    return Term(Quantity(name, kind), priors.of(kind.prior), expected=expected, applied=taken, **moves)
+    return Term(Quantity(name, kind, owner=owner), priors.of(kind.prior), expected=expected, applied=taken, **moves)
 
 
 def _turned(quantity: Quantity, uncertainty: float, axis: Array) -> Term:

@@ -140,7 +140,8 @@ class WindowRows:
         self.nuisances = Nuisances([summary.moved], self.data.channels, priors, applied, summary.reference)
         u_lag_s = max(priors.lag_window_s, summary.u_lag_s)
         self._scatter = SlopeScatter.of(self.data, u_lag_s, summary.attenuation)
-        own = SlopeScatter.of(self.data)  # the scatter between windows is in the covariance of the rows, not before it
+        # The scatter between windows is in the covariance of the rows, not before it.
+        own = replace(self._scatter, lag_s=np.zeros(1), attenuation=np.zeros(1))
         self.equations = Equations(self.data, self.nuisances, [0], priors.offset_mps2, own, scale)
         self._priors, self._held_mps2 = priors, held_mps2
         above = summary.temperature_degc - reference_degc

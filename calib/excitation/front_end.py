@@ -149,7 +149,7 @@ def aligned(
         u = np.hstack([without_corner(u, rate_hz, instrument.corner_hz), integral(u, rate_hz)])
         V = without_corner(V, sensor_rate_hz, instrument.sensor_corner_hz)
     at = resample(u, reference.clock, time_s - lag_s, reference.first_index, lost)
-    columns = np.hstack([V, at.u, at.du])
+    columns = np.vstack([V.T, at.u.T, at.du.T]).T  # the samples of a channel lie side by side, also in what is kept
     columns[~at.usable] = np.nan
     band_hz, noise = _band(raw, at.u[at.usable][:, :m], V, instrument, (rate_hz, sensor_rate_hz))
     clipped, independent, k = 0, 1.0, u.shape[1]
@@ -165,7 +165,7 @@ def aligned(
     raw_inside = _within(reference.time_s, span_s)
     independent *= (1.0 - _share(filled, usable)) * (1.0 - _share(raw_filled, raw_inside))
     counts = {"filled_samples": (filled & usable).sum(), "reference_filled_samples": (raw_filled & raw_inside).sum()}
-    kept = columns[usable]
+    kept = columns.T[:, usable].T
     points = Points(time_s[usable], kept[:, :3], kept[:, 3 : 3 + k], kept[:, 3 + k :])
     told = {name: float(count) for name, count in counts.items() if count}
     return Aligned(points, noise, clipped, independent, band_hz if limit_band else None, told)

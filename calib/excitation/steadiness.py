@@ -10,9 +10,8 @@ import numpy as np
 
 from calib.model import Array
 
-BLOCK_S = (
-    1.0  # the change of the mean is searched at the edges of such blocks; their scatter shows how well it is known
-)
+# The change of the mean is searched at the edges of such blocks. The scatter of the blocks shows how well it is known.
+BLOCK_S = 1.0
 FEWEST_BLOCKS = 4  # fewer blocks have two differences at most, too few to know their scatter
 # The median of chi-squared with three degrees of freedom over its mean.
 MEDIAN_OF_THREE = 0.789
@@ -31,9 +30,10 @@ def step(residual: Array, rate_hz: float) -> tuple[float, float]:
     blocks = len(residual) // size
     if blocks < FEWEST_BLOCKS:
         return 0.0, 0.0
-    samples = residual[: blocks * size].reshape(blocks, size, 3)
-    level = np.median(samples, axis=1)
-    spread = np.median(np.abs(samples - level[:, None]), axis=1).max(axis=1)
+    samples = np.ascontiguousarray(residual[: blocks * size].T).reshape(3, blocks, size)
+    low, middle, high = size // 4, size // 2, size - 1 - size // 4
+    samples.partition((low, middle, high), axis=2)
+    level, spread = samples[:, :, middle].T, (samples[:, :, high] - samples[:, :, low]).max(axis=0)
     weight = 1.0 / np.clip(spread / max(float(np.median(spread)), np.finfo(float).tiny), 1.0, 1e3) ** 2
     before, total = np.cumsum(weight)[:-1], float(weight.sum())
     per_block = total / (before * (total - before))  # variance of a difference of two means, over that of one block

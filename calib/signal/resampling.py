@@ -23,7 +23,7 @@ HALF = TAPS // 2
 BAND = 0.3  # of the sampling rate: the taps are the best for motion below
 RIDGE = 1e-11  # holds the noise amplification at one: more costs accuracy, less costs noise
 NODES = 64  # samples between the points at which the clock is inverted: straight in between to 1 ns
-CHUNK = 8192  # output samples worked on at a time, in cache
+CHUNK = 2048  # output samples worked on at a time: 16 taps of each fit into the cache
 # A signal is differentiated up to here and damped from twice as much: the paper's range and three octaves above it.
 DIFFERENTIATED_BAND_HZ = 50.0
 DIFFERENTIATED_BAND_LARGEST = 0.15  # of the sampling rate
