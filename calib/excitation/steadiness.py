@@ -30,10 +30,11 @@ def step(residual: Array, rate_hz: float) -> tuple[float, float]:
     blocks = len(residual) // size
     if blocks < FEWEST_BLOCKS:
         return 0.0, 0.0
+    # The samples of an axis lie side by side, so that a median is several times faster.
     samples = np.ascontiguousarray(residual[: blocks * size].T).reshape(3, blocks, size)
-    low, middle, high = size // 4, size // 2, size - 1 - size // 4
-    samples.partition((low, middle, high), axis=2)
-    level, spread = samples[:, :, middle].T, (samples[:, :, high] - samples[:, :, low]).max(axis=0)
+    level = np.median(samples, axis=2)
+    spread = np.median(np.abs(samples - level[..., None]), axis=2).max(axis=0)
+    level = level.T
     weight = 1.0 / np.clip(spread / max(float(np.median(spread)), np.finfo(float).tiny), 1.0, 1e3) ** 2
     before, total = np.cumsum(weight)[:-1], float(weight.sum())
     per_block = total / (before * (total - before))  # variance of a difference of two means, over that of one block
