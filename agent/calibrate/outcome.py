@@ -17,6 +17,7 @@ from calib.model import PARAMETERS, Array, Calibration, Window
 
 AXES = "xyz"
 FILE_WIDTH = 120  # columns if the output is no terminal
+KNOWN_BEFORE = "*"  # marks a parameter that --nominal or --prior tells rather than the data
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,6 +154,8 @@ def _print_calibration(console: Any, outcome: Outcome) -> None:
     console.print(table)
     kind = f", {outcome.uncertainty_kind}" if outcome.uncertainty_kind else ""
     console.print(f"  S in output unit per m/s², Q in output unit, U with k = {outcome.coverage_factor:.3g}{kind}")
+    if np.any(np.isfinite(values) & ~c.determined):
+        console.print(f"  {KNOWN_BEFORE} known before: the data do not halve its uncertainty", soft_wrap=True)
     _print_sources(console, outcome)
     console.print(f"  method {outcome.method}, {sum(w.used for w in outcome.windows)} windows", soft_wrap=True)
 
@@ -180,9 +183,10 @@ def _of(source: Mapping[str, float] | Array, k: int) -> float:
 
 
 def _cell(value: float, expanded: float, determined: bool) -> str:
-    if not determined:
+    if not math.isfinite(value):
         return "not determined"
-    return "0" if value == expanded == 0.0 else plus_minus(value, expanded)  # 0 because the frame was chosen so
+    text = "0" if value == expanded == 0.0 else plus_minus(value, expanded)  # 0 because the frame was chosen so
+    return text if determined else f"{text} {KNOWN_BEFORE}"
 
 
 def _print_windows(console: Any, windows: Sequence[Window]) -> None:

@@ -46,7 +46,7 @@ class WindowVerdict(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationResult:
-    """S and Q with their uncertainties. Arrays of 12 are in the order of PARAMETERS; NaN: not determined.
+    """S and Q with their uncertainties. Arrays of 12 are in the order of PARAMETERS; NaN: not known.
 
     `unit` is that of the indications, "" where the result does not say it. `degrees_of_freedom` (12,), NaN where they
     are not stated or without end. `budget` {source: (12,) standard uncertainty}. `files`: what the result was made

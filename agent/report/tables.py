@@ -18,6 +18,7 @@ from calib.model import PARAMETERS
 AXES = "xyz"
 MOST_ROWS = 200  # of windows; report.json has all
 NOT_KNOWN = "not determined"
+KNOWN_BEFORE = "known before"  # a parameter whose value the prior tells rather than the data
 
 
 def table(
@@ -153,10 +154,11 @@ def facts(pairs: Mapping[str, Any]) -> str:
 
 def _cell(result: CalibrationResult, k: int) -> str:
     """Value ± U, which may wrap before ± only."""
-    if not result.determined[k]:
+    if not np.isfinite(result.values[k]):
         return NOT_KNOWN
     text = plus_minus(float(result.values[k]), float(result.expanded_uncertainty[k])).replace("-", "−")
-    return text.replace("± ", "±\N{NO-BREAK SPACE}")
+    text = text.replace("± ", "±\N{NO-BREAK SPACE}")
+    return text if result.determined[k] else f"{text} ({KNOWN_BEFORE})"
 
 
 def _words(value: Any) -> str:

@@ -15,7 +15,7 @@ import numpy as np
 from calib.distributions import coverage_factor
 from calib.estimate.budget import Budget, budget
 from calib.estimate.condense import Condensed, condense, effective
-from calib.estimate.determined import Flags, determined
+from calib.estimate.determined import determined
 from calib.estimate.equations import Equations
 from calib.estimate.fixed_mount import mean_input, never_turned
 from calib.estimate.gauss_newton import Solution, slope_residuals, solve
@@ -46,7 +46,8 @@ class Nuisance:
 class Adjustment:
     """What the windows say of S and Q, what that rests on, and whether it may be used.
 
-    `calibration` has NaN where the data do not determine a parameter. `contributions` {source: (12,) standard
+    `calibration` has NaN for a parameter that the data do not determine and of which nothing was known before; what was
+    known of S and Q makes it the posterior. `contributions` {source: (12,) standard
     uncertainties} is the budget. `reasons`: why it is refused, empty if it is not. `rank` of the input vectors, 4 at
     most. `offset_scatter_mps2`, `slope_scatter` (relative) and `lag_scatter_s`: between windows, as estimated.
     `misfit`: what S a + Q leaves of the signal. `nuisance_pull`: how far the nuisances moved from what was stated, in
@@ -113,15 +114,25 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
         scatter = larger
         solution = _solution([e.window for e in found], data, priors, applied, scatter)
     shares = budget(solution, priors.offset_mps2)
-    u = np.sqrt(np.diag(shares.covariance)[:12])
-    told = determined(solution.x[:12], u, _prior_u(stated), solution.equations.seen)
+    mean, covariance = solution.x[:12].copy(), shares.covariance[:12, :12].copy()
+    if priors is not stated:
+        mean, covariance = _offset_combined(mean, covariance, stated)
+    told = determined(mean, np.sqrt(np.diag(covariance)), _prior_u(stated), solution.equations.seen)
+    known = told | np.isfinite(_prior_u(stated))
 
     def turned(static: int, polarity: int) -> Solution:
         reduced = [excited(w).window for w in turned_windows(used, static, polarity)]
         return _solution(reduced, data, priors, applied, scatter)
 
     return Adjustment(
-        calibration=_calibration(solution, shares, told),
+        calibration=Calibration(
+            np.where(known, mean, np.nan)[:9].reshape(3, 3),
+            np.where(known, mean, np.nan)[9:],
+            np.where(np.outer(known, known), covariance, np.nan),
+            told,
+            data.type_a.degrees_of_freedom,
+            "3 (adjustment)",
+        ),
         nuisances=_reported(solution, shares),
         contributions=shares.contributions,
         coverage_factor=coverage_factor(float(np.min(shares.degrees_of_freedom[told], initial=np.inf))),
@@ -174,11 +185,22 @@ def _without_offset(priors: Priors) -> Priors:
     return Priors(priors.values, priors.parameters, covariance)
 
 
-def _calibration(solution: Solution, shares: Budget, told: Flags) -> Calibration:
-    values = np.where(told, solution.x[:12], np.nan)
-    covariance = np.where(np.outer(told, told), shares.covariance[:12, :12], np.nan)
-    freedom = solution.equations.data.type_a.degrees_of_freedom
-    return Calibration(values[:9].reshape(3, 3), values[9:], covariance, told, freedom, "3 (adjustment)")
+def _offset_combined(mean: Array, covariance: Array, priors: Priors) -> tuple[Array, Array]:
+    """S and Q (12,) and their covariance, with what was known of Q used for Q alone: S stays as the data left it.
+
+    It is the update of a Kalman filter that only considers S (Schmidt 1966).
+    """
+    u = _prior_u(priors)
+    known = 9 + np.flatnonzero(np.isfinite(u[9:]))
+    if not known.size or priors.parameters is None or priors.covariance is None:
+        return mean, covariance
+    within = np.ix_(known, known)
+    gain = np.zeros((12, known.size))
+    gain[9:] = np.linalg.solve(covariance[within] + priors.covariance[within], covariance[known, 9:]).T
+    kept = np.eye(12)
+    kept[:, known] -= gain
+    mean = mean + gain @ (priors.parameters[known] - mean[known])
+    return mean, kept @ covariance @ kept.T + gain @ priors.covariance[within] @ gain.T
 
 
 def _reported(solution: Solution, shares: Budget) -> tuple[Nuisance, ...]:

@@ -198,3 +198,20 @@ def test_a_refused_result_tells_nothing_of_s(session):
     result = CliRunner().invoke(calibrate, [*files, *known], standalone_mode=False)
     told = _told(result)
     assert (result.return_value, told["sensitivity"], told["invariant"]) == (3, [[None] * 3] * 3, None)
+
+
+def test_a_parameter_that_the_prior_tells_has_its_posterior_and_a_star(session, tmp_path):
+    files = [part for name in ("sensor", "reference", "poses") for part in (f"--{name}", str(session / f"{name}.csv"))]
+    covariance = np.diag([1e-8] * 9 + [1.0] * 3).tolist()
+    earlier = {"sensitivity": S_TRUE.tolist(), "offset": [0.0] * 3, "covariance": covariance}
+    (tmp_path / "earlier.json").write_text(json.dumps(earlier))
+    known = [*files, "--prior", str(tmp_path / "earlier.json")]
+    told = _told(CliRunner().invoke(calibrate, [*known, "--json", "-"], standalone_mode=False))
+    assert told["determined"]["sensitivity"][0][0] is False
+    assert told["determined"]["offset"] == [True] * 3
+    assert abs(told["sensitivity"][0][0] - S_TRUE[0, 0]) < 3e-4
+    assert 5e-5 < told["standard_uncertainty"]["sensitivity"][0][0] <= 1e-4
+    result = CliRunner().invoke(calibrate, known, standalone_mode=False)
+    (row,) = [line for line in result.stdout.splitlines() if line.strip().startswith("x ")]
+    assert row.split()[4] == "*", row
+    assert "* known before: the data do not halve its uncertainty" in result.stdout
