@@ -97,7 +97,7 @@ def test_what_the_prior_says_better_than_the_data_is_not_determined_by_them():
     found = adjust(clamp_points(np.random.default_rng(9), Faults(offset_mps2=0.05)).windows, known)
     assert not found.calibration.determined[[0, 4, 8]].any()
     u = found.calibration.standard_uncertainty[[0, 4, 8]]
-    assert ((0.5e-4 < u) & (u <= 1e-4)).all()
+    assert ((u > 0.5e-4) & (u <= 1e-4)).all()
     assert (np.abs(np.diag(found.calibration.sensitivity - S_TRUE)) <= 4 * u).all()
 
 
