@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -12,7 +13,15 @@ import numpy as np
 from calib.estimate.nuisances import Applied, Inputs, Nuisances, Priors
 from calib.model import Array, Calibration, Pose
 from calib.paper.propagation import Contribution, Response, Statement, propagate
-from calib.paper.sine_fit import ComplexArray, acceleration, cycle_edges, four_parameter, three_parameter
+from calib.paper.sine_fit import (
+    ComplexArray,
+    SineFit,
+    acceleration,
+    coarse_frequency_hz,
+    cycle_edges,
+    four_parameter,
+    three_parameter,
+)
 from calib.paper.statistics import Repeatability, repeatability
 
 # Largest u of a determined parameter, relative to the largest main sensitivity (docs/vocabulary.md).
@@ -20,6 +29,8 @@ DETERMINED_U = 0.1
 # If the residual of the reference is above this part of its amplitude, the reference is no sine, and Methods 1 and 2 do
 # not apply. Vibrating tables keep distortion below 5 %; a second sine of equal amplitude gives 100 %.
 NOT_A_SINE = 0.2
+# Amplitudes of cycles that differ by more belong to different parts of a run: the table starts, stops or rests.
+STEADY = 0.1
 # If the phase between output and reference is closer than this to 90 deg, the sign of the sensitivity is not known.
 NEAREST_QUADRATURE_RAD = np.deg2rad(30)
 LEAST_CYCLES = 2  # each cycle gives one value, and an SD needs two
@@ -100,12 +111,12 @@ class AmplitudeCalibration:
 
 def ratios(run: Run) -> Ratios:
     """The ratios of a run: frequency by a four-parameter fit of the reference, amplitudes by three-parameter fits of
-    each cycle.
+    each cycle. Where the run holds more than the sine, it is the longest part with whole cycles of one amplitude.
 
     Raises ValueError, with the position, if the reference has no sine or fewer than two whole cycles.
     """
     try:
-        whole = four_parameter(run.time_s, run.reference)
+        run, whole = _sine(run)
         edges = cycle_edges(run.time_s, whole.frequency_hz)
     except ValueError as error:
         raise ValueError(f"position {run.pose.position}: {error}") from None
@@ -129,8 +140,42 @@ def ratios(run: Run) -> Ratios:
         whole.u_frequency_hz if run.quantity == "velocity" else 0.0,
         np.abs(reference),
         phasors[:, 1:] / reference[:, None],
-        float(whole.residual_sd[0] / whole.amplitude[0]),
+        _distortion(whole),
     )
+
+
+def _sine(run: Run) -> tuple[Run, SineFit]:
+    """The run, or its steady part if it holds more than the sine, and the sine of its reference."""
+    with suppress(ValueError):
+        whole = four_parameter(run.time_s, run.reference)
+        if _distortion(whole) <= NOT_A_SINE:
+            return run, whole
+    run = _steady(run, coarse_frequency_hz(run.time_s, run.reference))
+    return run, four_parameter(run.time_s, run.reference)
+
+
+def _distortion(reference: SineFit) -> float:
+    return float(reference.residual_sd[0] / reference.amplitude[0])
+
+
+def _steady(run: Run, frequency_hz: float) -> Run:
+    """The longest part of a run in which the cycles of the reference have one amplitude; the run itself if no part has
+    enough cycles."""
+    edges = cycle_edges(run.time_s, frequency_hz)
+    cycles = [slice(a, b) for a, b in itertools.pairwise(edges)]
+    amplitude = np.array([
+        float(three_parameter(run.time_s[c], run.reference[c], frequency_hz).amplitude[0]) for c in cycles
+    ])  # fmt: skip
+    moving = amplitude[amplitude > 0.5 * amplitude.max()]
+    same = np.abs(amplitude / np.median(moving) - 1.0) <= STEADY
+    ends = np.flatnonzero(np.diff(np.concatenate([[0], same, [0]])))
+    first, stop = max(zip(ends[::2], ends[1::2], strict=True), key=lambda part: part[1] - part[0], default=(0, 0))
+    # The first and the last cycle of the part may hold the end of a rest.
+    first, stop = first + (first > 0), stop - (stop < len(cycles))
+    if stop - first < LEAST_CYCLES:
+        return run
+    part = slice(edges[first], edges[stop])
+    return replace(run, time_s=run.time_s[part], reference=run.reference[part], indications=run.indications[part])
 
 
 def read(ratio: Ratios, run: int, i: int, j: int, phase_of: int) -> Reading:

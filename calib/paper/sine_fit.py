@@ -92,7 +92,7 @@ def four_parameter(time_s: ArrayLike, signal: ArrayLike, frequency_hz: float | N
     origin = float(t.mean())
     tau = t - origin
     line_hz = (len(t) - 1) / len(t) / float(np.ptp(t))
-    f = _coarse(tau, y, line_hz) if frequency_hz is None else frequency_hz
+    f = coarse_frequency_hz(t, signal) if frequency_hz is None else frequency_hz
     for _ in range(MAX_STEPS):
         design = _design(2 * np.pi * f * tau)
         sine = _least_squares(design, y)[0][:2, 0]
@@ -106,6 +106,22 @@ def four_parameter(time_s: ArrayLike, signal: ArrayLike, frequency_hz: float | N
             u_frequency = float(np.sqrt(spread[3, 3]) * residual[0] / (2 * np.pi))
             return _fit(f, u_frequency, origin, x, spread, residual, len(t))
     raise ValueError(f"no sine of one frequency in {len(t)} points over {np.ptp(t):.4g} s")
+
+
+def coarse_frequency_hz(time_s: ArrayLike, signal: ArrayLike) -> float:
+    """The frequency near the highest line of the spectrum of `signal` (n,) whose sine has the smallest residual.
+
+    Raises ValueError as `three_parameter` does, and if the signal does not move.
+    """
+    t, y = _checked(time_s, signal)
+    line_hz = (len(t) - 1) / len(t) / float(np.ptp(t))
+    spectrum = np.abs(np.fft.rfft(y[:, 0] - y.mean()))
+    if not spectrum.any():
+        raise ValueError("the signal does not move")
+    lines = np.unique(np.maximum(max(int(np.argmax(spectrum)), 1) + SCAN_LINES, LEAST_LINES))
+    tau = t - t.mean()
+    left = [_least_squares(_design(2 * np.pi * line_hz * line * tau), y)[2][0] for line in lines]
+    return float(line_hz * lines[int(np.argmin(left))])
 
 
 def acceleration(velocity: ArrayLike, frequency_hz: float) -> ComplexArray:
@@ -155,16 +171,6 @@ def _least_squares(design: Array, y: Array) -> tuple[Array, Array, Array]:
     rest = y - design @ x
     freedom = len(y) - design.shape[1]
     return x, inverse @ inverse.T, np.sqrt(np.einsum("nc,nc->c", rest, rest) / freedom)
-
-
-def _coarse(tau: Array, y: Array, line_hz: float) -> float:
-    """The frequency near the highest line of the spectrum whose sine has the smallest residual."""
-    spectrum = np.abs(np.fft.rfft(y[:, 0] - y.mean()))
-    if not spectrum.any():
-        raise ValueError("the signal does not move")
-    lines = np.maximum(max(int(np.argmax(spectrum)), 1) + SCAN_LINES, LEAST_LINES)
-    left = [_least_squares(_design(2 * np.pi * line_hz * line * tau), y)[2][0] for line in np.unique(lines)]
-    return float(line_hz * np.unique(lines)[int(np.argmin(left))])
 
 
 def _fit(f: float, u_f: float, origin: float, x: Array, spread: Array, residual: Array, points: int) -> SineFit:

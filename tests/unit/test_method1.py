@@ -145,3 +145,27 @@ def test_data_that_cannot_be_used_are_named() -> None:
     assert "no sine" in reasons[0]
     late = method1.solve([run(on_axis("x"), lag_s=0.25 / F)])
     assert any("its sign cannot be told" in reason for reason in late.reasons)
+
+
+@pytest.mark.parametrize("rests_s", [(0.9, 0.0), (0.0, 1.3), (0.7, 0.8), (1.45, 0.6)])
+@pytest.mark.parametrize("lag_s", [0.0, 0.004])
+def test_rests_beside_the_sine_are_left_out(rests_s: tuple[float, float], lag_s: float) -> None:
+    """The table moves within the stretch only; it starts and stops at any phase."""
+    runs = []
+    for whole in each_axis(lag_s=lag_s, n=4000):
+        moving = np.arange(len(whole.time_s)) / 1000.0
+        moving = (moving >= rests_s[0]) & (moving < 4.0 - rests_s[1])
+        rest = np.array([0.3, -0.1, G])
+        resting = np.where(moving, whole.reference, 0.0), np.where(moving[:, None], whole.indications, rest)
+        runs.append(replace(whole, reference=resting[0], indications=resting[1]))
+    result = method1.solve(runs)
+    assert result.reasons == ()
+    assert_allclose(result.calibration.sensitivity, S_TRUE, atol=1e-9)
+    assert all(len(ratio.ratio) >= 3 for ratio in result.ratios)
+
+
+def test_two_sines_are_no_sine_with_rests() -> None:
+    """Trimming must not make a sine out of what is none."""
+    runs = each_axis(n=4000)
+    runs = [replace(r, reference=r.reference + 10.0 * np.sin(2 * pi * 4.7 * r.time_s)) for r in runs]
+    assert any("not a sine" in reason or "no sine" in reason for reason in method1.solve(runs).reasons)
