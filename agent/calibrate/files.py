@@ -153,7 +153,10 @@ class Files:
         sensor, reference = self._cut(interval, start_s, stop_s)
         if sensor is None or reference is None:
             return None
-        return aligned(sensor, reference, self._instrument, (start_s, stop_s), lag_s, limit_band=limit_band)
+        leave_out = self._options.settings.leave_out
+        return aligned(
+            sensor, reference, self._instrument, (start_s, stop_s), lag_s, limit_band=limit_band, leave_out=leave_out
+        )
 
     def _rest_floor(self) -> Array | None:
         """The usual noise of the sensor at rest: the median over all static poses."""

@@ -114,9 +114,7 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
         scatter = larger
         solution = _solution([e.window for e in found], data, priors, applied, scatter)
     shares = budget(solution, priors.offset_mps2)
-    mean, covariance = solution.x[:12].copy(), shares.covariance[:12, :12].copy()
-    if priors is not stated:
-        mean, covariance = _offset_combined(mean, covariance, stated)
+    mean, covariance = solution.x[:12], shares.covariance[:12, :12]
     told = determined(mean, np.sqrt(np.diag(covariance)), _prior_u(stated), solution.equations.seen)
     known = told | np.isfinite(_prior_u(stated))
 
@@ -183,24 +181,6 @@ def _without_offset(priors: Priors) -> Priors:
     covariance[9:, :], covariance[:, 9:] = 0.0, 0.0
     covariance[range(9, 12), range(9, 12)] = np.inf
     return Priors(priors.values, priors.parameters, covariance)
-
-
-def _offset_combined(mean: Array, covariance: Array, priors: Priors) -> tuple[Array, Array]:
-    """S and Q (12,) and their covariance, with what was known of Q used for Q alone: S stays as the data left it.
-
-    It is the update of a Kalman filter that only considers S (Schmidt 1966).
-    """
-    u = _prior_u(priors)
-    known = 9 + np.flatnonzero(np.isfinite(u[9:]))
-    if not known.size or priors.parameters is None or priors.covariance is None:
-        return mean, covariance
-    within = np.ix_(known, known)
-    gain = np.zeros((12, known.size))
-    gain[9:] = np.linalg.solve(covariance[within] + priors.covariance[within], covariance[known, 9:]).T
-    kept = np.eye(12)
-    kept[:, known] -= gain
-    mean = mean + gain @ (priors.parameters[known] - mean[known])
-    return mean, kept @ covariance @ kept.T + gain @ priors.covariance[within] @ gain.T
 
 
 def _reported(solution: Solution, shares: Budget) -> tuple[Nuisance, ...]:

@@ -17,9 +17,10 @@ from calib.excitation.turning import feels_gravity, standing_parts
 from calib.excitation.window_verdict import DEFAULT_LIMITS, Limits
 from calib.excitation.windows import LEAST_MOTION_MPS2, Points, at_rest, motion_windows, rest_window, still_window
 from calib.model import Array, Pose, Window, WindowSums
-from calib.signal.band import STOP_BAND, band_above_noise, lowpass, noise_in_band
+from calib.signal.band import STOP_BAND, band_above_noise, lowpass, noise_in_band, without_short_holes
 from calib.signal.corner import integral, with_integral, without_corner
-from calib.signal.holes import Mask, short_holes_filled
+from calib.signal.glitches import glitches
+from calib.signal.holes import Mask
 from calib.signal.instrument import Instrument
 from calib.signal.resampling import (
     BAND,
@@ -134,15 +135,23 @@ def aligned(
     lag_s: float = 0.0,
     *,
     limit_band: bool = True,
+    leave_out: bool = True,
 ) -> Aligned | None:
-    """Samples within `span_s` that have a reference, in m/s2; None where there are fewer than two."""
+    """Samples within `span_s` that have a reference, in m/s2; None where there are fewer than two.
+
+    Without `leave_out` the reference's glitches stay (see calib.signal.glitches).
+    """
     rate_hz = reference.clock.rate_hz
     raw = reference.values / instrument.sensitivity
+    odd = glitches(raw) if leave_out else np.zeros(len(raw), dtype=bool)
+    if instrument.derivatives:  # between the two sides of a step is no value: the hole is longer than those filled
+        odd = np.convolve(odd, np.ones(3), "same") > 0.5
+    raw[odd] = np.nan
     time_s = sensor.time_s
     if len(time_s) < 2:
         return None
     sensor_rate_hz = float((len(time_s) - 1) / (time_s[-1] - time_s[0]))
-    raw, V, raw_filled, filled = _without_short_holes(raw, sensor.values, (rate_hz, sensor_rate_hz))
+    raw, V, raw_filled, filled = without_short_holes(raw, sensor.values, (rate_hz, sensor_rate_hz))
     u, lost = differentiate(raw, rate_hz, instrument.derivatives) if instrument.derivatives else (raw, 0)
     m, inside = u.shape[1], _within(time_s, span_s)
     if instrument.has_corner:
@@ -164,28 +173,15 @@ def aligned(
         return None
     raw_inside = _within(reference.time_s, span_s)
     independent *= (1.0 - _share(filled, usable)) * (1.0 - _share(raw_filled, raw_inside))
-    counts = {"filled_samples": (filled & usable).sum(), "reference_filled_samples": (raw_filled & raw_inside).sum()}
+    counts = {
+        "filled_samples": (filled & usable).sum(),
+        "reference_filled_samples": (raw_filled & raw_inside).sum(),
+        "reference_glitches": (odd & raw_inside).sum(),
+    }
     kept = columns.T[:, usable].T
     points = Points(time_s[usable], kept[:, :3], kept[:, 3 : 3 + k], kept[:, 3 + k :])
     told = {name: float(count) for name, count in counts.items() if count}
     return Aligned(points, noise, clipped, independent, band_hz if limit_band else None, told)
-
-
-def _without_short_holes(raw: Array, V: Array, rates_hz: tuple[float, float]) -> tuple[Array, Array, Mask, Mask]:
-    """The reference's samples and the sensor's with their short holes filled, and which of each were.
-
-    Nothing is filled where the band of the motion is not known in both. The sensor may feel a wider band, and weak
-    motion that only the reference tells from noise.
-    """
-    signals, bands_hz = (raw, V), []
-    if any(np.isnan(x).any() for x in signals):
-        found_hz = (band_above_noise(x, rate_hz)[0] for x, rate_hz in zip(signals, rates_hz, strict=True))
-        bands_hz = [band_hz for band_hz in found_hz if band_hz is not None]
-    if len(bands_hz) < len(signals):
-        return raw, V, np.zeros(len(raw), dtype=bool), np.zeros(len(V), dtype=bool)
-    raw, raw_filled = short_holes_filled(raw, rates_hz[0], bands_hz[0])
-    V, filled = short_holes_filled(V, rates_hz[1], max(bands_hz))
-    return raw, V, raw_filled, filled
 
 
 def nothing_in(pose: Pose, start_s: float, stop_s: float, reason: str) -> Window:
@@ -231,7 +227,9 @@ def _motion(
     lag_s: float,
     settings: Settings,
 ) -> list[Window]:
-    found = aligned(sensor, reference, instrument, span_s, lag_s, limit_band=settings.limit_band)
+    found = aligned(
+        sensor, reference, instrument, span_s, lag_s, limit_band=settings.limit_band, leave_out=settings.leave_out
+    )
     if found is None:
         return []
     if instrument.has_corner:

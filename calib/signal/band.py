@@ -13,7 +13,7 @@ from functools import lru_cache
 import numpy as np
 
 from calib.model import Array
-from calib.signal.holes import Mask, in_short_holes
+from calib.signal.holes import Mask, in_short_holes, short_holes_filled
 
 SEGMENT_S = 4.0  # length of a segment of a spectrum: lines 0.25 Hz apart, and many segments in a few minutes
 LEAST_SEGMENTS = 8  # fewer segments give spectra that are too uncertain to choose a band
@@ -118,6 +118,23 @@ def lowpass(x: Array, rate_hz: float, band_hz: float) -> Array:
         near = np.convolve(missing, np.ones(2 * half + 1), "same") > 0.5
         out[near] = np.nan
     return out
+
+
+def without_short_holes(raw: Array, V: Array, rates_hz: tuple[float, float]) -> tuple[Array, Array, Mask, Mask]:
+    """The reference's samples and the sensor's with their short holes filled, and which of each were.
+
+    Nothing is filled where the band of the motion is not known in both. The sensor may feel a wider band, and weak
+    motion that only the reference tells from noise.
+    """
+    signals, bands_hz = (raw, V), []
+    if any(np.isnan(x).any() for x in signals):
+        found_hz = (band_above_noise(x, rate_hz)[0] for x, rate_hz in zip(signals, rates_hz, strict=True))
+        bands_hz = [band_hz for band_hz in found_hz if band_hz is not None]
+    if len(bands_hz) < len(signals):
+        return raw, V, np.zeros(len(raw), dtype=bool), np.zeros(len(V), dtype=bool)
+    raw, raw_filled = short_holes_filled(raw, rates_hz[0], bands_hz[0])
+    V, filled = short_holes_filled(V, rates_hz[1], max(bands_hz))
+    return raw, V, raw_filled, filled
 
 
 def _fast_length(least: int) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 
@@ -99,7 +100,9 @@ def check_shape(block: SampleBlock, axes: int) -> None:
 
 
 class SensorContract(ABC):
-    million = 1_000_000
+    """What every driver must do. `samples` are read without a pause; a million, unless the environment says fewer."""
+
+    samples = int(os.environ.get("FIELDCAL_CONTRACT_SAMPLES", "1000000"))
 
     @pytest.fixture
     @abstractmethod
@@ -239,9 +242,9 @@ class SensorContract(ABC):
                 assert block.flags & (BlockFlags.GAP | BlockFlags.RESTART)
             number = int(numbers[-1])
 
-    def test_a_million_samples_none_lost_doubled_or_shifted(self, rig: Rig) -> None:
+    def test_no_sample_is_lost_doubled_or_shifted(self, rig: Rig) -> None:
         rig.open()
-        blocks = rig.blocks(self.million / rig.rate_hz)
+        blocks = rig.blocks(self.samples / rig.rate_hz)
         block = next(blocks)
         assert block.first_index == 0
         next_number = int(rig.number(block.indications)[0])
@@ -251,7 +254,7 @@ class SensorContract(ABC):
             assert np.array_equal(rig.number(block.indications), np.arange(next_number, next_number + block.n))
             index += block.n
             next_number += block.n
-            if index >= self.million:
+            if index >= self.samples:
                 break
             block = next(blocks)
             assert block.flags == BlockFlags.NONE

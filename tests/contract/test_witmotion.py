@@ -57,7 +57,7 @@ class WitMotionRig(SerialRig):
 
 
 class TestWitMotion(SerialContract):
-    million = 100_000  # two frames per sample; it shares code with serial-binary, whose test reads a million
+    samples = 100_000  # two frames per sample; it shares code with serial-binary, whose test reads more
 
     @pytest.fixture
     def rig(self, tmp_path: Path) -> Iterator[WitMotionRig]:

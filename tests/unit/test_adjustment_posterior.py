@@ -94,16 +94,13 @@ def test_with_only_the_nominal_sensitivity_an_offset_that_nothing_tells_stays_un
 
 
 @pytest.mark.parametrize("u_offset", [0.01, 0.1, 10.0])
-def test_at_a_mount_that_never_turned_what_was_known_of_q_tells_q_alone(u_offset: float) -> None:
-    """S is as without that prior; Q is the mean of both statements on it, weighted by their variances."""
+def test_at_a_mount_that_never_turned_q_comes_from_the_mean_output_alone(u_offset: float) -> None:
+    """The mean output tells nothing of S there, so what was known of Q must not; the agent does the same."""
     down = np.array([0.0, 0.0, -9.81])
     windows, _, _ = recorded([np.eye(3)[0], np.eye(3)[2]], [down, down], 7)
     (without, u_without), (values, u) = (told(adjust(windows, priors(q))) for q in (np.inf, u_offset))
-    np.testing.assert_allclose(values[:9], without[:9], rtol=0, atol=1e-12)
-    np.testing.assert_allclose(u[:9], u_without[:9], rtol=1e-12)
-    found = adjust(windows, priors(np.inf))
-    covariance = found.covariance[9:12, 9:12]
-    weight = np.linalg.inv(covariance) + np.eye(3) / u_offset**2
-    expected = np.linalg.solve(weight, np.linalg.solve(covariance, found.mean[9:12]))
-    np.testing.assert_allclose(values[9:], expected, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(u[9:], np.sqrt(np.diag(np.linalg.inv(weight))), rtol=1e-9)
+    known = np.isfinite(without)
+    np.testing.assert_allclose(values[known], without[known], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(u[known], u_without[known], rtol=1e-12)
+    assert np.isfinite(values).all()
+    assert (np.abs(values - np.append(S_TRUE.ravel(), Q_TRUE)) <= 4.0 * u).all()
