@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from calib.model import Array
 
-# Curvature over the usual curvature nearby. Gaussian motion and noise reach 8 once in a day of 1 kHz.
+# Curvature over the usual curvature nearby. Gaussian motion with noise reaches 7 in 3.6 million samples.
 LIMIT = 50.0
 LIMIT_STEPS = 8.0  # times the resolution of the samples, below which a curvature may be rounding
 BLOCK = 64  # samples in which the usual curvature is the median
