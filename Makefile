@@ -24,7 +24,7 @@ run: $(VENV)/runtime  ## the agent on the virtual bench, with a router beside it
 # The drivers' contract reads 200,000 samples here, more than any counter holds; `pytest tests/contract` reads a million.
 test: export FIELDCAL_CONTRACT_SAMPLES = 200000
 test: $(VENV)/development
-	$(BIN)/python -m pytest -n auto --dist loadscope --no-loadscope-reorder -m "not faults" || \
+	$(BIN)/python -m pytest -n auto --dist loadscope -m "not faults" || \
 		{ test $$? = 1 && $(BIN)/python -m pytest --last-failed --last-failed-no-failures none -m "not faults"; }
 
 nightly: $(VENV)/development  ## the twins under Debian's kernel in QEMU; needs qemu-system-x86, busybox-static and Debian's apt
