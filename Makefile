@@ -21,11 +21,14 @@ run: $(VENV)/runtime  ## the agent on the virtual bench, with a router beside it
 	$(BIN)/fieldcal run --preset $(PRESET) --with-router
 
 # Tests of running programs against the clock can fail where other work delays them. What failed runs once more, alone.
-# The drivers' contract reads 200,000 samples here, more than any counter holds; `pytest tests/contract` reads a million.
+once_more = { test $$? = 1 && $(BIN)/python -m pytest --last-failed --last-failed-no-failures none $(1); }
+
+# The drivers' contract reads 200,000 samples here, which a counter of 16 bits does three times; `pytest tests/contract`
+# reads a million.
 test: export FIELDCAL_CONTRACT_SAMPLES = 200000
 test: $(VENV)/development
 	$(BIN)/python -m pytest -n auto --dist loadscope -m "not faults" || \
-		{ test $$? = 1 && $(BIN)/python -m pytest --last-failed --last-failed-no-failures none -m "not faults"; }
+		$(call once_more,-m "not faults")
 
 nightly: $(VENV)/development  ## the twins under Debian's kernel in QEMU; needs qemu-system-x86, busybox-static and Debian's apt
 	$(BIN)/python -m tests.nightly
@@ -45,9 +48,9 @@ faults: $(VENV)/development  ## breaks the agent on purpose, for an hour; needs 
 # The slow disk is tested alone, because a busy machine makes a disk look slower than it is. What failed runs once more.
 faults-short: $(VENV)/development  ## the same in a few minutes; skips what this machine cannot do
 	$(BIN)/python -m pytest -n auto -m faults tests/faults -k "not slow" || \
-		{ test $$? = 1 && $(BIN)/python -m pytest --last-failed --last-failed-no-failures none -m faults tests/faults; }
+		$(call once_more,-m faults tests/faults)
 	$(BIN)/python -m pytest -m faults tests/faults -k slow || \
-		{ test $$? = 1 && $(BIN)/python -m pytest --last-failed --last-failed-no-failures none -m faults tests/faults; }
+		$(call once_more,-m faults tests/faults)
 
 soak: $(VENV)/development  ## 24 h in 72 min, then an hour in real time; writes docs/reliability.md
 	$(BIN)/python -m benchmarks.soak --part soak-day

@@ -117,6 +117,7 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
     mean, covariance = solution.x[:12], shares.covariance[:12, :12]
     told = determined(mean, np.sqrt(np.diag(covariance)), _prior_u(stated), solution.equations.seen)
     known = told | np.isfinite(_prior_u(stated))
+    values = np.where(known, mean, np.nan)
 
     def turned(static: int, polarity: int) -> Solution:
         reduced = [excited(w).window for w in turned_windows(used, static, polarity)]
@@ -124,8 +125,8 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
 
     return Adjustment(
         calibration=Calibration(
-            np.where(known, mean, np.nan)[:9].reshape(3, 3),
-            np.where(known, mean, np.nan)[9:],
+            values[:9].reshape(3, 3),
+            values[9:],
             np.where(np.outer(known, known), covariance, np.nan),
             told,
             data.type_a.degrees_of_freedom,

@@ -67,7 +67,7 @@ def test_the_chain_and_each_file_alone_replay_bit_for_bit(data_dir: Path) -> Non
         assert replayed.returncode == 0, replayed.stdout + replayed.stderr
         assert json.loads(replayed.stdout)["equal"] is True
     whole = json.loads(fieldcal("replay", *files, "--json", "-").stdout)
-    # One calibration of three windows; where the machine pauses, more follow before the agent is interrupted.
+    # One calibration of three windows, as a rule. A window that lost samples comes in parts, and each may give one.
     assert len(whole["calibrations"]) == len(results(data_dir, "calibration")) >= 1
     assert len(whole["windows"]) == len(results(data_dir, "window")) >= 3
 

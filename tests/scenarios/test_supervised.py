@@ -127,17 +127,13 @@ def test_it_tells_how_it_is_from_beginning_to_end(
         while (sample := subscriber.try_recv()) is not None:
             states.append(json.loads(sample.payload.to_string())["state"])
         subscriber.undeclare()
-    assert [s for i, s in enumerate(states) if s != states[i - 1] or i == 0] == [
-        "running",
-        "degraded",
-        "running",
-        "stopping",
-    ]
+    expected = ["running", "degraded", "running", "stopping"]
+    assert [state for state, _ in groupby(states)] == expected
     log = [json.loads(line) for line in (tmp_path / "log").read_text().splitlines()]
     assert {entry["level"] for entry in log} == {"info", "warning"}
     # A state is logged again where its reason changes.
     logged = [e["state"] for e in log if e.get("event") == "state"]
-    assert [state for state, _ in groupby(logged)] == ["running", "degraded", "running", "stopping"]
+    assert [state for state, _ in groupby(logged)] == expected
     first, *between, last = [e["state"] for e in log if e.get("event") == "device"]
     assert (first, set(between), last) == ("open", {"lost"}, "open")
 
