@@ -14,6 +14,7 @@ the front end has removed the lag that was found, because the remaining lag is t
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,19 +70,16 @@ class Equations:
         m/s2; None takes it from the data."""
         self.data, self.nuisances, self.scatter = data, nuisances, scatter
         self.pose_of_window = np.array(pose_of)
-        known = np.isfinite(nuisances.gravity).all(axis=1)[self.pose_of_window]
-        self.known = known
+        self.known = known = nuisances.known[self.pose_of_window]
         self.output_per_mps2 = self._output_per_mps2() if output_per_mps2 is None else output_per_mps2
-        self.unseen = self._unseen_inputs()
-        self.rank = 4 - len(self.unseen)
-        self.seen = self._seen()
         noise2 = data.type_a.noise**2 / data.count[:, None]
         variance = noise2 + (offset_scatter_mps2 * self.output_per_mps2) ** 2
         # If gravity is not known in a pose, the mean has no information and gets no weight.
         self.mean_weight = np.where(known[:, None], 1.0 / np.sqrt(variance), 0.0)
         self.white_share = np.where(known[:, None], noise2 / variance, 0.0)
 
-    def _unseen_inputs(self) -> Array:
+    @cached_property
+    def unseen(self) -> Array:
         """Directions (k, 4) of (a_x, a_y, a_z, 1) normal to every input vector, with angles as stated. The rank is
         4 - k."""
         data, nuisances, m = self.data, self.nuisances, self.data.channels
@@ -96,7 +94,13 @@ class Equations:
         _, singular, ways = np.linalg.svd(np.vstack([rows / scale, np.zeros((4, 4))]), full_matrices=False)
         return np.asarray(ways[singular <= RANK_TOLERANCE * singular[0]] / scale)
 
-    def _seen(self) -> NDArray[np.bool_]:
+    @property
+    def rank(self) -> int:
+        """The rank of the input vectors, 4 at most."""
+        return 4 - len(self.unseen)
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
         """(12,) flags of the parameters (S row by row, then Q) that have no component in a direction of `unseen`."""
         parts = np.abs(self.unseen) / np.linalg.norm(self.unseen, axis=1, keepdims=True)
         free = parts.max(axis=0, initial=0.0) > UNSEEN_SHARE
@@ -175,7 +179,7 @@ class Equations:
         D = inputs.mean_direction[self.pose_of_window]
         moved = np.einsum("wkm,wm->wk", D, data.mean_x[:, :m])
         rate = np.einsum("wkm,wm->wk", D, data.mean_x[:, m:])
-        G = np.nan_to_num(inputs.gravity[self.pose_of_window])
+        G = inputs.gravity[self.pose_of_window]
         # If a window is no whole number of cycles, the mean of du/dt is not 0, and lag and quadrature add to the mean.
         per_omega = np.divide(1.0, np.sqrt(data.omega2), out=np.zeros_like(data.count), where=data.omega2 > 0.0)
         share = (data.mean_x[:, m] if m else 0.0 * data.count) * per_omega
@@ -188,7 +192,7 @@ class Equations:
             jacobian[:, i, 3 * i : 3 * i + 3] = felt[:, i]
             jacobian[:, i, 9 + i] = 1.0
         d_input = np.einsum("jwkm,wm->jwk", inputs.d_mean_direction[:, self.pose_of_window], data.mean_x[:, :m])
-        d_input = d_input + np.nan_to_num(inputs.d_gravity[:, self.pose_of_window])
+        d_input = d_input + inputs.d_gravity[:, self.pose_of_window]
         d_input = d_input + inputs.d_quadrature[:, self.pose_of_window] * share[:, None]
         jacobian[..., 12:] = np.einsum("ik,jwk->wij", S, d_input)
         jacobian[..., 12:] += self.output_per_mps2 * nuisances.offset[:, self.pose_of_window].transpose(1, 2, 0)

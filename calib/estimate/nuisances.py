@@ -116,7 +116,9 @@ class Nuisances:
             if pose.along_rate_s is not None:
                 self._along_rate[p, :m, :m] = pose.along_rate_s
         self.direction, self.mean_direction = self._stated @ self._along, self._stated
-        self.gravity = np.array([pose.gravity_mps2 for pose in poses])
+        stated = np.array([pose.gravity_mps2 for pose in poses])
+        self.known = np.isfinite(stated).all(axis=1)  # (P,) if the gravity of a pose is not known, it is 0 here
+        self.gravity = np.where(self.known[:, None], stated, 0.0)
         self._real = own_channels(channels)
         self._magnitude = np.maximum(np.linalg.norm(self.gravity, axis=1), np.finfo(float).tiny)
         self._turn_direction = self._stacked("turn_direction", (n, 3))

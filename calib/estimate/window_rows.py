@@ -143,12 +143,19 @@ class WindowRows:
         # The scatter between windows is in the covariance of the rows, not before it.
         own = replace(self._scatter, lag_s=np.zeros(1), attenuation=np.zeros(1))
         self.equations = Equations(self.data, self.nuisances, [0], priors.offset_mps2, own, scale)
-        self._priors, self._held_mps2 = priors, held_mps2
+        self._priors, self._held_mps2, self._seen_degc = priors, held_mps2, seen_degc
         above = summary.temperature_degc - reference_degc
         self._temperature_k = above if np.isfinite(above) else 0.0
         told = np.isfinite(above) or not np.isfinite(seen_degc).all()
         self._perhaps_k = () if told else tuple(degc - reference_degc for degc in seen_degc)
         self._live = np.repeat(np.diag(self.data.root[0]) > 0.0, 3)
+
+    def made_of(
+        self, summary: Summary, priors: Priors, held_mps2: Array | None, seen_degc: tuple[float, float]
+    ) -> bool:
+        """Whether these rows are those of this window under these statements; see `__init__`."""
+        same = self.summary is summary and self._priors is priors and self._held_mps2 is held_mps2
+        return same and (bool(np.isfinite(summary.temperature_degc)) or self._seen_degc == seen_degc)
 
     @property
     def terms(self) -> list[Term]:

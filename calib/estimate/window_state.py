@@ -74,6 +74,7 @@ class WindowState:
         self._temperature_range = (np.inf, -np.inf)
         self._residual_sd = np.full(3, np.nan)
         self._held: Held | None = None  # at a fixed mount, from the first window on
+        self._made: dict[int, WindowRows] = {}  # rows of the recent windows, by id(summary): made once, used twice
         self.windows = 0
 
     @property
@@ -95,6 +96,7 @@ class WindowState:
         other._joint, other._positions = self._joint.copy(), list(self._positions)
         other._references, other._before = dict(self._references), list(self._before)
         other._mounted, other._sensitivity = list(self._mounted), list(self._sensitivity)
+        other._made = dict(self._made)
         return other
 
     def _take(self, rows: WindowRows, wandered: JointState) -> None:
@@ -105,6 +107,9 @@ class WindowState:
         self._settle()
         if len(self._joint.recent) > MOST_RECENT:
             self._absorb(1)
+        self._made[id(summary)] = rows
+        recent = {id(kept) for kept in self._joint.recent}
+        self._made = {key: made for key, made in self._made.items() if key in recent}
         self._noise = self._noise.pooled(rows.noise)
         self._residual_sd = summary.data.type_a.noise[0].copy()
         if np.isfinite(summary.temperature_degc):
@@ -117,7 +122,11 @@ class WindowState:
     def _rows(self, summary: Summary) -> WindowRows:
         reference_degc = self._stated.temperature.reference_degc
         held = self._held.mps2 if self._held is not None else np.zeros(3) if self._fixed else None
-        return WindowRows(summary, self._priors(summary), self.scale, reference_degc, held, self._seen_degc)
+        priors, seen_degc = self._priors(summary), self._seen_degc
+        made = self._made.get(id(summary))
+        if made is not None and made.made_of(summary, priors, held, seen_degc):
+            return made
+        return WindowRows(summary, priors, self.scale, reference_degc, held, seen_degc)
 
     def _priors(self, summary: Summary) -> Priors:
         """What is stated now beside the reference of a window."""

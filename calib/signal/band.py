@@ -7,7 +7,6 @@ band by the same filter: V = S a + Q holds for the filtered signals as well, wha
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -40,8 +39,7 @@ def band_above_noise(x: Array, rate_hz: float) -> tuple[float | None, Array]:
         return None, np.zeros(m)
     x, segments = _bridged(x), 0
     while 2 * segments < LEAST_SEGMENTS:  # more of the shorter segments are free of missing samples
-        spectra = [_spectrum([x[:, k : k + 1]], size) for k in range(m)]
-        powers, segments = np.stack([power for power, _ in spectra]), spectra[0][1]
+        powers, segments = _spectra(x, size)
         if 2 * segments < LEAST_SEGMENTS and (size := size // 2) < FEWEST_LINES:
             return None, np.zeros(m)
     window = hanning(size)
@@ -157,18 +155,13 @@ def hanning(size: int) -> Array:
     return window
 
 
-def _spectrum(stretches: Sequence[Array], size: int) -> tuple[Array, int]:
-    """Power spectrum (size // 2 + 1,) averaged over whole Hann-windowed segments of `size`, and their number.
+def _spectra(x: Array, size: int) -> tuple[Array, int]:
+    """Power spectra (m, size // 2 + 1) of x (n, m), averaged over whole Hann-windowed segments, and their number.
 
-    The powers of several channels are added. Segments with missing samples are left out.
+    Segments with missing samples are left out: samples from both sides of a gap, joined, would show a jump.
     """
-    window = hanning(size)[:, None]
-    total, count = np.zeros(size // 2 + 1), 0
-    for x in stretches:
-        for start in range(0, len(x) - size + 1, size):
-            part = x[start : start + size]
-            if np.isnan(part).any():
-                continue  # samples from both sides of a gap, joined, would show a jump that is no noise
-            total += np.sum(np.abs(np.fft.rfft((part - part.mean(axis=0)) * window, axis=0)) ** 2, axis=1)
-            count += 1
-    return total / max(count, 1), count
+    whole = len(x) // size
+    parts = np.ascontiguousarray(x[: whole * size].reshape(whole, size, -1).swapaxes(1, 2))
+    parts = parts[~np.isnan(parts).any(axis=(1, 2))]
+    lines = np.fft.rfft((parts - parts.mean(axis=2, keepdims=True)) * hanning(size), axis=2)
+    return np.sum(np.abs(lines) ** 2, axis=0) / max(len(parts), 1), len(parts)
