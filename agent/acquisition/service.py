@@ -26,6 +26,7 @@ from agent.delivery.store import Store
 from agent.recording.acceleration import encode_acceleration
 from agent.recording.files import final_name
 from agent.recording.fingerprint import fingerprint, versions
+from agent.recording.owner import check_owner
 from agent.recording.recalling import memories_of
 from agent.recording.retention import keep_files
 from agent.recording.signing import Signer
@@ -63,10 +64,12 @@ class Service:
 
         Returns whether all threads have ended. Where it returns False, a router or disk that does not respond blocks
         one of them, and the caller must end the process with `os._exit`.
-        Raises StoreError or OSError where the data directory cannot be used, KeyFileError for an unusable signing key.
+        Raises StoreError or OSError where the data directory cannot be used, OtherGatewayError where it is another
+        gateway's, KeyFileError for an unusable signing key.
         """
         self._data_dir.mkdir(parents=True, exist_ok=True)
         config = self._config
+        check_owner(self._data_dir, f"{config.gateway.site}/{config.gateway.name}")
         signer = Signer.load(config.recording.signing_key) if config.recording.signing_key else None
         recall = partial(memories_of, restore=Pipeline.restore)
         self._store = Store(self._data_dir, keep=keep_results(config.results), recall=recall)

@@ -15,14 +15,15 @@ import msgspec
 from agent.delivery.history import FILE_NAME, History, StoreError
 from agent.recording.chain import Link, chain_faults, missing_after
 from agent.recording.comparison import OTHER_CPU
-from agent.recording.files import FILE_METADATA, recordings
+from agent.recording.files import recordings
 from agent.recording.integrity import Integrity, check_integrity
 from agent.recording.pruned_ranges import PRUNED_METADATA, from_metadata, merged
 from agent.recording.reading import open_recording
 from agent.recording.records import Fault
 from agent.recording.repair import REPAIR_METADATA
 from agent.recording.replaying import Replay, ReplayedFile, Restore
-from agent.recording.signing import SIGNATURE_METADATA, verify_file
+from agent.recording.results_chain import FILE_METADATA, PREVIOUS_RESULTS
+from agent.recording.signing import SIGNATURE_METADATA, Statement, signed_results, verify_file
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
@@ -149,7 +150,8 @@ def audit_files(
             integrity = check_integrity(file, size)
             verdict = _verdict(path, sha256, size, integrity, replayed.run(path))
             if key is not None:
-                fault = verify_file(file, size, integrity.metadata.get(SIGNATURE_METADATA), key)
+                signature = integrity.metadata.get(SIGNATURE_METADATA)
+                fault = verify_file(file, size, signature, key, _statement(verdict, integrity))
                 verdict.reasons += [fault] if fault else []
             if strict:
                 verdict.reasons += verdict.notes
@@ -189,6 +191,13 @@ def _verdict(path: Path, sha256: str, size: int, integrity: Integrity, replay: R
     )
 
 
+def _statement(verdict: AuditedFile, integrity: Integrity) -> Statement:
+    """What the signature of a file must say of it; its content is hashed when the signature is checked."""
+    previous_sha256 = integrity.metadata.get(FILE_METADATA, {}).get("previous_sha256", "")
+    replay = verdict.replay
+    return Statement(replay.gateway, replay.file_sequence, previous_sha256, integrity.results.text, 0, "")
+
+
 def _link(verdict: AuditedFile, integrity: Integrity) -> Link:
     return Link(
         path=verdict.path,
@@ -198,6 +207,8 @@ def _link(verdict: AuditedFile, integrity: Integrity) -> Link:
         incomplete=verdict.incomplete,
         repaired=verdict.repaired,
         previous_sha256=integrity.metadata.get(FILE_METADATA, {}).get("previous_sha256", ""),
+        previous_results=integrity.metadata.get(FILE_METADATA, {}).get(PREVIOUS_RESULTS, ""),
+        signed_results=signed_results(integrity.metadata.get(SIGNATURE_METADATA)),
     )
 
 

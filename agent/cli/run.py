@@ -75,6 +75,7 @@ def serve(config: Config, data_dir: Path, watch: Any, duration_s: float | None) 
     """Run the service until a signal or for `duration_s` seconds; returns the exit status."""
     from agent.acquisition.service import Service
     from agent.config.key_file import KeyFileError
+    from agent.recording.owner import OtherGatewayError
 
     service = Service(config, data_dir, watch)
     for number in STOP_SIGNALS:
@@ -83,6 +84,9 @@ def serve(config: Config, data_dir: Path, watch: Any, duration_s: float | None) 
         ended = service.run(duration_s)
     except KeyFileError as error:
         click.echo(f"fieldcal run: recording.signing_key: {error}", err=True)
+        return 2
+    except OtherGatewayError as error:
+        click.echo(f"fieldcal run: {error}", err=True)
         return 2
     except (StoreError, OSError) as error:
         click.echo(f"fieldcal run: {error}", err=True)

@@ -12,7 +12,8 @@ from pathlib import Path
 from agent.core.memory import Memory
 from agent.delivery.history import Record
 from agent.delivery.schema import RESULT_COLUMNS, checked, insert_results, withdraw, write_latest, write_memory
-from agent.recording.files import FILE_METADATA, final_name, recordings
+from agent.recording.files import final_name, recordings
+from agent.recording.results_chain import FILE_METADATA
 from agent.recording.scan import scan
 
 _log = logging.getLogger(__name__)

@@ -25,6 +25,8 @@ class Link:
     incomplete: bool
     repaired: bool
     previous_sha256: str
+    previous_results: str  # the chain of results at its beginning; "" in a file of an older version
+    signed_results: str | None  # the chain at its end, as its signature says; None without such a signature
 
 
 def chain_faults(
@@ -33,11 +35,12 @@ def chain_faults(
     """Yield (index in `links`, what is wrong) for each recording that does not follow the one before it.
 
     `pruned`: the Pruned events of these recordings. `deleted`: all file numbers that events or metadata name as deleted
-    by retention. Only neighbours of the same gateway with rising numbers are compared. `from_first`: all recordings
-    from number 1 must be there or be named as deleted.
+    by retention. Only neighbours of the same gateway with rising numbers are compared. `from_first`: the recordings are
+    those of a directory: of one gateway, and all from number 1 must be there or be named as deleted.
     """
     if from_first and links:
         yield from ((0, fault) for fault in _gap(0, links[0], pruned, deleted))
+        yield from _foreign(links)
     for index, (before, after) in enumerate(pairwise(links), start=1):
         if before.gateway != after.gateway or after.file_sequence <= before.file_sequence:
             continue
@@ -45,6 +48,16 @@ def chain_faults(
             yield from ((index, fault) for fault in _gap(before.file_sequence, after, pruned, deleted))
         elif not _follows(before, after):
             yield index, f"{before.path} is not the file that this one names as the one before it: its SHA-256 differs"
+        elif before.signed_results is not None and after.previous_results not in ("", before.signed_results):
+            yield index, f"its chain of results does not begin where the one of {before.path} ends"
+
+
+def _foreign(links: Sequence[Link]) -> Iterator[tuple[int, str]]:
+    known = [link for link in links if link.gateway]  # a file that cannot be read names none
+    for index, link in enumerate(links):
+        if link.gateway and link.gateway != known[0].gateway:
+            whose = f"a recording of the gateway {link.gateway}, but {known[0].path} is one of {known[0].gateway}"
+            yield index, f"{whose}; a directory holds the recordings of one gateway"
 
 
 def _follows(before: Link, after: Link) -> bool:

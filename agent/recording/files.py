@@ -13,10 +13,10 @@ from mcap.writer import CompressionType, Writer
 
 from agent.core.events import RunStart
 from agent.recording.messages import schema_data, schema_of
-from agent.recording.signing import SIGNATURE_METADATA, Signer
+from agent.recording.results_chain import FILE_METADATA, PREVIOUS_RESULTS, ResultsChain
+from agent.recording.signing import SIGNATURE_METADATA, Signer, Statement
 
 ACTIVE_SUFFIX = ".active"
-FILE_METADATA = "fieldcal.file"
 _NAME = re.compile(r"fieldcal-(\d{6,18})\.mcap(\.active)?")
 
 
@@ -71,6 +71,10 @@ class RecordingFile:
         signer: Signer | None = None,
     ) -> None:
         self._signer = signer
+        self._gateway = f"{start.site}/{start.gateway}"
+        self._number = start.file_sequence
+        self._previous_sha256 = origin.get("previous_sha256", "")
+        self._results = ResultsChain.of_text(origin.get(PREVIOUS_RESULTS, ""))
         self.final_path = directory / f"fieldcal-{start.file_sequence:06d}.mcap"
         self.path = self.final_path.with_name(self.final_path.name + ACTIVE_SUFFIX)
         self._stream = _HashedFile(self.path)
@@ -97,6 +101,7 @@ class RecordingFile:
         """Add a message; it is on disk after the next `sync`."""
         # MCAP's sequence has 32 bits only; the message itself holds the full number.
         self._writer.add_message(self._channel(topic), log_time, data, publish_time, sequence & 0xFFFFFFFF)
+        self._results.add(topic, data)
         self._unsynced = True
 
     def note(self, name: str, metadata: dict[str, str]) -> None:
@@ -112,18 +117,27 @@ class RecordingFile:
             self._stream.sync()
             self._unsynced = False
 
-    def finish(self) -> str:
-        """Close the file with summary and footer under its final name; returns its SHA-256 (hexadecimal)."""
+    def statement(self) -> Statement:
+        """What can be signed of the file: all bytes written so far. Call it after `sync` or `finish`."""
+        return Statement(
+            self._gateway,
+            self._number,
+            self._previous_sha256,
+            self._results.text,
+            self._stream.tell(),
+            self._stream.sha256().hex(),
+        )
+
+    def finish(self) -> None:
+        """Close the file with summary and footer under its final name."""
         if self._signer is not None:
             self._writer.flush()
-            signature = self._signer.metadata(self._stream.sha256(), self._stream.tell())
-            self._writer.add_metadata(SIGNATURE_METADATA, signature)
+            self._writer.add_metadata(SIGNATURE_METADATA, self._signer.metadata(self.statement()))
         self._writer.finish()
         self._stream.sync()
         self._stream.close()
         self.path.rename(self.final_path)
         sync_directory(self.final_path.parent)
-        return self._stream.sha256().hex()
 
     def abandon(self) -> None:
         """Close the file as it is, without summary and footer.

@@ -15,6 +15,7 @@ from mcap.records import Attachment, DataEnd, Footer, MessageIndex, Metadata
 
 from agent.recording.crc_location import changed_byte
 from agent.recording.records import MAGIC, Fault, Record, RecordError, parse, record_name, refusal, walk
+from agent.recording.results_chain import ResultsChain
 from agent.recording.summary import KINDS, DerivedSummary
 
 FAULTS_KEPT = 20  # faults kept for one file; the others are only counted
@@ -31,6 +32,7 @@ class Integrity:
     chunks: int = 0
     messages: int = 0
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)  # by name; of one name, the last record
+    results: ResultsChain = field(default_factory=ResultsChain)  # at the end of the file
 
     def add(self, fault: Fault) -> None:
         """Count a fault; keep it if it is among the first."""
@@ -51,6 +53,7 @@ def check_integrity(file: BinaryIO, size: int) -> Integrity:
         found.good_bytes = size
     except RecordError as error:
         found.add(error.fault)
+    found.results = check.results
     for broken in check.broken_sums:
         found.add(broken.fault if found.faults else _located(file, size, broken))
     return found
@@ -90,6 +93,11 @@ class _Check:
         self._derived = DerivedSummary()
         self._groups: dict[int, list[tuple[Record, Any]]] = {}
         self.broken_sums: list[_BrokenSum] = []
+
+    @property
+    def results(self) -> ResultsChain:
+        """The chain of the results so far."""
+        return self._derived.results
 
     def take(self, record: Record) -> None:
         """Check the next record of the file; add what is wrong to the faults."""

@@ -11,6 +11,7 @@ import hashlib
 import logging
 import os
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -21,8 +22,11 @@ from mcap.records import Attachment, DataEnd, Footer, Metadata, SummaryOffset
 
 from agent.recording.files import ACTIVE_SUFFIX, recordings, sync_directory
 from agent.recording.integrity import check_integrity
+from agent.recording.reading import first_event
 from agent.recording.records import MAGIC, Record, RecordError, parse, unpack, walk
-from agent.recording.signing import SIGNATURE_METADATA, Signer
+from agent.recording.results_chain import FILE_METADATA
+from agent.recording.scan import metadata_of
+from agent.recording.signing import SIGNATURE_METADATA, Signer, Statement
 from agent.recording.summary import KINDS, DerivedSummary
 
 REPAIR_METADATA = "fieldcal.repair"
@@ -52,6 +56,7 @@ def close_torn(directory: Path, signer: Signer | None = None) -> None:
 def close_file(path: Path, signer: Signer | None = None) -> str:
     """Close one file; return what was done, as a sentence. Raises OSError, or RecordError where data would be lost."""
     final = path.with_name(path.name.removesuffix(ACTIVE_SUFFIX))
+    sign = _signing(path, signer) if signer is not None else None
     if final.exists():
         raise FileExistsError(f"{final.name} exists already")
     with open(path, "r+b") as file:
@@ -66,7 +71,7 @@ def close_file(path: Path, signer: Signer | None = None) -> str:
         if check_integrity(file, size).finished:
             torn = 0  # the file is complete; only its final name is missing
         else:
-            _append(file, sound, size, signer)
+            _append(file, sound, size, sign)
     path.rename(final)
     sync_directory(path.parent)
     return f"{final} was left unfinished and is closed now; the last {torn} bytes were incomplete"
@@ -81,6 +86,9 @@ class _Sound:
     sha256: Any
     derived: DerivedSummary
     chunks: int
+
+
+Sign = Callable[[_Sound], dict[str, str]]
 
 
 def _sound_part(file: BinaryIO, size: int) -> _Sound:
@@ -149,12 +157,29 @@ def _take(derived: DerivedSummary, record: Record) -> None:
         derived.add_attachment(record, parsed)
 
 
-def _append(file: BinaryIO, sound: _Sound, size: int, signer: Signer | None) -> None:
+def _signing(path: Path, signer: Signer) -> Sign | None:
+    """What gives the signature record of a file whose other records are closed; None where it names no gateway."""
+    start = first_event(path)
+    previous_sha256 = metadata_of(path).get(FILE_METADATA, {}).get("previous_sha256", "")
+    if start is None:
+        return None
+    gateway, number = f"{start.site}/{start.gateway}", start.file_sequence
+
+    def sign(sound: _Sound) -> dict[str, str]:
+        sha256 = sound.sha256.hexdigest()
+        return signer.metadata(
+            Statement(gateway, number, previous_sha256, sound.derived.results.text, sound.length, sha256)
+        )
+
+    return sign
+
+
+def _append(file: BinaryIO, sound: _Sound, size: int, sign: Sign | None) -> None:
     """Write the end of the file. Where the disk has no space for it, restore the file as it was and raise OSError."""
     length = sound.length
     file.seek(length)
     tail = file.read(TAIL_MAX)
-    end = _end(sound, tail, size, signer)
+    end = _end(sound, tail, size, sign)
     try:
         file.seek(length)
         file.write(end)
@@ -168,7 +193,7 @@ def _append(file: BinaryIO, sound: _Sound, size: int, signer: Signer | None) -> 
         raise
 
 
-def _end(sound: _Sound, tail: bytes, size: int, signer: Signer | None) -> bytes:
+def _end(sound: _Sound, tail: bytes, size: int, sign: Sign | None) -> bytes:
     """The bytes that close the file, to be written after its intact part."""
     parts: list[bytes] = []
 
@@ -193,8 +218,8 @@ def _end(sound: _Sound, tail: bytes, size: int, signer: Signer | None) -> bytes:
         )
     note = {"found_bytes": str(size), "kept_bytes": str(kept), "torn_bytes": str(size - kept)}
     add(Metadata(name=REPAIR_METADATA, metadata=note))
-    if signer is not None:
-        add(Metadata(name=SIGNATURE_METADATA, metadata=signer.metadata(sound.sha256.digest(), sound.length)))
+    if sign is not None:
+        add(Metadata(name=SIGNATURE_METADATA, metadata=sign(sound)))
     return b"".join(parts) + _summary(sound)
 
 

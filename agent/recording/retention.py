@@ -69,7 +69,7 @@ def due(directory: Path, keep: KeepFiles, active: Path | None, waiting: str, *, 
         old = oldest_ns is not None and status.st_mtime_ns < oldest_ns and not chosen
         if path == active or (limit is not None and number >= limit) or not (freed < excess or old):
             break
-        if _is_kept(path) or (chosen and chosen[-1][0] + 1 != number):
+        if is_kept(path) or (chosen and chosen[-1][0] + 1 != number):
             if chosen:
                 break
             continue
@@ -92,7 +92,7 @@ def due(directory: Path, keep: KeepFiles, active: Path | None, waiting: str, *, 
 def delete(directory: Path, pruned: Pruned) -> None:
     """Delete the files of a range, except those that a reader has opened since `due` named them. Raises OSError."""
     for number, path in recordings(directory):
-        if pruned.first_file <= number <= pruned.last_file and not _is_kept(path):
+        if pruned.first_file <= number <= pruned.last_file and not is_kept(path):
             path.unlink(missing_ok=True)
     sync_directory(directory)
     _log.info("recordings %d to %d deleted", pruned.first_file, pruned.last_file)
@@ -110,7 +110,8 @@ def _excess(directory: Path, keep: KeepFiles, total: int) -> int:
     return max(excess, total - keep.bytes) if keep.bytes is not None else excess
 
 
-def _is_kept(path: Path) -> bool:
+def is_kept(path: Path) -> bool:
+    """Whether a recording is pinned, or open in a program that reads it."""
     if path.with_name(path.name + PIN_SUFFIX).exists():
         return True
     with contextlib.suppress(FileNotFoundError), open(path, "rb") as file:

@@ -1,51 +1,99 @@
-"""Signatures of recordings: Ed25519 over the SHA-256 of all bytes of a file before the signature.
+"""Signatures of recordings: Ed25519 over a text about the file: its gateway, number, predecessor, results and content.
 
 The signature is a metadata record, the last record of the file's data section. Only the summary follows it. The audit
-derives what the summary must say from the signed bytes, so the summary needs no signature.
+derives what the summary must say from the signed bytes, so the summary needs no signature. docs/audit.md gives the
+layout. Files of version 1 have a signature over the SHA-256 of the content alone.
 """
 
 from __future__ import annotations
 
-import base64
-import binascii
 import hashlib
 import struct
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
 from mcap.opcode import Opcode
 
 from agent.config.key_file import KeyFileError, load_private_key, read_key_file
+from agent.recording.signed_text import (
+    SignedText,
+    SignedTextError,
+    count,
+    key_id,
+    sign,
+    signature_fault,
+    values_of,
+    written,
+)
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 
 SIGNATURE_METADATA = "fieldcal.signature"
-_CONTEXT = b"fieldcal recording, version 1\n"  # a signature that the key made for another purpose is not valid here
+_CONTEXT_1 = b"fieldcal recording, version 1\n"
+_PURPOSE_2 = "fieldcal recording, version 2"
+_LINES_2 = ["gateway", "recording", "previous", "results", "content"]
 _HEAD = struct.Struct("<BQ")
 _OTHER_BYTES = "its signature is of other bytes than the file holds: the file was changed after it was signed"
 
 
+@dataclass(frozen=True, slots=True)
+class Statement:
+    """What the signature of a recording says.
+
+    `previous_sha256`: of the whole file before it, "" where there is none or it was never closed. `results`: the text
+    of the ResultsChain at the end. `length`, `sha256`: of all bytes before the record of the signature.
+    """
+
+    gateway: str
+    file_sequence: int
+    previous_sha256: str
+    results: str
+    length: int
+    sha256: str
+
+    @property
+    def values(self) -> dict[str, str]:
+        """The lines that signatures and heads have in common."""
+        return {
+            "gateway": self.gateway,
+            "recording": str(self.file_sequence),
+            "previous": self.previous_sha256 or "-",
+            "results": self.results,
+            "content": f"{self.length} {self.sha256}",
+        }
+
+    @property
+    def text(self) -> str:
+        """The bytes that a signature of version 2 is over. Raises ValueError for a name of several lines."""
+        return written(_PURPOSE_2, self.values)
+
+
 class Signer:
-    """Signs recordings with a gateway's private key."""
+    """Signs with a gateway's private key."""
 
     def __init__(self, key: Ed25519PrivateKey) -> None:
         self._key = key
-        self.key_id = key_id(key.public_key())
+        self.public_key = key.public_key()
 
     @staticmethod
     def load(path: Path) -> Signer:
         """Make a Signer with the key in a PEM file (PKCS #8, not encrypted). Raises KeyFileError."""
         return Signer(load_private_key(path))
 
-    def metadata(self, sha256: bytes, length: int) -> dict[str, str]:
-        """The metadata record that signs the first `length` bytes of a file, which have this SHA-256."""
+    def sign(self, text: str) -> SignedText:
+        """Sign a text of `signed_text.written`."""
+        return sign(self._key, text)
+
+    def metadata(self, statement: Statement) -> dict[str, str]:
+        """The metadata record with the signature of a recording."""
+        signed = self.sign(statement.text)
         return {
             "algorithm": "Ed25519",
-            "key_id": self.key_id,
-            "bytes": str(length),
-            "sha256": sha256.hex(),
-            "signature": base64.b64encode(self._key.sign(_CONTEXT + sha256)).decode(),
+            "text": signed.text,
+            "public_key": signed.public_key,
+            "signature": signed.signature,
         }
 
 
@@ -63,44 +111,68 @@ def load_public_key(path: Path) -> Ed25519PublicKey:
     return key
 
 
-def key_id(key: Ed25519PublicKey) -> str:
-    """The first 16 hexadecimal digits of the SHA-256 of the 32 bytes of a public key."""
-    return hashlib.sha256(key.public_bytes_raw()).hexdigest()[:16]
-
-
-def signature_fault(metadata: dict[str, str], sha256: bytes, length: int, key: Ed25519PublicKey) -> str:
-    """Why a signature is not one by `key` over `length` bytes with this SHA-256; "" where it is."""
-    from cryptography.exceptions import InvalidSignature
-
-    if metadata.get("key_id") != key_id(key):
-        return f"signed with the key {metadata.get('key_id', '')!r:.40}, not with {key_id(key)}"
-    if metadata.get("sha256") != sha256.hex() or metadata.get("bytes") != str(length):
-        return _OTHER_BYTES
+def signed_results(metadata: dict[str, str] | None) -> str | None:
+    """The chain of results at the end of a file, as its signature names it; None where it names none."""
     try:
-        key.verify(base64.b64decode(metadata.get("signature", ""), validate=True), _CONTEXT + sha256)
-    except (InvalidSignature, binascii.Error):
-        return "its signature was not made with this key"
-    return ""
+        return values_of((metadata or {}).get("text", ""), _PURPOSE_2, _LINES_2)[3]
+    except SignedTextError:
+        return None
 
 
-def verify_file(file: BinaryIO, size: int, metadata: dict[str, str] | None, key: Ed25519PublicKey) -> str:
+def verify_file(
+    file: BinaryIO, size: int, metadata: dict[str, str] | None, key: Ed25519PublicKey, found: Statement
+) -> str:
     """Why an MCAP file is not signed with `key` up to its summary; "" where it is. Raises OSError.
 
-    `size`: of the file in bytes. `metadata`: its signature record, None where it has none.
+    `size`: of the file in bytes. `metadata`: its signature record, None where it has none. `found`: what its signature
+    must say, as its other records do; length and SHA-256 are computed here.
     """
     if metadata is None:
         return "no signature in this file"
-    length = metadata.get("bytes", "")
-    if not (length.isascii() and length.isdigit() and len(length) < 19 and int(length) < size):
+    try:
+        said = values_of(metadata["text"], _PURPOSE_2, _LINES_2) if "text" in metadata else []
+        length = count(said[4].partition(" ")[0] if said else metadata.get("bytes", ""))
+    except SignedTextError as error:
+        return f"its signature cannot be read: {error}"
+    if length >= size:
         return _OTHER_BYTES
-    digest, left = hashlib.sha256(), int(length)
-    file.seek(0)
-    while left and (piece := file.read(min(left, 1 << 20))):
-        digest.update(piece)
-        left -= len(piece)
+    digest = prefix_sha256(file, length)
     # Here the record of the signature must begin, and the record DataEnd must follow it.
     opcode, body = _HEAD.unpack(file.read(_HEAD.size).ljust(_HEAD.size, b"\0"))
     file.seek(min(body, size), 1)
     if opcode != Opcode.METADATA or file.read(1) != bytes([Opcode.DATA_END]):
         return "unsigned data follow its signature"
-    return signature_fault(metadata, digest.digest(), int(length), key)
+    if not said:
+        return _fault_1(metadata, digest, key)
+    return _fault_2(metadata, replace(found, length=length, sha256=digest.hex()), said, key)
+
+
+def prefix_sha256(file: BinaryIO, length: int) -> bytes:
+    """The SHA-256 of the first `length` bytes of a file; the file is then positioned after them. Raises OSError."""
+    digest, left = hashlib.sha256(), length
+    file.seek(0)
+    while left and (piece := file.read(min(left, 1 << 20))):
+        digest.update(piece)
+        left -= len(piece)
+    return digest.digest()
+
+
+def _fault_1(metadata: dict[str, str], sha256: bytes, key: Ed25519PublicKey) -> str:
+    if metadata.get("key_id") != key_id(key):
+        return f"signed with the key {metadata.get('key_id', '')!r:.40}, not with {key_id(key)}"
+    if metadata.get("sha256") != sha256.hex():
+        return _OTHER_BYTES
+    return signature_fault(metadata.get("signature", ""), _CONTEXT_1 + sha256, key)
+
+
+def _fault_2(metadata: dict[str, str], found: Statement, said: list[str], key: Ed25519PublicKey) -> str:
+    signed = SignedText(metadata["text"], metadata.get("public_key", ""), metadata.get("signature", ""))
+    if signed.key_id != key_id(key):
+        return signed.fault(key)
+    values = found.values
+    if said[4] != values["content"]:
+        return _OTHER_BYTES
+    for name, value in zip(values, said, strict=True):
+        if value != values[name]:
+            return f"its signature says {name} {value!r:.80}, its content {values[name]!r:.80}"
+    return signed.fault(key)

@@ -19,6 +19,7 @@ from mcap.records import (
 )
 
 from agent.recording.records import ChunkMessage, Record, content, refusal, unpack
+from agent.recording.results_chain import FILE_METADATA, PREVIOUS_RESULTS, ResultsChain
 
 KINDS = (
     Opcode.SCHEMA,
@@ -39,6 +40,7 @@ class DerivedSummary:
 
     def __init__(self) -> None:
         self.messages = 0
+        self.results = ResultsChain()  # of the results so far
         self.chunks: list[ChunkIndex] = []
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
@@ -54,6 +56,7 @@ class DerivedSummary:
         self._awaited = None  # until the chunk is known to be intact
         chunk = unpack(record)
         times: list[int] = []
+        messages: list[tuple[str, bytes]] = []
         awaited: dict[int, list[tuple[int, int]]] = {}
         for part in content(record, chunk):
             if isinstance(part, ChunkMessage):
@@ -62,6 +65,7 @@ class DerivedSummary:
                 times.append(part.log_time)
                 awaited.setdefault(part.channel_id, []).append((part.log_time, part.offset))
                 self._counts[part.channel_id] = self._counts.get(part.channel_id, 0) + 1
+                messages.append((self._channels[part.channel_id].topic, part.data))
             else:
                 self._declare(record, part)
         start, end = min(times, default=0), max(times, default=0)
@@ -71,6 +75,8 @@ class DerivedSummary:
             self._start_time = min(start, self._start_time) if self.messages else start
             self._end_time = max(end, self._end_time)
         self.messages += len(times)
+        for topic, data in messages:
+            self.results.add(topic, data)
         index = ChunkIndex(
             chunk_length=record.end - record.offset,
             chunk_start_offset=record.offset,
@@ -113,6 +119,8 @@ class DerivedSummary:
 
     def add_metadata(self, record: Record, metadata: Metadata) -> None:
         """Take a Metadata record."""
+        if metadata.name == FILE_METADATA:
+            self.results = ResultsChain.of_text(metadata.metadata.get(PREVIOUS_RESULTS, ""))
         self._metadata.append(MetadataIndex(record.offset, record.end - record.offset, metadata.name))
 
     def add_attachment(self, record: Record, attachment: Attachment) -> None:

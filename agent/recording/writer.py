@@ -15,12 +15,15 @@ from typing import Protocol
 
 from agent.core.events import RESULTS, Event, Output, Pruned, RunStart
 from agent.recording.files import RecordingFile, newest, recordings, sync_directory
+from agent.recording.head import HeadKeeper, Tell
 from agent.recording.messages import EVENTS_TOPIC, encode, topic_of
 from agent.recording.pruned_ranges import PRUNED_METADATA, Ranges, from_metadata, merged, to_metadata
 from agent.recording.repair import close_torn
+from agent.recording.results_chain import PREVIOUS_RESULTS
 from agent.recording.retention import FOR_EVER, KeepFiles, delete, due, free_bytes
 from agent.recording.scan import metadata_of
-from agent.recording.signing import Signer
+from agent.recording.set_aside import deleted, finish, highest_number, remove_statements, set_aside
+from agent.recording.signing import SIGNATURE_METADATA, Signer, signed_results
 
 log = logging.getLogger(__name__)
 
@@ -52,7 +55,8 @@ class Recorder:
     `retry_s`: seconds of event time until the first attempt after a failure; the time doubles with each failure.
     `keep`: limits beyond which old recordings are deleted.
     `ledger`: the store, which remembers the highest file number also when all files are deleted; without it the numbers
-    go on from the files in the directory. `signer`: signs each file; None: files are not signed.
+    go on from the files in the directory. `signer`: signs each file and the head; None: nothing is signed.
+    `tell_head`: gets each new head (agent.recording.head), to publish it.
     """
 
     def __init__(
@@ -67,6 +71,7 @@ class Recorder:
         keep: KeepFiles = FOR_EVER,
         ledger: Ledger | None = None,
         signer: Signer | None = None,
+        tell_head: Tell = lambda _: None,
     ) -> None:
         self._directory = directory
         results = [f"/{sensor}/{what}" for sensor in sensors for what in RESULTS]
@@ -77,6 +82,8 @@ class Recorder:
         self._keep = keep
         self._ledger = ledger
         self._signer = signer
+        self._head = HeadKeeper(directory, signer, tell_head) if signer is not None else None
+        self._gateway = ""  # of the newest RunStart
         self._file: RecordingFile | None = None
         self._failures = 0  # since the last file that was written without a failure
         self._utc_minus_monotonic_ns = 0
@@ -109,7 +116,8 @@ class Recorder:
     @property
     def next_file_sequence(self) -> int:
         """The number for the next file: one above all numbers used so far, also by unfinished and deleted files."""
-        return max([self._numbered, *(number for number, _ in recordings(self._directory))]) + 1
+        there = [number for number, _ in recordings(self._directory)]
+        return max(self._numbered, highest_number(self._directory), *there) + 1
 
     @property
     def wants_rotation(self) -> bool:
@@ -130,6 +138,7 @@ class Recorder:
 
     def close_torn(self) -> None:
         """Close the files that a crash left open. Call it before `next_file_sequence` is first used. Raises OSError."""
+        finish(self._directory)
         close_torn(self._directory, self._signer)
 
     def look_for_pruning(self) -> None:
@@ -155,19 +164,17 @@ class Recorder:
             messages = [(topic_of(item), encode(event_sequence, item)) for item in (event, *results)]
             if isinstance(event, RunStart):
                 self._begin(event)
+            if isinstance(event, Pruned):
+                self._pruned = merged([*self._pruned, (event.first_file, event.last_file)])
             if self._file is not None:
                 for topic, data in messages:
                     self._file.append(topic, data, log_time, publish_time, event_sequence)
-                if isinstance(event, Pruned):
-                    self._pruned = merged([*self._pruned, (event.first_file, event.last_file)])
                 if isinstance(event, RunStart | Pruned) and self._pruned:
                     self._file.note(PRUNED_METADATA, to_metadata(self._pruned))
                 if results or isinstance(event, RunStart | Pruned):
                     self._file.sync()
             if isinstance(event, RunStart):
-                self._number(event.file_sequence)
-                self._may_age = True
-                self.look_for_pruning()
+                self._begun(event)
             if isinstance(event, Pruned):
                 self._prune(event)
         except OSError as error:
@@ -187,6 +194,8 @@ class Recorder:
         try:
             if self._file is not None:
                 self._file.sync()
+                if self._head is not None:
+                    self._head.go_on(self._file, self._now_ns, self._utc_ns)
                 if self._now_ns - self._since_ns > RETRY_MAX_NS:
                     self._failures = 0
                 if free_bytes(self._directory) < LEAST_ROOM:
@@ -204,10 +213,13 @@ class Recorder:
         except OSError as error:
             self._fail(f"{error.strerror or error} ({self.path})")
         else:
+            if self._head is not None:
+                self._head.end(self._file, self._now_ns, self._utc_ns)
             self._failures = 0
             self._file = None
 
     def _begin(self, start: RunStart) -> None:
+        self._gateway = f"{start.site}/{start.gateway}"
         self.close()
         if free_bytes(self._directory) < 2 * LEAST_ROOM:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self._directory))
@@ -217,13 +229,35 @@ class Recorder:
         origin = {"previous_file": name, "previous_sha256": digest}
         if self._ledger is not None:
             origin["published"] = str(self._ledger.published())
+        if self._signer is not None and name:
+            origin[PREVIOUS_RESULTS] = _signed_results(self._directory / name)
+        self._pruned = merged([*self._pruned, *self._set_aside()])
         self._since_ns = self._now_ns
         self._file = RecordingFile(self._directory, start, self._topics, origin, self._signer)
         sync_directory(self._directory)
         self.fault = ""
 
+    def _set_aside(self) -> Ranges:
+        """The recordings that were deleted while nothing could be recorded."""
+        ranges, faults = deleted(self._directory, self._gateway, self._signer.public_key if self._signer else None)
+        for fault in faults:
+            log.warning("%s", fault)
+        return ranges
+
+    def _begun(self, start: RunStart) -> None:
+        """The RunStart is on the disk. A crash before that leaves no file, and its number is used again."""
+        self._number(start.file_sequence)
+        self._may_age = True
+        remove_statements(self._directory, self._pruned)
+        if self._head is not None and self._file is not None:
+            self._head.begin(self._file, self._now_ns, self._utc_ns)
+        self.look_for_pruning()
+
+    @property
+    def _utc_ns(self) -> int:
+        return self._now_ns + self._utc_minus_monotonic_ns
+
     def _number(self, file_sequence: int) -> None:
-        # Called when the RunStart is on disk. A crash before that leaves no file, and the number is used again.
         self._numbered = file_sequence
         if self._ledger is not None:
             try:
@@ -236,10 +270,14 @@ class Recorder:
     def _prune(self, pruned: Pruned) -> None:
         """Delete the files; check whether more are due.
 
-        Where nothing is recorded, space is needed first: the event is then recorded again in the next file.
+        Where nothing is recorded, statements say that the files were deleted, and the event is recorded again in the
+        next file.
         """
         try:
-            delete(self._directory, pruned)
+            if self._file is None:
+                set_aside(self._directory, pruned.first_file, pruned.last_file, self._gateway, self._signer)
+            else:
+                delete(self._directory, pruned)
         except OSError as error:
             log.warning("recordings %d to %d cannot be deleted: %s", pruned.first_file, pruned.last_file, error)
         if self._file is None:
@@ -273,6 +311,11 @@ class Recorder:
             self._utc_minus_monotonic_ns = utc_ns - monotonic_ns
             self._now_ns = monotonic_ns
         return max(utc_ns, 0), max(monotonic_ns, 0)
+
+
+def _signed_results(path: Path) -> str:
+    """The chain of results at the end of a recording; "" where its signature names none. Raises OSError."""
+    return signed_results(metadata_of(path).get(SIGNATURE_METADATA)) or "" if path.exists() else ""
 
 
 def _pruned_before(directory: Path) -> Ranges:

@@ -1,0 +1,109 @@
+"""The head of a gateway's recordings: a signed text that says how far they reach, and when.
+
+The chain of recordings shows what is missing before a recording, never what is missing after the newest one. Whoever
+keeps a head elsewhere can show later that recordings up to it existed, and with which content.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from agent.recording.signed_text import SignedText, SignedTextError, count, values_of, written
+from agent.recording.signing import Signer, Statement
+
+if TYPE_CHECKING:
+    from agent.recording.files import RecordingFile
+
+Tell = Callable[[bytes], None]
+
+HEAD_NAME = "head.json"
+_PURPOSE = "fieldcal head, version 1"
+_LINES = ["gateway", "recording", "previous", "results", "content", "opening", "closed", "utc_ns"]
+HEAD_S = 60.0  # s of event time between two heads of one recording
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Head:
+    """What a head says.
+
+    `statement`: of the newest recording, over its first `length` bytes. `opening`: `<bytes> <SHA-256>` of the beginning
+    of this recording, the same in all of its heads. `closed`: whether the recording was finished.
+    """
+
+    statement: Statement
+    opening: str
+    closed: bool
+    utc_ns: int
+
+    @property
+    def text(self) -> str:
+        """The bytes that the signature of a head is over."""
+        more = {"opening": self.opening, "closed": "yes" if self.closed else "no", "utc_ns": str(self.utc_ns)}
+        return written(_PURPOSE, self.statement.values | more)
+
+    @property
+    def place(self) -> tuple[int, int]:
+        """How far the recordings reach: number of the recording, and bytes of it."""
+        return self.statement.file_sequence, self.statement.length
+
+    @staticmethod
+    def of(signed: SignedText) -> Head:
+        """What a signed text says; its signature is not checked. Raises SignedTextError where it is no head."""
+        gateway, number, previous, results, content, opening, closed, utc_ns = values_of(signed.text, _PURPOSE, _LINES)
+        length, _, sha256 = content.partition(" ")
+        previous_sha256 = "" if previous == "-" else previous
+        statement = Statement(gateway, count(number), previous_sha256, results, count(length), sha256)
+        head = Head(statement, opening, closed == "yes", count(utc_ns))
+        if head.text != signed.text:
+            raise SignedTextError("its lines are not as this program writes them")
+        return head
+
+
+class HeadKeeper:
+    """Signs the head of a recording that is written, keeps it beside the recordings, and passes it on to `tell`.
+
+    Call it only for bytes that are on the disk: a head must never reach further than a recording after a power cut.
+    """
+
+    def __init__(self, directory: Path, signer: Signer, tell: Tell) -> None:
+        self._path = directory / HEAD_NAME
+        self._signer = signer
+        self._tell = tell
+        self._opening = ""
+        self._next_ns = 0
+
+    def begin(self, file: RecordingFile, now_ns: int, utc_ns: int) -> None:
+        """The first event of a recording is on the disk. `now_ns`: event time, CLOCK_MONOTONIC."""
+        statement = file.statement()
+        self._opening = f"{statement.length} {statement.sha256}"
+        self._sign(statement, now_ns, utc_ns, closed=False)
+
+    def go_on(self, file: RecordingFile, now_ns: int, utc_ns: int) -> None:
+        """All of a recording so far is on the disk. Signs a head when the last one is HEAD_S old."""
+        if now_ns >= self._next_ns:
+            self._sign(file.statement(), now_ns, utc_ns, closed=False)
+
+    def end(self, file: RecordingFile, now_ns: int, utc_ns: int) -> None:
+        """The recording is finished."""
+        self._sign(file.statement(), now_ns, utc_ns, closed=True)
+
+    def _sign(self, statement: Statement, now_ns: int, utc_ns: int, *, closed: bool) -> None:
+        self._next_ns = now_ns + int(HEAD_S * 1e9)
+        signed = self._signer.sign(Head(statement, self._opening, closed, utc_ns).text).json
+        self._tell(signed)
+        try:
+            new = self._path.with_name(HEAD_NAME + ".new")
+            with open(new, "wb") as file:
+                file.write(signed)
+                file.flush()
+                os.fsync(file.fileno())
+            new.replace(self._path)
+        except OSError as error:  # the disk may be full; the head is published nevertheless
+            _log.info("%s cannot be written: %s", self._path, error.strerror)

@@ -1,0 +1,70 @@
+"""Data directories of gateways for attacks on their chains: recorded by a small pipeline, with a store, signed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from click.testing import CliRunner
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
+
+from agent.cli.audit import recordings_of, run_audit
+from agent.delivery.store import Store
+from agent.recording.files import recordings
+from agent.recording.retention import KeepFiles
+from agent.recording.signing import Signer
+from agent.recording.writer import Recorder
+from tests.replay.stand_in import CONFIG, StandIn, happenings, run_start
+
+KEY = Ed25519PrivateKey.from_private_bytes(bytes(range(32)))
+ROTATE_EACH = 9  # events
+
+
+def record(
+    directory: Path, *, gateway: str = "gateway", seed: int = 1, blocks: int = 20, keep: KeepFiles | None = None
+) -> list[Path]:
+    """Record one run of `gateway` into `directory`, signed with KEY; returns its recordings."""
+    directory.mkdir(exist_ok=True)
+    store = Store(directory, 0)
+    recorder = Recorder(
+        directory, ["acc", "ref"], ["bridge-1"], keep=keep or KeepFiles(), ledger=store, signer=Signer(KEY)
+    )
+    recorder.close_torn()
+    pipeline = StandIn(CONFIG)
+    for number, event in enumerate(happenings(blocks, seed)):
+        at = number + number // ROTATE_EACH
+        if number % ROTATE_EACH == 0:
+            start = run_start(pipeline, at, recorder.next_file_sequence, event.t_monotonic_ns)
+            start = msgspec.structs.replace(start, gateway=gateway, run_id=f"run-{seed}")
+            assert recorder.record(at, start, pipeline.step(start)), recorder.fault
+        assert recorder.record(at + 1, event, pipeline.step(event)), recorder.fault
+    recorder.close()
+    store.close()
+    return [path for _, path in recordings(directory)]
+
+
+def audited(directory: Path, **options: Any) -> tuple[int, str]:
+    """(exit status, text) of `fieldcal audit DIRECTORY --public-key K --strict`; `options` replace these options."""
+    return _run(directory, as_json=False, **options)
+
+
+def audited_json(directory: Path, **options: Any) -> dict[str, Any]:
+    """What the same audit prints with `--json -`."""
+    return json.loads(_run(directory, as_json=True, **options)[1])  # type: ignore[no-any-return]
+
+
+def _run(directory: Path, **options: Any) -> tuple[int, str]:
+    runner = CliRunner()
+    with runner.isolation() as (out, _, _):
+        status = run_audit(
+            recordings_of([directory]), StandIn.restore, **{"strict": True, "key": KEY.public_key()} | options
+        )
+        return status, out.getvalue().decode()
+
+
+def public_pem(key: Ed25519PrivateKey = KEY) -> bytes:
+    """The public key as a PEM file holds it."""
+    return key.public_key().public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo)
