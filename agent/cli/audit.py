@@ -3,26 +3,28 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+import time
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 import msgspec
 
-from agent.delivery.history import FILE_NAME, History, StoreError
+from agent.cli.given import Given, read_head, recordings_of
+from agent.delivery.history import StoreError
 from agent.recording.chain import Link, chain_faults, missing_after
 from agent.recording.comparison import OTHER_CPU
-from agent.recording.files import recordings
+from agent.recording.end_check import check_end
+from agent.recording.head import HEAD_NAME
 from agent.recording.integrity import Integrity, check_integrity
-from agent.recording.pruned_ranges import PRUNED_METADATA, from_metadata, merged
+from agent.recording.pruned_ranges import PRUNED_METADATA, Ranges, from_metadata, merged
 from agent.recording.reading import open_recording
 from agent.recording.records import Fault
 from agent.recording.repair import REPAIR_METADATA
 from agent.recording.replaying import Replay, ReplayedFile, Restore
 from agent.recording.results_chain import FILE_METADATA, PREVIOUS_RESULTS
+from agent.recording.set_aside import deleted as statements
 from agent.recording.signing import SIGNATURE_METADATA, Statement, signed_results, verify_file
 
 if TYPE_CHECKING:
@@ -54,26 +56,37 @@ class AuditedFile(msgspec.Struct, kw_only=True):
     "--public-key", metavar="K", type=click.Path(path_type=Path), help="Require signatures by this key (PEM)."
 )
 @click.option(
+    "--head", "heads", multiple=True, metavar="F", type=click.Path(path_type=Path),
+    help="A head of the recordings that was kept elsewhere: no recording up to it may be missing.",
+)  # fmt: skip
+@click.option(
     "--strict", is_flag=True, help="Fail also for repaired files, and where a result cannot be decided on this machine."
 )
 @click.option("--json", "json_to", type=click.Choice(["-"]), help="Print one JSON object on standard output.")
-def audit(files: tuple[Path, ...], public_key: Path | None, strict: bool, json_to: str | None) -> int:
+def audit(
+    files: tuple[Path, ...], public_key: Path | None, heads: tuple[Path, ...], strict: bool, json_to: str | None
+) -> int:
     """Check recordings, given in order: every byte, whether results follow from the data, whether a file is missing.
 
     Give a data directory instead of files to check all its recordings; then no recording may be missing. Exit status: 0
-    all passed, 3 a check failed, 2 a file cannot be read.
+    all passed, 3 a check failed, 2 a file cannot be read. The end of the output says what cannot be proven.
     """
     from agent.config.key_file import KeyFileError
     from agent.core.pipeline import Pipeline
     from agent.recording.fingerprint import compute_as
     from agent.recording.reading import first_event
+    from agent.recording.signed_text import SignedTextError
     from agent.recording.signing import load_public_key
 
     try:
         key = load_public_key(public_key) if public_key is not None else None
         given = recordings_of(files)
-    except (KeyFileError, StoreError) as error:
+        given.heads.extend(read_head(path) for path in heads)
+    except (KeyFileError, StoreError, SignedTextError) as error:
         click.echo(str(error), err=True)
+        return 2
+    except OSError as error:
+        click.echo(f"{error.filename}: {error.strerror}", err=True)
         return 2
     if not given.paths and not given.up_to:
         # Where the store knows of recordings that are gone, the audit itself reports them.
@@ -85,49 +98,33 @@ def audit(files: tuple[Path, ...], public_key: Path | None, strict: bool, json_t
     return run_audit(given, Pipeline.restore, as_json=json_to is not None, strict=strict, key=key)
 
 
-@dataclass(frozen=True, slots=True)
-class Given:
-    """Recordings to audit. `up_to`: for a whole directory, the highest file number; none up to it may be missing."""
-
-    paths: Sequence[Path]
-    up_to: int | None = None
-
-
-def recordings_of(paths: Sequence[Path]) -> Given:
-    """The given files, or all recordings of a single given directory. Raises StoreError."""
-    if len(paths) != 1 or not paths[0].is_dir():
-        return Given(paths)
-    files = recordings(paths[0])
-    store = paths[0] / FILE_NAME
-    highest = files[-1][0] if files else 0
-    if store.exists():
-        with History(store) as history:
-            highest = max(highest, history.file_sequence())
-    return Given([path for _, path in files], highest)
-
-
 def run_audit(
     given: Given, restore: Restore, *, as_json: bool, strict: bool = False, key: Ed25519PublicKey | None = None
 ) -> int:
     """Audit, print, and return the exit status. With a `key`, files must be signed by it."""
     try:
-        audited = audit_files(given, restore, strict=strict, key=key)
+        audited, links, deleted = _audited(given, restore, strict=strict, key=key)
+        end = check_end(given.heads, links, deleted, key, time.time_ns())
     except OSError as error:
         click.echo(f"{error.filename}: {error.strerror}", err=True)
         return 2
-    numbers = [file.replay.file_sequence for file in audited]
-    lost = missing_after(max(numbers, default=0), given.up_to or 0)
-    ok = not lost and all(file.ok for file in audited)
+    if strict and key is not None and not given.heads and links[-1:] and links[-1].signed_results is not None:
+        end.reasons.append(f"there is no {HEAD_NAME} beside signed recordings, and none was given (--head, --witness)")
+    lost = missing_after(links, given.up_to or 0, deleted)
+    ok = not lost and not end.reasons and all(file.ok for file in audited)
     if as_json:
         undecidable = sum(file.replay.undecidable for file in audited)
         unsealed = sum(file.repaired for file in audited)
-        verdict = {"ok": ok, "undecidable": undecidable, "unsealed": unsealed, "missing": lost, "files": audited}
+        counted = {"undecidable": undecidable, "unsealed": unsealed}
+        verdict = {"ok": ok, **counted, "missing": lost, "end": end, "files": audited}
         click.echo(msgspec.json.encode(verdict).decode())
     else:
         for file in audited:
             click.echo(describe(file))
         if lost:
             click.echo(f"FAILED: {lost}")
+        for line in end.describe():
+            click.echo(line)
     return 0 if ok else 3
 
 
@@ -135,6 +132,13 @@ def audit_files(
     given: Given, restore: Restore, *, strict: bool = False, key: Ed25519PublicKey | None = None
 ) -> list[AuditedFile]:
     """The verdict on each file. Each file is also compared with the one before it. Raises OSError."""
+    return _audited(given, restore, strict=strict, key=key)[0]
+
+
+def _audited(
+    given: Given, restore: Restore, *, strict: bool, key: Ed25519PublicKey | None
+) -> tuple[list[AuditedFile], list[Link], Ranges]:
+    """(the verdicts, the links of the chain, the file numbers that retention deleted)."""
     from agent.recording.fingerprint import fingerprint
 
     replayed = Replay(restore, fingerprint(), elsewhere=OTHER_CPU)
@@ -159,12 +163,15 @@ def audit_files(
             links.append(_link(verdict, integrity))
             said += from_metadata(integrity.metadata.get(PRUNED_METADATA))
     pruned = [event for verdict in audited for event in verdict.replay.pruned]
-    deleted = merged([*said, *((event.first_file, event.last_file) for event in pruned)])
-    for index, fault in chain_faults(links, pruned, deleted, from_first=given.up_to is not None):
+    if given.directory is not None:
+        gateway = next((link.gateway for link in links if link.gateway), "")
+        said += statements(given.directory, gateway, key)[0]
+    gone = merged([*said, *((event.first_file, event.last_file) for event in pruned)])
+    for index, fault in chain_faults(links, pruned, gone, from_first=given.up_to is not None):
         audited[index].reasons.append(fault)
     for verdict in audited:
         verdict.ok = not verdict.reasons
-    return audited
+    return audited, links, gone
 
 
 def _verdict(path: Path, sha256: str, size: int, integrity: Integrity, replay: ReplayedFile) -> AuditedFile:

@@ -66,21 +66,24 @@ def _follows(before: Link, after: Link) -> bool:
     return before.incomplete or unnamed or after.previous_sha256 == before.sha256
 
 
-def missing_after(last: int, expected: int) -> str:
-    """The fault where file numbers up to `expected` were used and `last` is the highest there; "" where none is."""
-    return f"{_span(last + 1, expected)} missing at the end" if expected > last else ""
+def missing_after(links: Sequence[Link], expected: int, deleted: Ranges) -> str:
+    """The fault where file numbers up to `expected` were used and the highest ones are not there; "" where none is."""
+    last = max((link.file_sequence for link in links), default=0)
+    missing = first_outside(deleted, last + 1, expected)
+    return f"{span(missing[0], expected)} missing at the end" if missing is not None else ""
 
 
 def _gap(before: int, after: Link, pruned: Sequence[Pruned], deleted: Ranges) -> Iterator[str]:
     """Yield the faults of the file numbers that are missing between number `before` and the recording `after`."""
     unsaid = first_outside(deleted, before + 1, after.file_sequence - 1)
     if unsaid is not None:
-        yield f"{_span(*unsaid)} missing before it, and no recording given here says that retention deleted it"
+        yield f"{span(*unsaid)} missing before it, and no recording given here says that retention deleted it"
     for event in pruned:
         neighbour = event.last_file + 1 == after.file_sequence
         if neighbour and after.previous_sha256 and event.last_sha256 != after.previous_sha256:
             yield f"the SHA-256 of the deleted recording {event.last_file} is not the one that this recording names"
 
 
-def _span(first: int, last: int) -> str:
+def span(first: int, last: int) -> str:
+    """`recording 3 is` or `recordings 3 to 5 are`, for a sentence."""
     return f"recording {first} is" if first == last else f"recordings {first} to {last} are"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,10 @@ from click.testing import CliRunner
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
-from agent.cli.audit import recordings_of, run_audit
+from agent.cli.audit import run_audit
+from agent.cli.given import recordings_of
 from agent.delivery.store import Store
+from agent.recording.end_check import GivenHead
 from agent.recording.files import recordings
 from agent.recording.retention import KeepFiles
 from agent.recording.signing import Signer
@@ -20,11 +23,11 @@ from agent.recording.writer import Recorder
 from tests.replay.stand_in import CONFIG, StandIn, happenings, run_start
 
 KEY = Ed25519PrivateKey.from_private_bytes(bytes(range(32)))
-ROTATE_EACH = 9  # events
+ROTATE_EACH = 8  # events
 
 
 def record(
-    directory: Path, *, gateway: str = "gateway", seed: int = 1, blocks: int = 20, keep: KeepFiles | None = None
+    directory: Path, *, gateway: str = "gateway", seed: int = 1, blocks: int = 14, keep: KeepFiles | None = None
 ) -> list[Path]:
     """Record one run of `gateway` into `directory`, signed with KEY; returns its recordings."""
     directory.mkdir(exist_ok=True)
@@ -56,12 +59,12 @@ def audited_json(directory: Path, **options: Any) -> dict[str, Any]:
     return json.loads(_run(directory, as_json=True, **options)[1])  # type: ignore[no-any-return]
 
 
-def _run(directory: Path, **options: Any) -> tuple[int, str]:
+def _run(directory: Path, *, heads: Sequence[GivenHead] = (), **options: Any) -> tuple[int, str]:
     runner = CliRunner()
     with runner.isolation() as (out, _, _):
-        status = run_audit(
-            recordings_of([directory]), StandIn.restore, **{"strict": True, "key": KEY.public_key()} | options
-        )
+        given = recordings_of([directory])
+        given.heads.extend(heads)
+        status = run_audit(given, StandIn.restore, **{"strict": True, "key": KEY.public_key()} | options)
         return status, out.getvalue().decode()
 
 

@@ -1,0 +1,56 @@
+"""What `fieldcal audit` is given: recordings, or a data directory with its store and heads."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from agent.delivery.history import FILE_NAME, History
+from agent.recording.end_check import GivenHead
+from agent.recording.files import recordings
+from agent.recording.head import HEAD_NAME, Head
+from agent.recording.reading import open_recording
+from agent.recording.signed_text import LARGEST, SignedText, SignedTextError
+
+
+@dataclass(frozen=True, slots=True)
+class Given:
+    """Recordings to audit. `up_to`: for a whole directory, the highest file number; none up to it may be missing.
+
+    `directory`: this directory. `heads`: heads that the recordings must reach.
+    """
+
+    paths: Sequence[Path]
+    up_to: int | None = None
+    directory: Path | None = None
+    heads: list[GivenHead] = field(default_factory=list)
+
+
+def recordings_of(paths: Sequence[Path]) -> Given:
+    """The given files, or all recordings of a single given directory. Raises StoreError."""
+    if len(paths) != 1 or not paths[0].is_dir():
+        return Given(paths)
+    files = recordings(paths[0])
+    store, head = paths[0] / FILE_NAME, paths[0] / HEAD_NAME
+    highest = files[-1][0] if files else 0
+    if store.exists():
+        with History(store) as history:
+            highest = max(highest, history.file_sequence())
+    heads = [GivenHead(str(head), _begin_of(head), elsewhere=False)] if head.exists() else []
+    return Given([path for _, path in files], highest, paths[0], heads)
+
+
+def read_head(path: Path) -> GivenHead:
+    """A head from a file. Raises SignedTextError where the file holds none, OSError where it cannot be read."""
+    data = _begin_of(path)
+    try:
+        Head.of(SignedText.read(data))
+    except SignedTextError as error:
+        raise SignedTextError(f"{path}: not a head of recordings: {error}") from None
+    return GivenHead(str(path), data, elsewhere=True)
+
+
+def _begin_of(path: Path) -> bytes:
+    with open_recording(path) as file:
+        return file.read(LARGEST + 1).rstrip(b"\n")
