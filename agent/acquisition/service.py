@@ -90,6 +90,7 @@ class Service:
             keep=keep_files(config.recording),
             ledger=self._store,
             signer=signer,
+            tell_head=self._tell_head,
         )
         self._recorder.close_torn()
         events = EventQueue(len(config.devices))
@@ -137,6 +138,11 @@ class Service:
         )
         publisher.start()
         return publisher
+
+    def _tell_head(self, head: bytes) -> None:
+        """Publish a head; the recording's thread calls this."""
+        if self._publisher is not None:
+            self._publisher.tell_head(head)
 
     def _command_reception(self, events: EventQueue) -> Reception | None:
         if not self._config.commands.enabled:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import zenoh
@@ -19,12 +19,15 @@ _log = logging.getLogger(__name__)
 _Queryable = zenoh.Queryable[zenoh.Handler[zenoh.Query]]
 
 
-def answer_queries(queryable: _Queryable, gateway: str, store: Path, status: Callable[[], bytes]) -> None:
+def answer_queries(
+    queryable: _Queryable, gateway: str, store: Path, told: Callable[[], Mapping[str, bytes]]
+) -> None:
     """Answer queries until the queryable is undeclared or its session closes. Runs in a thread of its own.
 
-    `gateway`: Zenoh key of the gateway. `store`: path of its store. `status`: gives the gateway's status, JSON or b"".
+    `gateway`: Zenoh key of the gateway. `store`: path of its store. `told`: gives what the gateway says of itself, JSON
+    by the end of its key: `status`, `head`.
     A query for `<keys>` gets the newest result of each channel that matches, a calibration only while it is in force,
-    and the gateway's status where its key matches.
+    and the gateway's status and head where their keys match.
     A query for `<keys>?after=<sequence>` gets the first REPLIES_MAX results after that number, in order. Several of
     them have the same key, so the query must use the consolidation NONE; otherwise Zenoh passes on only the last one.
     Where retention has deleted some of these results, the error REMOVED comes first.
@@ -34,10 +37,10 @@ def answer_queries(queryable: _Queryable, gateway: str, store: Path, status: Cal
         with query:  # without closing the query, the sender waits until its timeout
             try:
                 records, removed = _answers(query, gateway, store)
-                told = _reply_status(query, gateway, status())
+                replied = _reply_told(query, gateway, told())
                 if removed:
                     query.reply_err(f"{REMOVED}{removed}")
-                elif not records and not told:
+                elif not records and not replied:
                     query.reply_err(NOTHING)
                 for record in records:
                     query.reply(
@@ -51,12 +54,12 @@ def answer_queries(queryable: _Queryable, gateway: str, store: Path, status: Cal
                 _log.warning("a query could not be answered: %s", error)
 
 
-def _reply_status(query: zenoh.Query, gateway: str, status: bytes) -> bool:
-    key = result_key(gateway, "", "status")
-    if not status or "after" in query.parameters or not query.key_expr.intersects(key):
-        return False
-    query.reply(key, status, encoding=zenoh.Encoding.APPLICATION_JSON)
-    return True
+def _reply_told(query: zenoh.Query, gateway: str, told: Mapping[str, bytes]) -> bool:
+    wanted = {} if "after" in query.parameters else {result_key(gateway, "", what): told[what] for what in told}
+    matching = {key: value for key, value in wanted.items() if query.key_expr.intersects(key)}
+    for key, value in matching.items():
+        query.reply(key, value, encoding=zenoh.Encoding.APPLICATION_JSON)
+    return bool(matching)
 
 
 def _answers(query: zenoh.Query, gateway: str, store: Path) -> tuple[list[Record], int]:

@@ -86,8 +86,8 @@ class Publisher:
         self._said = ""
         self._previous = store.published()
         self._publishers: dict[str, AdvancedPublisher] = {}
-        self._status = b""  # the gateway's newest status
-        self._status_put = b""
+        self._told: dict[str, bytes] = {}  # the newest of what the gateway says of itself, by the end of its key
+        self._told_put: dict[str, bytes] = {}
         self._thread = threading.Thread(target=self._run, name="publication", daemon=True)
 
     def start(self) -> None:
@@ -112,7 +112,14 @@ class Publisher:
         Only the newest status is published, and none is stored. It is not a result: it has no sequence number, and a
         query with `?after=` does not return it.
         """
-        self._status = status
+        self._tell("status", status)
+
+    def tell_head(self, head: bytes) -> None:
+        """Publish the head of the recordings (agent.recording.head) at `<gateway>/head`, as a status. Returns at once."""
+        self._tell("head", head)
+
+    def _tell(self, what: str, value: bytes) -> None:
+        self._told = self._told | {what: value}  # replaced, since other threads read it
         self._wake.set()
 
     def state(self) -> PublicationState:
@@ -151,7 +158,7 @@ class Publisher:
             open_things.callback(queryable.undeclare)
             threading.Thread(
                 target=answer_queries,
-                args=(queryable, self._key, self._store.path, lambda: self._status),
+                args=(queryable, self._key, self._store.path, lambda: self._told),
                 name="answers",
                 daemon=True,
             ).start()
@@ -164,12 +171,12 @@ class Publisher:
             for record in history.latest():
                 if record.sequence <= self._store.published():
                     self._put(session, record, previous=0)
-            self._status_put = b""
+            self._told_put = {}
             stopping = False
             while not stopping:
                 stopping = self._stop.is_set()  # read first: the last round then sends all that was handed over
                 if self._find_router(session):
-                    self._send_status(session)
+                    self._send_told(session)
                     self._send_waiting(session, history)
                     self._send_blocks(session)
                 self._wake.wait(0 if stopping else POLL_S)
@@ -182,11 +189,11 @@ class Publisher:
         self._connected = connected
         return connected
 
-    def _send_status(self, session: zenoh.Session) -> None:
-        status = self._status
-        if status != self._status_put:
-            self._publisher(session, result_key(self._key, "", "status"), cached=1).put(status)
-            self._status_put = status
+    def _send_told(self, session: zenoh.Session) -> None:
+        for what, value in self._told.items():
+            if value != self._told_put.get(what):
+                self._publisher(session, result_key(self._key, "", what), cached=1).put(value)
+                self._told_put[what] = value
 
     def _send_waiting(self, session: zenoh.Session, history: History) -> None:
         self._fault = ""
