@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import click
 import msgspec
 
-from agent.cli.given import Given, read_head, recordings_of
+from agent.cli.given import Given, add_witnessed, read_head, recordings_of
 from agent.delivery.history import StoreError
 from agent.recording.chain import Link, chain_faults, missing_after
 from agent.recording.comparison import OTHER_CPU
@@ -60,11 +60,20 @@ class AuditedFile(msgspec.Struct, kw_only=True):
     help="A head of the recordings that was kept elsewhere: no recording up to it may be missing.",
 )  # fmt: skip
 @click.option(
+    "--witness", metavar="DIR", type=click.Path(path_type=Path),
+    help="The directory of `fieldcal witness`, with the heads that it kept of this gateway.",
+)  # fmt: skip
+@click.option(
     "--strict", is_flag=True, help="Fail also for repaired files, and where a result cannot be decided on this machine."
 )
 @click.option("--json", "json_to", type=click.Choice(["-"]), help="Print one JSON object on standard output.")
 def audit(
-    files: tuple[Path, ...], public_key: Path | None, heads: tuple[Path, ...], strict: bool, json_to: str | None
+    files: tuple[Path, ...],
+    public_key: Path | None,
+    heads: tuple[Path, ...],
+    witness: Path | None,
+    strict: bool,
+    json_to: str | None,
 ) -> int:
     """Check recordings, given in order: every byte, whether results follow from the data, whether a file is missing.
 
@@ -77,12 +86,15 @@ def audit(
     from agent.recording.reading import first_event
     from agent.recording.signed_text import SignedTextError
     from agent.recording.signing import load_public_key
+    from agent.recording.witness import WitnessError
 
     try:
         key = load_public_key(public_key) if public_key is not None else None
         given = recordings_of(files)
         given.heads.extend(read_head(path) for path in heads)
-    except (KeyFileError, StoreError, SignedTextError) as error:
+        if witness is not None:
+            add_witnessed(given, witness)
+    except (KeyFileError, StoreError, SignedTextError, WitnessError) as error:
         click.echo(str(error), err=True)
         return 2
     except OSError as error:
@@ -105,6 +117,7 @@ def run_audit(
     try:
         audited, links, deleted = _audited(given, restore, strict=strict, key=key)
         end = check_end(given.heads, links, deleted, key, time.time_ns())
+        end.reasons += given.faults
     except OSError as error:
         click.echo(f"{error.filename}: {error.strerror}", err=True)
         return 2

@@ -25,6 +25,7 @@ COMMANDS = {
     "command": ("agent.cli.command", "Send a signed command to an agent: pose, hold, accept, rollback."),
     "keys": ("agent.cli.keys", "Make certificates for Zenoh over TLS, and keys that sign commands."),
     "router": ("agent.cli.router", "Run a Zenoh router, for tests and small sites."),
+    "witness": ("agent.cli.witness", "Keep the signed heads of recordings on another machine."),
     "simulate": (
         "agent.cli.simulate",
         "Serve virtual devices on pseudo-terminals, or write a recording with known true values.",

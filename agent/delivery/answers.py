@@ -19,9 +19,7 @@ _log = logging.getLogger(__name__)
 _Queryable = zenoh.Queryable[zenoh.Handler[zenoh.Query]]
 
 
-def answer_queries(
-    queryable: _Queryable, gateway: str, store: Path, told: Callable[[], Mapping[str, bytes]]
-) -> None:
+def answer_queries(queryable: _Queryable, gateway: str, store: Path, told: Callable[[], Mapping[str, bytes]]) -> None:
     """Answer queries until the queryable is undeclared or its session closes. Runs in a thread of its own.
 
     `gateway`: Zenoh key of the gateway. `store`: path of its store. `told`: gives what the gateway says of itself, JSON

@@ -115,7 +115,7 @@ class Publisher:
         self._tell("status", status)
 
     def tell_head(self, head: bytes) -> None:
-        """Publish the head of the recordings (agent.recording.head) at `<gateway>/head`, as a status. Returns at once."""
+        """Publish the head of the recordings (agent.recording.head) at `<gateway>/head`. Returns at once."""
         self._tell("head", head)
 
     def _tell(self, what: str, value: bytes) -> None:

@@ -64,7 +64,7 @@ class End(msgspec.Struct, kw_only=True):
             result = f", result {self.result}" if self.result else ""
             yield (
                 f"{self.head}: the head of {self.gateway} names recording {self.recording}, its first {self.length} "
-                f"bytes{result}; signed {_when(self.utc_ns)}, {_age(self.age_s)}"
+                f"bytes{result}; signed {when(self.utc_ns)}, {_age(self.age_s)}"
             )
         yield from (f"FAILED: {reason}" for reason in self.reasons)
         yield from (f"not proven: {what}" for what in self.unproven)
@@ -88,12 +88,16 @@ def check_end(
         except SignedTextError as error:
             end.reasons.append(f"{given.source}: not a head: {error}")
             continue
-        fault = "its signature is not by the given key" if signed.fault(key) else _fault(head, by_number, deleted)
+        if signed.fault(key):
+            end.reasons.append(f"{given.source}: its signature is not by the given key")
+            continue
         if gateway and head.statement.gateway != gateway:
             fault = f"it is a head of {head.statement.gateway!r:.130}, the recordings are of {gateway!r:.130}"
+        else:
+            fault = _fault(head, by_number, deleted)
         if fault:
             end.reasons.append(f"{given.source}: {fault}")
-        if newest is None or head.place > newest[0].place:
+        if newest is None or (head.place, given.elsewhere) > (newest[0].place, newest[1].elsewhere):
             newest = head, given
     if newest is not None:
         _name(end, *newest, now_ns)
@@ -102,7 +106,7 @@ def check_end(
     elif not any(given.elsewhere for given in heads):
         end.unproven.append(BESIDE)
     else:
-        end.unproven.append(f"whether more was recorded after {_when(end.utc_ns)}")
+        end.unproven.append(f"whether more was recorded after {when(end.utc_ns)}")
     if key is None:
         end.unproven.append(NO_KEY)
     return end
@@ -122,19 +126,20 @@ def _fault(head: Head, by_number: Mapping[int, Link], deleted: Ranges) -> str:
     number, length = head.place
     missing = first_outside(deleted, max(by_number, default=0) + 1, number)
     if missing is not None:
-        return f"{span(*missing)} missing at the end: this head of {_when(head.utc_ns)} names recording {number}"
+        return f"{span(*missing)} missing at the end: this head of {when(head.utc_ns)} names recording {number}"
     if number not in by_number:
         return ""  # deleted by retention; or a gap, which the chain names
     path = by_number[number].path
     with open_recording(Path(path)) as file:
         if file.seek(0, 2) < length:
-            return f"{path} has {file.tell()} bytes, but this head of {_when(head.utc_ns)} names {length}"
+            return f"{path} has {file.tell()} bytes, but this head of {when(head.utc_ns)} names {length}"
         if prefix_sha256(file, length).hex() != head.statement.sha256:
             return f"{path} is not the recording that this head names: its first {length} bytes are others"
     return ""
 
 
-def _when(utc_ns: int) -> str:
+def when(utc_ns: int) -> str:
+    """A time as text, for any number."""
     try:
         return f"{datetime.fromtimestamp(utc_ns // 1_000_000_000, UTC):%Y-%m-%d %H:%M:%S} UTC"
     except (ValueError, OverflowError, OSError):

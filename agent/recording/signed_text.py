@@ -17,7 +17,7 @@ import msgspec
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 
-LARGEST = 8 << 10  # bytes of a signed text with its signature, in JSON
+LARGEST = 4 << 10  # bytes of a signed text with its signature, in JSON; a head has 900
 
 
 class SignedTextError(ValueError):
@@ -32,10 +32,13 @@ class SignedText(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     signature: str
 
     @staticmethod
-    def read(data: bytes) -> SignedText:
-        """Read the JSON of a signed text; the signature is not checked. Raises SignedTextError, for any bytes."""
-        if len(data) > LARGEST:
-            raise SignedTextError(f"more than {LARGEST} bytes")
+    def read(data: bytes, largest: int = LARGEST) -> SignedText:
+        """Read the JSON of a signed text; the signature is not checked. Raises SignedTextError, for any bytes.
+
+        `largest`: bytes that it may have.
+        """
+        if len(data) > largest:
+            raise SignedTextError(f"more than {largest} bytes")
         try:
             return msgspec.json.decode(data, type=SignedText)
         except (msgspec.DecodeError, ValueError, RecursionError) as error:

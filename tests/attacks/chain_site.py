@@ -17,7 +17,6 @@ from agent.cli.given import recordings_of
 from agent.delivery.store import Store
 from agent.recording.end_check import GivenHead
 from agent.recording.files import recordings
-from agent.recording.retention import KeepFiles
 from agent.recording.signing import Signer
 from agent.recording.writer import Recorder
 from tests.replay.stand_in import CONFIG, StandIn, happenings, run_start
@@ -27,13 +26,23 @@ ROTATE_EACH = 8  # events
 
 
 def record(
-    directory: Path, *, gateway: str = "gateway", seed: int = 1, blocks: int = 14, keep: KeepFiles | None = None
+    directory: Path,
+    *,
+    gateway: str = "gateway",
+    seed: int = 1,
+    blocks: int = 14,
+    key: Ed25519PrivateKey = KEY,
+    heads: list[bytes] | None = None,
 ) -> list[Path]:
-    """Record one run of `gateway` into `directory`, signed with KEY; returns its recordings."""
+    """Record one run of `gateway` into `directory`, signed with `key`; returns its recordings.
+
+    All heads that the gateway publishes are added to `heads`.
+    """
     directory.mkdir(exist_ok=True)
     store = Store(directory, 0)
+    told = [] if heads is None else heads
     recorder = Recorder(
-        directory, ["acc", "ref"], ["bridge-1"], keep=keep or KeepFiles(), ledger=store, signer=Signer(KEY)
+        directory, ["acc", "ref"], ["bridge-1"], ledger=store, signer=Signer(key), tell_head=told.append
     )
     recorder.close_torn()
     pipeline = StandIn(CONFIG)

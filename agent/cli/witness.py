@@ -1,0 +1,118 @@
+"""`fieldcal witness`: keeps the signed heads of recordings on another machine than the gateway's."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from pathlib import Path
+
+import click
+import zenoh
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
+from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
+
+from agent.cli.tls_options import tls_files, tls_options
+from agent.config.key_file import KeyFileError
+from agent.delivery.keys import PREFIX, parse_key
+from agent.delivery.session import EndpointError, session_config
+from agent.keys.files import KeyFileError as KeyNotWritten
+from agent.keys.files import write_new
+from agent.recording.signed_text import key_id
+from agent.recording.signing import Signer, load_public_key
+from agent.recording.witness import KEY_NAME, PUBLIC_NAME, Witness, WitnessError
+
+INBOX = 1000  # heads that may wait; the oldest are dropped, and each gateway publishes a new one within a minute
+CONNECT_MS = 10_000
+CLOSE_S = 2.0  # s to wait at the end until a head that has arrived is kept
+HEADS = f"{PREFIX}/*/*/head"
+
+
+@click.command()
+@click.option("--dir", "directory", type=click.Path(file_okay=False, path_type=Path), default=Path("witness"),
+              show_default=True, help="Where the heads are kept, and the witness's own key.")  # fmt: skip
+@click.option("--connect", "endpoints", multiple=True, default=["tcp/127.0.0.1:7447"], show_default=True,
+              metavar="ENDPOINT", help="Router; may be given several times.")  # fmt: skip
+@click.option("--key", default=HEADS, show_default=True, metavar="KEYEXPR", help="Which gateways.")
+@click.option("--public-key", "public_keys", multiple=True, type=click.Path(path_type=Path), metavar="K",
+              help="Key of a gateway (PEM); may be given several times. Then no other key is taken; without it, the "
+              "first key that is seen for a gateway.")  # fmt: skip
+@tls_options
+def witness(
+    directory: Path,
+    endpoints: tuple[str, ...],
+    key: str,
+    public_keys: tuple[Path, ...],
+    ca: str | None,
+    certificate: str | None,
+    certificate_key: str | None,
+) -> int:
+    """Keep the heads that gateways publish, with the time of this machine, signed with a key of this machine.
+
+    `fieldcal audit DATA --witness DIR` then notices recordings that are missing at the end. Run it on a machine that
+    those who can write on the gateway cannot write on. Exit status: 1 no router or a fault of the disk, 2 bad input.
+    """
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    tls = tls_files(endpoints, ca, certificate, certificate_key)
+    try:
+        trusted = {key_id(trusted): trusted for trusted in map(load_public_key, public_keys)}
+        kept = Witness(directory, _signer(directory), trusted, time.time_ns)
+        config = session_config("client", connect=endpoints, tls=tls)
+    except (KeyFileError, KeyNotWritten, EndpointError, WitnessError) as error:
+        click.echo(f"fieldcal witness: {error}", err=True)
+        return 2
+    config.insert_json5("connect/timeout_ms", str(CONNECT_MS))
+    try:
+        session = zenoh.open(config)
+    except zenoh.ZError:
+        click.echo(f"fieldcal witness: no Zenoh router answers at {', '.join(endpoints)}", err=True)
+        return 1
+    with session:
+        return _follow(session, key, kept, stop)
+
+
+def _follow(session: zenoh.Session, key: str, kept: Witness, stop: threading.Event) -> int:
+    subscriber = declare_advanced_subscriber(
+        session,
+        key,
+        zenoh.handlers.RingChannel(INBOX),
+        history=HistoryConfig(detect_late_publishers=True),
+        recovery=RecoveryConfig(heartbeat=True),  # type: ignore[call-arg]
+    )
+    faults: list[OSError] = []
+
+    def take_all() -> None:
+        for sample in subscriber:
+            address = parse_key(str(sample.key_expr))
+            try:
+                _, said = kept.take(address.source if address else "", sample.payload.to_bytes())
+            except OSError as error:
+                faults.append(error)
+                stop.set()
+                return
+            if said:
+                click.echo(said)
+
+    thread = threading.Thread(target=take_all, name="witness", daemon=True)
+    thread.start()
+    click.echo(f"keeping the heads of {key}")
+    stop.wait()
+    subscriber.undeclare()
+    thread.join(CLOSE_S)
+    for fault in faults:
+        click.echo(f"fieldcal witness: {fault}", err=True)
+    return 1 if faults else 0
+
+
+def _signer(directory: Path) -> Signer:
+    """The witness's own key, made at the first start. Raises KeyFileError or KeyNotWritten."""
+    path = directory / KEY_NAME
+    if not path.exists():
+        key = Ed25519PrivateKey.generate()
+        private = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+        public = key.public_key().public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo)
+        write_new(directory, {KEY_NAME: private, PUBLIC_NAME: public})
+    return Signer.load(path)
