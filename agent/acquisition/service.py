@@ -91,6 +91,7 @@ class Service:
             ledger=self._store,
             signer=signer,
             tell_head=self._tell_head,
+            epoch=self._store.epoch,
         )
         self._recorder.close_torn()
         events = EventQueue(len(config.devices))
@@ -227,7 +228,8 @@ class Service:
     ) -> None:
         """Put results into the store, then give them to the publisher. The recording's thread calls this."""
         path = self._recorder.path if recorded else None
-        records = [Record.of(r, recorded=recorded, recording=final_name(path) if path else "") for r in results]
+        name, epoch = final_name(path) if path else "", self._store.epoch
+        records = [Record.of(result, recorded=recorded, recording=name, epoch=epoch) for result in results]
         try:
             self._store.commit(records, memories)
         except StoreError as error:

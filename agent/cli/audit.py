@@ -23,7 +23,7 @@ from agent.recording.reading import open_recording
 from agent.recording.records import Fault
 from agent.recording.repair import REPAIR_METADATA
 from agent.recording.replaying import Replay, ReplayedFile, Restore
-from agent.recording.results_chain import FILE_METADATA, PREVIOUS_RESULTS
+from agent.recording.results_chain import EPOCH, FILE_METADATA, PREVIOUS_RESULTS
 from agent.recording.set_aside import deleted as statements
 from agent.recording.signing import SIGNATURE_METADATA, Statement, signed_results, verify_file
 
@@ -213,9 +213,9 @@ def _verdict(path: Path, sha256: str, size: int, integrity: Integrity, replay: R
 
 def _statement(verdict: AuditedFile, integrity: Integrity) -> Statement:
     """What the signature of a file must say of it; its content is hashed when the signature is checked."""
-    previous_sha256 = integrity.metadata.get(FILE_METADATA, {}).get("previous_sha256", "")
-    replay = verdict.replay
-    return Statement(replay.gateway, replay.file_sequence, previous_sha256, integrity.results.text, 0, "")
+    origin, replay = integrity.metadata.get(FILE_METADATA, {}), verdict.replay
+    epoch, previous_sha256 = origin.get(EPOCH, ""), origin.get("previous_sha256", "")
+    return Statement(replay.gateway, epoch, replay.file_sequence, previous_sha256, integrity.results.text, 0, "")
 
 
 def _link(verdict: AuditedFile, integrity: Integrity) -> Link:

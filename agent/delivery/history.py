@@ -37,9 +37,9 @@ FILE_NAME = "state.sqlite"
 class Record:
     """A result as it is stored and published.
 
-    `payload`: its JSON with the added field `recorded`, which is false where the result and its raw data are in no
-    recording. `sensor`: empty for a result of the gateway itself. `sequence`: rises over all runs of a gateway, with
-    gaps.
+    `payload`: its JSON with two added fields: `recorded`, which is false where the result and its raw data are in no
+    recording, and `epoch`, which names the numbering that `sequence` belongs to. `sensor`: empty for a result of the
+    gateway itself. `sequence`: rises over all runs of a gateway, with gaps.
     """
 
     sequence: int
@@ -53,9 +53,9 @@ class Record:
     identity: str = ""  # for a calibration, the identity of the device
 
     @staticmethod
-    def of(result: Result, *, recorded: bool, recording: str) -> Record:
+    def of(result: Result, *, recorded: bool, recording: str, epoch: str = "") -> Record:
         """Make the record of a result. A number that is not finite becomes null in the JSON."""
-        fields = {**msgspec.structs.asdict(result), "recorded": recorded}
+        fields = {**msgspec.structs.asdict(result), "recorded": recorded, "epoch": epoch}
         identity = result.identity if isinstance(result, CalibrationUpdate) else ""
         return Record(
             result.sequence,

@@ -13,7 +13,7 @@ from agent.core.memory import Memory
 from agent.delivery.history import Record
 from agent.delivery.schema import RESULT_COLUMNS, checked, insert_results, withdraw, write_latest, write_memory
 from agent.recording.files import final_name, recordings
-from agent.recording.results_chain import FILE_METADATA
+from agent.recording.results_chain import EPOCH, FILE_METADATA
 from agent.recording.scan import scan
 
 _log = logging.getLogger(__name__)
@@ -57,7 +57,9 @@ def recover(connection: sqlite3.Connection, directory: Path, *, everything: bool
         if not recovered.file_sequence:
             recovered.file_sequence = number
             recovered.published = _published(found.metadata.get(FILE_METADATA, {}))
-        records = [Record.of(result, recorded=True, recording=final_name(path)) for result in found.results]
+        epoch = found.metadata.get(FILE_METADATA, {}).get(EPOCH, "")
+        name = final_name(path)
+        records = [Record.of(result, recorded=True, recording=name, epoch=epoch) for result in found.results]
         missing = [r for r in _missing(connection, records) if r.sequence > removed.get((r.sensor, r.what), 0)]
         insert_results(connection, [record.row for record in missing])
         recovered.results += len(missing)

@@ -15,8 +15,10 @@ import msgspec
 
 from agent.core.memory import MOST_MEMORIES
 
-SCHEMA_VERSION = 2
-MARKS = frozenset({"floor", "published", "clean", "file"})
+SCHEMA_VERSION = 3
+# `epoch` names the numbering of the results. Version 2 had the same tables without this mark; a start adds it.
+EPOCH = "epoch"
+MARKS = frozenset({"floor", "published", "clean", "file", EPOCH})
 RESULT_COLUMNS = "sequence, run_id, sensor, what, payload, t_utc_ns, recorded, recording, identity"
 _RESULTS = """CREATE TABLE results (
     sequence INTEGER PRIMARY KEY, run_id TEXT NOT NULL, sensor TEXT NOT NULL, what TEXT NOT NULL,
@@ -74,10 +76,10 @@ def write_mark(connection: sqlite3.Connection, name: str, value: int) -> None:
 
 
 def read_marks(connection: sqlite3.Connection) -> dict[str, int]:
-    """Read all numbers named in MARKS. Raises DamagedRow or sqlite3.Error."""
+    """Read all numbers named in MARKS; `epoch` may be missing. Raises DamagedRow or sqlite3.Error."""
     rows = connection.execute("SELECT name, value, crc FROM marks").fetchall()
     marks = {str(name): value for name, value in map(checked, rows) if isinstance(value, int)}
-    if marks.keys() != MARKS:
+    if marks.keys() | {EPOCH} != MARKS:
         raise DamagedRow(f"the table marks has {', '.join(sorted(marks))} instead of {', '.join(sorted(MARKS))}")
     return marks
 
@@ -169,7 +171,7 @@ _WITHDRAWN_IN_1 = """
 SELECT DISTINCT status.sensor FROM results AS status JOIN latest ON latest.sensor = status.sensor
 WHERE latest.what = 'calibration' AND status.what = 'status' AND status.sequence > latest.sequence
 AND json_extract(CAST(status.payload AS TEXT), '$.status') = 'UNCALIBRATED'"""
-_MIGRATIONS: dict[int, Callable[[sqlite3.Connection], None]] = {1: _add_crcs}
+_MIGRATIONS: dict[int, Callable[[sqlite3.Connection], None]] = {1: _add_crcs, 2: lambda _: None}
 
 
 def damage(connection: sqlite3.Connection) -> str:

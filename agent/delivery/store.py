@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import secrets
 import sqlite3
 import threading
 import time
@@ -15,6 +16,7 @@ from agent.delivery.opening import lock, open_or_set_aside
 from agent.delivery.recovery import Recall, Recovered, no_memories, recover, recover_memories
 from agent.delivery.retention import FOR_EVER, KeepResults, Sweep
 from agent.delivery.schema import (
+    EPOCH,
     DamagedRow,
     StoreError,
     create_tables,
@@ -42,6 +44,8 @@ class Store:
     was good. `recovered`: what was restored from the recordings in `data_dir`: everything where the store is new; after
     a crash the results that were recorded but not committed.
 
+    `epoch`: names the numbering of the results of this store. A store that is made anew has another one, so that a
+    consumer does not take its results for old ones where its numbers are lower.
     `count_from`: a new store does not know which sequence numbers were used before. It begins after this number, by
     default the UTC in milliseconds (small enough for JavaScript's numbers), and after all numbers in the recordings.
     `keep`: limits beyond which old results are deleted.
@@ -171,6 +175,9 @@ class Store:
             if new:
                 create_tables(self._connection, {"floor": first, "published": first, "clean": 0, "file": 0})
             marks = read_marks(self._connection)
+            # By chance: a clock that was set back, or an older copy of the disk, must not repeat it.
+            epoch = marks.get(EPOCH, secrets.randbits(63))
+            self.epoch = f"{epoch:016x}"
             directory = self.path.parent
             recovered = Recovered() if marks["clean"] else recover(self._connection, directory, everything=new)
             if new or recovered.results:
@@ -187,5 +194,6 @@ class Store:
             write_mark(self._connection, "floor", self._last)
             write_mark(self._connection, "published", self._published)
             write_mark(self._connection, "file", self._file_sequence)
+            write_mark(self._connection, EPOCH, epoch)
             write_mark(self._connection, "clean", 0)
         return recovered

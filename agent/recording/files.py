@@ -13,7 +13,7 @@ from mcap.writer import CompressionType, Writer
 
 from agent.core.events import RunStart
 from agent.recording.messages import schema_data, schema_of
-from agent.recording.results_chain import FILE_METADATA, PREVIOUS_RESULTS, ResultsChain
+from agent.recording.results_chain import EPOCH, FILE_METADATA, PREVIOUS_RESULTS, ResultsChain
 from agent.recording.signing import SIGNATURE_METADATA, Signer, Statement
 
 ACTIVE_SUFFIX = ".active"
@@ -73,6 +73,7 @@ class RecordingFile:
         self._signer = signer
         self._gateway = f"{start.site}/{start.gateway}"
         self._number = start.file_sequence
+        self._epoch = origin.get(EPOCH, "")
         self._previous_sha256 = origin.get("previous_sha256", "")
         self._results = ResultsChain.of_text(origin.get(PREVIOUS_RESULTS, ""))
         self.final_path = directory / f"fieldcal-{start.file_sequence:06d}.mcap"
@@ -121,6 +122,7 @@ class RecordingFile:
         """What can be signed of the file: all bytes written so far. Call it after `sync` or `finish`."""
         return Statement(
             self._gateway,
+            self._epoch,
             self._number,
             self._previous_sha256,
             self._results.text,

@@ -23,7 +23,7 @@ Tell = Callable[[bytes], None]
 
 HEAD_NAME = "head.json"
 _PURPOSE = "fieldcal head, version 1"
-_LINES = ["gateway", "recording", "previous", "results", "content", "opening", "closed", "utc_ns"]
+_LINES = ["gateway", "epoch", "recording", "previous", "results", "content", "opening", "closed", "utc_ns"]
 HEAD_S = 60.0  # s of event time between two heads of one recording
 
 _log = logging.getLogger(__name__)
@@ -56,10 +56,12 @@ class Head:
     @staticmethod
     def of(signed: SignedText) -> Head:
         """What a signed text says; its signature is not checked. Raises SignedTextError where it is no head."""
-        gateway, number, previous, results, content, opening, closed, utc_ns = values_of(signed.text, _PURPOSE, _LINES)
+        gateway, epoch, number, previous, results, content, opening, closed, utc_ns = values_of(
+            signed.text, _PURPOSE, _LINES
+        )
         length, _, sha256 = content.partition(" ")
-        previous_sha256 = "" if previous == "-" else previous
-        statement = Statement(gateway, count(number), previous_sha256, results, count(length), sha256)
+        epoch, previous = ("" if value == "-" else value for value in (epoch, previous))
+        statement = Statement(gateway, epoch, count(number), previous, results, count(length), sha256)
         head = Head(statement, opening, closed == "yes", count(utc_ns))
         if head.text != signed.text:
             raise SignedTextError("its lines are not as this program writes them")

@@ -24,7 +24,7 @@ from agent.recording.files import ACTIVE_SUFFIX, recordings, sync_directory
 from agent.recording.integrity import check_integrity
 from agent.recording.reading import first_event
 from agent.recording.records import MAGIC, Record, RecordError, parse, unpack, walk
-from agent.recording.results_chain import FILE_METADATA
+from agent.recording.results_chain import EPOCH, FILE_METADATA
 from agent.recording.scan import metadata_of
 from agent.recording.signing import SIGNATURE_METADATA, Signer, Statement
 from agent.recording.summary import KINDS, DerivedSummary
@@ -160,7 +160,8 @@ def _take(derived: DerivedSummary, record: Record) -> None:
 def _signing(path: Path, signer: Signer) -> Sign | None:
     """What gives the signature record of a file whose other records are closed; None where it names no gateway."""
     start = first_event(path)
-    previous_sha256 = metadata_of(path).get(FILE_METADATA, {}).get("previous_sha256", "")
+    origin = metadata_of(path).get(FILE_METADATA, {})
+    epoch, previous_sha256 = origin.get(EPOCH, ""), origin.get("previous_sha256", "")
     if start is None:
         return None
     gateway, number = f"{start.site}/{start.gateway}", start.file_sequence
@@ -168,7 +169,7 @@ def _signing(path: Path, signer: Signer) -> Sign | None:
     def sign(sound: _Sound) -> dict[str, str]:
         sha256 = sound.sha256.hexdigest()
         return signer.metadata(
-            Statement(gateway, number, previous_sha256, sound.derived.results.text, sound.length, sha256)
+            Statement(gateway, epoch, number, previous_sha256, sound.derived.results.text, sound.length, sha256)
         )
 
     return sign

@@ -15,6 +15,7 @@ from agent.recording.messages import MessageError, decode, is_result_topic, sche
 
 FILE_METADATA = "fieldcal.file"  # the metadata record at the beginning of each recording
 PREVIOUS_RESULTS = "previous_results"  # in it: the chain at the end of the file before, as text
+EPOCH = "epoch"  # in it: the epoch of the store when the recording began
 _AS_TEXT = re.compile(r"(\d{1,19}) ([0-9a-f]{64})")
 
 

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 SIGNATURE_METADATA = "fieldcal.signature"
 _CONTEXT_1 = b"fieldcal recording, version 1\n"
 _PURPOSE_2 = "fieldcal recording, version 2"
-_LINES_2 = ["gateway", "recording", "previous", "results", "content"]
+_LINES_2 = ["gateway", "epoch", "recording", "previous", "results", "content"]
 _HEAD = struct.Struct("<BQ")
 _OTHER_BYTES = "its signature is of other bytes than the file holds: the file was changed after it was signed"
 
@@ -42,11 +42,13 @@ _OTHER_BYTES = "its signature is of other bytes than the file holds: the file wa
 class Statement:
     """What the signature of a recording says.
 
-    `previous_sha256`: of the whole file before it, "" where there is none or it was never closed. `results`: the text
-    of the ResultsChain at the end. `length`, `sha256`: of all bytes before the record of the signature.
+    `epoch`: of the store, "" where there was none. `previous_sha256`: of the whole file before it, "" where there is
+    none or it was never closed. `results`: the text of the ResultsChain at the end. `length`, `sha256`: of all bytes
+    before the record of the signature.
     """
 
     gateway: str
+    epoch: str
     file_sequence: int
     previous_sha256: str
     results: str
@@ -58,6 +60,7 @@ class Statement:
         """The lines that signatures and heads have in common."""
         return {
             "gateway": self.gateway,
+            "epoch": self.epoch or "-",
             "recording": str(self.file_sequence),
             "previous": self.previous_sha256 or "-",
             "results": self.results,
@@ -114,7 +117,7 @@ def load_public_key(path: Path) -> Ed25519PublicKey:
 def signed_results(metadata: dict[str, str] | None) -> str | None:
     """The chain of results at the end of a file, as its signature names it; None where it names none."""
     try:
-        return values_of((metadata or {}).get("text", ""), _PURPOSE_2, _LINES_2)[3]
+        return values_of((metadata or {}).get("text", ""), _PURPOSE_2, _LINES_2)[4]
     except SignedTextError:
         return None
 
@@ -131,7 +134,7 @@ def verify_file(
         return "no signature in this file"
     try:
         said = values_of(metadata["text"], _PURPOSE_2, _LINES_2) if "text" in metadata else []
-        length = count(said[4].partition(" ")[0] if said else metadata.get("bytes", ""))
+        length = count(said[5].partition(" ")[0] if said else metadata.get("bytes", ""))
     except SignedTextError as error:
         return f"its signature cannot be read: {error}"
     if length >= size:
@@ -170,7 +173,7 @@ def _fault_2(metadata: dict[str, str], found: Statement, said: list[str], key: E
     if signed.key_id != key_id(key):
         return signed.fault(key)
     values = found.values
-    if said[4] != values["content"]:
+    if said[5] != values["content"]:
         return _OTHER_BYTES
     for name, value in zip(values, said, strict=True):
         if value != values[name]:

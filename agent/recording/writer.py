@@ -19,7 +19,7 @@ from agent.recording.head import HeadKeeper, Tell
 from agent.recording.messages import EVENTS_TOPIC, encode, topic_of
 from agent.recording.pruned_ranges import PRUNED_METADATA, Ranges, from_metadata, merged, to_metadata
 from agent.recording.repair import close_torn
-from agent.recording.results_chain import PREVIOUS_RESULTS
+from agent.recording.results_chain import EPOCH, PREVIOUS_RESULTS
 from agent.recording.retention import FOR_EVER, KeepFiles, delete, due, free_bytes
 from agent.recording.scan import metadata_of
 from agent.recording.set_aside import deleted, finish, highest_number, remove_statements, set_aside
@@ -56,7 +56,7 @@ class Recorder:
     `keep`: limits beyond which old recordings are deleted.
     `ledger`: the store, which remembers the highest file number also when all files are deleted; without it the numbers
     go on from the files in the directory. `signer`: signs each file and the head; None: nothing is signed.
-    `tell_head`: gets each new head (agent.recording.head), to publish it.
+    `tell_head`: gets each new head (agent.recording.head), to publish it. `epoch`: of the store; each file names it.
     """
 
     def __init__(
@@ -72,6 +72,7 @@ class Recorder:
         ledger: Ledger | None = None,
         signer: Signer | None = None,
         tell_head: Tell = lambda _: None,
+        epoch: str = "",
     ) -> None:
         self._directory = directory
         results = [f"/{sensor}/{what}" for sensor in sensors for what in RESULTS]
@@ -83,6 +84,7 @@ class Recorder:
         self._ledger = ledger
         self._signer = signer
         self._head = HeadKeeper(directory, signer, tell_head) if signer is not None else None
+        self._epoch = epoch
         self._gateway = ""  # of the newest RunStart
         self._file: RecordingFile | None = None
         self._failures = 0  # since the last file that was written without a failure
@@ -226,7 +228,7 @@ class Recorder:
         if self._failures:
             close_torn(self._directory, self._signer)  # the failed file, so that the next one can name its SHA-256
         name, digest = newest(self._directory)
-        origin = {"previous_file": name, "previous_sha256": digest}
+        origin = {"previous_file": name, "previous_sha256": digest, EPOCH: self._epoch}
         if self._ledger is not None:
             origin["published"] = str(self._ledger.published())
         if self._signer is not None and name:

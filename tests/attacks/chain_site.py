@@ -41,9 +41,8 @@ def record(
     directory.mkdir(exist_ok=True)
     store = Store(directory, 0)
     told = [] if heads is None else heads
-    recorder = Recorder(
-        directory, ["acc", "ref"], ["bridge-1"], ledger=store, signer=Signer(key), tell_head=told.append
-    )
+    names = (["acc", "ref"], ["bridge-1"])
+    recorder = Recorder(directory, *names, ledger=store, signer=Signer(key), tell_head=told.append, epoch=store.epoch)
     recorder.close_torn()
     pipeline = StandIn(CONFIG)
     for number, event in enumerate(happenings(blocks, seed)):
