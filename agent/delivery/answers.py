@@ -28,6 +28,7 @@ def answer_queries(queryable: _Queryable, gateway: str, store: Path, told: Calla
     and the gateway's status and head where their keys match.
     A query for `<keys>?after=<sequence>` gets the first REPLIES_MAX results after that number, in order. Several of
     them have the same key, so the query must use the consolidation NONE; otherwise Zenoh passes on only the last one.
+    With `epoch=<epoch>;after=<sequence>` only results of this epoch are given.
     Where retention has deleted some of these results, the error REMOVED comes first.
     Where there is no result, the answer is the error NOTHING: no answer at all would mean that the gateway is absent.
     """
@@ -74,4 +75,5 @@ def _answers(query: zenoh.Query, gateway: str, store: Path) -> tuple[list[Record
         if not after.isascii() or not after.isdigit() or int(after) >= 2**63:
             raise ValueError(f"after={after}: not a sequence number")
         gone = [r.up_to for r in history.removed() if (r.sensor, r.what) in wanted and r.up_to > int(after)]
-        return history.after(int(after), wanted, limit=REPLIES_MAX), max(gone, default=0)
+        epoch = query.parameters.get("epoch")
+        return history.after(int(after), wanted, limit=REPLIES_MAX, epoch=epoch), max(gone, default=0)

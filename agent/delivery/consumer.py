@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+import logging
 import queue
 import threading
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +21,7 @@ from agent.config.tls import TlsFiles
 from agent.delivery import memory as memory_file
 from agent.delivery.answers import NOTHING, REMOVED
 from agent.delivery.keys import PREFIX, narrow
+from agent.delivery.progress import Progress
 from agent.delivery.received import Received, receive
 from agent.delivery.session import session_config
 
@@ -32,13 +34,16 @@ SAVE_S = 1.0  # s between two writes of the memory file while results come witho
 
 __all__ = ["Consumer", "Received"]
 
+_log = logging.getLogger(__name__)
+
 
 class Consumer:
     """Receives the results under the key expression `key`, through the routers at `endpoints`.
 
     Iterating yields the results of each gateway in the order of their sequence, each once.
-    `last_sequence`: the last result known of each gateway (`<site>/<gateway>`: number). Such a gateway begins with the
-    results after that number, any other gateway with the values in force.
+    `last_sequence`: the last result known of each gateway (`<site>/<gateway>`: number, or, better,
+    `<site>/<gateway>/<epoch>`: number). Such a gateway begins with the results after that number, any other gateway
+    with the values in force. The attribute of this name is in the same form.
     `memory`: a file, made if it does not exist, in which the consumer keeps the last result that it has processed, so
     that it continues there after a restart. A result counts as processed when the next one is asked for. After a crash
     the results of its last second may come again, with the same numbers.
@@ -46,6 +51,9 @@ class Consumer:
     Each result names the result published before it. Where this is not the last one known, results are missing: the
     consumer asks the gateway's store with `?after=` and holds later results until it answers. After a lost connection
     the newest results come again (history and recovery of Zenoh's advanced subscriber), so that a gap is seen at once.
+    A result that is not the very next one counts only when the gateway's store has it too. Otherwise it is given with
+    `confirmed` false, and does not move the numbers, so that one message of a stranger cannot hide what follows. When
+    the gateway's store was made anew, its results have another epoch; the first of them has `new_epoch` true.
     `close` may be called from another thread than the one that iterates.
     Raises EndpointError, ConnectionError or MemoryFileError; iterating raises OSError where `memory` cannot be written.
     """
@@ -64,7 +72,8 @@ class Consumer:
         self._saved_s = time.monotonic()
         self._saved = dict(self._done)
         self._told: dict[str, int] = {}  # by source: number up to which the user was told that results are removed
-        self.last_sequence = self._done | dict(last_sequence or {})
+        self._progress = Progress(self._done | dict(last_sequence or {}))
+        self._unconfirmed: dict[tuple[str, str, int], Received] = {}  # given already, although the store had them not
         self._key = key
         self._inbox: queue.Queue[zenoh.Sample | None] = queue.Queue(maxsize=INBOX)  # None: the session is closed
         self._held: dict[str, deque[Received]] = {}
@@ -125,41 +134,115 @@ class Consumer:
             self._inbox.put(sample)
         self._inbox.put(None)  # the subscriber is undeclared
 
+    @property
+    def last_sequence(self) -> dict[str, int]:
+        """The last result that was taken of each gateway and epoch."""
+        return dict(self._progress.numbers)
+
     def _follow(self, result: Received) -> Iterator[Received]:
-        source = result.address.source
-        known = self.last_sequence.get(source)
-        if known is not None and result.sequence <= known:
+        if self._progress.has(result):
             return
-        if known is not None and result.previous == known:
+        if self._progress.is_next(result):
             yield from self._deliver(result)
             return
+        source = result.address.source
         self._held.setdefault(source, deque(maxlen=INBOX)).append(result)
         yield from self._ask(source)
 
     def _ask(self, source: str) -> Iterator[Received]:
+        """Ask a gateway for what follows the last result known of it, then give what was held meanwhile."""
         selector = narrow(self._key, source)
-        known = self.last_sequence.get(source)
+        if self._progress.number(source) is None:
+            results, answered, _ = self._get(selector)  # the values in force
+            yield from self._deliver(*results, first=True)
+            if not results or not self._held_is_new(source):
+                if answered:
+                    self._held.pop(source, None)
+                return
+        self._find_epoch(source, selector)
+        epochs = self._other_epochs(source, selector)
+        answered = yield from self._pages(source, f"{selector}?after=", self._progress.number(source) or 0, epochs)
+        for epoch in epochs:
+            yield from self._pages(source, f"{selector}?epoch={epoch};after=", 0, {}, epoch)
+        if answered:
+            held = self._held.pop(source, ())
+            yield from self._deliver_unconfirmed(*sorted(held, key=lambda r: r.sequence))
+
+    def _other_epochs(self, source: str, selector: str) -> dict[str, None]:
+        """The epochs of held results that are not known yet and that the gateway's store has."""
+        held = {r.epoch for r in self._held.get(source, ()) if self._progress.is_other_epoch(r)}
+        return dict.fromkeys(r.epoch for r in self._get(selector)[0] if r.epoch in held) if held else {}
+
+    def _pages(
+        self, source: str, question: str, after: int, others: dict[str, None], epoch: str | None = None
+    ) -> Generator[Received, None, bool]:
+        """Ask until nothing more comes; returns whether the gateway answered.
+
+        Results of other epochs are not given, but these epochs are added to `others`; with `epoch`, only its results
+        are given.
+        """
         while True:
-            results, answered, removed = self._get(selector if known is None else f"{selector}?after={known}")
+            results, answered, removed = self._get(f"{question}{after}")
+            if not results:
+                return answered
+            after = results[-1].sequence
+            if epoch is None:
+                others |= dict.fromkeys(r.epoch for r in results if self._progress.is_other_epoch(r))
+                results = [r for r in results if r.epoch not in others]
+            else:
+                results = [r for r in results if r.epoch == epoch]
             if results and removed > self._told.get(source, 0):
                 self._told[source] = removed
                 results[0] = replace(results[0], removed_up_to=removed)
             yield from self._deliver(*results)
-            if known is None or known == self.last_sequence[source]:
-                break
-            known = self.last_sequence[source]
-        if answered:
-            held = self._held.pop(source, ())
-            yield from self._deliver(*sorted(held, key=lambda r: r.sequence))
 
-    def _deliver(self, *results: Received) -> Iterator[Received]:
+    def _find_epoch(self, source: str, selector: str) -> None:
+        """Find the epoch of a number that was given without one: that of the result with this number in the store."""
+        known, held = self._progress.number(source), self._held.get(source, ())
+        if known is None or not self._progress.without_epoch(source):
+            return
+        other = next((r.epoch for r in held if self._progress.is_other_epoch(r)), None)
+        if other is None:
+            return
+        results, _, removed = self._get(f"{selector}?after={known - 1}")
+        if results and results[0].sequence == known:
+            self._progress.adopt(source, results[0].epoch, known)
+        elif removed >= known:
+            self._progress.adopt(source, other, known)
+
+    def _held_is_new(self, source: str) -> bool:
+        return not all(self._progress.has(result) for result in self._held.get(source, ()))
+
+    def _deliver(self, *results: Received, first: bool = False) -> Iterator[Received]:
         for result in results:
-            if result.sequence > self.last_sequence.get(result.address.source, -1):
-                self.last_sequence[result.address.source] = result.sequence
-                yield result
-                self._done[result.address.source] = result.sequence
-                if time.monotonic() - self._saved_s > SAVE_S:
-                    self._remember()
+            source = result.address.source
+            if self._progress.has(result):
+                continue
+            new_epoch = self._progress.is_other_epoch(result) and not (first or self._progress.without_epoch(source))
+            if new_epoch:
+                _log.warning(
+                    "%s counts its results anew, from %d: its store was made anew",
+                    result.address.source,
+                    result.sequence,
+                )
+            self._progress.take(result)
+            given = self._unconfirmed.pop(_identity(result), None)
+            if given is None or given.fields != result.fields:
+                yield replace(result, new_epoch=new_epoch) if new_epoch else result
+            self._done = self._progress.numbers | {}
+            if time.monotonic() - self._saved_s > SAVE_S:
+                self._remember()
+
+    def _deliver_unconfirmed(self, *results: Received) -> Iterator[Received]:
+        for result in results:
+            identity = _identity(result)
+            if self._progress.has(result) or identity in self._unconfirmed:
+                continue
+            _log.warning("%s: result %d is not in its store", result.address.source, result.sequence)
+            self._unconfirmed[identity] = result
+            if len(self._unconfirmed) > INBOX:
+                self._unconfirmed.pop(next(iter(self._unconfirmed)))
+            yield replace(result, confirmed=False)
 
     def _remember(self) -> None:
         if self._memory is not None and self._done != self._saved:
@@ -182,6 +265,10 @@ class Consumer:
             removed = max(removed, gone)
             answered |= reply.err is None or gone > 0 or reply.err.payload.to_bytes() == NOTHING
         return sorted((r for r in results if r is not None), key=lambda r: r.sequence), answered, removed
+
+
+def _identity(result: Received) -> tuple[str, str, int]:
+    return result.address.source, result.epoch, result.sequence
 
 
 def _removed(error: zenoh.ReplyError) -> int:

@@ -146,13 +146,26 @@ class History:
         if found:
             raise StoreError(f"{self._path}: damaged: {found}")
 
-    def after(self, sequence: int, channels: Collection[tuple[str, str]] | None = None, *, limit: int) -> list[Record]:
-        """The first `limit` results after number `sequence`, in order; only of `channels` (sensor, what) if given."""
+    def after(
+        self,
+        sequence: int,
+        channels: Collection[tuple[str, str]] | None = None,
+        *,
+        limit: int,
+        epoch: str | None = None,
+    ) -> list[Record]:
+        """The first `limit` results after number `sequence`, in order.
+
+        Only of `channels` (sensor, what) and of one `epoch` ("" for results of older versions) where these are given.
+        """
         where, values = "sequence > ?", [sequence]
         if channels is not None:
             rows = ", ".join(["(?, ?)"] * len(channels)) or "(NULL, NULL)"
             where += f" AND (sensor, what) IN (VALUES {rows})"
         names = [name for channel in channels or () for name in channel]
+        if epoch is not None:
+            where += " AND ifnull(json_extract(CAST(payload AS TEXT), '$.epoch'), '') = ?"
+            names.append(epoch)
         return self._records(f"WHERE {where} ORDER BY sequence LIMIT ?", *values, *names, limit)
 
     def count_after(self, sequence: int) -> int:

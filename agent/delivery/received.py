@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +15,7 @@ from agent.delivery.keys import Address, parse_key
 LARGEST_RESULT = 256 << 10  # bytes; the largest result, a calibration, has 5 kB
 LARGEST_NUMBER = 2**63 - 1
 _DIGITS_MAX = 19
+_EPOCH = re.compile(r"(?:[0-9a-f]{16})?")
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +29,12 @@ class Received:
     previous: int | None  # number of the result that the gateway published before; None in an answer to a query
     # Where not None: retention has deleted results between the last one received and this number.
     removed_up_to: int | None = None
+    epoch: str = ""  # names the numbering that `sequence` belongs to; "" from an older version
+    # The first result of an epoch, after results of another one: the gateway's store was made anew.
+    new_epoch: bool = False
+    # False: the gateway's store does not have this result. It may not have been able to write it; or a stranger
+    # published it.
+    confirmed: bool = True
 
 
 def receive(key: str, payload: bytes, attachment: bytes | None) -> Received | None:
@@ -49,11 +57,14 @@ def receive(key: str, payload: bytes, attachment: bytes | None) -> Received | No
     sequence = fields.get("sequence")
     if type(sequence) is not int or not 0 <= sequence <= LARGEST_NUMBER or fields.get("sensor") != address.sensor:
         return None
+    epoch = fields.get("epoch", "")
+    if not isinstance(epoch, str) or not _EPOCH.fullmatch(epoch):
+        return None
     if attachment is None:
-        return Received(key, address, sequence, fields, None)
+        return Received(key, address, sequence, fields, None, epoch=epoch)
     if len(attachment) > _DIGITS_MAX or not attachment.isdigit():
         return None
-    return Received(key, address, sequence, fields, int(attachment))
+    return Received(key, address, sequence, fields, int(attachment), epoch=epoch)
 
 
 def _has_its_shapes(calibration: CalibrationUpdate) -> bool:

@@ -228,7 +228,7 @@ class Recorder:
         if self._failures:
             close_torn(self._directory, self._signer)  # the failed file, so that the next one can name its SHA-256
         name, digest = newest(self._directory)
-        origin = {"previous_file": name, "previous_sha256": digest, EPOCH: self._epoch}
+        origin = {"previous_file": name, "previous_sha256": digest} | ({EPOCH: self._epoch} if self._epoch else {})
         if self._ledger is not None:
             origin["published"] = str(self._ledger.published())
         if self._signer is not None and name:
