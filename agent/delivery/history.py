@@ -55,7 +55,7 @@ class Record:
     @staticmethod
     def of(result: Result, *, recorded: bool, recording: str, epoch: str = "") -> Record:
         """Make the record of a result. A number that is not finite becomes null in the JSON."""
-        fields = {**msgspec.structs.asdict(result), "recorded": recorded, "epoch": epoch}
+        fields = {**msgspec.structs.asdict(result), "recorded": recorded} | ({"epoch": epoch} if epoch else {})
         identity = result.identity if isinstance(result, CalibrationUpdate) else ""
         return Record(
             result.sequence,
