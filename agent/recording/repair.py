@@ -158,19 +158,19 @@ def _take(derived: DerivedSummary, record: Record) -> None:
 
 
 def _signing(path: Path, signer: Signer) -> Sign | None:
-    """What gives the signature record of a file whose other records are closed; None where it names no gateway."""
+    """What gives the signature record of a file whose other records are closed; None where it cannot be signed."""
     start = first_event(path)
-    origin = metadata_of(path).get(FILE_METADATA, {})
-    epoch, previous_sha256 = origin.get(EPOCH, ""), origin.get("previous_sha256", "")
     if start is None:
         return None
+    origin = metadata_of(path).get(FILE_METADATA, {})
+    epoch, previous_sha256 = origin.get(EPOCH, ""), origin.get("previous_sha256", "")
     gateway, number = f"{start.site}/{start.gateway}", start.file_sequence
+    if "\n" in gateway + epoch + previous_sha256:  # not a file of this program
+        return None
 
     def sign(sound: _Sound) -> dict[str, str]:
-        sha256 = sound.sha256.hexdigest()
-        return signer.metadata(
-            Statement(gateway, epoch, number, previous_sha256, sound.derived.results.text, sound.length, sha256)
-        )
+        results, sha256 = sound.derived.results.text, sound.sha256.hexdigest()
+        return signer.metadata(Statement(gateway, epoch, number, previous_sha256, results, sound.length, sha256))
 
     return sign
 

@@ -250,7 +250,10 @@ class Recorder:
         """The RunStart is on the disk. A crash before that leaves no file, and its number is used again."""
         self._number(start.file_sequence)
         self._may_age = True
-        remove_statements(self._directory, self._pruned)
+        try:
+            remove_statements(self._directory, self._pruned)
+        except OSError as error:  # they stay until the next file begins
+            log.info("%s cannot be deleted: %s", error.filename, error.strerror)
         if self._head is not None and self._file is not None:
             self._head.begin(self._file, self._now_ns, self._utc_ns)
         self.look_for_pruning()

@@ -32,6 +32,10 @@ def start(recorder: Recorder, number: int = 0) -> bool:
     return recorder.record(number, event, pipeline.step(event))
 
 
+def cannot(*_: object) -> None:
+    raise OSError(errno.EIO, os.strerror(errno.EIO), "fieldcal-000001.deleted")
+
+
 def prune_while_full(directory: Path, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Delete by retention while nothing can be recorded, then be killed; returns the numbers that are left."""
     with monkeypatch.context() as full:
@@ -55,6 +59,13 @@ def test_deletions_on_a_full_disk_are_known_after_a_kill(tmp_path: Path, monkeyp
     assert sum(path.stat().st_size for path in directory.glob("fieldcal-*")) < 0.7 * whole, "space was made"
     status, text = audited(directory)
     assert status == 0, text
+    recorder = recorder_on(directory)
+    with monkeypatch.context() as failing:
+        failing.setattr("agent.recording.writer.remove_statements", cannot)
+        assert start(recorder), "what cannot be deleted costs no recording"
+    assert list(directory.glob("*.deleted"))
+    recorder.close()
+    left.append(left[-1] + 1)
     recorder = recorder_on(directory)
     assert start(recorder)
     assert [number for number, _ in recordings(directory)] == [*left, left[-1] + 1]
