@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import Any
@@ -17,7 +18,10 @@ from agent.calibrate.files import Files, Options
 from agent.calibrate.outcome import Outcome, nothing_used
 from agent.calibrate.poses import PoseInterval, Setting, beside_reference, read_poses
 from agent.calibrate.priors import contradictions, instrument_of, priors_of
-from agent.calibrate.tables import ReferenceTable, TableError, read_reference, read_sensor
+from agent.calibrate.tables import ReferenceTable, SensorTable, read_reference, read_sensor
+from agent.calibrate.wrong_unit import check_gravity
+from agent.reading.source import Progress, TableError
+from agent.reading.units import Sensitivity, sensitivity_of
 from calib.estimate.nuisances import Priors
 from calib.estimate.verdict import dead_reasons
 from calib.excitation.front_end import Settings
@@ -34,7 +38,7 @@ def calibrated(options: dict[str, Any]) -> Outcome:
     """The outcome for these options. Raises TableError and click.UsageError."""
     _check(options)
     if not options["reference"] and not options["poses"] and not options["plain"]:
-        return norm_fitted(read_sensor(options["sensor"]), options)
+        return norm_fitted(_sensor(options, None), options)
     if options["method"] != "3":
         return by_amplitudes(read_files(options), options)
     if options["plain"]:
@@ -50,24 +54,51 @@ def read_files(options: dict[str, Any], instrument: Instrument | None = None) ->
     paths = [options[name] for name in ("sensor", "reference") if options[name]]
     size = sum(path.stat().st_size for path in paths if path.is_file())
     with _bar("reading", size if size > BAR_FROM_BYTES else 0) as bar:
-        sensor = read_sensor(options["sensor"], bar)
-        reference = read_reference(options["reference"], bar) if options["reference"] else None
+        sensor = _sensor(options, bar)
+        reference = _reference(options, bar) if options["reference"] else None
     instrument = instrument or Instrument()
     if reference is not None:
         instrument = replace(instrument, quantity=reference.quantity)
         _check_quantity(reference, instrument, options["reference_quantity"])
-    poses = _poses(options, setting_of(options, reference), reference)
+    setting = setting_of(options, reference)
+    if reference is not None and setting.reference_coupling == "dc":
+        check_gravity(reference)
+    poses = _poses(options, setting, reference)
     plain = options["plain"]
     limits = Limits.of(options["u_offset_mps2"], math.radians(options["u_angle_deg"]))
     settings = Settings(Limits() if plain else limits, leave_out=not plain, limit_band=not plain)
     return Files(sensor, reference, poses, instrument, Options(settings, align=not plain))
 
 
+def _sensor(options: dict[str, Any], progress: Progress | None) -> SensorTable:
+    table = read_sensor(options["sensor"], progress, options.get("columns"))
+    _say(table.said)
+    return table
+
+
+def _reference(options: dict[str, Any], progress: Progress | None) -> ReferenceTable:
+    columns, stated = options.get("reference_columns"), options.get("sensitivity")
+    table = read_reference(options["reference"], progress, columns, _sensitivity(stated) if stated else None)
+    _say(table.said)
+    return table
+
+
+def _sensitivity(text: str) -> Sensitivity:
+    try:
+        return sensitivity_of(text)
+    except ValueError as error:
+        raise click.BadParameter(str(error), param_hint="--sensitivity") from None
+
+
+def _say(said: Sequence[str]) -> None:
+    for line in said:
+        click.echo(line, err=True)
+
+
 def _check_quantity(reference: ReferenceTable, instrument: Instrument, stated: str | None) -> None:
     if stated and reference.quantity != stated:
         raise TableError(
-            f"{reference.path}, line 1: column {reference.column} holds {reference.quantity}, "
-            f"but --reference-quantity says {stated}"
+            f"{reference.path}, {reference.column} holds {reference.quantity}, but --reference-quantity says {stated}"
         )
     if instrument.derivatives and instrument.has_corner:
         raise TableError(

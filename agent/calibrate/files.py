@@ -10,7 +10,8 @@ import numpy as np
 
 from agent.calibrate.poses import PoseInterval
 from agent.calibrate.streams import FileStream
-from agent.calibrate.tables import ReferenceTable, SensorTable, TableError
+from agent.calibrate.tables import ReferenceTable, SensorTable
+from agent.reading.source import TableError
 from calib.excitation.alignment import Drift, drift
 from calib.excitation.front_end import (
     DEFAULT_SETTINGS,

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import itertools
 import math
 from collections.abc import Sequence
@@ -13,7 +11,11 @@ from typing import Literal
 
 import numpy as np
 
-from agent.calibrate.tables import TableError, fields_of, header_of, number_of, open_table, require
+from agent.calibrate.wrong_unit import unit_hint
+from agent.reading.delimited import fields_of, number_of
+from agent.reading.dialect import Dialect, dialect_of, lines_of
+from agent.reading.source import TableError
+from agent.reading.units import SUFFIXES
 from calib.geometry import STANDARD_GRAVITY_MPS2, along, at_rest, beside, clamp, on_axis
 from calib.model import Array, Pose
 
@@ -117,6 +119,7 @@ def _felt(stated: Sequence[float] | None, setting: Setting) -> Sequence[float] |
         told = ", ".join(f"{g:.6g}" for g in stated)
         raise ValueError(
             f"gx,gy,gz ({told}) has length {math.hypot(*stated):.6g} m/s2, but gravity has 9.7 to 9.9 m/s2"
+            f"{unit_hint(math.hypot(*stated))}"
         )
     return stated
 
@@ -142,23 +145,20 @@ def _without_what_the_reference_feels(pose: Pose) -> Pose:
 
 def read_rows(path: Path) -> list[PoseRow]:
     """The lines of poses.csv, in any of its forms. Raises TableError."""
-    with open_table(path) as file:
-        header = header_of(path, file)
-        try:
-            text = io.TextIOWrapper(file, encoding="utf-8", newline="")
-            lines = [(n, row) for n, row in enumerate(csv.reader(text), start=2) if any(f.strip() for f in row)]
-        except (UnicodeDecodeError, csv.Error) as error:
-            raise TableError(f"{path}: the file is not UTF-8 text with comma-separated fields: {error}") from None
-    require(path, header, ("start_s", "stop_s"))
+    dialect = dialect_of(path)
+    lines = [(number, dialect.fields(line)) for number, line in lines_of(path, dialect)]
+    header = dialect.header
+    _require(path, dialect, ("start_s", "stop_s"))
     forms = [form for form in FORMS if set(form) & set(header)]
     if len(forms) != 1 and forms not in TOGETHER:
         wanted = "; ".join(",".join(form) for form in FORMS)
-        raise TableError(f"{path}, line 1: expected one of {wanted} (gravity may go with a direction or an axis); "
-                         f"the header is {','.join(header)!r}")  # fmt: skip
+        raise TableError(
+            f"{path}, line {dialect.header_line}: expected one of {wanted} (gravity may go with a direction or an "
+            f"axis); the header is {','.join(header)!r}"
+        )
     names = [name for form in forms for name in form]
-    require(path, header, names)
-    rows = [_row(path, line, dict(zip(header, fields_of(path, line, row, header), strict=True)), names)
-            for line, row in lines]  # fmt: skip
+    _require(path, dialect, names)
+    rows = [_row(path, line, dialect, fields_of(path, line, row, header), names) for line, row in lines]
     if not rows:
         raise TableError(f"{path}: the file has no poses; add a line for each pose")
     for before, row in itertools.pairwise(sorted(rows, key=lambda row: row.start_s)):
@@ -168,10 +168,28 @@ def read_rows(path: Path) -> list[PoseRow]:
     return rows
 
 
-def _row(path: Path, line: int, fields: dict[str, str], names: Sequence[str]) -> PoseRow:
-    axis = fields["axis"] if "axis" in names else None
-    values = {n: number_of(path, line, n, fields[n]) for n in ("start_s", "stop_s", *names) if n != "axis"}
+def _row(path: Path, line: int, dialect: Dialect, fields: Sequence[str], names: Sequence[str]) -> PoseRow:
+    places = {name: dialect.header.index(name) for name in ("start_s", "stop_s", *names)}
+    axis = fields[places.pop("axis")] if "axis" in names else None
+    values = {name: number_of(path, line, dialect, k, fields[k]) for name, k in places.items()}
+    for name, value in values.items():
+        if math.isnan(value):
+            raise TableError(f"{path}, line {line}, column {name}: {fields[places[name]]!r} is not a finite number")
     start_s, stop_s = values.pop("start_s"), values.pop("stop_s")
     if not stop_s > start_s:
         raise TableError(f"{path}, line {line}, column stop_s: {stop_s:g} is not after start_s {start_s:g}")
     return PoseRow(line, start_s, stop_s, values, axis)
+
+
+def _require(path: Path, dialect: Dialect, names: Sequence[str]) -> None:
+    """Check that all columns are there once. Raises TableError."""
+    where = f"{path}, line {dialect.header_line}"
+    header = dialect.header
+    if len(set(header)) < len(header):
+        raise TableError(f"{where}: a column is there twice, remove one: {','.join(header)!r}")
+    for name in names:
+        if name not in header:
+            stem = name.rsplit("_", 1)[0]
+            others = [n for n in header if n.rsplit("_", 1)[0] == stem and n.rpartition("_")[2] in {*SUFFIXES, "rad"}]
+            hint = f"; {others[0]} has another unit, convert it" if others else ""
+            raise TableError(f"{where}: column {name} is missing in the header {','.join(header)!r}{hint}")

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from agent.calibrate.tables import TableError
+from agent.reading.source import TableError
 from calib.estimate.nuisances import Priors
 from calib.estimate.quantities import PRIORS
 from calib.model import PARAMETERS, Array, Calibration

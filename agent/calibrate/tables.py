@@ -1,26 +1,21 @@
-"""Reads sensor.csv and reference.csv fast, also files larger than memory. Every fault is reported with its place."""
+"""The samples of a sensor and of a reference, from files of any format, also larger than memory."""
 
 from __future__ import annotations
 
-import io
 import math
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from agent.calibrate.decimals import decimals
+from agent.reading.choice import AXES, Choice, Chosen, quantity_of
+from agent.reading.formats import open_source
+from agent.reading.source import Array, Progress, Source, TableError
+from agent.reading.units import Sensitivity, unit_of
 from calib.signal.stamps import kind_of
 
-Array = NDArray[np.float64]
-Progress = Callable[[int], Any]  # called with the number of bytes that were just read
-
-CHUNK_BYTES = 1 << 18  # fits into the second-level cache while it is parsed
-LARGEST = 1e15  # no indication or time is larger, and its squares and their sums stay finite
 SENSOR = ("time_s", "vx", "vy", "vz")
 TEMPERATURE = "temperature_degc"
 # Columns of a reference, and the quantity that they hold.
@@ -30,31 +25,34 @@ REFERENCES = {
     ("v",): "velocity",
     ("d",): "displacement",
 }
+ELECTRICAL = ("indication", "count")
 # A stamp may be earlier than the previous one by up to this time, because of jitter or a burst that was read late
 # (delays are some tens of ms).
 LATEST_STAMP_S = 0.1
 ROWS_AT_ONCE = 1 << 20
-
-
-class TableError(Exception):
-    """The file cannot be used. The message names file, line, column and value."""
+# From these values on, a time without unit counts since 1970, in this part of a second: 1e9 s is the year 2001.
+SINCE_1970 = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorTable:
-    """sensor.csv: stamps (n,) in s, indications (n, 3), temperature (n,) in degC or None. The arrays are on disk."""
+    """Stamps (n,) in s, indications (n, 3), temperature (n,) in degC or None. The arrays are on disk.
+
+    A row of indications is NaN where one of them is missing. `said`: what was guessed, for the user.
+    """
 
     path: Path
     time_s: Array
     v: Array
     temperature_degc: Array | None
+    said: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReferenceTable:
-    """reference.csv: stamps (n,) in s, channels (n, 1 or 3) of a quantity of calib.signal.instrument in SI units.
+    """Stamps (n,) in s, channels (n, 1 or 3) of a quantity of calib.signal.instrument in SI units.
 
-    `column` names the first channel in the header.
+    `column` says where the file names the first channel. `said`: what was guessed, for the user.
     """
 
     path: Path
@@ -62,147 +60,152 @@ class ReferenceTable:
     x: Array
     quantity: str
     column: str
+    said: tuple[str, ...] = ()
 
 
-def read_sensor(path: Path, progress: Progress | None = None) -> SensorTable:
-    """Read sensor.csv. Raises TableError."""
-    with open_table(path) as file:
-        header = header_of(path, file)
-        require(path, header, SENSOR)
-        names = [*SENSOR, TEMPERATURE] if TEMPERATURE in header else [*SENSOR]
-        rows = _columns(path, file, header, names, progress)
-    _check_time(path, rows[:, 0])
-    return SensorTable(path, rows[:, 0], rows[:, 1:4], rows[:, 4] if len(names) > 4 else None)
+def read_sensor(path: Path, progress: Progress | None = None, columns: str | None = None) -> SensorTable:
+    """Read the samples of a sensor, in the unit of the file. `columns` is the option --columns. Raises TableError."""
+    source = open_source(path)
+    choice = Choice(source, columns, "--columns")
+    chosen = _sensor_columns(choice)
+    rows = _rows(source, chosen, progress, np.ones(len(chosen) - 1))
+    return SensorTable(path, rows[:, 0], rows[:, 1:4], rows[:, 4] if len(chosen) > 4 else None, tuple(choice.said))
 
 
-def read_reference(path: Path, progress: Progress | None = None) -> ReferenceTable:
-    """Read reference.csv: `a`, `v` or `d` alone, or `ax,ay,az`. Raises TableError."""
-    with open_table(path) as file:
-        header = header_of(path, file)
-        found = [names for names in REFERENCES if set(names) <= set(header)]
-        if len(found) != 1:
-            wanted = ", ".join(f"time_s,{','.join(names)}" for names in REFERENCES)
-            raise TableError(f"{path}, line 1: expected exactly one of {wanted}; the header is {','.join(header)!r}")
-        require(path, header, ("time_s", *found[0]))
-        rows = _columns(path, file, header, ["time_s", *found[0]], progress)
-    _check_time(path, rows[:, 0])
-    return ReferenceTable(path, rows[:, 0], rows[:, 1:], REFERENCES[found[0]], found[0][0])
+def _sensor_columns(choice: Choice) -> list[Chosen]:
+    """Columns of time, x, y, z and, where there is one, temperature."""
+    if not choice.is_stated and (found := choice.standard(SENSOR)):
+        return [*found, *(choice.standard([TEMPERATURE]) or [])]
+    roles = {role: choice.stated(role) or choice.guessed(role) for role in ("time", *AXES)}
+    known = {role: column for role, column in roles.items() if column}
+    rest = choice.rest(list(known.values()))
+    if "time" in known and len(known) == 1 and len(rest) == len(AXES):
+        known |= dict(zip(AXES, rest, strict=True))
+    if not known and len(rest) == 4 and all(c.column.name.isdigit() for c in rest):
+        known = dict(zip(("time", *AXES), rest, strict=True))
+    missing = [role for role in ("time", *AXES) if role not in known]
+    if missing:
+        names = dict(zip(("time", *AXES), SENSOR, strict=True))
+        raise choice.fault(f"column {', '.join(names[role] for role in missing)} is missing")
+    temperature = choice.stated("temperature") or choice.guessed("temperature")
+    if temperature and temperature.column.group == known["time"].column.group:
+        known["temperature"] = temperature
+    if not choice.is_stated:
+        choice.say(known)
+    return list(known.values())
 
 
-def open_table(path: Path) -> IO[bytes]:
-    """The file, opened. Raises TableError."""
-    try:
-        return path.open("rb")
-    except OSError as error:
-        raise TableError(f"{path}: {error.strerror}") from None
+def read_reference(
+    path: Path, progress: Progress | None = None, columns: str | None = None, sensitivity: Sensitivity | None = None
+) -> ReferenceTable:
+    """Read the samples of a reference in SI units. `columns` is the option --reference-columns. Raises TableError."""
+    source = open_source(path)
+    choice = Choice(source, columns, "--reference-columns")
+    chosen, quantity = _reference_columns(choice, sensitivity)
+    scale = np.array([_si(choice, c, sensitivity) for c in chosen[1:]])
+    rows = _rows(source, chosen, progress, scale)
+    return ReferenceTable(
+        path, rows[:, 0], rows[:, 1:], quantity, f"{source.header}: column {chosen[1].column}", tuple(choice.said)
+    )
 
 
-def header_of(path: Path, file: IO[bytes]) -> list[str]:
-    """Column names in the first line. Raises TableError."""
-    line = file.readline()
-    try:
-        header = [name.strip() for name in line.decode("utf-8-sig").split(",")]
-    except UnicodeDecodeError:
-        raise TableError(f"{path}, line 1: the line is not UTF-8 text") from None
-    if len(set(header)) < len(header):
-        raise TableError(f"{path}, line 1: a column is there twice, remove one: {','.join(header)!r}")
-    return header
+def _reference_columns(choice: Choice, sensitivity: Sensitivity | None) -> tuple[list[Chosen], str]:
+    """Columns of time and of one or three channels, and their quantity."""
+    if not choice.is_stated:
+        found = {names: choice.standard(("time_s", *names)) for names in REFERENCES}
+        there = [(names, columns) for names, columns in found.items() if columns]
+        if len(there) > 1:
+            raise choice.fault(f"expected exactly one of {' | '.join(','.join(names) for names, _ in there)}")
+        if there:
+            names, columns = there[0]
+            return columns or [], sensitivity.quantity if sensitivity else REFERENCES[names]
+    time = choice.stated("time") or choice.guessed("time")
+    letters = {letter: choice.stated(letter) for letter in "avd"}
+    one = [(letter, column) for letter, column in letters.items() if column]
+    three = [choice.stated(axis) for axis in AXES]
+    if not one and not any(three):
+        three = [choice.guessed(axis) for axis in AXES]
+    given = [column for column in three if column]
+    if not one and not given and time:
+        given = choice.rest([time])
+    if not time or len(one) + len(given) not in (1, 3) or (one and given):
+        raise choice.fault("expected exactly one of time and one channel, or time and x, y and z,")
+    channels = [column for _, column in one] or given
+    quantity = {"a": "acceleration", "v": "velocity", "d": "displacement"}[one[0][0]] if one else None
+    quantity = (sensitivity.quantity if sensitivity else None) or quantity or quantity_of(channels[0])
+    if quantity is None and len(channels) == 3:
+        quantity = "acceleration"
+    if quantity is None and not _is_electrical(channels[0]):
+        raise choice.fault(f"neither name nor unit tells what {str(channels[0].column)!r} is, add its unit")
+    if not choice.is_stated:
+        choice.say({"time": time} | {f"{k}": c for k, c in zip(AXES, channels, strict=False)})
+    return [time, *channels], quantity or "acceleration"
 
 
-def require(path: Path, header: Sequence[str], names: Sequence[str]) -> None:
-    """Check that all columns are there, and none of them also in another unit (time_ms, ax_g). Raises TableError."""
-    for name in names:
-        base = name.rsplit("_", 1)[0]
-        others = [n for n in header if n.isidentifier() and n.rsplit("_", 1)[0] == base and n not in names]
-        if name not in header:
-            hint = f"; {others[0]} has another unit, convert it" if others else ""
-            raise TableError(f"{path}, line 1: column {name} is missing in the header {','.join(header)!r}{hint}")
-        if others:
-            raise TableError(
-                f"{path}, line 1: the header has both {name} and {others[0]}; remove the one with the wrong unit"
-            )
+def _is_electrical(chosen: Chosen) -> bool:
+    unit = unit_of(chosen.unit) if chosen.unit else None
+    return unit is not None and unit.quantity in ELECTRICAL
 
 
-def _columns(
-    path: Path, file: IO[bytes], header: Sequence[str], names: Sequence[str], progress: Progress | None
-) -> Array:
-    """The named columns (n, k) of all further lines, n >= 2.
+def _si(choice: Choice, chosen: Chosen, sensitivity: Sensitivity | None) -> float:
+    """What one unit of the column is in SI units."""
+    unit = unit_of(chosen.unit) if chosen.unit else None
+    if sensitivity is None:
+        if unit is not None and unit.quantity in ELECTRICAL:
+            raise choice.fault(f"column {str(chosen.column)!r} is in {chosen.unit}, so --sensitivity is needed, "
+                               "for example --sensitivity '100 mV/g'")  # fmt: skip
+        return 1.0 if unit is None else unit.si
+    if unit is not None and unit.quantity not in ELECTRICAL:
+        raise choice.fault(f"column {str(chosen.column)!r} is in {chosen.unit} already; remove --sensitivity")
+    if not sensitivity.indication:
+        return sensitivity.per / sensitivity.value
+    if unit is not None and unit.quantity != sensitivity.indication:
+        raise choice.fault(f"--sensitivity is not for {chosen.unit}, the unit of column {str(chosen.column)!r}")
+    return (1.0 if unit is None else unit.si) * sensitivity.per / sensitivity.value
+
+
+def _rows(source: Source, chosen: Sequence[Chosen], progress: Progress | None, scale: Array) -> Array:
+    """The chosen columns (n, k), n >= 2: times in s, the others times `scale`.
+
+    Where one of the channels (columns 1 to 3) has no value, the others have none either.
 
     A temporary file on disk holds them while they are used.
     """
-    places = [header.index(name) for name in names]
-    line, rest = 2, b""
+    count, time_unit = 0, unit_of(chosen[0].unit) if chosen[0].unit else None
+    if time_unit is not None and time_unit.quantity != "time":
+        raise TableError(f"{source.path}, {source.header}: column {str(chosen[0].column)!r} is in {chosen[0].unit}, "
+                         "which is no unit of time")  # fmt: skip
+    second = None if time_unit is None else time_unit.si
     with tempfile.TemporaryFile() as spool:
-        while data := file.read(CHUNK_BYTES):
-            text, rest = _whole_lines(rest + data)
-            line += _append(spool, path, line, text, header, places)
-            if progress is not None:
-                progress(len(data))
-        line += _append(spool, path, line, rest.rstrip(b"\r\n") + b"\n" if rest.strip() else b"", header, places)
-        if line < 4:
-            raise TableError(f"{path}: the file has {line - 2} rows of data, at least 2 are needed")
+        for rows in source.pieces([c.column for c in chosen], progress):
+            if second is None:
+                second = next((part for least, part in SINCE_1970 if len(rows) and rows[0, 0] >= least), 1.0)
+            _check_whole(source, chosen, rows, count)
+            rows[:, 0] *= second
+            rows[:, 1:] *= scale
+            rows[np.isnan(rows[:, 1:4]).any(axis=1), 1:4] = np.nan
+            spool.write(np.ascontiguousarray(rows).data)
+            count += len(rows)
+        if count < 2:
+            raise TableError(f"{source.path}: the file has {count} rows of data, at least 2 are needed")
         spool.flush()
-        return np.asarray(np.memmap(spool, dtype=np.float64, mode="r", shape=(line - 2, len(places))))
+        found = np.asarray(np.memmap(spool, dtype=np.float64, mode="r", shape=(count, len(chosen))))
+    _check_time(source, chosen[0], found[:, 0])
+    return found
 
 
-def _whole_lines(data: bytes) -> tuple[bytes, bytes]:
-    """Whole lines, and the rest. Blank lines stay in the rest, because they may be the end of the file."""
-    end = data.rstrip(b"\r\n")
-    cut = end.rfind(b"\n") + 1
-    whole = data[:cut]
-    return whole.replace(b"\r\n", b"\n") if b"\r" in whole else whole, data[cut:]
+def _check_whole(source: Source, chosen: Sequence[Chosen], rows: Array, before: int) -> None:
+    """Check that each row has a time, and that no value is infinite. Raises TableError."""
+    wrong = np.isinf(rows)
+    wrong[:, 0] |= np.isnan(rows[:, 0])
+    if wrong.any():
+        row, k = (int(i[0]) for i in np.nonzero(wrong))
+        name, value = chosen[k].column, rows[row, k]
+        where = f"{source.path}, {source.place(before + row)}, column {name}"
+        raise TableError(f"{where}: {value:g} is not a finite number; correct the value, or remove the row")
 
 
-def _append(spool: IO[bytes], path: Path, line: int, text: bytes, header: Sequence[str], places: Sequence[int]) -> int:
-    """Parse whole lines, of which the first has the number `line`, and append their columns.
-
-    Gives the number of lines.
-    """
-    if not text:
-        return 0
-    rows = decimals(text, len(header))
-    if rows is None:
-        rows = _rows(path, line, text, header)
-    spool.write(np.ascontiguousarray(rows[:, places]).data)
-    return len(rows)
-
-
-def _rows(path: Path, first_line: int, text: bytes, header: Sequence[str]) -> Array:
-    """Parse numbers in any notation. Raises TableError for the first line that is wrong."""
-    try:
-        rows = np.loadtxt(io.BytesIO(text), delimiter=",", comments=None, ndmin=2)
-    except ValueError:
-        rows = np.empty((0, 0))
-    if rows.shape == (text.count(b"\n"), len(header)) and (np.abs(rows) <= LARGEST).all():
-        return rows
-    parsed = []
-    for line, content in enumerate(text.decode("utf-8", "replace").splitlines(), start=first_line):
-        fields = fields_of(path, line, content.split(","), header)
-        parsed.append([number_of(path, line, name, field) for name, field in zip(header, fields, strict=True)])
-    return np.array(parsed)
-
-
-def fields_of(path: Path, line: int, fields: list[str], header: Sequence[str]) -> list[str]:
-    """The fields without blanks around them. Raises TableError if their number is not that of the header."""
-    if len(fields) != len(header):
-        raise TableError(f"{path}, line {line}: {len(fields)} fields, but the header has {len(header)}")
-    return [field.strip() for field in fields]
-
-
-def number_of(path: Path, line: int, column: str, text: str) -> float:
-    """A finite number that is not larger than LARGEST. Raises TableError."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise TableError(f"{path}, line {line}, column {column}: {text.strip()!r} is not a finite number")
-    if abs(value) > LARGEST:
-        raise TableError(f"{path}, line {line}, column {column}: {text.strip()!r} is larger than {LARGEST:g}")
-    return value
-
-
-def _check_time(path: Path, time_s: Array) -> None:
+def _check_time(source: Source, time: Chosen, time_s: Array) -> None:
     """Check that time increases. Stamps may decrease by LATEST_STAMP_S, but not if they are on an exact grid.
 
     Raises TableError.
@@ -220,6 +223,9 @@ def _check_time(path: Path, time_s: Array) -> None:
         if len(wrong):
             at = int(wrong[0])
             later = f"{part[at]:.10g} after {before[at]:.10g}"
-            raise TableError(f"{path}, line {first + at + 2}, column time_s: {later}; time must not decrease")
+            where = f"{source.path}, {source.place(first + at)}, column {time.column}"
+            raise TableError(f"{where}: {later}; time must not decrease, sort or cut the file")
     if not newest > float(time_s[0]):
-        raise TableError(f"{path}, column time_s: the value is {newest:.10g} in every line; time must increase")
+        raise TableError(
+            f"{source.path}, column {time.column}: the value is {newest:.10g} in every row; time must increase"
+        )

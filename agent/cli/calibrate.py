@@ -12,7 +12,8 @@ import click
 from agent.calibrate.calibrating import calibrated
 from agent.calibrate.origin import origin
 from agent.calibrate.outcome import as_json, print_outcome
-from agent.calibrate.tables import REFERENCES, TableError
+from agent.calibrate.tables import REFERENCES
+from agent.reading.source import TableError
 from calib.signal.instrument import QUANTITIES
 
 _REFERENCES = " or ".join(",".join(("time_s", *names)) for names in REFERENCES)
@@ -33,8 +34,13 @@ _U = _Finite(0)
 
 
 @click.command()
-@click.option("--sensor", type=_FILE, required=True, help="Columns time_s,vx,vy,vz[,temperature_degc].")
-@click.option("--reference", type=_FILE, help=f"Columns {_REFERENCES}, in SI units.")
+@click.option("--sensor", type=_FILE, required=True, help="Columns time_s,vx,vy,vz[,temperature_degc], or others.")
+@click.option("--reference", type=_FILE, help=f"Columns {_REFERENCES} in SI units, or others.")
+@click.option("--columns", metavar="time=NAME,x=NAME,...", help="Columns of the sensor, if they have other names.")
+@click.option(
+    "--reference-columns", metavar="time=NAME,x=NAME,...", help="Columns of the reference; a unit as x=NAME:mg."
+)
+@click.option("--sensitivity", metavar="'100 mV/g'", help="Of a reference whose file has mV or counts.")
 @click.option(
     "--poses", type=_FILE, help="Columns start_s,stop_s and theta_deg,alpha_deg | dx,dy,dz | axis | gx,gy,gz."
 )

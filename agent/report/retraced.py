@@ -10,7 +10,7 @@ import click
 from agent.calibrate.calibrating import read_files
 from agent.calibrate.files import Files
 from agent.calibrate.origin import SourceFile, source_file
-from agent.calibrate.tables import TableError
+from agent.reading.source import TableError
 from agent.report.result import CalibrationResult, WindowVerdict
 from agent.report.trace import Trace
 

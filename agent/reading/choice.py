@@ -1,0 +1,161 @@
+"""Chooses the columns of a file: those that are stated, those with this program's names, or those that it can guess."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from agent.reading.source import Column, Source, TableError
+from agent.reading.units import UNITS, split, unit_of
+
+TIME_WORDS = frozenset(
+    ["time", "timestamp", "t", "datetime", "date", "epoch", "stamp", "utc", "zeit", "temps", "seconds", "secs"]
+)
+TEMPERATURE_WORDS = frozenset(["temperature", "temp", "degc"])
+# Quantities of a reference with one axis, by the words of a column's name; "a" and "d" are also this program's names.
+QUANTITY_WORDS = {
+    "acceleration": frozenset(["a", "acc", "accel", "acceleration", "beschleunigung", "accelerazione"]),
+    "velocity": frozenset(["v", "vel", "velocity", "speed"]),
+    "displacement": frozenset(["d", "disp", "displacement", "position"]),
+}
+_OTHER_AXES = re.compile(r"(gyr|mag|ang|rot|quat|eul|vel|pos|disp|orient|cov|omega|grav)")
+_AXIS = re.compile(r"(?:a|v|s|acc|accel|acceleration|accelerometer)?([xyz])")
+AXES = ("x", "y", "z")
+
+
+@dataclass(frozen=True, slots=True)
+class Chosen:
+    """A column and its unit in lower case, "" where none is stated."""
+
+    column: Column
+    unit: str
+
+
+class Choice:
+    """Chooses columns of one file. `stated`: the text of the option `option`, such as "time=t,x=ax". Raises TableError.
+
+    Words on the left side are time, x, y, z, temperature, a, v, d and group; on the right side stands a name of a
+    column, with ":UNIT" if the file does not state the unit.
+    """
+
+    def __init__(self, source: Source, stated: str | None, option: str) -> None:
+        self._source, self._option = source, option
+        self._stated = self._read(stated)
+        self.group = self._stated.pop("group", None)
+        self.said: list[str] = []  # what was guessed
+        self._columns = [c for c in source.columns if self.group is None or c.group == self.group]
+        if not self._columns:
+            raise self.fault(f"there is no group {self.group!r}" if self.group else "there are no columns of numbers")
+
+    def _read(self, stated: str | None) -> dict[str, str]:
+        words: dict[str, str] = {}
+        for part in re.split(r",(?=\s*\w+\s*=)", stated) if stated else ():
+            word, equals, name = (piece.strip() for piece in part.partition("="))
+            if not equals or not name or word not in ("time", *AXES, "temperature", "a", "v", "d", "group"):
+                raise TableError(
+                    f"{self._option}: {part!r} is not understood; write time=NAME,x=NAME,y=NAME,z=NAME with names of "
+                    "columns; a unit may follow a name: x=NAME:mg"
+                )
+            words[word] = name
+        return words
+
+    def fault(self, what: str) -> TableError:
+        """An error that says what was seen and how to say it."""
+        seen = ",".join(str(c) for c in self._source.columns[:24])
+        more = ",..." if len(self._source.columns) > 24 else ""
+        return TableError(
+            f"{self._source.path}, {self._source.header}: {what} in the header {seen + more!r}; say which columns to "
+            f"use: {self._option} time=NAME,x=NAME,... (a unit may follow a name: x=NAME:mg)"
+        )
+
+    @property
+    def is_stated(self) -> bool:
+        """Whether columns are stated."""
+        return bool(self._stated)
+
+    def stated(self, word: str) -> Chosen | None:
+        """The column that is stated for `word`, None where none is."""
+        name = self._stated.get(word)
+        if name is None:
+            return None
+        for candidate, unit in ((name, ""), (name.rpartition(":")[0], name.rpartition(":")[2])):
+            found = [c for c in self._columns if candidate in (c.name, str(c))]
+            if len(found) > 1:
+                groups = ", ".join(repr(c.group) for c in found)
+                raise self.fault(f"column {candidate!r} is in several groups ({groups}), add group=NAME")
+            if found and unit and unit_of(unit) is None:
+                raise self.fault(f"unit {unit!r} of column {candidate!r} is not known; known are {', '.join(UNITS)}")
+            if found:
+                return Chosen(found[0], unit or _unit(found[0]))
+        raise self.fault(f"there is no column {name!r}")
+
+    def standard(self, names: Iterable[str]) -> list[Chosen] | None:
+        """The columns that have exactly these names, in the units of these names. None where one is missing.
+
+        Raises TableError where one of them is also there in another unit.
+        """
+        found = []
+        for name in names:
+            same = [c for c in self._columns if c.name == name]
+            if len(same) != 1:
+                return None
+            base = name.rsplit("_", 1)[0]
+            others = [c.name for c in self._columns if c.name != name and split(c.name)[1] and split(c.name)[0] == base]
+            if others:
+                raise self.fault(f"there are both {name} and {others[0]}")
+            if same[0].unit and name == "time_s" and unit_of(same[0].unit) != unit_of("s"):
+                raise self.fault(f"column {name} is in {same[0].unit!r}")
+            found.append(Chosen(same[0], "s" if name == "time_s" else _unit(same[0])))
+        return found
+
+    def guessed(self, role: str) -> Chosen | None:
+        """The only column whose name tells that it is `role`: time, x, y, z, temperature. None where none does."""
+        found = [c for c in self._columns if _role(c) == role]
+        if len(found) > 1:
+            raise self.fault(f"several columns could be {role}: {', '.join(repr(str(c)) for c in found)}")
+        return Chosen(found[0], _unit(found[0])) if found else None
+
+    def rest(self, taken: Sequence[Chosen]) -> list[Chosen]:
+        """The columns that are not taken and that are neither times nor temperatures."""
+        columns = [t.column for t in taken]
+        group = {c.group for c in columns}
+        return [
+            Chosen(c, _unit(c)) for c in self._columns
+            if c not in columns and _role(c) not in ("time", "temperature") and (not group or c.group in group)
+        ]  # fmt: skip
+
+    def say(self, found: Mapping[str, Chosen]) -> None:
+        """Keep for the user what was guessed."""
+        told = ", ".join(f"{word}={c.column}{f' in {c.unit}' if c.unit else ''}" for word, c in found.items())
+        self.said.append(f"{self._source.path}: columns guessed: {told}; state others with {self._option}")
+
+
+def quantity_of(chosen: Chosen) -> str | None:
+    """The quantity of a column by its unit, or by its name. None where neither tells."""
+    unit = unit_of(chosen.unit) if chosen.unit else None
+    if unit is not None and unit.quantity in QUANTITY_WORDS:
+        return unit.quantity
+    words = set(_words(split(chosen.column.name)[0]))
+    return next((quantity for quantity, known in QUANTITY_WORDS.items() if words & known), None)
+
+
+def _unit(column: Column) -> str:
+    return column.unit or split(column.name)[1]
+
+
+def _words(name: str) -> list[str]:
+    return re.findall(r"[a-z]+|\d+", re.sub(r"([a-z])([A-Z])", r"\1 \2", name).lower())
+
+
+def _role(column: Column) -> str:
+    words = _words(split(column.name)[0])
+    if TIME_WORDS & set(words):
+        return "time"
+    if TEMPERATURE_WORDS & set(words):
+        return "temperature"
+    if not words or any(_OTHER_AXES.match(word) for word in words):
+        return ""
+    if found := _AXIS.fullmatch(words[-1]) or (words[0] in AXES and _AXIS.fullmatch(words[0])):
+        return found[1]
+    return ""

@@ -1,0 +1,59 @@
+"""The table of formats. A new format is one file and one line here."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from agent.reading.source import Source, TableError
+
+
+@dataclass(frozen=True, slots=True)
+class Format:
+    """A format: its name, how a file of it ends and begins, and the function that opens it.
+
+    `begins`: the first bytes of every such file, () where a file has none that are sure. `opens`: "module:function".
+    `extra`: the extra of fieldcal that has the libraries, "" where none is needed.
+    """
+
+    name: str
+    suffixes: tuple[str, ...]
+    begins: tuple[bytes, ...]
+    opens: str
+    extra: str = ""
+
+
+FORMATS: tuple[Format, ...] = ()
+TEXT = Format("CSV", (".csv", ".tsv", ".txt", ".dat"), (), "agent.reading.delimited:Delimited")
+LONGEST_BEGIN = 1024
+
+
+def open_source(path: Path) -> Source:
+    """Open a file in any of the formats; a file that begins like none of them is read as text. Raises TableError."""
+    if path.exists() and not path.is_file():
+        raise TableError(f"{path}: not a file")
+    try:
+        with path.open("rb") as file:
+            begin = file.read(LONGEST_BEGIN)
+    except OSError as error:
+        raise TableError(f"{path}: {error.strerror}") from None
+    form = format_of(path, begin)
+    module, _, name = form.opens.partition(":")
+    opened: Callable[[Path], Source] = getattr(importlib.import_module(module), name)
+    try:
+        return opened(path)
+    except ImportError as error:
+        raise TableError(
+            f"{path}: {form.name} files need {error.name}, which is not installed: pip install 'fieldcal[{form.extra}]'"
+        ) from None
+
+
+def format_of(path: Path, begin: bytes) -> Format:
+    """The format of a file that begins with these bytes."""
+    for form in FORMATS:
+        if any(begin.startswith(magic) for magic in form.begins):
+            return form
+    suffix = path.suffix.lower()
+    return next((form for form in FORMATS if not form.begins and suffix in form.suffixes), TEXT)

@@ -1,0 +1,115 @@
+"""What every format gives: named columns of numbers, read in pieces, so that memory does not grow with the length."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Progress = Callable[[int], Any]  # called with the number of bytes that were just read
+
+ROWS_AT_ONCE = 1 << 16
+# A compressed file of measured samples does not grow more than this. A file that says so is damaged or hostile.
+MOST_EXPANSION = 200
+ALWAYS_ALLOWED_BYTES = 1 << 28
+
+
+class TableError(Exception):
+    """The file cannot be used. The message names file, line or row, column, value and remedy."""
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """A column of numbers as the file names it.
+
+    `unit`: as the file states it, "" where it states none. A time that the file gives as a date has the unit "s": it is
+    in seconds since 1970, UTC. `group`: the device, channel group or topic to which the column belongs; "" where the
+    file has no groups.
+    """
+
+    name: str
+    unit: str = ""
+    group: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.group}.{self.name}" if self.group else self.name
+
+
+class Source(ABC):
+    """An opened file. `columns`: what it has. `header`: the place where it names them, for messages."""
+
+    path: Path
+    columns: Sequence[Column]
+    header = "columns"
+
+    @abstractmethod
+    def pieces(self, columns: Sequence[Column], progress: Progress | None) -> Iterator[Array]:
+        """Yield the rows (n, k) of these columns in order, NaN where the file has no value. Raises TableError."""
+
+    def place(self, row: int) -> str:
+        """Where row `row`, counted from 0, is found in the file."""
+        return f"row {row + 1}"
+
+
+class Slices(Protocol):
+    """Values that can be read from one row to another: an array, or a data set on disk."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, rows: slice, /) -> Any: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """The times of samples at a constant rate, in s."""
+
+    start_s: float
+    rate_hz: float
+    samples: int
+
+    def __len__(self) -> int:
+        return self.samples
+
+    def __getitem__(self, rows: slice, /) -> Array:
+        return self.start_s + np.arange(*rows.indices(self.samples)) / self.rate_hz
+
+
+class Arrays(Source):
+    """A file whose columns can be sliced: each column with its values (n,).
+
+    Raises TableError for a file that announces far more values than its size can hold.
+    """
+
+    def __init__(self, path: Path, values: Mapping[Column, Slices]) -> None:
+        check_announced(path, sum(8 * len(v) for v in values.values() if not isinstance(v, Grid)))
+        self.path, self.columns, self._values = path, tuple(values), values
+
+    def pieces(self, columns: Sequence[Column], progress: Progress | None) -> Iterator[Array]:
+        """Yield the rows of these columns, which must have the same length."""
+        lengths = {str(column): len(self._values[column]) for column in columns}
+        n = min(lengths.values())
+        if max(lengths.values()) != n:
+            told = ", ".join(f"{name!r} has {length}" for name, length in lengths.items())
+            raise TableError(f"{self.path}: the columns have different numbers of values: {told}; choose others")
+        share = self.path.stat().st_size / max(n, 1)
+        for first in range(0, n, ROWS_AT_ONCE):
+            rows = slice(first, min(first + ROWS_AT_ONCE, n))
+            yield np.column_stack([np.asarray(self._values[c][rows], dtype=np.float64).ravel() for c in columns])
+            if progress is not None:
+                progress(round(share * (rows.stop - first)))
+
+
+def check_announced(path: Path, size_bytes: int) -> None:
+    """Refuse a file that announces far more values than its own size can hold. Raises TableError."""
+    allowed = max(ALWAYS_ALLOWED_BYTES, MOST_EXPANSION * path.stat().st_size)
+    if size_bytes > allowed:
+        raise TableError(
+            f"{path}: the file says that it holds {size_bytes:.3g} bytes of values, {allowed:.3g} are allowed for its "
+            "size; it is damaged or hostile: write it anew without compression"
+        )

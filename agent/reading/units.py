@@ -1,0 +1,113 @@
+"""Units as files write them, and what they are in SI."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from calib.geometry import STANDARD_GRAVITY_MPS2
+
+
+@dataclass(frozen=True, slots=True)
+class Unit:
+    """A unit: the quantity, and how much of the SI unit (s, m/s2, m/s, m) one of it is."""
+
+    quantity: str
+    si: float
+
+
+_SPELLINGS = {
+    ("time", 1.0): "s sec secs second seconds utc",
+    ("time", 1e-3): "ms msec millisecond milliseconds",
+    ("time", 1e-6): "us µs usec microsecond microseconds",
+    ("time", 1e-9): "ns nsec nanosecond nanoseconds",
+    ("time", 60.0): "min",
+    ("acceleration", 1.0): "m/s2 m/s^2 m/s**2 m/s/s mps2 ms-2 ms^-2 m·s-2 m.s-2 m*s^-2",
+    ("acceleration", 1e-3): "mm/s2 mm/s^2",
+    ("acceleration", 1e-2): "cm/s2 cm/s^2 gal",
+    ("acceleration", STANDARD_GRAVITY_MPS2): "g gn g0 g_n grav",
+    ("acceleration", 1e-3 * STANDARD_GRAVITY_MPS2): "mg milli-g millig mgn",
+    ("acceleration", 1e-6 * STANDARD_GRAVITY_MPS2): "ug µg",
+    ("velocity", 1.0): "m/s mps",
+    ("velocity", 1e-2): "cm/s",
+    ("velocity", 1e-3): "mm/s",
+    ("displacement", 1.0): "m",
+    ("displacement", 1e-3): "mm",
+    ("displacement", 1e-6): "um µm",
+    ("indication", 1e3): "v volt volts",  # of the electrical units the base is 1 mV
+    ("indication", 1.0): "mv",
+    ("indication", 1e-3): "uv µv",
+    ("count", 1.0): "count counts lsb cnt cnts digit digits raw",
+    ("temperature", 1.0): "degc °c c celsius deg_c",
+}
+UNITS = {name: Unit(*key) for key, names in _SPELLINGS.items() for name in names.split()}
+# After "_" in a name these are units, not parts of the name: time_ms, ax_g.
+SUFFIXES = frozenset(
+    [
+        "s",
+        "ms",
+        "us",
+        "ns",
+        "sec",
+        "mps2",
+        "ms2",
+        "g",
+        "mg",
+        "ug",
+        "mps",
+        "mm",
+        "um",
+        "mv",
+        "counts",
+        "count",
+        "lsb",
+        "raw",
+        "degc",
+    ]
+)
+_ALSO = {"ms2": "m/s2"}
+
+
+def unit_of(text: str) -> Unit | None:
+    """The unit that `text` names, None where it names none that is known."""
+    plain = text.strip().strip("[]()").strip().lower().replace("²", "2").replace("\u03bc", "µ").replace(" ", "")
+    return UNITS.get(_ALSO.get(plain, plain))
+
+
+_BRACKETS = re.compile(r"(?P<base>.*?)[\s_]*[\[(](?P<unit>[^\])]*)[\])]\s*")
+_SUFFIX = re.compile(r"(?P<base>.+)[_ ](?P<unit>[A-Za-z0-9]+)")
+
+
+def split(name: str) -> tuple[str, str]:
+    """A name of a column without its unit, and the unit: "Acc X [g]" and "acc_x_g" have the unit g."""
+    if (found := _BRACKETS.fullmatch(name)) and unit_of(found["unit"]):
+        return found["base"], found["unit"]
+    if (found := _SUFFIX.fullmatch(name)) and found["unit"].lower() in SUFFIXES:
+        return found["base"], found["unit"]
+    return name, ""
+
+
+@dataclass(frozen=True, slots=True)
+class Sensitivity:
+    """The sensitivity of an instrument: a reading of `indication` units for each `per` SI units of `quantity`."""
+
+    value: float
+    indication: str
+    quantity: str
+    per: float
+
+
+def sensitivity_of(text: str) -> Sensitivity:
+    """ "100 mV/g", "28.8 V/(m/s)"; a number alone is in the unit of the column, for 1 m/s2. Raises ValueError."""
+    found = re.fullmatch(r"\s*([-+.\deE]+)\s*(?:([^\s\d/(]+)\s*/\s*(\S.*))?", text)
+    value = float(found[1]) if found else 0.0
+    if not found or not 0.0 < abs(value) < 1e15:
+        raise ValueError(f"{text!r} is not a sensitivity; write it as 100 mV/g or 10.2 mV/(m/s2)")
+    if not found[2]:
+        return Sensitivity(value, "", "acceleration", 1.0)
+    indication, per = unit_of(found[2]), unit_of(found[3])
+    if not indication or indication.quantity not in ("indication", "count"):
+        raise ValueError(f"{found[2]!r} in {text!r} is none of V, mV, counts")
+    if not per or per.quantity not in ("acceleration", "velocity", "displacement"):
+        raise ValueError(f"{found[3]!r} in {text!r} is none of g, m/s2, m/s, m")
+    return Sensitivity(value * indication.si, indication.quantity, per.quantity, per.si)
