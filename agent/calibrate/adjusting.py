@@ -52,7 +52,8 @@ def norm_fitted(sensor: SensorTable, options: dict[str, Any]) -> Outcome:
     priors = priors_of(options)
     clock = clock_from_stamps(sensor.time_s)
     gravity = options["gravity_mps2"] or STANDARD_GRAVITY_MPS2
-    windows = rests_anywhere(clock.time_of(np.arange(len(sensor.time_s))), np.asarray(sensor.v), gravity)
+    there = np.flatnonzero(np.isfinite(sensor.v).all(axis=1))
+    windows = rests_anywhere(clock.time_of(there), np.asarray(sensor.v)[there], gravity)
     try:
         found = norm_fit(windows, gravity, u_gravity_mps2(options))
     except ValueError as error:

@@ -180,10 +180,13 @@ def _rows(source: Source, chosen: Sequence[Chosen], progress: Progress | None, s
         for rows in source.pieces([c.column for c in chosen], progress):
             if second is None:
                 second = next((part for least, part in SINCE_1970 if len(rows) and rows[0, 0] >= least), 1.0)
-            _check_whole(source, chosen, rows, count)
-            rows[:, 0] *= second
-            rows[:, 1:] *= scale
-            rows[np.isnan(rows[:, 1:4]).any(axis=1), 1:4] = np.nan
+            if not np.isfinite(rows.sum()):
+                _check_whole(source, chosen, rows, count)
+                rows[np.isnan(rows[:, 1:4]).any(axis=1), 1:4] = np.nan
+            if second != 1.0:
+                rows[:, 0] *= second
+            if (scale != 1.0).any():
+                rows[:, 1:] *= scale
             spool.write(np.ascontiguousarray(rows).data)
             count += len(rows)
         if count < 2:

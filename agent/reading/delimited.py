@@ -20,7 +20,8 @@ import numpy as np
 from agent.reading.dialect import LARGEST, MISSING, Dialect, dialect_of, lines_of, seconds_of
 from agent.reading.source import Array, Column, Progress, Source, TableError
 
-CHUNK_BYTES = 1 << 22
+CHUNK_BYTES = 1 << 23
+BLOCK_BYTES = 1 << 20  # pyarrow parses blocks of a chunk on all cores
 LONGEST_LINE = 1 << 20
 
 
@@ -53,7 +54,7 @@ class Delimited(Source):
                     continue
                 if skip > 0:
                     text = b"".join(text.splitlines(keepends=True)[skip:])
-                if text.strip():
+                if not text.isspace():
                     yield self._rows(max(line - lines, self.dialect.first_line), text, places)
 
     def place(self, row: int) -> str:
@@ -64,7 +65,8 @@ class Delimited(Source):
     def _rows(self, line: int, text: bytes, places: Sequence[int]) -> Array:
         with contextlib.suppress(ValueError):
             rows = self._parse(text, self.dialect, places)
-            if not (np.abs(rows) > LARGEST).any():
+            least, most = np.fmin.reduce(rows, axis=None), np.fmax.reduce(rows, axis=None)
+            if not (least < -LARGEST or most > LARGEST):
                 return rows
         return self._one_by_one(line, text, places)
 
@@ -166,7 +168,7 @@ def _arrow_parser() -> Any:
         try:
             table = csv.read_csv(
                 pa.BufferReader(text),
-                csv.ReadOptions(column_names=names, block_size=CHUNK_BYTES),
+                csv.ReadOptions(column_names=names, block_size=BLOCK_BYTES),
                 csv.ParseOptions(delimiter=dialect.delimiter),
                 csv.ConvertOptions(
                     column_types=kinds, include_columns=[names[k] for k in places], null_values=missing,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from agent.calibrate.tables import ReferenceTable, SensorTable, read_reference, read_sensor
+from agent.cli.main import run_cli
 from agent.reading import delimited
 from agent.reading.source import TableError
 from agent.reading.units import sensitivity_of
@@ -228,3 +230,32 @@ def test_as_pandas_writes_it(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.time_s, START_S + VALUES[:, 0], rtol=0, atol=2.5e-7)
     np.testing.assert_array_equal(np.delete(found.v, 7, axis=0), np.delete(VALUES[:, 1:], 7, axis=0))
     assert np.isnan(found.v[7]).all()
+
+
+def test_gaps_do_not_hide_the_rests(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    random = np.random.default_rng(5)
+    towards = random.normal(size=(14, 3))
+    rests = np.repeat(G * towards / np.linalg.norm(towards, axis=1)[:, None], 400, axis=0)
+    V = rests + random.normal(0, 0.002, rests.shape)
+    lines = [f"{k / 100:.2f},{','.join(f'{x:.5f}' for x in row)}" for k, row in enumerate(V)]
+    whole = written(tmp_path, HEADER + "\n".join(lines), "whole.csv")
+    for k in range(50, len(lines), 97):
+        lines[k] = f"{k / 100:.2f},,{lines[k].split(',', 2)[2]}"
+    gaps = written(tmp_path, HEADER + "\n".join(lines), "gaps.csv")
+    found = []
+    for path in (whole, gaps):
+        assert run_cli(["calibrate", "--sensor", str(path), "--json", "-"]) == 0
+        found.append(json.loads(capsys.readouterr().out))
+    np.testing.assert_allclose(found[1]["sensitivity"], found[0]["sensitivity"], atol=1e-4)
+    assert len(found[1]["windows"]) == len(found[0]["windows"]) == 14
+
+
+def test_a_reference_in_g_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = np.random.default_rng(4).normal([0.01, -0.02, 0.99], 0.01, (N, 3))
+    text = "time_s,ax,ay,az\n" + "".join(f"{k / 100},{x},{y},{z}\n" for k, (x, y, z) in enumerate(rows.tolist()))
+    sensor, beside = written(tmp_path, HEADER + table()), written(tmp_path, text, "reference.csv")
+    arguments = ["calibrate", "--sensor", str(sensor), "--reference", str(beside), "--rotation", "1,0,0,0,1,0,0,0,1"]
+    assert run_cli(arguments) == 2
+    told = capsys.readouterr().err
+    assert "values of about 1 at rest are in g; state the unit with --reference-columns time=NAME,x=NAME:g" in told
+    assert told.count("\n") == 1
