@@ -19,7 +19,7 @@ def main() -> None:
 
         status = run_cli()
     except KeyboardInterrupt:  # while modules load
-        status = 1
+        status = 130
     sys.exit(status)
 
 

@@ -100,7 +100,10 @@ _U = _Finite(0)
 @click.option("--u-nominal-pct", type=_Finite(0, min_open=True), help="Its standard uncertainty.")
 @click.option("--prior", type=_FILE, help="Earlier result of this command (JSON), used as prior.")
 @click.option("--plain", is_flag=True, help="Method 3 exactly as in the paper, without nuisances.")
-@click.option("--json", "json_to", type=click.Choice(["-"]), help="Print one JSON object on standard output.")
+@click.option(
+    "--json", "json_to", type=click.Path(path_type=Path, allow_dash=True, dir_okay=False, writable=True),
+    help="Write one JSON object to this file; -: print it, and nothing else, on standard output.",
+)  # fmt: skip
 def calibrate(**options: Any) -> int:
     """Calibrate from files: sensor.csv, reference.csv, poses.csv.
 
@@ -111,9 +114,15 @@ def calibrate(**options: Any) -> int:
     except TableError as error:
         click.echo(f"fieldcal calibrate: {error}", err=True)
         return 2
-    if options["json_to"]:
-        click.echo(as_json(replace(outcome, more={**outcome.more, **origin(options)})))
-    else:
+    json_to: Path | None = options["json_to"]
+    if json_to is not None:
+        told = as_json(replace(outcome, more={**outcome.more, **origin(options)}))
+        try:
+            with click.open_file(str(json_to), "w") as file:
+                file.write(told + "\n")
+        except OSError as error:
+            raise click.BadParameter(f"{json_to}: {error.strerror}", param_hint="--json") from None
+    if json_to != Path("-"):
         print_outcome(outcome)
     for reason in outcome.reasons:
         click.echo(f"refused: {reason}", err=True)

@@ -13,6 +13,7 @@ import click
 
 from agent import __version__
 
+INTERRUPTED = 130  # exit status after Ctrl-C: 128 and the number of SIGINT
 COMMANDS = {
     "run": ("agent.cli.run", "Run the agent: read devices, calibrate, record and publish."),
     "calibrate": ("agent.cli.calibrate", "Calibrate a sensor from recorded files (CSV)."),
@@ -64,7 +65,8 @@ def _discard_output() -> None:
 
 
 def run_cli(arguments: list[str] | None = None) -> int:
-    """Run a command; returns the exit status: 0 done, 1 internal fault or fault of the machine, 2 bad input, 3 refused.
+    """Run a command; returns the exit status: 0 done, 1 internal fault or fault of the machine, 2 bad input, 3 refused,
+    INTERRUPTED after Ctrl-C.
 
     No traceback reaches a user unless FIELDCAL_TRACEBACK is set.
     """
@@ -77,7 +79,7 @@ def run_cli(arguments: list[str] | None = None) -> int:
         return error.exit_code
     except (click.Abort, KeyboardInterrupt):
         click.echo("interrupted", err=True)
-        return 1
+        return INTERRUPTED
     except BrokenPipeError:
         # The program that reads the output has ended.
         _discard_output()

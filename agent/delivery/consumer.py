@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import json
 import logging
 import queue
@@ -29,6 +30,7 @@ INBOX = 1000  # samples that may wait or be held; further ones are dropped and l
 ANSWER_S = 5.0  # s that one query waits for its answer
 RETRY_S = 1.0  # s between two queries to a gateway whose results are held because an earlier one is missing
 CONNECT_S = 10.0
+CLOSE_S = 2.0  # that closing waits for the thread that takes samples; it ends at once unless the inbox is full
 SAVE_S = 1.0  # s between two writes of the memory file while results come without a pause; a pause writes it at once
 
 
@@ -54,7 +56,8 @@ class Consumer:
     A result that is not the very next one counts only when the gateway's store has it too. Otherwise it is given with
     `confirmed` false, and does not move the numbers, so that one message of a stranger cannot hide what follows. When
     the gateway's store was made anew, its results have another epoch; the first of them has `new_epoch` true.
-    `close` may be called from another thread than the one that iterates.
+    `close` may be called from another thread than the one that iterates. Ctrl-C while the consumer waits for a result
+    ends the iteration, as `close` does. At the end of the program the consumer closes itself.
     Raises EndpointError, ConnectionError or MemoryFileError; iterating raises OSError where `memory` cannot be written.
     """
 
@@ -94,7 +97,10 @@ class Consumer:
             recovery=RecoveryConfig(heartbeat=True),  # type: ignore[call-arg]
         )
         self._open.callback(subscriber.undeclare)
-        threading.Thread(target=self._take_samples, args=(subscriber,), name="consumer", daemon=True).start()
+        self._taking = threading.Thread(target=self._take_samples, args=(subscriber,), name="consumer", daemon=True)
+        self._taking.start()
+        # Where Zenoh's thread still runs when the interpreter ends, Python aborts the process.
+        atexit.register(self.close)
 
     def __iter__(self) -> Iterator[Received]:
         try:
@@ -112,6 +118,8 @@ class Consumer:
                 for source in list(self._held):
                     yield from self._ask(source)
                 continue
+            except KeyboardInterrupt:
+                return
             if sample is None:
                 return
             if (result := _received(sample)) is not None:
@@ -122,6 +130,8 @@ class Consumer:
         with self._mutex:
             self._closed = True
             self._open.close()
+        self._taking.join(CLOSE_S)
+        atexit.unregister(self.close)
 
     def __enter__(self) -> Self:
         return self

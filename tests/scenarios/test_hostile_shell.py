@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from agent.delivery.history import Record
 from agent.delivery.store import Store
-from tests.scenarios.processes import ROOT, fieldcal
+from tests.scenarios.processes import ROOT, fieldcal, interrupt, started, wait_until
 from tests.unit.results import calibration, status
 
 
@@ -53,3 +55,36 @@ def test_an_output_without_unicode_gets_what_it_can_take(tmp_path: Path) -> None
     told = subprocess.run(command, cwd=ROOT, env=ascii_only, capture_output=True, text=True, timeout=20, check=False)
     assert told.returncode == 0, told.stderr
     assert "26154 ? 12" in told.stdout
+
+
+def rests(tmp_path: Path) -> Path:
+    """A file of a sensor at rest in 14 positions, with names of columns that must be guessed."""
+    random = np.random.default_rng(5)
+    towards = random.normal(size=(14, 3))
+    V = np.repeat(9.8 * towards / np.linalg.norm(towards, axis=1)[:, None], 400, axis=0)
+    V += random.normal(0, 0.002, V.shape)
+    path = tmp_path / "rests.csv"
+    np.savetxt(path, np.column_stack([np.arange(len(V)) / 100, V]), "%.5f", ",", header="Time,X,Y,Z", comments="")
+    return path
+
+
+def test_calibrate_on_control_c_ends_with_130(tmp_path: Path) -> None:
+    pipe, output = tmp_path / "result.json", tmp_path / "output"
+    os.mkfifo(pipe)  # nobody reads it, so the command cannot end by itself
+    with started("calibrate", "--sensor", rests(tmp_path), "--json", pipe, output=output) as process:
+        wait_until(lambda: "guessed" in output.read_text(), 20, "the file is read")
+        interrupt(process)
+    assert process.returncode == 130
+    assert output.read_text().splitlines()[-1] == "interrupted"
+    assert "Traceback" not in output.read_text()
+
+
+def test_json_goes_to_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "result.json"
+    told = fieldcal("calibrate", "--sensor", rests(tmp_path), "--json", path)
+    assert (told.returncode, json.loads(path.read_text())["status"]) == (0, "valid")
+    assert "Sx" in told.stdout  # the table
+    refused = fieldcal("calibrate", "--sensor", rests(tmp_path), "--json", tmp_path / "nowhere" / "result.json")
+    assert refused.returncode == 2
+    assert f"{tmp_path}/nowhere/result.json" in refused.stderr
+    assert "Traceback" not in refused.stderr

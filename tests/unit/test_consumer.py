@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import queue
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -263,3 +265,28 @@ def test_keys_are_taken_apart() -> None:
     assert (gateway.sensor, gateway.what) == ("", "status")
     assert parse_key("fieldcal/v2/s/g/mems/window") is None
     assert parse_key(f"{PREFIX}/s/g") is None
+
+
+CONSUMING = """
+import os, signal, sys, threading, time, traceback
+from agent.delivery.consumer import Consumer
+
+def interrupt_while_it_waits(main=threading.main_thread().ident):
+    while "get" not in [f.name for f in traceback.extract_stack(sys._current_frames()[main])]:
+        time.sleep(0.01)
+    os.kill(os.getpid(), signal.SIGINT)
+
+consumer = Consumer([sys.argv[1]])
+if sys.argv[2] == "iterate":
+    threading.Thread(target=interrupt_while_it_waits).start()
+    for received in consumer:
+        pass
+print("ended")
+"""
+
+
+@pytest.mark.parametrize("what", ["iterate", "leave"])
+def test_a_consumer_ends_without_a_traceback(site: Site, what: str) -> None:
+    command = [sys.executable, "-c", CONSUMING, site.endpoint, what]
+    told = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
+    assert (told.returncode, told.stdout, told.stderr) == (0, "ended\n", "")
