@@ -67,7 +67,7 @@ def read_sensor(path: Path, progress: Progress | None = None, columns: str | Non
     """Read the samples of a sensor, in the unit of the file. `columns` is the option --columns. Raises TableError."""
     source = open_source(path)
     choice = Choice(source, columns, "--columns")
-    chosen = _sensor_columns(choice)
+    chosen = choice.in_one_group(_sensor_columns)
     rows = _rows(source, chosen, progress, np.ones(len(chosen) - 1))
     return SensorTable(path, rows[:, 0], rows[:, 1:4], rows[:, 4] if len(chosen) > 4 else None, tuple(choice.said))
 
@@ -101,7 +101,7 @@ def read_reference(
     """Read the samples of a reference in SI units. `columns` is the option --reference-columns. Raises TableError."""
     source = open_source(path)
     choice = Choice(source, columns, "--reference-columns")
-    chosen, quantity = _reference_columns(choice, sensitivity)
+    chosen, quantity = choice.in_one_group(lambda choice: _reference_columns(choice, sensitivity))
     scale = np.array([_si(choice, c, sensitivity) for c in chosen[1:]])
     rows = _rows(source, chosen, progress, scale)
     return ReferenceTable(

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from copy import copy
 from dataclasses import dataclass
+from typing import TypeVar
 
 from agent.reading.source import Column, Source, TableError
 from agent.reading.units import UNITS, split, unit_of
@@ -22,6 +25,7 @@ QUANTITY_WORDS = {
 _OTHER_AXES = re.compile(r"(gyr|mag|ang|rot|quat|eul|vel|pos|disp|orient|cov|omega|grav)")
 _AXIS = re.compile(r"(?:a|v|s|acc|accel|acceleration|accelerometer)?([xyz])")
 AXES = ("x", "y", "z")
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,11 +46,37 @@ class Choice:
     def __init__(self, source: Source, stated: str | None, option: str) -> None:
         self._source, self._option = source, option
         self._stated = self._read(stated)
-        self.group = self._stated.pop("group", None)
+        group = self._stated.pop("group", None)
         self.said: list[str] = []  # what was guessed
-        self._columns = [c for c in source.columns if self.group is None or c.group == self.group]
+        self._columns = [c for c in source.columns if group is None or c.group == group]
         if not self._columns:
-            raise self.fault(f"there is no group {self.group!r}" if self.group else "there are no columns of numbers")
+            raise self.fault(f"there is no group {group!r}" if group else "there are no columns of numbers")
+
+    def in_one_group(self, choose: Callable[[Choice], Result]) -> Result:
+        """What `choose` finds in the only group where it finds something. Raises TableError if there is no such one.
+
+        Where several groups have something, the one with the fewest columns is taken if it is the only one: a device
+        with one axis is the reference.
+        """
+        groups = list(dict.fromkeys(c.group for c in self._columns))
+        if self.is_stated or len(groups) < 2:
+            return choose(self)
+        found: dict[str, tuple[Choice, Result]] = {}
+        for group in groups:
+            inner = copy(self)
+            inner._columns, inner.said = [c for c in self._columns if c.group == group], []
+            with suppress(TableError):
+                found[group] = (inner, choose(inner))
+        sizes = {group: len(inner._columns) for group, (inner, _) in found.items()}
+        fewest = [group for group, size in sizes.items() if size == min(sizes.values())]
+        if len(fewest) != 1:
+            told = f"several groups could be meant ({', '.join(fewest)})" if found else "no group has what is needed"
+            raise self.fault(f"{told}, add group=NAME: it is")
+        inner, result = found[fewest[0]]
+        self.said += inner.said or [
+            f"{self._source.path}: taken is {fewest[0]}; state others with {self._option} group=NAME"
+        ]
+        return result
 
     def _read(self, stated: str | None) -> dict[str, str]:
         words: dict[str, str] = {}

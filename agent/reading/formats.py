@@ -25,7 +25,12 @@ class Format:
     extra: str = ""
 
 
-FORMATS: tuple[Format, ...] = ()
+FORMATS = (
+    Format("MCAP", (".mcap",), (b"\x89MCAP0\r\n",), "agent.reading.recording:open_mcap"),
+    Format("Parquet", (".parquet",), (b"PAR1",), "agent.reading.arrow:Parquet", "files"),
+    Format("Feather", (".feather", ".arrow"), (b"ARROW1",), "agent.reading.arrow:Feather", "files"),
+    Format("WAV", (".wav",), (b"RIFF", b"RF64"), "agent.reading.wav:open_wav"),
+)
 TEXT = Format("CSV", (".csv", ".tsv", ".txt", ".dat"), (), "agent.reading.delimited:Delimited")
 LONGEST_BEGIN = 1024
 

@@ -202,15 +202,18 @@ def parse(record: Record) -> McapRecord:
     return parsed
 
 
-def unpack(record: Record) -> Chunk:
-    """The content of a Chunk record, its sizes and CRC checked. Raises RecordError."""
+def unpack(record: Record, *, crc_needed: bool = True) -> Chunk:
+    """The content of a Chunk record, its sizes and CRC checked. Raises RecordError.
+
+    `crc_needed` False: other programs may leave the CRC out.
+    """
     try:
-        return _unpack(record.body)
+        return _unpack(record.body, crc_needed)
     except (ValueError, zstandard.ZstdError) as error:
         raise refusal(record, str(error)) from None
 
 
-def _unpack(body: bytes) -> Chunk:
+def _unpack(body: bytes, crc_needed: bool) -> Chunk:
     if len(body) < _CHUNK.size:
         raise ValueError("too short for a chunk")
     start_time, end_time, size, crc, name_length = _CHUNK.unpack_from(body)
@@ -232,7 +235,7 @@ def _unpack(body: bytes) -> Chunk:
         raise ValueError(f"compression {compression!r} is neither zstd nor none")
     if len(data) != size:
         raise ValueError(f"{len(data)} bytes after decompression, but the chunk states {size}")
-    if crc == 0 or zlib.crc32(data) != crc:
+    if (crc_needed or crc) and (crc == 0 or zlib.crc32(data) != crc):
         raise ValueError("its CRC does not fit its content")
     return Chunk(start_time, end_time, compression.decode(), len(packed), data)
 

@@ -1,0 +1,99 @@
+"""Recordings of this program (MCAP): the raw samples of its devices, read block by block."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from agent.core.events import DeviceChange, RunStart
+from agent.reading.source import Array, Column, Progress, Source, TableError
+from agent.recording.reading import RecordingReader, first_event
+from hw.block import BlockFlags, SampleBlock
+
+AXES = {1: ("a",), 3: ("x", "y", "z")}
+QUANTITIES = {"m/s2": "a", "m/s": "v", "m": "d"}  # name of the channel of a uniaxial device, by its unit
+LONGEST_HOLE_S = 10.0  # a longer one is left to the time stamps
+
+
+class Recording(Source):
+    """A recording. Each device is a group with `time_s`, its axes and, where it has one, `temperature_degc`.
+
+    The time is the arrival of the burst to which a sample belongs, in s since 1970. Lost samples that the device
+    counted are rows of NaN. Raises TableError for a file that is damaged; one that only ends early is read to its end.
+    """
+
+    header = "devices"
+
+    def __init__(self, path: Path, start: RunStart) -> None:
+        self.path = path
+        self._utc_ns = start.t_utc_ns - start.t_monotonic_ns
+        devices = [device["name"] for device in json.loads(start.config_json)["devices"]]
+        units: dict[str, str] = {}
+        columns: dict[str, list[Column]] = {}
+        for event in self._events():
+            if isinstance(event, DeviceChange) and event.info_json:
+                units[event.device] = json.loads(event.info_json)["unit"]
+            if isinstance(event, SampleBlock) and event.device not in columns:
+                columns[event.device] = _columns(event, units.get(event.device, "count"))
+                if len(columns) == len(devices):
+                    break
+        self.columns = [column for name in sorted(columns) for column in columns[name]]
+
+    def pieces(self, columns: Sequence[Column], progress: Progress | None) -> Iterator[Array]:
+        """Yield the samples of one device. Raises TableError if the columns belong to several devices."""
+        device = columns[0].group
+        if any(column.group != device for column in columns):
+            raise TableError(f"{self.path}: the columns belong to several devices; add group=NAME of one device")
+        names = [column.name for column in columns]
+        size, blocks, following = self.path.stat().st_size, 0, None
+        for event in self._events():
+            if not isinstance(event, SampleBlock) or event.device != device:
+                continue
+            table = self._table(event, names)
+            missing = 0 if following is None else event.first_index - following
+            if 0 < missing < LONGEST_HOLE_S * event.nominal_rate_hz and not event.flags & BlockFlags.RESTART:
+                hole = np.full((missing, len(names)), np.nan)
+                hole[:, names.index("time_s")] = table[0, names.index("time_s")]
+                yield hole
+            following = event.first_index + event.n
+            blocks += 1
+            yield table
+        if progress is not None:
+            progress(size)
+
+    def _table(self, block: SampleBlock, names: Sequence[str]) -> Array:
+        counts = np.diff(block.burst_count, prepend=0)
+        arrivals = np.repeat((block.burst_t_monotonic_ns + self._utc_ns) * 1e-9, counts)
+        given = {"time_s": arrivals, "temperature_degc": np.full(block.n, block.temperature_degc or np.nan)}
+        axes = [name for name in names if name not in given]
+        known = [c.name for c in self.columns if c.group == block.device and c.name not in given]
+        given |= {name: block.indications[:, known.index(name)].astype(np.float64) for name in axes}
+        return np.column_stack([given[name] for name in names])
+
+    def _events(self) -> Iterator[object]:
+        reader = RecordingReader(self.path)
+        for step in reader.steps():
+            yield step.event
+        if reader.fault is not None and reader.fault.kind == "corrupt":
+            raise TableError(f"{self.path}, {reader.fault}; `fieldcal audit {self.path}` says more")
+
+
+def _columns(block: SampleBlock, unit: str) -> list[Column]:
+    axes = AXES[block.indications.shape[1]]
+    if len(axes) == 1:
+        axes = (QUANTITIES.get(unit, "a"),)
+    found = [Column("time_s", "s", block.device), *(Column(axis, unit, block.device) for axis in axes)]
+    return [*found, Column("temperature_degc", "degC", block.device)] if block.temperature_degc is not None else found
+
+
+def open_mcap(path: Path) -> Source:
+    """Open a recording of this program, or of ROS 2. Raises TableError."""
+    start = first_event(path)
+    if start is not None:
+        return Recording(path, start)
+    from agent.reading.ros2 import RosBag
+
+    return RosBag(path)
