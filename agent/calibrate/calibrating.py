@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import click
@@ -38,7 +39,7 @@ def calibrated(options: dict[str, Any]) -> Outcome:
     """The outcome for these options. Raises TableError and click.UsageError."""
     _check(options)
     if not options["reference"] and not options["poses"] and not options["plain"]:
-        return norm_fitted(_sensor(options, None), options)
+        return norm_fitted(sensor_of(options["sensor"], options.get("columns")), options)
     if options["method"] != "3":
         return by_amplitudes(read_files(options), options)
     if options["plain"]:
@@ -54,8 +55,9 @@ def read_files(options: dict[str, Any], instrument: Instrument | None = None) ->
     paths = [options[name] for name in ("sensor", "reference") if options[name]]
     size = sum(path.stat().st_size for path in paths if path.is_file())
     with _bar("reading", size if size > BAR_FROM_BYTES else 0) as bar:
-        sensor = _sensor(options, bar)
-        reference = _reference(options, bar) if options["reference"] else None
+        sensor = sensor_of(options["sensor"], options.get("columns"), bar)
+        stated = (options.get("reference_columns"), options.get("sensitivity"))
+        reference = reference_of(options["reference"], *stated, bar) if options["reference"] else None
     instrument = instrument or Instrument()
     if reference is not None:
         instrument = replace(instrument, quantity=reference.quantity)
@@ -70,15 +72,18 @@ def read_files(options: dict[str, Any], instrument: Instrument | None = None) ->
     return Files(sensor, reference, poses, instrument, Options(settings, align=not plain))
 
 
-def _sensor(options: dict[str, Any], progress: Progress | None) -> SensorTable:
-    table = read_sensor(options["sensor"], progress, options.get("columns"))
+def sensor_of(path: Path, columns: str | None, progress: Progress | None = None) -> SensorTable:
+    """Read a sensor's file, and print what was guessed. Raises TableError."""
+    table = read_sensor(path, progress, columns)
     _say(table.said)
     return table
 
 
-def _reference(options: dict[str, Any], progress: Progress | None) -> ReferenceTable:
-    columns, stated = options.get("reference_columns"), options.get("sensitivity")
-    table = read_reference(options["reference"], progress, columns, _sensitivity(stated) if stated else None)
+def reference_of(
+    path: Path, columns: str | None, sensitivity: str | None, progress: Progress | None = None
+) -> ReferenceTable:
+    """Read a reference's file, and print what was guessed. Raises TableError and click.BadParameter."""
+    table = read_reference(path, progress, columns, _sensitivity(sensitivity) if sensitivity else None)
     _say(table.said)
     return table
 

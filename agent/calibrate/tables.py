@@ -65,10 +65,10 @@ class ReferenceTable:
 
 def read_sensor(path: Path, progress: Progress | None = None, columns: str | None = None) -> SensorTable:
     """Read the samples of a sensor, in the unit of the file. `columns` is the option --columns. Raises TableError."""
-    source = open_source(path)
-    choice = Choice(source, columns, "--columns")
-    chosen = choice.in_one_group(_sensor_columns)
-    rows = _rows(source, chosen, progress, np.ones(len(chosen) - 1))
+    with open_source(path) as source:
+        choice = Choice(source, columns, "--columns")
+        chosen = choice.in_one_group(_sensor_columns)
+        rows = _rows(source, chosen, progress, np.ones(len(chosen) - 1))
     return SensorTable(path, rows[:, 0], rows[:, 1:4], rows[:, 4] if len(chosen) > 4 else None, tuple(choice.said))
 
 
@@ -99,11 +99,11 @@ def read_reference(
     path: Path, progress: Progress | None = None, columns: str | None = None, sensitivity: Sensitivity | None = None
 ) -> ReferenceTable:
     """Read the samples of a reference in SI units. `columns` is the option --reference-columns. Raises TableError."""
-    source = open_source(path)
-    choice = Choice(source, columns, "--reference-columns")
-    chosen, quantity = choice.in_one_group(lambda choice: _reference_columns(choice, sensitivity))
-    scale = np.array([_si(choice, c, sensitivity) for c in chosen[1:]])
-    rows = _rows(source, chosen, progress, scale)
+    with open_source(path) as source:
+        choice = Choice(source, columns, "--reference-columns")
+        chosen, quantity = choice.in_one_group(lambda choice: _reference_columns(choice, sensitivity))
+        scale = np.array([_si(choice, c, sensitivity) for c in chosen[1:]])
+        rows = _rows(source, chosen, progress, scale)
     return ReferenceTable(
         path, rows[:, 0], rows[:, 1:], quantity, f"{source.header}: column {chosen[1].column}", tuple(choice.said)
     )

@@ -16,7 +16,8 @@ from agent import __version__
 INTERRUPTED = 130  # exit status after Ctrl-C: 128 and the number of SIGINT
 COMMANDS = {
     "run": ("agent.cli.run", "Run the agent: read devices, calibrate, record and publish."),
-    "calibrate": ("agent.cli.calibrate", "Calibrate a sensor from recorded files (CSV)."),
+    "calibrate": ("agent.cli.calibrate", "Calibrate a sensor from recorded files."),
+    "convert": ("agent.cli.convert", "Write a recorded file of another format as CSV."),
     "replay": ("agent.cli.replay", "Run recordings through the same pipeline and print the calibrations."),
     "audit": ("agent.cli.audit", "Check recordings: every byte, and that the results follow from the data."),
     "show": ("agent.cli.show", "Show the calibration in force, status and history of a data directory."),

@@ -18,6 +18,7 @@ class Arrow(Source):
         import pyarrow as pa
 
         self.path, self._error = path, pa.ArrowException
+        self._file: Any = None
         try:
             schema = self._schema()
         except (pa.ArrowException, OSError) as error:
@@ -37,6 +38,10 @@ class Arrow(Source):
                     done = round(share * self.path.stat().st_size)
         except (self._error, OSError) as error:
             raise self._damaged(error) from None
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
 
     def _damaged(self, error: Exception) -> TableError:
         reason = str(error).partition("\n")[0]
@@ -75,14 +80,15 @@ class Feather(Arrow):
     def _schema(self) -> Any:
         import pyarrow as pa
 
-        self._file = pa.ipc.open_file(pa.memory_map(str(self.path)))
-        return self._file.schema
+        self._file = pa.memory_map(str(self.path))
+        self._table = pa.ipc.open_file(self._file)
+        return self._table.schema
 
     def _batches(self, names: Sequence[str]) -> Iterator[tuple[Any, float]]:
-        for k in range(self._file.num_record_batches):
-            batch = self._file.get_batch(k)
+        for k in range(self._table.num_record_batches):
+            batch = self._table.get_batch(k)
             check_announced(self.path, 8 * batch.num_rows * batch.num_columns)
-            yield batch.select(list(names)), (k + 1) / self._file.num_record_batches
+            yield batch.select(list(names)), (k + 1) / self._table.num_record_batches
 
 
 def _is_number(kind: Any) -> bool:

@@ -30,6 +30,10 @@ FORMATS = (
     Format("Parquet", (".parquet",), (b"PAR1",), "agent.reading.arrow:Parquet", "files"),
     Format("Feather", (".feather", ".arrow"), (b"ARROW1",), "agent.reading.arrow:Feather", "files"),
     Format("WAV", (".wav",), (b"RIFF", b"RF64"), "agent.reading.wav:open_wav"),
+    Format("HDF5", (".h5", ".hdf5"), (b"\x89HDF\r\n\x1a\n",), "agent.reading.hdf5:open_hdf5", "hdf5"),
+    Format("MATLAB 7.3", (".mat",), (b"MATLAB 7.3",), "agent.reading.hdf5:open_hdf5", "hdf5"),
+    Format("MATLAB", (".mat",), (b"MATLAB 5.0",), "agent.reading.matlab:open_matlab"),
+    Format("TDMS", (".tdms",), (b"TDSm",), "agent.reading.tdms:open_tdms", "tdms"),
 )
 TEXT = Format("CSV", (".csv", ".tsv", ".txt", ".dat"), (), "agent.reading.delimited:Delimited")
 LONGEST_BEGIN = 1024

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +52,15 @@ class Source(ABC):
     def pieces(self, columns: Sequence[Column], progress: Progress | None) -> Iterator[Array]:
         """Yield the rows (n, k) of these columns in order, NaN where the file has no value. Raises TableError."""
 
+    def close(self) -> None:  # noqa: B027 - most formats keep no file open
+        """Close the file."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
     def place(self, row: int) -> str:
         """Where row `row`, counted from 0, is found in the file."""
         return f"row {row + 1}"
@@ -81,14 +90,20 @@ class Grid:
 
 
 class Arrays(Source):
-    """A file whose columns can be sliced: each column with its values (n,).
+    """A file whose columns can be sliced: each column with its values (n,). `closes` closes the file.
 
     Raises TableError for a file that announces far more values than its size can hold.
     """
 
-    def __init__(self, path: Path, values: Mapping[Column, Slices]) -> None:
+    def __init__(
+        self, path: Path, values: Mapping[Column, Slices], closes: Callable[[], object] = lambda: None
+    ) -> None:
         check_announced(path, sum(8 * len(v) for v in values.values() if not isinstance(v, Grid)))
-        self.path, self.columns, self._values = path, tuple(values), values
+        self.path, self.columns, self._values, self._closes = path, tuple(values), values, closes
+
+    def close(self) -> None:
+        """Close the file."""
+        self._closes()
 
     def pieces(self, columns: Sequence[Column], progress: Progress | None) -> Iterator[Array]:
         """Yield the rows of these columns, which must have the same length."""

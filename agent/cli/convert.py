@@ -1,0 +1,74 @@
+"""`fieldcal convert`: writes the samples of a file of any format as the plain CSV of `fieldcal calibrate`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+import numpy as np
+
+from agent.calibrate.calibrating import reference_of, sensor_of
+from agent.calibrate.tables import REFERENCES, SENSOR, TEMPERATURE
+from agent.reading.source import ROWS_AT_ONCE, Array, TableError
+
+_FILE = click.Path(path_type=Path, dir_okay=False)
+
+
+@click.command()
+@click.argument("file", type=_FILE)
+@click.option("-o", "--output", type=_FILE, required=True, help="The CSV file to write; it must not exist.")
+@click.option(
+    "--as", "role", type=click.Choice(["sensor", "reference"]), default="sensor", show_default=True,
+    help="A sensor keeps its unit; a reference is written in SI units.",
+)  # fmt: skip
+@click.option("--columns", metavar="time=NAME,x=NAME,...", help="Columns to take; a unit as x=NAME:mg.")
+@click.option("--sensitivity", metavar="'100 mV/g'", help="Of a reference whose file has mV or counts.")
+def convert(file: Path, output: Path, role: str, columns: str | None, sensitivity: str | None) -> int:
+    """Write the samples of FILE as plain CSV: time_s,vx,vy,vz of a sensor; time_s,a of a reference, or ax,ay,az, v, d.
+
+    Exit status 0 if it is written, 2 on bad input.
+    """
+    if sensitivity and role == "sensor":
+        raise click.UsageError("--sensitivity is for --as reference")
+    try:
+        if role == "sensor":
+            sensor = sensor_of(file, columns)
+            names, values = [*SENSOR], [sensor.time_s, sensor.v]
+            if sensor.temperature_degc is not None:
+                names, values = [*names, TEMPERATURE], [*values, sensor.temperature_degc]
+        else:
+            reference = reference_of(file, columns, sensitivity)
+            names = ["time_s", *_names(reference.quantity, reference.x.shape[1])]
+            values = [reference.time_s, reference.x]
+        rows = _write(output, names, values)
+    except TableError as error:
+        click.echo(f"fieldcal convert: {error}", err=True)
+        return 2
+    except FileExistsError:
+        click.echo(f"fieldcal convert: {output}: the file exists; remove it, or choose another name", err=True)
+        return 2
+    click.echo(f"{output}: {rows} rows of {','.join(names)}")
+    return 0
+
+
+def _names(quantity: str, channels: int) -> tuple[str, ...]:
+    for names, held in REFERENCES.items():
+        if held == quantity and len(names) == channels:
+            return names
+    raise TableError(
+        f"a {quantity} with {channels} axes is no reference; choose one axis with --columns time=NAME,x=NAME"
+    )
+
+
+def _write(path: Path, names: list[str], values: list[Array]) -> int:
+    """Write the columns so that reading them gives the same numbers; a gap is written as nan."""
+    try:
+        file = path.open("x", encoding="ascii")
+    except (FileNotFoundError, NotADirectoryError, PermissionError) as error:
+        raise TableError(f"{path}: {error.strerror}") from None
+    with file:
+        file.write(",".join(names) + "\n")
+        for first in range(0, len(values[0]), ROWS_AT_ONCE):
+            part = np.column_stack([v[first : first + ROWS_AT_ONCE] for v in values]).tolist()
+            file.writelines(",".join(map(repr, row)) + "\n" for row in part)
+    return len(values[0])
