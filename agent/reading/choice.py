@@ -73,9 +73,8 @@ class Choice:
             told = f"several groups could be meant ({', '.join(fewest)})" if found else "no group has what is needed"
             raise self.fault(f"{told}, add group=NAME: it is")
         inner, result = found[fewest[0]]
-        self.said += inner.said or [
-            f"{self._source.path}: taken is {fewest[0]}; state others with {self._option} group=NAME"
-        ]
+        other = f"state another with {self._option} group=NAME"
+        self.said += inner.said or [f"{self._source.path}: group {fewest[0]} is taken; {other}"]
         return result
 
     def _read(self, stated: str | None) -> dict[str, str]:
