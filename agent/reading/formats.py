@@ -33,6 +33,7 @@ FORMATS = (
     Format("HDF5", (".h5", ".hdf5"), (b"\x89HDF\r\n\x1a\n",), "agent.reading.hdf5:open_hdf5", "hdf5"),
     Format("MATLAB 7.3", (".mat",), (b"MATLAB 7.3",), "agent.reading.hdf5:open_hdf5", "hdf5"),
     Format("MATLAB", (".mat",), (b"MATLAB 5.0",), "agent.reading.matlab:open_matlab"),
+    Format("MiniSEED", (".mseed", ".miniseed", ".msd"), (), "agent.reading.seismic:open_miniseed", "seismic"),
     Format("TDMS", (".tdms",), (b"TDSm",), "agent.reading.tdms:open_tdms", "tdms"),
 )
 TEXT = Format("CSV", (".csv", ".tsv", ".txt", ".dat"), (), "agent.reading.delimited:Delimited")

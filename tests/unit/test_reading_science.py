@@ -12,6 +12,7 @@ from scipy.io import savemat
 
 from agent.calibrate.tables import read_reference, read_sensor
 from agent.reading import source
+from agent.reading.units import sensitivity_of
 from tests.unit.test_reading_csv import written
 from tests.unit.test_reading_formats import RATE_HZ, TIME_S, V, fault, same
 
@@ -180,3 +181,43 @@ def test_broken_tdms(tmp_path: Path) -> None:
     data = path.read_bytes()
     fault(written(tmp_path, data[:20], "b.tdms"), "cannot be read: .*; write it anew|no columns of numbers")
     fault(written(tmp_path, data[:28] + b"\xff" * 60 + data[88:], "c.tdms"), "cannot be read: .*; write it anew")
+
+
+# MiniSEED
+
+
+def miniseed(path: Path, parts: list[tuple[str, np.ndarray, float]]) -> Path:
+    """Traces of a station: code of the channel, samples, start in s after 22:13:20."""
+    obspy = pytest.importorskip("obspy", reason="ObsPy is not installed (extra seismic)")
+    traces = []
+    for code, samples, start_s in parts:
+        about = {"network": "XX", "station": "FIELD", "channel": code, "sampling_rate": RATE_HZ}
+        about["starttime"] = obspy.UTCDateTime("2023-11-14T22:13:20") + start_s
+        traces.append(obspy.Trace(samples, about))
+    obspy.Stream(traces).write(str(path), format="MSEED")
+    return path
+
+
+@pytest.mark.filterwarnings("default")
+def test_miniseed(tmp_path: Path) -> None:
+    whole = np.round(1000 * V).astype(np.int32)
+    x, y, z = whole.T
+    path = miniseed(
+        tmp_path / "a.mseed", [("HNE", x, 0.0), ("HNN", y, 0.0), ("HNZ", z[:100], 0.0), ("HNZ", z[130:], 1.3)]
+    )
+    gap = whole.astype(float)
+    gap[100:130] = np.nan
+    same(path, 1_700_000_000 + TIME_S, gap)
+    found = read_reference(
+        miniseed(tmp_path / "b.mseed", [("HHZ", z, 0.0)]), None, None, sensitivity_of("50 counts/(m/s)")
+    )
+    assert found.quantity == "velocity"
+    np.testing.assert_allclose(found.x[:, 0], z / 50, rtol=1e-14)
+
+
+@pytest.mark.filterwarnings("default")
+def test_broken_miniseed(tmp_path: Path) -> None:
+    pytest.importorskip("obspy", reason="ObsPy is not installed (extra seismic)")
+    fault(written(tmp_path, b"nothing of that kind" * 40, "a.mseed"), "cannot be read: .*; write it anew")
+    data = miniseed(tmp_path / "b.mseed", [("HNE", np.arange(300, dtype=np.int32), 0.0)]).read_bytes()
+    fault(written(tmp_path, data[:30], "c.mseed"), "cannot be read: .*; write it anew")
