@@ -171,7 +171,7 @@ def _rows(source: Source, chosen: Sequence[Chosen], progress: Progress | None, s
 
     A temporary file on disk holds them while they are used.
     """
-    count, time_unit = 0, unit_of(chosen[0].unit) if chosen[0].unit else None
+    count, whole, time_unit = 0, 0, unit_of(chosen[0].unit) if chosen[0].unit else None
     if time_unit is not None and time_unit.quantity != "time":
         raise TableError(f"{source.path}, {source.header}: column {str(chosen[0].column)!r} is in {chosen[0].unit}, "
                          "which is no unit of time")  # fmt: skip
@@ -189,8 +189,9 @@ def _rows(source: Source, chosen: Sequence[Chosen], progress: Progress | None, s
                 rows[:, 1:] *= scale
             spool.write(np.ascontiguousarray(rows).data)
             count += len(rows)
-        if count < 2:
-            raise TableError(f"{source.path}: the file has {count} rows of data, at least 2 are needed")
+            whole += int(np.isfinite(rows[:, 1]).sum())
+        if whole < 2:
+            raise TableError(f"{source.path}: the file has {whole} rows of data, at least 2 are needed")
         spool.flush()
         found = np.asarray(np.memmap(spool, dtype=np.float64, mode="r", shape=(count, len(chosen))))
     _check_time(source, chosen[0], found[:, 0])

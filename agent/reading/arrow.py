@@ -21,7 +21,7 @@ class Arrow(Source):
         self._file: Any = None
         try:
             schema = self._schema()
-        except (pa.ArrowException, OSError) as error:
+        except (pa.ArrowException, OSError, ValueError) as error:
             raise self._damaged(error) from None
         self.columns = [Column(f.name, "s" if pa.types.is_timestamp(f.type) else "") for f in schema
                         if _is_number(f.type)]  # fmt: skip
@@ -36,7 +36,7 @@ class Arrow(Source):
                 if progress is not None:
                     progress(round(share * self.path.stat().st_size) - done)
                     done = round(share * self.path.stat().st_size)
-        except (self._error, OSError) as error:
+        except (self._error, OSError, ValueError) as error:
             raise self._damaged(error) from None
 
     def close(self) -> None:

@@ -59,7 +59,9 @@ def open_hdf5(path: Path) -> Arrays:
             source = Arrays(path, with_times(values, _rates(file)), file.close)
             opened.pop_all()
             return source
-    except (OSError, RuntimeError, KeyError) as error:
+    except TableError:
+        raise
+    except Exception as error:  # h5py raises many kinds for broken files
         reason = str(error).partition("\n")[0]
         raise TableError(f"{path}: the file cannot be read: {reason}; write it anew") from None
 

@@ -14,9 +14,10 @@ AXES = {"E": "x", "N": "y", "Z": "z"}
 
 
 def open_miniseed(path: Path) -> Arrays:
-    """Each sensor of a station (network.station.location.channel without its last letter) is a group with `time_s` and its components.
+    """Each sensor of a station is a group with `time_s` and its components.
 
-    A component that is missing in a part of the time has gaps there. Raises TableError.
+    The group is named network.station.location.channel, without the last letter of the channel. A component that is
+    missing for a time has gaps there. Raises TableError.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # ObsPy's own, about packages that it uses

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import resource
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, Self
@@ -115,7 +117,13 @@ class Arrays(Source):
         share = self.path.stat().st_size / max(n, 1)
         for first in range(0, n, ROWS_AT_ONCE):
             rows = slice(first, min(first + ROWS_AT_ONCE, n))
-            yield np.column_stack([np.asarray(self._values[c][rows], dtype=np.float64).ravel() for c in columns])
+            try:
+                part = np.column_stack([np.asarray(self._values[c][rows], dtype=np.float64).ravel() for c in columns])
+            except Exception as error:  # the libraries raise many kinds for damaged files
+                reason = str(error).partition("\n")[0]
+                where = f"{self.path}, {self.place(first)} to {rows.stop}"
+                raise TableError(f"{where}: the values cannot be read: {reason}; write the file anew") from None
+            yield part
             if progress is not None:
                 progress(round(share * (rows.stop - first)))
 
@@ -128,3 +136,17 @@ def check_announced(path: Path, size_bytes: int) -> None:
             f"{path}: the file says that it holds {size_bytes:.3g} bytes of values, {allowed:.3g} are allowed for its "
             "size; it is damaged or hostile: write it anew without compression"
         )
+
+
+@contextmanager
+def bounded_memory(size_bytes: int) -> Iterator[None]:
+    """Let this process take at most so many more bytes of memory, so that a library that trusts a file raises
+    MemoryError."""
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    limits = [pages * resource.getpagesize() + size_bytes, *(limit for limit in (soft, hard) if limit >= 0)]
+    resource.setrlimit(resource.RLIMIT_AS, (min(limits), hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))

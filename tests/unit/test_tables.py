@@ -71,6 +71,7 @@ def test_a_file_of_many_chunks_is_the_same(tmp_path: Path, monkeypatch: pytest.M
         (HEADER + "0,1,2,3\n0.1,1,2,-inf\n0.2,1,2,3\n", "line 3, column vz: '-inf' is not a finite number"),
         (HEADER + "0,1,2,3\n\nnan,1,2,3\n0.2,1,2,3\n", "line 4, column time_s: nan is not a finite number"),
         (HEADER + "0,1,2,3\n0.1,1,2,1e200\n0.2,1,2,3\n", "line 3, column vz: '1e200' is larger than 1e\\+19"),
+        (HEADER + "0,1,2,3\n1,,,\n2,,,\n", "1 rows of data, at least 2 are needed"),
         (HEADER + "0,1,2,3\n", "1 rows of data, at least 2 are needed"),
         (HEADER, "0 rows of data"),
         ("", "line 1: the file is empty; expected a header such as time_s"),
