@@ -62,6 +62,25 @@ class WindowSums:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class BandSums:
+    """Sums of products of a window in B bands of frequency (calib.excitation.bands).
+
+    `reference_channels` is m. `low_hz`, `high_hz` (B,) are the limits of the bands, `points` (B,) the numbers of points
+    in them, of which the share `independent` is statistically independent. `products` (B, 2 m + 3, 2 m + 3) are sums
+    over points of products of u in m/s2, du/dt in m/s3 and V in output unit. `noise` (B, 2 m) is the power of the
+    reference's noise that was subtracted from their diagonals; it is still in the residuals.
+    """
+
+    reference_channels: int
+    low_hz: Array
+    high_hz: Array
+    points: Array
+    independent: float
+    products: Array
+    noise: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Window:
     """One window of known excitation: its pose, its sums, and the verdict whether it is used.
 
@@ -86,6 +105,7 @@ class Window:
     u_lag_s: float = 0.0
     independent: float = 1.0
     reference_noise: Array | None = None  # (2, m) rms of the reference's own noise in u, m/s2, and in du/dt, m/s3
+    bands: BandSums | None = None  # None at rest, and where no response over frequency is estimated
 
 
 @dataclass(frozen=True, slots=True, eq=False)

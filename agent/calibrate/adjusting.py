@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,30 +14,80 @@ from agent.calibrate.outcome import NuisanceValue, Outcome, nothing_used
 from agent.calibrate.priors import priors_of, row_contradictions, u_gravity_mps2
 from agent.calibrate.tables import SensorTable
 from calib.estimate.adjustment import Adjustment, adjust
-from calib.estimate.lag_search import without_lag
+from calib.estimate.lag_search import starts, without_lag
 from calib.estimate.norm_fit import norm_fit
 from calib.estimate.nuisances import Applied, Priors
+from calib.excitation.bands import motion_band_hz
 from calib.excitation.windows import rests_anywhere
 from calib.geometry import STANDARD_GRAVITY_MPS2
 from calib.model import PARAMETERS, Window
 from calib.signal.stamps import clock_from_stamps
 
+METHOD = "3 (adjustment)"
+LAG_SD = 3.0  # how far a lag is searched, in its stated standard uncertainties
+RESPONSE_TURNS = 6
+HOPELESS = 2  # turns after which a refusal no longer comes from the response that is not yet taken out
+UNSETTLED = (
+    "the response of sensor and reference over frequency does not settle: within the motion's band they differ too "
+    "much, as at a filter's corner or a resonance; calibrate with motion at lower frequencies"
+)
+# Standard uncertainty of a term, relative to that of a low-pass filter at the upper end of the motion. It is honest for
+# filters, means and resonances from 1.5 times that frequency on (shown by benchmarks.response).
+RESPONSE_U = 10.0
+
 
 def adjusted(files: Files, priors: Priors) -> Outcome:
-    """Make windows with the lag taken out, and adjust them."""
+    """Make windows with the lag and the response over frequency taken out, and adjust them."""
     applied = Applied(0.0, priors.reference_corner_at_hz, priors.sensor_corner_at_hz)
-    latest: dict[float, Adjustment] = {}  # key: the lag that was taken out
+    stated: Priors | None = None  # with the response, whose scale is that of the motion
+    latest: dict[Applied, Adjustment] = {}
 
-    def at(windows: Sequence[Window], lag_s: float) -> Adjustment:
-        if lag_s not in latest:
+    def at(windows: Sequence[Window], taken: Applied) -> Adjustment:
+        nonlocal stated
+        stated = stated or with_response(priors, windows)
+        if taken not in latest:
             latest.clear()
-            latest[lag_s] = adjust(_used(windows), priors, replace(applied, lag_s=lag_s))
-        return latest[lag_s]
+            latest[taken] = adjust(_used(windows), stated, taken)
+        return latest[taken]
 
-    windows, lag_s = without_lag(applied.lag_s, files.windows, _used, lambda made, lag_s: at(made, lag_s).lag_s or 0.0)
-    if not _used(windows):
-        return nothing_used(windows, files.rate_hz, "3 (adjustment)")
-    return _outcome(at(windows, lag_s), windows, files.rate_hz)
+    def lag_of(taken: Applied, made: Sequence[Window], lag_s: float) -> float:
+        return at(made, replace(taken, lag_s=lag_s)).lag_s or 0.0
+
+    for turn in range(RESPONSE_TURNS):
+        make = partial(files.windows, response=applied.response)
+        windows, lag_s = without_lag(applied.lag_s, make, _used, partial(lag_of, applied))
+        if turn == 0 and not _used(windows):
+            lag_s = _usable_lag_s(files, priors, windows)
+            windows, lag_s = without_lag(lag_s, make, _used, partial(lag_of, applied))
+        if not _used(windows):
+            break
+        found = at(windows, replace(applied, lag_s=lag_s))
+        if found.response is None or found.response.terms.is_near(applied.response):
+            return _outcome(found, windows, files.rate_hz)
+        if found.reasons and turn >= HOPELESS:
+            return _outcome(found, windows, files.rate_hz)
+        applied = replace(applied, lag_s=lag_s, response=found.response.terms)
+    if applied.response.is_flat:
+        return nothing_used(windows, files.rate_hz, METHOD)
+    return Outcome(None, (UNSETTLED,), windows, files.rate_hz, METHOD)
+
+
+def _usable_lag_s(files: Files, priors: Priors, windows: Sequence[Window]) -> float:
+    """The lag nearest to 0 at which windows can be used: a sensor that is late seems not to follow its reference."""
+    furthest_s = LAG_SD * priors.lag_s
+    tried = sorted(starts(-furthest_s, furthest_s, windows), key=abs) if furthest_s else []
+    return next((lag_s for lag_s in tried if _used(files.windows(lag_s))), 0.0)
+
+
+def with_response(priors: Priors, windows: Sequence[Window]) -> Priors:
+    """The priors with those of the response, where the motion covers a band that is wide enough to tell it."""
+    band_hz = motion_band_hz(_used(windows))
+    if band_hz is None:
+        return priors
+    told = {"response": RESPONSE_U, "response_hz": band_hz[1]}
+    if not priors.reference_frequency_hz:
+        told["reference_frequency_hz"] = float(np.sqrt(band_hz[0] * band_hz[1]))
+    return Priors({**priors.values, **told}, priors.parameters, priors.covariance)
 
 
 def _used(windows: Sequence[Window]) -> list[Window]:
@@ -88,6 +139,29 @@ def _outcome(found: Adjustment, windows: Sequence[Window], rate_hz: float) -> Ou
             "lag_scatter_s": found.lag_scatter_s,
             "misfit": found.misfit,
             "nuisance_pull": found.nuisance_pull,
+            **_response(found),
             "invariant": None if found.reasons else found.invariant,
         },
     )  # fmt: skip
+
+
+def _response(found: Adjustment) -> dict[str, Any]:
+    """The members of the JSON object that tell the response over frequency."""
+    told = found.response
+    if told is None:
+        return dict.fromkeys(("reference_frequency_hz", "valid_band_hz", "sensitivity_at_0hz", "response"))
+    return {
+        "reference_frequency_hz": told.reference_frequency_hz,
+        "valid_band_hz": list(told.valid_band_hz),
+        "sensitivity_at_0hz": {"sensitivity": told.at_0hz, "standard_uncertainty": told.u_at_0hz},
+        "response": [
+            {
+                "low_hz": band.low_hz,
+                "high_hz": band.high_hz,
+                "sensitivity_re": band.sensitivity.real,
+                "sensitivity_im": band.sensitivity.imag,
+                "standard_uncertainty": band.standard_uncertainty,
+            }
+            for band in told.bands
+        ],
+    }

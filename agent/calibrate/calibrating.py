@@ -68,7 +68,7 @@ def read_files(options: dict[str, Any], instrument: Instrument | None = None) ->
     poses = _poses(options, setting, reference)
     plain = options["plain"]
     limits = Limits.of(options["u_offset_mps2"], math.radians(options["u_angle_deg"]))
-    settings = Settings(Limits() if plain else limits, leave_out=not plain, limit_band=not plain)
+    settings = Settings(Limits() if plain else limits, leave_out=not plain, limit_band=not plain, bands=not plain)
     return Files(sensor, reference, poses, instrument, Options(settings, align=not plain))
 
 

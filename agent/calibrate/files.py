@@ -27,6 +27,7 @@ from calib.excitation.pieces import pieces_of
 from calib.excitation.windows import Points, motion_windows, rest_sd
 from calib.model import Array, Window
 from calib.signal.instrument import Instrument
+from calib.signal.response import FLAT, Response
 from calib.signal.samples import Samples
 
 GUARD_S = 0.1  # not used at both ends of a pose, because of handling and of errors of the clocks
@@ -71,25 +72,30 @@ class Files:
         """Rate of the sensor from its stamps."""
         return self._sensor.clock.rate_hz
 
-    def windows(self, lag_s: float = 0.0, progress: Callable[[float], Any] | None = None) -> list[Window]:
-        """All windows in the order of the poses, used or not. `lag_s` is the lag of the sensor's indications.
+    def windows(
+        self, lag_s: float = 0.0, response: Response = FLAT, progress: Callable[[float], Any] | None = None
+    ) -> list[Window]:
+        """All windows in the order of the poses, used or not. `lag_s` is the lag of the sensor's indications, and
+        `response` their response over frequency.
 
         The first call finds whether the two clocks have different rates, and corrects that. `progress` is called with
         the seconds of recording that were just done.
         """
-        found = self._made(lag_s, progress)
+        found = self._made(lag_s, response, progress)
         if self._options.align and self._reference is not None and self.drift is None:
             self.drift = drift(found)
             if self.drift is not None and self.drift.significant:
                 self._reference.stretch(self.drift.rate, self.drift.time_s)
-                found = self._made(lag_s, progress)
+                found = self._made(lag_s, response, progress)
         return found
 
-    def _made(self, lag_s: float, progress: Callable[[float], Any] | None) -> list[Window]:
+    def _made(self, lag_s: float, response: Response, progress: Callable[[float], Any] | None) -> list[Window]:
         floor = self._rest_floor()
         windows: list[Window] = []
         for interval in self.poses:
-            found = [w for piece in self._pieces(interval) for w in self._windows(interval, *piece, lag_s, floor)]
+            found = [
+                w for piece in self._pieces(interval) for w in self._windows(interval, *piece, lag_s, response, floor)
+            ]
             windows += found or [_nothing(interval, "no samples of the sensor, or none of the reference, in this pose")]
             if progress is not None:
                 progress(interval.stop_s - interval.start_s)
@@ -100,21 +106,31 @@ class Files:
         return pieces_of(interval.start_s, interval.stop_s, longest_s, self._options.guard_s)
 
     def _windows(
-        self, interval: PoseInterval, start_s: float, stop_s: float, lag_s: float, floor: Array | None
+        self,
+        interval: PoseInterval,
+        start_s: float,
+        stop_s: float,
+        lag_s: float,
+        response: Response,
+        floor: Array | None,
     ) -> list[Window]:
-        sensor, reference = self._cut(interval, start_s, stop_s)
+        sensor, reference = self._cut(interval, start_s, stop_s, response)
         if sensor is None or (reference is None and interval.pose.direction.shape[1]):
             return []
         span_s, settings = (start_s, stop_s), self._options.settings
         try:
-            return windows_of(interval.pose, sensor, reference, self._instrument, span_s, lag_s, settings, floor)
+            return windows_of(
+                interval.pose, sensor, reference, self._instrument, span_s, lag_s, settings, floor, response
+            )
         except Unusable as error:
             return [nothing_in(interval.pose, start_s, stop_s, str(error))]
 
-    def _cut(self, interval: PoseInterval, start_s: float, stop_s: float) -> tuple[Samples | None, Samples | None]:
+    def _cut(
+        self, interval: PoseInterval, start_s: float, stop_s: float, response: Response = FLAT
+    ) -> tuple[Samples | None, Samples | None]:
         if self._reference is None or not interval.pose.direction.shape[1]:
             return self._sensor.cut(start_s, stop_s), None
-        around_s = margin_s(self._instrument, self._reference.clock.rate_hz)
+        around_s = margin_s(self._instrument, self._reference.clock.rate_hz) + response.reach_s
         sensor = self._sensor.cut(start_s - 0.5 * around_s, stop_s + 0.5 * around_s)
         return sensor, self._reference.cut(start_s - around_s, stop_s + around_s)
 

@@ -157,7 +157,18 @@ def _print_calibration(console: Any, outcome: Outcome) -> None:
     if np.any(np.isfinite(values) & ~c.determined):
         console.print(f"  {KNOWN_BEFORE} known before: the data do not halve its uncertainty", soft_wrap=True)
     _print_sources(console, outcome)
+    _print_frequencies(console, outcome)
     console.print(f"  method {outcome.method}, {sum(w.used for w in outcome.windows)} windows", soft_wrap=True)
+
+
+def _print_frequencies(console: Any, outcome: Outcome) -> None:
+    if outcome.more.get("valid_band_hz"):
+        low_hz, high_hz = outcome.more["valid_band_hz"]
+        at_hz = outcome.more["reference_frequency_hz"]
+        console.print(
+            f"  S holds at {at_hz:.3g} Hz; from {low_hz:.3g} to {high_hz:.3g} Hz it is right within a third of U",
+            soft_wrap=True,
+        )
 
 
 def _print_sources(console: Any, outcome: Outcome) -> None:

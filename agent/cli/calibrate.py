@@ -99,6 +99,11 @@ _U = _Finite(0)
 @click.option("--nominal", type=_Finite(min=0, min_open=True), help="Nominal sensitivity, output unit per m/s2.")
 @click.option("--u-nominal-pct", type=_Finite(0, min_open=True), help="Its standard uncertainty.")
 @click.option("--prior", type=_FILE, help="Earlier result of this command (JSON), used as prior.")
+@click.option(
+    "--reference-frequency-hz",
+    type=_Finite(min=0, min_open=True),
+    help="The frequency at which S holds. Default: the geometric middle of the motion's band.",
+)
 @click.option("--plain", is_flag=True, help="Method 3 exactly as in the paper, without nuisances.")
 @click.option(
     "--json", "json_to", type=click.Path(path_type=Path, allow_dash=True, dir_okay=False, writable=True),

@@ -21,8 +21,10 @@ from calib.estimate.fixed_mount import mean_input, never_turned
 from calib.estimate.gauss_newton import Solution, slope_residuals, solve
 from calib.estimate.nuisances import Applied, Nuisances, Priors
 from calib.estimate.quantities import LAG, Kind
+from calib.estimate.response_told import ResponseTold, response_told
 from calib.estimate.slope_scatter import SlopeScatter, estimated
 from calib.estimate.verdict import misfit, nuisance_pull, reasons, turned_windows
+from calib.excitation.bands import motion_band_hz
 from calib.excitation.excited import excited
 from calib.model import Array, Calibration, Pose, Window
 
@@ -52,7 +54,7 @@ class Adjustment:
     most. `offset_scatter_mps2`, `slope_scatter` (relative) and `lag_scatter_s`: between windows, as estimated.
     `misfit`: what S a + Q leaves of the signal. `nuisance_pull`: how far the nuisances moved from what was stated, in
     standard deviations, worst direction. `mean` (N,) and `covariance` (N, N): joint state of [S, Q, nuisances], nothing
-    blanked.
+    blanked. `response`: over frequency; None where it is no unknown.
     """
 
     calibration: Calibration
@@ -70,6 +72,7 @@ class Adjustment:
     nuisance_pull: float
     mean: Array
     covariance: Array
+    response: ResponseTold | None
 
     @property
     def expanded_uncertainty(self) -> Array:
@@ -101,7 +104,7 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
         priors = _without_offset(priors)
     found = [excited(w) for w in used]
     plain = not any(priors.values.values())  # with every nuisance fixed it is Method 3: all points weigh the same
-    data = condense([e.window for e in found], alike=plain)
+    data = condense([e.window for e in found], alike=plain, response_hz=priors.response_hz)
     if not plain:
         data = effective(data, min(w.independent for w in used))
     u_lag_s = [max(w.u_lag_s, priors.lag_window_s) if priors.lag_s > 0.0 else 0.0 for w in used]
@@ -123,6 +126,7 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
         reduced = [excited(w).window for w in turned_windows(used, static, polarity)]
         return _solution(reduced, data, priors, applied, scatter)
 
+    k = coverage_factor(float(np.min(shares.degrees_of_freedom[told], initial=np.inf)))
     return Adjustment(
         calibration=Calibration(
             values[:9].reshape(3, 3),
@@ -134,7 +138,7 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
         ),
         nuisances=_reported(solution, shares),
         contributions=shares.contributions,
-        coverage_factor=coverage_factor(float(np.min(shares.degrees_of_freedom[told], initial=np.inf))),
+        coverage_factor=k,
         reasons=tuple(reasons(used, solution, shares, told, turned)),
         rank=solution.equations.rank,
         chi2=shares.consistency[0],
@@ -146,7 +150,17 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
         nuisance_pull=nuisance_pull(solution, shares.covariance)[0],
         mean=solution.x,
         covariance=shares.covariance,
+        response=_response(solution, shares.covariance, priors, used, k),
     )
+
+
+def _response(
+    solution: Solution, covariance: Array, priors: Priors, windows: Sequence[Window], k: float
+) -> ResponseTold | None:
+    band_hz = motion_band_hz(windows)
+    if not priors.response or band_hz is None:
+        return None
+    return response_told(solution, covariance, priors.reference_frequency_hz, band_hz, k)
 
 
 def _solution(

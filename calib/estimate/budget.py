@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calib.estimate.banded import BetweenBands
 from calib.estimate.gauss_newton import Solution, slope_residuals
 from calib.estimate.scatter import between_windows
 from calib.model import Array
@@ -32,6 +33,7 @@ class Budget:
     degrees_of_freedom: Array
     offset_scatter_mps2: float
     slope_scatter: float
+    between_bands: BetweenBands
     consistency: tuple[float, float]  # chi-squared of the windows against noise and stated scatter, and its expectation
 
 
@@ -47,6 +49,10 @@ def budget(solution: Solution, stated_offset_scatter_mps2: float) -> Budget:
         sources["offset between windows"] = (larger**2 * seen.offset.term, freedom)
     if seen.slope.scatter > 0.0:
         sources["slopes between windows"] = (seen.slope.scatter**2 * seen.slope.term, seen.slope.degrees_of_freedom)
+    banded = solution.equations.data.bands
+    bands = BetweenBands() if banded is None else banded.between
+    if bands.relative_u > 0.0:
+        sources["response between bands"] = (_alike(solution, bands.relative_u), np.inf)
     half = solution.half
     sources["prior of S and Q"] = (half[:12].T @ solution.prior_precision[:12, :12] @ half[:12], np.inf)
     terms = solution.equations.nuisances.terms
@@ -64,6 +70,7 @@ def budget(solution: Solution, stated_offset_scatter_mps2: float) -> Budget:
         degrees_of_freedom=effective,
         offset_scatter_mps2=seen.offset.scatter,
         slope_scatter=seen.slope.scatter,
+        between_bands=bands,
         consistency=seen.consistency,
     )
 
@@ -80,7 +87,17 @@ def _type_a(solution: Solution) -> Array:
     type_a = equations.data.type_a
     slope_rows = equations.scatter.whiten(slope_residuals(solution)[1])
     mean_rows = mean_rows * np.sqrt(equations.white_share)[..., None]
-    return _quadratic(slope_rows, type_a.slopes) + _quadratic(mean_rows, type_a.means)
+    band_rows = equations.band_rows(solution.jacobian)
+    return _quadratic(slope_rows, type_a.slopes) + _quadratic(mean_rows, type_a.means) + band_rows.T @ band_rows
+
+
+def _alike(solution: Solution, relative: float) -> Array:
+    """(N, N) of a relative standard uncertainty that all slopes share."""
+    S = np.append(solution.x[:9], np.zeros(len(solution.x) - 9))
+    rows = slope_residuals(solution)[1]
+    rows = rows.reshape(-1, rows.shape[-1])
+    loading = rows.T @ (rows @ np.linalg.solve(solution.half, S))
+    return np.asarray(relative**2 * np.outer(loading, loading))
 
 
 def _quadratic(rows: Array, covariance: Array) -> Array:

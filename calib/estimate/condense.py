@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from calib.estimate.banded import Banded, banded
 from calib.estimate.type_a import FEWEST_FREEDOM, LEAST_INFLATION, Segments, TypeA, pooled
 from calib.excitation.excited import OF_STRONGEST
 from calib.model import Array, Window, own_channels
@@ -40,25 +41,29 @@ class Condensed:
     mean_v: Array
     count: Array
     type_a: TypeA
+    bands: Banded | None = None
 
 
-def condense(windows: Sequence[Window], *, alike: bool = False) -> Condensed:
+def condense(windows: Sequence[Window], *, alike: bool = False, response_hz: float = 0.0) -> Condensed:
     """Condense the windows' sums; M is the largest number of reference channels among them.
 
-    `alike` as in calib.estimate.type_a.pooled.
+    `alike` as in calib.estimate.type_a.pooled. `response_hz`: upper end of the motion that is to tell the response
+    over frequency; 0 where that is no unknown.
     """
     channels = max(w.sums.reference_channels for w in windows)
     segments = [_segments(w, channels) for w in windows]
     roots, whiteners = zip(*(_root(s.xx.sum(0)) for s in segments), strict=True)
+    omega2 = np.array([_omega2(s.xx.sum(0), channels) for s in segments])
     return Condensed(
         channels=channels,
         root=np.array(roots),
         slopes=np.array([t @ s.xv.sum(0) for t, s in zip(whiteners, segments, strict=True)]),
-        omega2=np.array([_omega2(s.xx.sum(0), channels) for s in segments]),
+        omega2=omega2,
         mean_x=np.array([s.mean[:-3] for s in segments]),
         mean_v=np.array([s.mean[-3:] for s in segments]),
         count=np.array([s.count.sum() for s in segments]),
         type_a=pooled(segments, roots, whiteners, alike=alike),
+        bands=banded(windows, channels, response_hz) if response_hz else None,
     )
 
 

@@ -7,6 +7,9 @@ S_i of S,
     slope on du/dt  -S_i D lag_i + S_i D' / omega
     mean of V       S_i (D mean(u) + G) + Q_i + S_i (D' / omega - lag_i D) mean(du/dt) + offset of the position
 
+Where the response over frequency is an unknown, what is left of it adds to the slopes of each window
+(calib.estimate.banded), and S is replaced by the sensitivity at 0 Hz.
+
 The term in omega^2 = <du^2> / <u^2> is the projection of d2u/dt2 on u. It is exact for a sine, and for any motion after
 the front end has removed the lag that was found, because the remaining lag is then negligible.
 """
@@ -37,20 +40,22 @@ UNSEEN_SHARE = 0.02
 class Rows:
     """Whitened residuals (observed minus predicted), and the derivatives of the predictions.
 
-    Slopes: `slope` (W, 2M, 3) and `d_slope` (W, 2M, 3, N); means: `mean` (W, 3) and `d_mean` (W, 3, N). The N unknowns
-    are [S row by row, Q, nuisances].
+    Slopes: `slope` (W, 2M, 3) and `d_slope` (W, 2M, 3, N); means: `mean` (W, 3) and `d_mean` (W, 3, N); what the bands
+    tell of the response: `band` (R,) and `d_band` (R, N). The N unknowns are [S row by row, Q, nuisances].
     """
 
     slope: Array
     d_slope: Array
     mean: Array
     d_mean: Array
+    band: Array
+    d_band: Array
 
     def stacked(self) -> tuple[Array, Array]:
-        """Residuals (rows,) and Jacobian (rows, N), the slopes first, then the means."""
+        """Residuals (rows,) and Jacobian (rows, N), the slopes first, then the means, then the bands."""
         n = self.d_mean.shape[-1]
-        residual = np.concatenate([self.slope.ravel(), self.mean.ravel()])
-        return residual, np.vstack([self.d_slope.reshape(-1, n), self.d_mean.reshape(-1, n)])
+        residual = np.concatenate([self.slope.ravel(), self.mean.ravel(), self.band])
+        return residual, np.vstack([self.d_slope.reshape(-1, n), self.d_mean.reshape(-1, n), self.d_band])
 
 
 class Equations:
@@ -124,15 +129,26 @@ class Equations:
         """Residuals and derivatives at x = [S row by row, Q, nuisances] (N,)."""
         S, Q, z = x[:9].reshape(3, 3), x[9:12], x[12:]
         inputs = self.nuisances.at(z)
-        return Rows(*self._slopes(S, inputs), *self._means(S, Q, z, inputs))
+        # S is that at the reference frequency; the response is 1 at 0 Hz, where the sensitivity is this times S.
+        steady, by_nuisance = self.nuisances.steady(z)
+        slope, d_slope = self._slopes(steady * S, inputs)
+        mean, d_mean = self._means(steady * S, Q, z, inputs)
+        for moves in (d_slope, d_mean):
+            moves[..., :9] *= steady
+            moves[..., 12:] += (moves[..., :9] @ x[:9])[..., None] * by_nuisance
+        return Rows(slope, d_slope, mean, d_mean, *self._bands(inputs))
 
     def split(self, rows: Array) -> tuple[Array, Array]:
-        """Stacked rows (rows, ...) back into slopes (W, 2M, 3, ...) and means (W, 3, ...)."""
-        slopes = self.data.slopes
+        """Stacked rows (rows, ...) back into slopes (W, 2M, 3, ...) and means (W, 3, ...); those of bands are left."""
+        slopes, means = self.data.slopes, self.data.mean_v
         return (
             rows[: slopes.size].reshape(*slopes.shape, *rows.shape[1:]),
-            rows[slopes.size :].reshape(*self.data.mean_v.shape, *rows.shape[1:]),
+            rows[slopes.size : slopes.size + means.size].reshape(*means.shape, *rows.shape[1:]),
         )
+
+    def band_rows(self, rows: Array) -> Array:
+        """Those of the stacked rows (rows, ...) that the bands tell."""
+        return rows[self.data.slopes.size + self.data.mean_v.size :]
 
     def _slopes(self, S: Array, inputs: Inputs) -> tuple[Array, Array]:
         data, D, ahead = self.data, *(d[self.pose_of_window] for d in (inputs.direction, inputs.rate_direction))
@@ -145,6 +161,8 @@ class Equations:
         on_rate = ideal * on_du[..., None] + np.einsum("ik,bkm->bim", S, ahead)
         on_rate[:, :, :1] += (across @ S.T)[..., None]
         slopes = np.concatenate([ideal * on_u[..., None], on_rate], axis=2)  # (W, 3, 2M)
+        passed, d_passed = self._passed(inputs)  # (W, 2M, M) and (J, W, 2M, M)
+        slopes += np.einsum("bim,brm->bir", ideal, passed)
         residual = data.slopes - np.einsum("brc,bic->bri", data.root, slopes)
 
         nuisances = self.nuisances
@@ -158,9 +176,11 @@ class Equations:
         d_z = np.concatenate(
             [d_ideal * on_u[..., None, None] + ideal[..., None] * d_on_u[:, :, None, :], d_on_rate], axis=2
         )
+        d_z += np.einsum("bimj,brm->birj", d_ideal, passed) + np.einsum("bim,jbrm->birj", ideal, d_passed)
         n = 12 + len(nuisances)
         jacobian = np.zeros((*data.slopes.shape, n))  # (W, 2M, 3, N)
         per_row = np.concatenate([D[:, None] * on_u[..., None, None], D[:, None] * on_du[..., None, None]], axis=3)
+        per_row += np.einsum("bkm,brm->bkr", D, passed)[:, None]
         per_row[:, :, :, D.shape[2] :] += ahead[:, None]
         per_row[:, :, :, D.shape[2] : D.shape[2] + 1] += across[:, None, :, None]
         for i in range(3):
@@ -168,6 +188,25 @@ class Equations:
         jacobian[..., 12:] = np.einsum("brc,bicj->brij", data.root, d_z)
         noise = data.type_a.noise[:, None]
         return self._whitened(residual / noise), self._whitened(jacobian / noise[..., None])
+
+    def _passed(self, inputs: Inputs) -> tuple[Array, Array]:
+        """What the response that is left adds to the slopes, (W, 2M, M), and its derivatives (J, W, 2M, M)."""
+        bands, m = self.data.bands, self.data.channels
+        if bands is None:
+            nothing = np.zeros((1 + len(self.nuisances), len(self.data.slopes), 2 * m, m))
+            return nothing[0], nothing[1:]
+        terms = np.vstack([inputs.response, self.nuisances.response])
+        passed = np.einsum("jk,bkrm->jbrm", terms, bands.projected)
+        return passed[0], passed[1:]
+
+    def _bands(self, inputs: Inputs) -> tuple[Array, Array]:
+        """Residuals (R,) of what the bands tell of the response alone, and their derivatives (R, N)."""
+        bands, n = self.data.bands, 12 + len(self.nuisances)
+        if bands is None:
+            return np.zeros(0), np.zeros((0, n))
+        jacobian = np.zeros((len(bands.residual), n))
+        jacobian[:, 12:] = bands.moves @ self.nuisances.response.T
+        return bands.residual - bands.moves @ inputs.response, jacobian
 
     def _whitened(self, slopes: Array) -> Array:
         """Rows (W, 2M, 3, ...) weighted for the scatter between windows as well."""

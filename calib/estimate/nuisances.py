@@ -18,10 +18,21 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
-from calib.estimate.quantities import LAG, PRIORS, REFERENCE_CORNER, SENSOR_CORNER, Kind, Stated, Statement
+from calib.estimate.quantities import (
+    LAG,
+    PRIORS,
+    REFERENCE_CORNER,
+    RESPONSE,
+    SENSOR_CORNER,
+    Kind,
+    Stated,
+    Statement,
+)
 from calib.estimate.terms import terms
 from calib.model import Array, Pose, own_channels
+from calib.signal.response import FLAT, POWERS, Response, by_term
 
 
 @dataclass(frozen=True, init=False)
@@ -58,6 +69,7 @@ class Applied:
     lag_s: float = 0.0
     reference_corner_hz: float = 0.0
     sensor_corner_hz: float = 0.0
+    response: Response = FLAT
 
     @classmethod
     def of(cls, priors: Priors, lag_s: float) -> Applied:
@@ -65,9 +77,14 @@ class Applied:
         return cls(lag_s, priors.reference_corner_at_hz, priors.sensor_corner_at_hz)
 
     @property
-    def by_kind(self) -> dict[Kind, float]:
+    def by_kind(self) -> dict[Kind, tuple[float, ...]]:
         """The same values by the kind of the unknown."""
-        return {LAG: self.lag_s, REFERENCE_CORNER: self.reference_corner_hz, SENSOR_CORNER: self.sensor_corner_hz}
+        return {
+            LAG: (self.lag_s,),
+            REFERENCE_CORNER: (self.reference_corner_hz,),
+            SENSOR_CORNER: (self.sensor_corner_hz,),
+            RESPONSE: self.response.terms,
+        }
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,8 +95,8 @@ class Inputs:
     for silent channels, which have no motion of their own, but whose means act on the sensor. `rate_direction`
     (P, 3, M) in s applies to the motion's derivative: it is the part of the silent channels' motion that is 90 deg
     ahead. `quadrature` (P, 3) is relative motion 90 deg ahead that the reference does not measure; `gravity` (P, 3) in
-    m/s2; `lag_s` (3,); `reference_corner` and `sensor_corner` in rad/s. The derivatives `d_...` have the same shapes
-    with J in front.
+    m/s2; `lag_s` (3,); `reference_corner` and `sensor_corner` in rad/s; `response` (5,) in s^k. The
+    derivatives `d_...` have the same shapes with J in front.
     """
 
     direction: Array
@@ -90,6 +107,7 @@ class Inputs:
     lag_s: Array
     reference_corner: float
     sensor_corner: float
+    response: Array
     d_direction: Array
     d_mean_direction: Array
     d_rate_direction: Array
@@ -117,8 +135,8 @@ class Nuisances:
                 self._along_rate[p, :m, :m] = pose.along_rate_s
         self.direction, self.mean_direction = self._stated @ self._along, self._stated
         stated = np.array([pose.gravity_mps2 for pose in poses])
-        self.known = np.isfinite(stated).all(axis=1)  # (P,) if the gravity of a pose is not known, it is 0 here
-        self.gravity = np.where(self.known[:, None], stated, 0.0)
+        self.known: NDArray[np.bool_] = np.isfinite(stated).all(axis=1)
+        self.gravity = np.where(self.known[:, None], stated, 0.0)  # 0 in a pose whose gravity is not known
         self._real = own_channels(channels)
         self._magnitude = np.maximum(np.linalg.norm(self.gravity, axis=1), np.finfo(float).tiny)
         self._turn_direction = self._stacked("turn_direction", (n, 3))
@@ -132,6 +150,10 @@ class Nuisances:
         self.lag = self._stacked("lag", (3,))
         self.reference_corner = self._stacked("reference_corner", (1,))[:, 0]
         self.sensor_corner = self._stacked("sensor_corner", (1,))[:, 0]
+        self.response = self._stacked("response", (len(POWERS),))
+        # Of ln |h| at the reference frequency by the terms, when the response is 1 at 0 Hz.
+        self._at_reference = by_term(np.array([2.0 * np.pi * priors.reference_frequency_hz]))[0].real
+        self._applied_response = np.array([t.applied for t in self.terms]) @ self.response
         self._corner_hz = (self.reference_corner - self.sensor_corner) / (2.0 * np.pi)
 
     def __len__(self) -> int:
@@ -145,6 +167,11 @@ class Nuisances:
     def _stacked(self, name: str, shape: tuple[int, ...]) -> Array:
         maps = [getattr(t, name) for t in self.terms]
         return np.array([np.zeros(shape) if m is None else m for m in maps]).reshape(len(self.terms), *shape)
+
+    def steady(self, z: Array) -> tuple[float, Array]:
+        """The sensitivity at 0 Hz over that at the reference frequency, and the derivatives (J,) of its logarithm."""
+        away = self._at_reference @ (self._applied_response + z @ self.response)
+        return float(np.exp(-away)), -(self.response @ self._at_reference)
 
     def at(self, z: Array) -> Inputs:
         """The inputs when the nuisances have the values `z` (J,)."""
@@ -181,6 +208,7 @@ class Nuisances:
             z @ self.lag,
             float(z @ self.reference_corner),
             float(z @ self.sensor_corner),
+            z @ self.response,
             d_direction @ self._along,
             d_direction,
             d_direction @ self._along_rate,

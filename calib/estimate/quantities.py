@@ -35,6 +35,10 @@ def _percent(value: float) -> float:
     return value / 100.0
 
 
+def _or_0(value: float | None) -> float:
+    return value or 0.0
+
+
 def _percent_a_year(value: float) -> float:
     return float(value / 100.0 / np.sqrt(YEAR_DAYS))
 
@@ -55,7 +59,7 @@ class Statement:
     configuration: tuple[str, ...] = ()
     at_fixed_mount: tuple[str, ...] = ()
     option: str = ""
-    convert: Callable[[float], float] = float
+    convert: Callable[..., float] = float
 
 
 Loosening = Literal["jump", "lean", "line", "remount"]
@@ -290,6 +294,13 @@ REFERENCE_CORNER = Kind(
     mean=Statement("reference_corner_at_hz", 0.0, ("certificate.corner_hz",), option="reference_corner_hz"),
     of_reference=True,
 )  # fmt: skip
+RESPONSE = Kind(
+    # Of both instruments together, as the lag is. A standard uncertainty of 30 at the upper end of the motion is honest
+    # for low-pass filters, means and resonances from 1.5 times that frequency on.
+    "response", "1", "response over frequency",
+    prior=Statement("response"),
+    of_reference=True, stated=False,
+)  # fmt: skip
 ROTATION = Kind(
     "mounting rotation", "rad", "mounting rotation",
     prior=Statement("rotation_rad", _deg(0.2), ("uncertainty.rotation_deg",), option="u_rotation_deg", convert=_deg),
@@ -313,7 +324,13 @@ BETWEEN_WINDOWS = (
     Statement("lag_window_s", 0.0, ("uncertainty.lag_window_s",)),  # least value; the data may show a larger one
 )
 OF_SENSOR = (SENSITIVITY, SENSITIVITY_RATE, OFFSET, OFFSET_RATE, SENSITIVITY_TEMPERATURE, OFFSET_TEMPERATURE)
-PRIORS = by_name([s for k in KINDS.values() if k not in OF_SENSOR for s in k.statements] + list(BETWEEN_WINDOWS))
+FREQUENCIES = (
+    Statement("response_hz"),  # to which the terms of the response are scaled
+    Statement("reference_frequency_hz", option="reference_frequency_hz", convert=_or_0),  # at which S holds
+)
+PRIORS = by_name(
+    [s for k in KINDS.values() if k not in OF_SENSOR for s in k.statements] + [*BETWEEN_WINDOWS, *FREQUENCIES]
+)
 WALKS = by_name([s for k in OF_SENSOR for s in k.statements] + [k.walk for k in KINDS.values() if k.walk is not None])
 
 S_AND_Q = tuple(Quantity(name, SENSITIVITY if k < 9 else OFFSET) for k, name in enumerate(PARAMETERS))

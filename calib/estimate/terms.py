@@ -16,6 +16,7 @@ import numpy as np
 from calib.estimate import quantities as kinds
 from calib.estimate.quantities import Kind, Quantity, Stated
 from calib.model import Array, Pose, own_channels
+from calib.signal.response import POWERS
 
 PARALLEL = 1e-3  # rad; if motion and gravity are parallel within this angle, there is no horizontal normal
 AXES = "xyz"
@@ -27,7 +28,8 @@ class Term:
 
     Effects: `turn_direction`, `turn_gravity` (P, 3) rotation in rad; `transverse`, `quadrature` (P, 3) transverse
     motion in phase and 90 deg ahead, relative to the motion; `reference` (M,) relative error of the reference;
-    `gravity` (1,) in m/s2; `offset` (P, 3) in m/s2; `lag` (3,) in s; `reference_corner`, `sensor_corner` (1,) in rad/s.
+    `gravity` (1,) in m/s2; `offset` (P, 3) in m/s2; `lag` (3,) in s; `reference_corner`, `sensor_corner` (1,) in rad/s;
+    `response` (5,) the terms of the response in s^k (calib.estimate.response).
     None means no effect. `expected` is the prior's mean. `applied` is the part that the front end has already removed
     from the data; the remaining part is estimated.
     """
@@ -44,6 +46,7 @@ class Term:
     lag: Array | None = None
     reference_corner: Array | None = None
     sensor_corner: Array | None = None
+    response: Array | None = None
     expected: float = 0.0
     applied: float = 0.0
 
@@ -83,7 +86,7 @@ class Term:
 
 
 def terms(
-    poses: Sequence[Pose], channels: int, priors: Stated, applied: Mapping[Kind, float], reference: str = ""
+    poses: Sequence[Pose], channels: int, priors: Stated, applied: Mapping[Kind, Sequence[float]], reference: str = ""
 ) -> list[Term]:
     """All nuisances of P poses and a reference with this number of channels; also those whose uncertainty is 0.
 
@@ -97,7 +100,7 @@ def terms(
 
 
 def _terms(
-    poses: Sequence[Pose], channels: int, priors: Stated, applied: Mapping[Kind, float], reference: str
+    poses: Sequence[Pose], channels: int, priors: Stated, applied: Mapping[Kind, Sequence[float]], reference: str
 ) -> Iterator[Term]:
     yield from _clamp_terms(poses, priors)
     yield from _pose_terms(poses, priors, reference)
@@ -120,6 +123,12 @@ def _terms(
     yield _term("lag", kinds.LAG, priors, applied, reference, lag=np.ones(3))
     for name, k in zip(_axes("lag"), np.eye(3), strict=True):
         yield _term(name, kinds.LAG_OF_AXIS, priors, owner=reference, lag=k)
+    if priors.response > 0.0:
+        for n, power in enumerate(POWERS):
+            unit = 1.0 / (power * (2.0 * np.pi * priors.response_hz) ** power)
+            taken = {kinds.RESPONSE: [applied[kinds.RESPONSE][n] / unit]}
+            term = unit * np.eye(len(POWERS))[n]
+            yield _term(f"response_{power}", kinds.RESPONSE, priors, taken, reference, response=term)
     turn = np.full(1, 2.0 * np.pi)
     yield _term("reference_corner", kinds.REFERENCE_CORNER, priors, applied, reference, reference_corner=turn)
     yield _term("sensor_corner", kinds.SENSOR_CORNER, priors, applied, sensor_corner=turn)
@@ -235,10 +244,15 @@ def _at(name: str, kind: Kind, pose: Pose) -> Quantity:
 
 
 def _term(
-    name: str, kind: Kind, priors: Stated, applied: Mapping[Kind, float] | None = None, owner: str = "", **moves: Array
+    name: str,
+    kind: Kind,
+    priors: Stated,
+    applied: Mapping[Kind, Sequence[float]] | None = None,
+    owner: str = "",
+    **moves: Array,
 ) -> Term:
     """A nuisance that is common to all positions; `moves` are its effects, as fields of Term."""
-    taken, expected = (applied or {}).get(kind, 0.0), priors.of(kind.mean)
+    taken, expected = float((applied or {}).get(kind, [0.0])[0]), priors.of(kind.mean)
     return Term(Quantity(name, kind, owner=owner), priors.of(kind.prior), expected=expected, applied=taken, **moves)
 
 

@@ -24,6 +24,7 @@ MISFIT_LIMIT = 0.1  # of the signal; with right signs, 0.01 was left in the wors
 # clamp whose errors are twice its default uncertainty is still used.
 STATED_TIMES = 2.0
 LEAST_FELT = 0.1  # least sensitivity of a working output in its best direction, relative to the largest sensitivity
+MOST_BETWEEN_BANDS = 0.01  # relative; a pair that is far apart, or turned, deviates by several per cent
 CONFOUNDED_LAG = 0.01  # largest error of S due to an undetermined lag, relative to the scale of S
 
 
@@ -43,6 +44,7 @@ def reasons(
         _rank_reasons(windows, solution)
         or _sign_reasons(solution, turned)
         or _lag_reasons(solution, shares)
+        or _response_reasons(shares)
         or [*_prior_reasons(solution), *_misfit_reasons(solution)]
         or _nuisance_reasons(solution, shares.covariance)
         or _nothing_determined(solution, determined)
@@ -92,6 +94,17 @@ def _lag_reasons(solution: Solution, shares: Budget) -> list[str]:
         f"distinguish the lag from a rotation (u(lag) is {after * 1e3:.3g} ms, {before * 1e3:.3g} ms before the data), "
         f"and u(lag) alone gives S a standard uncertainty of {moved:.1%}, limit {CONFOUNDED_LAG:.0%}. This happens "
         "with motion in a plane at one frequency: excite another frequency or direction"
+    ]
+
+
+def _response_reasons(shares: Budget) -> list[str]:
+    bands = shares.between_bands
+    if bands.relative_u <= MOST_BETWEEN_BANDS:
+        return []
+    return [
+        f"no smooth response over frequency explains the bands: they deviate by {bands.relative_u:.1%}, limit "
+        f"{MOST_BETWEEN_BANDS:.0%}, most at {bands.at_hz:.3g} Hz by {bands.largest:.1%}; look there for a resonance, "
+        "a filter's edge, a source of noise or a loose mount, or calibrate with motion that leaves this band out"
     ]
 
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.excitation.bands import without_noise
 from calib.model import Array, Window, WindowSums, own_channels
 
 # Least power of an excited channel, relative to its noise. Noise reduces the slopes; the correction for it leaves a
@@ -105,8 +106,13 @@ def _reduced(window: Window, live: NDArray[np.bool_], along: Array, ahead: Array
         for k in np.flatnonzero(live):
             own = scatter[:, at + k, at + k]
             scatter[:, at + k, at + k] = own - np.minimum(sums.count * power[k], MOST_NOISE * own)
+    bands = None
+    if window.bands is not None and channels == m:
+        bands = without_noise(
+            replace(window.bands, products=np.where(np.outer(both, both), window.bands.products, 0.0)), np.sqrt(noise)
+        )
     if live.all():
-        return replace(window, sums=replace(sums, scatter=scatter))
+        return replace(window, sums=replace(sums, scatter=scatter), bands=bands)
     pairs = np.eye(channels // m)
     moving, rate = (
         np.asarray(np.kron(pairs, part), dtype=float) for part in (np.diag(live.astype(float)) + along, ahead)
@@ -119,4 +125,5 @@ def _reduced(window: Window, live: NDArray[np.bool_], along: Array, ahead: Array
         # The stated directions stay: the silent channel measured the shared motion, and its error is in `along`.
         pose=replace(pose, along=moving, along_rate_s=rate),
         sums=WindowSums(channels, sums.count, np.where(both, sums.mean, mean), scatter),
+        bands=bands,
     )

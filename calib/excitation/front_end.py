@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -31,6 +32,7 @@ from calib.signal.resampling import (
     differentiator_lost,
     resample,
 )
+from calib.signal.response import FLAT, Response, passed
 from calib.signal.samples import Samples
 
 # Samples beyond a window's ends, the reference's (the sensor's half of it): half the taps of resampling, of
@@ -53,12 +55,13 @@ class Unusable(ValueError):  # noqa: N818 - said of samples
 class Settings:
     """How windows are made. Method 3 as printed needs `leave_out` False (every point is kept) and `limit_band` False.
 
-    `limits`: what a window must keep to be used.
+    `limits`: what a window must keep to be used. `bands`: windows with motion hold sums in bands as well.
     """
 
     limits: Limits = DEFAULT_LIMITS
     leave_out: bool = True
     limit_band: bool = True
+    bands: bool = False
 
 
 DEFAULT_SETTINGS = Settings()
@@ -102,11 +105,13 @@ def windows_of(
     lag_s: float = 0.0,
     settings: Settings = DEFAULT_SETTINGS,
     floor: Array | None = None,
+    response: Response = FLAT,
 ) -> list[Window]:
     """The windows between two times in one pose, each with its verdict; empty where sensor and reference do not meet.
 
     `sensor` and `reference` hold the samples of `span_s` and of a margin around it (`margin_s`; for the sensor half of
-    it is enough). The sensor's indications are taken to come late by `lag_s`. Without a reference the pose must be one
+    it is enough). The sensor's indications are taken to come late by `lag_s`, and to be what `response` makes of the
+    motion. Without a reference the pose must be one
     at rest; `floor` (3,) is then the sensor's noise at rest elsewhere. Raises Unusable where a device cannot take
     part: the message says which one and why.
     """
@@ -120,7 +125,7 @@ def windows_of(
             raise Unusable(f"{name} was at the end of its range")
         _check_holes(sensor, sensor.device)
         _check_holes(reference, name)
-        found = _motion(pose, sensor, reference, instrument, span_s, lag_s, settings)
+        found = _motion(pose, sensor, reference, instrument, span_s, lag_s, settings, response)
     if sensor.saturated:
         reason = "the sensor was at the end of its range"
         found = [replace(w, used=False, reason=w.reason or reason) for w in found]
@@ -136,6 +141,7 @@ def aligned(
     *,
     limit_band: bool = True,
     leave_out: bool = True,
+    response: Response = FLAT,
 ) -> Aligned | None:
     """Samples within `span_s` that have a reference, in m/s2; None where there are fewer than two.
 
@@ -157,7 +163,7 @@ def aligned(
     if instrument.has_corner:
         u = np.hstack([without_corner(u, rate_hz, instrument.corner_hz), integral(u, rate_hz)])
         V = without_corner(V, sensor_rate_hz, instrument.sensor_corner_hz)
-    at = resample(u, reference.clock, time_s - lag_s, reference.first_index, lost)
+    at = resample(passed(u, rate_hz, response), reference.clock, time_s - lag_s, reference.first_index, lost)
     columns = np.vstack([V.T, at.u.T, at.du.T]).T  # the samples of a channel lie side by side, also in what is kept
     columns[~at.usable] = np.nan
     band_hz, noise = _band(raw, at.u[at.usable][:, :m], V, instrument, (rate_hz, sensor_rate_hz))
@@ -178,8 +184,7 @@ def aligned(
         "reference_filled_samples": (raw_filled & raw_inside).sum(),
         "reference_glitches": (odd & raw_inside).sum(),
     }
-    kept = columns.T[:, usable].T
-    points = Points(time_s[usable], kept[:, :3], kept[:, 3 : 3 + k], kept[:, 3 + k :])
+    points = Points(time_s[usable], *np.split(columns.T[:, usable].T, [3, 3 + k], axis=1))
     told = {name: float(count) for name, count in counts.items() if count}
     return Aligned(points, noise, clipped, independent, band_hz if limit_band else None, told)
 
@@ -226,11 +231,10 @@ def _motion(
     span_s: tuple[float, float],
     lag_s: float,
     settings: Settings,
+    response: Response,
 ) -> list[Window]:
-    found = aligned(
-        sensor, reference, instrument, span_s, lag_s, limit_band=settings.limit_band, leave_out=settings.leave_out
-    )
-    if found is None:
+    how = {"limit_band": settings.limit_band, "leave_out": settings.leave_out}
+    if (found := aligned(sensor, reference, instrument, span_s, lag_s, response=response, **how)) is None:
         return []
     if instrument.has_corner:
         pose = with_integral(pose)
@@ -242,8 +246,9 @@ def _motion(
 def _beside(pose: Pose, found: Aligned, settings: Settings) -> list[Window]:
     """Windows in motion and, where the reference feels gravity, at rest; each in one position against gravity."""
     points, limits, leave_out = found.points, settings.limits, settings.leave_out
+    in_motion = partial(motion_windows, pose, limits=limits, leave_out=leave_out, bands=settings.bands)
     if points.u.shape[1] != 3 or not feels_gravity(points.u):
-        return motion_windows(pose, points, limits, leave_out=leave_out)
+        return in_motion(points)
     rate_hz = (len(points.time_s) - 1) / (points.time_s[-1] - points.time_s[0])
     standing = standing_parts(points.u, rate_hz)
     # Between two turns by hand, gravity is the excitation, and what hands shake is left out.
@@ -251,7 +256,7 @@ def _beside(pose: Pose, found: Aligned, settings: Settings) -> list[Window]:
     windows: list[Window] = []
     for part in [points.part(a, b) for a, b in standing] or [points]:
         still = still_window(pose, part, limits, leave_out=leave_out) if turned and at_rest(part) else None
-        made = [still] if still else motion_windows(pose, part, limits, leave_out=leave_out)
+        made = [still] if still else in_motion(part)
         if standing and made and all(_silent(window) for window in made):
             made = [still_window(pose, part, limits, leave_out=leave_out)]
         windows += made

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from calib import geometry
 from calib.excitation import detection
+from calib.excitation.bands import band_sums
 from calib.excitation.rests import find_rests
 from calib.excitation.steadiness import step
 from calib.excitation.sums import factor, pool, window_sums
@@ -47,16 +48,17 @@ class Points(NamedTuple):
 
 
 def motion_windows(
-    pose: Pose, points: Points, limits: Limits = DEFAULT_LIMITS, *, leave_out: bool = True
+    pose: Pose, points: Points, limits: Limits = DEFAULT_LIMITS, *, leave_out: bool = True, bands: bool = False
 ) -> list[Window]:
     """The windows in samples of one pose: kind "motion" where the reference moves, kind "quiet" where it hardly moves.
 
-    If `leave_out` is false, the sums hold all points, knocks included (Method 3 as printed).
+    If `leave_out` is false, the sums hold all points, knocks included (Method 3 as printed). With `bands`, windows hold
+    sums in bands of frequency as well.
     """
     return [
         window
         for kind, first, stop in motion_parts(points.u, _rate(points.time_s))
-        for window in judged(kind, pose, points.part(first, stop), limits, leave_out=leave_out)
+        for window in judged(kind, pose, points.part(first, stop), limits, leave_out=leave_out, bands=bands)
     ]
 
 
@@ -76,8 +78,9 @@ def motion_parts(u: Array, rate_hz: float) -> list[tuple[Kind, int, int]]:
 
 
 def judged(
-    kind: Kind, pose: Pose, points: Points, limits: Limits = DEFAULT_LIMITS, *, leave_out: bool = True
-) -> list[Window]:
+    kind: Kind, pose: Pose, points: Points, limits: Limits = DEFAULT_LIMITS, *, leave_out: bool = True,
+    bands: bool = False,
+) -> list[Window]:  # fmt: skip
     """The windows of one part (see `motion_parts`), with their verdicts.
 
     The part is cut where samples are missing, and into windows not longer than `limits.longest_s`.
@@ -87,7 +90,7 @@ def judged(
         longest = round(limits.longest_s * _rate(points.time_s[first:stop]))
         for a, b in _pieces(first, stop, longest):
             part = points.part(a, b)
-            windows.append(_motion(kind, pose, part, _rate(part.time_s), limits, leave_out))
+            windows.append(_motion(kind, pose, part, _rate(part.time_s), limits, leave_out, bands))
     return windows
 
 
@@ -191,6 +194,7 @@ def _motion(
     rate_hz: float,
     limits: Limits,
     leave_out: bool,
+    bands: bool,
     stepped: tuple[float, float] | None = None,
 ) -> Window:
     """One window. It is judged without the knocks, also where they stay in its sums.
@@ -210,7 +214,7 @@ def _motion(
     sound = _sound(struck, rate_hz, limits)
     if leave_out and not sound.all():
         left = Points(*(column[sound] for column in points))
-        rest = _motion(kind, pose, left, rate_hz, limits, leave_out, stepped)
+        rest = _motion(kind, pose, left, rate_hz, limits, leave_out, bands, stepped)
         return _without_segments(rest, int((~sound).sum()))
     clean = sums = _sums(V, u, du, rate_hz, limits)
     if struck.any():
@@ -224,7 +228,11 @@ def _motion(
     verdict = judge(sums, struck, numbers, limits)
     if kind == "quiet" and verdict.used:
         verdict = Verdict(False, "the reference is calm here", verdict.numbers)
-    return _window(kind, pose, t, sums, verdict, int(struck.sum()) if leave_out else 0)
+    window = _window(kind, pose, t, sums, verdict, int(struck.sum()) if leave_out else 0)
+    if not (bands and verdict.used):
+        return window
+    # Without a knock's points the others would not be evenly spaced: the window's own regression takes their places.
+    return replace(window, bands=band_sums(u, du, np.where(struck[:, None], V - residual, V), rate_hz))
 
 
 def _sound(struck: NDArray[np.bool_], rate_hz: float, limits: Limits) -> NDArray[np.bool_]:

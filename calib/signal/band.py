@@ -104,6 +104,15 @@ def lowpass(x: Array, rate_hz: float, band_hz: float) -> Array:
     cut = 1.25 * band_hz / rate_hz
     taps = 2.0 * cut * np.sinc(2.0 * cut * n) * np.kaiser(2 * half + 1, 0.1102 * (STOP_BAND_DB - 8.7))
     taps /= taps.sum()
+    return convolved(x, taps)
+
+
+def convolved(x: Array, taps: Array) -> Array:
+    """x (n, m) convolved with symmetrically placed taps (2 half + 1,).
+
+    Rows within `half` of an end or of a missing sample (NaN) are NaN.
+    """
+    half = len(taps) // 2
     if len(x) <= 2 * half:
         return np.full_like(x, np.nan)
     out: Array = np.full(x.T.shape, np.nan).T

@@ -1,0 +1,96 @@
+"""Instruments that respond differently over frequency: is S right at its frequency, covered by U, or refused?
+
+    python -m benchmarks.response [--runs 100] [--write]
+
+A sensor and a tri-axial reference move together for 300 s; a filter is in the sensor or (its inverse) in the reference.
+The reference's error is drawn from its stated uncertainty of 0.1 %.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import argparse
+import multiprocessing
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from agent.calibrate.adjusting import adjusted
+from benchmarks.page import machine, write_part
+from calib.estimate.nuisances import Priors
+from tests.pair import Filter, lowpass, moving_mean, pair, resonance
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "response.md"
+U_REFERENCE = 1e-3
+BANDS_HZ = ((0.3, 2.0), (0.5, 20.0), (1.0, 40.0))
+RATIOS = (1.5, 2.0, 5.0, 20.0)  # of a filter's corner over the upper end of the motion
+FILTERS: dict[str, Callable[[float], Filter]] = {
+    "low-pass, order 1": lambda f: lowpass(1, f),
+    "low-pass, order 2": lambda f: lowpass(2, f),
+    "low-pass, order 4": lambda f: lowpass(4, f),
+    "moving mean": lambda f: moving_mean(0.443 / f),  # 3 dB down at f
+    "resonance, Q 5": lambda f: resonance(f, 5.0),
+    "resonance, Q 50": lambda f: resonance(f, 50.0),
+}
+Job = tuple[str, float, tuple[float, float], bool, int]
+Result = tuple[bool, float, float]  # refused; relative error of S_xx without the reference's, over its u with it
+
+
+def one(job: Job) -> Result:
+    """One run: whether it was refused, the relative error of S_xx besides the reference's, and error over u."""
+    name, ratio, band_hz, in_reference, seed = job
+    made_of = FILTERS[name](ratio * band_hz[1])
+    response: Filter = (lambda f: 1.0 / made_of(f)) if in_reference else made_of
+    error = U_REFERENCE * np.random.default_rng([seed, 99]).normal()
+    made = pair(seed, response, band_hz=band_hz, rate_hz=10.0 * band_hz[1], seconds=300.0, reference_error=float(error))
+    found = adjusted(
+        made.files, Priors(reference=U_REFERENCE, reference_frequency_hz=made.reference_frequency_hz)
+    ).calibration
+    if found is None:
+        return True, 0.0, 0.0
+    away = found.sensitivity[0, 0] / made.sensitivity[0, 0] - 1.0
+    u = found.standard_uncertainty[0] / made.sensitivity[0, 0]
+    return False, float(away + error), float(away / u)
+
+
+def table(runs: int) -> list[str]:
+    """The lines of the table, one for each filter, ratio and side; the three bands of motion are in each line."""
+    lines = [
+        "| filter | corner over motion | in | refused | RMS of S less the reference's error, % | within 2 u | most |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    keys = [(name, ratio, side) for name in FILTERS for ratio in RATIOS for side in (False, True)]
+    with multiprocessing.Pool() as pool:
+        for name, ratio, side in keys:
+            jobs = [(name, ratio, band, side, seed) for band in BANDS_HZ for seed in range(runs)]
+            found = pool.map(one, jobs, chunksize=1)
+            told = np.array([(away, z) for refused, away, z in found if not refused]).reshape(-1, 2)
+            rms = f"{100.0 * np.sqrt(np.mean(told[:, 0] ** 2)):.4f}" if len(told) else "-"
+            within = f"{np.count_nonzero(np.abs(told[:, 1]) <= 2.0)} of {len(told)}"
+            most = f"{np.abs(told[:, 1]).max():.1f}" if len(told) else "-"
+            where = "reference" if side else "sensor"
+            refused = f"{len(found) - len(told)} of {len(found)}"
+            line = f"| {name} | {ratio:g} | {where} | {refused} | {rms} | {within} | {most} |"
+            print(line, flush=True)
+            lines.append(line)
+    return lines
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--runs", type=int, default=100)
+    parser.add_argument("--write", action="store_true", help="write docs/response.md")
+    arguments = parser.parse_args()
+    lines = table(arguments.runs)
+    if arguments.write:
+        text = "\n".join([*lines, "", f"{arguments.runs} runs a band of motion; {machine()}."])
+        write_part("table", text, PAGE)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,117 @@
+"""Sums of a window in bands of frequency, beside its sums over time (calib.excitation.sums).
+
+Two instruments respond alike at one frequency only. The sums of a band tell the slopes of V on u and on du/dt in that
+band. u, du/dt and V are tapered alike, so that a linear relation between them stays what it is. By Parseval's theorem
+the sums of all bands together are the centred sums over time of the tapered window.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.model import Array, BandSums, Window
+
+BANDS_AN_OCTAVE = 6
+TAPER = 0.1  # of the window, at each end: longer than the impulse response of any filter of an instrument
+MORE_LINES = 6  # in a band, beside those that the regression on u and du/dt uses; a band with fewer joins the next one
+FEWEST_BANDS = 4
+# A band is used if the motion is so many times the reference's noise, in power: the correction leaves a tenth of it.
+OVER_NOISE = 100.0
+# A response is told by motion that has so large a share of its power in so many third octaves.
+LEAST_SHARE, FEWEST_THIRDS = 1e-2, 4
+BELOW, ABOVE = 1e-2, 1e-3  # shares of the motion's power outside its band: a response differs more above than below
+
+
+def band_sums(u: Array, du: Array, V: Array, rate_hz: float) -> BandSums | None:
+    """Band sums of evenly sampled u (n, m) in m/s2, du (n, m) in m/s3 and V (n, 3) in output unit.
+
+    None where the window is too short for a few bands, and without a reference or with its integrals
+    (calib.signal.corner).
+    """
+    n, m = u.shape
+    fewest = 2 * m + MORE_LINES
+    if m not in (1, 3) or n < 2 * FEWEST_BANDS * fewest:
+        return None
+    taper, density = _taper(n)
+    rows = np.vstack([u.T, du.T, V.T])
+    rows -= (rows @ taper / taper.sum())[:, None]
+    lines = np.fft.rfft(rows * taper, axis=1)[:, 1:]
+    frequency_hz: Array = np.fft.rfftfreq(n, 1.0 / rate_hz)[1:].astype(np.float64)
+    edges = _edges(frequency_hz, fewest)
+    products = np.array([(lines[:, a:b] @ lines[:, a:b].conj().T).real for a, b in itertools.pairwise(edges.tolist())])
+    ends_hz = np.append(frequency_hz, 0.5 * rate_hz)[edges]
+    nothing = np.zeros((len(products), 2 * m))
+    return BandSums(m, ends_hz[:-1], ends_hz[1:], 2.0 * np.diff(edges), density, 2.0 / n * products, nothing)
+
+
+def without_noise(bands: BandSums, noise: Array) -> BandSums:
+    """The bands with motion, the power of the reference's white noise subtracted.
+
+    `noise` (2, m): its rms in u and du/dt. Their ratio tells up to which frequency it is.
+    """
+    m, total = noise.shape[1], float(bands.points.sum())
+    power = np.zeros((len(bands.points), 2 * m))
+    kept = np.ones(len(power), dtype=bool)
+    for k in np.flatnonzero(noise[0] > 0.0):
+        end_hz = np.sqrt(3.0) * noise[1, k] / noise[0, k] / (2.0 * np.pi)
+        low, high = np.minimum(bands.low_hz, end_hz), np.minimum(bands.high_hz, end_hz)
+        power[:, k] = total * noise[0, k] ** 2 * (high - low) / end_hz
+        power[:, m + k] = total * noise[1, k] ** 2 * (high**3 - low**3) / end_hz**3
+        moved = bands.products[:, range(m), range(m)].sum(axis=1)
+        kept &= (moved > OVER_NOISE * power[:, k]) & (bands.high_hz <= end_hz)
+    products = bands.products.copy()
+    products[:, range(2 * m), range(2 * m)] -= power
+    low_hz, high_hz, points = (part[kept] for part in (bands.low_hz, bands.high_hz, bands.points))
+    return BandSums(m, low_hz, high_hz, points, bands.independent, products[kept], power[kept])
+
+
+@lru_cache(maxsize=4)
+def _taper(n: int) -> tuple[Array, float]:
+    """A cosine taper (n,) with mean square 1, and the share of the points that it leaves independent."""
+    ramp = max(int(TAPER * n), 1)
+    taper = np.ones(n)
+    taper[:ramp] = 0.5 - 0.5 * np.cos(np.pi * (np.arange(ramp) + 0.5) / ramp)
+    taper[n - ramp :] = taper[:ramp][::-1]
+    taper /= np.sqrt(np.mean(taper**2))
+    taper.flags.writeable = False
+    return taper, float(1.0 / np.mean(taper**4))
+
+
+def _edges(frequency_hz: Array, fewest: int) -> NDArray[np.int64]:
+    """Numbers of the lines at which bands begin, and the number of lines; each band has `fewest` lines or more."""
+    octave = np.floor(BANDS_AN_OCTAVE * np.log2(frequency_hz / frequency_hz[0])).astype(np.int64)
+    starts = [0]
+    for k in (np.flatnonzero(np.diff(octave)) + 1).tolist():
+        if k - starts[-1] >= fewest:
+            starts.append(k)
+    if len(starts) > 1 and len(frequency_hz) - starts[-1] < fewest:
+        starts.pop()
+    return np.array([*starts, len(frequency_hz)])
+
+
+def motion_band_hz(windows: Sequence[Window]) -> tuple[float, float] | None:
+    """The band in Hz of the motion of all windows. None where no window has bands, or where the motion is in a few
+    narrow bands only (sines), which cannot tell a response over frequency."""
+    bands = [w.bands for w in windows if w.bands is not None and len(w.bands.points)]
+    if not bands:
+        return None
+    low, high = (np.concatenate([getattr(b, name) for b in bands]) for name in ("low_hz", "high_hz"))
+    power = np.concatenate(
+        [np.trace(b.products[:, : b.reference_channels, : b.reference_channels], axis1=1, axis2=2) for b in bands]
+    )
+    if not power.sum() > 0.0:
+        return None
+    third = np.round(3.0 * np.log2(np.sqrt(low * high))).astype(int)
+    shares = np.array([power[third == k].sum() for k in np.unique(third)]) / power.sum()
+    if np.count_nonzero(shares > LEAST_SHARE) < FEWEST_THIRDS:
+        return None
+    ends = []
+    for edge, order, outside in ((low, np.argsort(low), BELOW), (high, np.argsort(-high), ABOVE)):
+        share = np.cumsum(power[order]) / power.sum()
+        ends.append(float(edge[order][np.searchsorted(share, outside)]))
+    return ends[0], ends[1]

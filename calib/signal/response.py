@@ -1,0 +1,92 @@
+"""The response of the sensor over that of the reference: ln h(i omega) = -lag i omega + sum over k of c_k (i omega)^k.
+
+The c_k are real: they are the cumulants of the impulse response between the two instruments. A low-pass filter of first
+order at omega_0 has c_k = (-1)^k / (k omega_0^k).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.model import Array
+from calib.signal.band import convolved
+
+Complex = NDArray[np.complex128]
+POWERS = (2, 3, 4, 5, 6)  # fixed beforehand: if the data chose the number of terms, u would be too small
+CYCLES = 3.0  # at the upper end of the motion, by which the taps of a filter reach to both sides
+SPACED = 6.0  # times the upper end of the motion: the rate of taps that is enough for it
+FINER = 8  # times the resolution of the taps, for the spectrum they are fitted to
+WEIGHT_ABOVE = 1e-3  # of the filter above the motion, where it must only stay small
+NEAR = 3e-3  # of ln h
+HELD = 1.1  # times the upper end of the motion: above it the polynomial is not continued
+
+
+@dataclass(frozen=True, slots=True)
+class Response:
+    """The terms c_k in s^k of a response, in the order of POWERS, and the upper end in Hz of the motion that told."""
+
+    terms: tuple[float, ...] = (0.0,) * len(POWERS)
+    to_hz: float = 0.0
+
+    @property
+    def is_flat(self) -> bool:
+        """Whether both instruments respond alike."""
+        return not any(self.terms)
+
+    def is_near(self, other: Response) -> bool:
+        """Whether they differ by less than NEAR in the motion: what is left is estimated exactly."""
+        frequency_hz = np.linspace(0.0, max(self.to_hz, other.to_hz), 50)
+        return bool(np.abs(self.at(frequency_hz) - other.at(frequency_hz)).max() < NEAR)
+
+    @property
+    def reach_s(self) -> float:
+        """How far its filter reaches to each side, in s."""
+        return 0.0 if self.is_flat else (CYCLES + 1.0) / self.to_hz
+
+    def at(self, frequency_hz: Array) -> Complex:
+        """ln h at these frequencies, without the lag."""
+        return np.asarray(by_term(2.0 * np.pi * frequency_hz) @ np.array(self.terms))
+
+
+FLAT = Response()
+
+
+def by_term(omega: Array) -> Complex:
+    """(i omega)^k (..., 5) for angular frequencies (...,): the derivatives of ln h by the terms."""
+    return np.stack([(1j * omega) ** k for k in POWERS], axis=-1)
+
+
+def passed(u: Array, rate_hz: float, response: Response) -> Array:
+    """u (n, m) as an instrument with this response shows it: 1 at 0 Hz.
+
+    Rows within the filter's length of an end or of a missing sample (NaN) are NaN.
+    """
+    if response.is_flat or not response.to_hz > 0.0:
+        return u
+    step = max(1, int(rate_hz / (SPACED * response.to_hz)))
+    taps = _taps(response, rate_hz / step)
+    spread = np.zeros((len(taps) - 1) * step + 1)
+    spread[::step] = taps
+    return convolved(u, spread)
+
+
+@lru_cache(maxsize=8)
+def _taps(response: Response, rate_hz: float) -> Array:
+    """Least-squares taps (2 half + 1,) of a filter that is the response in the motion, and no more than alike above."""
+    half = int(np.ceil(CYCLES * rate_hz / response.to_hz))
+    frequency_hz = np.linspace(0.0, 0.5 * rate_hz, FINER * half + 1)
+    end_hz = min(HELD * response.to_hz, 0.5 * rate_hz)
+    beyond = np.clip((frequency_hz - end_hz) / max(0.5 * rate_hz - end_hz, 1e-9 * rate_hz), 0.0, 1.0)
+    wanted = np.exp(response.at(np.minimum(frequency_hz, end_hz)) * (0.5 + 0.5 * np.cos(np.pi * beyond)))
+    weight = np.where(frequency_hz <= HELD * response.to_hz, 1.0, WEIGHT_ABOVE)
+    rows = np.exp(-2j * np.pi / rate_hz * frequency_hz[:, None] * np.arange(-half, half + 1)) * weight[:, None]
+    target = wanted * weight
+    taps, *_ = np.linalg.lstsq(
+        np.vstack([rows.real, rows.imag]), np.concatenate([target.real, target.imag]), rcond=1e-6
+    )
+    taps.flags.writeable = False
+    return np.asarray(taps)

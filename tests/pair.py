@@ -1,0 +1,104 @@
+"""A sensor and a tri-axial reference that move together, with any response over frequency between them.
+
+Signals are made line by line of their spectra, so that a response acts exactly, whatever the estimator thinks of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import butter, freqs
+
+from agent.calibrate.files import Files, Options
+from agent.calibrate.poses import PoseInterval
+from agent.calibrate.tables import ReferenceTable, SensorTable
+from calib.excitation.front_end import Settings
+from calib.geometry import beside
+from calib.model import Array
+from calib.signal.instrument import Instrument
+
+Complex = NDArray[np.complex128]
+Filter = Callable[[Array], Complex]
+
+OFFSET = np.array([0.1, -0.2, 0.3])
+BEYOND_S = 20.0  # at each end, so that no end of the record is an end of the motion
+
+
+def flat(frequency_hz: Array) -> Complex:
+    """Both respond alike."""
+    return np.ones(len(frequency_hz), dtype=complex)
+
+
+def lowpass(order: int, corner_hz: float) -> Filter:
+    """A Butterworth filter."""
+    b, a = butter(order, 2.0 * np.pi * corner_hz, analog=True)
+    return lambda frequency_hz: np.asarray(freqs(b, a, 2.0 * np.pi * frequency_hz)[1])
+
+
+def moving_mean(length_s: float) -> Filter:
+    """The mean over the last `length_s`."""
+    return lambda f: np.asarray(np.sinc(f * length_s) * np.exp(-1j * np.pi * f * length_s))
+
+
+def resonance(frequency_hz: float, quality: float) -> Filter:
+    """A mount that resonates."""
+    return lambda f: np.asarray(1.0 / (1.0 - (f / frequency_hz) ** 2 + 1j * f / frequency_hz / quality))
+
+
+def highpass(corner_hz: float) -> Filter:
+    """An AC-coupled instrument of first order."""
+    return lambda f: np.asarray(1j * f / (1j * f + corner_hz))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pair:
+    """The files of both, S at the reference frequency, and that frequency in Hz."""
+
+    files: Files
+    sensitivity: Array
+    reference_frequency_hz: float
+
+
+def pair(
+    seed: int,
+    response: Filter,
+    *,
+    band_hz: tuple[float, float] = (0.5, 10.0),
+    rate_hz: float = 100.0,
+    seconds: float = 120.0,
+    level_mps2: float = 1.0,
+    noise_mps2: float = 0.01,
+    reference_noise_mps2: float = 0.0,
+    reference_error: float = 0.0,
+) -> Pair:
+    """Random motion in `band_hz`, the same power at all its frequencies; `reference_error` is relative."""
+    random = np.random.default_rng(seed)
+    n = int((seconds + 2.0 * BEYOND_S) * rate_hz)
+    frequency_hz = np.fft.rfftfreq(n, 1.0 / rate_hz)
+    frequency_hz[0] = 1e-9
+    moved = (frequency_hz >= band_hz[0]) & (frequency_hz <= band_hz[1])
+    lines = (random.normal(size=(3, len(moved))) + 1j * random.normal(size=(3, len(moved)))) * moved
+    lines *= level_mps2 / np.fft.irfft(lines, n).std()
+    middle_hz = float(np.sqrt(band_hz[0] * band_hz[1]))
+    at_middle = float(abs(response(np.array([middle_hz]))[0]))
+    sensitivity = np.eye(3) + 0.02 * random.normal(size=(3, 3))
+    inside = slice(int(BEYOND_S * rate_hz), int((BEYOND_S + seconds) * rate_hz))
+    u = np.fft.irfft(lines, n).T[inside]
+    felt = np.fft.irfft(lines * response(frequency_hz) / at_middle, n)
+    V = (sensitivity @ felt).T[inside] + OFFSET
+    V += noise_mps2 * random.normal(size=V.shape)
+    u = u * (1.0 + reference_error) + reference_noise_mps2 * random.normal(size=u.shape)
+    time_s = np.arange(len(u)) / rate_hz
+    pose = beside(np.eye(3))
+    files = Files(
+        SensorTable(Path("sensor.csv"), time_s, V, None),
+        ReferenceTable(Path("reference.csv"), time_s, u, "acceleration", "ax_mps2"),
+        [PoseInterval(0.0, float(time_s[-1]), pose)],
+        Instrument(),
+        Options(Settings(bands=True)),
+    )
+    return Pair(files, sensitivity, middle_hz)

@@ -1,0 +1,149 @@
+"""Instruments that respond differently over frequency: S is right at its frequency, or the data are refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from agent.calibrate.adjusting import adjusted
+from agent.calibrate.outcome import Outcome
+from calib.estimate.adjustment import adjust
+from calib.estimate.nuisances import Priors
+from calib.excitation.bands import band_sums
+from calib.signal.response import POWERS, Response, passed
+from tests.pair import Filter, Pair, flat, highpass, lowpass, moving_mean, pair, resonance
+
+EXACT = {"reference": 1e-9, "rotation_rad": 1e-9, "lag_axis_s": 1e-9}
+ALIKE = {
+    "nothing": flat,
+    "low-pass, order 1": lowpass(1, 15.0),
+    "low-pass, order 2": lowpass(2, 15.5),
+    "low-pass, order 4": lowpass(4, 15.0),
+    "mean of 32 ms": moving_mean(0.032),
+    "resonance": resonance(22.0, 10.0),
+}
+
+
+def calibrated(made: Pair, **stated: float) -> Outcome:
+    return adjusted(made.files, Priors(**{**EXACT, "reference_frequency_hz": made.reference_frequency_hz, **stated}))
+
+
+def errors(made: Pair, found: Outcome) -> tuple[np.ndarray, np.ndarray]:  # type: ignore[type-arg]
+    assert found.calibration is not None, found.reasons
+    return found.calibration.sensitivity - made.sensitivity, found.calibration.standard_uncertainty[:9].reshape(3, 3)
+
+
+@pytest.mark.parametrize("name", ALIKE)
+def test_s_is_right_at_its_frequency(name: str) -> None:
+    made = pair(1, ALIKE[name])
+    error, u = errors(made, calibrated(made))
+    assert np.abs(error).max() < 1e-3
+    assert np.abs(error / u).max() < 4.0
+
+
+def test_a_constant_s_would_be_wrong() -> None:
+    """The same data, taken for instruments that respond alike: the tests above fail without the response."""
+    made = pair(1, ALIKE["low-pass, order 2"])
+    windows = [w for w in made.files.windows() if w.used]
+    found = adjust(windows, Priors(**EXACT)).calibration
+    assert np.abs(np.diag(found.sensitivity - made.sensitivity)).min() > 0.01
+
+
+def test_u_covers_with_the_error_of_the_reference() -> None:
+    """30 runs over five filters; n is 30, because the nine elements share the reference's error."""
+    random, inside = np.random.default_rng(7), 0
+    filters = list(ALIKE.values())
+    for seed in range(30):
+        made = pair(100 + seed, filters[seed % len(filters)], reference_error=2e-4 * random.normal(), seconds=60.0)
+        error, u = errors(made, calibrated(made, reference=2e-4))
+        inside += int(abs(error[0, 0]) <= 2.0 * u[0, 0])
+    assert inside >= 25  # 99.9 % of binomials of 30 with 0.9545
+
+
+def test_the_response_is_told_as_it_is() -> None:
+    response = ALIKE["low-pass, order 2"]
+    made = pair(2, response)
+    told = calibrated(made).more
+    assert told["reference_frequency_hz"] == pytest.approx(made.reference_frequency_hz)
+    low_hz, high_hz = told["valid_band_hz"]
+    assert low_hz < made.reference_frequency_hz < high_hz < 10.0
+    at_reference = abs(response(np.array([made.reference_frequency_hz]))[0])
+    for band in told["response"]:
+        middle_hz = np.sqrt(band["low_hz"] * band["high_hz"])
+        true = abs(response(np.array([middle_hz]))[0]) / at_reference * made.sensitivity[0, 0]
+        found = abs(band["sensitivity_re"][0, 0] + 1j * band["sensitivity_im"][0, 0])
+        assert found == pytest.approx(true, abs=4.0 * band["standard_uncertainty"][0, 0])
+    at_0hz = told["sensitivity_at_0hz"]
+    away = at_0hz["sensitivity"][0, 0] - made.sensitivity[0, 0] / at_reference
+    assert abs(away) < 4.0 * at_0hz["standard_uncertainty"][0, 0]
+
+
+@pytest.mark.parametrize(
+    "response", [lowpass(2, 7.0), lowpass(4, 10.0), resonance(7.0, 10.0), resonance(10.5, 30.0), highpass(0.2)]
+)
+def test_near_a_corner_or_a_resonance_s_is_right_or_refused(response: Filter) -> None:
+    made = pair(3, response)
+    found = calibrated(made)
+    assert (found.calibration is None) == bool(found.reasons)
+    if found.calibration is not None:
+        error, u = errors(made, found)
+        assert np.abs(error / u).max() < 4.0
+
+
+@pytest.mark.parametrize("response", [lowpass(4, 10.0), resonance(7.0, 10.0), highpass(0.2)])
+def test_what_no_smooth_response_explains_is_refused(response: Filter) -> None:
+    assert calibrated(pair(3, response)).reasons
+
+
+def test_a_band_that_deviates_is_named() -> None:
+    def notched(frequency_hz: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
+        return np.asarray(1.0 - 0.3 * np.exp(-0.5 * ((frequency_hz - 6.0) / 0.3) ** 2) + 0j)
+
+    (reason,) = calibrated(pair(4, notched)).reasons
+    assert "no smooth response over frequency" in reason
+    assert "most at 6.35 Hz" in reason
+
+
+def test_a_small_deviation_is_in_u() -> None:
+    made = pair(5, resonance(13.5, 10.0))
+    error, u = errors(made, calibrated(made))
+    assert np.abs(np.diag(error)).max() > 1e-4  # twice what noise leaves
+    assert np.abs(np.diag(error) / np.diag(u)).max() < 2.0
+
+
+def test_noise_of_the_reference_does_not_look_like_a_response() -> None:
+    made = pair(6, ALIKE["low-pass, order 2"], reference_noise_mps2=0.03)
+    error, u = errors(made, calibrated(made))
+    assert np.abs(error / u).max() < 4.0
+    assert np.abs(error).max() < 3e-3
+
+
+@pytest.mark.parametrize("rate_hz", [50.0, 1000.0])
+def test_the_filter_is_the_response_within_the_motion(rate_hz: float) -> None:
+    omega = 2.0 * np.pi * 15.0
+    terms = tuple((-1.0) ** k / (k * omega**k) for k in POWERS)
+    response = Response(terms, 10.0)
+    t = np.arange(int(20.0 * rate_hz)) / rate_hz
+    for frequency_hz in (0.5, 3.0, 9.9):
+        h = np.exp(sum(c * (2j * np.pi * frequency_hz) ** k for c, k in zip(terms, POWERS, strict=True)))
+        wave = np.exp(2j * np.pi * frequency_hz * t)
+        found = passed(np.column_stack([wave.real, wave.imag]), rate_hz, response)
+        sound = np.isfinite(found).all(axis=1)
+        assert sound.mean() > 0.9
+        np.testing.assert_allclose(found[sound, 0] + 1j * found[sound, 1], (h * wave)[sound], atol=1e-4)
+
+
+def test_bands_add_up_to_the_tapered_window() -> None:
+    """Parseval's theorem, with a taper and a mean that are made here anew."""
+    random = np.random.default_rng(8)
+    u, du, V = random.normal(size=(500, 1)), random.normal(size=(500, 1)), random.normal(size=(500, 3))
+    sums = band_sums(u, du, V, 100.0)
+    assert sums is not None
+    ramp = 0.5 - 0.5 * np.cos(np.pi * (np.arange(50) + 0.5) / 50)
+    taper = np.concatenate([ramp, np.ones(400), ramp[::-1]])
+    taper /= np.sqrt(np.mean(taper**2))
+    rows = np.hstack([u, du, V])
+    rows = (rows - taper @ rows / taper.sum()) * taper[:, None]
+    # The line at half the rate counts twice in the bands.
+    last = rows.T @ np.cos(np.pi * np.arange(500))
+    np.testing.assert_allclose(sums.products.sum(axis=0), rows.T @ rows + np.outer(last, last) / 500, atol=1e-9)
