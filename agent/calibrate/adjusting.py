@@ -39,12 +39,13 @@ RESPONSE_U = 10.0
 def adjusted(files: Files, priors: Priors) -> Outcome:
     """Make windows with the lag and the response over frequency taken out, and adjust them."""
     applied = Applied(0.0, priors.reference_corner_at_hz, priors.sensor_corner_at_hz)
-    stated: Priors | None = None  # with the response, whose scale is that of the motion
+    stated = priors  # later with the response, whose scale is that of the motion
     latest: dict[Applied, Adjustment] = {}
 
     def at(windows: Sequence[Window], taken: Applied) -> Adjustment:
         nonlocal stated
-        stated = stated or with_response(priors, windows)
+        if not stated.response:
+            stated = with_response(priors, windows)
         if taken not in latest:
             latest.clear()
             latest[taken] = adjust(_used(windows), stated, taken)

@@ -41,6 +41,14 @@ def test_s_is_right_at_its_frequency(name: str) -> None:
     assert np.abs(error / u).max() < 4.0
 
 
+def test_a_sensor_that_is_late_by_a_sixth_of_a_cycle() -> None:
+    """75 ms at 2 Hz: at first hardly a window can be used, so the response is told only when the lag is known."""
+    made = pair(0, lowpass(2, 3.0), band_hz=(0.3, 2.0), rate_hz=20.0, seconds=200.0)
+    error, u = errors(made, calibrated(made))
+    assert np.abs(error).max() < 1e-3
+    assert np.abs(error / u).max() < 4.0
+
+
 def test_a_constant_s_would_be_wrong() -> None:
     """The same data, taken for instruments that respond alike: the tests above fail without the response."""
     made = pair(1, ALIKE["low-pass, order 2"])
@@ -50,14 +58,14 @@ def test_a_constant_s_would_be_wrong() -> None:
 
 
 def test_u_covers_with_the_error_of_the_reference() -> None:
-    """30 runs over five filters; n is 30, because the nine elements share the reference's error."""
+    """20 runs over six filters; n is 20, because the nine elements share the reference's error."""
     random, inside = np.random.default_rng(7), 0
     filters = list(ALIKE.values())
-    for seed in range(30):
+    for seed in range(20):
         made = pair(100 + seed, filters[seed % len(filters)], reference_error=2e-4 * random.normal(), seconds=60.0)
         error, u = errors(made, calibrated(made, reference=2e-4))
         inside += int(abs(error[0, 0]) <= 2.0 * u[0, 0])
-    assert inside >= 25  # 99.9 % of binomials of 30 with 0.9545
+    assert inside >= 15  # 99.9 % of binomials of 20 with 0.9545
 
 
 def test_the_response_is_told_as_it_is() -> None:
