@@ -18,6 +18,7 @@ from agent.calibrate.outcome import Outcome, nothing_used
 from agent.calibrate.poses import PoseInterval, Setting, beside_reference, read_poses
 from agent.calibrate.priors import contradictions, instrument_of, priors_of
 from agent.calibrate.tables import ReferenceTable, TableError, read_reference, read_sensor
+from agent.terminal.text import for_drawing
 from calib.estimate.nuisances import Priors
 from calib.estimate.verdict import dead_reasons
 from calib.excitation.front_end import Settings
@@ -155,7 +156,7 @@ def _bar(label: str, length: int) -> AbstractContextManager[Any]:
     """A progress bar on a terminal, or nothing if `length` is 0. The context gives a function that takes each step."""
     if not length or not sys.stderr.isatty():
         return nullcontext(None)
-    return _Bar(click.progressbar(length=length, label=label, file=sys.stderr))
+    return _Bar(click.progressbar(length=length, label=label, file=for_drawing(sys.stderr)))
 
 
 class _Bar(AbstractContextManager[Any]):

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.calibrate.decimals import decimals
+from agent.config.files import open_file
 from calib.signal.stamps import kind_of
 
 Array = NDArray[np.float64]
@@ -92,7 +93,7 @@ def read_reference(path: Path, progress: Progress | None = None) -> ReferenceTab
 def open_table(path: Path) -> IO[bytes]:
     """The file, opened. Raises TableError."""
     try:
-        return path.open("rb")
+        return open_file(path)
     except OSError as error:
         raise TableError(f"{path}: {error.strerror}") from None
 

@@ -23,6 +23,7 @@ from agent.recording.records import Fault
 from agent.recording.repair import REPAIR_METADATA
 from agent.recording.replaying import Replay, ReplayedFile, Restore
 from agent.recording.signing import SIGNATURE_METADATA, verify_file
+from agent.terminal.text import say
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
@@ -72,11 +73,11 @@ def audit(files: tuple[Path, ...], public_key: Path | None, strict: bool, json_t
         key = load_public_key(public_key) if public_key is not None else None
         given = recordings_of(files)
     except (KeyFileError, StoreError) as error:
-        click.echo(str(error), err=True)
+        say(str(error), err=True)
         return 2
     if not given.paths and not given.up_to:
         # Where the store knows of recordings that are gone, the audit itself reports them.
-        click.echo(f"{files[0]}: this directory has no recordings (fieldcal-*.mcap)", err=True)
+        say(f"{files[0]}: this directory has no recordings (fieldcal-*.mcap)", err=True)
         return 2
     start = first_event(given.paths[0]) if given.paths else None
     if start is not None:
@@ -112,7 +113,7 @@ def run_audit(
     try:
         audited = audit_files(given, restore, strict=strict, key=key)
     except OSError as error:
-        click.echo(f"{error.filename}: {error.strerror}", err=True)
+        say(f"{error.filename}: {error.strerror}", err=True)
         return 2
     numbers = [file.replay.file_sequence for file in audited]
     lost = missing_after(max(numbers, default=0), given.up_to or 0)
@@ -124,9 +125,10 @@ def run_audit(
         click.echo(msgspec.json.encode(verdict).decode())
     else:
         for file in audited:
-            click.echo(describe(file))
+            for line in describe(file):
+                say(line)
         if lost:
-            click.echo(f"FAILED: {lost}")
+            say(f"FAILED: {lost}")
     return 0 if ok else 3
 
 
@@ -231,7 +233,7 @@ def _metadata_reasons(integrity: Integrity, replay: ReplayedFile) -> list[str]:
     return []
 
 
-def describe(file: AuditedFile) -> str:
+def describe(file: AuditedFile) -> list[str]:
     """The verdict as text: one line, and one more line for each reason and note."""
     replay = file.replay
     how = f"equal within {replay.tolerance:g}" if replay.tolerance else "equal bit for bit"
@@ -239,4 +241,4 @@ def describe(file: AuditedFile) -> str:
     lines = [f"{file.path}: {verdict}; {file.size} bytes, {file.chunks} chunks, {replay.events} events replayed"]
     lines += [f"  {reason}" for reason in file.reasons]
     lines += [f"  note: {note}" for note in file.notes if note not in file.reasons]
-    return "\n".join(lines)
+    return lines

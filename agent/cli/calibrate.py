@@ -13,6 +13,7 @@ from agent.calibrate.calibrating import calibrated
 from agent.calibrate.origin import origin
 from agent.calibrate.outcome import as_json, print_outcome
 from agent.calibrate.tables import REFERENCES, TableError
+from agent.terminal.text import say
 from calib.signal.instrument import QUANTITIES
 
 _REFERENCES = " or ".join(",".join(("time_s", *names)) for names in REFERENCES)
@@ -103,12 +104,12 @@ def calibrate(**options: Any) -> int:
     try:
         outcome = calibrated(options)
     except TableError as error:
-        click.echo(f"fieldcal calibrate: {error}", err=True)
+        say(f"fieldcal calibrate: {error}", err=True)
         return 2
     if options["json_to"]:
         click.echo(as_json(replace(outcome, more={**outcome.more, **origin(options)})))
     else:
         print_outcome(outcome)
     for reason in outcome.reasons:
-        click.echo(f"refused: {reason}", err=True)
+        say(f"refused: {reason}", err=True)
     return 3 if outcome.reasons else 0

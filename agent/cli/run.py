@@ -16,6 +16,7 @@ import click
 
 from agent.config import Config, ConfigError, load_config, parse_config
 from agent.delivery.history import StoreError
+from agent.terminal.text import say
 
 LOOPBACK = "tcp/127.0.0.1:7447"
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -61,7 +62,7 @@ def run(
                 settings, truth = load_config(config), None
         except ConfigError as error:
             for fault in error.faults:
-                click.echo(fault, err=True)
+                say(fault, err=True)
             return 2
         said = [stack.enter_context(router(LOOPBACK))] if with_router else []
         title = f"virtual bench, {preset}" if truth else str(config)
@@ -82,10 +83,10 @@ def serve(config: Config, data_dir: Path, watch: Any, duration_s: float | None) 
     try:
         ended = service.run(duration_s)
     except KeyFileError as error:
-        click.echo(f"fieldcal run: recording.signing_key: {error}", err=True)
+        say(f"fieldcal run: recording.signing_key: {error}", err=True)
         return 2
     except (StoreError, OSError) as error:
-        click.echo(f"fieldcal run: {error}", err=True)
+        say(f"fieldcal run: {error}", err=True)
         return 1
     if not ended:
         # A router or disk that does not respond blocks a thread. Do not wait for this thread.

@@ -60,6 +60,9 @@ def _options(raw: Mapping[str, Any], faults: list[Told]) -> Iterator[tuple[str, 
             faults.append((("devices", i, "driver"), str(error)))
         except ValidationError as error:
             faults += [(("devices", i, "options", *path), what) for path, what in _told(error, options)]
+        except (Exception, SystemExit) as error:  # of a plug-in
+            fault = f"driver {driver!r} fails on its options: {type(error).__name__}: {error}"
+            faults.append((("devices", i, "driver"), fault))
         else:
             yield str(device.get("name")), held
 

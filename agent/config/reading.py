@@ -9,6 +9,7 @@ from pathlib import Path as FilePath
 from typing import Any
 
 from agent.config.faults import faults_of, shown
+from agent.config.files import read_file
 from agent.config.lines import Path, lines_of
 from agent.config.names import Told
 from agent.config.whole import Config
@@ -34,14 +35,9 @@ class ConfigError(Exception):
 def load_config(path: FilePath) -> Config:
     """Read and check a TOML file, and the files it names. Raises ConfigError with all faults."""
     try:
-        with open(path, "rb") as file:
-            text = file.read(LARGEST_FILE + 1).decode("utf-8")
+        text = read_file(path, LARGEST_FILE).decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError([f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}"]) from None
-    if len(text) > LARGEST_FILE:
-        raise ConfigError(
-            [f"{path}: the file has more than {LARGEST_FILE} bytes, so it is not read; is it a configuration?"]
-        )
     if (deep := _LONG_KEY.search(text)) is not None:
         line = text.count("\n", 0, deep.start()) + 1
         raise ConfigError(

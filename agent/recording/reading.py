@@ -7,7 +7,6 @@ incomplete record at the end, reading ends after the last good record.
 from __future__ import annotations
 
 import contextlib
-import errno
 import fcntl
 import os
 from collections.abc import Iterator
@@ -19,6 +18,7 @@ from typing import BinaryIO
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
+from agent.config.files import open_file
 from agent.core.events import Event, Output, RunStart
 from agent.recording.messages import MessageError, decode, topic_of
 from agent.recording.records import ChunkMessage, Fault, Record, RecordError, content, refusal, unpack, walk
@@ -115,9 +115,7 @@ def open_recording(path: Path) -> BufferedReader:
 
     Raises OSError, also where `path` is a pipe or a device: reading from one could wait or last for ever.
     """
-    if path.exists() and not path.is_file() and not path.is_dir():
-        raise OSError(errno.EINVAL, "Not a file", str(path))
-    file = open(path, "rb")  # noqa: SIM115 - the caller closes it
+    file = open_file(path)
     with contextlib.suppress(OSError):  # the file system has no locks
         fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
     return file
