@@ -20,6 +20,7 @@ from mcap.records import Channel, Schema
 
 from agent.config.files import open_file
 from agent.core.events import Event, Output, RunStart
+from agent.recording.limits import MOST_RESULTS, Budget
 from agent.recording.messages import MessageError, decode, topic_of
 from agent.recording.records import ChunkMessage, Fault, Record, RecordError, content, refusal, unpack, walk
 
@@ -59,6 +60,8 @@ class RecordingReader:
                     if isinstance(item, Output):
                         if step is None or number != step.event_sequence:
                             raise refusal(record, f"a result of event {number} does not follow that event")
+                        if len(step.results) == MOST_RESULTS:
+                            raise refusal(record, f"event {number} has more than {MOST_RESULTS} results")
                         step.results.append(item)
                         continue
                     self._check_order(record, step, number, item)
@@ -83,9 +86,10 @@ class RecordingReader:
 
     def _items(self, file: BinaryIO) -> Iterator[tuple[Record, int, Event | Output]]:
         """Yield (chunk record, event sequence, event or result) for every message."""
+        budget = Budget()
         for record in walk(file, os.fstat(file.fileno()).st_size):
             if record.opcode == Opcode.CHUNK:
-                for part in content(record, unpack(record)):
+                for part in content(record, unpack(record, budget), budget):
                     if isinstance(part, ChunkMessage):
                         yield record, *self._item(record, part)
                     elif isinstance(part, Schema):

@@ -21,6 +21,7 @@ from mcap.records import Attachment, DataEnd, Footer, Metadata, SummaryOffset
 
 from agent.recording.files import ACTIVE_SUFFIX, recordings, sync_directory
 from agent.recording.integrity import check_integrity
+from agent.recording.limits import Budget
 from agent.recording.records import MAGIC, Record, RecordError, parse, unpack, walk
 from agent.recording.signing import SIGNATURE_METADATA, Signer
 from agent.recording.summary import KINDS, DerivedSummary
@@ -96,7 +97,7 @@ def _sound_part(file: BinaryIO, size: int) -> _Sound:
     try:
         for record in walk(file, size):
             if broken is not None:
-                goes_on |= record.opcode == Opcode.CHUNK and _is_sound(record)
+                goes_on = goes_on or (record.opcode == Opcode.CHUNK and _is_sound(record))
                 continue
             if record.opcode == Opcode.DATA_END:
                 break
@@ -118,7 +119,7 @@ def _sound_part(file: BinaryIO, size: int) -> _Sound:
 
 def _is_sound(chunk: Record) -> bool:
     try:
-        unpack(chunk)
+        unpack(chunk, Budget())
     except RecordError:
         return False
     return True
