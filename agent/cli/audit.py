@@ -53,9 +53,7 @@ class AuditedFile(msgspec.Struct, kw_only=True):
 @click.option(
     "--public-key", metavar="K", type=click.Path(path_type=Path), help="Require signatures by this key (PEM)."
 )
-@click.option(
-    "--strict", is_flag=True, help="Fail also for repaired files, and where a result cannot be decided on this machine."
-)
+@click.option("--strict", is_flag=True, help="Fail also for repaired files, and for files of another CPU or version.")
 @click.option("--json", "json_to", type=click.Choice(["-"]), help="Print one JSON object on standard output.")
 def audit(files: tuple[Path, ...], public_key: Path | None, strict: bool, json_to: str | None) -> int:
     """Check recordings, given in order: every byte, whether results follow from the data, whether a file is missing.
@@ -216,6 +214,11 @@ def _reasons(integrity: Integrity, replay: ReplayedFile) -> list[str]:
         reasons.append(f"cannot be replayed: {replay.refused}")
     if replay.first_difference is not None:
         reasons.append(f"the results do not follow from the data: {replay.first_difference}")
+    if replay.undecidable:
+        reasons.append(
+            "not decided: a decision is so close that this CPU takes another one than was recorded, so what follows in "
+            "this file is not checked; audit the file on a CPU like the one that recorded it"
+        )
     if replay.different > 1:
         reasons.append(f"results differ after {replay.different} events")
     if not replay.events:
