@@ -14,12 +14,12 @@ from typing import Any
 
 import click
 
+from agent.cli.stopping import STOP_SIGNALS, StoppedAtStart, stopped_by_signals
 from agent.config import Config, ConfigError, load_config, parse_config
 from agent.delivery.history import StoreError
 from agent.terminal.text import say
 
 LOOPBACK = "tcp/127.0.0.1:7447"
-STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @click.command()
@@ -78,10 +78,12 @@ def serve(config: Config, data_dir: Path, watch: Any, duration_s: float | None) 
     from agent.config.key_file import KeyFileError
 
     service = Service(config, data_dir, watch)
-    for number in STOP_SIGNALS:
-        signal.signal(number, lambda *_: service.stop())
     try:
-        ended = service.run(duration_s)
+        with stopped_by_signals(lambda: service.begun, service.stop):
+            ended = service.run(duration_s)
+    except StoppedAtStart:
+        say("stopped before the start was complete", err=True)
+        return 0
     except KeyFileError as error:
         say(f"fieldcal run: recording.signing_key: {error}", err=True)
         return 2
