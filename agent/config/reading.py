@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Iterator
 from pathlib import Path as FilePath
 from typing import Any
 
 from agent.config.faults import faults_of, shown
 from agent.config.files import read_file
-from agent.config.lines import Path, lines_of
+from agent.config.lines import lines_of
 from agent.config.names import Told
+from agent.config.size import size_faults
 from agent.config.whole import Config
 
 LARGEST_FILE = 4 << 20  # bytes; a day with one pose each second needs as many
 # The sections of a configuration have four levels. tomllib needs quadratic time for a long dotted key: hours for 4 MB.
 DEEPEST_KEY = 16
-LONGEST_LIST = 86_400  # one pose each second of a day; each fault in a list needs 2 kB and 25 us
 SHOWN_FAULTS = 100
 _PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+"""
 _LINE = re.compile(r"\(at line (\d+), column \d+\)")  # as in the messages of tomllib
@@ -51,8 +50,8 @@ def load_config(path: FilePath) -> Config:
         raise ConfigError([f"{path}: {place}not TOML: {error}"]) from None
     except RecursionError:
         raise ConfigError([f"{path}: its tables or lists are nested too deep to be read"]) from None
-    if longest := list(_long_lists(raw, ())):
-        raise _refused(longest, str(path), text)
+    if too_large := size_faults(raw):
+        raise _refused(too_large, str(path), text)
     return parse_config(raw, str(path), text)
 
 
@@ -76,12 +75,3 @@ def _refused(faults: list[Told], origin: str, text: str) -> ConfigError:
         told.append(f"{origin}: {place}{f'{shown(path)}: ' if path else ''}{what}")
     more = len(faults) - SHOWN_FAULTS
     return ConfigError(told + ([f"{origin}: and {more} more faults, not shown"] if more > 0 else []))
-
-
-def _long_lists(value: Any, path: Path) -> Iterator[Told]:
-    if isinstance(value, list) and len(value) > LONGEST_LIST:
-        yield path, f"has {len(value)} entries, at most {LONGEST_LIST} are allowed; shorten it"
-    elif isinstance(value, dict | list):
-        for name, item in value.items() if isinstance(value, dict) else enumerate(value):
-            if isinstance(item, dict | list):
-                yield from _long_lists(item, (*path, name))
