@@ -99,9 +99,9 @@ def guard_standard_streams() -> None:
 def _guarded(stream: Any, descriptor: int) -> GuardedStream:
     if not isinstance(stream, io.TextIOWrapper):
         return GuardedStream(open(descriptor, "wb", closefd=False), encoding="utf-8", errors="replace")
-    encoding, line_buffering = stream.encoding, stream.line_buffering
+    kept = {name: getattr(stream, name) for name in ("encoding", "line_buffering", "write_through")}
     # An output without a plus-minus sign is better than none.
-    return GuardedStream(stream.detach(), encoding=encoding, errors="replace", line_buffering=line_buffering)
+    return GuardedStream(stream.detach(), errors="replace", **kept)
 
 
 def _written(match: re.Match[str]) -> str:

@@ -17,7 +17,6 @@ POSE = "{a = 1, b = 2, c = 3, d = 4}"
 HOSTILE: dict[str, Callable[[], str]] = {
     "unknown settings": lambda: HEAD + "".join(f"a{k} = 1\n" for k in range(120_000)),
     "a day of wrong poses": lambda: f"{HEAD}[[channels]]\nsensor = 'm'\nposes = [{','.join([POSE] * 30_000)}]\n",
-    "devices of unknown drivers": lambda: HEAD + "".join(f'[[devices]]\ndriver = "d{k}"\n' for k in range(30_000)),
     "a few thousand devices": lambda: HEAD + "".join(f'[[devices]]\ndriver = "d{k}"\n' for k in range(6_000)),
 }
 

@@ -84,7 +84,6 @@ def test_a_program_without_standard_streams_runs(tmp_path: Path) -> None:
     assert "Traceback" not in told.stderr
     recording = next(data.glob("fieldcal-*.mcap")).read_bytes()
     assert recording.startswith(b"\x89MCAP0\r\n"), "what is printed has not reached the recording"
-    assert run("check", tmp_path / "none.toml", shell=">&- 2>&- <&-").returncode == 2
 
 
 def install(directory: Path, source: str) -> None:

@@ -149,12 +149,6 @@ def test_whatever_the_program_prints_is_guarded(tmp_path: Path) -> None:
     text = re.sub(r"\x1b\[[0-9;]*m", "", told.decode()).replace("\r\n", "")
     assert "\\u001b]0;owned\\u0007" in text
     harmless(text)
-    named = subprocess.run(
-        [sys.executable, "-m", "agent", "check", str(tmp_path / HOSTILE.replace("\x00", ""))],
-        cwd=ROOT, capture_output=True, timeout=30, check=False,
-    )  # fmt: skip
-    assert (named.returncode, named.stderr.count(b"\n")) == (2, 1)
-    harmless(named.stderr.decode().replace("\n", ""))
 
 
 def test_a_page_and_a_figure_obey_nothing() -> None:
@@ -166,17 +160,17 @@ def test_a_page_and_a_figure_obey_nothing() -> None:
     assert len(figure_text("y" * 10_000)) < 100
 
 
-@pytest.mark.parametrize("label", ["$\\frac{-->" + HOSTILE, "y" * 100_000])
-def test_a_report_of_a_hostile_result_is_made(tmp_path: Path, label: str) -> None:
+def test_a_report_of_a_hostile_result_is_made(tmp_path: Path) -> None:
     """Names, units and reasons in a RESULT.json that somebody else made."""
     pytest.importorskip("matplotlib")
+    label, long = "$\\frac{-->" + HOSTILE, "y" * 100_000
     result = {
         "sensitivity": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
         "offset": [0.0, 0.0, 0.0],
         "standard_uncertainty": {"sensitivity": [[0.01] * 3] * 3, "offset": [0.1] * 3},
-        "budget": {label: [0.01] * 12},
+        "budget": {label: [0.01] * 12, long: [0.02] * 12},
         "status": "refused",
-        "reasons": [label],
+        "reasons": [label, long],
         "method": label,
         "output_unit": label,
         "windows": [{"start_s": 0.0, "stop_s": 1.0, "used": True, "reason": "", "points": 3, "position": label}],
