@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import sys
 
@@ -12,9 +11,10 @@ def main() -> None:
     # scipy carries its own OpenBLAS beside numpy's; both read this when they load, and sums over another number of
     # threads differ in the last bit.
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="replace")  # an output without a plus-minus sign is better than none
     try:
+        from agent.terminal.text import guard_standard_streams
+
+        guard_standard_streams()
         from agent.cli.main import run_cli
 
         status = run_cli()

@@ -134,7 +134,9 @@ def load_driver(name: str) -> DriverFactory:
         entry = found[0]
     try:
         driver = entry.load()
-    except Exception as error:  # a plug-in may raise any error while it is imported
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # a plug-in may raise anything while it is imported, also SystemExit
         raise ConfigurationError(f"driver {name!r} ({entry.value}) cannot be loaded: {error!r}") from error
     model = getattr(driver, "options_model", None)
     if not (callable(driver) and isinstance(model, type) and issubclass(model, Options)):

@@ -108,7 +108,7 @@ class Reader(threading.Thread):
                 self._report_lost(str(error))
             except DeviceError as error:
                 self._report_lost(str(error))
-            except Exception as error:  # a driver's own bug must not end the agent
+            except (Exception, SystemExit) as error:  # a driver's own bug must not end the agent, nor this thread
                 self._report_lost(f"fault in the driver: {type(error).__name__}: {error}")
             finally:
                 self._sensor.close()

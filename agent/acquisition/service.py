@@ -54,9 +54,10 @@ class Service:
         self._watch = watch
         self._stop_request = threading.Event()
         self._sequence = 0
+        self.begun = False  # whether the devices are read; before that, a stop is as harmless as a power cut
 
     def stop(self) -> None:
-        """End the run; `run` returns within two seconds."""
+        """End the run that has begun; `run` returns within two seconds."""
         self._stop_request.set()
 
     def run(self, duration_s: float | None) -> bool:
@@ -102,6 +103,7 @@ class Service:
         writer = RecordingThread(self._recorder, self._deliver, flush_s=config.recording.flush_s)
         plant = Plant(self._data_dir, events, writer, self._recorder, Outbox(self._store), self._publisher)
         self._supervisor = Supervisor(config, self._run_id, self._origin_ns, plant, Notifier(os.environ))
+        self.begun = True
         try:
             writer.put(0, self._run_start(continuation=False), [])
             with few_objects():

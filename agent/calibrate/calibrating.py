@@ -23,6 +23,7 @@ from agent.calibrate.tables import ReferenceTable, SensorTable, read_reference, 
 from agent.calibrate.wrong_unit import check_gravity
 from agent.reading.source import Progress, TableError
 from agent.reading.units import Sensitivity, sensitivity_of
+from agent.terminal.text import for_drawing
 from calib.estimate.nuisances import Priors
 from calib.estimate.verdict import dead_reasons
 from calib.excitation.front_end import Settings
@@ -191,7 +192,7 @@ def _bar(label: str, length: int) -> AbstractContextManager[Any]:
     """A progress bar on a terminal, or nothing if `length` is 0. The context gives a function that takes each step."""
     if not length or not sys.stderr.isatty():
         return nullcontext(None)
-    return _Bar(click.progressbar(length=length, label=label, file=sys.stderr))
+    return _Bar(click.progressbar(length=length, label=label, file=for_drawing(sys.stderr)))
 
 
 class _Bar(AbstractContextManager[Any]):

@@ -9,6 +9,8 @@ from typing import Any
 
 import msgspec
 
+from agent.config.files import open_file
+
 FILES = ("sensor", "reference", "poses", "prior")  # options of `fieldcal calibrate` that name a file
 
 
@@ -22,7 +24,7 @@ class SourceFile(msgspec.Struct, frozen=True):
 
 def source_file(path: Path) -> SourceFile:
     """Measure and hash a file. Raises OSError."""
-    with open(path, "rb") as file:
+    with open_file(path) as file:
         return SourceFile(str(path), path.stat().st_size, hashlib.file_digest(file, "sha256").hexdigest())
 
 

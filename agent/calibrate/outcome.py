@@ -126,15 +126,15 @@ def _plain(value: Any) -> Any:
 
 def print_outcome(outcome: Outcome) -> None:
     """Print the windows with their verdicts, and S and Q with their expanded uncertainties."""
-    from rich.console import Console
+    from agent.terminal.console import TextConsole
 
-    console = Console(highlight=False, markup=False, width=None if sys.stdout.isatty() else FILE_WIDTH)
+    console = TextConsole(width=None if sys.stdout.isatty() else FILE_WIDTH)
     _print_windows(console, outcome.windows)
     if outcome.calibration is not None:
         _print_calibration(console, outcome)
     for n in outcome.nuisances:
         console.print(f"  {n.name}: {plus_minus(n.value, outcome.coverage_factor * n.standard_uncertainty)} {n.unit}")
-    console.print(f"  sampling rate {outcome.rate_hz:.7g} Hz", soft_wrap=True)
+    console.print_line(f"  sampling rate {outcome.rate_hz:.7g} Hz")
 
 
 def _print_calibration(console: Any, outcome: Outcome) -> None:
@@ -155,19 +155,18 @@ def _print_calibration(console: Any, outcome: Outcome) -> None:
     kind = f", {outcome.uncertainty_kind}" if outcome.uncertainty_kind else ""
     console.print(f"  S in output unit per m/s², Q in output unit, U with k = {outcome.coverage_factor:.3g}{kind}")
     if np.any(np.isfinite(values) & ~c.determined):
-        console.print(f"  {KNOWN_BEFORE} known before: the data do not halve its uncertainty", soft_wrap=True)
+        console.print_line(f"  {KNOWN_BEFORE} known before: the data do not halve its uncertainty")
     _print_sources(console, outcome)
     _print_frequencies(console, outcome)
-    console.print(f"  method {outcome.method}, {sum(w.used for w in outcome.windows)} windows", soft_wrap=True)
+    console.print_line(f"  method {outcome.method}, {sum(w.used for w in outcome.windows)} windows")
 
 
 def _print_frequencies(console: Any, outcome: Outcome) -> None:
     if outcome.more.get("valid_band_hz"):
         low_hz, high_hz = outcome.more["valid_band_hz"]
         at_hz = outcome.more["reference_frequency_hz"]
-        console.print(
-            f"  S holds at {at_hz:.3g} Hz; from {low_hz:.3g} to {high_hz:.3g} Hz it is right within a third of U",
-            soft_wrap=True,
+        console.print_line(
+            f"  S holds at {at_hz:.3g} Hz; from {low_hz:.3g} to {high_hz:.3g} Hz it is right within a third of U"
         )
 
 
@@ -186,7 +185,7 @@ def _print_sources(console: Any, outcome: Outcome) -> None:
         parts = {name: _of(source, worst) for name, source in outcome.more["budget"].items()}
         large = sorted((name for name in parts if parts[name] > 0.1 * u[worst]), key=lambda name: -parts[name])
         sources = ", ".join(f"{name} {parts[name]:.2g}" for name in large)
-        console.print(f"  u({PARAMETERS[worst]}) = {u[worst]:.2g}: {sources}", soft_wrap=True)
+        console.print_line(f"  u({PARAMETERS[worst]}) = {u[worst]:.2g}: {sources}")
 
 
 def _of(source: Mapping[str, float] | Array, k: int) -> float:
@@ -204,4 +203,4 @@ def _print_windows(console: Any, windows: Sequence[Window]) -> None:
     for w in windows:
         left = f", {w.left_out} left out" if w.left_out else ""
         verdict = f"{w.points} points{left}" if w.used else f"not used: {w.reason}"
-        console.print(f"  {w.start_s:10.3f} to {w.stop_s:10.3f} s  {w.pose.position}: {verdict}", soft_wrap=True)
+        console.print_line(f"  {w.start_s:10.3f} to {w.stop_s:10.3f} s  {w.pose.position}: {verdict}")

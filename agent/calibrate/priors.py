@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from agent.config.files import read_file
 from agent.reading.source import TableError
 from calib.estimate.nuisances import Priors
 from calib.estimate.quantities import PRIORS
@@ -61,10 +62,13 @@ def _known(options: dict[str, Any]) -> tuple[Array | None, Array | None]:
     return None, None
 
 
+LARGEST_PRIOR = 64 << 20  # bytes; a result lists all its windows, each with 0.3 kB
+
+
 def _read_prior(path: Path) -> tuple[Array, Array]:
     """Values and covariance from a result of this command. A value that is null there is not known."""
     try:
-        told = json.loads(path.read_text())
+        told = json.loads(read_file(path, LARGEST_PRIOR))
         values = np.append(np.array(told["sensitivity"], dtype=float).ravel(), np.array(told["offset"], dtype=float))
         covariance = np.array(told["covariance"], dtype=float)
     except OSError as error:

@@ -26,6 +26,7 @@ from agent.recording.replaying import Replay, ReplayedFile, Restore
 from agent.recording.results_chain import EPOCH, FILE_METADATA, PREVIOUS_RESULTS
 from agent.recording.set_aside import deleted as statements
 from agent.recording.signing import SIGNATURE_METADATA, Statement, signed_results, verify_file
+from agent.terminal.text import say
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
@@ -63,9 +64,7 @@ class AuditedFile(msgspec.Struct, kw_only=True):
     "--witness", metavar="DIR", type=click.Path(path_type=Path),
     help="The directory of `fieldcal witness`, with the heads that it kept of this gateway.",
 )  # fmt: skip
-@click.option(
-    "--strict", is_flag=True, help="Fail also for repaired files, and where a result cannot be decided on this machine."
-)
+@click.option("--strict", is_flag=True, help="Fail also for repaired files, and for files of another CPU or version.")
 @click.option("--json", "json_to", type=click.Choice(["-"]), help="Print one JSON object on standard output.")
 def audit(
     files: tuple[Path, ...],
@@ -95,14 +94,14 @@ def audit(
         if witness is not None:
             add_witnessed(given, witness)
     except (KeyFileError, StoreError, SignedTextError, WitnessError) as error:
-        click.echo(str(error), err=True)
+        say(str(error), err=True)
         return 2
     except OSError as error:
-        click.echo(f"{error.filename}: {error.strerror}", err=True)
+        say(f"{error.filename}: {error.strerror}", err=True)
         return 2
     if not given.paths and not given.up_to:
         # Where the store knows of recordings that are gone, the audit itself reports them.
-        click.echo(f"{files[0]}: this directory has no recordings (fieldcal-*.mcap)", err=True)
+        say(f"{files[0]}: this directory has no recordings (fieldcal-*.mcap)", err=True)
         return 2
     start = first_event(given.paths[0]) if given.paths else None
     if start is not None:
@@ -119,7 +118,7 @@ def run_audit(
         end = check_end(given.heads, links, deleted, key, time.time_ns())
         end.reasons += given.faults
     except OSError as error:
-        click.echo(f"{error.filename}: {error.strerror}", err=True)
+        say(f"{error.filename}: {error.strerror}", err=True)
         return 2
     if strict and key is not None and not given.heads and links[-1:] and links[-1].signed_results is not None:
         end.reasons.append(f"there is no {HEAD_NAME} beside signed recordings, and none was given (--head, --witness)")
@@ -133,11 +132,12 @@ def run_audit(
         click.echo(msgspec.json.encode(verdict).decode())
     else:
         for file in audited:
-            click.echo(describe(file))
+            for line in describe(file):
+                say(line)
         if lost:
-            click.echo(f"FAILED: {lost}")
+            say(f"FAILED: {lost}")
         for line in end.describe():
-            click.echo(line)
+            say(line)
     return 0 if ok else 3
 
 
@@ -245,6 +245,11 @@ def _reasons(integrity: Integrity, replay: ReplayedFile) -> list[str]:
         reasons.append(f"cannot be replayed: {replay.refused}")
     if replay.first_difference is not None:
         reasons.append(f"the results do not follow from the data: {replay.first_difference}")
+    if replay.undecidable:
+        reasons.append(
+            "not decided: a decision is so close that this CPU takes another one than was recorded, so what follows in "
+            "this file is not checked; audit the file on a CPU like the one that recorded it"
+        )
     if replay.different > 1:
         reasons.append(f"results differ after {replay.different} events")
     if not replay.events:
@@ -262,7 +267,7 @@ def _metadata_reasons(integrity: Integrity, replay: ReplayedFile) -> list[str]:
     return []
 
 
-def describe(file: AuditedFile) -> str:
+def describe(file: AuditedFile) -> list[str]:
     """The verdict as text: one line, and one more line for each reason and note."""
     replay = file.replay
     how = f"equal within {replay.tolerance:g}" if replay.tolerance else "equal bit for bit"
@@ -270,4 +275,4 @@ def describe(file: AuditedFile) -> str:
     lines = [f"{file.path}: {verdict}; {file.size} bytes, {file.chunks} chunks, {replay.events} events replayed"]
     lines += [f"  {reason}" for reason in file.reasons]
     lines += [f"  note: {note}" for note in file.notes if note not in file.reasons]
-    return "\n".join(lines)
+    return lines

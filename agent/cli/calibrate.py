@@ -14,6 +14,7 @@ from agent.calibrate.origin import origin
 from agent.calibrate.outcome import as_json, print_outcome
 from agent.calibrate.tables import REFERENCES
 from agent.reading.source import TableError
+from agent.terminal.text import say
 from calib.signal.instrument import QUANTITIES
 
 _REFERENCES = " or ".join(",".join(("time_s", *names)) for names in REFERENCES)
@@ -117,7 +118,7 @@ def calibrate(**options: Any) -> int:
     try:
         outcome = calibrated(options)
     except TableError as error:
-        click.echo(f"fieldcal calibrate: {error}", err=True)
+        say(f"fieldcal calibrate: {error}", err=True)
         return 2
     json_to: Path | None = options["json_to"]
     if json_to is not None:
@@ -130,5 +131,5 @@ def calibrate(**options: Any) -> int:
     if json_to != Path("-"):
         print_outcome(outcome)
     for reason in outcome.reasons:
-        click.echo(f"refused: {reason}", err=True)
+        say(f"refused: {reason}", err=True)
     return 3 if outcome.reasons else 0

@@ -9,6 +9,7 @@ import click
 
 from agent.config import ConfigError, load_config
 from agent.config.tls import expiry_warning
+from agent.terminal.text import say
 
 
 @click.command()
@@ -19,16 +20,16 @@ def check(config: Path) -> int:
         loaded = load_config(config)
     except ConfigError as error:
         for fault in error.faults:
-            click.echo(fault, err=True)
+            say(fault, err=True)
         return 2
     poses = sum(len(channel.poses) for channel in loaded.channels)
     stops = sum(len(channel.positions) for channel in loaded.channels if isinstance(channel.positions, tuple))
     if loaded.zenoh.tls and (warning := expiry_warning(loaded.zenoh.tls.files, datetime.now(UTC))):
-        click.echo(f"{config}: zenoh.tls.{warning}", err=True)
+        say(f"{config}: zenoh.tls.{warning}", err=True)
     for i, channel in enumerate(loaded.channels):
         for section, beside in zip(("", "check_reference."), channel.by_reference, strict=False):
             if overdue := beside.certificate.overdue(datetime.now(UTC)):
-                click.echo(f"{config}: channels.{i}.{section}certificate.{overdue}", err=True)
+                say(f"{config}: channels.{i}.{section}certificate.{overdue}", err=True)
     told = f"{poses} poses" + (f", {stops} positions that the agent finds" if stops else "")
-    click.echo(f"{config}: good; {len(loaded.devices)} devices, {len(loaded.channels)} channels, {told}")
+    say(f"{config}: good; {len(loaded.devices)} devices, {len(loaded.channels)} channels, {told}")
     return 0

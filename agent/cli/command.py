@@ -17,9 +17,11 @@ from agent.commanding.envelope import Order, seal
 from agent.commanding.local import LocalAgent
 from agent.commanding.refusal import Refused
 from agent.commanding.sending import send
+from agent.config.key_file import KeyFileError
 from agent.delivery.keys import CHUNK, gateway_key
 from agent.delivery.session import EndpointError
-from agent.keys.files import KeyFileError, SigningKey, read_signing_key
+from agent.keys.files import SigningKey, read_signing_key
+from agent.terminal.text import say
 
 VALID_S = 60.0  # s; a command takes effect when it arrives, or not at all
 
@@ -144,12 +146,12 @@ def _run(
     except EndpointError as error:
         raise click.UsageError(str(error)) from None
     except (OSError, msgspec.DecodeError, ValueError) as error:
-        click.echo(f"fieldcal command: {error}", err=True)
+        say(f"fieldcal command: {error}", err=True)
         return 1
     if not answer.taken:
-        click.echo(f"refused: {answer.reason}", err=True)
+        say(f"refused: {answer.reason}", err=True)
         return 3
-    click.echo(f"taken: {verb} of {sensor}")
+    say(f"taken: {verb} of {sensor}")
     return 0
 
 

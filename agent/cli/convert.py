@@ -10,6 +10,7 @@ import numpy as np
 from agent.calibrate.calibrating import reference_of, sensor_of
 from agent.calibrate.tables import REFERENCES, SENSOR, TEMPERATURE
 from agent.reading.source import ROWS_AT_ONCE, Array, TableError
+from agent.terminal.text import say
 
 _FILE = click.Path(path_type=Path, dir_okay=False)
 
@@ -42,12 +43,12 @@ def convert(file: Path, output: Path, role: str, columns: str | None, sensitivit
             values = [reference.time_s, reference.x]
         rows = _write(output, names, values)
     except TableError as error:
-        click.echo(f"fieldcal convert: {error}", err=True)
+        say(f"fieldcal convert: {error}", err=True)
         return 2
     except FileExistsError:
-        click.echo(f"fieldcal convert: {output}: the file exists; remove it, or choose another name", err=True)
+        say(f"fieldcal convert: {output}: the file exists; remove it, or choose another name", err=True)
         return 2
-    click.echo(f"{output}: {rows} rows of {','.join(names)}")
+    say(f"{output}: {rows} rows of {','.join(names)}")
     return 0
 
 

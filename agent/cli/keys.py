@@ -11,12 +11,14 @@ from typing import Any
 
 import click
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat, load_pem_private_key
+from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 from cryptography.x509 import load_pem_x509_certificate
 
+from agent.config.key_file import KeyFileError, read_key_file, read_private_key
 from agent.delivery.keys import CHUNK
 from agent.keys.certificates import LONGEST_NAME, Credential, issue, make_authority
-from agent.keys.files import KeyFileError, SigningKey, write_new
+from agent.keys.files import SigningKey, write_new
+from agent.terminal.text import say
 
 AUTHORITY_DAYS = 3650
 # Five years: a gateway is used for years, and its certificate must not expire before somebody visits it.
@@ -42,7 +44,7 @@ def _refusing(command: Callable[..., None]) -> Callable[..., int]:
         try:
             command(*arguments, **options)
         except KeyFileError as error:
-            click.echo(f"fieldcal keys: {error}", err=True)
+            say(f"fieldcal keys: {error}", err=True)
             return 2
         return 0
 
@@ -151,15 +153,16 @@ def _issue(directory: Path, file: str, name: str, days: int, hosts: tuple[str, .
 def _save(directory: Path, file: str, credential: Credential) -> None:
     write_new(directory, {f"{file}.key": credential.key_pem, f"{file}.pem": credential.certificate_pem})
     ends = credential.certificate.not_valid_after_utc
-    click.echo(f"{directory / file}.pem, valid until {ends:%Y-%m-%d}, and {directory / file}.key")
+    say(f"{directory / file}.pem, valid until {ends:%Y-%m-%d}, and {directory / file}.key")
 
 
 def _read_authority(directory: Path) -> Credential:
+    for name in ("ca.pem", "ca.key"):
+        if not (directory / name).exists():
+            raise KeyFileError(f"{directory / name}: No such file or directory; run `fieldcal keys authority` first")
+    key, _ = read_private_key(directory / "ca.key")
     try:
-        certificate = load_pem_x509_certificate((directory / "ca.pem").read_bytes())
-        key = load_pem_private_key((directory / "ca.key").read_bytes(), password=None)
-    except OSError as error:
-        raise KeyFileError(f"{error.filename}: {error.strerror}; run `fieldcal keys authority` first") from None
-    except (ValueError, TypeError):
-        raise KeyFileError(f"{directory}: ca.pem or ca.key is not a PEM file that can be read") from None
-    return Credential(certificate, key)  # type: ignore[arg-type]
+        certificate = load_pem_x509_certificate(read_key_file(directory / "ca.pem"))
+    except ValueError:
+        raise KeyFileError(f"{directory / 'ca.pem'}: not a certificate in PEM") from None
+    return Credential(certificate, key)

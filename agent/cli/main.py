@@ -89,6 +89,9 @@ def run_cli(arguments: list[str] | None = None) -> int:
         _discard_output()
         click.echo(f"fieldcal: {error}", err=True)
         return 1
+    except SystemExit as error:  # of a plug-in: no command of ours raises it
+        click.echo(f"fieldcal: a plug-in or library asked the program to end: SystemExit: {error}", err=True)
+        return 1
     except Exception as error:
         if os.environ.get("FIELDCAL_TRACEBACK"):
             raise

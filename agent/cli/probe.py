@@ -11,6 +11,7 @@ from typing import Any, get_args
 
 import click
 
+from agent.terminal.text import say
 from hw.fifo_sensor import FifoSensor
 from hw.i2c import I2CDevice
 from hw.self_test import SelfTestReport
@@ -166,21 +167,21 @@ def as_object(report: SelfTestReport) -> dict[str, Any]:
 
 def _print(buses: list[Bus], ports: list[dict[str, str]]) -> None:
     if not buses:
-        click.echo("no I2C bus (no /dev/i2c-N): enable the adapter and load the kernel module i2c-dev")
+        say("no I2C bus (no /dev/i2c-N): enable the adapter and load the kernel module i2c-dev")
     for bus in buses:
         if bus.fault:
-            click.echo(bus.fault)
+            say(bus.fault)
             continue
-        click.echo(f"/dev/i2c-{bus.number}: " + ("" if bus.answers else "no device that a driver recognises"))
+        say(f"/dev/i2c-{bus.number}: " + ("" if bus.answers else "no device that a driver recognises"))
         for answer in bus.answers:
-            click.echo(f"  0x{answer.address:02X}  {answer.identity or answer.note}")
+            say(f"  0x{answer.address:02X}  {answer.identity or answer.note}")
             if answer.drivers:
-                click.echo(f"        driver {' or '.join(answer.drivers)}")
+                say(f"        driver {' or '.join(answer.drivers)}")
             for line in _self_test_lines(answer.self_test):
-                click.echo(f"        {line}")
+                say(f"        {line}")
     for port in ports:
         details = ", ".join(text for text in (port["description"], port["serial_number"]) if text)
-        click.echo(f"{port['port']}: {details or 'no details'}")
+        say(f"{port['port']}: {details or 'no details'}")
 
 
 def _self_test_lines(result: dict[str, Any] | None) -> Iterator[str]:

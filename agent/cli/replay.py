@@ -12,6 +12,7 @@ import msgspec
 
 from agent.core.events import CalibrationUpdate
 from agent.recording.replaying import Replay, ReplayedFile, Restore
+from agent.terminal.text import say
 
 SHOWN = 12  # calibrations shown in the table; `--json` gives all
 
@@ -53,7 +54,7 @@ def run_replay(files: Sequence[Path], restore: Restore, *, as_json: bool) -> int
     elif not unreadable:
         _print(replayed)
     for line in unreadable:
-        click.echo(line, err=True)
+        say(line, err=True)
     if unreadable:
         return 2
     corrupt = any(file.fault and file.fault.kind == "corrupt" for file in replayed.files)
@@ -78,10 +79,11 @@ def as_object(replayed: Replay) -> dict[str, Any]:
 
 def _print(replayed: Replay) -> None:
     from rich import box
-    from rich.console import Console
     from rich.table import Table
 
-    console = Console(highlight=False, width=None if sys.stdout.isatty() else 120)
+    from agent.terminal.console import TextConsole
+
+    console = TextConsole(width=None if sys.stdout.isatty() else 120)
     table = Table(box=box.SIMPLE, title="Calibrations, with expanded uncertainty")
     for name in ("sensor", "result", "windows", "Sxx", "Syy", "Szz", "Qx", "Qy", "Qz", "unit"):
         table.add_column(name, overflow="fold")
@@ -91,10 +93,11 @@ def _print(replayed: Replay) -> None:
     if len(replayed.calibrations) > SHOWN:
         console.print(f"only the last {SHOWN} of {len(replayed.calibrations)} calibrations are shown; --json - has all")
     for file in replayed.files:
-        console.print(describe(file), markup=False, soft_wrap=True)
+        for line in describe(file):
+            say(line)
 
 
-def describe(file: ReplayedFile) -> str:
+def describe(file: ReplayedFile) -> list[str]:
     """The replay of one file as text: one line, and one more line for each result, fault and note."""
     how = "continued from the file before" if file.in_chain else "from its own snapshot"
     lines = [f"{file.path}: {file.events} events, {file.results} results, {how}"]
@@ -112,7 +115,7 @@ def describe(file: ReplayedFile) -> str:
         lines.append(f"  {'ends early' if file.fault.kind == 'torn' else 'damaged'} at {file.fault}")
         lines.append(f"  last good byte {file.good_bytes}")
     lines += [f"  {note}" for note in file.notes]
-    return "\n".join(lines)
+    return lines
 
 
 def _cells(update: CalibrationUpdate) -> list[str]:

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from agent.terminal.text import say
+
 if TYPE_CHECKING:
     from agent.report.material import Material
 
@@ -35,9 +37,7 @@ def report(inputs: tuple[Path, ...], output: Path, unit: str | None, sensor: str
     try:
         import matplotlib  # noqa: F401 - imported to check for it before any other work
     except ImportError:
-        click.echo(
-            "fieldcal report: the figures need matplotlib; install it with: pip install 'fieldcal[report]'", err=True
-        )
+        say("fieldcal report: the figures need matplotlib; install it with: pip install 'fieldcal[report]'", err=True)
         return 1
     from agent.report.material import MaterialError, gather
     from agent.report.writing import write
@@ -46,16 +46,16 @@ def report(inputs: tuple[Path, ...], output: Path, unit: str | None, sensor: str
         material = gather(inputs, sensor)
         _name_unit(material, unit)
     except MaterialError as error:
-        click.echo(f"fieldcal report: {error}", err=True)
+        say(f"fieldcal report: {error}", err=True)
         return 2
     for notice in material.notices:
-        click.echo(f"fieldcal report: {notice}", err=True)
+        say(f"fieldcal report: {notice}", err=True)
     try:
         write(material, output)
     except OSError as error:
-        click.echo(f"fieldcal report: {error.filename or output}: {error.strerror}", err=True)
+        say(f"fieldcal report: {error.filename or output}: {error.strerror}", err=True)
         return 2
-    click.echo(output / "report.html")
+    say(str(output / "report.html"))
     return _status(material)
 
 
@@ -63,7 +63,7 @@ def _status(material: Material) -> int:
     refused = [result for result in material.results if result.refused]
     for result in refused:
         for reason in result.reasons:
-            click.echo(f"refused: {reason}", err=True)
+            say(f"refused: {reason}", err=True)
     return 3 if refused else 0
 
 

@@ -11,6 +11,7 @@ import zenoh
 
 from agent.delivery.router import DEFAULT_ENDPOINT, open_router
 from agent.delivery.session import EndpointError, EndpointRefused
+from agent.terminal.text import say
 
 
 @click.command(help="Run a Zenoh router, for tests and small sites. It prints its endpoint and runs until Ctrl-C.")
@@ -32,11 +33,11 @@ def router(listen: str | None, config_file: Path | None) -> int:
     try:
         session, endpoints = open_router(listen, config_file)
     except EndpointError as error:
-        click.echo(f"fieldcal router: {error}", err=True)
+        say(f"fieldcal router: {error}", err=True)
         return 1 if isinstance(error, EndpointRefused) else 2
     # From now on Zenoh prints which clients it refuses, and why; RUST_LOG sets other levels (docs/security.md).
     zenoh.init_log_from_env_or("warn")
-    click.echo(f"router at {', '.join(endpoints)}")
+    say(f"router at {', '.join(endpoints)}")
     stop.wait()
     session.close()
     return 0

@@ -14,11 +14,12 @@ from typing import Any
 
 import click
 
+from agent.cli.stopping import STOP_SIGNALS, StoppedAtStart, stopped_by_signals
 from agent.config import Config, ConfigError, load_config, parse_config
 from agent.delivery.history import StoreError
+from agent.terminal.text import say
 
 LOOPBACK = "tcp/127.0.0.1:7447"
-STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @click.command()
@@ -61,7 +62,7 @@ def run(
                 settings, truth = load_config(config), None
         except ConfigError as error:
             for fault in error.faults:
-                click.echo(fault, err=True)
+                say(fault, err=True)
             return 2
         said = [stack.enter_context(router(LOOPBACK))] if with_router else []
         title = f"virtual bench, {preset}" if truth else str(config)
@@ -78,18 +79,20 @@ def serve(config: Config, data_dir: Path, watch: Any, duration_s: float | None) 
     from agent.recording.owner import OtherGatewayError
 
     service = Service(config, data_dir, watch)
-    for number in STOP_SIGNALS:
-        signal.signal(number, lambda *_: service.stop())
     try:
-        ended = service.run(duration_s)
+        with stopped_by_signals(lambda: service.begun, service.stop):
+            ended = service.run(duration_s)
+    except StoppedAtStart:
+        say("stopped before the start was complete", err=True)
+        return 0
     except KeyFileError as error:
-        click.echo(f"fieldcal run: recording.signing_key: {error}", err=True)
+        say(f"fieldcal run: recording.signing_key: {error}", err=True)
         return 2
     except OtherGatewayError as error:
         click.echo(f"fieldcal run: {error}", err=True)
         return 2
     except (StoreError, OSError) as error:
-        click.echo(f"fieldcal run: {error}", err=True)
+        say(f"fieldcal run: {error}", err=True)
         return 1
     if not ended:
         # A router or disk that does not respond blocks a thread. Do not wait for this thread.

@@ -9,6 +9,7 @@ from typing import Any
 
 import click
 
+from agent.terminal.text import say
 from hw.sensor import BUILT_IN, ConfigurationError, DriverFactory, driver_names, load_driver
 
 # unit by the ending of the option's name
@@ -34,7 +35,7 @@ def sensors(names: tuple[str, ...], json_to: str | None) -> int:
     known = driver_names()
     strangers = [name for name in names if name not in known]
     for name in strangers:
-        click.echo(f"fieldcal sensors: no driver {name!r}; available drivers: {', '.join(known)}", err=True)
+        say(f"fieldcal sensors: no driver {name!r}; available drivers: {', '.join(known)}", err=True)
     if strangers:
         return 2
     drivers = [describe(name) for name in names or known]
@@ -45,7 +46,7 @@ def sensors(names: tuple[str, ...], json_to: str | None) -> int:
         if i:
             click.echo()
         for line in as_lines(driver):
-            click.echo(line)
+            say(line)
     return 0
 
 

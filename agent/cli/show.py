@@ -16,9 +16,10 @@ from agent.core.events import RESULTS, CalibrationUpdate, StatusChange, WindowRe
 from agent.delivery.calibrations import calibrations
 from agent.delivery.history import FILE_NAME, History, Record, StoreError
 from agent.terminal.quantity import size
+from agent.terminal.text import one_line, say
 
 if TYPE_CHECKING:
-    from rich.console import Console
+    from agent.terminal.console import TextConsole
 
 HISTORY_SHOWN = 10  # newest calibrations and windows of a sensor
 
@@ -41,7 +42,7 @@ def show(data_dir: Path, json_to: str | None, limit: int) -> int:
         else:
             _print(overview)
     except StoreError as error:
-        click.echo(f"fieldcal show: {error}", err=True)
+        say(f"fieldcal show: {error}", err=True)
         return 2
     return 0
 
@@ -116,28 +117,29 @@ def as_object(overview: Overview) -> dict[str, Any]:
 
 
 def _print(overview: Overview) -> None:
-    from rich.console import Console
+    from agent.terminal.console import TextConsole
 
-    console = Console(highlight=False, markup=False)
+    console = TextConsole()
     if not overview.sensors:
-        console.print(f"{overview.data_dir}: no results yet", soft_wrap=True)
+        console.print_line(f"{overview.data_dir}: no results yet")
     for sensor, held in overview.sensors.items():
         _print_sensor(console, sensor, held)
     names = [name for name, _ in overview.recordings]
     span = f": {' to '.join(dict.fromkeys((names[0], names[-1])))}" if names else ""
     total = size(sum(octets for _, octets in overview.recordings))
-    console.print(f"{len(names)} recordings in {overview.data_dir}, {total}{span}", soft_wrap=True)
+    console.print_line(f"{len(names)} recordings in {overview.data_dir}, {total}{span}")
 
 
-def _print_sensor(console: Console, sensor: str, held: SensorHistory) -> None:
+def _print_sensor(console: TextConsole, sensor: str, held: SensorHistory) -> None:
     from rich.text import Text
 
     from agent.terminal.wording import STATUS_STYLES, calibration_cells, result_lines, verdict, window_span
 
     name, said = "UNCALIBRATED", "no status yet"
     if held.status and isinstance(status := held.status.result, StatusChange):
-        name, said = status.status, f"since {_time(status.t_utc_ns)}  {status.reason}"
-    heading = Text.assemble((sensor, "bold"), "  ", (name, STATUS_STYLES.get(name, "cyan")), f"  {said}")
+        name, said = status.status, one_line(f"since {_time(status.t_utc_ns)}  {status.reason}")
+    status_text = (one_line(name), STATUS_STYLES.get(name, "cyan"))
+    heading = Text.assemble((one_line(sensor), "bold"), "  ", status_text, f"  {said}")
     console.print(heading, soft_wrap=True)
     if held.calibration and isinstance(calibration := held.calibration.result, CalibrationUpdate):
         _print_calibration(console, calibration)
@@ -148,21 +150,21 @@ def _print_sensor(console: Console, sensor: str, held: SensorHistory) -> None:
         if isinstance(update := record.result, CalibrationUpdate):
             cells = calibration_cells(update)
             main = "  ".join(f"S{axis}{axis} {cells[i][i]}" for i, axis in enumerate("xyz"))
-            console.print(f"    {_time(update.date_utc_ns)}  {update.windows:3d} windows  {main}", soft_wrap=True)
+            console.print_line(f"    {_time(update.date_utc_ns)}  {update.windows:3d} windows  {main}")
     console.print("  newest windows" if held.windows else "  no window yet", style="dim")
     for record in held.windows:
         if isinstance(window := record.result, WindowReport):
             words = f"{window_span(window)}  {window.position}  {verdict(window)}"
-            console.print(f"    {_time(window.t_utc_ns)}  {words}", soft_wrap=True)
+            console.print_line(f"    {_time(window.t_utc_ns)}  {words}")
     for what, records in held.routine.items():
         console.print(f"  newest {what} results" if records else f"  no {what} result yet", style="dim")
         for record in records:
             words = result_lines(record.result, None)[0]
-            console.print(f"    {_time(record.t_utc_ns)}  {words}", soft_wrap=True)
+            console.print_line(f"    {_time(record.t_utc_ns)}  {words}")
     console.print()
 
 
-def _print_calibration(console: Console, calibration: CalibrationUpdate) -> None:
+def _print_calibration(console: TextConsole, calibration: CalibrationUpdate) -> None:
     from rich import box
     from rich.table import Table
 
@@ -180,7 +182,7 @@ def _print_calibration(console: Console, calibration: CalibrationUpdate) -> None
         f"{calibration.method}, {calibration.windows} windows, {_since(calibration)}",
         f"of {calibration.identity}",
     ):
-        console.print(f"  {line}", soft_wrap=True)
+        console.print_line(f"  {line}")
 
 
 def _since(calibration: CalibrationUpdate) -> str:

@@ -15,6 +15,7 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.terminal.text import say
 from hw.virtual.bench import Bench, Truth
 from hw.virtual.playback import PlaybackError, Player, read_track
 from hw.virtual.presets import PRESETS
@@ -87,12 +88,12 @@ def simulate(
             return _serve_bench(bench, link)
         write_files(bench, directory, duration_s, {"preset": preset, "seed": seed})
     except PlaybackError as error:
-        click.echo(str(error), err=True)
+        say(str(error), err=True)
         return 2
     except (FileExistsError, FileNotFoundError, NotADirectoryError, PermissionError) as error:
-        click.echo(f"{error.filename2 or error.filename}: {error.strerror}", err=True)
+        say(f"{error.filename2 or error.filename}: {error.strerror}", err=True)
         return 2
-    click.echo(
+    say(
         f"fieldcal calibrate --sensor {directory}/sensor.csv --reference {directory}/reference.csv"
         f" --poses {directory}/poses.csv --nominal {bench.parameters.sensor.nominal_sensitivity:.6g} --u-nominal-pct 20"
     )
@@ -143,7 +144,7 @@ def _json_ready(truth: Truth) -> dict[str, Any]:
 def _serve_track(player: Player, link: Path | None) -> int:
     with _Serving() as serving:
         device = serving.start(PtyDevice(player, link=link))
-        click.echo(device.path)
+        say(str(device.path))
         if serving.wait_for_reader(device):
             player.begin(time.monotonic())
             while not player.finished and serving.goes_on():
@@ -161,7 +162,7 @@ def _serve_bench(bench: Bench, link: Path | None) -> int:
             devices[role] = serving.start(PtyDevice(serial_lines(bench, role, bench_time), link=own_link))
         for role, device in devices.items():
             options = ", ".join(f"{name} = {json.dumps(value)}" for name, value in serial_options(bench, role).items())
-            click.echo(f"{role} {device.path}  # serial-csv: {options}")
+            say(f"{role} {device.path}  # serial-csv: {options}")
         if serving.wait_for_reader(devices["sensor"]):
             bench_time.begin(time.monotonic())
             while serving.goes_on():

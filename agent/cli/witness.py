@@ -17,11 +17,11 @@ from agent.cli.tls_options import tls_files, tls_options
 from agent.config.key_file import KeyFileError
 from agent.delivery.keys import PREFIX, parse_key
 from agent.delivery.session import EndpointError, session_config
-from agent.keys.files import KeyFileError as KeyNotWritten
 from agent.keys.files import write_new
 from agent.recording.signed_text import key_id
 from agent.recording.signing import Signer, load_public_key
 from agent.recording.witness import KEY_NAME, PUBLIC_NAME, Witness, WitnessError
+from agent.terminal.text import say
 
 INBOX = 1000  # heads that may wait; the oldest are dropped, and each gateway publishes a new one within a minute
 CONNECT_MS = 10_000
@@ -61,14 +61,14 @@ def witness(
         trusted = {key_id(trusted): trusted for trusted in map(load_public_key, public_keys)}
         kept = Witness(directory, _signer(directory), trusted, time.time_ns)
         config = session_config("client", connect=endpoints, tls=tls)
-    except (KeyFileError, KeyNotWritten, EndpointError, WitnessError) as error:
-        click.echo(f"fieldcal witness: {error}", err=True)
+    except (KeyFileError, EndpointError, WitnessError) as error:
+        say(f"fieldcal witness: {error}", err=True)
         return 2
     config.insert_json5("connect/timeout_ms", str(CONNECT_MS))
     try:
         session = zenoh.open(config)
     except zenoh.ZError:
-        click.echo(f"fieldcal witness: no Zenoh router answers at {', '.join(endpoints)}", err=True)
+        say(f"fieldcal witness: no Zenoh router answers at {', '.join(endpoints)}", err=True)
         return 1
     with session:
         return _follow(session, key, kept, stop)
@@ -94,21 +94,21 @@ def _follow(session: zenoh.Session, key: str, kept: Witness, stop: threading.Eve
                 stop.set()
                 return
             if said:
-                click.echo(said)
+                say(said)
 
     thread = threading.Thread(target=take_all, name="witness", daemon=True)
     thread.start()
-    click.echo(f"keeping the heads of {key}")
+    say(f"keeping the heads of {key}")
     stop.wait()
     subscriber.undeclare()
     thread.join(CLOSE_S)
     for fault in faults:
-        click.echo(f"fieldcal witness: {fault}", err=True)
+        say(f"fieldcal witness: {fault}", err=True)
     return 1 if faults else 0
 
 
 def _signer(directory: Path) -> Signer:
-    """The witness's own key, made at the first start. Raises KeyFileError or KeyNotWritten."""
+    """The witness's own key, made at the first start. Raises KeyFileError."""
     path = directory / KEY_NAME
     if not path.exists():
         key = Ed25519PrivateKey.generate()

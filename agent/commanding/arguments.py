@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from typing import Annotated, Literal, get_args
 
@@ -27,7 +28,7 @@ class Pose(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_default
     alpha_deg: Annotated[float, msgspec.Meta(ge=-360, le=360)] | None = None
     direction: Vector | None = None
     gravity_mps2: Vector | None = None
-    position: Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,62}$")] | None = None
+    position: Annotated[str, msgspec.Meta(pattern=r"\A[A-Za-z0-9][A-Za-z0-9_.-]{0,62}\Z")] | None = None
 
     def __post_init__(self) -> None:
         if (self.theta_deg is None) != (self.alpha_deg is None):
@@ -67,9 +68,22 @@ Arguments = Pose | Hold | Accept | Rollback
 _KINDS: dict[Verb, type[Arguments]] = {"pose": Pose, "hold": Hold, "accept": Accept, "rollback": Rollback}
 
 
+def refuse_doubled_keys(text: bytes | str) -> None:
+    """Raise ValueError where an object in a JSON text has a key twice: two readers could see two different commands."""
+    json.loads(text, object_pairs_hook=_once_each)
+
+
+def _once_each(pairs: list[tuple[str, object]]) -> None:
+    names = [name for name, _ in pairs]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"the key {twice!r} is there twice")
+
+
 def parse_arguments(verb: Verb, text: bytes | str) -> Arguments:
     """Read the arguments of a command from JSON. Raises Refused, which names the field."""
     try:
+        refuse_doubled_keys(text)
         return msgspec.json.decode(text, type=_KINDS[verb])
     except (msgspec.DecodeError, ValueError, RecursionError) as error:
         raise Refused("out of limits", f"{verb}: {error}") from None

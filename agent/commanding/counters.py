@@ -8,6 +8,9 @@ from pathlib import Path
 
 import msgspec
 
+from agent.config.files import read_file
+
+LARGEST = 1 << 20  # bytes; a hundred keys take 10 kB
 FILE_NAME = "command-counters.json"
 
 
@@ -25,10 +28,10 @@ class Counters:
         self._floor = 0
         self.set_aside: Path | None = None
         try:
-            self._taken = msgspec.json.decode(self._path.read_bytes(), type=dict[str, int])
+            self._taken = msgspec.json.decode(read_file(self._path, LARGEST), type=dict[str, int])
         except FileNotFoundError:
             self._floor = time.time_ns()
-        except (msgspec.DecodeError, ValueError, RecursionError):
+        except (OSError, msgspec.DecodeError, ValueError, RecursionError):
             self._floor = time.time_ns()
             self.set_aside = self._path.with_name(f"{FILE_NAME}.corrupt-{self._floor}")
             self._path.rename(self.set_aside)

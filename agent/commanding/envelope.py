@@ -18,12 +18,12 @@ import msgspec
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 
-from agent.commanding.arguments import Arguments, Verb
+from agent.commanding.arguments import Arguments, Verb, refuse_doubled_keys
 from agent.commanding.refusal import Refused
 
 LARGEST = 4096  # bytes of a command; the longest pose takes 400
 _MARK = b"fieldcal-command-1"
-_HEAD = re.compile(_MARK + rb" ([A-Za-z0-9][A-Za-z0-9_.-]{0,62}) ([A-Za-z0-9+/]{86}==)\n")
+_HEAD = re.compile(_MARK + rb" ([A-Za-z0-9][A-Za-z0-9_.-]{0,62}) ([A-Za-z0-9+/]{85}[AQgw]==)\n")
 Int64 = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 
 
@@ -61,6 +61,7 @@ class Envelope:
         except InvalidSignature:
             raise Refused("bad signature", f"the signature was not made with key {self.key_id}") from None
         try:
+            refuse_doubled_keys(self.body)
             return msgspec.json.decode(self.body, type=Order)
         except (msgspec.DecodeError, ValueError, RecursionError) as error:
             raise Refused("malformed", f"not a command: {error}") from None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Discriminator, Field, Tag, model_validator
+from pydantic import Discriminator, FailFast, Field, Tag, model_validator
 
 from agent.config.knowledge import Certificate, Knowledge, Nine
 from agent.config.pose import PoseInterval, Stop, tell_apart
@@ -59,7 +59,7 @@ class Channel(Knowledge):
     # is gravity in the sensor's frame; state it only if the reference is AC-coupled.
     rotation: Nine | None = None
     rotation_gravity_mps2: Vector | None = (0.0, 0.0, 0.0)
-    poses: tuple[PoseInterval, ...] = ()
+    poses: Annotated[tuple[PoseInterval, ...], FailFast()] = ()  # a day may have 86,400; the first fault is told
     poses_repeat_s: Annotated[float | None, Field(gt=0)] = None
     # Instead of poses, without times: the stops in which the sensor may be, or "free" for a clamp at any angles. The
     # agent finds the position and its time from gravity. clamp_theta_deg is the inclination of the clamp, if it is

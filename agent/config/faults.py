@@ -17,6 +17,7 @@ from agent.config.tls import tls_faults
 from agent.config.whole import Config
 from hw.sensor import DeviceError, Options, load_driver
 
+MOST_DEVICES = 100  # whose options are checked; more are a fault of their own
 SHOWN_CHARACTERS = 100  # of a value or a path in a fault
 _IN_WORDS = {
     "missing": "is missing; add it",
@@ -49,7 +50,7 @@ def shown(path: Path) -> str:
 
 def _options(raw: Mapping[str, Any], faults: list[Told]) -> Iterator[tuple[str, Options]]:
     """The options of each device by its name, as its driver takes them; those that it refuses are faults."""
-    for i, device in enumerate(_entries(raw, "devices")):
+    for i, device in enumerate(_entries(raw, "devices")[:MOST_DEVICES]):
         driver, options = device.get("driver"), device.get("options", {})
         if not isinstance(driver, str) or not isinstance(options, dict):
             continue  # the section's own check names it
@@ -60,6 +61,9 @@ def _options(raw: Mapping[str, Any], faults: list[Told]) -> Iterator[tuple[str, 
             faults.append((("devices", i, "driver"), str(error)))
         except ValidationError as error:
             faults += [(("devices", i, "options", *path), what) for path, what in _told(error, options)]
+        except (Exception, SystemExit) as error:  # of a plug-in
+            fault = f"driver {driver!r} fails on its options: {type(error).__name__}: {error}"
+            faults.append((("devices", i, "driver"), fault))
         else:
             yield str(device.get("name")), held
 

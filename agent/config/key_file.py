@@ -1,9 +1,11 @@
-"""The private key that signs recordings, from its file."""
+"""Key files: a private key must be its owner's alone, whatever it is used for."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from agent.config.files import read_file, read_private_file
 
 if TYPE_CHECKING:  # only who reads keys pays for it
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -17,25 +19,48 @@ class KeyFileError(Exception):
 
 def load_private_key(path: Path) -> Ed25519PrivateKey:
     """Read an Ed25519 private key from a PEM file (PKCS #8, not encrypted). Raises KeyFileError."""
-    from cryptography.exceptions import UnsupportedAlgorithm
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-    from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
-    try:
-        key = load_pem_private_key(read_key_file(path), password=None)
-    except (ValueError, TypeError, UnsupportedAlgorithm):  # its message may quote the key
-        raise KeyFileError(f"{path}: not a private key in PEM without a password") from None
-    if not isinstance(key, Ed25519PrivateKey):
-        raise KeyFileError(
-            f"{path}: a private key, but not an Ed25519 key; `openssl genpkey -algorithm ed25519` makes one"
-        )
+    key: Ed25519PrivateKey = read_private_key(path, Ed25519PrivateKey)[0]
     return key
 
 
-def read_key_file(path: Path) -> bytes:
-    """Read a key file, at most LARGEST_KEY_FILE bytes of it. Raises KeyFileError."""
+def read_private_key(
+    path: Path, kind: type = object, what: str = "a private key in PEM without a password"
+) -> tuple[Any, bytes]:
+    """Read a private key (PEM, not encrypted); gives the key, which is of this `kind`, and the content of the file.
+
+    `what` says in the error what is expected.
+
+    Raises KeyFileError, also where another user may read or write the file.
+    """
+    from cryptography.exceptions import UnsupportedAlgorithm
+    from cryptography.hazmat.primitives.serialization import load_pem_private_key
+
     try:
-        with open(path, "rb") as file:
-            return file.read(LARGEST_KEY_FILE)
+        text, exposed = read_private_file(path, LARGEST_KEY_FILE)
     except OSError as error:
-        raise KeyFileError(f"{path}: cannot be read: {error.strerror}") from None
+        raise _unread(path, error) from None
+    try:
+        key = load_pem_private_key(text, password=None)
+    except (ValueError, TypeError, UnsupportedAlgorithm):  # its message may quote the key
+        raise KeyFileError(f"{path}: not {what}") from None
+    if not isinstance(key, kind):
+        raise KeyFileError(
+            f"{path}: a private key, but not an Ed25519 key; `openssl genpkey -algorithm ed25519` makes one"
+        )
+    if exposed:
+        raise KeyFileError(f"{path}: {exposed}")
+    return key, text
+
+
+def read_key_file(path: Path) -> bytes:
+    """Read a file with a public key or a certificate, of at most LARGEST_KEY_FILE bytes. Raises KeyFileError."""
+    try:
+        return read_file(path, LARGEST_KEY_FILE)
+    except OSError as error:
+        raise _unread(path, error) from None
+
+
+def _unread(path: Path, error: OSError) -> KeyFileError:
+    return KeyFileError(f"{path}: cannot be read: {error.strerror}")

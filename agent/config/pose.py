@@ -16,6 +16,8 @@ from calib.model import Pose
 # sensor is not known better than that.
 LEAST_APART_DEG = 1.0
 
+LATEST_S = 1e9  # s, 30 years; with later times the start of the next window could not be told from this one's
+
 
 class Stop(Section):
     """One position of the sensor. Give one of three forms:
@@ -80,8 +82,8 @@ class Stop(Section):
 class PoseInterval(Stop):
     """The sensor's position between two times, in seconds since the sensor's first sample."""
 
-    start_s: Annotated[float, Field(ge=0)]
-    stop_s: Annotated[float, Field(gt=0)]
+    start_s: Annotated[float, Field(ge=0, le=LATEST_S)]
+    stop_s: Annotated[float, Field(gt=0, le=LATEST_S)]
 
     @model_validator(mode="after")
     def _ends_after_it_begins(self) -> PoseInterval:

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Iterator
 from pathlib import Path as FilePath
 from typing import Any
 
 from agent.config.faults import faults_of, shown
-from agent.config.lines import Path, lines_of
+from agent.config.files import read_file
+from agent.config.lines import lines_of
 from agent.config.names import Told
+from agent.config.size import size_faults
 from agent.config.whole import Config
 
 LARGEST_FILE = 4 << 20  # bytes; a day with one pose each second needs as many
 # The sections of a configuration have four levels. tomllib needs quadratic time for a long dotted key: hours for 4 MB.
 DEEPEST_KEY = 16
-LONGEST_LIST = 86_400  # one pose each second of a day; each fault in a list needs 2 kB and 25 us
 SHOWN_FAULTS = 100
 _PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+"""
 _LINE = re.compile(r"\(at line (\d+), column \d+\)")  # as in the messages of tomllib
@@ -34,14 +34,9 @@ class ConfigError(Exception):
 def load_config(path: FilePath) -> Config:
     """Read and check a TOML file, and the files it names. Raises ConfigError with all faults."""
     try:
-        with open(path, "rb") as file:
-            text = file.read(LARGEST_FILE + 1).decode("utf-8")
+        text = read_file(path, LARGEST_FILE).decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError([f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}"]) from None
-    if len(text) > LARGEST_FILE:
-        raise ConfigError(
-            [f"{path}: the file has more than {LARGEST_FILE} bytes, so it is not read; is it a configuration?"]
-        )
     if (deep := _LONG_KEY.search(text)) is not None:
         line = text.count("\n", 0, deep.start()) + 1
         raise ConfigError(
@@ -55,8 +50,8 @@ def load_config(path: FilePath) -> Config:
         raise ConfigError([f"{path}: {place}not TOML: {error}"]) from None
     except RecursionError:
         raise ConfigError([f"{path}: its tables or lists are nested too deep to be read"]) from None
-    if longest := list(_long_lists(raw, ())):
-        raise _refused(longest, str(path), text)
+    if too_large := size_faults(raw):
+        raise _refused(too_large, str(path), text)
     return parse_config(raw, str(path), text)
 
 
@@ -80,12 +75,3 @@ def _refused(faults: list[Told], origin: str, text: str) -> ConfigError:
         told.append(f"{origin}: {place}{f'{shown(path)}: ' if path else ''}{what}")
     more = len(faults) - SHOWN_FAULTS
     return ConfigError(told + ([f"{origin}: and {more} more faults, not shown"] if more > 0 else []))
-
-
-def _long_lists(value: Any, path: Path) -> Iterator[Told]:
-    if isinstance(value, list) and len(value) > LONGEST_LIST:
-        yield path, f"has {len(value)} entries, at most {LONGEST_LIST} are allowed; shorten it"
-    elif isinstance(value, dict | list):
-        for name, item in value.items() if isinstance(value, dict) else enumerate(value):
-            if isinstance(item, dict | list):
-                yield from _long_lists(item, (*path, name))

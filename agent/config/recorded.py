@@ -6,6 +6,7 @@ import json
 import re
 from typing import Any
 
+from agent.config.size import size_faults
 from agent.config.whole import Config
 from calib.estimate.quantities import YEAR_DAYS
 
@@ -18,7 +19,12 @@ def recorded_config(text: str) -> Config:
     Before version 0.2 the drift of the reference was `process.reference_pct`, per square-root day, and
     `certificate.calibrated` was any text: what is no date counts as not stated.
     """
-    raw: dict[str, Any] = json.loads(text)
+    try:
+        raw: dict[str, Any] = json.loads(text)
+    except RecursionError:
+        raise ValueError("its tables or lists are nested too deep to be read") from None
+    if too_large := size_faults(raw):
+        raise ValueError(f"{'.'.join(map(str, too_large[0][0]))} {too_large[0][1]}".strip())
     for channel in raw["channels"]:
         if (per_root_day := channel["process"].pop("reference_pct", None)) is not None:
             certificate = channel["certificate"]

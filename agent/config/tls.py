@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import stat
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from agent.config.key_file import KeyFileError, read_key_file, read_private_key
 
 if TYPE_CHECKING:  # loaded only when files are checked, since it is slow
     from cryptography.x509 import Certificate
@@ -33,19 +34,14 @@ def tls_faults(files: TlsFiles) -> list[str]:
     An expired certificate is not a fault but a warning (`expiry_warning`): the gateway must go on measuring without it.
     """
     from cryptography.exceptions import InvalidSignature
-    from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
     faults: list[str] = []
     ca, certificate = (_certificate(name, getattr(files, name), faults) for name in ("ca", "certificate"))
     key = None
-    text = _text("key", files.key, faults)
-    if text is not None:
-        try:
-            key = load_pem_private_key(text, password=None)
-        except (ValueError, TypeError):
-            faults.append(f"key: {files.key}: not a private key in PEM without a password")
-        if Path(files.key).stat().st_mode & (stat.S_IROTH | stat.S_IWOTH):
-            faults.append(f"key: {files.key}: all users can read or write this private key; run chmod 600 on it")
+    try:
+        key, _ = read_private_key(Path(files.key))
+    except KeyFileError as error:
+        faults.append(f"key: {error}")
     if key is not None and certificate is not None and key.public_key() != certificate.public_key():
         faults.append(f"key: {files.key}: not the private key of the certificate {files.certificate}")
     if ca is not None and certificate is not None:
@@ -72,20 +68,10 @@ def expiry_warning(files: TlsFiles, now: datetime) -> str:
 def _certificate(name: str, path: str, faults: list[str]) -> Certificate | None:
     from cryptography.x509 import load_pem_x509_certificate
 
-    text = _text(name, path, faults)
-    if text is None:
-        return None
     try:
-        return load_pem_x509_certificate(text)
+        return load_pem_x509_certificate(read_key_file(Path(path)))
+    except KeyFileError as error:
+        faults.append(f"{name}: {error}")
     except ValueError:
         faults.append(f"{name}: {path}: not a certificate in PEM")
-        return None
-
-
-def _text(name: str, path: str, faults: list[str]) -> bytes | None:
-    try:
-        with open(path, "rb") as file:
-            return file.read(1 << 16)
-    except OSError as error:
-        faults.append(f"{name}: {path}: cannot be read: {error.strerror}")
-        return None
+    return None

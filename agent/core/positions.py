@@ -78,6 +78,10 @@ class FoundPositions:
         serials = [s.serial for s in self._stretches]
         self._angles = {serial: pose for serial, pose in self._angles.items() if serial in serials}
 
+    def pass_over(self, time_s: float) -> None:
+        """Leave out all pieces that begin before `time_s`."""
+        self.done(Piece(time_s, max(self._after_s, time_s), OPEN))
+
     @property
     def keep_from_s(self) -> float:
         """Samples before this time are not needed any more."""

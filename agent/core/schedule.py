@@ -64,6 +64,11 @@ class ToldTimes:
         self._after_s = piece.stop_s
         self.piece = next(self._upcoming, None)
 
+    def pass_over(self, time_s: float) -> None:
+        """Leave out all pieces that begin before `time_s`."""
+        self._after_s = max(self._after_s, time_s)
+        self._plan()
+
     @property
     def keep_from_s(self) -> float:
         """Samples before this time are not needed any more."""

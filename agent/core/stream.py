@@ -17,6 +17,9 @@ from hw.block import BlockFlags, SampleBlock
 # Largest rate of sample numbers, as a multiple of the nominal rate. A faster count is no count of samples but, for
 # example, of microseconds; filling the gaps between its numbers would use up the memory.
 FASTEST = 10.0
+# The most places for samples, as a multiple of the samples that are there, and beyond: a few samples with large gaps
+# between their numbers would use up the memory too.
+SPARSEST, SPARSE = 10, 1_000_000
 
 
 # Samples of which nobody can count how many are missing before them: they get a clock of their own.
@@ -188,7 +191,8 @@ class DeviceStream:
         first, stop = (int(i) for i in np.clip(np.ceil(edges), oldest, end))
         if stop <= first:
             return None
-        if stop - first > FASTEST * rate_hz * (stop_s - start_s) + 1:
+        count = sum(block.n for block in blocks)
+        if stop - first > min(FASTEST * rate_hz * (stop_s - start_s) + 1, SPARSEST * count + SPARSE):
             return Samples(self._name, first, np.empty((0, axes)), clock, in_time=False)
         times_s = clock.time_of(np.arange(first, stop))
         within = start_s - 1 / rate_hz <= times_s[0] and times_s[-1] <= stop_s + 1 / rate_hz

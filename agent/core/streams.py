@@ -38,6 +38,9 @@ class Verdict:
     lag_s: float
 
 
+MOST_DUE = 100  # pieces between two events; a tick comes each second, a window has 1 s, and samples are 60 s late
+
+
 def told_in(window: Window, missing: Mapping[str, float]) -> Window:
     """The window with what is missing in its numbers."""
     return replace(window, numbers={**window.numbers, **missing}) if missing else window
@@ -96,9 +99,18 @@ class Streams:
         self._places.turn(0.0 if first_s is None else now_s - first_s, pose)
 
     def due(self, now_s: float) -> Iterator[Piece]:
-        """The pieces whose samples are all there, or later than anybody waits for; what is old is then forgotten."""
+        """The pieces whose samples are all there, or later than anybody waits for; what is old is then forgotten.
+
+        Between two events pass a few pieces at most. If more than MOST_DUE are due, the time has jumped: those that end
+        before the samples that are kept are left out, whatever their number is.
+        """
         first_s = self._sensor.first_sample_s
+        made = 0
         while (piece := self._places.piece) is not None and first_s is not None and self._due(piece, first_s, now_s):
+            made += 1
+            if made == MOST_DUE:
+                self._places.pass_over(now_s - first_s - self._channel.late_horizon_s - 2.0 * self._horizon_s)
+                continue
             yield piece
             self._places.done(piece)
             self._number += 1

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import msgspec
 
+from agent.config.files import read_file
+
 SIZE_MAX = 16 << 20  # bytes read at most; one gateway takes about 50
 
 
@@ -24,8 +26,7 @@ class _Content(msgspec.Struct, forbid_unknown_fields=True):
 def load(path: Path) -> dict[str, int]:
     """Read the last sequence number by `<site>/<gateway>`; empty where there is no file. Raises MemoryFileError."""
     try:
-        with open(path, "rb") as file:
-            content = msgspec.json.decode(file.read(SIZE_MAX), type=_Content)
+        content = msgspec.json.decode(read_file(path, SIZE_MAX), type=_Content)
     except FileNotFoundError:
         return {}
     except OSError as error:

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import zenoh
 
-from agent.delivery.session import EndpointError, EndpointRefused, session_config
+from agent.config.files import read_file
+from agent.delivery.session import EndpointError, EndpointRefused, check_private_key, session_config
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 LARGEST_FILE = 1 << 20  # bytes; access rules for a thousand gateways take half of this
@@ -60,12 +61,9 @@ def open_router(listen: str | None, config_file: Path | None = None) -> tuple[ze
 def _read_config(path: Path) -> zenoh.Config:
     """Read a file as JSON5, whatever its name ends with. Raises EndpointError, which names the file."""
     try:
-        with open(path, "rb") as file:
-            text = file.read(LARGEST_FILE + 1).decode()
+        text = read_file(path, LARGEST_FILE).decode()
     except (OSError, UnicodeDecodeError) as error:
         raise EndpointError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
-    if len(text) > LARGEST_FILE:
-        raise EndpointError(f"{path}: more than {LARGEST_FILE} bytes: too large for a configuration file")
     depth = deepest = 0
     for bracket in re.findall(r"[\[{}\]]", text):
         depth += 1 if bracket in "[{" else -1
@@ -73,9 +71,14 @@ def _read_config(path: Path) -> zenoh.Config:
     if deepest > DEEPEST:
         raise EndpointError(f"{path}: brackets {deepest} deep, more than the limit of {DEEPEST}")
     try:
-        return zenoh.Config.from_json5(text)
+        config = zenoh.Config.from_json5(text)
+        keys = [json.loads(config.get_json(f"transport/link/tls/{side}_private_key")) for side in ("listen", "connect")]
     except zenoh.ZError as error:
         raise EndpointError(f"{path}: {_first_line(error)}") from None
+    for key in keys:
+        if key is not None:
+            check_private_key(Path(key))
+    return config
 
 
 def _first_line(error: zenoh.ZError) -> str:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Literal
 
 import zenoh
 
+from agent.config.key_file import KeyFileError, read_private_key
 from agent.config.tls import TlsFiles
 
 # Bytes. A block of corrected acceleration at 10 kHz takes a fifth of this; Zenoh's default limit is 1 GiB.
@@ -31,7 +33,7 @@ def session_config(
 ) -> zenoh.Config:
     """A Zenoh configuration that uses only the given endpoints; with `tls`, both sides of a link show certificates.
 
-    Raises EndpointError where a given endpoint is not valid.
+    Raises EndpointError where a given endpoint is not valid, or another user may read the private key.
     """
     config = zenoh.Config()
     for key, value in {
@@ -54,9 +56,20 @@ def session_config(
     return config
 
 
+def check_private_key(path: Path) -> None:
+    """Raise EndpointError where a private key is not its owner's alone. Zenoh itself reports a file that is missing."""
+    if not path.exists():
+        return
+    try:
+        read_private_key(path)
+    except KeyFileError as error:
+        raise EndpointError(str(error)) from None
+
+
 def _tls(files: TlsFiles | None) -> dict[str, object]:
     if files is None:
         return {}
+    check_private_key(Path(files.key))
     return {
         "root_ca_certificate": files.ca,
         "connect_certificate": files.certificate,

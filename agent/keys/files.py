@@ -7,21 +7,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from cryptography.exceptions import UnsupportedAlgorithm
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import (
     Encoding,
     NoEncryption,
     PrivateFormat,
-    load_pem_private_key,
 )
 
-LARGEST = 1 << 16
+from agent.config.key_file import KeyFileError, read_private_key
+
+_WHAT = "a command key, see `fieldcal keys command`"
 _NAMED = "fieldcal command key "
-
-
-class KeyFileError(Exception):
-    """A key file cannot be read or written. The message names the file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,20 +58,8 @@ def write_new(directory: Path, files: Mapping[str, bytes]) -> None:
 
 def read_signing_key(path: Path) -> SigningKey:
     """Read an operator's key from its file. Raises KeyFileError."""
-    try:
-        with open(path, "rb") as file:
-            if os.fstat(file.fileno()).st_mode & 0o077:
-                raise KeyFileError(
-                    f"{path}: other users can read this private key; make a new key, or run chmod 600 on this file"
-                )
-            text = file.read(LARGEST)
-    except OSError as error:
-        raise KeyFileError(f"{path}: cannot be read: {error.strerror}") from None
+    key, text = read_private_key(path, Ed25519PrivateKey, _WHAT)
     named = next((line for line in text.splitlines() if line.startswith(_NAMED.encode())), None)
-    try:
-        key = load_pem_private_key(text, password=None)
-    except (ValueError, TypeError, UnsupportedAlgorithm):
-        key = None
-    if named is None or not isinstance(key, Ed25519PrivateKey):
-        raise KeyFileError(f"{path}: not a command key, see `fieldcal keys command`")
+    if named is None:
+        raise KeyFileError(f"{path}: not {_WHAT}")
     return SigningKey(named.decode(errors="replace").removeprefix(_NAMED).strip(), key)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from agent.config.files import open_file
 from agent.reading.source import Source, TableError
 
 
@@ -42,10 +43,8 @@ LONGEST_BEGIN = 1024
 
 def open_source(path: Path) -> Source:
     """Open a file in any of the formats; a file that begins like none of them is read as text. Raises TableError."""
-    if path.exists() and not path.is_file():
-        raise TableError(f"{path}: not a file")
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             begin = file.read(LONGEST_BEGIN)
     except OSError as error:
         raise TableError(f"{path}: {error.strerror}") from None

@@ -12,6 +12,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
 from agent.reading.source import ROWS_AT_ONCE, Array, Column, Progress, Source, TableError
+from agent.recording.limits import Budget
 from agent.recording.records import ChunkMessage, RecordError, content, unpack, walk
 
 IMU = "sensor_msgs/msg/Imu"
@@ -69,10 +70,11 @@ class RosBag(Source):
         channels: dict[int, Channel] = {}
         try:
             with self.path.open("rb") as file:
+                budget = Budget()
                 for record in walk(file, os.fstat(file.fileno()).st_size):
                     if record.opcode != Opcode.CHUNK:
                         continue
-                    for part in content(record, unpack(record, crc_needed=False)):
+                    for part in content(record, unpack(record, budget, crc_needed=False), budget):
                         if isinstance(part, ChunkMessage):
                             if part.channel_id in channels:
                                 channel = channels[part.channel_id]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import msgspec
@@ -22,7 +22,10 @@ THRESHOLD = "_threshold"  # numbers["x"] was held against numbers["x_threshold"]
 
 
 class Difference(msgspec.Struct, frozen=True, kw_only=True):
-    """Where recorded and computed results part. `undecidable`: a decision so close that another CPU may turn it."""
+    """Where recorded and computed results part. `undecidable`: a decision so close that another CPU may turn it.
+
+    How close it is, is computed here; the statistic that was recorded must be the same one.
+    """
 
     file: str
     event_sequence: int
@@ -64,7 +67,7 @@ def compare(
             field=field,
             recorded=_short(before),
             computed=_short(now),
-            undecidable=decision and tolerance > 0 and _on_the_edge([*recorded, *computed]),
+            undecidable=decision and tolerance > 0 and _on_the_edge(recorded, computed),
         )
 
     for before, now in zip(recorded, computed, strict=False):
@@ -113,17 +116,30 @@ def _same(a: float, b: float, tolerance: float, scale: float) -> bool:
     return abs(a - b) <= max(tolerance * max(abs(a), abs(b), scale), FLOOR)
 
 
-def _on_the_edge(results: Sequence[Output]) -> bool:
-    """Whether a statistic of these windows lies within OTHER_CPU of what it was held against."""
-    for result in results:
+def _on_the_edge(recorded: Sequence[Output], computed: Sequence[Output]) -> bool:
+    """Whether a computed statistic lies within OTHER_CPU of the computed threshold that it was held against.
+
+    The recording is not believed: a window of it with another statistic or threshold is no decision on the edge.
+    """
+    windows = [result for result in recorded if isinstance(result, WindowReport)]
+    for result in computed:
         if isinstance(result, WindowReport):
-            for name, threshold in result.numbers.items():
-                statistic = result.numbers.get(name.removesuffix(THRESHOLD))
-                if not name.endswith(THRESHOLD) or statistic is None:
-                    continue
-                if abs(statistic - threshold) <= OTHER_CPU * abs(threshold):
+            names = [name for name in result.numbers if name.endswith(THRESHOLD) and _close(result.numbers, name)]
+            before = [w for w in windows if (w.sensor, w.sequence) == (result.sensor, result.sequence)]
+            for name in names:
+                pair = (name, name.removesuffix(THRESHOLD))
+                if all(_agree(w.numbers, result.numbers, pair) for w in before):
                     return True
     return False
+
+
+def _close(numbers: Mapping[str, float], threshold: str) -> bool:
+    statistic, level = numbers.get(threshold.removesuffix(THRESHOLD)), numbers[threshold]
+    return statistic is not None and abs(statistic - level) <= OTHER_CPU * abs(level)
+
+
+def _agree(recorded: Mapping[str, float], computed: Mapping[str, float], names: Sequence[str]) -> bool:
+    return all(name in recorded and _same(recorded[name], computed[name], OTHER_CPU, 0.0) for name in names)
 
 
 def _empty(item: Output) -> set[str]:

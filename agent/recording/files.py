@@ -12,10 +12,12 @@ from typing import IO, cast
 from mcap.writer import CompressionType, Writer
 
 from agent.core.events import RunStart
+from agent.recording.limits import UNPACKED_LIMIT, most_unpacked
 from agent.recording.messages import schema_data, schema_of
 from agent.recording.results_chain import EPOCH, FILE_METADATA, PREVIOUS_RESULTS, ResultsChain
 from agent.recording.signing import SIGNATURE_METADATA, Signer, Statement
 
+LARGE = UNPACKED_LIMIT // 2  # bytes; the chunk of a larger message is not compressed, since a reader would refuse it
 ACTIVE_SUFFIX = ".active"
 _NAME = re.compile(r"fieldcal-(\d{6,18})\.mcap(\.active)?")
 
@@ -80,6 +82,7 @@ class RecordingFile:
         self.path = self.final_path.with_name(self.final_path.name + ACTIVE_SUFFIX)
         self._stream = _HashedFile(self.path)
         self._unsynced = False
+        self._unpacked = 0  # bytes of all messages, without those that are not compressed
         stream = cast(IO[bytes], self._stream)  # it has all methods that the Writer calls
         self._writer = Writer(stream, compression=CompressionType.ZSTD, enable_data_crcs=True)
         self._channels: dict[str, int] = {}
@@ -98,12 +101,30 @@ class RecordingFile:
         """Bytes in the file; up to one further chunk is in memory."""
         return self._stream.tell()
 
+    @property
+    def full(self) -> bool:
+        """Whether so much was compressed into so few bytes that a reader would soon refuse more, see limits."""
+        return self._unpacked > most_unpacked(self.size) // 2
+
     def append(self, topic: str, data: bytes, log_time: int, publish_time: int, sequence: int) -> None:
         """Add a message; it is on disk after the next `sync`."""
+        channel, large = self._channel(topic), len(data) > LARGE
+        if large:
+            self._writer.flush()
+            self._compress(CompressionType.NONE)
         # MCAP's sequence has 32 bits only; the message itself holds the full number.
-        self._writer.add_message(self._channel(topic), log_time, data, publish_time, sequence & 0xFFFFFFFF)
+        self._writer.add_message(channel, log_time, data, publish_time, sequence & 0xFFFFFFFF)
         self._results.add(topic, data)
+        if large:
+            self._writer.flush()
+            self._compress(CompressionType.ZSTD)
+        else:
+            self._unpacked += len(data)
         self._unsynced = True
+
+    def _compress(self, compression: CompressionType) -> None:
+        """Choose how the chunks from now on are compressed. The Writer has no public way for this."""
+        self._writer._Writer__compression = compression  # type: ignore[attr-defined]
 
     def note(self, name: str, metadata: dict[str, str]) -> None:
         """Add a metadata record after all messages appended so far."""

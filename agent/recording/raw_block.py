@@ -12,6 +12,7 @@ import numpy as np
 from agent.proto import fieldcal_pb2 as pb
 from hw.block import BlockFlags, SampleBlock
 
+FASTEST_HZ = 1e6  # of any device; memory for a window is reserved by the rate. A sound card has 1.9e5
 COUNTS, DECIMALS = ("x_counts", "y_counts", "z_counts"), ("x", "y", "z")
 
 
@@ -50,12 +51,16 @@ def decode_block(data: bytes) -> tuple[int, SampleBlock]:
     m = pb.RawBlockBytes.FromString(data)
     if m.axes not in (1, 3):
         raise ValueError(f"the block says {m.axes} axes; only 1 and 3 are possible")
+    if not 0 < m.nominal_rate_hz <= FASTEST_HZ:
+        raise ValueError(f"the block says {m.nominal_rate_hz:g} samples a second; at most {FASTEST_HZ:g} are possible")
     arrival = np.frombuffer(m.burst_t_monotonic_ns, "<i8")
     count = np.frombuffer(m.burst_count, "<i4")
     names, kind = (DECIMALS, "<f8") if m.decimal else (COUNTS, "<i4")
     columns = [np.frombuffer(getattr(m, name), kind) for name in names[: m.axes]]
     n = len(columns[0])
-    if len(arrival) != len(count) or not len(count) or count[-1] != n or any(len(c) != n for c in columns):
+    if len(arrival) != len(count) or not len(count) or (np.diff(count, prepend=0) < 0).any():
+        raise ValueError(f"{len(arrival)} times of bursts, but {len(count)} counts, which must not decrease")
+    if count[-1] != n or any(len(c) != n for c in columns):
         raise ValueError(f"x has {n} samples; the number of samples in the bursts or on another axis is different")
     indications = np.empty((n, m.axes), columns[0].dtype)
     for axis, column in enumerate(columns):

@@ -7,7 +7,6 @@ incomplete record at the end, reading ends after the last good record.
 from __future__ import annotations
 
 import contextlib
-import errno
 import fcntl
 import os
 from collections.abc import Iterator
@@ -19,7 +18,9 @@ from typing import BinaryIO
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
+from agent.config.files import open_file
 from agent.core.events import Event, Output, RunStart
+from agent.recording.limits import MOST_RESULTS, Budget
 from agent.recording.messages import MessageError, decode, topic_of
 from agent.recording.records import ChunkMessage, Fault, Record, RecordError, content, refusal, unpack, walk
 
@@ -59,6 +60,8 @@ class RecordingReader:
                     if isinstance(item, Output):
                         if step is None or number != step.event_sequence:
                             raise refusal(record, f"a result of event {number} does not follow that event")
+                        if len(step.results) == MOST_RESULTS:
+                            raise refusal(record, f"event {number} has more than {MOST_RESULTS} results")
                         step.results.append(item)
                         continue
                     self._check_order(record, step, number, item)
@@ -83,9 +86,10 @@ class RecordingReader:
 
     def _items(self, file: BinaryIO) -> Iterator[tuple[Record, int, Event | Output]]:
         """Yield (chunk record, event sequence, event or result) for every message."""
+        budget = Budget()
         for record in walk(file, os.fstat(file.fileno()).st_size):
             if record.opcode == Opcode.CHUNK:
-                for part in content(record, unpack(record)):
+                for part in content(record, unpack(record, budget), budget):
                     if isinstance(part, ChunkMessage):
                         yield record, *self._item(record, part)
                     elif isinstance(part, Schema):
@@ -115,9 +119,7 @@ def open_recording(path: Path) -> BufferedReader:
 
     Raises OSError, also where `path` is a pipe or a device: reading from one could wait or last for ever.
     """
-    if path.exists() and not path.is_file() and not path.is_dir():
-        raise OSError(errno.EINVAL, "Not a file", str(path))
-    file = open(path, "rb")  # noqa: SIM115 - the caller closes it
+    file = open_file(path)
     with contextlib.suppress(OSError):  # the file system has no locks
         fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
     return file

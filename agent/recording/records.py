@@ -33,10 +33,9 @@ from mcap.records import (
     SummaryOffset,
 )
 
+from agent.recording.limits import MOST_MESSAGES_IN_CHUNK, UNPACKED_LIMIT, Budget, LimitExceededError
+
 MAGIC = b"\x89MCAP0\r\n"
-# Largest record or unpacked chunk in bytes; it bounds the memory used. The agent writes chunks of 1 MiB, and a
-# snapshot, of which the largest that a configuration allows (10 kHz, six axes) has 76 MB.
-RECORD_LIMIT = 128 << 20
 _INCONSISTENT = "the lengths in it do not agree with its size"
 _HEAD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
@@ -148,7 +147,7 @@ def walk(file: BinaryIO, size: int) -> Iterator[Record]:
     if magic != MAGIC:
         reason = "the file does not begin with the bytes of an MCAP file"
         raise _ended(file, size, 0, "magic", reason, early=MAGIC.startswith(magic))
-    offset, opcode = len(MAGIC), 0
+    offset, opcode, budget = len(MAGIC), 0, Budget()
     while opcode != Opcode.FOOTER:
         head = file.read(_HEAD.size)
         if len(head) < _HEAD.size or not any(head):  # some file systems replace lost data with zeros
@@ -159,9 +158,10 @@ def walk(file: BinaryIO, size: int) -> Iterator[Record]:
         if length > size - offset - _HEAD.size:
             reason = f"its {length} bytes reach beyond the end of the file"
             raise _ended(file, size, offset, record_name(opcode), reason)
-        if length > RECORD_LIMIT:
-            reason = f"its {length} bytes are more than the limit of {RECORD_LIMIT}"
-            raise RecordError("corrupt", offset, record_name(opcode), reason)
+        try:
+            budget.take_record(opcode, length)
+        except LimitExceededError as error:
+            raise RecordError("corrupt", offset, record_name(opcode), str(error)) from None
         yield Record(offset, opcode, file.read(length))
         offset += _HEAD.size + length
     end = file.read(len(MAGIC))
@@ -202,18 +202,20 @@ def parse(record: Record) -> McapRecord:
     return parsed
 
 
-def unpack(record: Record, *, crc_needed: bool = True) -> Chunk:
+def unpack(record: Record, budget: Budget, *, crc_needed: bool = True) -> Chunk:
     """The content of a Chunk record, its sizes and CRC checked. Raises RecordError.
 
-    `crc_needed` False: other programs may leave the CRC out.
+    `budget`: of this pass over the file. What exceeds it is not decompressed. `crc_needed` False: other programs may
+    leave the CRC out.
     """
     try:
-        return _unpack(record.body, crc_needed)
+        return _unpack(record, budget, crc_needed)
     except (ValueError, zstandard.ZstdError) as error:
         raise refusal(record, str(error)) from None
 
 
-def _unpack(body: bytes, crc_needed: bool) -> Chunk:
+def _unpack(record: Record, budget: Budget, crc_needed: bool) -> Chunk:
+    body = record.body
     if len(body) < _CHUNK.size:
         raise ValueError("too short for a chunk")
     start_time, end_time, size, crc, name_length = _CHUNK.unpack_from(body)
@@ -222,8 +224,9 @@ def _unpack(body: bytes, crc_needed: bool) -> Chunk:
         raise ValueError(_INCONSISTENT)
     compression = body[_CHUNK.size : data_at - 8]
     packed = memoryview(body)[data_at:]
-    if size > RECORD_LIMIT:
-        raise ValueError(f"{size} bytes decompressed, more than the limit of {RECORD_LIMIT}")
+    if compression and size > UNPACKED_LIMIT:
+        raise ValueError(f"{size} bytes decompressed, more than the limit of {UNPACKED_LIMIT}")
+    budget.take_chunk(record.end, size)
     if compression == b"zstd":
         # zstd allocates the size that the frame states, whatever limit it is given. So this size is checked first.
         if zstandard.frame_content_size(packed) != size:
@@ -240,9 +243,17 @@ def _unpack(body: bytes, crc_needed: bool) -> Chunk:
     return Chunk(start_time, end_time, compression.decode(), len(packed), data)
 
 
-def content(record: Record, chunk: Chunk) -> Iterator[ChunkMessage | Schema | Channel]:
+def content(record: Record, chunk: Chunk, budget: Budget) -> Iterator[ChunkMessage | Schema | Channel]:
     """Yield messages, schemas and channels of `chunk`, unpacked from `record`, in order. Raises RecordError."""
+    try:
+        yield from _content(record, chunk, budget)
+    except LimitExceededError as error:
+        raise refusal(record, str(error)) from None
+
+
+def _content(record: Record, chunk: Chunk, budget: Budget) -> Iterator[ChunkMessage | Schema | Channel]:
     data, offset, size = chunk.data, 0, len(chunk.data)
+    messages = 0
     while offset < size:
         body_at = offset + _HEAD.size
         opcode, length = _HEAD.unpack_from(data, offset) if body_at <= size else (0, 0)
@@ -252,11 +263,16 @@ def content(record: Record, chunk: Chunk) -> Iterator[ChunkMessage | Schema | Ch
         if opcode == Opcode.MESSAGE and length >= _MESSAGE.size:
             channel_id, sequence, log_time, publish_time = _MESSAGE.unpack_from(data, body_at)
             payload = data[body_at + _MESSAGE.size : body_at + length]
+            messages += 1
+            if messages > MOST_MESSAGES_IN_CHUNK:
+                break
             yield ChunkMessage(offset, channel_id, sequence, log_time, publish_time, payload)
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            budget.take_record(opcode, length)
             inside = Record(record.offset, opcode, data[body_at : body_at + length])
             yield cast(Schema | Channel, parse(inside))
         else:
             reason = f"{record_name(opcode)} of {length} bytes is not allowed at byte {offset} of a decompressed chunk"
             raise refusal(record, reason)
         offset = body_at + length
+    budget.take_messages(record.end, messages)

@@ -22,6 +22,7 @@ from mcap.records import Attachment, DataEnd, Footer, Metadata, SummaryOffset
 
 from agent.recording.files import ACTIVE_SUFFIX, recordings, sync_directory
 from agent.recording.integrity import check_integrity
+from agent.recording.limits import Budget
 from agent.recording.reading import first_event
 from agent.recording.records import MAGIC, Record, RecordError, parse, unpack, walk
 from agent.recording.results_chain import EPOCH, FILE_METADATA
@@ -104,7 +105,7 @@ def _sound_part(file: BinaryIO, size: int) -> _Sound:
     try:
         for record in walk(file, size):
             if broken is not None:
-                goes_on |= record.opcode == Opcode.CHUNK and _is_sound(record)
+                goes_on = goes_on or (record.opcode == Opcode.CHUNK and _is_sound(record))
                 continue
             if record.opcode == Opcode.DATA_END:
                 break
@@ -126,7 +127,7 @@ def _sound_part(file: BinaryIO, size: int) -> _Sound:
 
 def _is_sound(chunk: Record) -> bool:
     try:
-        unpack(chunk)
+        unpack(chunk, Budget())
     except RecordError:
         return False
     return True

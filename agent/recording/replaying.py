@@ -23,6 +23,7 @@ class PipelineLike(Protocol):
     def snapshot(self) -> bytes: ...
 
 
+LONGEST_REASON = 1000  # characters; a hostile configuration has a hundred thousand faults
 Restore = Callable[[str, bytes], PipelineLike]
 
 
@@ -123,7 +124,7 @@ class Replay:
             self._pipeline = self._restore(start.config_json, start.snapshot)
         except Exception as error:  # a damaged or forged snapshot may raise any exception
             file.refused = (
-                f"no pipeline can be made from its configuration and snapshot: {type(error).__name__}: {error}"
+                f"no pipeline can be made from its configuration and snapshot: {type(error).__name__}: {_short(error)}"
             )
 
     def _step(self, file: ReplayedFile, step: Step) -> None:
@@ -132,7 +133,7 @@ class Replay:
             outputs = recorded_ones(self._pipeline.step(step.event))
             computed = [_as_recorded(step.event_sequence, output) for output in outputs]
         except Exception as error:  # as above
-            file.refused = f"the pipeline fails at event {step.event_sequence}: {type(error).__name__}: {error}"
+            file.refused = f"the pipeline fails at event {step.event_sequence}: {type(error).__name__}: {_short(error)}"
             return
         file.results += len(computed)
         self.calibrations += [result for result in computed if isinstance(result, CalibrationUpdate)]
@@ -155,6 +156,11 @@ class Replay:
             return
         file.different += 1
         file.first_difference = file.first_difference or difference
+
+
+def _short(error: Exception) -> str:
+    text = str(error)
+    return text if len(text) <= LONGEST_REASON else f"{text[:LONGEST_REASON]}..."
 
 
 def _as_recorded(event_sequence: int, result: Output) -> Output:

@@ -15,9 +15,10 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Metadata, Schema
 
 from agent.core.events import Result
+from agent.recording.limits import Budget, longest
 from agent.recording.messages import MessageError, decode, is_result_topic
 from agent.recording.reading import open_recording
-from agent.recording.records import MAGIC, RECORD_LIMIT, ChunkMessage, Record, RecordError, content, parse, unpack
+from agent.recording.records import MAGIC, ChunkMessage, Record, RecordError, content, parse, unpack
 
 _HEAD = struct.Struct("<BQ")
 _CHANNEL_ID = struct.Struct("<H")
@@ -52,6 +53,7 @@ class _Scan:
     def __init__(self, file: BinaryIO, found: ScannedFile) -> None:
         self._file = file
         self._found = found
+        self._budget = Budget()
         self._schemas: dict[int, str] = {}
         self._results: dict[int, str] = {}  # schema name by channel, of channels with results
         self._others: set[int] = set()
@@ -78,7 +80,7 @@ class _Scan:
         while offset + _HEAD.size <= size:
             self._file.seek(offset)
             opcode, length = _HEAD.unpack(self._file.read(_HEAD.size))
-            if opcode in (0, Opcode.DATA_END) or length > min(RECORD_LIMIT, size - offset - _HEAD.size):
+            if opcode in (0, Opcode.DATA_END) or length > min(longest(opcode), size - offset - _HEAD.size):
                 return
             yield offset, opcode, length
             offset += _HEAD.size + length
@@ -103,7 +105,7 @@ class _Scan:
             return
         record = self._record(chunk[0], Opcode.CHUNK, chunk[1])
         try:
-            for part in content(record, unpack(record)):
+            for part in content(record, unpack(record, self._budget), self._budget):
                 self._take_part(part)
         except (RecordError, MessageError) as error:
             self._found.faults.append(str(error))

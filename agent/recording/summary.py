@@ -18,6 +18,7 @@ from mcap.records import (
     SummaryOffset,
 )
 
+from agent.recording.limits import Budget
 from agent.recording.records import ChunkMessage, Record, content, refusal, unpack
 from agent.recording.results_chain import FILE_METADATA, PREVIOUS_RESULTS, ResultsChain
 
@@ -39,6 +40,7 @@ class DerivedSummary:
     """
 
     def __init__(self) -> None:
+        self._budget = Budget()
         self.messages = 0
         self.results = ResultsChain()  # of the results so far
         self.chunks: list[ChunkIndex] = []
@@ -54,11 +56,11 @@ class DerivedSummary:
     def add_chunk(self, record: Record) -> None:
         """Take a Chunk record: decompress it and read the records in it."""
         self._awaited = None  # until the chunk is known to be intact
-        chunk = unpack(record)
+        chunk = unpack(record, self._budget)
         times: list[int] = []
         messages: list[tuple[str, bytes]] = []
         awaited: dict[int, list[tuple[int, int]]] = {}
-        for part in content(record, chunk):
+        for part in content(record, chunk, self._budget):
             if isinstance(part, ChunkMessage):
                 if part.channel_id not in self._channels:
                     raise refusal(record, f"message on channel {part.channel_id}, which no record before it declares")

@@ -128,7 +128,7 @@ class Recorder:
         age_ns = self._now_ns - self._since_ns
         if file is None:
             return age_ns >= min(self._retry_ns << min(max(0, self._failures - 1), 20), RETRY_MAX_NS)
-        return age_ns >= self._max_age_ns or file.size >= self._max_bytes
+        return age_ns >= self._max_age_ns or file.size >= self._max_bytes or file.full
 
     @property
     def pruning(self) -> Pruned | None:

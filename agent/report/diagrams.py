@@ -13,6 +13,7 @@ from matplotlib.ticker import MaxNLocator
 from agent.report.result import CalibrationResult
 from agent.report.style import AXIS_COLOURS, INK, RESULT_COLOURS, RESULT_MARKERS, WIDTH_IN, bare, figure
 from agent.report.units import labelled, sensitivity_unit
+from agent.terminal.text import figure_text
 from calib.model import PARAMETERS, Array
 
 AXES = "xyz"
@@ -45,7 +46,7 @@ def rows_in_space(result: CalibrationResult) -> Figure | None:
         axes.plot(*S[i][:, None], "o", color=AXIS_COLOURS[i], markersize=6, fillstyle=fill, label=label)
     for line in axes.lines:
         line.set_clip_on(False)
-    drawn.legend(loc="lower center", ncols=1, title=labelled("Rows of S", sensitivity_unit(result.unit)))
+    drawn.legend(loc="lower center", ncols=1, title=labelled("Rows of S", figure_text(sensitivity_unit(result.unit))))
     return drawn
 
 
@@ -81,7 +82,11 @@ def main_sensitivities(results: Sequence[CalibrationResult]) -> Figure | None:
                 _bar(axes, row, value[k], expanded[k], row)
         if not any(np.isfinite(value[k]) for value, _ in values):
             axes.set_xticks([])
-        axes.set(yticks=range(len(results)), yticklabels=[r.label for r in results], title=labelled(name, unit))
+        axes.set(
+            yticks=range(len(results)),
+            yticklabels=[figure_text(r.label) for r in results],
+            title=labelled(name, figure_text(unit)),
+        )
         axes.set_ylim(len(results) - 0.4, -0.6)
         axes.margins(x=0.15)
         axes.locator_params(axis="x", nbins=5)
@@ -102,7 +107,7 @@ def transverse_sensitivities(results: Sequence[CalibrationResult]) -> Figure | N
             continue
         shift = (k - 0.5 * (len(results) - 1)) * step
         for row in range(6):
-            _bar(axes, row + shift, value[row], expanded[row], k, result.label if row == 0 else None)
+            _bar(axes, row + shift, value[row], expanded[row], k, figure_text(result.label) if row == 0 else None)
     axes.axvline(0, color=INK, linewidth=0.8)
     axes.set(yticks=range(6), yticklabels=[f"$S_{{{AXES[i]}{AXES[j]}}}$" for i, j in TRANSVERSE])
     axes.set_xlabel("% of the main sensitivity of the row")

@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 
 from agent.calibrate.origin import SourceFile, source_file
+from agent.config.files import read_file
 from agent.core.events import CalibrationUpdate, StatusChange, WindowReport
 from agent.delivery.calibrations import calibrations, made
 from agent.delivery.history import FILE_NAME, History, Record, StoreError
@@ -26,6 +27,7 @@ from agent.report.result import (
 from agent.report.retraced import retrace
 from agent.report.trace import Trace
 
+LARGEST_RESULT = 64 << 20  # bytes of a RESULT.json, which lists all its windows
 MOST_HISTORY = 1000  # newest calibrations and windows of a data directory
 MOST_RECORDINGS = 2  # newest files whose windows are computed again point by point; each takes about a second
 RECORDING_ENDINGS = (".mcap", ".mcap.active")
@@ -94,7 +96,7 @@ def _from_results(paths: Sequence[Path], sensor: str | None) -> Material:
 
 def _read_result(path: Path) -> CalibrationResult:
     try:
-        fields = msgspec.json.decode(path.read_bytes(), type=dict[str, Any])
+        fields = msgspec.json.decode(read_file(path, LARGEST_RESULT), type=dict[str, Any])
         return parse(fields, path.stem)
     except OSError as error:
         raise MaterialError(f"{path}: {error.strerror or error}") from None

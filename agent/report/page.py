@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from html import escape
 from importlib.resources import files
 
 from agent import __version__
@@ -13,6 +12,7 @@ from agent.report.material import Material
 from agent.report.result import CalibrationResult
 from agent.report.trace import Residuals
 from agent.report.units import ACCELERATION, output_unit, sensitivity_unit
+from agent.terminal.text import page_text
 
 
 def page(material: Material, figures: Sequence[Drawn], seen: Sequence[Residuals]) -> str:
@@ -23,29 +23,29 @@ def page(material: Material, figures: Sequence[Drawn], seen: Sequence[Residuals]
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)}</title>\n<style>\n{style}</style>\n</head>\n<body>\n{body}\n</body>\n</html>\n"
+        f"<title>{page_text(title)}</title>\n<style>\n{style}</style>\n</head>\n<body>\n{body}\n</body>\n</html>\n"
     )
 
 
 def _head(title: str, material: Material) -> Iterator[str]:
-    yield f"<h1>{escape(title)}</h1>"
+    yield f"<h1>{page_text(title)}</h1>"
     for notice in material.notices:
-        yield f'<div class="box">{escape(notice)}</div>'
+        yield f'<div class="box">{page_text(notice)}</div>'
     for result in material.results:
         several = len(material.results) > 1
         if several:
-            yield f"<h2>{escape(result.label)}</h2>"
+            yield f"<h2>{page_text(result.label)}</h2>"
         yield from _summary(result, several=several)
 
 
 def _summary(result: CalibrationResult, *, several: bool) -> Iterator[str]:
     status = "refused" if result.refused else "valid"
-    method = "" if several or not result.fields.get("method") else f", {escape(result.label)}"
+    method = "" if several or not result.fields.get("method") else f", {page_text(result.label)}"
     yield f'<p><span class="status {status}">{status.upper()}</span>{method}</p>'
     if identity := result.fields.get("identity"):
-        yield f'<p class="soft">of {escape(str(identity))}</p>'
+        yield f'<p class="soft">of {page_text(str(identity))}</p>'
     if result.reasons:
-        reasons = "".join(f"<li>{escape(reason)}</li>" for reason in result.reasons)
+        reasons = "".join(f"<li>{page_text(reason)}</li>" for reason in result.reasons)
         yield f'<div class="box">{"Refused, because" if result.refused else "Please note"}<ul>{reasons}</ul></div>'
     if not result.determined.any():
         return
@@ -55,21 +55,21 @@ def _summary(result: CalibrationResult, *, several: bool) -> Iterator[str]:
     s_words = f"S without a dimension, in {unit} per {ACCELERATION}" if s_unit == "1" else f"S in {s_unit}"
     factors = sorted({f"{k:.3g}" for k in result.coverage_factor[result.determined]})
     words = f"{s_words}, Q in {unit}. After ±: expanded uncertainty U with k = {' or '.join(factors)}"
-    yield f'<p class="soft">{escape(words)}{f", {escape(str(kind))}" if kind else ""}.</p>'
+    yield f'<p class="soft">{page_text(words)}{f", {page_text(str(kind))}" if kind else ""}.</p>'
 
 
 def _figures(figures: Sequence[Drawn]) -> Iterator[str]:
     if figures:
         yield '<h2>Figures</h2>\n<div class="figures">'
         for drawn in figures:
-            svg = drawn.svg.replace("<svg ", f'<svg role="img" aria-label="{escape(drawn.caption)}" ', 1)
-            yield f"<figure>{svg}<figcaption>{escape(drawn.caption)}</figcaption></figure>"
+            svg = drawn.svg.replace("<svg ", f'<svg role="img" aria-label="{page_text(drawn.caption)}" ', 1)
+            yield f"<figure>{svg}<figcaption>{page_text(drawn.caption)}</figcaption></figure>"
         yield "</div>"
 
 
 def _numbers(material: Material, seen: Sequence[Residuals]) -> Iterator[str]:
     for result in material.results:
-        about = f", {escape(result.label)}" if len(material.results) > 1 else ""
+        about = f", {page_text(result.label)}" if len(material.results) > 1 else ""
         yield f"<h2>Numbers{about}</h2>"
         if result.determined.any():
             yield "<h3>Parameters</h3>" + tables.parameters(result)
@@ -97,4 +97,4 @@ def _origin(material: Material) -> Iterator[str]:
     rows = [[file.path, str(file.size_bytes), file.sha256] for file in material.files]
     if rows:
         yield tables.table(["made from", "bytes", "SHA-256"], rows, "words", frozenset({2}))
-    yield f'<p class="soft">Written by fieldcal {escape(__version__)}. report.json contains all numbers too.</p>'
+    yield f'<p class="soft">Written by fieldcal {page_text(__version__)}. report.json contains all numbers too.</p>'

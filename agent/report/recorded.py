@@ -93,8 +93,6 @@ def _take(out: Recorded, event: Event, results: list[Output], windows: _Windows)
 
 def _start(path: Path) -> RunStart:
     try:
-        with open(path, "rb"):
-            pass
         reader = RecordingReader(path)
         step = next(reader.steps(), None)
     except OSError as error:

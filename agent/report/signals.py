@@ -12,6 +12,7 @@ from matplotlib.patches import Patch
 from agent.report.style import AXIS_COLOURS, INK, figure
 from agent.report.trace import Residuals, by_phase, spans, spectrum
 from agent.report.units import output_unit
+from agent.terminal.text import figure_text
 from calib.model import Array
 
 AXES = "xyz"
@@ -33,7 +34,7 @@ def indications(seen: Residuals, unit: str) -> Figure:
         axes.plot(time_s, seen.model[shown, k], color=INK, linewidth=0.8)
         axes.set_title(f"$V_{AXES[k]}$" + (", mean taken off" if seen.centred else ""))
         axes.locator_params(axis="y", nbins=5)
-    drawn.supylabel(f"indication in {output_unit(unit)}", fontsize=10)
+    drawn.supylabel(f"indication in {figure_text(output_unit(unit))}", fontsize=10)
     subplots[-1].set_xlabel("time in s")
     return drawn
 
@@ -44,9 +45,9 @@ def left_over(seen: Residuals, unit: str) -> Figure:
     drawn = figure(3.3 + 2.0 * len(ways))
     heights = [0.9] * 3 + [2.0] * len(ways)
     subplots = drawn.subplots(len(heights), 1, gridspec_kw={"height_ratios": heights})
-    _over_time(subplots[:3], seen, output_unit(unit))
+    _over_time(subplots[:3], seen, figure_text(output_unit(unit)))
     for axes, way in zip(subplots[3:], ways, strict=True):
-        way(axes, seen, output_unit(unit))
+        way(axes, seen, figure_text(output_unit(unit)))
     handles = [Patch(color=colour, label=axis) for axis, colour in zip(AXES, AXIS_COLOURS, strict=True)]
     drawn.legend(handles=handles, loc="outside upper center", ncols=3)
     return drawn

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from html import escape
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,7 @@ from agent.report.result import CalibrationResult
 from agent.report.trace import Residuals
 from agent.report.units import ACCELERATION, output_unit, position_name, said, sensitivity_unit
 from agent.terminal.quantity import plus_minus
+from agent.terminal.text import page_text
 from calib.model import PARAMETERS
 
 AXES = "xyz"
@@ -27,7 +27,7 @@ def table(
     """An HTML table of escaped cells. Columns in `text` are aligned to the left and may wrap."""
 
     def cell(tag: str, k: int, content: str) -> str:
-        return f"<{tag}{' class=text' if k in text else ''}>{escape(content)}</{tag}>"
+        return f"<{tag}{' class=text' if k in text else ''}>{page_text(content)}</{tag}>"
 
     head = "".join(cell("th", k, h) for k, h in enumerate(heads))
     body = "".join("<tr>" + "".join(cell("td", k, c) for k, c in enumerate(row)) + "</tr>" for row in rows)

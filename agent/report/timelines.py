@@ -13,6 +13,7 @@ from agent.core.events import CalibrationUpdate
 from agent.report.result import CalibrationResult, WindowVerdict
 from agent.report.style import AXIS_COLOURS, INK, PALE, REFUSED, SHADES, USED, bare, figure
 from agent.report.units import output_unit, position_name
+from agent.terminal.text import figure_text
 from calib.model import PARAMETERS
 
 AXES = "xyz"
@@ -36,7 +37,7 @@ def windows(verdicts: Sequence[WindowVerdict]) -> Figure | None:
         axes.barh(
             lane, w.stop_s - w.start_s, left=w.start_s, height=0.6, color=_colour(w), edgecolor=INK, linewidth=0.5
         )
-    labels = [_short(position_name(name)) for name in lanes]
+    labels = [figure_text(_short(position_name(name))) for name in lanes]
     axes.set(yticks=range(len(lanes)), yticklabels=labels, xlabel="time in s")
     axes.set_ylim(len(lanes) - 0.4, -0.6)
     axes.set_ylabel("position" if by_position else "")
@@ -74,7 +75,7 @@ def history(updates: Sequence[CalibrationUpdate], unit: str) -> Figure | None:
         upper.errorbar(when, 100 * (S[:, k] / S[-1, k] - 1), 100 * U[:, MAIN[k]] / abs(S[-1, k]), **style)
         lower.errorbar(when, Q[:, k], U[:, 9 + k], **style)
     upper.set(title="main sensitivities", ylabel="% difference from the newest")
-    lower.set(title="offsets", ylabel=f"Q in {output_unit(unit)}", xlabel="UTC")
+    lower.set(title="offsets", ylabel=f"Q in {figure_text(output_unit(unit))}", xlabel="UTC")
     handles, labels = upper.get_legend_handles_labels()
     drawn.legend(handles, labels, loc="outside upper right", ncols=3)
     return drawn
@@ -95,7 +96,7 @@ def budget(result: CalibrationResult) -> Figure | None:
             left=left,
             height=0.7,
             color=SHADES[k % len(SHADES)],
-            label=name,
+            label=figure_text(name),
         )
         left += np.nan_to_num(shares[k])
     labels = [f"${p[0]}_{{{p[1:]}}}$" for p in PARAMETERS]

@@ -12,8 +12,10 @@ from rich.live import Live
 from rich.text import Text
 
 from agent.core.events import CalibrationUpdate
+from agent.terminal.console import TextConsole
 from agent.terminal.quantity import duration
 from agent.terminal.state import ViewState
+from agent.terminal.text import one_line
 from agent.terminal.wording import (
     STATUS_STYLES,
     calibration_cells,
@@ -34,7 +36,7 @@ class Screen:
     def __init__(self, state: ViewState, stream: TextIO) -> None:
         self._live = Live(
             Picture(state),
-            console=Console(file=stream, highlight=False),
+            console=TextConsole(stream),
             auto_refresh=False,
             vertical_overflow="crop",
         )
@@ -96,7 +98,7 @@ class Picture:
     def _sensor(self, sensor: str) -> list[Text]:
         status, calibration = self._state.statuses.get(sensor), self._state.calibrations.get(sensor)
         name = status.status if status else ""
-        reason = f"  {status.reason}" if status else ""
+        reason = f"  {one_line(status.reason)}" if status else ""
         lines = [Text.assemble((sensor, "bold"), "  ", (name, STATUS_STYLES.get(name, "cyan")), (reason, "dim"))]
         if calibration is None:
             return lines
@@ -147,6 +149,7 @@ def _row(cells: tuple[str, ...], widths: tuple[int, ...]) -> str:
 
 
 def _fit(cell: str, width: int) -> str:
+    cell = one_line(cell)
     if width == 0:
         return cell
     if len(cell) >= abs(width):

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, Protocol
 
 from agent.core.events import CalibrationUpdate, Result, StatusChange, WindowReport
+from agent.terminal.text import one_line
 from calib.model import Array
 
 if TYPE_CHECKING:
@@ -77,5 +78,5 @@ class ViewState:
 
     def say(self, message: str) -> None:
         """Add a message line."""
-        self.messages.append(message)
+        self.messages.append(one_line(message))
         self.messages_said += 1

@@ -6,6 +6,7 @@ from typing import Protocol, TextIO
 
 from agent.core.events import Result
 from agent.terminal.state import ViewState
+from agent.terminal.text import one_line
 from agent.terminal.wording import publication_line, result_lines
 
 
@@ -84,6 +85,6 @@ class Lines:
 
     def _write(self, line: str) -> None:
         try:
-            print(line, file=self._stream, flush=True)
+            print(one_line(line), file=self._stream, flush=True)
         except (OSError, ValueError):
             return  # the reader of the lines was closed; the agent goes on

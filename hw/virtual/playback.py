@@ -30,6 +30,8 @@ def read_track(path: Path, columns: tuple[str, ...] | None = None, rate_hz: floa
     The times come from the column `time_s`, or from `rate_hz` if it is given. Raises PlaybackError.
     """
     try:
+        if path.exists() and not path.is_file():
+            raise PlaybackError(f"{path}: not a regular file")
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise PlaybackError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None

@@ -203,6 +203,7 @@ def test_a_signing_key_that_cannot_sign_is_a_fault(
 
 def test_a_signing_key_that_can_sign_is_good(tmp_path: Path) -> None:
     key_of("sound", tmp_path / "recording.key")
+    (tmp_path / "recording.key").chmod(0o600)
     (tmp_path / "f.toml").write_text(f'{GOOD}signing_key = "{tmp_path}/recording.key"\n')
     assert run_cli(["check", str(tmp_path / "f.toml")]) == 0
 

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from agent.config import ConfigError, load_config, parse_config
-from agent.config.reading import LARGEST_FILE, LONGEST_LIST, SHOWN_FAULTS
+from agent.config.reading import LARGEST_FILE, SHOWN_FAULTS
+from agent.config.size import LONGEST_LIST
 
 DEVICES = """
 [[devices]]

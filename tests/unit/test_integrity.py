@@ -18,9 +18,10 @@ from mcap.writer import IndexType, Writer
 
 from agent.recording.crc_location import changed_byte
 from agent.recording.integrity import Integrity, check_integrity
+from agent.recording.limits import RECORD_LIMIT
 from agent.recording.messages import encode, schema_data, topic_of
 from agent.recording.reading import RecordingReader
-from agent.recording.records import MAGIC, RECORD_LIMIT, RecordError
+from agent.recording.records import MAGIC, RecordError
 from tests.replay.forgery import records, with_sums, write_messages
 from tests.replay.stand_in import CONFIG, StandIn, happenings, record_run, run_start
 

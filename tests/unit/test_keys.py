@@ -93,14 +93,13 @@ def test_the_files_of_one_certificate_fit_together_and_others_do_not(site: Path,
     (tmp_path / "f.key").write_bytes(foreign.key_pem)
     (tmp_path / "f.key").chmod(0o644)
     assert tls_faults(TlsFiles(ca, str(tmp_path / "f.pem"), str(tmp_path / "f.key"))) == [
-        f"key: {tmp_path}/f.key: all users can read or write this private key; run chmod 600 on it",
+        f"key: {tmp_path}/f.key: other users can read or write this private key (mode 0644); run chmod 600 on it",
         f"certificate: {tmp_path}/f.pem: not signed by the authority in {ca}",
     ]
     assert tls_faults(TlsFiles(str(tmp_path / "no"), f"{gateway}.key", f"{gateway}.pem")) == [
         f"ca: {tmp_path}/no: cannot be read: No such file or directory",
         f"certificate: {gateway}.key: not a certificate in PEM",
         f"key: {gateway}.pem: not a private key in PEM without a password",
-        f"key: {gateway}.pem: all users can read or write this private key; run chmod 600 on it",
     ]
 
 
@@ -139,7 +138,7 @@ def test_a_command_key_comes_with_the_configuration_that_lets_it_in(tmp_path: Pa
     assert signing.key.public_key().public_bytes_raw() == commands.keys[0].public_bytes
     assert commands.keys[0].may("hold", "any")
     path.chmod(0o640)
-    with pytest.raises(KeyFileError, match="other users can read this private key"):
+    with pytest.raises(KeyFileError, match="other users can read or write this private key"):
         read_signing_key(path)
 
 
