@@ -241,7 +241,7 @@ def test_broken_wavs(spoil: Callable[[bytes], bytes], message: str, tmp_path: Pa
 
 
 def test_a_directory_is_told(tmp_path: Path) -> None:
-    fault(tmp_path, "not a file")
+    fault(tmp_path, "Is a directory")
 
 
 def test_a_missing_library_names_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
