@@ -45,7 +45,8 @@ def one(job: Job) -> Result:
     name, ratio, band_hz, in_reference, seed = job
     made_of = FILTERS[name](ratio * band_hz[1])
     response: Filter = (lambda f: 1.0 / made_of(f)) if in_reference else made_of
-    error = U_REFERENCE * np.random.default_rng([seed, 99]).normal()
+    key = [seed, list(FILTERS).index(name), round(10.0 * ratio), round(band_hz[1]), int(in_reference)]
+    error = U_REFERENCE * np.random.default_rng(key).normal()
     made = pair(seed, response, band_hz=band_hz, rate_hz=10.0 * band_hz[1], seconds=300.0, reference_error=float(error))
     found = adjusted(
         made.files, Priors(reference=U_REFERENCE, reference_frequency_hz=made.reference_frequency_hz)

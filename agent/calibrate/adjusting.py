@@ -25,6 +25,7 @@ from calib.signal.stamps import clock_from_stamps
 
 METHOD = "3 (adjustment)"
 LAG_SD = 3.0  # how far a lag is searched, in its stated standard uncertainties
+LEAST_USED = 0.05  # of the points in motion
 RESPONSE_TURNS = 6
 HOPELESS = 2  # turns after which a refusal no longer comes from the response that is not yet taken out
 UNSETTLED = (
@@ -44,8 +45,9 @@ def adjusted(files: Files, priors: Priors) -> Outcome:
 
     def at(windows: Sequence[Window], taken: Applied) -> Adjustment:
         nonlocal stated
-        if not stated.response:
-            stated = with_response(priors, windows)
+        if not stated.response and (told := with_response(priors, windows)).response:
+            stated = told
+            latest.clear()
         if taken not in latest:
             latest.clear()
             latest[taken] = adjust(_used(windows), stated, taken)
@@ -71,6 +73,19 @@ def adjusted(files: Files, priors: Priors) -> Outcome:
     if applied.response.is_flat:
         return nothing_used(windows, files.rate_hz, METHOD)
     return Outcome(None, (UNSETTLED,), windows, files.rate_hz, METHOD)
+
+
+def _hardly_used(windows: Sequence[Window]) -> tuple[str, ...]:
+    """The reason for a refusal where almost none of the motion can be used: a few points by chance tell nothing."""
+    moved = [w for w in windows if w.kind == "motion"]
+    used, points = (sum(w.points for w in some) for some in (_used(moved), moved))
+    if not used or used >= LEAST_USED * points:
+        return ()
+    refused = next(w for w in moved if not w.used)
+    return (
+        f"only {used} of {points} points in motion can be used, at least {LEAST_USED:.0%} are needed; the first window "
+        f"that cannot be used ({refused.pose.position}): {refused.reason}",
+    )
 
 
 def _usable_lag_s(files: Files, priors: Priors, windows: Sequence[Window]) -> float:
@@ -120,9 +135,10 @@ def norm_fitted(sensor: SensorTable, options: dict[str, Any]) -> Outcome:
 
 
 def _outcome(found: Adjustment, windows: Sequence[Window], rate_hz: float) -> Outcome:
+    reasons = found.reasons or _hardly_used(windows)
     nuisances = [NuisanceValue(n.name, n.value, n.standard_uncertainty, n.unit) for n in found.nuisances]
     return Outcome(
-        None if found.reasons else found.calibration, found.reasons, windows, rate_hz, found.calibration.method,
+        None if reasons else found.calibration, reasons, windows, rate_hz, found.calibration.method,
         coverage_factor=found.coverage_factor,
         uncertainty_kind="combined",
         nuisances=nuisances,
@@ -141,7 +157,7 @@ def _outcome(found: Adjustment, windows: Sequence[Window], rate_hz: float) -> Ou
             "misfit": found.misfit,
             "nuisance_pull": found.nuisance_pull,
             **_response(found),
-            "invariant": None if found.reasons else found.invariant,
+            "invariant": None if reasons else found.invariant,
         },
     )  # fmt: skip
 

@@ -103,6 +103,14 @@ def test_what_no_smooth_response_explains_is_refused(response: Filter) -> None:
     assert calibrated(pair(3, response)).reasons
 
 
+def test_a_few_points_by_chance_are_no_result() -> None:
+    """The windows are refused before the response is known; two seconds that are left would give S 13 % off."""
+    resonant = resonance(3.0, 5.0)
+    made = pair(0, lambda f: 1.0 / resonant(f), band_hz=(0.3, 2.0), rate_hz=20.0, seconds=300.0)
+    (reason,) = calibrated(made).reasons
+    assert "only 40 of" in reason
+
+
 def test_a_band_that_deviates_is_named() -> None:
     def notched(frequency_hz: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
         return np.asarray(1.0 - 0.3 * np.exp(-0.5 * ((frequency_hz - 6.0) / 0.3) ** 2) + 0j)
