@@ -39,6 +39,7 @@ OF_THE_CONFIGURATION = {
 AT_A_FIXED_MOUNT = {"gravity_direction_rad": 6 * DEG, "lean_rad": 6 * DEG, "tilt_rad": 0.0}
 WHERE_IT_TURNS = {"gravity_direction_rad": DEG, "lean_rad": 0.0, "tilt_rad": 0.0}
 OF_THE_OPTIONS = {
+    "reference_frequency_hz": (5.0, {"reference_frequency_hz": 5.0}),
     "u_angle_deg": (1.0, {"angle_rad": DEG, "gravity_direction_rad": DEG}),
     "u_theta_deg": (2.0, {"theta_rad": 2 * DEG}),
     "u_theta_position_deg": (3.0, {"theta_position_rad": 3 * DEG}),
