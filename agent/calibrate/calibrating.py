@@ -23,7 +23,7 @@ from agent.calibrate.tables import ReferenceTable, SensorTable, read_reference, 
 from agent.calibrate.wrong_unit import check_gravity
 from agent.reading.source import Progress, TableError
 from agent.reading.units import Sensitivity, sensitivity_of
-from agent.terminal.text import for_drawing
+from agent.terminal.text import for_drawing, say
 from calib.estimate.nuisances import Priors
 from calib.estimate.verdict import dead_reasons
 from calib.excitation.front_end import Settings
@@ -98,7 +98,7 @@ def _sensitivity(text: str) -> Sensitivity:
 
 def _say(said: Sequence[str]) -> None:
     for line in said:
-        click.echo(line, err=True)
+        say(line, err=True)
 
 
 def _check_quantity(reference: ReferenceTable, instrument: Instrument, stated: str | None) -> None:

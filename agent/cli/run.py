@@ -89,7 +89,7 @@ def serve(config: Config, data_dir: Path, watch: Any, duration_s: float | None) 
         say(f"fieldcal run: recording.signing_key: {error}", err=True)
         return 2
     except OtherGatewayError as error:
-        click.echo(f"fieldcal run: {error}", err=True)
+        say(f"fieldcal run: {error}", err=True)
         return 2
     except (StoreError, OSError) as error:
         say(f"fieldcal run: {error}", err=True)

@@ -73,7 +73,7 @@ class Delimited(Source):
     def _one_by_one(self, line: int, text: bytes, places: Sequence[int]) -> Array:
         dialect = self.dialect
         encoding = "utf-8" if dialect.encoding.startswith("utf") else dialect.encoding
-        told = "".join(text.decode(encoding, "replace")).split("\n")
+        told = text.decode(encoding, "replace").split("\n")
         parsed = []
         for number, content in enumerate(told, start=line):
             if not content.strip() or content.lstrip().startswith("#"):

@@ -73,8 +73,7 @@ def banded(windows: Sequence[Window], channels: int, to_hz: float) -> Banded:
         return Banded(projected, np.zeros(0), np.zeros((0, len(POWERS))), BetweenBands())
     residual, moves = np.concatenate([t.residual for t in found]), np.vstack([t.moves for t in found])
     # Only what the terms can change is kept: as many rows as there are terms.
-    scale = np.linalg.norm(moves, axis=0)
-    scale[scale == 0.0] = 1.0
+    scale = _unit(np.sum(moves**2, axis=0))
     triangle = np.asarray(np.linalg.qr(np.column_stack([moves / scale, residual]), mode="r"), dtype=np.float64)
     fitted, *_ = np.linalg.lstsq(moves / scale, residual, rcond=None)
     left = residual - moves / scale @ fitted
@@ -91,7 +90,7 @@ class _Factor:
         powers = np.diag(self.gram)
         self.omega = float(np.sqrt(powers[m:].sum() / powers[:m].sum()))
         self.middle_hz = float(np.sqrt(bands.low_hz[b] * bands.high_hz[b]))
-        scale = np.where(powers > 0.0, np.sqrt(np.maximum(powers, 0.0)), 1.0)
+        scale = _unit(powers)
         values, vectors = np.linalg.eigh(self.gram / np.outer(scale, scale))
         live = values > RELATED * values[-1]
         root = np.where(live, np.sqrt(np.maximum(values, 0.0)), 0.0)
@@ -113,10 +112,15 @@ class _Factor:
         return np.asarray(rows / self.noise[axis])
 
 
+def _unit(powers: Array) -> Array:
+    """The root of each power, 1 where there is none: a unit in which no column is much larger than the others."""
+    return np.where(powers > 0.0, np.sqrt(np.maximum(powers, 0.0)), 1.0)
+
+
 def _projected(factors: Sequence[_Factor]) -> Array:
     """(K, 2M, M) see Banded."""
     gram = np.sum([f.gram for f in factors], axis=0)
-    scale = np.where(np.diag(gram) > 0.0, np.sqrt(np.maximum(np.diag(gram), 0.0)), 1.0)
+    scale = _unit(np.diag(gram))
     inverse = np.linalg.pinv(gram / np.outer(scale, scale), RELATED, hermitian=True) / np.outer(scale, scale)
     terms, m = by_term(np.array([f.omega for f in factors])), len(gram) // 2
     moved = sum(
@@ -149,16 +153,13 @@ def _told(factors: Sequence[_Factor], axis: int) -> _Told:
     lagged = np.vstack([f.seen(-1j * f.omega, axis) for f in factors])
     observed = np.concatenate([f.slopes[:, axis] / f.noise[axis] for f in factors])
     moved = [np.vstack([f.seen(complex(terms[b, k]), axis) for b, f in enumerate(factors)]) for k in range(len(POWERS))]
-    scale = np.linalg.norm(own, axis=0)
-    live = scale > 0.0
-    start, *_ = np.linalg.lstsq(own[:, live] / scale[live], observed, rcond=RELATED)
+    live = own.any(axis=0)
+    moving = own[:, live] / _unit(np.sum(own[:, live] ** 2, axis=0))
     gain = np.zeros(own.shape[1])
-    gain[live] = start / scale[live]
+    gain[live] = _fitted(own[:, live], observed)
     # With the lag in the fit, a lag that is left does not reduce the gain.
-    both = np.column_stack([own[:, live] / scale[live], lagged @ gain])
-    fitted, *_ = np.linalg.lstsq(both / np.linalg.norm(both, axis=0).clip(1e-300), observed, rcond=RELATED)
-    gain[live] = (fitted / np.linalg.norm(both, axis=0).clip(1e-300))[:-1] / scale[live]
-    free, _ = np.linalg.qr(np.column_stack([own[:, live] / scale[live], lagged @ gain]))
+    gain[live] = _fitted(np.column_stack([own[:, live], lagged @ gain]), observed)[:-1]
+    free, _ = np.linalg.qr(np.column_stack([moving, lagged @ gain]))
     rows = np.column_stack([observed, *(part @ gain for part in moved)])
     rows -= free @ (free.T @ rows)
     at_hz, noise = (
@@ -166,6 +167,13 @@ def _told(factors: Sequence[_Factor], axis: int) -> _Told:
         for values in ([f.middle_hz for f in factors], [f.noise[axis] for f in factors])
     )
     return _Told(rows[:, 0], rows[:, 1:], observed, at_hz, noise, free.shape[1])
+
+
+def _fitted(columns: Array, observed: Array) -> Array:
+    """Least squares of `observed` (R,) on columns (R, p)."""
+    unit = _unit(np.sum(columns**2, axis=0))
+    solution, *_ = np.linalg.lstsq(columns / unit, observed, rcond=RELATED)
+    return np.asarray(solution / unit)
 
 
 def _between(found: Sequence[_Told], left: Array) -> BetweenBands:

@@ -22,6 +22,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.estimate.banded import Banded
 from calib.estimate.condense import Condensed
 from calib.estimate.nuisances import Inputs, Nuisances
 from calib.estimate.slope_scatter import SlopeScatter
@@ -133,7 +134,7 @@ class Equations:
         steady, by_nuisance = self.nuisances.steady(z)
         slope, d_slope = self._slopes(steady * S, inputs)
         mean, d_mean = self._means(steady * S, Q, z, inputs)
-        for moves in (d_slope, d_mean):
+        for moves in (d_slope, d_mean) if by_nuisance.any() else ():
             moves[..., :9] *= steady
             moves[..., 12:] += (moves[..., :9] @ x[:9])[..., None] * by_nuisance
         return Rows(slope, d_slope, mean, d_mean, *self._bands(inputs))
@@ -161,8 +162,9 @@ class Equations:
         on_rate = ideal * on_du[..., None] + np.einsum("ik,bkm->bim", S, ahead)
         on_rate[:, :, :1] += (across @ S.T)[..., None]
         slopes = np.concatenate([ideal * on_u[..., None], on_rate], axis=2)  # (W, 3, 2M)
-        passed, d_passed = self._passed(inputs)  # (W, 2M, M) and (J, W, 2M, M)
-        slopes += np.einsum("bim,brm->bir", ideal, passed)
+        if data.bands is not None:
+            passed, d_passed = self._passed(data.bands, inputs)
+            slopes += np.einsum("bim,brm->bir", ideal, passed)
         residual = data.slopes - np.einsum("brc,bic->bri", data.root, slopes)
 
         nuisances = self.nuisances
@@ -176,11 +178,13 @@ class Equations:
         d_z = np.concatenate(
             [d_ideal * on_u[..., None, None] + ideal[..., None] * d_on_u[:, :, None, :], d_on_rate], axis=2
         )
-        d_z += np.einsum("bimj,brm->birj", d_ideal, passed) + np.einsum("bim,jbrm->birj", ideal, d_passed)
+        if data.bands is not None:
+            d_z += np.einsum("bimj,brm->birj", d_ideal, passed) + np.einsum("bim,jbrm->birj", ideal, d_passed)
         n = 12 + len(nuisances)
         jacobian = np.zeros((*data.slopes.shape, n))  # (W, 2M, 3, N)
         per_row = np.concatenate([D[:, None] * on_u[..., None, None], D[:, None] * on_du[..., None, None]], axis=3)
-        per_row += np.einsum("bkm,brm->bkr", D, passed)[:, None]
+        if data.bands is not None:
+            per_row += np.einsum("bkm,brm->bkr", D, passed)[:, None]
         per_row[:, :, :, D.shape[2] :] += ahead[:, None]
         per_row[:, :, :, D.shape[2] : D.shape[2] + 1] += across[:, None, :, None]
         for i in range(3):
@@ -189,12 +193,8 @@ class Equations:
         noise = data.type_a.noise[:, None]
         return self._whitened(residual / noise), self._whitened(jacobian / noise[..., None])
 
-    def _passed(self, inputs: Inputs) -> tuple[Array, Array]:
+    def _passed(self, bands: Banded, inputs: Inputs) -> tuple[Array, Array]:
         """What the response that is left adds to the slopes, (W, 2M, M), and its derivatives (J, W, 2M, M)."""
-        bands, m = self.data.bands, self.data.channels
-        if bands is None:
-            nothing = np.zeros((1 + len(self.nuisances), len(self.data.slopes), 2 * m, m))
-            return nothing[0], nothing[1:]
         terms = np.vstack([inputs.response, self.nuisances.response])
         passed = np.einsum("jk,bkrm->jbrm", terms, bands.projected)
         return passed[0], passed[1:]

@@ -44,13 +44,6 @@ class Gateway:
 
 
 @pytest.fixture
-def site() -> Iterator[Site]:
-    site = Site()
-    yield site
-    site.kill()
-
-
-@pytest.fixture
 def gateway(site: Site, tmp_path: Path) -> Iterator[Gateway]:
     gateway = Gateway(site, tmp_path / "a", AHEAD)
     yield gateway

@@ -15,7 +15,7 @@ from tests.scenarios.processes import ROOT
 
 # Stands for a start that takes long: in Python, and in one call of a library that no signal interrupts.
 SLOW = """
-import sys, time, hashlib
+import sys, threading, hashlib
 from agent.acquisition import service
 def slow(*_, **__):
     print("slow", flush=True)
@@ -28,7 +28,7 @@ CALLS = {
     "python": """
     while True:
         try:
-            time.sleep(0.01)
+            threading.Event().wait()  # for ever
         except Exception:
             pass""",
     "library": "hashlib.pbkdf2_hmac('sha256', b'', b'', 2_000_000_000)",

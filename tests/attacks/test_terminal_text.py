@@ -162,7 +162,6 @@ def test_a_page_and_a_figure_obey_nothing() -> None:
 
 def test_a_report_of_a_hostile_result_is_made(tmp_path: Path) -> None:
     """Names, units and reasons in a RESULT.json that somebody else made."""
-    pytest.importorskip("matplotlib")
     label, long = "$\\frac{-->" + HOSTILE, "y" * 100_000
     result = {
         "sensitivity": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],

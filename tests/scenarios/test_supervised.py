@@ -77,13 +77,6 @@ def systemd(tmp_path: Path) -> Iterator[Systemd]:
 
 
 @pytest.fixture
-def site() -> Iterator[Site]:
-    site = Site()
-    yield site
-    site.kill()
-
-
-@pytest.fixture
 def imu(tmp_path: Path) -> Iterator[PtyDevice]:
     device = PtyDevice(SampleLines(lambda _, n: np.ones((n, 3)), lambda t_s: int(t_s * 100)), link=tmp_path / "imu")
     device.start()

@@ -86,13 +86,6 @@ def next_query(queryable: zenoh.Queryable[zenoh.Handler[zenoh.Query]]) -> zenoh.
 
 
 @pytest.fixture
-def site() -> Iterator[Site]:
-    site = Site()
-    yield site
-    site.kill()
-
-
-@pytest.fixture
 def gateway(site: Site, tmp_path: Path) -> Iterator[Gateway]:
     gateway = Gateway(site, tmp_path)
     yield gateway
@@ -273,7 +266,7 @@ from agent.delivery.consumer import Consumer
 
 def interrupt_while_it_waits(main=threading.main_thread().ident):
     while "get" not in [f.name for f in traceback.extract_stack(sys._current_frames()[main])]:
-        time.sleep(0.01)
+        time.sleep(0.01)  # polls; the condition decides, not the time
     os.kill(os.getpid(), signal.SIGINT)
 
 consumer = Consumer([sys.argv[1]])

@@ -19,13 +19,6 @@ from tests.unit.zenoh_site import Site, record
 
 
 @pytest.fixture
-def site() -> Iterator[Site]:
-    site = Site()
-    yield site
-    site.kill()
-
-
-@pytest.fixture
 def gateway(site: Site, tmp_path: Path) -> Iterator[Gateway]:
     gateway = Gateway(site, tmp_path / "gateway")
     gateway.publisher.start()

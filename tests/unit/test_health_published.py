@@ -17,13 +17,6 @@ from tests.unit.zenoh_site import KEY, Site, record, wait_for
 
 
 @pytest.fixture
-def site() -> Iterator[Site]:
-    site = Site()
-    yield site
-    site.kill()
-
-
-@pytest.fixture
 def store(tmp_path: Path) -> Iterator[Store]:
     store = Store(tmp_path, 0)
     yield store

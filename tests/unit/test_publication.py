@@ -23,13 +23,6 @@ ALL = zenoh.ConsolidationMode.NONE
 
 
 @pytest.fixture
-def site() -> Iterator[Site]:
-    site = Site()
-    yield site
-    site.kill()
-
-
-@pytest.fixture
 def store(tmp_path: Path) -> Iterator[Store]:
     store = Store(tmp_path, 0)
     yield store

@@ -6,22 +6,12 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
 import zenoh
 
 from agent.delivery.session import session_config
 from tests.unit.zenoh_site import Site, router_process
-
-
-@pytest.fixture
-def site() -> Iterator[Site]:
-    site = Site()
-    yield site
-    site.kill()
-
 
 _AGENT = """
 import os, sys, time

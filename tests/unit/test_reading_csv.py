@@ -220,7 +220,8 @@ def test_sensitivities_that_are_none(text: str) -> None:
 
 
 def test_as_pandas_writes_it(tmp_path: Path) -> None:
-    pandas = pytest.importorskip("pandas")
+    import pandas
+
     frame = pandas.DataFrame(VALUES[:, 1:], columns=["accel_x", "accel_y", "accel_z"])
     frame.index = pandas.to_datetime(START_S * 10**9 + (VALUES[:, 0] * 1e9).round().astype(int), utc=True)
     frame.index.name = "timestamp"

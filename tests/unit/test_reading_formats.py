@@ -122,7 +122,8 @@ def test_a_bag_without_imu(tmp_path: Path) -> None:
 
 
 def frame() -> object:
-    pandas = pytest.importorskip("pandas")
+    import pandas
+
     pytest.importorskip("pyarrow", reason="pyarrow is not installed (extra files)")
     return pandas.DataFrame({"time": TIME_S, "x": V[:, 0], "label": "a", "y": V[:, 1], "z": V[:, 2]})
 
@@ -144,7 +145,8 @@ def test_frames_of_pandas(kind: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("unit", ["ms", "us", "ns"])
 def test_dates_and_gaps_of_pandas(unit: str, tmp_path: Path) -> None:
-    pandas = pytest.importorskip("pandas")
+    import pandas
+
     table = frame()
     stamps = pandas.Series(1_700_000_000 * 10**9 + (TIME_S * 1e9).round().astype("int64"))
     table["time"] = stamps.astype("datetime64[ns]").astype(f"datetime64[{unit}]").dt.tz_localize("UTC")
@@ -203,7 +205,7 @@ def test_wav_of_scipy(dtype: type, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("subtype", ["PCM_16", "PCM_24", "FLOAT", "DOUBLE"])
 def test_wav_of_soundfile(subtype: str, tmp_path: Path) -> None:
-    soundfile = pytest.importorskip("soundfile")
+    soundfile = pytest.importorskip("soundfile", reason="soundfile is not installed; it only checks the stdlib reader")
     path = tmp_path / "a.wav"
     soundfile.write(path, V / 20, RATE_HZ, subtype=subtype, format="WAVEX" if subtype == "PCM_24" else "WAV")
     same(path, v=soundfile.read(path)[0])

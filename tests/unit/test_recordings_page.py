@@ -46,7 +46,8 @@ def write(kind: str, site: Path) -> None:
     t, *v = np.loadtxt(site / "sensor.csv", delimiter=",", skiprows=1).T[:4]
     at, a = np.loadtxt(site / "reference.csv", delimiter=",", skiprows=1).T
     if kind == "parquet":
-        pandas = pytest.importorskip("pandas")
+        import pandas
+
         pandas.DataFrame({"time": t, "accX": v[0], "accY": v[1], "accZ": v[2]}).to_parquet(site / "imu.parquet")
         pandas.DataFrame({"time": at, "acc": a / G * 1e3}).to_feather(site / "shaker.feather")
     elif kind == "wav":
@@ -56,10 +57,12 @@ def write(kind: str, site: Path) -> None:
         wavfile.write(site / "one.wav", 1000, np.interp(np.arange(0, at[-1], 1e-3), at, a))
     elif kind == "mat":
         savemat(site / "imu.mat", {"t": t, "acc": np.column_stack(v)})
-        with pytest.importorskip("h5py").File(site / "imu.h5", "w") as file:
+        with pytest.importorskip("h5py", reason="h5py is not installed (extra hdf5)").File(
+            site / "imu.h5", "w"
+        ) as file:
             file["t"], file["ref"] = at, a / G
     elif kind == "tdms":
-        nptdms = pytest.importorskip("nptdms")
+        nptdms = pytest.importorskip("nptdms", reason="npTDMS is not installed (extra tdms)")
         with nptdms.TdmsWriter(site / "daq.tdms") as writer:
             channels = [("imu", "time", t, "s"), *(("imu", f"acc {n}", x, "") for n, x in zip("xyz", v, strict=True))]
             channels += [("shaker", "time", at, "s"), ("shaker", "acc", a, "m/s2")]

@@ -65,4 +65,4 @@ def wait_for(condition: Callable[[], bool], timeout_s: float = 10.0) -> None:
     end = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < end, f"{condition} did not come true within {timeout_s} s"
-        time.sleep(0.01)
+        time.sleep(0.01)  # polls; the condition decides, not the time
