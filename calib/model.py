@@ -106,6 +106,7 @@ class Window:
     independent: float = 1.0
     reference_noise: Array | None = None  # (2, m) rms of the reference's own noise in u, m/s2, and in du/dt, m/s3
     bands: BandSums | None = None  # None at rest, and where no response over frequency is estimated
+    response: tuple[float, ...] = ()  # terms (calib.signal.response) that were taken out; () where none were
 
 
 @dataclass(frozen=True, slots=True, eq=False)

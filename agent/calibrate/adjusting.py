@@ -32,9 +32,6 @@ UNSETTLED = (
     "the response of sensor and reference over frequency does not settle: within the motion's band they differ too "
     "much, as at a filter's corner or a resonance; calibrate with motion at lower frequencies"
 )
-# Standard uncertainty of a term, relative to that of a low-pass filter at the upper end of the motion. It is honest for
-# filters, means and resonances from 1.5 times that frequency on (shown by benchmarks.response).
-RESPONSE_U = 10.0
 
 
 def adjusted(files: Files, priors: Priors) -> Outcome:
@@ -98,12 +95,7 @@ def _usable_lag_s(files: Files, priors: Priors, windows: Sequence[Window]) -> fl
 def with_response(priors: Priors, windows: Sequence[Window]) -> Priors:
     """The priors with those of the response, where the motion covers a band that is wide enough to tell it."""
     band_hz = motion_band_hz(_used(windows))
-    if band_hz is None:
-        return priors
-    told = {"response": RESPONSE_U, "response_hz": band_hz[1]}
-    if not priors.reference_frequency_hz:
-        told["reference_frequency_hz"] = float(np.sqrt(band_hz[0] * band_hz[1]))
-    return Priors({**priors.values, **told}, priors.parameters, priors.covariance)
+    return priors if band_hz is None else priors.with_response(band_hz)
 
 
 def _used(windows: Sequence[Window]) -> list[Window]:

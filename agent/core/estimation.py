@@ -22,6 +22,7 @@ from calib.estimate.innovation import Innovation
 from calib.estimate.recursion import Recursion
 from calib.estimate.window_rows import Summary
 from calib.model import PARAMETERS, Calibration, Window, WindowSums
+from calib.signal.response import Response
 
 DAY_S = 86400.0
 MAX_CHANGE_OFFSET_MPS2 = 0.5  # as much as a mount that leans by 3 deg
@@ -74,7 +75,7 @@ class Estimation:
         self._held: list[Summary] = []
         self._witnesses = Witnesses([beside.reference for beside in self._beside])
         self._proposed: list[tuple[Calibration, Recursion]] = []  # proposals whose windows the state did not take
-        self._tried: Tried | None = None  # what `lag_after` did, for `judge` right after it
+        self._tried: Tried | None = None  # what `after` did, for `judge` right after it
         self._lag_watches = [LagWatch(beside, self.gate.limit) for beside in self._beside]
         self._explain_s: float | None = None  # time of the next explanation of held windows; None where none are held
 
@@ -102,8 +103,14 @@ class Estimation:
         """By which the sensor's indications come after the reference's, as far as known."""
         return self.recursion.lag_s
 
+    @property
+    def response(self) -> Response:
+        """The response of the sensor over that of the reference, as far as known."""
+        return self.recursion.response
+
     def _summary(self, window: Window, day: float, lag_s: float, temperature_degc: float) -> Summary:
-        return Summary.of(window, day, lag_s, temperature_degc, self.recursion.reference)
+        known = self.recursion
+        return Summary.of(window, day, lag_s, temperature_degc, known.reference, known.motion_to_hz)
 
     def date_certificate(self, day: float, utc_ns: int) -> None:
         """Tell the state the date of the certificate of the reference in use. `utc_ns` is the UTC of `day`."""
@@ -111,13 +118,13 @@ class Estimation:
         before_s = None if dated is None else utc_ns * 1e-9 - dated.timestamp()
         self.recursion.date_certificate(None if before_s is None else day - before_s / DAY_S)
 
-    def lag_after(self, windows: Sequence[Window], day: float, lag_s: float, temperature_degc: float) -> float:
-        """The lag once these windows, made with `lag_s` taken out, were taken."""
+    def after(self, windows: Sequence[Window], day: float, lag_s: float, temperature_degc: float) -> Recursion:
+        """The state once these windows, made with `lag_s` taken out, were taken."""
         self._tried = self._try(windows[0], day, lag_s, temperature_degc)
         trial = self._tried.after
         for window in windows[1:]:
             _, trial = trial.with_window(self._summary(window, day, lag_s, temperature_degc))
-        return trial.lag_s
+        return trial
 
     def contradicted(self, found: Found, day: float, lag_s: float) -> bool:
         """Whether a window, made with `lag_s` taken out, contradicts the state, or does not follow the reference."""
@@ -203,7 +210,7 @@ class Estimation:
         return explained(self.recursion, self._held, jump, self.gate.limit, fixed_mount=fixed)
 
     def _tried_of(self, window: Window, day: float, lag_s: float, temperature_degc: float) -> Tried:
-        """The window tried on the state; what `lag_after` did is not done again."""
+        """The window tried on the state; what `after` did is not done again."""
         tried = self._tried
         if tried is None or tried.window_sums is not window.sums or tried.summary.lag_s != lag_s:
             return self._try(window, day, lag_s, temperature_degc)

@@ -7,10 +7,12 @@ one device) and changes it to what version n + 1 writes.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
+from calib.estimate.banded import Deviations
 from calib.estimate.quantities import (
     ALPHA,
     ALPHA_BY_POSITION,
@@ -167,4 +169,22 @@ def _with_kind(quantity: list[Any]) -> tuple[str, Kind, str, str]:
     return name, KINDS[kind], position, owner
 
 
-MIGRATIONS: Mapping[int, Callable[[dict[str, Any]], None]] = {1: from_version_1, 2: from_version_2}
+def from_version_3(state: dict[str, Any]) -> None:
+    """Version 3 knew no response over frequency: windows had no bands, and S was that of the whole motion."""
+    for estimation in _estimations(state):
+        recursions = [estimation["recursion"], *(proposal["recursion"] for proposal in estimation["proposed"])]
+        for recursion in recursions:
+            recursion["over"] = {"motion_hz": None, "deviations": asdict(Deviations())}
+            if recursion["held"] is not None:
+                recursion["held"]["steady"] = {}
+        recent = (summary for recursion in recursions for summary in recursion["recent"])
+        for summary in (*recent, *estimation["held"], *estimation["witnesses"]):
+            summary |= {"response": [], "motion_hz": None}
+            summary["data"]["bands"] = None
+
+
+MIGRATIONS: Mapping[int, Callable[[dict[str, Any]], None]] = {
+    1: from_version_1,
+    2: from_version_2,
+    3: from_version_3,
+}

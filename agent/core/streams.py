@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from calib.estimate.lag_search import without_lag
 from calib.excitation.front_end import most_margin_s
 from calib.excitation.placing import Placed
 from calib.model import Pose, Window
+from calib.signal.response import FLAT, Response
 from calib.signal.timing import HORIZON_S
 from hw.block import LARGEST, SampleBlock
 
@@ -38,6 +40,7 @@ class Verdict:
     lag_s: float
 
 
+RESPONSE_TURNS = 6  # the first windows begin with no response
 MOST_DUE = 100  # pieces between two events; a tick comes each second, a window has 1 s, and samples are 60 s late
 
 
@@ -256,23 +259,31 @@ class Streams:
     def _found(
         self, piece: Piece, first_s: float, day: float, estimation: Estimation | None
     ) -> tuple[Found, float, Anew | None]:
-        """The windows, made again until no lag is left in them that matters; what a search for another lag found."""
-
-        def make(lag_s: float) -> Found:
-            return windows_in(piece, first_s, self._beside[self.place], self.by_device, lag_s)
-
+        """The windows, made again until neither a lag nor a response is left in them that matters; what a search for
+        another lag found."""
         if estimation is None or self._channel.reference is None:
             lag_s = 0.0 if estimation is None else estimation.lag_s
-            return make(lag_s), lag_s, None
-        found, lag_s = without_lag(
-            estimation.lag_s,
-            make,
-            lambda found: found.used,
-            lambda found, lag_s: estimation.lag_after(found.used, day, lag_s, found.temperature_degc),
-        )
+            return self._make(piece, first_s, FLAT, np.inf, lag_s), lag_s, None
+        lag_s, response = estimation.lag_s, estimation.response
+        trial = estimation.recursion
+
+        def lag_of(found: Found, lag_s: float) -> float:
+            nonlocal trial
+            trial = estimation.after(found.used, day, lag_s, found.temperature_degc)
+            return trial.lag_s
+
+        for _ in range(RESPONSE_TURNS):
+            make = partial(self._make, piece, first_s, response, estimation.recursion.motion_to_hz)
+            found, lag_s = without_lag(lag_s, make, lambda found: found.used, lag_of)
+            if not found.used or trial.response.is_near(response):
+                break
+            response = trial.response
         if not estimation.contradicted(found, day, lag_s):
             return found, lag_s, None
         anew = estimation.lag_watch.search(estimation.recursion, make, found.windows, day)
         if anew is not None and not anew.beyond:
             return anew.found, anew.lag_s, anew
         return found.because(estimation.lag_watch.beyond), lag_s, None
+
+    def _make(self, piece: Piece, first_s: float, response: Response, to_hz: float, lag_s: float) -> Found:
+        return windows_in(piece, first_s, self._beside[self.place], self.by_device, lag_s, response, to_hz)

@@ -160,11 +160,11 @@ def _best(loose: Recursion, make: Callable[[float], Found], lags_s: Sequence[flo
     """The windows and the lag to which the best of the starts `lags_s` leads."""
 
     def misfit(lag_s: float) -> tuple[int, float]:
-        told = [loose.innovation(s, at_its_lag=True) for s in _summaries(make(lag_s), day, lag_s, loose.reference)]
+        told = [loose.innovation(s, at_its_lag=True) for s in _summaries(make(lag_s), day, lag_s, loose)]
         return -len(told), sum(t.statistic for t in told)
 
     def lag_after(found: Found, lag_s: float) -> float:
-        first, *others = _summaries(found, day, lag_s, loose.reference)
+        first, *others = _summaries(found, day, lag_s, loose)
         trial = loose.with_window(first, at_its_lag=True)[1]
         for summary in others:
             trial = trial.with_window(summary)[1]
@@ -175,7 +175,7 @@ def _best(loose: Recursion, make: Callable[[float], Found], lags_s: Sequence[flo
 
 def _explains(base: Recursion, found: Found, lag_s: float, day: float, limit: Limit) -> bool:
     """Whether the windows, taken one after the other, are all consistent with the state; at least one is used."""
-    trial, summaries = base, _summaries(found, day, lag_s, base.reference)
+    trial, summaries = base, _summaries(found, day, lag_s, base)
     for k, summary in enumerate(summaries):
         told, trial = trial.with_window(summary, at_its_lag=k == 0)
         if told.statistic > limit(told.degrees_of_freedom):
@@ -185,13 +185,14 @@ def _explains(base: Recursion, found: Found, lag_s: float, day: float, limit: Li
 
 def _decisive(recursion: Recursion, loose: Recursion, found: Found, lag_s: float, day: float, limit: Limit) -> bool:
     """Whether the other lag alone makes the difference: chi-squared falls by more than one unknown does by chance."""
-    first = _summaries(found, day, lag_s, loose.reference)[0]
+    first = _summaries(found, day, lag_s, loose)[0]
     tight = recursion.innovation(first, at_its_lag=True).statistic
     return tight - loose.innovation(first, at_its_lag=True).statistic > limit(1.0)
 
 
-def _summaries(found: Found, day: float, lag_s: float, reference: str) -> list[Summary]:
-    return [Summary.of(window, day, lag_s, found.temperature_degc, reference) for window in found.used]
+def _summaries(found: Found, day: float, lag_s: float, state: Recursion) -> list[Summary]:
+    told = lag_s, found.temperature_degc, state.reference, state.motion_to_hz
+    return [Summary.of(window, day, *told) for window in found.used]
 
 
 def _too_far(lag_s: float, mean_s: float, u_s: float) -> str:

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
 
 from agent.config import Channel
 from agent.core.schedule import Piece
 from agent.core.stream import DeviceStream
+from calib.excitation.bands import ABOVE, HIGHEST, share_above
 from calib.excitation.front_end import LEAST_MARGIN_S, Settings, Unusable, margin_s, nothing_in, windows_of
 from calib.excitation.window_verdict import Limits
 from calib.model import Window
+from calib.signal.response import FLAT, Response
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,11 +41,19 @@ class Found:
         return replace(self, windows=[replace(w, numbers={**w.numbers, **numbers}) for w in self.windows])
 
 
-def windows_in(piece: Piece, first_s: float, channel: Channel, streams: dict[str, DeviceStream], lag_s: float) -> Found:
+def windows_in(
+    piece: Piece,
+    first_s: float,
+    channel: Channel,
+    streams: dict[str, DeviceStream],
+    lag_s: float,
+    response: Response = FLAT,
+    to_hz: float = np.inf,
+) -> Found:
     """The windows of a stretch in one pose, each with its verdict; one unused window where there is nothing to judge.
 
     `first_s` is the time of the sensor's first sample; the windows' times count from it. The sensor's indications are
-    taken to come late by `lag_s`.
+    taken to come late by `lag_s`, and to be what `response` makes of the motion. Motion above `to_hz` is filtered out.
     """
     start_s, stop_s = first_s + piece.start_s, first_s + piece.stop_s
     around_s = margin_of(channel, streams)
@@ -53,10 +66,17 @@ def windows_in(piece: Piece, first_s: float, channel: Channel, streams: dict[str
         if reference is None:
             return Found([refused(piece, f"no samples of the reference {channel.reference}")])
     known = channel.priors(fixed_mount=channel.fixed_mount)
-    settings = Settings(Limits.of(known.offset_mps2, known.angle_rad, channel.window_s))
-    span_s = (start_s, stop_s)
+    limits, span_s = Limits.of(known.offset_mps2, known.angle_rad, channel.window_s), (start_s, stop_s)
+
+    def made(limit_hz: float | None) -> list[Window]:
+        settings = Settings(limits, bands=True, to_hz=limit_hz)
+        how: dict[str, Any] = {"settings": settings, "response": response}
+        return windows_of(piece.pose, sensor, reference, channel.instrument, span_s, lag_s, **how)
+
     try:
-        found = windows_of(piece.pose, sensor, reference, channel.instrument, span_s, lag_s, settings)
+        found = made(None)
+        if any(share_above(window, HIGHEST * to_hz) > ABOVE for window in found):
+            found = made(to_hz)
     except Unusable as error:
         return Found([refused(piece, str(error))])
     if not found:

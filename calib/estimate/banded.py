@@ -8,24 +8,25 @@ takes out what is known of h; what is left is small, so that all is linear in it
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib.distributions import chi2_quantile
+from calib.excitation.bands import HIGHEST
 from calib.excitation.sums import NOISE_FLOOR
 from calib.model import Array, BandSums, Window
-from calib.signal.response import POWERS, by_term
+from calib.signal.response import POWERS, Complex, by_term
 
-HIGHEST = 1.001  # times the upper end of the motion: a band that ends there is rounded
 PROBABILITY = 0.99  # confidence of the test for scatter between bands
+TINY = float(np.finfo(float).tiny)
 RELATED = 1e-9  # relative eigenvalue of the channels' scatter below which a direction was not excited
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BetweenBands:
-    """How far bands deviate, beyond their noise, from the response that fits all of them best.
+    """How far bands deviate, beyond their noise, from the response that fits all of them best (see Deviations).
 
     `scatter` is the relative SD, 0 where noise explains all. A narrow feature raises the noise of its band and so has
     little weight in it: `shift` is how far the deviations move the slopes of whole windows, relative; 0 where noise
@@ -43,18 +44,69 @@ class BetweenBands:
         return max(self.scatter, self.shift)
 
 
+@dataclass(frozen=True, slots=True)
+class Deviations:
+    """Sums over the bands of windows, from which `between` follows. The sums of several windows add.
+
+    `square` of the rows that the best response leaves, in units of their noise, with `freedom` degrees of freedom;
+    `signal` of the rows themselves; `moved`, `power` and `variance`: how far the deviations move the slopes of whole
+    windows, their size, and the variance that noise alone gives to `moved`. `at_hz`, `largest` as in BetweenBands.
+    """
+
+    freedom: float = 0.0
+    square: float = 0.0
+    signal: float = 0.0
+    moved: float = 0.0
+    power: float = 0.0
+    variance: float = 0.0
+    at_hz: float = 0.0
+    largest: float = 0.0
+
+    def plus(self, other: Deviations) -> Deviations:
+        """Those of both; the frequency is that of the larger deviation."""
+        worst = max(self, other, key=lambda one: one.largest)
+        added = {name: getattr(self, name) + getattr(other, name) for name in _ADDED}
+        return replace(worst, **added)
+
+    @property
+    def times_noise(self) -> float:
+        """The variance of the rows over that of their noise; 1 where noise alone shows as much in one of 100 cases."""
+        if self.freedom < 1.0 or self.square <= chi2_quantile(PROBABILITY, self.freedom):
+            return 1.0
+        return max(self.square / self.freedom, 1.0)
+
+    @property
+    def between(self) -> BetweenBands:
+        """The deviations beyond noise, which shows as much in one of 100 cases."""
+        if self.freedom < 1.0:
+            return BetweenBands()
+        excess = self.square - self.freedom if self.times_noise > 1.0 else 0.0
+        shifted = self.moved**2 > chi2_quantile(PROBABILITY, 1.0) * self.variance
+        shift = abs(self.moved) / self.power if shifted else 0.0
+        return BetweenBands(float(np.sqrt(max(excess, 0.0) / self.signal)), shift, self.at_hz, self.largest)
+
+
+_ADDED = ("freedom", "square", "signal", "moved", "power", "variance")
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Banded:
     """What the bands of W windows with M channels say of the K terms of the response that is left.
 
     `projected` (W, K, 2M, M): derivatives, by the terms, of the slopes of h u on [u, du/dt] of the whole window.
-    `residual` (R,) and `moves` (R, K): whitened rows of the terms alone, of all windows together.
+    `residual` (R,) and `moves` (R, K): whitened rows of the terms alone, of all windows together; where the bands
+    deviate by more than their noise, their noise is taken as much larger.
     """
 
     projected: Array
     residual: Array
     moves: Array
-    between: BetweenBands
+    deviations: Deviations
+
+    @property
+    def between(self) -> BetweenBands:
+        """How far the bands deviate from one response."""
+        return self.deviations.between
 
 
 def banded(windows: Sequence[Window], channels: int, to_hz: float) -> Banded:
@@ -66,50 +118,65 @@ def banded(windows: Sequence[Window], channels: int, to_hz: float) -> Banded:
             continue
         kept = np.flatnonzero(window.bands.high_hz <= HIGHEST * to_hz)
         if kept.size:
-            factors = [_Factor(window.bands, b) for b in kept.tolist()]
+            factors = _Factors(window.bands, kept)
             projected[w] = _projected(factors)
             found += [_told(factors, axis) for axis in range(3)]
     if not found:
-        return Banded(projected, np.zeros(0), np.zeros((0, len(POWERS))), BetweenBands())
+        return Banded(projected, np.zeros(0), np.zeros((0, len(POWERS))), Deviations())
     residual, moves = np.concatenate([t.residual for t in found]), np.vstack([t.moves for t in found])
     # Only what the terms can change is kept: as many rows as there are terms.
     scale = _unit(np.sum(moves**2, axis=0))
     triangle = np.asarray(np.linalg.qr(np.column_stack([moves / scale, residual]), mode="r"), dtype=np.float64)
     fitted, *_ = np.linalg.lstsq(moves / scale, residual, rcond=None)
     left = residual - moves / scale @ fitted
-    size = len(POWERS)
-    return Banded(projected, triangle[:size, size], triangle[:size, :size] * scale, _between(found, left))
+    size, deviations = len(POWERS), _deviations(found, left)
+    triangle /= np.sqrt(deviations.times_noise)
+    return Banded(projected, triangle[:size, size], triangle[:size, :size] * scale, deviations)
 
 
-class _Factor:
-    """The regression of V on u and du/dt in one band: `root` (2M, 2M), `slopes` (2M, 3) = root b, `noise` (3,)."""
+class _Factors:
+    """The regressions of V on u and du/dt in B bands of a window.
 
-    def __init__(self, bands: BandSums, b: int) -> None:
-        m = bands.reference_channels
-        self.gram, cross = bands.products[b, : 2 * m, : 2 * m], bands.products[b, : 2 * m, 2 * m :]
-        powers = np.diag(self.gram)
-        self.omega = float(np.sqrt(powers[m:].sum() / powers[:m].sum()))
-        self.middle_hz = float(np.sqrt(bands.low_hz[b] * bands.high_hz[b]))
-        scale = _unit(powers)
-        values, vectors = np.linalg.eigh(self.gram / np.outer(scale, scale))
-        live = values > RELATED * values[-1]
-        root = np.where(live, np.sqrt(np.maximum(values, 0.0)), 0.0)
-        inverse = np.divide(1.0, root, out=np.zeros_like(root), where=live)
-        self.root = root[:, None] * vectors.T * scale
-        self.slopes = inverse[:, None] * (vectors.T @ (cross / scale[:, None]))
-        total = np.diag(bands.products[b])[-3:]
-        b_of = np.linalg.pinv(self.root, RELATED) @ self.slopes
-        left = total - np.sum(self.slopes**2, axis=0) + bands.noise[b] @ b_of**2
+    `gram` (B, 2M, 2M) is that of [u, du/dt], `root` (B, 2M, 2M) its factor, `slopes` (B, 2M, 3) = root b, `noise`
+    (B, 3) their noise. `omega` (B,) in rad/s is that of the motion in the band, `middle_hz` (B,) the band's middle.
+    """
+
+    def __init__(self, bands: BandSums, kept: NDArray[np.int64]) -> None:
+        m, products = bands.reference_channels, bands.products[kept]
+        self.gram, cross = products[:, : 2 * m, : 2 * m], products[:, : 2 * m, 2 * m :]
+        powers = np.diagonal(products, axis1=1, axis2=2)
+        self.omega = np.sqrt(powers[:, m : 2 * m].sum(axis=1) / powers[:, :m].sum(axis=1))
+        self.middle_hz = np.sqrt(bands.low_hz[kept] * bands.high_hz[kept])
+        scale = _unit(powers[:, : 2 * m])
+        values, vectors = np.linalg.eigh(self.gram / (scale[:, :, None] * scale[:, None]))
+        live = values > RELATED * values[:, -1:]
+        root = np.where(live, np.sqrt(np.maximum(values, 0.0)), 0.0)[..., None]
+        inverse = np.divide(1.0, root, out=np.zeros_like(root), where=root > 0.0)
+        ways = vectors.transpose(0, 2, 1)
+        self.root = root * ways * scale[:, None]
+        self.slopes = inverse * (ways @ (cross / scale[..., None]))
+        b = (vectors @ (inverse * self.slopes)) / scale[..., None]
+        total = powers[:, 2 * m :]
+        left = total - np.sum(self.slopes**2, axis=1) + np.einsum("br,bri->bi", bands.noise[kept], b**2)
         left = np.maximum(left, NOISE_FLOOR**2 * total)
         # The mean of 1 / noise^2 is right if two degrees of freedom fewer are counted (the inverse of a chi-squared).
-        freedom = bands.points[b] - np.count_nonzero(live) - 2.0
-        self.noise = np.maximum(np.sqrt(left / freedom / bands.independent), np.finfo(float).tiny)
+        freedom = bands.points[kept] - np.count_nonzero(live, axis=1) - 2.0
+        self.noise = np.maximum(np.sqrt(left / freedom[:, None] / bands.independent), TINY)
 
-    def seen(self, response: complex, axis: int) -> Array:
-        """(2M, M) whitened slopes of an axis if V is `response` times u, by channel."""
-        m = len(self.root) // 2
-        rows = response.real * self.root[:, :m] + response.imag / self.omega * self.root[:, m:]
-        return np.asarray(rows / self.noise[axis])
+    def seen(self, response: Complex, axis: int) -> Array:
+        """(2 M B, M) whitened slopes of an axis, by channel, if V is `response` (B,) times u."""
+        m = self.root.shape[2] // 2
+        rows = response.real[:, None, None] * self.root[..., :m]
+        rows += (response.imag / self.omega)[:, None, None] * self.root[..., m:]
+        return np.asarray((rows / self.noise[:, axis, None, None]).reshape(-1, m))
+
+    def observed(self, axis: int) -> Array:
+        """(2 M B,) whitened slopes of an axis."""
+        return np.asarray((self.slopes[..., axis] / self.noise[:, axis, None]).ravel())
+
+    def by_row(self, values: Array) -> Array:
+        """Values of the bands (B,) for each of the rows (2 M B,)."""
+        return np.repeat(values, self.root.shape[1])
 
 
 def _unit(powers: Array) -> Array:
@@ -117,16 +184,14 @@ def _unit(powers: Array) -> Array:
     return np.where(powers > 0.0, np.sqrt(np.maximum(powers, 0.0)), 1.0)
 
 
-def _projected(factors: Sequence[_Factor]) -> Array:
+def _projected(factors: _Factors) -> Array:
     """(K, 2M, M) see Banded."""
-    gram = np.sum([f.gram for f in factors], axis=0)
+    gram, m = factors.gram.sum(axis=0), factors.gram.shape[1] // 2
     scale = _unit(np.diag(gram))
     inverse = np.linalg.pinv(gram / np.outer(scale, scale), RELATED, hermitian=True) / np.outer(scale, scale)
-    terms, m = by_term(np.array([f.omega for f in factors])), len(gram) // 2
-    moved = sum(
-        terms[b].real[:, None, None] * f.gram[:, :m] + (terms[b].imag / f.omega)[:, None, None] * f.gram[:, m:]
-        for b, f in enumerate(factors)
-    )
+    terms = by_term(factors.omega)
+    moved = np.einsum("bk,brm->krm", terms.real, factors.gram[..., :m])
+    moved += np.einsum("bk,brm->krm", terms.imag / factors.omega[:, None], factors.gram[..., m:])
     return np.asarray(inverse @ moved)
 
 
@@ -147,12 +212,11 @@ class _Told:
     free: int
 
 
-def _told(factors: Sequence[_Factor], axis: int) -> _Told:
-    terms = by_term(np.array([f.omega for f in factors]))
-    own = np.vstack([f.seen(1.0 + 0.0j, axis) for f in factors])
-    lagged = np.vstack([f.seen(-1j * f.omega, axis) for f in factors])
-    observed = np.concatenate([f.slopes[:, axis] / f.noise[axis] for f in factors])
-    moved = [np.vstack([f.seen(complex(terms[b, k]), axis) for b, f in enumerate(factors)]) for k in range(len(POWERS))]
+def _told(factors: _Factors, axis: int) -> _Told:
+    terms = by_term(factors.omega)
+    own = factors.seen(np.ones(len(terms), dtype=complex), axis)
+    lagged = factors.seen(-1j * factors.omega, axis)
+    observed = factors.observed(axis)
     live = own.any(axis=0)
     moving = own[:, live] / _unit(np.sum(own[:, live] ** 2, axis=0))
     gain = np.zeros(own.shape[1])
@@ -160,12 +224,9 @@ def _told(factors: Sequence[_Factor], axis: int) -> _Told:
     # With the lag in the fit, a lag that is left does not reduce the gain.
     gain[live] = _fitted(np.column_stack([own[:, live], lagged @ gain]), observed)[:-1]
     free, _ = np.linalg.qr(np.column_stack([moving, lagged @ gain]))
-    rows = np.column_stack([observed, *(part @ gain for part in moved)])
+    rows = np.column_stack([observed, *(factors.seen(terms[:, k], axis) @ gain for k in range(len(POWERS)))])
     rows -= free @ (free.T @ rows)
-    at_hz, noise = (
-        np.repeat(values, len(factors[0].root))
-        for values in ([f.middle_hz for f in factors], [f.noise[axis] for f in factors])
-    )
+    at_hz, noise = factors.by_row(factors.middle_hz), factors.by_row(factors.noise[:, axis])
     return _Told(rows[:, 0], rows[:, 1:], observed, at_hz, noise, free.shape[1])
 
 
@@ -176,26 +237,20 @@ def _fitted(columns: Array, observed: Array) -> Array:
     return np.asarray(solution / unit)
 
 
-def _between(found: Sequence[_Told], left: Array) -> BetweenBands:
-    """The scatter of what the best response leaves; noise alone shows as much in one of 100 cases."""
+def _deviations(found: Sequence[_Told], left: Array) -> Deviations:
+    """The sums of what the best response leaves (R,)."""
     signal, at_hz, noise = (
         np.concatenate([getattr(part, of) for part in found]) for of in ("signal", "at_hz", "noise")
     )
-    square, size = left**2, signal**2
+    size, variance = signal**2, noise**2
+    power = float(np.sum(size * variance))
     freedom = float(np.count_nonzero(size) - sum(part.free for part in found) - len(POWERS))
-    if freedom < 1.0:
-        return BetweenBands()
-    excess = float(square.sum()) - freedom
-    seen = square.sum() > chi2_quantile(PROBABILITY, freedom)
-    scatter = float(np.sqrt(max(excess, 0.0) / size.sum())) if seen else 0.0
-    power = size * noise**2
-    moved = left * signal * noise**2 / power.sum()
-    variance = float(np.sum(size * noise**4)) / float(power.sum()) ** 2
-    shift = float(moved.sum())
-    shifted = shift**2 > chi2_quantile(PROBABILITY, 1.0) * variance
+    moved = left * signal * variance
     third: NDArray[np.int64] = np.round(3.0 * np.log2(at_hz)).astype(np.int64)
     own = {k: third == k for k in np.unique(third).tolist()}
-    by = {k: abs(float(moved[rows].sum())) for k, rows in own.items()}
-    worst = max(by, key=lambda k: by[k])
-    largest = by[worst] * float(power.sum()) / float(power[own[worst]].sum())
-    return BetweenBands(scatter, abs(shift) if shifted else 0.0, float(np.exp2(worst / 3.0)), largest)
+    worst = max(own, key=lambda k: abs(float(moved[own[k]].sum())))
+    largest = abs(float(moved[own[worst]].sum())) / max(float(np.sum((size * variance)[own[worst]])), TINY)
+    return Deviations(
+        freedom, float(np.sum(left**2)), float(size.sum()), float(moved.sum()), power,
+        float(np.sum(size * variance**2)), float(np.exp2(worst / 3.0)), largest,
+    )  # fmt: skip

@@ -63,7 +63,7 @@ def condense(windows: Sequence[Window], *, alike: bool = False, response_hz: flo
         mean_v=np.array([s.mean[-3:] for s in segments]),
         count=np.array([s.count.sum() for s in segments]),
         type_a=pooled(segments, roots, whiteners, alike=alike),
-        bands=banded(windows, channels, response_hz) if response_hz else None,
+        bands=banded(windows, channels, response_hz) if response_hz and any(w.bands for w in windows) else None,
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -35,18 +35,30 @@ def never_turned(inputs: Array) -> bool:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Held:
-    """The constant input acceleration (3,) at a fixed mount, as stated, and how nuisances move it, by key (3,)."""
+    """The constant input acceleration (3,) at a fixed mount, as stated, and how nuisances move it, by key (3,).
+
+    `steady`: derivatives, by key, of the logarithm of the sensitivity at 0 Hz over S.
+    """
 
     mps2: Array
     by: Mapping[str, Array]
+    steady: Mapping[str, float] = field(default_factory=dict)
 
-    def parameters(self, state: JointState) -> tuple[Array, Array]:
-        """S and Q (12,) and a factor (12, N) of their covariance, of a state with the mean output in the place of Q."""
-        mean, factor = state.mean[:12].copy(), state.factor[:12].copy()
+    def parameters(self, state: JointState, joint: Array | None = None) -> tuple[Array, Array]:
+        """S and Q (12,) and a factor (12, k) of their covariance, of a state with the mean output in the place of Q.
+
+        `joint` (N, k) is a factor of the covariance of the state; None takes its own.
+        """
+        joint = state.factor if joint is None else joint
+        mean, factor = state.mean[:12].copy(), joint[:12].copy()
         moving, moves = [state.index(key) for key in self.by], np.array([*self.by.values()]).reshape(-1, 3)
-        S, felt = mean[:9].reshape(3, 3), self.mps2 + state.mean[moving] @ moves
+        terms, by_term = [state.index(key) for key in self.steady], np.array([*self.steady.values()])
+        felt = self.mps2 + state.mean[moving] @ moves
+        steady = float(np.exp(state.mean[terms] @ by_term))
+        S = steady * mean[:9].reshape(3, 3)
         mean[9:] -= S @ felt
-        factor[9:] -= felt @ factor[:9].reshape(3, 3, -1) + (S @ moves.T) @ state.factor[moving]
+        factor[9:] -= steady * (felt @ factor[:9].reshape(3, 3, -1)) + (S @ moves.T) @ joint[moving]
+        factor[9:] -= np.outer(S @ felt, by_term @ joint[terms])
         return mean, factor
 
     def mean_output_u(self, state: JointState, u_terms: Mapping[str, float]) -> Array:
@@ -78,11 +90,16 @@ class Held:
 
     def with_gravity(self, ratio: float) -> Held:
         """The same mount with the stated gravity multiplied by `ratio`."""
-        return Held(self.mps2 * ratio, self.by)
+        return replace(self, mps2=self.mps2 * ratio)
 
     def moved_by(self, other: Held, keys: Sequence[str]) -> Held:
         """The same acceleration, which nuisances with these keys move as `other` says."""
-        return Held(self.mps2, {**self.by, **{key: other.by[key] for key in keys if key in other.by}})
+        return replace(self, by={**self.by, **{key: other.by[key] for key in keys if key in other.by}})
+
+    def renamed(self, keys: Mapping[str, str]) -> Held:
+        """The same with new keys of the quantities by the old ones."""
+        by = {keys[key]: moves for key, moves in self.by.items()}
+        return replace(self, by=by, steady={keys[key]: moves for key, moves in self.steady.items()})
 
 
 def held_at(summary: Summary, priors: Priors) -> tuple[Held, Sequence[Term]]:

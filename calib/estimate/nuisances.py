@@ -34,6 +34,10 @@ from calib.estimate.terms import terms
 from calib.model import Array, Pose, own_channels
 from calib.signal.response import FLAT, POWERS, Response, by_term
 
+# Standard uncertainty of a term of the response, relative to that of a low-pass filter at the upper end of the motion.
+# It is honest for filters, means and resonances from 1.5 times that frequency on (shown by benchmarks.response).
+RESPONSE_U = 10.0
+
 
 @dataclass(frozen=True, init=False)
 class Priors(Stated):
@@ -61,6 +65,15 @@ class Priors(Stated):
         object.__setattr__(self, "parameters", parameters)
         object.__setattr__(self, "covariance", covariance)
 
+    def with_response(self, band_hz: tuple[float, float]) -> Priors:
+        """These and the priors of the response over frequency, for a motion in `band_hz`.
+
+        S holds at the frequency that is stated, or in the middle of the band.
+        """
+        stated_hz = self.reference_frequency_hz or float(np.sqrt(band_hz[0] * band_hz[1]))
+        told = {"response": RESPONSE_U, "response_hz": band_hz[1], "reference_frequency_hz": stated_hz}
+        return Priors({**self.values, **told}, self.parameters, self.covariance)
+
 
 @dataclass(frozen=True, slots=True)
 class Applied:
@@ -72,9 +85,9 @@ class Applied:
     response: Response = FLAT
 
     @classmethod
-    def of(cls, priors: Priors, lag_s: float) -> Applied:
-        """This lag, and the corners at the means of their priors, because no search finds the corners."""
-        return cls(lag_s, priors.reference_corner_at_hz, priors.sensor_corner_at_hz)
+    def of(cls, priors: Priors, lag_s: float, response: Response = FLAT) -> Applied:
+        """This lag and response, and the corners at the means of their priors, because no search finds the corners."""
+        return cls(lag_s, priors.reference_corner_at_hz, priors.sensor_corner_at_hz, response)
 
     @property
     def by_kind(self) -> dict[Kind, tuple[float, ...]]:

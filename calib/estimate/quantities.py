@@ -299,7 +299,7 @@ RESPONSE = Kind(
     # for low-pass filters, means and resonances from 1.5 times that frequency on.
     "response", "1", "response over frequency",
     prior=Statement("response"),
-    of_reference=True, stated=False,
+    of_reference=True, straight=LINEAR, stated=False,  # calib.estimate.over_frequency sees whether it changed
 )  # fmt: skip
 ROTATION = Kind(
     "mounting rotation", "rad", "mounting rotation",

@@ -9,26 +9,22 @@ Q, through swaps, restarts and changes of the configuration.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from calib.distributions import coverage_factor
-from calib.estimate.beforehand import Before
 from calib.estimate.correction import Law
 from calib.estimate.determined import determined
-from calib.estimate.fixed_mount import Held
 from calib.estimate.gauss_newton import Flags
 from calib.estimate.innovation import Innovation, innovation
 from calib.estimate.joint_state import JointState
-from calib.estimate.linearised import Linearised
 from calib.estimate.quantities import ALL_RATES, GRAVITY, LAG, REFERENCE, REFERENCE_DRIFT, Quantity
 from calib.estimate.reference_step import Alike, alike
-from calib.estimate.window_rows import Noise, Summary, WindowRows
+from calib.estimate.window_rows import Summary, WindowRows
 from calib.estimate.window_state import WindowState
 from calib.model import Array, Calibration
+from calib.signal.response import Response
 
 DATED = ", calibrated "  # in the identity of a reference whose certificate states its date
 STEADY = np.zeros(12)  # rates of S and Q
@@ -69,6 +65,16 @@ class Recursion(WindowState):
         return float(state.mean[state.index(key)]) if key in state else self._beside[self._place].priors.of(LAG.mean)
 
     @property
+    def response(self) -> Response:
+        """The response of the sensor over that of the reference in use, as far as known."""
+        return self._over.response(self._joint.state, self.reference)
+
+    @property
+    def motion_to_hz(self) -> float:
+        """Upper end of the motion that is used; inf before a window told a band that is wide enough for a response."""
+        return self._over.to_hz
+
+    @property
     def determined(self) -> Flags:
         """(12,) see calib.estimate.determined."""
         mean, covariance = self._parameters()
@@ -93,9 +99,10 @@ class Recursion(WindowState):
         return mean, np.asarray(factor @ factor.T)
 
     def _parameters_factor(self) -> tuple[Array, Array]:
+        state, factor = self._joint.state, self._over.factor(self._joint.state)
         if self._held is not None:
-            return self._held.parameters(self._joint.state)
-        return self._joint.state.mean[:12].copy(), self._joint.state.factor[:12].copy()
+            return self._held.parameters(state, factor)
+        return state.mean[:12].copy(), factor[:12].copy()
 
     def law(self, day: float | None = None) -> Law:
         """S and Q over temperature, with all that their covariance knows of each other; `day`: wandered on until it."""
@@ -108,7 +115,7 @@ class Recursion(WindowState):
         state = self._joint.state
         more = [state.index(quantity.name) for quantity, _ in temperature.terms(self.scale)]
         mean, factor = self._parameters_factor()
-        mean, factor = np.append(mean, state.mean[more]), np.vstack([factor, state.factor[more]])
+        mean, factor = np.append(mean, state.mean[more]), np.vstack([factor, self._over.factor(state)[more]])
         low, high = self.temperature_range_degc
         u_beyond = temperature.u_offset_mps2[1] * self.scale
         return Law(
@@ -264,7 +271,7 @@ class Recursion(WindowState):
         if calibrated and dated not in self._references and reference in self._references:
             keys = self._joint.hand_over(reference, dated)  # the date of the same certificate was stated later
             if self._held is not None:
-                self._held = Held(self._held.mps2, {keys[key]: moves for key, moves in self._held.by.items()})
+                self._held = self._held.renamed(keys)
             self._references = {(dated if of == reference else of): s for of, s in self._references.items()}
             self._mounted = [dated if of == reference else of for of in self._mounted]
         if calibrated:
@@ -305,45 +312,3 @@ class Recursion(WindowState):
         state.intersect(slice(0, 12), values, calibration.covariance)
         self._joint.base = state.copy()
         self._joint.point = state.mean.copy()
-
-    # --- state
-
-    def snapshot(self) -> dict[str, Any]:
-        """All that changes, exactly."""
-        return self._joint.snapshot() | {
-            "stated": [before.snapshot() for before in self._before],
-            "mounted": list(self._mounted),
-            "references": dict(self._references),
-            "sensitivity": list(self._sensitivity),
-            "positions": list(self._positions),
-            "noise": asdict(self._noise),
-            "day": self._day,
-            "temperature_range": list(self._temperature_range),
-            "residual_sd": self._residual_sd.copy(),
-            "fixed": self._fixed,
-            "held": None if self._held is None else {"mps2": self._held.mps2, "by": dict(self._held.by)},
-            "windows": self.windows,
-            "scale": self.scale,
-        }
-
-    def load(self, state: Mapping[str, Any]) -> None:
-        """Go on from a snapshot. Where it was made with other statements, `restate` and `meet` must follow.
-
-        Unknowns that an older version of the program did not have come in with their priors.
-        """
-        self._joint = Linearised.load(state)
-        self._place, self._references = 0, dict(state["references"])
-        for place, stated in enumerate(self._beside[: len(state["mounted"])]):
-            self._before[place] = Before.load(state["stated"][place], stated)
-            self._mounted[place], self._sensitivity[place] = state["mounted"][place], state["sensitivity"][place]
-        self._positions = list(state["positions"])
-        self._noise = Noise(**state["noise"])
-        self._day = state["day"]
-        low, high = state["temperature_range"]
-        self._temperature_range = (low, high)
-        self._residual_sd = np.array(state["residual_sd"])
-        self._fixed = self._fixed and state["fixed"]  # a mount that turned once is fixed no more
-        self._held = None if state["held"] is None else Held(**state["held"])
-        self.windows, self.scale = state["windows"], state["scale"]
-        for summary in self._joint.recent[-1:]:
-            self._know(summary)

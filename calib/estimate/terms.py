@@ -16,7 +16,7 @@ import numpy as np
 from calib.estimate import quantities as kinds
 from calib.estimate.quantities import Kind, Quantity, Stated
 from calib.model import Array, Pose, own_channels
-from calib.signal.response import POWERS
+from calib.signal.response import POWERS, in_units
 
 PARALLEL = 1e-3  # rad; if motion and gravity are parallel within this angle, there is no horizontal normal
 AXES = "xyz"
@@ -124,8 +124,7 @@ def _terms(
     for name, k in zip(_axes("lag"), np.eye(3), strict=True):
         yield _term(name, kinds.LAG_OF_AXIS, priors, owner=reference, lag=k)
     if priors.response > 0.0:
-        for n, power in enumerate(POWERS):
-            unit = 1.0 / (power * (2.0 * np.pi * priors.response_hz) ** power)
+        for n, (power, unit) in enumerate(zip(POWERS, in_units(priors.response_hz).tolist(), strict=True)):
             taken = {kinds.RESPONSE: [applied[kinds.RESPONSE][n] / unit]}
             term = unit * np.eye(len(POWERS))[n]
             yield _term(f"response_{power}", kinds.RESPONSE, priors, taken, reference, response=term)

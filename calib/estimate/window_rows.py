@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 
+from calib.estimate.banded import Banded, Deviations
 from calib.estimate.condense import Condensed, condense
 from calib.estimate.equations import Equations
 from calib.estimate.joint_state import JointState
@@ -16,8 +17,10 @@ from calib.estimate.quantities import LAG, MAIN_TEMPERATURE, offset_temperature
 from calib.estimate.slope_scatter import SlopeScatter
 from calib.estimate.terms import Term
 from calib.estimate.type_a import FEWEST_FREEDOM, LEAST_INFLATION, TypeA
+from calib.excitation.bands import motion_band_hz
 from calib.excitation.excited import excited
 from calib.model import Array, Pose, Window
+from calib.signal.response import FLAT, Response
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,10 +50,11 @@ MOST_FREEDOM = 400.0  # degrees of freedom: beyond, the oldest windows' scatter 
 class Summary:
     """All that is kept of a window: its slopes and means, the directions (3, k) that were excited and what the
     correction for noise leaves, its time in days, the lag that the front end took out, what the clocks leave of it, its
-    temperature, and the identity of its reference.
+    temperature, the identity of its reference, and the terms of the response that the front end took out.
 
     `pose` as stated, `moved` as `excited` leaves it. `held_mps2` (3,) is the mean input acceleration by the pose
-    as stated, NaN where nobody stated gravity.
+    as stated, NaN where nobody stated gravity. `motion_hz` is the band of the motion, None where that tells no response
+    over frequency.
     """
 
     pose: Pose
@@ -65,20 +69,28 @@ class Summary:
     u_lag_s: float = 0.0
     independent: float = 1.0
     reference: str = ""
+    response: tuple[float, ...] = ()
+    motion_hz: tuple[float, float] | None = None
 
     @classmethod
     def of(
-        cls, window: Window, day: float, lag_s: float = 0.0, temperature_degc: float = np.nan, reference: str = ""
+        cls,
+        window: Window,
+        day: float,
+        lag_s: float = 0.0,
+        temperature_degc: float = np.nan,
+        reference: str = "",
+        to_hz: float = np.inf,
     ) -> Summary:
-        """The summary of a window that is used."""
+        """The summary of a window that is used. Its bands up to `to_hz` tell the response over frequency."""
         found, sums, m = excited(window), window.sums, window.pose.direction.shape[1]
         mean = sums.count @ sums.mean[:, :m] / sums.count.sum()
         held = window.pose.gravity_mps2 + window.pose.direction @ mean
-        data = condense([found.window])
+        data = condense([found.window], response_hz=to_hz)
         moved = found.window.pose
         return cls(
             window.pose, moved, held, data, found.directions, found.attenuation, day, lag_s, temperature_degc,
-            window.u_lag_s, window.independent, reference,
+            window.u_lag_s, window.independent, reference, window.response, motion_band_hz([window]),
         )  # fmt: skip
 
     def with_gravity(self, ratio: float) -> Summary:
@@ -92,6 +104,9 @@ class Summary:
         held = {f.name: getattr(self, f.name) for f in fields(self)}
         data = {f.name: getattr(self.data, f.name) for f in fields(self.data)}
         data["type_a"] = {f.name: getattr(self.data.type_a, f.name) for f in fields(self.data.type_a)}
+        if (bands := self.data.bands) is not None:
+            of_bands = {f.name: getattr(bands, f.name) for f in fields(bands)}
+            data["bands"] = of_bands | {"deviations": asdict(bands.deviations)}
         poses = {
             name: {f.name: getattr(pose, f.name) for f in fields(pose)}
             for name, pose in (("pose", self.pose), ("moved", self.moved))
@@ -101,15 +116,20 @@ class Summary:
     @classmethod
     def load(cls, state: Mapping[str, Any]) -> Summary:
         """The summary whose snapshot this is."""
-        data = Condensed(**{**state["data"], "type_a": TypeA(**state["data"]["type_a"])})
-        return cls(**{**state, "pose": Pose(**state["pose"]), "moved": Pose(**state["moved"]), "data": data})
+        data = {**state["data"], "type_a": TypeA(**state["data"]["type_a"])}
+        if (bands := data["bands"]) is not None:
+            data["bands"] = Banded(**{**bands, "deviations": Deviations(**bands["deviations"])})
+        poses = {name: Pose(**state[name]) for name in ("pose", "moved")}
+        band = state["motion_hz"]
+        told = {"response": tuple(state["response"]), "motion_hz": None if band is None else (band[0], band[1])}
+        return cls(**{**state, **poses, **told, "data": Condensed(**data)})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rows:
-    """Observed less predicted (R,) and Jacobian (R, N), slopes first, in units in which their covariance is one.
+    """Observed less predicted (R,) and Jacobian (R, N), in units in which their covariance is one.
 
-    The noise of all windows' segments together scales that covariance, as in calib.estimate.adjustment.
+    The slopes come first, the bands last. The noise of all windows' segments together scales that covariance, as in calib.estimate.adjustment.
     """
 
     residual: Array
@@ -136,7 +156,7 @@ class WindowRows:
         seen_degc: tuple[float, float],
     ) -> None:
         self.summary, self.data = summary, summary.data
-        applied = Applied.of(priors, summary.lag_s)
+        applied = Applied.of(priors, summary.lag_s, Response(summary.response) if summary.response else FLAT)
         self.nuisances = Nuisances([summary.moved], self.data.channels, priors, applied, summary.reference)
         u_lag_s = max(priors.lag_window_s, summary.u_lag_s)
         self._scatter = SlopeScatter.of(self.data, u_lag_s, summary.attenuation)
@@ -191,6 +211,8 @@ class WindowRows:
             parts.append(_weighed(slope, d_slope, covariance))
         if self.equations.known[0]:
             parts.append(_weighed(mean, d_mean, self._mean_covariance(noise) + self._perhaps(state, at)))
+        if rows.band.size and self._priors.response:
+            parts.append((rows.band, rows.d_band))
         if not parts:
             return Rows(np.zeros(0), np.zeros((0, len(state))), 0)
         residual, jacobian = zip(*parts, strict=True)

@@ -16,9 +16,9 @@ along gravity (by 1.9 % for a drift of 0.24 m/s2).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import Self
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from typing import Any, Self
 
 import numpy as np
 
@@ -27,6 +27,7 @@ from calib.estimate.fixed_mount import Held, held_at, never_turned
 from calib.estimate.joint_state import JointState, gain_of
 from calib.estimate.linearised import Linearised
 from calib.estimate.nuisances import Priors
+from calib.estimate.over_frequency import OverFrequency, changed
 from calib.estimate.wander import TemperatureModel, Wander, wandered
 from calib.estimate.window_rows import Noise, Summary, WindowRows
 from calib.model import Array
@@ -74,6 +75,7 @@ class WindowState:
         self._temperature_range = (np.inf, -np.inf)
         self._residual_sd = np.full(3, np.nan)
         self._held: Held | None = None  # at a fixed mount, from the first window on
+        self._over = OverFrequency()
         self._made: dict[int, WindowRows] = {}  # rows of the recent windows, by id(summary): made once, used twice
         self.windows = 0
 
@@ -110,7 +112,7 @@ class WindowState:
         self._made[id(summary)] = rows
         recent = {id(kept) for kept in self._joint.recent}
         self._made = {key: made for key, made in self._made.items() if key in recent}
-        self._noise = self._noise.pooled(rows.noise)
+        self._noise, self._over = self._noise.pooled(rows.noise), self._over.taken(summary.data.bands)
         self._residual_sd = summary.data.type_a.noise[0].copy()
         if np.isfinite(summary.temperature_degc):
             low, high = self._temperature_range
@@ -165,12 +167,27 @@ class WindowState:
         if self._held is not None and not never_turned(np.array([self._held.mps2, summary.held_mps2])):
             self._unmount(self._held)
         day = summary.day if self._day is None else self._day  # from which the state will wander on
+        first = self._over.motion_hz is None and summary.motion_hz is not None
+        if first:
+            self._over = replace(self._over, motion_hz=summary.motion_hz)
+            self._state_response()
         self._mount(summary, day)
         rows = self._rows(summary)
         new = self._joint.append(rows.terms, day)
         if new and self._held is not None:
             self._held = self._held.moved_by(held_at(summary, self._priors(summary))[0], new)
+        if self._held is not None and not self._held.steady:
+            steady = self._over.steady(self._joint.state, summary.reference, self._priors(summary))
+            self._held = replace(self._held, steady=steady)
+        if first and self._joint.recent:
+            self._take_again()  # the windows before this one depend on the response as well
         return rows
+
+    def _state_response(self) -> None:
+        """The response over frequency is an unknown from now on, with its prior."""
+        self._beside = [replace(stated, priors=self._over.stated(stated.priors)) for stated in self._beside]
+        self._before = [replace(before, priors=self._over.stated(before.priors)) for before in self._before]
+        self._stated = self._beside[0]
 
     def _taken(self, before: JointState, since: float | None, rows: WindowRows) -> JointState:
         return self._corrected(self._wandered(before, since, rows.summary.day), rows)
@@ -186,7 +203,7 @@ class WindowState:
     def _settle(self) -> None:
         """Take the recent windows anew, from the base on, until the point is where the estimate is."""
         for _ in range(ITERATIONS):
-            if not self._joint.moved(self.scale):
+            if not (self._joint.moved(self.scale) or changed(self._joint.state, self._joint.point)):
                 return
             self._joint.point = self._joint.state.mean.copy()
             self._take_again()
@@ -225,6 +242,51 @@ class WindowState:
             del self._references[oldest]
             self._absorb(len(self._joint.recent))
             self._joint.keep([quantity.owner != oldest for quantity in self._joint.state.quantities])
+
+    # --- state
+
+    def snapshot(self) -> dict[str, Any]:
+        """All that changes, exactly."""
+        return self._joint.snapshot() | {
+            "stated": [before.snapshot() for before in self._before],
+            "mounted": list(self._mounted),
+            "references": dict(self._references),
+            "sensitivity": list(self._sensitivity),
+            "positions": list(self._positions),
+            "noise": asdict(self._noise),
+            "day": self._day,
+            "temperature_range": list(self._temperature_range),
+            "residual_sd": self._residual_sd.copy(),
+            "fixed": self._fixed,
+            "held": None if self._held is None else asdict(self._held),
+            "over": self._over.snapshot(),
+            "windows": self.windows,
+            "scale": self.scale,
+        }
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        """Go on from a snapshot. Where it was made with other statements, `restate` and `meet` must follow.
+
+        Unknowns that an older version of the program did not have come in with their priors.
+        """
+        self._joint = Linearised.load(state)
+        self._place, self._references = 0, dict(state["references"])
+        for place, stated in enumerate(self._beside[: len(state["mounted"])]):
+            self._before[place] = Before.load(state["stated"][place], stated)
+            self._mounted[place], self._sensitivity[place] = state["mounted"][place], state["sensitivity"][place]
+        self._positions = list(state["positions"])
+        self._noise = Noise(**state["noise"])
+        self._day = state["day"]
+        low, high = state["temperature_range"]
+        self._temperature_range = (low, high)
+        self._residual_sd = np.array(state["residual_sd"])
+        self._fixed = self._fixed and state["fixed"]  # a mount that turned once is fixed no more
+        self._held = None if state["held"] is None else Held(**state["held"])
+        self._over = OverFrequency.load(state["over"])
+        self._state_response()
+        self.windows, self.scale = state["windows"], state["scale"]
+        for summary in self._joint.recent[-1:]:
+            self._know(summary)
 
 
 def _later(day: float | None, other: float) -> float:

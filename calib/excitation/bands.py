@@ -24,6 +24,7 @@ FEWEST_BANDS = 4
 OVER_NOISE = 100.0
 # A response is told by motion that has so large a share of its power in so many third octaves.
 LEAST_SHARE, FEWEST_THIRDS = 1e-2, 4
+HIGHEST = 1.001  # times the upper end of the motion: a band that ends there is rounded
 BELOW, ABOVE = 1e-2, 1e-3  # shares of the motion's power outside its band: a response differs more above than below
 
 
@@ -92,6 +93,16 @@ def _edges(frequency_hz: Array, fewest: int) -> NDArray[np.int64]:
     if len(starts) > 1 and len(frequency_hz) - starts[-1] < fewest:
         starts.pop()
     return np.array([*starts, len(frequency_hz)])
+
+
+def share_above(window: Window, to_hz: float) -> float:
+    """The share of a window's motion, in power, that is above a frequency; 0 where the window has no bands."""
+    bands = window.bands
+    if bands is None:
+        return 0.0
+    m = bands.reference_channels
+    power = np.trace(bands.products[:, :m, :m], axis1=1, axis2=2)
+    return float(power[bands.high_hz > to_hz].sum() / max(power.sum(), np.finfo(float).tiny))
 
 
 def motion_band_hz(windows: Sequence[Window]) -> tuple[float, float] | None:

@@ -55,13 +55,15 @@ class Unusable(ValueError):  # noqa: N818 - said of samples
 class Settings:
     """How windows are made. Method 3 as printed needs `leave_out` False (every point is kept) and `limit_band` False.
 
-    `limits`: what a window must keep to be used. `bands`: windows with motion hold sums in bands as well.
+    `limits`: what a window must keep to be used. `bands`: windows with motion hold sums in bands as well. `to_hz`: both
+    signals are limited so that no motion above this frequency is left; None leaves it.
     """
 
     limits: Limits = DEFAULT_LIMITS
     leave_out: bool = True
     limit_band: bool = True
     bands: bool = False
+    to_hz: float | None = None
 
 
 DEFAULT_SETTINGS = Settings()
@@ -141,11 +143,13 @@ def aligned(
     *,
     limit_band: bool = True,
     leave_out: bool = True,
+    to_hz: float | None = None,
     response: Response = FLAT,
 ) -> Aligned | None:
     """Samples within `span_s` that have a reference, in m/s2; None where there are fewer than two.
 
-    Without `leave_out` the reference's glitches stay (see calib.signal.glitches).
+    `limit_band`, `leave_out`, `to_hz` as in Settings. Without `leave_out` the reference's glitches stay (see
+    calib.signal.glitches).
     """
     rate_hz = reference.clock.rate_hz
     raw = reference.values / instrument.sensitivity
@@ -166,7 +170,7 @@ def aligned(
     at = resample(passed(u, rate_hz, response), reference.clock, time_s - lag_s, reference.first_index, lost)
     columns = np.vstack([V.T, at.u.T, at.du.T]).T  # the samples of a channel lie side by side, also in what is kept
     columns[~at.usable] = np.nan
-    band_hz, noise = _band(raw, at.u[at.usable][:, :m], V, instrument, (rate_hz, sensor_rate_hz))
+    band_hz, noise = _band(raw, at.u[at.usable][:, :m], V, instrument, (rate_hz, sensor_rate_hz), to_hz)
     clipped, independent, k = 0, 1.0, u.shape[1]
     if band_hz is not None and limit_band:
         independent = min(1.0, 2.0 * FILTER_BAND * band_hz / sensor_rate_hz)
@@ -233,14 +237,18 @@ def _motion(
     settings: Settings,
     response: Response,
 ) -> list[Window]:
-    how = {"limit_band": settings.limit_band, "leave_out": settings.leave_out}
-    if (found := aligned(sensor, reference, instrument, span_s, lag_s, response=response, **how)) is None:
+    found = aligned(
+        sensor, reference, instrument, span_s, lag_s,
+        limit_band=settings.limit_band, leave_out=settings.leave_out, to_hz=settings.to_hz, response=response,
+    )  # fmt: skip
+    if found is None:
         return []
     if instrument.has_corner:
         pose = with_integral(pose)
     u_lag_s = float(np.hypot(sensor.clock.u_offset_s, reference.clock.u_offset_s))
     windows = _beside(pose, found, settings)
-    return [replace(_told(window, found), u_lag_s=u_lag_s) for window in windows]
+    taken = () if response.is_flat else response.terms
+    return [replace(_told(window, found), u_lag_s=u_lag_s, response=taken) for window in windows]
 
 
 def _beside(pose: Pose, found: Aligned, settings: Settings) -> list[Window]:
@@ -293,11 +301,11 @@ def _told(window: Window, found: Aligned) -> Window:
 
 
 def _band(
-    raw: Array, u: Array, V: Array, instrument: Instrument, rates_hz: tuple[float, float]
+    raw: Array, u: Array, V: Array, instrument: Instrument, rates_hz: tuple[float, float], to_hz: float | None
 ) -> tuple[float | None, Array]:
     """Where to limit both signals, None where that gains nothing, and the reference's noise (2, m) in what is left.
 
-    `rates_hz`: of the reference and of the sensor.
+    `rates_hz`: of the reference and of the sensor. `to_hz` as in Settings.
     """
     rate_hz, sensor_rate_hz = rates_hz
     derivatives, m = instrument.derivatives, raw.shape[1]
@@ -311,6 +319,7 @@ def _band(
     power = np.var(whole, axis=0).max(initial=0.0) if len(whole) else 0.0
     noisy = np.max(unlimited[0] ** 2, initial=0.0) > NOISE_MATTERS * power
     ends_hz = [found_hz if noisy else None, _told_hz(V, instrument, rate_hz, sensor_rate_hz)]
+    ends_hz.append(None if to_hz is None else to_hz / STOP_BAND)
     band_hz = min((end_hz for end_hz in ends_hz if end_hz is not None), default=None)
     if band_hz is None:
         return None, unlimited.reshape(2, m)

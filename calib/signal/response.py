@@ -22,6 +22,7 @@ SPACED = 6.0  # times the upper end of the motion: the rate of taps that is enou
 FINER = 8  # times the resolution of the taps, for the spectrum they are fitted to
 WEIGHT_ABOVE = 1e-3  # of the filter above the motion, where it must only stay small
 NEAR = 3e-3  # of ln h
+ROUNDED = 1024.0  # steps of a term, in units of that of a low-pass filter at the upper end of the motion
 HELD = 1.1  # times the upper end of the motion: above it the polynomial is not continued
 
 
@@ -43,6 +44,12 @@ class Response:
         return bool(np.abs(self.at(frequency_hz) - other.at(frequency_hz)).max() < NEAR)
 
     @property
+    def rounded(self) -> Response:
+        """The same to 0.1 %: a filter for it serves many windows."""
+        unit = in_units(self.to_hz)
+        return Response(tuple((np.round(np.array(self.terms) / unit * ROUNDED) / ROUNDED * unit).tolist()), self.to_hz)
+
+    @property
     def reach_s(self) -> float:
         """How far its filter reaches to each side, in s."""
         return 0.0 if self.is_flat else (CYCLES + 1.0) / self.to_hz
@@ -53,6 +60,11 @@ class Response:
 
 
 FLAT = Response()
+
+
+def in_units(to_hz: float) -> Array:
+    """(5,) the terms that a low-pass filter of first order at this frequency has, without their signs."""
+    return np.array([1.0 / (k * (2.0 * np.pi * to_hz) ** k) for k in POWERS])
 
 
 def by_term(omega: Array) -> Complex:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hw.block import BlockFlags, DeviceInfo, SampleBlock
-from hw.virtual.building_motion import Band, BuildingMotion, ComplexArray
+from hw.virtual.building_motion import Array, Band, BuildingMotion, ComplexArray, Response
 from hw.virtual.harm import HARMLESS, Harm, Role, Visit
 from hw.virtual.noise import Stream, generator
 from hw.virtual.schedule import STANDARD_GRAVITY_MPS2, rotation
@@ -35,13 +35,15 @@ STREAMS: dict[Role, tuple[Stream, Stream]] = {
 class Instrument:
     """One of the devices: its clock and its white noise.
 
-    It sends its samples in bursts of `burst`. `late` gives the delay of a burst after its newest sample.
+    It sends its samples in bursts of `burst`. `late` gives the delay of a burst after its newest sample. `response` is
+    its response over frequency; None: it shows all frequencies alike.
     """
 
     noise_mps2: float
     clock: Clock
     burst: int = 32
     late: Bursts = field(default_factory=Bursts)
+    response: Response | None = None
 
     def bursts(self, time_s: float) -> int:
         """Number of complete bursts at `time_s`."""
@@ -179,12 +181,16 @@ class Building:
     def visit(self, visit: int) -> list[SampleBlock]:
         """All blocks of a visit, of all devices, in order of arrival."""
         harm = self.harm if visit >= self.harmed_from else HARMLESS
-        motion = self._motion(visit, Stream.BUILDING_MOTION)
         elsewhere = self._motion(visit, Stream.BUILDING_HARM)
-        blocks = [block for role in self._instruments() for block in self._device(role, visit, harm, motion, elsewhere)]
+        motions: dict[Response | None, BuildingMotion] = {}
+        blocks: list[SampleBlock] = []
+        for role, instrument in self._instruments().items():
+            if instrument.response not in motions:
+                motions[instrument.response] = self._motion(visit, Stream.BUILDING_MOTION, instrument.response)
+            blocks += self._device(role, visit, harm, motions[instrument.response], elsewhere)
         return sorted(blocks, key=lambda block: block.t_monotonic_ns)
 
-    def _motion(self, visit: int, stream: Stream) -> BuildingMotion:
+    def _motion(self, visit: int, stream: Stream, response: Response | None = None) -> BuildingMotion:
         p = self.parameters
         random = generator(self.seed, stream, visit)
         level = float(np.exp(random.uniform(*np.log(p.level_mps2))))
@@ -194,7 +200,7 @@ class Building:
             shape = direction[None] / np.linalg.norm(direction)
         if any(p.across):
             shape = np.array([[p.across[0], 1.0, p.across[1]]])
-        return BuildingMotion(random, p.band, *self.span(visit), level, shape)
+        return BuildingMotion(random, p.band, *self.span(visit), level, shape, response=response)
 
     def _device(
         self, role: Role, visit: int, harm: Harm, motion: BuildingMotion, elsewhere: BuildingMotion

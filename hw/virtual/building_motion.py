@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
+Response = Callable[[Array], ComplexArray]  # a complex response at frequencies in Hz
 # Grid points per period of the upper end of the band: interpolation by cubic pieces is then accurate to 3e-6.
 POINTS_A_PERIOD = 32
 
@@ -38,7 +40,8 @@ class BuildingMotion:
     """Acceleration (m/s2) from `start_s` to `stop_s`; it fades in and out within `ramp_s` and is zero outside.
 
     `shape` (C, 3): each of the C rows is a direction with its own random motion of `level_mps2` rms. The imaginary part
-    of a complex row moves a quarter of a period ahead of the real part.
+    of a complex row moves a quarter of a period ahead of the real part. `response` is that of a device at frequencies
+    (k,): its output is given in place of the motion.
     """
 
     def __init__(
@@ -50,6 +53,7 @@ class BuildingMotion:
         level_mps2: float,
         shape: Array | ComplexArray,
         ramp_s: float = 0.4,
+        response: Response | None = None,
     ) -> None:
         self._start_s, self._stop_s, self._ramp_s = start_s, stop_s, ramp_s
         self._rate_hz = POINTS_A_PERIOD * band.high_hz
@@ -60,6 +64,8 @@ class BuildingMotion:
             + 1j * random.standard_normal((len(frequency_hz), len(shape)))
         )
         lines *= level_mps2 * points / np.sqrt(2 * np.sum(np.abs(lines) ** 2, axis=0))
+        if response is not None:
+            lines *= response(frequency_hz)[:, None]
         if np.iscomplexobj(shape):
             lines, shape = np.hstack([lines, 1j * lines]), np.vstack([shape.real, shape.imag])
         self._shape = np.asarray(shape, dtype=np.float64)

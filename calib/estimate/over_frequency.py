@@ -1,0 +1,92 @@
+"""What a joint state knows of the response over frequency, beside the terms that are among its unknowns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Self
+
+import numpy as np
+
+from calib.estimate.banded import Banded, Deviations
+from calib.estimate.joint_state import JointState
+from calib.estimate.nuisances import Priors
+from calib.estimate.quantities import RESPONSE
+from calib.model import Array
+from calib.signal.response import FLAT, Response, by_term, in_units
+
+NEAR = 1e-2  # change of ln h from which the windows must be linearised again
+
+
+@dataclass(frozen=True, slots=True)
+class OverFrequency:
+    """`motion_hz` is the band of the first window whose motion tells a response; None before. S means the same ever
+    after: it holds at one frequency, and motion above that band is not used. `deviations` of all windows from one
+    response."""
+
+    motion_hz: tuple[float, float] | None = None
+    deviations: Deviations = field(default_factory=Deviations)
+
+    @property
+    def to_hz(self) -> float:
+        """Upper end of the motion that is used; inf before a window told it."""
+        return np.inf if self.motion_hz is None else self.motion_hz[1]
+
+    def stated(self, priors: Priors) -> Priors:
+        """The priors with those of the response, once it is an unknown."""
+        return priors if self.motion_hz is None else priors.with_response(self.motion_hz)
+
+    def taken(self, bands: Banded | None) -> Self:
+        """After a window with these bands."""
+        return self if bands is None else replace(self, deviations=self.deviations.plus(bands.deviations))
+
+    def response(self, state: JointState, reference: str) -> Response:
+        """The response of the sensor over that of a reference, as estimated: what the front end is to take out."""
+        own = terms_of(state, reference)
+        if self.motion_hz is None or not own:
+            return FLAT
+        found = Response(tuple((state.mean[own] * in_units(self.to_hz)).tolist()), self.to_hz).rounded
+        return FLAT if found.is_flat else found
+
+    def factor(self, state: JointState) -> Array:
+        """A factor of the covariance of a state (N, N) or (N, N + 1), with what the bands deviate from one response."""
+        relative = self.deviations.between.relative_u
+        if not relative:
+            return state.factor
+        deviating = np.zeros((len(state), 1))
+        deviating[:9, 0] = relative * state.mean[:9]
+        return np.hstack([state.factor, deviating])
+
+    def steady(self, state: JointState, reference: str, priors: Priors) -> dict[str, float]:
+        """Derivatives, by the key of each term, of the logarithm of the sensitivity at 0 Hz over that at the reference
+        frequency."""
+        if self.motion_hz is None:
+            return {}
+        at_reference = by_term(np.array([2.0 * np.pi * self.stated(priors).reference_frequency_hz]))[0].real
+        moved = -at_reference * in_units(self.to_hz)
+        return {state.keys[k]: float(by) for k, by in zip(terms_of(state, reference), moved, strict=False)}
+
+    def snapshot(self) -> dict[str, Any]:
+        """Plain values, for `load`."""
+        return {"motion_hz": self.motion_hz, "deviations": asdict(self.deviations)}
+
+    @classmethod
+    def load(cls, state: Mapping[str, Any]) -> OverFrequency:
+        """The object whose snapshot this is."""
+        band = state["motion_hz"]
+        return cls(None if band is None else (band[0], band[1]), Deviations(**state["deviations"]))
+
+
+def terms_of(state: JointState, reference: str) -> list[int]:
+    """Where the terms of the response beside a reference are in a state, in the order of POWERS."""
+    return [k for k, q in enumerate(state.quantities) if q.kind is RESPONSE and q.owner == reference and not q.first]
+
+
+def changed(state: JointState, point: Array) -> bool:
+    """Whether a response in the state differs so much from the `point` (N,) that windows must be linearised again."""
+    unit = by_term(np.array([0.5, 1.0])) * in_units(1.0 / (2.0 * np.pi))
+    for owner in dict.fromkeys(q.owner for q in state.quantities if q.kind is RESPONSE):
+        own = terms_of(state, owner)
+        if np.abs(unit @ (state.mean - point)[own]).max() > NEAR:
+            return True
+    return False
