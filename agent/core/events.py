@@ -133,8 +133,28 @@ class WindowReport(Result, frozen=True, kw_only=True):
     fault: str = ""  # if the program itself failed: exception, file and line; otherwise ""
 
 
+class BandResponse(msgspec.Struct, frozen=True, kw_only=True):
+    """The complex sensitivity in a band of frequency, the lag taken out, and its standard uncertainty; each 3 x 3."""
+
+    low_hz: float
+    high_hz: float
+    sensitivity_re: list[list[float]]
+    sensitivity_im: list[list[float]]
+    standard_uncertainty: list[list[float]]
+
+
+class SteadySensitivity(msgspec.Struct, frozen=True, kw_only=True):
+    """The sensitivity at 0 Hz and its standard uncertainty; each 3 x 3."""
+
+    sensitivity: list[list[float]]
+    standard_uncertainty: list[list[float]]
+
+
 class CalibrationUpdate(Result, frozen=True, kw_only=True):
     """S and Q that are in force from `t_utc_ns` on.
+
+    S holds at `reference_frequency_hz`, and within a third of its expanded uncertainty in `valid_band_hz`. `response`
+    is empty where the motion has no band that is wide enough to tell it.
 
     If a parameter is not determined, its value and uncertainty are those of the prior. At a temperature T the offset is
     Q + sum of offset_temperature[k - 1] (T - T0)^k over k = 1.., T0 = reference_temperature_degc, and row i of S is
@@ -167,6 +187,10 @@ class CalibrationUpdate(Result, frozen=True, kw_only=True):
     u_offset_rate: list[float] = []
     # Identities of the references to whose errors S and Q owe their values; that of the newest window is the last.
     references: list[str] = []
+    reference_frequency_hz: float = 0.0  # 0 if nothing moved yet
+    valid_band_hz: list[float] = []  # [low, high]; empty where it is not known
+    sensitivity_at_0hz: SteadySensitivity | None = None
+    response: list[BandResponse] = []
     # If the calibration comes into force again, after a restart or by a rollback: the result that first put it in
     # force.
     made_run_id: str = ""

@@ -174,7 +174,7 @@ def from_version_3(state: dict[str, Any]) -> None:
     for estimation in _estimations(state):
         recursions = [estimation["recursion"], *(proposal["recursion"] for proposal in estimation["proposed"])]
         for recursion in recursions:
-            recursion["over"] = {"motion_hz": None, "deviations": asdict(Deviations())}
+            recursion["over"] = {"motion_hz": None, "deviations": asdict(Deviations()), "first_hz": 0.0}
             if recursion["held"] is not None:
                 recursion["held"]["steady"] = {}
         recent = (summary for recursion in recursions for summary in recursion["recent"])

@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import msgspec
 import numpy as np
 
-from agent.core.events import CalibrationUpdate, DriftReport, Estimate, StatusChange, WindowReport
+from agent.core.events import (
+    BandResponse,
+    CalibrationUpdate,
+    DriftReport,
+    Estimate,
+    StatusChange,
+    SteadySensitivity,
+    WindowReport,
+)
 from calib.estimate.drift import DriftVerdict
 from calib.estimate.quantities import MAIN_TEMPERATURE, RATES, offset_temperature
 from calib.estimate.recursion import Recursion
+from calib.estimate.response_told import ResponseTold
 from calib.model import Array, Calibration, Window
 
 UNCERTAINTY = "combined"
@@ -46,7 +56,30 @@ def calibration_update(source: Source, calibration: Calibration, recursion: Recu
         offset_temperature=[value for value, _ in by_power], u_offset_temperature=[u for _, u in by_power],
         sensitivity_temperature=S_temperature[0], u_sensitivity_temperature=S_temperature[1],
         offset_rate=rate, u_offset_rate=u_rate, references=[name for name in recursion.references if name],
+        reference_frequency_hz=recursion.reference_frequency_hz, **_over_frequency(recursion.response_told),
     )  # fmt: skip
+
+
+def _over_frequency(told: ResponseTold | None) -> dict[str, Any]:
+    """The fields of an update that tell the response over frequency."""
+    if told is None:
+        return {}
+    return {
+        "valid_band_hz": list(told.valid_band_hz),
+        "sensitivity_at_0hz": SteadySensitivity(
+            sensitivity=told.at_0hz.tolist(), standard_uncertainty=told.u_at_0hz.tolist()
+        ),
+        "response": [
+            BandResponse(
+                low_hz=band.low_hz,
+                high_hz=band.high_hz,
+                sensitivity_re=band.sensitivity.real.tolist(),
+                sensitivity_im=band.sensitivity.imag.tolist(),
+                standard_uncertainty=band.standard_uncertainty.tolist(),
+            )
+            for band in told.bands
+        ],
+    }
 
 
 def again(update: CalibrationUpdate, before: CalibrationUpdate) -> CalibrationUpdate:

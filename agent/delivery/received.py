@@ -68,8 +68,14 @@ def receive(key: str, payload: bytes, attachment: bytes | None) -> Received | No
 
 
 def _has_its_shapes(calibration: CalibrationUpdate) -> bool:
+    steady = calibration.sensitivity_at_0hz
+    squares_3 = [] if steady is None else [steady.sensitivity, steady.standard_uncertainty]
+    for band in calibration.response:
+        squares_3 += [band.sensitivity_re, band.sensitivity_im, band.standard_uncertainty]
     lengths = (calibration.offset, 3), (calibration.standard_uncertainty, 12), (calibration.determined, 12)
-    squares = (calibration.sensitivity, 3), (calibration.covariance, 12)
-    return all(len(values) == n for values, n in lengths) and all(
-        len(rows) == n and all(len(row) == n for row in rows) for rows, n in squares
+    squares = (calibration.sensitivity, 3), (calibration.covariance, 12), *((square, 3) for square in squares_3)
+    return (
+        len(calibration.valid_band_hz) in (0, 2)
+        and all(len(values) == n for values, n in lengths)
+        and all(len(rows) == n and all(len(row) == n for row in rows) for rows, n in squares)
     )

@@ -262,7 +262,27 @@ class Window(_message.Message):
     def __init__(self, event_sequence: _Optional[int] = ..., run_id: _Optional[str] = ..., sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., start_s: _Optional[float] = ..., stop_s: _Optional[float] = ..., position: _Optional[str] = ..., used: _Optional[bool] = ..., reason: _Optional[str] = ..., points: _Optional[int] = ..., left_out: _Optional[int] = ..., numbers: _Optional[_Mapping[str, float]] = ..., fault: _Optional[str] = ...) -> None: ...
 
 class Calibration(_message.Message):
-    __slots__ = ("event_sequence", "run_id", "sequence", "sensor", "t_utc_ns", "sxx", "sxy", "sxz", "syx", "syy", "syz", "szx", "szy", "szz", "qx", "qy", "qz", "u_sxx", "u_sxy", "u_sxz", "u_syx", "u_syy", "u_syz", "u_szx", "u_szy", "u_szz", "u_qx", "u_qy", "u_qz", "coverage_factor", "residual_sd_x", "residual_sd_y", "residual_sd_z", "windows", "method", "uncertainty_kind", "output_unit", "identity", "determined", "covariance", "reference_temperature_degc", "temperature_low_degc", "temperature_high_degc", "offset_temperature", "u_offset_temperature", "sensitivity_temperature", "u_sensitivity_temperature", "offset_rate", "u_offset_rate", "made_run_id", "made_sequence", "made_utc_ns", "references")
+    __slots__ = ("event_sequence", "run_id", "sequence", "sensor", "t_utc_ns", "sxx", "sxy", "sxz", "syx", "syy", "syz", "szx", "szy", "szz", "qx", "qy", "qz", "u_sxx", "u_sxy", "u_sxz", "u_syx", "u_syy", "u_syz", "u_szx", "u_szy", "u_szz", "u_qx", "u_qy", "u_qz", "coverage_factor", "residual_sd_x", "residual_sd_y", "residual_sd_z", "windows", "method", "uncertainty_kind", "output_unit", "identity", "determined", "covariance", "reference_temperature_degc", "temperature_low_degc", "temperature_high_degc", "offset_temperature", "u_offset_temperature", "sensitivity_temperature", "u_sensitivity_temperature", "offset_rate", "u_offset_rate", "made_run_id", "made_sequence", "made_utc_ns", "references", "reference_frequency_hz", "valid_band_hz", "sensitivity_at_0hz", "response")
+    class Steady(_message.Message):
+        __slots__ = ("sensitivity", "standard_uncertainty")
+        SENSITIVITY_FIELD_NUMBER: _ClassVar[int]
+        STANDARD_UNCERTAINTY_FIELD_NUMBER: _ClassVar[int]
+        sensitivity: _containers.RepeatedScalarFieldContainer[float]
+        standard_uncertainty: _containers.RepeatedScalarFieldContainer[float]
+        def __init__(self, sensitivity: _Optional[_Iterable[float]] = ..., standard_uncertainty: _Optional[_Iterable[float]] = ...) -> None: ...
+    class Band(_message.Message):
+        __slots__ = ("low_hz", "high_hz", "sensitivity_re", "sensitivity_im", "standard_uncertainty")
+        LOW_HZ_FIELD_NUMBER: _ClassVar[int]
+        HIGH_HZ_FIELD_NUMBER: _ClassVar[int]
+        SENSITIVITY_RE_FIELD_NUMBER: _ClassVar[int]
+        SENSITIVITY_IM_FIELD_NUMBER: _ClassVar[int]
+        STANDARD_UNCERTAINTY_FIELD_NUMBER: _ClassVar[int]
+        low_hz: float
+        high_hz: float
+        sensitivity_re: _containers.RepeatedScalarFieldContainer[float]
+        sensitivity_im: _containers.RepeatedScalarFieldContainer[float]
+        standard_uncertainty: _containers.RepeatedScalarFieldContainer[float]
+        def __init__(self, low_hz: _Optional[float] = ..., high_hz: _Optional[float] = ..., sensitivity_re: _Optional[_Iterable[float]] = ..., sensitivity_im: _Optional[_Iterable[float]] = ..., standard_uncertainty: _Optional[_Iterable[float]] = ...) -> None: ...
     EVENT_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     RUN_ID_FIELD_NUMBER: _ClassVar[int]
     SEQUENCE_FIELD_NUMBER: _ClassVar[int]
@@ -316,6 +336,10 @@ class Calibration(_message.Message):
     MADE_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     MADE_UTC_NS_FIELD_NUMBER: _ClassVar[int]
     REFERENCES_FIELD_NUMBER: _ClassVar[int]
+    REFERENCE_FREQUENCY_HZ_FIELD_NUMBER: _ClassVar[int]
+    VALID_BAND_HZ_FIELD_NUMBER: _ClassVar[int]
+    SENSITIVITY_AT_0HZ_FIELD_NUMBER: _ClassVar[int]
+    RESPONSE_FIELD_NUMBER: _ClassVar[int]
     event_sequence: int
     run_id: str
     sequence: int
@@ -369,7 +393,11 @@ class Calibration(_message.Message):
     made_sequence: int
     made_utc_ns: int
     references: _containers.RepeatedScalarFieldContainer[str]
-    def __init__(self, event_sequence: _Optional[int] = ..., run_id: _Optional[str] = ..., sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., sxx: _Optional[float] = ..., sxy: _Optional[float] = ..., sxz: _Optional[float] = ..., syx: _Optional[float] = ..., syy: _Optional[float] = ..., syz: _Optional[float] = ..., szx: _Optional[float] = ..., szy: _Optional[float] = ..., szz: _Optional[float] = ..., qx: _Optional[float] = ..., qy: _Optional[float] = ..., qz: _Optional[float] = ..., u_sxx: _Optional[float] = ..., u_sxy: _Optional[float] = ..., u_sxz: _Optional[float] = ..., u_syx: _Optional[float] = ..., u_syy: _Optional[float] = ..., u_syz: _Optional[float] = ..., u_szx: _Optional[float] = ..., u_szy: _Optional[float] = ..., u_szz: _Optional[float] = ..., u_qx: _Optional[float] = ..., u_qy: _Optional[float] = ..., u_qz: _Optional[float] = ..., coverage_factor: _Optional[float] = ..., residual_sd_x: _Optional[float] = ..., residual_sd_y: _Optional[float] = ..., residual_sd_z: _Optional[float] = ..., windows: _Optional[int] = ..., method: _Optional[str] = ..., uncertainty_kind: _Optional[str] = ..., output_unit: _Optional[str] = ..., identity: _Optional[str] = ..., determined: _Optional[_Iterable[bool]] = ..., covariance: _Optional[_Iterable[float]] = ..., reference_temperature_degc: _Optional[float] = ..., temperature_low_degc: _Optional[float] = ..., temperature_high_degc: _Optional[float] = ..., offset_temperature: _Optional[_Iterable[float]] = ..., u_offset_temperature: _Optional[_Iterable[float]] = ..., sensitivity_temperature: _Optional[_Iterable[float]] = ..., u_sensitivity_temperature: _Optional[_Iterable[float]] = ..., offset_rate: _Optional[_Iterable[float]] = ..., u_offset_rate: _Optional[_Iterable[float]] = ..., made_run_id: _Optional[str] = ..., made_sequence: _Optional[int] = ..., made_utc_ns: _Optional[int] = ..., references: _Optional[_Iterable[str]] = ...) -> None: ...
+    reference_frequency_hz: float
+    valid_band_hz: _containers.RepeatedScalarFieldContainer[float]
+    sensitivity_at_0hz: Calibration.Steady
+    response: _containers.RepeatedCompositeFieldContainer[Calibration.Band]
+    def __init__(self, event_sequence: _Optional[int] = ..., run_id: _Optional[str] = ..., sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., sxx: _Optional[float] = ..., sxy: _Optional[float] = ..., sxz: _Optional[float] = ..., syx: _Optional[float] = ..., syy: _Optional[float] = ..., syz: _Optional[float] = ..., szx: _Optional[float] = ..., szy: _Optional[float] = ..., szz: _Optional[float] = ..., qx: _Optional[float] = ..., qy: _Optional[float] = ..., qz: _Optional[float] = ..., u_sxx: _Optional[float] = ..., u_sxy: _Optional[float] = ..., u_sxz: _Optional[float] = ..., u_syx: _Optional[float] = ..., u_syy: _Optional[float] = ..., u_syz: _Optional[float] = ..., u_szx: _Optional[float] = ..., u_szy: _Optional[float] = ..., u_szz: _Optional[float] = ..., u_qx: _Optional[float] = ..., u_qy: _Optional[float] = ..., u_qz: _Optional[float] = ..., coverage_factor: _Optional[float] = ..., residual_sd_x: _Optional[float] = ..., residual_sd_y: _Optional[float] = ..., residual_sd_z: _Optional[float] = ..., windows: _Optional[int] = ..., method: _Optional[str] = ..., uncertainty_kind: _Optional[str] = ..., output_unit: _Optional[str] = ..., identity: _Optional[str] = ..., determined: _Optional[_Iterable[bool]] = ..., covariance: _Optional[_Iterable[float]] = ..., reference_temperature_degc: _Optional[float] = ..., temperature_low_degc: _Optional[float] = ..., temperature_high_degc: _Optional[float] = ..., offset_temperature: _Optional[_Iterable[float]] = ..., u_offset_temperature: _Optional[_Iterable[float]] = ..., sensitivity_temperature: _Optional[_Iterable[float]] = ..., u_sensitivity_temperature: _Optional[_Iterable[float]] = ..., offset_rate: _Optional[_Iterable[float]] = ..., u_offset_rate: _Optional[_Iterable[float]] = ..., made_run_id: _Optional[str] = ..., made_sequence: _Optional[int] = ..., made_utc_ns: _Optional[int] = ..., references: _Optional[_Iterable[str]] = ..., reference_frequency_hz: _Optional[float] = ..., valid_band_hz: _Optional[_Iterable[float]] = ..., sensitivity_at_0hz: _Optional[_Union[Calibration.Steady, _Mapping]] = ..., response: _Optional[_Iterable[_Union[Calibration.Band, _Mapping]]] = ...) -> None: ...
 
 class Status(_message.Message):
     __slots__ = ("event_sequence", "run_id", "sequence", "sensor", "t_utc_ns", "status", "before", "reason")

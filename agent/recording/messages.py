@@ -180,6 +180,9 @@ def _calibration_message(event_sequence: int, update: CalibrationUpdate) -> pb.C
     values |= zip(_U, values.pop("standard_uncertainty"), strict=True)
     values |= zip(_RESIDUALS, values.pop("residual_sd"), strict=True)
     values |= {name: np.ravel(values[name]) for name in _BY_POWER}
+    steady = values.pop("sensitivity_at_0hz")
+    values["sensitivity_at_0hz"] = None if steady is None else pb.Calibration.Steady(**_flat(steady))
+    values["response"] = [pb.Calibration.Band(**_flat(band)) for band in values["response"]]
     return pb.Calibration(event_sequence=event_sequence, covariance=covariance.ravel(), **values)
 
 
@@ -192,8 +195,25 @@ def _decode_calibration(data: bytes) -> tuple[int, Result]:
     values["residual_sd"] = [values.pop(name) for name in _RESIDUALS]
     values["covariance"] = np.array(values["covariance"]).reshape(12, 12).tolist()
     values |= {name: np.reshape(values[name], (-1, 3)).tolist() for name in _BY_POWER}
-    values |= {name: list(values[name]) for name in ("determined", "references", *_BY_AXIS)}
+    values |= {name: list(values[name]) for name in ("determined", "references", "valid_band_hz", *_BY_AXIS)}
+    values["response"] = [_square(band) for band in values["response"]]
+    if "sensitivity_at_0hz" in values:
+        values["sensitivity_at_0hz"] = _square(values["sensitivity_at_0hz"])
     return values.pop("event_sequence"), msgspec.convert(values, CalibrationUpdate)
+
+
+def _flat(part: msgspec.Struct) -> dict[str, Any]:
+    """The fields of a part of a calibration, matrices row by row."""
+    fields = msgspec.structs.asdict(part)
+    return {name: np.ravel(value) if isinstance(value, list) else value for name, value in fields.items()}
+
+
+def _square(part: Message) -> dict[str, Any]:
+    """The fields of a part of a calibration as Python values, matrices 3 x 3."""
+    return {
+        name: value if isinstance(value, float) else np.reshape(value, (3, 3)).tolist()
+        for name, value in _values(part).items()
+    }
 
 
 def _estimate_message(event_sequence: int, estimate: Estimate) -> pb.Estimate:

@@ -20,7 +20,7 @@ from calib.estimate.equations import Equations
 from calib.estimate.fixed_mount import mean_input, never_turned
 from calib.estimate.gauss_newton import Solution, slope_residuals, solve
 from calib.estimate.nuisances import Applied, Nuisances, Priors
-from calib.estimate.quantities import LAG, Kind
+from calib.estimate.quantities import LAG, RESPONSE, Kind
 from calib.estimate.response_told import ResponseTold, response_told
 from calib.estimate.slope_scatter import SlopeScatter, estimated
 from calib.estimate.verdict import misfit, nuisance_pull, reasons, turned_windows
@@ -160,7 +160,18 @@ def _response(
     band_hz = motion_band_hz(windows)
     if not priors.response or band_hz is None:
         return None
-    return response_told(solution, covariance, priors.reference_frequency_hz, band_hz, k)
+    nuisances = solution.equations.nuisances
+    own = np.flatnonzero([t.kind is RESPONSE for t in nuisances.terms])
+    applied = np.array([nuisances.terms[j].applied for j in own])
+    chosen = np.concatenate([np.arange(9), 12 + own])
+    return response_told(
+        np.append(solution.x[:9], solution.x[12 + own] + applied),
+        covariance[np.ix_(chosen, chosen)],
+        nuisances.response[own],
+        priors.reference_frequency_hz,
+        band_hz,
+        k,
+    )
 
 
 def _solution(

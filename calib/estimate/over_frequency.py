@@ -8,10 +8,12 @@ from typing import Any, Self
 
 import numpy as np
 
-from calib.estimate.banded import Banded, Deviations
+from calib.estimate.banded import Deviations
+from calib.estimate.condense import Condensed
 from calib.estimate.joint_state import JointState
 from calib.estimate.nuisances import Priors
 from calib.estimate.quantities import RESPONSE
+from calib.estimate.response_told import ResponseTold, response_told
 from calib.model import Array
 from calib.signal.response import FLAT, Response, by_term, in_units
 
@@ -26,6 +28,7 @@ class OverFrequency:
 
     motion_hz: tuple[float, float] | None = None
     deviations: Deviations = field(default_factory=Deviations)
+    first_hz: float = 0.0  # mean frequency of the first window with motion; 0 before
 
     @property
     def to_hz(self) -> float:
@@ -36,9 +39,15 @@ class OverFrequency:
         """The priors with those of the response, once it is an unknown."""
         return priors if self.motion_hz is None else priors.with_response(self.motion_hz)
 
-    def taken(self, bands: Banded | None) -> Self:
-        """After a window with these bands."""
-        return self if bands is None else replace(self, deviations=self.deviations.plus(bands.deviations))
+    def taken(self, data: Condensed) -> Self:
+        """After a window with these data."""
+        moving_hz = float(np.sqrt(data.omega2[0])) / (2.0 * np.pi)
+        deviations = self.deviations if data.bands is None else self.deviations.plus(data.bands.deviations)
+        return replace(self, deviations=deviations, first_hz=self.first_hz or moving_hz)
+
+    def reference_hz(self, priors: Priors) -> float:
+        """The frequency at which S holds; 0 if nothing moved yet."""
+        return self.stated(priors).reference_frequency_hz or self.first_hz
 
     def response(self, state: JointState, reference: str) -> Response:
         """The response of the sensor over that of a reference, as estimated: what the front end is to take out."""
@@ -57,24 +66,35 @@ class OverFrequency:
         deviating[:9, 0] = relative * state.mean[:9]
         return np.hstack([state.factor, deviating])
 
+    def told(self, state: JointState, reference: str, priors: Priors, coverage_factor: float) -> ResponseTold | None:
+        """The response beside a reference; None where it is no unknown."""
+        own = terms_of(state, reference)
+        if self.motion_hz is None or not own:
+            return None
+        chosen, effects = [*range(9), *own], np.diag(in_units(self.to_hz))
+        factor, hz = self.factor(state)[chosen], self.stated(priors).reference_frequency_hz
+        return response_told(
+            state.mean[chosen], factor @ factor.T, effects, hz, self.motion_hz, coverage_factor, per_octave=1.0
+        )
+
     def steady(self, state: JointState, reference: str, priors: Priors) -> dict[str, float]:
         """Derivatives, by the key of each term, of the logarithm of the sensitivity at 0 Hz over that at the reference
         frequency."""
         if self.motion_hz is None:
             return {}
-        at_reference = by_term(np.array([2.0 * np.pi * self.stated(priors).reference_frequency_hz]))[0].real
+        at_reference = by_term(np.array(2.0 * np.pi * self.stated(priors).reference_frequency_hz)).real
         moved = -at_reference * in_units(self.to_hz)
         return {state.keys[k]: float(by) for k, by in zip(terms_of(state, reference), moved, strict=False)}
 
     def snapshot(self) -> dict[str, Any]:
         """Plain values, for `load`."""
-        return {"motion_hz": self.motion_hz, "deviations": asdict(self.deviations)}
+        return {"motion_hz": self.motion_hz, "deviations": asdict(self.deviations), "first_hz": self.first_hz}
 
     @classmethod
     def load(cls, state: Mapping[str, Any]) -> OverFrequency:
         """The object whose snapshot this is."""
         band = state["motion_hz"]
-        return cls(None if band is None else (band[0], band[1]), Deviations(**state["deviations"]))
+        return cls(None if band is None else (band[0], band[1]), Deviations(**state["deviations"]), state["first_hz"])
 
 
 def terms_of(state: JointState, reference: str) -> list[int]:

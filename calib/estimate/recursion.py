@@ -21,6 +21,7 @@ from calib.estimate.innovation import Innovation, innovation
 from calib.estimate.joint_state import JointState
 from calib.estimate.quantities import ALL_RATES, GRAVITY, LAG, REFERENCE, REFERENCE_DRIFT, Quantity
 from calib.estimate.reference_step import Alike, alike
+from calib.estimate.response_told import ResponseTold
 from calib.estimate.window_rows import Summary, WindowRows
 from calib.estimate.window_state import WindowState
 from calib.model import Array, Calibration
@@ -68,6 +69,17 @@ class Recursion(WindowState):
     def response(self) -> Response:
         """The response of the sensor over that of the reference in use, as far as known."""
         return self._over.response(self._joint.state, self.reference)
+
+    @property
+    def response_told(self) -> ResponseTold | None:
+        """What is known of it, by frequency; None where it is no unknown."""
+        stated = self._beside[self._place].priors
+        return self._over.told(self._joint.state, self.reference, stated, self.coverage_factor)
+
+    @property
+    def reference_frequency_hz(self) -> float:
+        """The frequency at which S holds; 0 if nothing moved yet."""
+        return self._over.reference_hz(self._stated.priors)
 
     @property
     def motion_to_hz(self) -> float:

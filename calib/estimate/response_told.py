@@ -7,8 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.estimate.gauss_newton import Solution
-from calib.estimate.quantities import RESPONSE
 from calib.model import Array
 from calib.signal.response import Complex, Response, by_term
 
@@ -44,35 +42,38 @@ class ResponseTold:
 
 
 def response_told(
-    solution: Solution, covariance: Array, reference_hz: float, band_hz: tuple[float, float], coverage_factor: float
+    estimate: Array,
+    covariance: Array,
+    effects: Array,
+    reference_hz: float,
+    band_hz: tuple[float, float],
+    coverage_factor: float,
+    per_octave: float = PER_OCTAVE,
 ) -> ResponseTold:
-    """The response of a solution with this covariance (N, N); the motion was in `band_hz`."""
-    nuisances = solution.equations.nuisances
-    own = np.flatnonzero([t.kind is RESPONSE for t in nuisances.terms])
-    effects = nuisances.response[own]  # (K, 5)
-    z = solution.x[12 + own] + np.array([nuisances.terms[j].applied for j in own])
-    S = solution.x[:9]
-    chosen = np.concatenate([np.arange(9), 12 + own])
-    joint = covariance[np.ix_(chosen, chosen)]
+    """The response from S row by row and J unknowns of the response: `estimate` (9 + J,), `covariance` (9 + J, 9 + J).
+
+    `effects` (J, 5): what a unit of each of the J unknowns adds to the terms in s^k. The motion was in `band_hz`.
+    """
+    S, z = estimate[:9], estimate[9:]
 
     def at(frequency_hz: float) -> tuple[Complex, Array]:
-        by_nuisance = effects @ _log_h(frequency_hz, reference_hz)
-        h = np.exp(z @ by_nuisance)
-        moves = np.column_stack([np.eye(9) * h, np.outer(S * h, by_nuisance)])
-        variance = np.einsum("pa,ab,pb->p", moves, joint, moves.conj()).real
+        by_unknown = effects @ _log_h(frequency_hz, reference_hz)
+        h: Complex = np.exp(z @ by_unknown)
+        moves = np.column_stack([np.eye(9) * h, np.outer(S * h, by_unknown)])
+        variance = np.einsum("pa,ab,pb->p", moves, covariance, moves.conj()).real
         return (S * h).reshape(3, 3), np.sqrt(np.maximum(variance, 0.0)).reshape(3, 3)
 
     at_0hz, u_at_0hz = at(0.0)
     largest = float(np.abs(S).max())
     u = np.sqrt(np.diag(covariance)[:9]) / np.maximum(np.abs(S), LARGE * largest)
-    count = max(1, round(PER_OCTAVE * np.log2(band_hz[1] / band_hz[0])))
+    count = max(1, round(per_octave * np.log2(band_hz[1] / band_hz[0])))
     edges = np.geomspace(*band_hz, count + 1)
     bands = [
         BandSensitivity(low, high, *at(float(np.sqrt(low * high))))
         for low, high in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)
     ]
     grid = np.geomspace(*band_hz, GRID)
-    away = np.array([abs(np.exp(z @ (effects @ _log_h(f, reference_hz)))) - 1.0 for f in grid.tolist()])
+    away = np.abs(np.exp(_log_h(grid, reference_hz) @ (z @ effects))) - 1.0
     limit = coverage_factor * float(u.min()) / 3.0
     return ResponseTold(
         Response(tuple((z @ effects).tolist()), band_hz[1]),
@@ -84,11 +85,10 @@ def response_told(
     )
 
 
-def _log_h(frequency_hz: float, reference_hz: float) -> Complex:
-    """Derivatives (5,) of ln h by the terms, where |h| is 1 at the reference frequency."""
-    omega = 2.0 * np.pi * np.array([frequency_hz, reference_hz])
-    at, reference = by_term(omega)
-    return np.asarray(at - reference.real)
+def _log_h(frequency_hz: float | Array, reference_hz: float) -> Complex:
+    """Derivatives (..., 5) of ln h at frequencies (...,) by the terms, where |h| is 1 at the reference frequency."""
+    at = by_term(2.0 * np.pi * np.asarray(frequency_hz, dtype=np.float64))
+    return np.asarray(at - by_term(np.array(2.0 * np.pi * reference_hz)).real)
 
 
 def _around(grid: Array, good: NDArray[np.bool_], reference_hz: float) -> tuple[float, float]:

@@ -129,7 +129,8 @@ class Summary:
 class Rows:
     """Observed less predicted (R,) and Jacobian (R, N), in units in which their covariance is one.
 
-    The slopes come first, the bands last. The noise of all windows' segments together scales that covariance, as in calib.estimate.adjustment.
+    The slopes come first, the bands last. The noise of all windows' segments together scales that covariance, as in
+    calib.estimate.adjustment.
     """
 
     residual: Array

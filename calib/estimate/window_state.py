@@ -112,7 +112,7 @@ class WindowState:
         self._made[id(summary)] = rows
         recent = {id(kept) for kept in self._joint.recent}
         self._made = {key: made for key, made in self._made.items() if key in recent}
-        self._noise, self._over = self._noise.pooled(rows.noise), self._over.taken(summary.data.bands)
+        self._noise, self._over = self._noise.pooled(rows.noise), self._over.taken(summary.data)
         self._residual_sd = summary.data.type_a.noise[0].copy()
         if np.isfinite(summary.temperature_degc):
             low, high = self._temperature_range

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hw.block import BlockFlags, DeviceInfo, SampleBlock
-from hw.virtual.building_motion import Array, Band, BuildingMotion, ComplexArray, Response
+from hw.virtual.building_motion import Band, BuildingMotion, ComplexArray, Response
 from hw.virtual.harm import HARMLESS, Harm, Role, Visit
 from hw.virtual.noise import Stream, generator
 from hw.virtual.schedule import STANDARD_GRAVITY_MPS2, rotation
