@@ -29,7 +29,8 @@ class Prior(Section):
 
     `sensitivity` is the main one in output unit per m/s2, or all nine, row by row (row = output axis); left out, it is
     the data sheet's, which the drivers of the chips know. `offset` is in m/s2, as are its uncertainties. `corner_hz`
-    and `u_corner_hz` are of an AC-coupled sensor (first order), 0 where it responds to constants.
+    and `u_corner_hz` are of an AC-coupled sensor (first order), 0 where it responds to constants. S holds at
+    `reference_frequency_hz`; 0 takes the middle of the band of the first window.
     """
 
     sensitivity: Positive | Nine | None = None
@@ -39,6 +40,7 @@ class Prior(Section):
     u_offset_mps2: Positive = 20.0  # two g: nothing is known
     corner_hz: NotNegative = 0.0
     u_corner_hz: NotNegative = 0.0
+    reference_frequency_hz: NotNegative = 0.0
 
     def mean(self, nominal: float | None) -> Array:
         """(12,) S row by row and Q. Raises ValueError where neither configuration nor device tells a sensitivity."""

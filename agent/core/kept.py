@@ -153,8 +153,11 @@ def _basis(channel: Channel) -> dict[str, str]:
 
 
 def _made_otherwise(changed: Iterable[str], before: Mapping[str, str], channel: Channel) -> list[str]:
-    """Changed settings by which windows are made: windows that were made with the old ones tell nothing now."""
+    """Changed settings by which windows are made, or that give S another meaning: what was known tells nothing now."""
     found = sorted(WINDOWS.intersection(changed))
+    frequency_hz = msgspec.json.decode(before["prior"]).get("reference_frequency_hz", 0.0)
+    if frequency_hz != channel.prior.reference_frequency_hz:
+        found.append("prior.reference_frequency_hz")
     quantity = msgspec.json.decode(before["certificate"]).get("quantity", channel.certificate.quantity)
     return found if quantity == channel.certificate.quantity else [*found, "certificate.quantity"]
 

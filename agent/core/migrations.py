@@ -170,13 +170,17 @@ def _with_kind(quantity: list[Any]) -> tuple[str, Kind, str, str]:
 
 
 def from_version_3(state: dict[str, Any]) -> None:
-    """Version 3 knew no response over frequency: windows had no bands, and S was that of the whole motion."""
+    """Version 3 knew no response over frequency: windows had no bands, and S was that of the whole motion. Its noise
+    contained what a filter makes of white noise."""
     for estimation in _estimations(state):
         recursions = [estimation["recursion"], *(proposal["recursion"] for proposal in estimation["proposed"])]
         for recursion in recursions:
             recursion["over"] = {"motion_hz": None, "deviations": asdict(Deviations()), "first_hz": 0.0}
             if recursion["held"] is not None:
                 recursion["held"]["steady"] = {}
+            for newest in recursion["recent"][-1:]:
+                for ratio in ("slopes", "means"):
+                    recursion["noise"][ratio] *= newest["independent"]
         recent = (summary for recursion in recursions for summary in recursion["recent"])
         for summary in (*recent, *estimation["held"], *estimation["witnesses"]):
             summary |= {"response": [], "motion_hz": None}

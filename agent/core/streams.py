@@ -265,17 +265,18 @@ class Streams:
             lag_s = 0.0 if estimation is None else estimation.lag_s
             return self._make(piece, first_s, FLAT, np.inf, lag_s), lag_s, None
         lag_s, response = estimation.lag_s, estimation.response
-        trial = estimation.recursion
+        trial, known = estimation.recursion, estimation.recursion.response_is_known
 
         def lag_of(found: Found, lag_s: float) -> float:
             nonlocal trial
             trial = estimation.after(found.used, day, lag_s, found.temperature_degc)
-            return trial.lag_s
+            # What contradicts a known state must not move its lag: that would be an answer to another question.
+            return lag_s if known and estimation.contradicted(found, day, lag_s) else trial.lag_s
 
         for _ in range(RESPONSE_TURNS):
             make = partial(self._make, piece, first_s, response, estimation.recursion.motion_to_hz)
             found, lag_s = without_lag(lag_s, make, lambda found: found.used, lag_of)
-            if not found.used or trial.response.is_near(response):
+            if known or not found.used or trial.response.is_near(response):
                 break
             response = trial.response
         if not estimation.contradicted(found, day, lag_s):

@@ -15,8 +15,10 @@ from calib.estimate.nuisances import Priors
 from calib.estimate.quantities import RESPONSE
 from calib.estimate.response_told import ResponseTold, response_told
 from calib.model import Array
-from calib.signal.response import FLAT, Response, by_term, in_units
+from calib.signal.response import FLAT, Complex, Response, by_term, in_units
 
+WIDER = 1.25  # later windows may move so much faster than the first one
+KNOWN = 0.03  # standard uncertainty of ln h
 NEAR = 1e-2  # change of ln h from which the windows must be linearised again
 
 
@@ -33,11 +35,11 @@ class OverFrequency:
     @property
     def to_hz(self) -> float:
         """Upper end of the motion that is used; inf before a window told it."""
-        return np.inf if self.motion_hz is None else self.motion_hz[1]
+        return np.inf if self.motion_hz is None else WIDER * self.motion_hz[1]
 
     def stated(self, priors: Priors) -> Priors:
         """The priors with those of the response, once it is an unknown."""
-        return priors if self.motion_hz is None else priors.with_response(self.motion_hz)
+        return priors if self.motion_hz is None else priors.with_response(self.motion_hz, self.to_hz)
 
     def taken(self, data: Condensed) -> Self:
         """After a window with these data."""
@@ -56,6 +58,11 @@ class OverFrequency:
             return FLAT
         found = Response(tuple((state.mean[own] * in_units(self.to_hz)).tolist()), self.to_hz).rounded
         return FLAT if found.is_flat else found
+
+    def is_known(self, state: JointState, reference: str) -> bool:
+        """Whether windows have told the response beside a reference: one more cannot change it much."""
+        own = terms_of(state, reference)
+        return bool(own) and float(np.linalg.norm(_ends() @ state.factor[own], axis=1).max()) < KNOWN
 
     def factor(self, state: JointState) -> Array:
         """A factor of the covariance of a state (N, N) or (N, N + 1), with what the bands deviate from one response."""
@@ -104,9 +111,13 @@ def terms_of(state: JointState, reference: str) -> list[int]:
 
 def changed(state: JointState, point: Array) -> bool:
     """Whether a response in the state differs so much from the `point` (N,) that windows must be linearised again."""
-    unit = by_term(np.array([0.5, 1.0])) * in_units(1.0 / (2.0 * np.pi))
     for owner in dict.fromkeys(q.owner for q in state.quantities if q.kind is RESPONSE):
         own = terms_of(state, owner)
-        if np.abs(unit @ (state.mean - point)[own]).max() > NEAR:
+        if np.abs(_ends() @ (state.mean - point)[own]).max() > NEAR:
             return True
     return False
+
+
+def _ends() -> Complex:
+    """(2, 5) derivatives of ln h by the unknowns of the response, in the middle and at the upper end of the motion."""
+    return by_term(np.array([0.5, 1.0]) / WIDER) * in_units(1.0 / (2.0 * np.pi))

@@ -326,7 +326,12 @@ BETWEEN_WINDOWS = (
 OF_SENSOR = (SENSITIVITY, SENSITIVITY_RATE, OFFSET, OFFSET_RATE, SENSITIVITY_TEMPERATURE, OFFSET_TEMPERATURE)
 FREQUENCIES = (
     Statement("response_hz"),  # to which the terms of the response are scaled
-    Statement("reference_frequency_hz", option="reference_frequency_hz", convert=_or_0),  # at which S holds
+    Statement(  # at which S holds
+        "reference_frequency_hz",
+        configuration=("prior.reference_frequency_hz",),
+        option="reference_frequency_hz",
+        convert=_or_0,
+    ),
 )
 PRIORS = by_name(
     [s for k in KINDS.values() if k not in OF_SENSOR for s in k.statements] + [*BETWEEN_WINDOWS, *FREQUENCIES]

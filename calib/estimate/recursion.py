@@ -71,6 +71,11 @@ class Recursion(WindowState):
         return self._over.response(self._joint.state, self.reference)
 
     @property
+    def response_is_known(self) -> bool:
+        """Whether windows have told it: one more cannot change it much."""
+        return self._over.is_known(self._joint.state, self.reference)
+
+    @property
     def response_told(self) -> ResponseTold | None:
         """What is known of it, by frequency; None where it is no unknown."""
         stated = self._beside[self._place].priors

@@ -25,12 +25,16 @@ from calib.signal.response import FLAT, Response
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """Scatter of segments over that of white noise, pooled over windows: variance ratios of slopes and means, and the
-    degrees of freedom behind them."""
+    """Scatter of segments over that of white noise, and over what a filter makes of it, pooled over windows: variance
+    ratios of slopes and means, and the degrees of freedom behind them."""
 
     slopes: float = 1.0
     means: float = 1.0
     degrees_of_freedom: float = 0.0
+
+    def filtered(self, independent: float) -> Noise:
+        """The noise of a window of which a filter left this share of independent points, over white noise."""
+        return Noise(self.slopes / independent, self.means / independent, self.degrees_of_freedom)
 
     def pooled(self, own: Noise) -> Noise:
         """With another window's, by their degrees of freedom; the older ones forgotten beyond MOST_FREEDOM."""
@@ -189,14 +193,14 @@ class WindowRows:
         type_a, live, filtered = self.data.type_a, self._live, 1.0 / self.summary.independent
         freedom = type_a.degrees_of_freedom if np.isfinite(type_a.degrees_of_freedom) else 0.0
         own = min(freedom / FEWEST_FREEDOM, 1.0)
-        slopes = type_a.slope_ratio(live) if live.any() else filtered
-        means = float(np.diag(type_a.means).mean())
-        return Noise(own * slopes + (1.0 - own) * filtered, own * means + (1.0 - own) * filtered, freedom)
+        slopes = type_a.slope_ratio(live) / filtered if live.any() else 1.0
+        means = float(np.diag(type_a.means).mean()) / filtered
+        return Noise(own * slopes + 1.0 - own, own * means + 1.0 - own, freedom)
 
     def at(self, state: JointState, at: Array, noise: Noise) -> Rows:
         """Rows at the values `at` (N,) of the state's quantities; `noise` is the pooled one, to which this window's is
         added: the first window of all has no other."""
-        noise = noise.pooled(self.noise)
+        noise = noise.pooled(self.noise).filtered(self.summary.independent)
         x, chain = self._own(state, at)
         rows = self.equations.at(x)
         slope, d_slope = rows.slope.reshape(-1), rows.d_slope.reshape(-1, len(x))
