@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -170,10 +170,8 @@ class Files:
         sensor, reference = self._cut(interval, start_s, stop_s)
         if sensor is None or reference is None:
             return None
-        leave_out = self._options.settings.leave_out
-        return aligned(
-            sensor, reference, self._instrument, (start_s, stop_s), lag_s, limit_band=limit_band, leave_out=leave_out
-        )
+        settings = replace(self._options.settings, limit_band=limit_band)
+        return aligned(sensor, reference, self._instrument, (start_s, stop_s), lag_s, settings)
 
     def _rest_floor(self) -> Array | None:
         """The usual noise of the sensor at rest: the median over all static poses."""

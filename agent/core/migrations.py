@@ -185,6 +185,8 @@ def from_version_3(state: dict[str, Any]) -> None:
         for summary in (*recent, *estimation["held"], *estimation["witnesses"]):
             summary |= {"response": [], "motion_hz": None}
             summary["data"]["bands"] = None
+            for of in ("slopes", "means"):
+                summary["data"]["type_a"][of] = summary["data"]["type_a"][of] * summary["independent"]
 
 
 MIGRATIONS: Mapping[int, Callable[[dict[str, Any]], None]] = {

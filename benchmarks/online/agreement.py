@@ -41,6 +41,7 @@ STILL: dict[str, Any] = {
     "tilt_deg": 0.0,
 }  # fmt: skip
 TIMING = Timing(20.0, 60.0, 12)
+FREQUENCY_HZ = 3.0  # at which S holds: files would take the middle of all windows, the agent that of the first one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,7 +76,10 @@ def bench_day(seed: int) -> Both:
 def building(seed: int) -> Both:
     """A building that moves on all axes, twelve visits of 20 s."""
     drawn = node(seed, all_axes=True, timing=TIMING)
-    return both(drawn.config, list(visits(drawn.building, range(TIMING.windows))))
+    (channel,) = drawn.config.channels
+    prior = channel.prior.model_copy(update={"reference_frequency_hz": FREQUENCY_HZ})
+    config = drawn.config.model_copy(update={"channels": (channel.model_copy(update={"prior": prior}),)})
+    return both(config, list(visits(drawn.building, range(TIMING.windows))))
 
 
 def both(config: Config, events: Sequence[Event]) -> Both:
@@ -138,7 +142,7 @@ def _offline(channel: Channel, sensor: tuple[Array, Array, float], reference: tu
     mean = channel.prior.mean(1.0)
     u = channel.prior.standard_uncertainty(mean)
     priors = Priors(channel.priors(fixed_mount=channel.fixed_mount).values, mean, np.diag(u**2))
-    settings = Settings(Limits.of(priors.offset_mps2, priors.angle_rad, channel.window_s))
+    settings = Settings(Limits.of(priors.offset_mps2, priors.angle_rad, channel.window_s), bands=True)
     files = Files(
         SensorTable(Path("sensor"), stamps, values, None),
         ReferenceTable(Path("reference"), reference[0], reference[1], "acceleration", "a"),

@@ -106,7 +106,7 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
     plain = not any(priors.values.values())  # with every nuisance fixed it is Method 3: all points weigh the same
     data = condense([e.window for e in found], alike=plain, response_hz=priors.response_hz)
     if not plain:
-        data = effective(data, min(w.independent for w in used))
+        data = effective(data, np.array([w.independent for w in used]))
     u_lag_s = [max(w.u_lag_s, priors.lag_window_s) if priors.lag_s > 0.0 else 0.0 for w in used]
     scatter = SlopeScatter.of(data, u_lag_s, [e.attenuation for e in found])
     solution = _solution([e.window for e in found], data, priors, applied, scatter)

@@ -67,23 +67,24 @@ def condense(windows: Sequence[Window], *, alike: bool = False, response_hz: flo
     )
 
 
-def effective(data: Condensed, independent: float) -> Condensed:
+def effective(data: Condensed, independent: Array) -> Condensed:
     """The same data, scaled so that the noise of slopes and means has the variance 1 on average.
 
     Coloured or filtered noise leaves fewer independent points, so the data must have less weight compared with the
-    priors. The scatter between segments shows how much less; with few segments, `independent`, the share of independent
-    points that the filter leaves, is used in its place.
+    priors. `independent` (W,) is the share of independent points that the filters leave; the scatter between segments
+    shows how much fewer there are still.
     """
     type_a, live = data.type_a, np.repeat(np.any(np.diagonal(data.root, axis1=1, axis2=2) > 0.0, axis=0), 3)
     freedom = type_a.degrees_of_freedom if np.isfinite(type_a.degrees_of_freedom) else 0.0
     own = min(freedom / FEWEST_FREEDOM, 1.0)
     seen = [type_a.slope_ratio(live) if live.any() else 1.0, np.diag(type_a.means).mean()]
-    slopes, means = (max(own * float(ratio) + (1.0 - own) / independent, LEAST_INFLATION) for ratio in seen)
+    slopes, means = (max(own * float(ratio) + 1.0 - own, LEAST_INFLATION) for ratio in seen)
+    less = np.sqrt(slopes / independent)[:, None, None]
     return replace(
         data,
-        root=data.root / np.sqrt(slopes),
-        slopes=data.slopes / np.sqrt(slopes),
-        count=data.count / means,
+        root=data.root / less,
+        slopes=data.slopes / less,
+        count=data.count / means * independent,
         type_a=replace(type_a, slopes=type_a.slopes / slopes, means=type_a.means / means),
     )
 
@@ -107,7 +108,14 @@ def _segments(window: Window, channels: int) -> Segments:
         for powers, at in zip(window.reference_noise**2, (0, channels), strict=True):
             noise[at : at + len(powers)] = powers
     return Segments(
-        count, scatter[:, x, x], scatter[:, x, -3:], scatter[:, -3:, -3:], count[:, None] * mean, centre, noise
+        count,
+        scatter[:, x, x],
+        scatter[:, x, -3:],
+        scatter[:, -3:, -3:],
+        count[:, None] * mean,
+        centre,
+        noise,
+        window.independent,
     )
 
 

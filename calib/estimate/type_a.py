@@ -26,7 +26,8 @@ LEAST_INFLATION = 0.25  # variance ratios below it are the luck of few segments
 class Segments:
     """Sums of K segments about one centre: counts (K,), x x' (K, 2M, 2M), x V' (K, 2M, 3), V V' (K, 3, 3), sums of
     [x, V] (K, 2M + 3); `mean` (2M + 3,) is that centre. `noise` (2M,): power a sample of the reference's own noise,
-    which is no longer in xx but still in the residuals."""
+    which is no longer in xx but still in the residuals. `independent`: share of points that a filter left independent.
+    """
 
     count: Array
     xx: Array
@@ -35,6 +36,7 @@ class Segments:
     total: Array
     mean: Array
     noise: Array
+    independent: float = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,8 +44,8 @@ class TypeA:
     """How much slopes and means scatter.
 
     `noise` (W, 3): SD of the residuals within each window, output unit. `slopes` (6M, 6M) in the order basis, axis and
-    `means` (3, 3): covariance of the whitened slopes and means, identities if the residuals were white and independent
-    between axes. `degrees_of_freedom` of both, inf where single segments allow no such estimate.
+    `means` (3, 3): covariance of the whitened slopes and means, identities if the residuals were what a filter makes of
+    white noise, independent between axes. `degrees_of_freedom` of both, inf where single segments allow no estimate.
     """
 
     noise: Array
@@ -73,9 +75,9 @@ def pooled(
     size = roots[0].shape[0]
     slope_scores, mean_scores = [], []
     for window, beta, t in zip(windows, slopes, whiteners, strict=True):
-        score = np.einsum("rc,kci->kri", t, window.xv - window.xx @ beta) / sd
+        score = np.einsum("rc,kci->kri", t, window.xv - window.xx @ beta) / (sd / np.sqrt(window.independent))
         slope_scores.append(score.reshape(len(score), 3 * size))
-        score = (window.total[:, -3:] - window.total[:, :-3] @ beta) / sd
+        score = (window.total[:, -3:] - window.total[:, :-3] @ beta) / (sd / np.sqrt(window.independent))
         mean_scores.append(score / np.sqrt(window.count.sum()))
     live = np.repeat([any(r[j, j] > 0.0 for r in roots) for j in range(size)], 3)
     slope_cov, slope_dof = _scatter(slope_scores, live)

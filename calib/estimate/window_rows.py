@@ -190,11 +190,11 @@ class WindowRows:
     @property
     def noise(self) -> Noise:
         """What this window's own segments say; where they are few, the rest is what a filter makes of white noise."""
-        type_a, live, filtered = self.data.type_a, self._live, 1.0 / self.summary.independent
+        type_a, live = self.data.type_a, self._live
         freedom = type_a.degrees_of_freedom if np.isfinite(type_a.degrees_of_freedom) else 0.0
         own = min(freedom / FEWEST_FREEDOM, 1.0)
-        slopes = type_a.slope_ratio(live) / filtered if live.any() else 1.0
-        means = float(np.diag(type_a.means).mean()) / filtered
+        slopes = type_a.slope_ratio(live) if live.any() else 1.0
+        means = float(np.diag(type_a.means).mean())
         return Noise(own * slopes + 1.0 - own, own * means + 1.0 - own, freedom)
 
     def at(self, state: JointState, at: Array, noise: Noise) -> Rows:

@@ -63,8 +63,11 @@ def without_noise(bands: BandSums, noise: Array) -> BandSums:
         low, high = np.minimum(bands.low_hz, end_hz), np.minimum(bands.high_hz, end_hz)
         power[:, k] = total * noise[0, k] ** 2 * (high - low) / end_hz
         power[:, m + k] = total * noise[1, k] ** 2 * (high**3 - low**3) / end_hz**3
-        moved = bands.products[:, range(m), range(m)].sum(axis=1)
-        kept &= (moved > OVER_NOISE * power[:, k]) & (bands.high_hz <= end_hz)
+        for of in (k, m + k):
+            first = of - k
+            moved = bands.products[:, range(first, first + m), range(first, first + m)].sum(axis=1)
+            kept &= moved > OVER_NOISE * power[:, of]
+        kept &= bands.high_hz <= end_hz
     products = bands.products.copy()
     products[:, range(2 * m), range(2 * m)] -= power
     low_hz, high_hz, points = (part[kept] for part in (bands.low_hz, bands.high_hz, bands.points))

@@ -113,9 +113,8 @@ def windows_of(
 
     `sensor` and `reference` hold the samples of `span_s` and of a margin around it (`margin_s`; for the sensor half of
     it is enough). The sensor's indications are taken to come late by `lag_s`, and to be what `response` makes of the
-    motion. Without a reference the pose must be one
-    at rest; `floor` (3,) is then the sensor's noise at rest elsewhere. Raises Unusable where a device cannot take
-    part: the message says which one and why.
+    motion. Without a reference the pose must be one at rest; `floor` (3,) is then the sensor's noise at rest elsewhere.
+    Raises Unusable where a device cannot take part: the message says which one and why.
     """
     _check(sensor, sensor.device, 3)
     if reference is None:
@@ -140,20 +139,16 @@ def aligned(
     instrument: Instrument,
     span_s: tuple[float, float],
     lag_s: float = 0.0,
-    *,
-    limit_band: bool = True,
-    leave_out: bool = True,
-    to_hz: float | None = None,
+    settings: Settings = DEFAULT_SETTINGS,
     response: Response = FLAT,
 ) -> Aligned | None:
     """Samples within `span_s` that have a reference, in m/s2; None where there are fewer than two.
 
-    `limit_band`, `leave_out`, `to_hz` as in Settings. Without `leave_out` the reference's glitches stay (see
-    calib.signal.glitches).
+    Where nothing is left out, the reference's glitches stay (see calib.signal.glitches).
     """
     rate_hz = reference.clock.rate_hz
     raw = reference.values / instrument.sensitivity
-    odd = glitches(raw) if leave_out else np.zeros(len(raw), dtype=bool)
+    odd = glitches(raw) if settings.leave_out else np.zeros(len(raw), dtype=bool)
     if instrument.derivatives:  # between the two sides of a step is no value: the hole is longer than those filled
         odd = np.convolve(odd, np.ones(3), "same") > 0.5
     raw[odd] = np.nan
@@ -170,9 +165,9 @@ def aligned(
     at = resample(passed(u, rate_hz, response), reference.clock, time_s - lag_s, reference.first_index, lost)
     columns = np.vstack([V.T, at.u.T, at.du.T]).T  # the samples of a channel lie side by side, also in what is kept
     columns[~at.usable] = np.nan
-    band_hz, noise = _band(raw, at.u[at.usable][:, :m], V, instrument, (rate_hz, sensor_rate_hz), to_hz)
+    band_hz, noise = _band(raw, at.u[at.usable][:, :m], V, instrument, (rate_hz, sensor_rate_hz), settings.to_hz)
     clipped, independent, k = 0, 1.0, u.shape[1]
-    if band_hz is not None and limit_band:
+    if band_hz is not None and settings.limit_band:
         independent = min(1.0, 2.0 * FILTER_BAND * band_hz / sensor_rate_hz)
         clipped = _clipped(columns[np.isfinite(columns).all(axis=1) & inside & ~filled])
         columns = lowpass(columns, sensor_rate_hz, band_hz)
@@ -190,7 +185,7 @@ def aligned(
     }
     points = Points(time_s[usable], *np.split(columns.T[:, usable].T, [3, 3 + k], axis=1))
     told = {name: float(count) for name, count in counts.items() if count}
-    return Aligned(points, noise, clipped, independent, band_hz if limit_band else None, told)
+    return Aligned(points, noise, clipped, independent, band_hz if settings.limit_band else None, told)
 
 
 def nothing_in(pose: Pose, start_s: float, stop_s: float, reason: str) -> Window:
@@ -237,11 +232,7 @@ def _motion(
     settings: Settings,
     response: Response,
 ) -> list[Window]:
-    found = aligned(
-        sensor, reference, instrument, span_s, lag_s,
-        limit_band=settings.limit_band, leave_out=settings.leave_out, to_hz=settings.to_hz, response=response,
-    )  # fmt: skip
-    if found is None:
+    if (found := aligned(sensor, reference, instrument, span_s, lag_s, settings, response)) is None:
         return []
     if instrument.has_corner:
         pose = with_integral(pose)
