@@ -21,6 +21,7 @@ from calib.excitation.bands import motion_band_hz
 from calib.excitation.windows import rests_anywhere
 from calib.geometry import STANDARD_GRAVITY_MPS2
 from calib.model import PARAMETERS, Window
+from calib.signal.response import UNSETTLED
 from calib.signal.stamps import clock_from_stamps
 
 METHOD = "3 (adjustment)"
@@ -28,10 +29,6 @@ LAG_SD = 3.0  # how far a lag is searched, in its stated standard uncertainties
 LEAST_USED = 0.05  # of the points in motion
 RESPONSE_TURNS = 6
 HOPELESS = 2  # turns after which a refusal no longer comes from the response that is not yet taken out
-UNSETTLED = (
-    "the response of sensor and reference over frequency does not settle: within the motion's band they differ too "
-    "much, as at a filter's corner or a resonance; calibrate with motion at lower frequencies"
-)
 
 
 def adjusted(files: Files, priors: Priors) -> Outcome:
@@ -66,7 +63,7 @@ def adjusted(files: Files, priors: Priors) -> Outcome:
             return _outcome(found, windows, files.rate_hz)
         if found.reasons and turn >= HOPELESS:
             return _outcome(found, windows, files.rate_hz)
-        applied = replace(applied, lag_s=lag_s, response=found.response.terms)
+        applied = replace(applied, lag_s=lag_s, response=found.response.terms.modest)
     if applied.response.is_flat:
         return nothing_used(windows, files.rate_hz, METHOD)
     return Outcome(None, (UNSETTLED,), windows, files.rate_hz, METHOD)

@@ -20,7 +20,7 @@ from calib.estimate.lag_search import without_lag
 from calib.excitation.front_end import most_margin_s
 from calib.excitation.placing import Placed
 from calib.model import Pose, Window
-from calib.signal.response import FLAT, Response
+from calib.signal.response import FLAT, UNSETTLED, Response
 from calib.signal.timing import HORIZON_S
 from hw.block import LARGEST, SampleBlock
 
@@ -278,7 +278,9 @@ class Streams:
             found, lag_s = without_lag(lag_s, make, lambda found: found.used, lag_of)
             if known or not found.used or trial.response.is_near(response):
                 break
-            response = trial.response
+            response = trial.response.modest
+        else:
+            return found.refused(UNSETTLED), lag_s, None
         if not estimation.contradicted(found, day, lag_s):
             return found, lag_s, None
         anew = estimation.lag_watch.search(estimation.recursion, make, found.windows, day)

@@ -36,6 +36,10 @@ class Found:
             return self
         return replace(self, windows=[w if w.used else replace(w, reason=f"{w.reason}; {why}") for w in self.windows])
 
+    def refused(self, reason: str) -> Found:
+        """The same, none of the windows used for this reason."""
+        return replace(self, windows=[replace(w, used=False, reason=w.reason or reason) for w in self.windows])
+
     def told(self, numbers: Mapping[str, float]) -> Found:
         """The same with numbers more in each window."""
         return replace(self, windows=[replace(w, numbers={**w.numbers, **numbers}) for w in self.windows])

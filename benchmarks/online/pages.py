@@ -10,12 +10,12 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from benchmarks.online import agreement, bench, cost, coverage, day, drifting, harm, references, touched, year
+from benchmarks.online import agreement, bench, cost, coverage, day, drifting, filters, harm, references, touched, year
 from benchmarks.page import PAGE, machine, write_part
 from hw.virtual.building import Building
 from hw.virtual.harm import KINDS
 
-ONLINE = PAGE.with_name("online.md")
+ONLINE, RESPONSE = PAGE.with_name("online.md"), PAGE.with_name("response.md")
 
 
 def main() -> int:
@@ -59,6 +59,10 @@ def _harm(workers: int, runs: int | None) -> tuple[Path, str]:
     outcomes = spread(_one_harm, jobs, workers)
     wrong = [f"- {o.kind} ({o.name}), seed {o.seed}: {o.wrong}" for o in outcomes if o.wrong]
     return ONLINE, "\n".join([harm.table(outcomes), "", *wrong])
+
+
+def _filters(workers: int, runs: int | None) -> tuple[Path, str]:
+    return RESPONSE, filters.table(spread(filters.one, filters.jobs(runs or filters.RUNS), workers))
 
 
 def _one_harm(job: tuple[str, int]) -> harm.Outcome:
@@ -136,6 +140,7 @@ PARTS: dict[str, Callable[[int, int | None], tuple[Path, str]]] = {
     "year": _year,
     "harm": _harm,
     "coverage": _coverage,
+    "filters": _filters,
     "touched": _touched,
     "drift": _drift,
     "references": _references,

@@ -17,7 +17,7 @@ from calib.estimate.response_told import ResponseTold, response_told
 from calib.model import Array
 from calib.signal.response import FLAT, Complex, Response, by_term, in_units
 
-WIDER = 1.25  # later windows may move so much faster than the first one
+WIDER = 1.1  # later windows may move so much faster than the first one
 KNOWN = 0.03  # standard uncertainty of ln h
 NEAR = 1e-2  # change of ln h from which the windows must be linearised again
 

@@ -22,6 +22,11 @@ SPACED = 6.0  # times the upper end of the motion: the rate of taps that is enou
 FINER = 8  # times the resolution of the taps, for the spectrum they are fitted to
 WEIGHT_ABOVE = 1e-3  # of the filter above the motion, where it must only stay small
 NEAR = 3e-3  # of ln h
+LARGEST = 1.5  # of ln h in the motion: a resonance at 1.15 times its upper end; nearer ones are not told by this model
+UNSETTLED = (
+    "the response of sensor and reference over frequency does not settle: within the motion's band they differ too "
+    "much, as at a filter's corner or a resonance; calibrate with motion at lower frequencies"
+)
 ROUNDED = 1024.0  # steps of a term, in units of that of a low-pass filter at the upper end of the motion
 HELD = 1.1  # times the upper end of the motion: above it the polynomial is not continued
 
@@ -42,6 +47,13 @@ class Response:
         """Whether they differ by less than NEAR in the motion: what is left is estimated exactly."""
         frequency_hz = np.linspace(0.0, max(self.to_hz, other.to_hz), 50)
         return bool(np.abs(self.at(frequency_hz) - other.at(frequency_hz)).max() < NEAR)
+
+    @property
+    def modest(self) -> Response:
+        """The same with terms so small that the instruments differ by no more than LARGEST in the motion: the first
+        estimates, from a linear equation, may be much too large."""
+        size = float(np.abs(self.at(np.linspace(0.0, self.to_hz, 50))).max())
+        return self if size <= LARGEST else Response(tuple(c * LARGEST / size for c in self.terms), self.to_hz)
 
     @property
     def rounded(self) -> Response:
