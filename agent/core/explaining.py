@@ -13,7 +13,8 @@ import numpy as np
 
 from agent.core.gate import Limit
 from calib.estimate.innovation import Innovation
-from calib.estimate.quantities import OFFSET, Kind, Quantity
+from calib.estimate.nuisances import RESPONSE_U
+from calib.estimate.quantities import OFFSET, RESPONSE, Kind, Quantity
 from calib.estimate.recursion import Recursion
 from calib.estimate.window_rows import Summary
 from calib.geometry import STANDARD_GRAVITY_MPS2
@@ -91,6 +92,7 @@ def _lines(recursion: Recursion, jump: Array, fixed_mount: bool) -> dict[str, li
         if quantity.owner not in ("", recursion.reference) or quantity.first:
             continue
         stated = kind.source and _settings(kind, fixed_mount) and not (fixed_mount and "lean" in kind.loosened_by)
+        stated = stated or kind is RESPONSE
         if jump[k] > 0.0 if k < len(jump) else stated:
             lines.setdefault(kind.source or kind.name, []).append(k)
     if fixed_mount and OFFSET.name in lines:
@@ -104,10 +106,14 @@ def _with(recursion: Recursion, held: Sequence[Summary], jump: Array, line: str,
     quantities = recursion.quantities
     u = np.zeros(len(quantities))
     for k in members:
-        u[k] = jump[k] if k < len(jump) else FREE[quantities[k].kind.unit]
+        kind = quantities[k].kind
+        u[k] = jump[k] if k < len(jump) else RESPONSE_U if kind is RESPONSE else FREE[kind.unit]
     trial = recursion.copy()
     trial.loosen(u)
     chi2, _, after = _taken(trial, held)
+    if quantities[members[0]].kind is RESPONSE:
+        hz, change = after.response_change(recursion)
+        return Explanation(f"response at {hz:.3g} Hz", chi2, frozenset(members), quantities[members[0]], change)
     own = [quantities[k] for k in members if quantities[k].kind is quantities[members[0]].kind]
     moved = [_moved(recursion, after, quantity) for quantity in own]
     most = int(np.argmax([abs(change) / u_after for change, u_after in moved]))
@@ -135,6 +141,8 @@ def _told(explanation: Explanation, scale: float) -> str:
     else:
         unit, factor = UNITS.get(kind.unit, (kind.unit, 1.0))
         size = f"{factor * change:+.3g} {unit}"
+    if kind is RESPONSE:
+        return f"another {explanation.line} ({size})"
     return f"another {explanation.line} ({explanation.most.name} {size})"
 
 
@@ -144,6 +152,11 @@ def _remedy(best: Explanation, scale: float, fixed_mount: bool) -> str:
     if kind is OFFSET and fixed_mount:
         lean_deg = np.rad2deg(abs(best.change) / (scale * STANDARD_GRAVITY_MPS2))
         return f"A mount that leans by {lean_deg:.2g} deg does the same: level it, or {ACCEPT}"
+    if kind is RESPONSE:
+        return (
+            "A filter was set anew, or the mount came loose: set it back, tighten the mount, or state another "
+            "prior.reference_frequency_hz, which begins the estimation again"
+        )
     if "jump" in kind.loosened_by:
         return f"If the reference is sound, {ACCEPT}"
     assert kind.prior is not None  # see `_lines`

@@ -24,6 +24,7 @@ JUMP_SENSITIVITY = 0.1
 JUMP_OFFSET_MPS2 = 2.0
 SURELY = 1.6  # U = 2 u covers the errors 0 and d if u is d / 1.6
 SIGNIFICANT = 3.0  # standard uncertainties of a changed offset
+LARGEST_PHASE_RAD = 0.1  # of a lag that was not taken out: its second order is then 0.5 % of S
 WIDER = 3.0  # the possible jump over the one that was found: else the reference would take the larger part of it
 
 
@@ -73,17 +74,19 @@ def with_jump(
     wider: float = 1.0,
 ) -> Recursion | None:
     """See `jumped`. `leaning_rad`: by how much a fixed mount may have leaned; `u_reference` by how much the reference
-    may have stepped, relative."""
+    may have stepped, relative. None also if the response over frequency or the lag has changed."""
     trial = recursion.copy()
     # A line that was plugged anew may be late by another time; that is no change of S or Q.
-    trial.loosen(wider * possible_jump(recursion, held), leaning_rad, line=True)
+    trial.loosen(wider * possible_jump(recursion, held), leaning_rad, line=True, another_filter=True)
     trial.suspect_reference(held, u_reference)
     for k, summary in enumerate(held):
         told = trial.innovation(summary)
         if k and told.statistic > limit(told.degrees_of_freedom):
             return None
         trial.update(summary)
-    return trial
+    # With another filter or lag, the windows were made with the wrong ones taken out: they tell no exact S.
+    phase_rad = max(abs(trial.lag_s - summary.lag_s) * float(np.sqrt(summary.data.omega2.max())) for summary in held)
+    return None if phase_rad > LARGEST_PHASE_RAD or trial.has_another_response(recursion) else trial
 
 
 def _value(recursion: Recursion, key: str) -> float:

@@ -110,7 +110,7 @@ def table(found: Sequence[Outcome]) -> str:
             if not low <= covered <= high:
                 outside.append(f"{name} ({covered} of {len(known)}, {low} to {high} expected)")
     lines.append(
-        f"All runs together: {(np.abs(over_u[told]) <= 1.0).mean():.2%} of {told.sum()} values are within U. Parameters "
-        f"outside of the band of {LEVEL:.1%} for the number of covered runs: {', '.join(outside) or 'none'}."
+        f"All runs together: {(np.abs(over_u[told]) <= 1.0).mean():.2%} of {told.sum()} values are within U. "
+        f"Parameters outside of the band of {LEVEL:.1%} for the number of covered runs: {', '.join(outside) or 'none'}."
     )
     return "\n".join(lines)

@@ -13,7 +13,8 @@ from agent.core.events import CalibrationUpdate, DriftReport, Estimate, Result, 
 from benchmarks.online.node import Node, Timing, node
 from benchmarks.online.runner import EPOCH_NS, Run, visits
 from calib.model import PARAMETERS
-from hw.virtual.harm import HARMLESS, KINDS
+from hw.virtual.harm import HARMLESS
+from hw.virtual.harm_kinds import KINDS
 
 SEED = 20_000
 TIMING = Timing(20.0, 60.0, 12)
@@ -79,7 +80,8 @@ def wrong(update: CalibrationUpdate, drawn: Node, harmed: bool) -> str:
     building = drawn.building
     output = building.harm.output if harmed else np.eye(3)
     true = building.truth((update.t_utc_ns - EPOCH_NS) * 1e-9)
-    truth = np.concatenate([(output @ true.sensitivity).ravel(), output @ true.offset_at_mean])
+    size = building.harm.size(update.reference_frequency_hz) if harmed else 1.0
+    truth = np.concatenate([(size * output @ true.sensitivity).ravel(), output @ true.offset_at_mean])
     value = np.concatenate([np.ravel(update.sensitivity), update.offset])
     determined = np.array(update.determined)
     u = update.coverage_factor / 2.0 * np.array(update.standard_uncertainty)

@@ -13,7 +13,7 @@ from typing import Any
 from benchmarks.online import agreement, bench, cost, coverage, day, drifting, filters, harm, references, touched, year
 from benchmarks.page import PAGE, machine, write_part
 from hw.virtual.building import Building
-from hw.virtual.harm import KINDS
+from hw.virtual.harm_kinds import KINDS
 
 ONLINE, RESPONSE = PAGE.with_name("online.md"), PAGE.with_name("response.md")
 

@@ -19,6 +19,7 @@ from calib.signal.response import FLAT, Complex, Response, by_term, in_units
 
 WIDER = 1.1  # later windows may move so much faster than the first one
 KNOWN = 0.03  # standard uncertainty of ln h
+SURELY = 4.0  # standard uncertainties
 NEAR = 1e-2  # change of ln h from which the windows must be linearised again
 
 
@@ -63,6 +64,15 @@ class OverFrequency:
         """Whether windows have told the response beside a reference: one more cannot change it much."""
         own = terms_of(state, reference)
         return bool(own) and float(np.linalg.norm(_ends() @ state.factor[own], axis=1).max()) < KNOWN
+
+    def differs(self, state: JointState, earlier: JointState, reference: str) -> bool:
+        """Whether the response beside a reference is surely another in `state` than in an earlier state."""
+        own, was = terms_of(state, reference), terms_of(earlier, reference)
+        if not own or len(own) != len(was):
+            return False
+        moved = np.abs(_ends() @ (state.mean[own] - earlier.mean[was]))
+        u, u_was = (np.linalg.norm(_ends() @ one.factor[k], axis=1) for one, k in ((state, own), (earlier, was)))
+        return bool(np.any(moved > np.maximum(NEAR, SURELY * np.hypot(u, u_was))))
 
     def factor(self, state: JointState) -> Array:
         """A factor of the covariance of a state (N, N) or (N, N + 1), with what the bands deviate from one response."""

@@ -62,7 +62,7 @@ class Statement:
     convert: Callable[..., float] = float
 
 
-Loosening = Literal["jump", "lean", "line", "remount"]
+Loosening = Literal["jump", "lean", "line", "filter", "remount"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +78,7 @@ class Kind:
     `in_output_unit`: `walk` and `straight` must be multiplied by the sensor's output unit per m/s2.
     `loosened_by`: the events that may change it at once, so that its uncertainty is enlarged: a "jump" of the sensor
     that further windows confirmed, a "lean" of a fixed mount, a new "line" (a device or its wiring was started again),
-    a "remount" (the sensor or the reference was mounted again, or the stated poses changed).
+    another "filter", a "remount" (the sensor or the reference was mounted again, or the stated poses changed).
     `of_reference`: it belongs to the reference. It stays in the state when another reference takes its place, and is
     used again when that reference comes back.
     `straight`: the change up to which its product with S counts as linear; LINEAR if it is not multiplied by S.
@@ -300,6 +300,7 @@ RESPONSE = Kind(
     "response", "1", "response over frequency",
     prior=Statement("response"),
     of_reference=True, straight=LINEAR, stated=False,  # calib.estimate.over_frequency sees whether it changed
+    loosened_by=("filter",),
 )  # fmt: skip
 ROTATION = Kind(
     "mounting rotation", "rad", "mounting rotation",

@@ -75,6 +75,16 @@ class Recursion(WindowState):
         """Whether windows have told it: one more cannot change it much."""
         return self._over.is_known(self._joint.state, self.reference)
 
+    def response_change(self, since: Recursion) -> tuple[float, float]:
+        """The upper end of the motion in Hz, and by how much S is larger there than it was, relative."""
+        to_hz = self.response.to_hz or self.motion_to_hz
+        now, before = (one.response.at(np.array([to_hz])).real[0] for one in (self, since))
+        return to_hz, float(np.exp(now - before) - 1.0)
+
+    def has_another_response(self, than: Recursion) -> bool:
+        """Whether the response beside the reference in use is surely another than in an earlier state."""
+        return self._over.differs(self._joint.state, than._joint.state, self.reference)
+
     @property
     def response_told(self) -> ResponseTold | None:
         """What is known of it, by frequency; None where it is no unknown."""
@@ -196,13 +206,19 @@ class Recursion(WindowState):
         self._take(rows, self._wandered(self._joint.state, self._day, summary.day))
 
     def loosen(
-        self, standard_uncertainty: Array, tilt_rad: float = 0.0, *, u_rate: Array = STEADY, line: bool = False
+        self,
+        standard_uncertainty: Array,
+        tilt_rad: float = 0.0,
+        *,
+        u_rate: Array = STEADY,
+        line: bool = False,
+        another_filter: bool = False,
     ) -> None:
         """Something changed: S and Q (12,), or all `quantities` (N,), may be off by as much more from now on, and a
         fixed mount be tilted.
 
         `u_rate` (12,): S and Q may drift by as much more a day. `line`: a device or its line may have begun anew, which
-        makes the lag another.
+        makes the lag another. `another_filter`: the response over frequency may be another.
         """
         self._absorb(len(self._joint.recent))
         drifting = np.flatnonzero(u_rate)
@@ -215,7 +231,10 @@ class Recursion(WindowState):
                 continue
             if "lean" in quantity.kind.loosened_by and self._fixed:
                 u[k] = tilt_rad
-            elif "line" in quantity.kind.loosened_by and line and quantity.owner == self.reference:
+            elif quantity.owner == self.reference and (
+                (line and "line" in quantity.kind.loosened_by)
+                or (another_filter and "filter" in quantity.kind.loosened_by)
+            ):
                 u[k] = self._beside[self._place].priors.of(quantity.kind.prior)
         self._spread(u)
 

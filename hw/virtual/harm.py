@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Literal, Protocol
 
@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hw.block import BlockFlags, SampleBlock
-from hw.virtual.schedule import rotation
 
 Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 Role = Literal["sensor", "reference", "check"]
 
 
@@ -47,6 +47,11 @@ class Harm:
     def output(self) -> Array:
         """Matrix M (3, 3) of the sensor's output: while the fault lasts the true values are M S and M Q."""
         return np.eye(3)
+
+    def size(self, frequency_hz: float) -> float:
+        """The response of the sensor over that of the reference at a frequency, which multiplies S there."""
+        del frequency_hz
+        return 1.0
 
     def moved(self, visit: Visit, felt: Array) -> Array:
         """Acceleration (n, 3) at the device, from the acceleration `felt` (n, 3) without the fault."""
@@ -121,6 +126,26 @@ class Transformed(Harm):
 
     def shown(self, visit: Visit, values: Array) -> Array:
         return values @ self.matrix.T if visit.role == self.role else values
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Filtered(Harm):
+    """A device has another filter, or its mount a resonance: its response at frequencies (k,) in Hz, 1 at 0 Hz."""
+
+    role: Role = "sensor"
+    response: Callable[[Array], ComplexArray] = np.ones_like
+
+    def size(self, frequency_hz: float) -> float:
+        size = float(abs(self.response(np.array([frequency_hz]))[0]))
+        return size if self.role == "sensor" else 1.0 / size
+
+    def moved(self, visit: Visit, felt: Array) -> Array:
+        if visit.role != self.role:
+            return felt
+        step_s = float(np.mean(np.diff(visit.time_s)))
+        frequency_hz = np.fft.rfftfreq(len(felt), step_s).astype(np.float64)
+        # The motion begins and ends with nothing, so that a visit may be taken for periodic.
+        return np.fft.irfft(np.fft.rfft(felt, axis=0) * self.response(frequency_hz)[:, None], len(felt), axis=0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -249,71 +274,3 @@ def _shortened(block: SampleBlock, kept: NDArray[np.bool_], number: int) -> Samp
         indications=np.array(block.indications, dtype=np.float64)[kept],
         t_utc_ns=block.t_utc_ns - block.t_monotonic_ns + int(block.burst_t_monotonic_ns[some][-1]),
     )
-
-
-Drawing = Callable[[np.random.Generator], Harm]
-
-
-def _role(random: np.random.Generator) -> Role:
-    return "sensor" if random.random() < 0.5 else "reference"
-
-
-def _wrong_sensitivity(random: np.random.Generator) -> Harm:
-    role: Role = _role(random)
-    factor = (1.6, 1 / 1.6, -1.0)[int(random.integers(3))]
-    axes = np.eye(3)
-    if random.random() < 0.5:
-        return Transformed(f"wrong sensitivity, {role}", role, factor * axes)
-    axis = int(random.integers(3))
-    axes[axis, axis] = factor
-    return Transformed(f"wrong sensitivity, one axis, {role}", role, axes)
-
-
-def _swapped(random: np.random.Generator) -> Harm:
-    role: Role = _role(random)
-    order: Sequence[int] = ((1, 0, 2), (0, 2, 1), (2, 1, 0), (1, 2, 0), (2, 0, 1))[int(random.integers(5))]
-    return Transformed(f"swapped axes, {role}", role, np.eye(3)[list(order)])
-
-
-def _knocked_off(random: np.random.Generator) -> Harm:
-    axis = random.standard_normal(3)
-    turn = rotation(axis / np.linalg.norm(axis), np.deg2rad(random.uniform(8.0, 180.0)))
-    follows = bool(random.random() < 0.7)
-    return KnockedOff(f"knocked off, {'follows' if follows else 'hangs'}", turn, follows)
-
-
-def _lossy(random: np.random.Generator) -> Harm:
-    role, told = _role(random), bool(random.random() < 0.5)
-    return Lossy(f"10 % lost, {'told' if told else 'untold'}", role, 0.1, (1, 16)[int(random.integers(2))], told)
-
-
-def _clock_step(random: np.random.Generator) -> Harm:
-    what: Literal["arrival", "number", "utc"] = ("arrival", "number", "utc")[int(random.integers(3))]
-    step = float(np.exp(random.uniform(np.log(0.03), np.log(3.0))))
-    if what == "utc":
-        step *= 3600.0 * random.choice([-1.0, 1.0])
-    return ClockStep(f"clock step, {what}", _role(random), what, step)
-
-
-def _dead(random: np.random.Generator, role: Role) -> Harm:
-    noise = 0.005 * float(random.integers(2))
-    return DeadChannel(f"dead channel, {role}", role, int(random.integers(3)), noise)
-
-
-def _unplugged(random: np.random.Generator) -> Harm:
-    how: Literal["lost", "constant", "hum"] = ("lost", "constant", "hum")[int(random.integers(3))]
-    return Unplugged(f"unplugged, {how}", how)
-
-
-KINDS: dict[str, Drawing] = {
-    "reference unplugged": _unplugged,
-    "dead channel of the sensor": lambda random: _dead(random, "sensor"),
-    "dead channel of the reference": lambda random: _dead(random, "reference"),
-    "wrong sensitivity": _wrong_sensitivity,
-    "swapped axes": _swapped,
-    "knocked off its mount": _knocked_off,
-    "100 m away": lambda random: FarAway("100 m away", float(random.uniform(0.0, 0.65))),
-    "clipping": lambda random: Clipped("clipping", float(random.uniform(0.4, 1.6))),
-    "10 % lost": _lossy,
-    "clock step": _clock_step,
-}

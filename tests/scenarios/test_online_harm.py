@@ -13,7 +13,7 @@ from agent.core.events import CalibrationUpdate, Result
 from benchmarks.online import harm
 from benchmarks.online.node import Node, node
 from benchmarks.online.runner import Run, visits
-from hw.virtual.harm import KINDS
+from hw.virtual.harm_kinds import KINDS
 
 # Faults after which every window is wrong and must be refused or held. The other faults are harmless in some draws: a
 # dead reference channel without motion along it, lost samples that are reported, a step of UTC.

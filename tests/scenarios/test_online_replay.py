@@ -18,7 +18,8 @@ from benchmarks.online import harm, year
 from benchmarks.online.node import Timing, node
 from benchmarks.online.runner import Run, visits
 from hw.virtual.building import Building
-from hw.virtual.harm import HARMLESS, KINDS
+from hw.virtual.harm import HARMLESS
+from hw.virtual.harm_kinds import KINDS
 
 TIMING = Timing(12.0, 60.0, 6)
 SEED = 3
