@@ -144,10 +144,10 @@ class BandResponse(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class SteadySensitivity(msgspec.Struct, frozen=True, kw_only=True):
-    """The sensitivity at 0 Hz and its standard uncertainty; each 3 x 3."""
+    """The sensitivity at 0 Hz and its standard uncertainty; each 3 x 3, empty where the motion does not tell them."""
 
-    sensitivity: list[list[float]]
-    standard_uncertainty: list[list[float]]
+    sensitivity: list[list[float]] = []
+    standard_uncertainty: list[list[float]] = []
 
 
 class CalibrationUpdate(Result, frozen=True, kw_only=True):
@@ -189,7 +189,7 @@ class CalibrationUpdate(Result, frozen=True, kw_only=True):
     references: list[str] = []
     reference_frequency_hz: float = 0.0  # 0 if nothing moved yet
     valid_band_hz: list[float] = []  # [low, high]; empty where it is not known
-    sensitivity_at_0hz: SteadySensitivity | None = None
+    sensitivity_at_0hz: SteadySensitivity = msgspec.field(default_factory=SteadySensitivity)
     response: list[BandResponse] = []
     # If the calibration comes into force again, after a restart or by a rollback: the result that first put it in
     # force.

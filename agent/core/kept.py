@@ -133,12 +133,12 @@ def shelved(kept: Mapping[str, bytes], identity: str, memory: bytes) -> dict[str
 
 def plain(update: CalibrationUpdate | None) -> dict[str, Any] | None:
     """The update in a form that a snapshot can hold."""
-    return None if update is None else msgspec.structs.asdict(update)
+    return None if update is None else dict(msgspec.to_builtins(update))
 
 
 def update_of(state: dict[str, Any] | None) -> CalibrationUpdate | None:
     """The update from the form that `plain` gave."""
-    return None if state is None else CalibrationUpdate(**state)
+    return None if state is None else msgspec.convert(state, CalibrationUpdate)
 
 
 def _basis(channel: Channel) -> dict[str, str]:

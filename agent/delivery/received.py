@@ -69,7 +69,7 @@ def receive(key: str, payload: bytes, attachment: bytes | None) -> Received | No
 
 def _has_its_shapes(calibration: CalibrationUpdate) -> bool:
     steady = calibration.sensitivity_at_0hz
-    squares_3 = [] if steady is None else [steady.sensitivity, steady.standard_uncertainty]
+    squares_3 = [square for square in (steady.sensitivity, steady.standard_uncertainty) if square]
     for band in calibration.response:
         squares_3 += [band.sensitivity_re, band.sensitivity_im, band.standard_uncertainty]
     lengths = (calibration.offset, 3), (calibration.standard_uncertainty, 12), (calibration.determined, 12)

@@ -180,8 +180,7 @@ def _calibration_message(event_sequence: int, update: CalibrationUpdate) -> pb.C
     values |= zip(_U, values.pop("standard_uncertainty"), strict=True)
     values |= zip(_RESIDUALS, values.pop("residual_sd"), strict=True)
     values |= {name: np.ravel(values[name]) for name in _BY_POWER}
-    steady = values.pop("sensitivity_at_0hz")
-    values["sensitivity_at_0hz"] = None if steady is None else pb.Calibration.Steady(**_flat(steady))
+    values["sensitivity_at_0hz"] = pb.Calibration.Steady(**_flat(values["sensitivity_at_0hz"]))
     values["response"] = [pb.Calibration.Band(**_flat(band)) for band in values["response"]]
     return pb.Calibration(event_sequence=event_sequence, covariance=covariance.ravel(), **values)
 
@@ -211,7 +210,7 @@ def _flat(part: msgspec.Struct) -> dict[str, Any]:
 def _square(part: Message) -> dict[str, Any]:
     """The fields of a part of a calibration as Python values, matrices 3 x 3."""
     return {
-        name: value if isinstance(value, float) else np.reshape(value, (3, 3)).tolist()
+        name: value if isinstance(value, float) else np.reshape(value, (-1, 3)).tolist()
         for name, value in _values(part).items()
     }
 

@@ -178,8 +178,7 @@ def _note(year: Year, building: Building, update: CalibrationUpdate) -> None:
     year.time_s.append(now_s)
     year.syy_error.append(S[1, 1] / truth.sensitivity[1, 1] - 1)
     year.u_syy.append(u[SYY])
-    steady = update.sensitivity_at_0hz
-    held = S if steady is None else np.array(steady.sensitivity)
+    held = np.array(update.sensitivity_at_0hz.sensitivity or update.sensitivity)
     year.mean_error_mps2.append(held @ GRAVITY + at_temperature(update, truth.temperature_degc) - truth.mean_output)
     year.offset_error.append(np.array(update.offset) - truth.offset_at_mean)
     year.u_offset.append(u[9:])

@@ -15,7 +15,7 @@ from calib.estimate.quantities import KINDS, PRIORS, WALKS, Quantity, Statement
 from calib.estimate.wander import Wander
 
 STATED = Knowledge(
-    prior=Prior(sensitivity=1.0, corner_hz=0.2, u_corner_hz=0.03),
+    prior=Prior(sensitivity=1.0, corner_hz=0.2, u_corner_hz=0.03, reference_frequency_hz=4.0),
     certificate=Certificate(
         u_sensitivity_pct=0.7, lag_s=0.003, u_lag_s=0.0003, corner_hz=0.1, u_corner_hz=0.02, stability_pct=0.6
     ),
@@ -34,7 +34,7 @@ OF_THE_CONFIGURATION = {
     "rotation_rad": 5 * DEG, "transverse": 0.07, "offset_mps2": 0.08, "offset_position_mps2": 0.09,
     "gravity_mps2": 0.01, "lag_s": 0.0005, "lag_at_s": -0.003, "lag_window_s": 0.0011, "reference": 0.007,
     "reference_drift": 0.006, "reference_corner_at_hz": 0.1,
-    "reference_corner_hz": 0.02, "sensor_corner_at_hz": 0.2, "sensor_corner_hz": 0.03,
+    "reference_corner_hz": 0.02, "sensor_corner_at_hz": 0.2, "sensor_corner_hz": 0.03, "reference_frequency_hz": 4.0,
 }  # fmt: skip
 AT_A_FIXED_MOUNT = {"gravity_direction_rad": 6 * DEG, "lean_rad": 6 * DEG, "tilt_rad": 0.0}
 WHERE_IT_TURNS = {"gravity_direction_rad": DEG, "lean_rad": 0.0, "tilt_rad": 0.0}
