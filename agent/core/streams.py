@@ -276,7 +276,7 @@ class Streams:
         for _ in range(RESPONSE_TURNS):
             make = partial(self._make, piece, first_s, response, estimation.recursion.motion_to_hz)
             found, lag_s = without_lag(lag_s, make, lambda found: found.used, lag_of)
-            if known or not found.used or trial.response.is_near(response):
+            if known or not found.used or trial.response_is(response):
                 break
             response = trial.response.modest
         else:

@@ -19,6 +19,7 @@ from calib.signal.response import FLAT, Complex, Response, by_term, in_units
 
 WIDER = 1.1  # later windows may move so much faster than the first one
 KNOWN = 0.03  # standard uncertainty of ln h
+LEFT, LEFT_U = 3e-3, 1.0  # of ln h, and of its standard uncertainty: so much may be left in a window
 SURELY = 4.0  # standard uncertainties
 NEAR = 1e-2  # change of ln h from which the windows must be linearised again
 
@@ -64,6 +65,14 @@ class OverFrequency:
         """Whether windows have told the response beside a reference: one more cannot change it much."""
         own = terms_of(state, reference)
         return bool(own) and float(np.linalg.norm(_ends() @ state.factor[own], axis=1).max()) < KNOWN
+
+    def is_taken_out(self, taken: Response, state: JointState, reference: str) -> bool:
+        """Whether `taken` is the response beside a reference, but for a part of its uncertainty."""
+        own = terms_of(state, reference)
+        if not own:
+            return True
+        left = np.abs(_ends() @ (state.mean[own] - np.array(taken.terms) / in_units(self.to_hz)))
+        return bool(np.all(left < np.maximum(LEFT, LEFT_U * np.linalg.norm(_ends() @ state.factor[own], axis=1))))
 
     def differs(self, state: JointState, earlier: JointState, reference: str) -> bool:
         """Whether the response beside a reference is surely another in `state` than in an earlier state."""

@@ -61,7 +61,7 @@ class Recursion(WindowState):
 
     @property
     def lag_s(self) -> float:
-        """By how much the sensor's indications come after the reference's; as stated before any window told."""
+        """By how much the sensor is later than the reference; as stated before any window told."""
         state, key = self._joint.state, Quantity("lag", LAG, owner=self.reference).key
         return float(state.mean[state.index(key)]) if key in state else self._beside[self._place].priors.of(LAG.mean)
 
@@ -75,11 +75,15 @@ class Recursion(WindowState):
         """Whether windows have told it: one more cannot change it much."""
         return self._over.is_known(self._joint.state, self.reference)
 
+    def response_is(self, taken: Response) -> bool:
+        """Whether it is the one that was taken out of a window, but for a part of its uncertainty."""
+        return self._over.is_taken_out(taken, self._joint.state, self.reference)
+
     def response_change(self, since: Recursion) -> tuple[float, float]:
         """The upper end of the motion in Hz, and by how much S is larger there than it was, relative."""
-        to_hz = self.response.to_hz or self.motion_to_hz
+        to_hz = self.motion_to_hz
         now, before = (one.response.at(np.array([to_hz])).real[0] for one in (self, since))
-        return to_hz, float(np.exp(now - before) - 1.0)
+        return to_hz, float(np.expm1(now - before))
 
     def has_another_response(self, than: Recursion) -> bool:
         """Whether the response beside the reference in use is surely another than in an earlier state."""
@@ -88,8 +92,7 @@ class Recursion(WindowState):
     @property
     def response_told(self) -> ResponseTold | None:
         """What is known of it, by frequency; None where it is no unknown."""
-        stated = self._beside[self._place].priors
-        return self._over.told(self._joint.state, self.reference, stated, self.coverage_factor)
+        return self._over.told(self._joint.state, self.reference, self._stated.priors, self.coverage_factor)
 
     @property
     def reference_frequency_hz(self) -> float:
@@ -150,10 +153,7 @@ class Recursion(WindowState):
         )
 
     def quantity(self, name: str) -> tuple[float, float]:
-        """(value, standard uncertainty) of an unknown of the sensor, its mount or its present reference.
-
-        Raises KeyError where the state does not have it.
-        """
+        """(value, u) of an unknown of the sensor, its mount or its present reference. Raises KeyError for another."""
         state = self._joint.state
         k = state.index(name if name in state else f"{name} of {self.reference}")
         return float(state.mean[k]), float(np.sqrt(state.variance[k]))
@@ -190,7 +190,7 @@ class Recursion(WindowState):
 
     @property
     def references(self) -> list[str]:
-        """Identities of the references to whose errors S and Q owe their values; the newest window's is the last."""
+        """References to whose errors S and Q owe their values; the newest window's is the last."""
         return list(self._references)
 
     @property

@@ -57,17 +57,22 @@ def _within(n: int, low: int, high: int, share: float) -> float:
 def test_the_first_window_alone_is_as_uncertain_as_it_says() -> None:
     """The colour of the noise is estimated from the segments of this one window.
 
-    The rms of 480 errors divided by u must be 1; by chance it differs by 3 %.
+    The rms of 480 errors divided by u must be 1; by chance it differs by 3 %. One weak window alone may not tell a
+    response that settles; it is refused then.
     """
-    errors = []
+    errors, refused = [], 0
     for seed in range(160):
         drawn = node(seed, all_axes=True, timing=Timing(20.0, 60.0, 1))
         run = Run(drawn.config)
         results = [r for event in visits(drawn.building, range(1)) for r in run.feed(event)]
-        update = next(r for r in results if isinstance(r, CalibrationUpdate))
+        update = next((r for r in results if isinstance(r, CalibrationUpdate)), None)
+        refused += update is None
+        if update is None:
+            continue
         truth = drawn.building.truth((update.t_utc_ns - EPOCH_NS) * 1e-9).sensitivity
         u = np.reshape(update.standard_uncertainty[:9], (3, 3))
         known = np.array(update.determined)[[0, 4, 8]]
         errors.append(np.diag((np.array(update.sensitivity) - truth) / u)[known])
     rms = float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
     assert 0.85 < rms < 1.04
+    assert refused <= 2
