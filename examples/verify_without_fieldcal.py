@@ -103,6 +103,19 @@ def verified(signed, key, purpose):
     return dict(line.split(" ", 1) for line in lines)
 
 
+def verify_result(key, gateway, epoch, public_key, topic, sequence, message):
+    """Verify one result: its signature is the last field of its message, and is over the lines and all bytes before."""
+    text = (
+        f"fieldcal result, version 1\ngateway {gateway}\nepoch {epoch}\nsequence {sequence}\ntopic {topic}\n"
+        f"public_key {public_key}\n\n"
+    )
+    try:
+        need(message[-67:-64] == b"\xc2\x3e\x40", f"result {sequence} is not signed")
+        key.verify(message[-64:], text.encode() + message[:-67])
+    except InvalidSignature:
+        raise ValueError(f"the signature of result {sequence} was not made with this key, or it was changed") from None
+
+
 def verify_file(path, key, wanted):
     """Verify one closed recording: (lines that its signature has, SHA-256, chain of results at its beginning)."""
     need(0 < path.stat().st_size <= FILE, "it is empty or too large")
@@ -120,6 +133,9 @@ def verify_file(path, key, wanted):
                 length, signature = at, item
             elif name.rsplit("/", 1)[-1] in RESULTS:
                 number, digest = str(item.sequence), hashlib.sha256(digest + name.encode() + b"\0" + raw).digest()
+                if "public_key" in origin:  # of an older version: the results have no signatures of their own
+                    gateway = f"{start.site}/{start.gateway}"
+                    verify_result(key, gateway, origin.get("epoch") or "-", origin["public_key"], name, number, raw)
                 if item.sequence == wanted:
                     say(f"{name}: {item}")
             last, before = name, last
