@@ -124,6 +124,8 @@ class WatchedKeys:
 
 def add_key(path: Path, gateway: str, public_key: bytes) -> None:
     """Add the key of a gateway to a list, which is made where it does not exist. Raises KeyFileError."""
+    if not _GATEWAY.fullmatch(gateway):
+        raise KeyFileError(f"{path}: {gateway!r:.130} is not <site>/<gateway>, so it gets no key")
     known = read_known_keys(path) if path.exists() else KnownKeys()
     owner = next((name for name, keys in known.gateways.items() if public_key in keys), gateway)
     if owner != gateway:

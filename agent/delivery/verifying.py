@@ -19,7 +19,7 @@ from agent.recording.result_signing import SignedResult
 from agent.recording.signed_text import SignedTextError
 
 LOG_S = 10.0
-GATEWAYS_MAX = 1000  # named in counts; strangers may invent names for ever
+GATEWAYS_MAX = 1000  # named in counts, and trusted at their first result; strangers may invent names for ever
 _log = logging.getLogger(__name__)
 
 
@@ -87,7 +87,7 @@ class Verifier:
 
     def _key_fault(self, keys: KnownKeys, signed: SignedResult) -> str:
         new = signed.gateway not in keys.gateways and signed.public_key not in keys.revoked
-        if new and self._trust_first:
+        if new and self._trust_first and len(keys.gateways) < GATEWAYS_MAX:
             add_key(self._keys.path, signed.gateway, signed.public_key)
             return ""
         return keys.fault(signed.gateway, signed.public_key)

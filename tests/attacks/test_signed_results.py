@@ -9,10 +9,11 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from agent.config.key_file import KeyFileError
 from agent.config.known_keys import WatchedKeys, read_known_keys, revoke_key
-from agent.delivery import answers
+from agent.delivery import answers, verifying
 from agent.delivery.consumer import Consumer
 from agent.delivery.history import History, Record
 from agent.delivery.received import receive
@@ -152,6 +153,28 @@ def test_a_gateway_that_the_list_does_not_name_is_refused_unless_the_first_key_i
     forged = signed_record(calibration(5), signer_of("site/gw", "", OTHER), "")
     with pytest.raises(UnverifiedError, match="not with"):
         receive(PLACE, forged.payload, b"\n" + forged.signed, verifier)
+
+
+def test_strangers_cannot_fill_or_break_the_list_of_a_consumer_that_trusts_the_first_key(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(verifying, "GATEWAYS_MAX", 3)
+    path = listed(tmp_path / "known.keys", KEY)
+    verifier = Verifier(WatchedKeys(path), trust_first=True)
+
+    def publish(gateway: str) -> None:
+        key = Ed25519PrivateKey.generate()
+        record = signed_record(calibration(1), signer_of(gateway, "", key), "")
+        receive(f"fieldcal/v1/{gateway}/mems/calibration", record.payload, b"\n" + record.signed, verifier)
+
+    for gateway in ("a b/c", "#/c", "a/\u202e"):
+        with pytest.raises(UnverifiedError, match="is not <site>/<gateway>"):
+            publish(gateway)
+    publish("site/2")
+    publish("site/3")
+    with pytest.raises(UnverifiedError, match="names no key of 'site/4'"):
+        publish("site/4")
+    assert list(read_known_keys(path).gateways) == ["site/gw", "site/2", "site/3"]
 
 
 def test_a_key_is_replaced_and_revoked_while_the_consumer_runs(site: Site, tmp_path: Path) -> None:
