@@ -9,18 +9,23 @@ import sqlite3
 import struct
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
+import msgspec
 import pytest
 import verify_without_fieldcal as outsider
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 
+from agent.delivery.consumer import Consumer, Received
 from tests.attacks.chain_site import KEY, public_pem, record
+from tests.attacks.signed_site import listed
 from tests.replay.forgery import with_changed_messages
 from tests.scenarios.processes import ROOT, fieldcal
+from tests.unit.zenoh_site import Site
 
 SCRIPT = ROOT / "examples" / "verify_without_fieldcal.py"
 PAGE = (ROOT / "docs" / "audit.md").read_text("utf-8")
@@ -48,7 +53,7 @@ poses_repeat_s = 1
 rotate_s = 1
 signing_key = "{key}"
 [zenoh]
-enabled = false
+connect = ["{endpoint}"]
 """
 
 
@@ -60,11 +65,21 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     private.write_bytes(KEY.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))
     private.chmod(0o600)
     (directory / "gateway.pub").write_bytes(public_pem())
-    (directory / "config.toml").write_text(CONFIG.format(key=private))
+    router = Site()
+    (directory / "config.toml").write_text(CONFIG.format(key=private, endpoint=router.endpoint))
     record(directory / "other", gateway="other")
     record(directory / "twin")
+    consumer = Consumer([router.endpoint], keys=listed(directory / "known.keys", KEY, gateway="site/gateway"))
+    received: list[Received] = []
+    iterating = threading.Thread(target=lambda: received.extend(consumer), daemon=True)
+    iterating.start()
     done = fieldcal("run", directory / "config.toml", "--data-dir", directory / "data", "--duration", "5")
     assert done.returncode == 0, done.stderr
+    consumer.close()
+    iterating.join(10.0)
+    router.kill()
+    assert consumer.refused == {}
+    (directory / "received").write_bytes(msgspec.msgpack.encode([result.signed for result in received]))
     return directory
 
 
@@ -119,6 +134,12 @@ def test_the_store_holds_the_bytes_of_the_recording(site: Path) -> None:
     ]
     assert kept == stored
     assert len(kept) >= 2
+
+
+def test_a_consumer_received_the_same_bytes(recorded: Path) -> None:
+    with closing(sqlite3.connect(recorded / "data" / "state.sqlite")) as store:
+        kept = [bytes(data) for (data,) in store.execute("SELECT data FROM signed ORDER BY sequence")]
+    assert msgspec.msgpack.decode((recorded / "received").read_bytes()) == kept
 
 
 def change_byte(data: Path, _: Path) -> None:
