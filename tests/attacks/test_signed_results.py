@@ -210,7 +210,9 @@ def test_unsigned_results_of_the_past_do_not_hide_the_signed_ones(
     gateway.signer = signer_of("site/gw", gateway.store.epoch, KEY)
     numbers = gateway.send(7)
     with Consumer([site.endpoint], last_sequence={"site/gw": 0}, keys=listed(tmp_path / "known", KEY)) as consumer:
-        assert numbers_of(taken(consumer, numbers[-1])) == numbers
+        results = taken(consumer, numbers[-1])
+        assert numbers_of(results) == numbers
+        assert all(result.confirmed for result in results), "they came from the store"
     with Consumer([site.endpoint], last_sequence={"site/gw": 0}) as consumer:
         assert len(taken(consumer, numbers[-1])) == 19, "without a list of keys all are given, as before"
     gateway.stop()
