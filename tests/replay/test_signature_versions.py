@@ -32,6 +32,7 @@ def test_a_recording_of_each_version_of_the_signature_passes(version: Path, tmp_
     for given in (files, [version]):
         status, text = audited(given, version / "gateway.pub")
         assert status == 0, text
+    assert ("results signed" in text) == version.name.endswith("-results")
     data = files[0].read_bytes()
     at = data.index(b"previous_sha256")
     forged = tmp_path / files[0].name
