@@ -20,81 +20,23 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-from mcap.opcode import Opcode
-from mcap.records import Channel, Metadata, Schema
-from mcap.writer import CompressionType, Writer
 
 from agent.cli.given import read_head
 from agent.config.known_keys import KnownKeys
 from agent.recording.head import HEAD_NAME
-from agent.recording.limits import Budget
-from agent.recording.messages import schema_data
-from agent.recording.records import ChunkMessage, RecordError, content, parse, unpack, walk
+from agent.recording.records import RecordError
 from agent.recording.result_signing import PUBLIC_KEY
 from agent.recording.results_chain import FILE_METADATA, PREVIOUS_RESULTS
 from agent.recording.signing import SIGNATURE_METADATA
 from tests.attacks.chain_site import KEY, audited, known, record
+from tests.replay.forgery import Message, Unpacked
 
 SEED = 14
 OTHER = Ed25519PrivateKey.from_private_bytes(bytes(range(1, 33)))
-Message = tuple[str, str, int, int, int, bytes]  # topic, schema, log time, publish time, sequence, data
-
-
-@dataclass
-class Unpacked:
-    """What a file holds: its metadata records and its messages, in order. `boundaries`: ends of all records, bytes."""
-
-    metadata: list[tuple[str, dict[str, str]]] = field(default_factory=list)
-    messages: list[Message] = field(default_factory=list)
-    boundaries: list[int] = field(default_factory=list)
-
-    @staticmethod
-    def of(path: Path) -> Unpacked:
-        """Read a file of this program."""
-        found, budget = Unpacked(), Budget()
-        schemas: dict[int, str] = {}
-        channels: dict[int, tuple[str, str]] = {}
-        with open(path, "rb") as file:
-            for one in walk(file, path.stat().st_size):
-                found.boundaries.append(one.end)
-                if one.opcode == Opcode.METADATA:
-                    metadata = parse(one)
-                    assert isinstance(metadata, Metadata)
-                    found.metadata.append((metadata.name, metadata.metadata))
-                for part in content(one, unpack(one, budget), budget) if one.opcode == Opcode.CHUNK else ():
-                    if isinstance(part, Schema):
-                        schemas[part.id] = part.name
-                    elif isinstance(part, Channel):
-                        channels[part.id] = part.topic, schemas[part.schema_id]
-                    elif isinstance(part, ChunkMessage):
-                        times = part.log_time, part.publish_time, part.sequence
-                        found.messages.append((*channels[part.channel_id], *times, part.data))
-        return found
-
-    def write(self, path: Path) -> None:
-        """Write the file; CRCs, indexes and summary are right. The signature stays as it was."""
-        with open(path, "wb") as file:
-            writer = Writer(file, compression=CompressionType.ZSTD, enable_data_crcs=True)
-            writer.start("", "fieldcal")
-            last = [entry for entry in self.metadata if entry[0] == SIGNATURE_METADATA]
-            for name, metadata in (entry for entry in self.metadata if entry not in last):
-                writer.add_metadata(name, metadata)
-            schemas: dict[str, int] = {}
-            channels: dict[tuple[str, str], int] = {}
-            for topic, schema, log_time, publish_time, sequence, data in self.messages:
-                if schema not in schemas:
-                    schemas[schema] = writer.register_schema(schema, "protobuf", schema_data(schema))
-                if (topic, schema) not in channels:
-                    channels[topic, schema] = writer.register_channel(topic, "protobuf", schemas[schema])
-                writer.add_message(channels[topic, schema], log_time, data, publish_time, sequence)
-            writer.flush()
-            for name, metadata in last:
-                writer.add_metadata(name, metadata)
-            writer.finish()
 
 
 @dataclass(frozen=True)

@@ -86,14 +86,14 @@ def _records(path: Path, found: ScannedFile) -> list[Record]:
 
 
 def _signed(path: Path, found: ScannedFile, sequences: set[int]) -> list[tuple[int, bytes]]:
-    """(sequence, signed result) of these results of a recording, as far as their signatures are valid."""
+    """(sequence, signed result) of these results of a recording. Signatures are not verified: consumers do that."""
     origin = found.metadata.get(FILE_METADATA, {})
     start = first_event(path) if sequences and PUBLIC_KEY in origin else None
     if start is None:
         return []
     each = zip(found.results, found.messages, strict=True)
     signed = [recorded_result(*one, f"{start.site}/{start.gateway}", origin) for one in each]
-    return [(one.sequence, one.data) for one in signed if one and one.sequence in sequences and not one.fault]
+    return [(one.sequence, one.data) for one in signed if one and one.sequence in sequences and one.is_written]
 
 
 def recover_memories(connection: sqlite3.Connection, directory: Path, recall: Recall) -> int:

@@ -44,6 +44,11 @@ class SignedResult:
         values = (self.gateway, self.epoch or "-", str(self.sequence), self.topic, public_key)
         return written(_PURPOSE, dict(zip(_NAMES, values, strict=True))).encode() + b"\n" + self.message
 
+    @property
+    def is_written(self) -> bool:
+        """Whether the names have one line each, so that `data` can be made; those of a hostile recording may not."""
+        return not any("\n" in name for name in (self.gateway, self.epoch, self.topic))
+
     @staticmethod
     def read(data: bytes) -> SignedResult:
         """Read such bytes; the signature is not verified. Raises SignedTextError, for any bytes."""
@@ -67,7 +72,7 @@ class SignedResult:
         from cryptography.exceptions import InvalidSignature
         from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
-        if self.message[-_TAIL:-64] != _FIELD:
+        if self.message[-_TAIL:-64] != _FIELD or not self.is_written:
             return "it is not signed"
         try:
             Ed25519PublicKey.from_public_bytes(self.public_key).verify(self.message[-64:], self.data[:-_TAIL])

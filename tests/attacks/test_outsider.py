@@ -23,7 +23,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption,
 from agent.delivery.consumer import Consumer, Received
 from tests.attacks.chain_site import KEY, public_pem, record
 from tests.attacks.signed_site import listed
-from tests.replay.forgery import with_changed_messages
+from tests.replay.forgery import change_messages
 from tests.scenarios.processes import ROOT, fieldcal
 from tests.unit.zenoh_site import Site
 
@@ -162,11 +162,7 @@ def cut(data: Path, kept: float) -> None:
 
 def change_result(data: Path, _: Path) -> None:
     """As a careful forger would: all CRCs are right."""
-    path = data / "fieldcal-000001.mcap"
-    content = path.read_bytes()
-    changed = with_changed_messages(content, b"mems", b"MEMS")
-    assert changed != content
-    path.write_bytes(changed)
+    change_messages(data / "fieldcal-000001.mcap", b"mems", b"MEMS")
 
 
 def resign(data: Path, _: Path) -> None:

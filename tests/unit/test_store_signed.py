@@ -14,9 +14,10 @@ from agent.delivery.store import Store
 from agent.recording.files import recordings
 from agent.recording.result_signing import SignedResult
 from agent.recording.scan import scan
-from tests.attacks.chain_site import KEY
+from tests.attacks.chain_site import KEY, audited
 from tests.attacks.chain_site import record as record_run
 from tests.attacks.signed_site import signed_record, signer_of
+from tests.replay.forgery import change_messages
 from tests.unit.results import window
 
 
@@ -89,3 +90,19 @@ def test_a_lost_store_gets_the_signed_results_of_the_recordings(tmp_path: Path) 
     assert [signed.message for signed in read] == stored
     assert {(signed.gateway, signed.fault) for signed in read} == {("site/gateway", "")}
     assert [signed.sequence for signed in read] == [record.sequence for record in records]
+
+
+def test_names_of_several_lines_in_a_recording_harm_no_store(tmp_path: Path) -> None:
+    directory = tmp_path / "a"
+    files = record_run(directory, blocks=3)
+    change_messages(files[0], b"site", b"s\nte")
+    for path in directory.glob("state.sqlite*"):
+        path.unlink()
+    store = Store(directory)
+    with History(store.path) as history:
+        records = history.after(0, limit=99)
+    store.close()
+    assert len(records) == len(scan(files[0]).results) > 0
+    assert {record.signed for record in records} == {b""}
+    status, text = audited(directory, keys=None, strict=False)
+    assert (status, "it is not signed" in text) == (3, True), text
