@@ -231,7 +231,11 @@ class Service:
         """Put results into the store, then give them to the publisher. The recording's thread calls this."""
         path = self._recorder.path if recorded else None
         name, epoch = final_name(path) if path else "", self._store.epoch
-        records = [Record.of(result, recorded=recorded, recording=name, epoch=epoch) for result in results]
+        signed = [self._recorder.results.signed(event_sequence, result) for result in results]
+        records = [
+            Record.of(result, recorded=recorded, recording=name, epoch=epoch, signed=one.data if one else b"")
+            for result, one in zip(results, signed, strict=True)
+        ]
         try:
             self._store.commit(records, memories)
         except StoreError as error:

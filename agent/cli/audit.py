@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import time
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,13 +24,14 @@ from agent.recording.reading import open_recording
 from agent.recording.records import Fault
 from agent.recording.repair import REPAIR_METADATA
 from agent.recording.replaying import Replay, ReplayedFile, Restore
+from agent.recording.result_check import check_results
 from agent.recording.results_chain import EPOCH, FILE_METADATA, PREVIOUS_RESULTS
 from agent.recording.set_aside import deleted as statements
 from agent.recording.signing import SIGNATURE_METADATA, Statement, signed_results, verify_file
 from agent.terminal.text import say
 
 if TYPE_CHECKING:
-    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+    from agent.config.known_keys import KnownKeys
 
 
 class AuditedFile(msgspec.Struct, kw_only=True):
@@ -48,6 +50,7 @@ class AuditedFile(msgspec.Struct, kw_only=True):
     fault_count: int
     chunks: int
     messages: int
+    signed_results: int = 0  # results with a valid signature of their own
     replay: ReplayedFile
 
 
@@ -56,6 +59,10 @@ class AuditedFile(msgspec.Struct, kw_only=True):
 @click.option(
     "--public-key", metavar="K", type=click.Path(path_type=Path), help="Require signatures by this key (PEM)."
 )
+@click.option(
+    "--keys", "known_keys", metavar="F", type=click.Path(path_type=Path),
+    help="Require signatures by the keys that this list (`fieldcal keys`) has for each gateway; revoked ones fail.",
+)  # fmt: skip
 @click.option(
     "--head", "heads", multiple=True, metavar="F", type=click.Path(path_type=Path),
     help="A head of the recordings that was kept elsewhere: no recording up to it may be missing.",
@@ -69,6 +76,7 @@ class AuditedFile(msgspec.Struct, kw_only=True):
 def audit(
     files: tuple[Path, ...],
     public_key: Path | None,
+    known_keys: Path | None,
     heads: tuple[Path, ...],
     witness: Path | None,
     strict: bool,
@@ -84,11 +92,10 @@ def audit(
     from agent.recording.fingerprint import compute_as
     from agent.recording.reading import first_event
     from agent.recording.signed_text import SignedTextError
-    from agent.recording.signing import load_public_key
     from agent.recording.witness import WitnessError
 
     try:
-        key = load_public_key(public_key) if public_key is not None else None
+        keys = _known(public_key, known_keys)
         given = recordings_of(files)
         given.heads.extend(read_head(path) for path in heads)
         if witness is not None:
@@ -106,21 +113,33 @@ def audit(
     start = first_event(given.paths[0]) if given.paths else None
     if start is not None:
         compute_as(start.fingerprint)
-    return run_audit(given, Pipeline.restore, as_json=json_to is not None, strict=strict, key=key)
+    return run_audit(given, Pipeline.restore, as_json=json_to is not None, strict=strict, keys=keys)
+
+
+def _known(public_key: Path | None, known_keys: Path | None) -> KnownKeys | None:
+    """The keys of the options; None where neither is given. Raises KeyFileError."""
+    from agent.config.known_keys import KnownKeys, read_known_keys
+    from agent.recording.signing import load_public_key
+
+    if public_key is None and known_keys is None:
+        return None
+    listed = read_known_keys(known_keys) if known_keys is not None else KnownKeys()
+    anywhere = (load_public_key(public_key).public_bytes_raw(),) if public_key is not None else ()
+    return replace(listed, anywhere=anywhere)
 
 
 def run_audit(
-    given: Given, restore: Restore, *, as_json: bool, strict: bool = False, key: Ed25519PublicKey | None = None
+    given: Given, restore: Restore, *, as_json: bool, strict: bool = False, keys: KnownKeys | None = None
 ) -> int:
-    """Audit, print, and return the exit status. With a `key`, files must be signed by it."""
+    """Audit, print, and return the exit status. With `keys`, files must be signed by a key of their gateway."""
     try:
-        audited, links, deleted = _audited(given, restore, strict=strict, key=key)
-        end = check_end(given.heads, links, deleted, key, time.time_ns())
+        audited, links, deleted = _audited(given, restore, strict=strict, keys=keys)
+        end = check_end(given.heads, links, deleted, keys, time.time_ns())
         end.reasons += given.faults
     except OSError as error:
         say(f"{error.filename}: {error.strerror}", err=True)
         return 2
-    if strict and key is not None and not given.heads and links[-1:] and links[-1].signed_results is not None:
+    if strict and keys is not None and not given.heads and links[-1:] and links[-1].signed_results is not None:
         end.reasons.append(f"there is no {HEAD_NAME} beside signed recordings, and none was given (--head, --witness)")
     lost = missing_after(links, given.up_to or 0, deleted)
     ok = not lost and not end.reasons and all(file.ok for file in audited)
@@ -142,14 +161,14 @@ def run_audit(
 
 
 def audit_files(
-    given: Given, restore: Restore, *, strict: bool = False, key: Ed25519PublicKey | None = None
+    given: Given, restore: Restore, *, strict: bool = False, keys: KnownKeys | None = None
 ) -> list[AuditedFile]:
     """The verdict on each file. Each file is also compared with the one before it. Raises OSError."""
-    return _audited(given, restore, strict=strict, key=key)[0]
+    return _audited(given, restore, strict=strict, keys=keys)[0]
 
 
 def _audited(
-    given: Given, restore: Restore, *, strict: bool, key: Ed25519PublicKey | None
+    given: Given, restore: Restore, *, strict: bool, keys: KnownKeys | None
 ) -> tuple[list[AuditedFile], list[Link], Ranges]:
     """(the verdicts, the links of the chain, the file numbers that retention deleted)."""
     from agent.recording.fingerprint import fingerprint
@@ -166,10 +185,17 @@ def _audited(
             file.seek(0)
             integrity = check_integrity(file, size)
             verdict = _verdict(path, sha256, size, integrity, replayed.run(path))
-            if key is not None:
+            fault = ""
+            if keys is not None:
                 signature = integrity.metadata.get(SIGNATURE_METADATA)
-                fault = verify_file(file, size, signature, key, _statement(verdict, integrity))
+                fault = verify_file(file, size, signature, keys, _statement(verdict, integrity))
                 verdict.reasons += [fault] if fault else []
+            results = check_results(path, verdict.replay.gateway, None if fault else keys)
+            verdict.signed_results = results.signed
+            if results.fault:
+                verdict.reasons.append(
+                    f"{results.faults} results without a valid signature; the first: {results.fault}"
+                )
             if strict:
                 verdict.reasons += verdict.notes
             audited.append(verdict)
@@ -178,7 +204,7 @@ def _audited(
     pruned = [event for verdict in audited for event in verdict.replay.pruned]
     if given.directory is not None:
         gateway = next((link.gateway for link in links if link.gateway), "")
-        said += statements(given.directory, gateway, key)[0]
+        said += statements(given.directory, gateway, keys)[0]
     gone = merged([*said, *((event.first_file, event.last_file) for event in pruned)])
     for index, fault in chain_faults(links, pruned, gone, from_first=given.up_to is not None):
         audited[index].reasons.append(fault)
@@ -273,6 +299,7 @@ def describe(file: AuditedFile) -> list[str]:
     how = f"equal within {replay.tolerance:g}" if replay.tolerance else "equal bit for bit"
     verdict = f"passed, {replay.results} results {how}" if file.ok else "FAILED"
     lines = [f"{file.path}: {verdict}; {file.size} bytes, {file.chunks} chunks, {replay.events} events replayed"]
+    lines[0] += f", {file.signed_results} results signed" if file.signed_results else ""
     lines += [f"  {reason}" for reason in file.reasons]
     lines += [f"  note: {note}" for note in file.notes if note not in file.reasons]
     return lines

@@ -1,4 +1,4 @@
-"""`fieldcal keys`: makes certificates and command keys."""
+"""`fieldcal keys`: makes certificates and command keys. agent.cli.known_keys has the list of gateways' keys."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 from cryptography.x509 import load_pem_x509_certificate
 
+from agent.cli.known_keys import add, list_keys, revoke
 from agent.config.key_file import KeyFileError, read_key_file, read_private_key
 from agent.delivery.keys import CHUNK
 from agent.keys.certificates import LONGEST_NAME, Credential, issue, make_authority
@@ -53,11 +54,15 @@ def _refusing(command: Callable[..., None]) -> Callable[..., int]:
 
 @click.group()
 def keys() -> None:
-    """Make certificates for Zenoh over TLS, and keys that sign commands.
+    """Make certificates for Zenoh over TLS, and keys that sign commands; list the keys that gateways sign with.
 
     First make the authority, once for a site. Then make a certificate for the router and for each gateway, consumer and
     commander. Only the owner can read the private keys (*.key), and no file is ever overwritten.
     """
+
+
+for listing in (list_keys, add, revoke):
+    keys.add_command(listing)
 
 
 @keys.command()

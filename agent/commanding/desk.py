@@ -18,6 +18,8 @@ from agent.commanding.counters import Counters
 from agent.commanding.envelope import Order, parse_envelope
 from agent.commanding.refusal import Refused
 from agent.config.commands import CommandKey, Commands
+from agent.config.key_file import KeyFileError
+from agent.config.known_keys import WatchedKeys
 from agent.core.events import Command
 from agent.delivery.history import History, StoreError
 from agent.delivery.keys import CHUNK
@@ -67,6 +69,7 @@ class CommandDesk:
         self._sensors = frozenset(sensors)
         self._rights = {key.id: key for key in settings.keys}
         self._keys = {key.id: Ed25519PublicKey.from_public_bytes(key.public_bytes) for key in settings.keys}
+        self._revoked = WatchedKeys(settings.revoked_keys) if settings.revoked_keys is not None else None
         self._store = store
         self._put = put
         self.counters = Counters(data_dir)
@@ -106,6 +109,7 @@ class CommandDesk:
         key = self._keys.get(envelope.key_id)
         if key is None:
             raise Refused("unknown key", f"the gateway's configuration has no key {envelope.key_id} in commands.keys")
+        self._check_revoked(key)
         order = envelope.open(key)
         now_utc_ns = time.time_ns()
         self._check_place(order, address)
@@ -141,6 +145,19 @@ class CommandDesk:
         if order.sensor not in self._sensors:
             known = ", ".join(sorted(self._sensors))
             raise Refused("no such sensor", f"there is no sensor {order.sensor!r}; the sensors are {known}")
+
+    def _check_revoked(self, key: Ed25519PublicKey) -> None:
+        """The list is read again when it changes, so that a key can be revoked while the agent runs."""
+        if self._revoked is None:
+            return
+        try:
+            revoked = self._revoked.now().revoked
+        except KeyFileError as error:
+            raise Refused(
+                "revoked key", f"commands are refused while the list of revoked keys is bad: {error}"
+            ) from None
+        if (reason := revoked.get(key.public_bytes_raw())) is not None:
+            raise Refused("revoked key", f"this key is revoked: {reason}")
 
     def _check_right(self, order: Order, rights: CommandKey) -> None:
         if not rights.may(order.verb, order.sensor):

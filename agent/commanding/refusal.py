@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Literal
 
 Kind = Literal[
-    "too large", "unsigned", "unknown key", "bad signature", "malformed", "other gateway", "no such sensor",
-    "no right", "expired", "replayed", "out of limits", "too many", "not kept",
+    "too large", "unsigned", "unknown key", "revoked key", "bad signature", "malformed", "other gateway",
+    "no such sensor", "no right", "expired", "replayed", "out of limits", "too many", "not kept",
 ]  # fmt: skip
 
 

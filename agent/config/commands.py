@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import binascii
+from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
@@ -48,6 +49,9 @@ class Commands(Section):
 
     enabled: bool = False
     keys: Annotated[tuple[CommandKey, ...], Field(max_length=100)] = ()
+    revoked_keys: Annotated[
+        Path | None, Field(description="list of keys (`fieldcal keys revoke`): commands of a revoked key are refused")
+    ] = None
 
     @model_validator(mode="after")
     def _keys(self) -> Commands:

@@ -10,6 +10,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from agent.config.key_file import KeyFileError, load_private_key
+from agent.config.known_keys import read_known_keys
 from agent.config.lines import Path
 from agent.config.names import Told, name_faults
 from agent.config.sinks import Tls
@@ -88,6 +89,13 @@ def _file_faults(raw: Mapping[str, Any]) -> Iterator[Told]:
             load_private_key(FilePath(key))
         except KeyFileError as error:
             yield ("recording", "signing_key"), f"{error}; `openssl genpkey -algorithm ed25519` makes one"
+    commands = raw.get("commands")
+    revoked = commands.get("revoked_keys") if isinstance(commands, Mapping) else None
+    if isinstance(revoked, str):
+        try:
+            read_known_keys(FilePath(revoked))
+        except KeyFileError as error:
+            yield ("commands", "revoked_keys"), str(error)
     try:
         files = Tls.model_validate(zenoh.get("tls") if isinstance(zenoh, Mapping) else None).files
     except ValidationError:

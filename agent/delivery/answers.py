@@ -29,6 +29,7 @@ def answer_queries(queryable: _Queryable, gateway: str, store: Path, told: Calla
     A query for `<keys>?after=<sequence>` gets the first REPLIES_MAX results after that number, in order. Several of
     them have the same key, so the query must use the consolidation NONE; otherwise Zenoh passes on only the last one.
     With `epoch=<epoch>;after=<sequence>` only results of this epoch are given.
+    A signed result is in the attachment of its answer, as `attachment_of` makes it.
     Where retention has deleted some of these results, the error REMOVED comes first.
     Where there is no result, the answer is the error NOTHING: no answer at all would mean that the gateway is absent.
     """
@@ -46,11 +47,17 @@ def answer_queries(queryable: _Queryable, gateway: str, store: Path, told: Calla
                         result_key(gateway, record.sensor, record.what),
                         record.payload,
                         encoding=zenoh.Encoding.APPLICATION_JSON,
+                        attachment=attachment_of(record) or None,
                     )
             except (StoreError, ValueError) as error:
                 query.reply_err(str(error))
             except zenoh.ZError as error:
                 _log.warning("a query could not be answered: %s", error)
+
+
+def attachment_of(record: Record, previous: str = "") -> bytes:
+    """The attachment of a result: the number of the one before, and after a line break the signed result, if any."""
+    return previous.encode() + (b"\n" + record.signed if record.signed else b"")
 
 
 def _reply_told(query: zenoh.Query, gateway: str, told: Mapping[str, bytes]) -> bool:

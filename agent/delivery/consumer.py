@@ -13,11 +13,12 @@ from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Self
+from typing import NamedTuple, Self
 
 import zenoh
 from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
+from agent.config.known_keys import WatchedKeys
 from agent.config.tls import TlsFiles
 from agent.delivery import memory as memory_file
 from agent.delivery.answers import NOTHING, REMOVED
@@ -25,6 +26,7 @@ from agent.delivery.keys import PREFIX, narrow
 from agent.delivery.progress import Progress
 from agent.delivery.received import Received, receive
 from agent.delivery.session import session_config
+from agent.delivery.verifying import Refusals, UnverifiedError, Verifier
 
 INBOX = 1000  # samples that may wait or be held; further ones are dropped and later fetched from the gateway's store
 ANSWER_S = 5.0  # s that one query waits for its answer
@@ -56,9 +58,14 @@ class Consumer:
     A result that is not the very next one counts only when the gateway's store has it too. Otherwise it is given with
     `confirmed` false, and does not move the numbers, so that one message of a stranger cannot hide what follows. When
     the gateway's store was made anew, its results have another epoch; the first of them has `new_epoch` true.
+    `keys`: a list of known keys (agent.config.known_keys). Then only results are given that a key of their gateway
+    signed, with the fields that were signed. Others are refused: logged, and counted by gateway in `refused`. The file
+    is read again when it changes. `trust_first`: a gateway without a key in the list gets the key of its first result,
+    which is added to the list.
     `close` may be called from another thread than the one that iterates. Ctrl-C while the consumer waits for a result
     ends the iteration, as `close` does. At the end of the program the consumer closes itself.
-    Raises EndpointError, ConnectionError or MemoryFileError; iterating raises OSError where `memory` cannot be written.
+    Raises EndpointError, ConnectionError, MemoryFileError or KeyFileError; iterating raises OSError where `memory`
+    cannot be written.
     """
 
     def __init__(
@@ -69,7 +76,11 @@ class Consumer:
         memory: Path | None = None,
         *,
         tls: TlsFiles | None = None,
+        keys: Path | None = None,
+        trust_first: bool = False,
     ) -> None:
+        self._verifier = Verifier(WatchedKeys(keys), trust_first=trust_first) if keys is not None else None
+        self._refusals = Refusals()
         self._memory = memory
         self._done = memory_file.load(memory) if memory is not None else {}
         self._saved_s = time.monotonic()
@@ -122,7 +133,7 @@ class Consumer:
                 return
             if sample is None:
                 return
-            if (result := _received(sample)) is not None:
+            if (result := self._received(sample)[0]) is not None:
                 yield from self._follow(result)
 
     def close(self) -> None:
@@ -149,6 +160,11 @@ class Consumer:
         """The last result that was taken of each gateway and epoch."""
         return dict(self._progress.numbers)
 
+    @property
+    def refused(self) -> dict[str, int]:
+        """The number of results that were not verified, by the gateway as one of which they were published."""
+        return dict(self._refusals.counts)
+
     def _follow(self, result: Received) -> Iterator[Received]:
         if self._progress.has(result):
             return
@@ -163,11 +179,11 @@ class Consumer:
         """Ask a gateway for what follows the last result known of it, then give what was held meanwhile."""
         selector = narrow(self._key, source)
         if self._progress.number(source) is None:
-            results, answered, _ = self._get(selector)  # the values in force
-            yield from self._deliver(*results, first=True)
-            if not results or not self._held_is_new(source):
-                if answered:
-                    self._held.pop(source, None)
+            answer = self._get(selector)  # the values in force
+            yield from self._deliver(*answer.results, first=True)
+            if not answer.results or not self._held_is_new(source):
+                if answer.answered:
+                    yield from self._deliver_unconfirmed(*self._held.pop(source, ()))
                 return
         self._find_epoch(source, selector)
         epochs = self._other_epochs(source, selector)
@@ -181,7 +197,7 @@ class Consumer:
     def _other_epochs(self, source: str, selector: str) -> dict[str, None]:
         """The epochs of held results that are not known yet and that the gateway's store has."""
         held = {r.epoch for r in self._held.get(source, ()) if self._progress.is_other_epoch(r)}
-        return dict.fromkeys(r.epoch for r in self._get(selector)[0] if r.epoch in held) if held else {}
+        return dict.fromkeys(r.epoch for r in self._get(selector).results if r.epoch in held) if held else {}
 
     def _pages(
         self, source: str, question: str, after: int, others: dict[str, None], epoch: str | None = None
@@ -192,10 +208,10 @@ class Consumer:
         are given.
         """
         while True:
-            results, answered, removed = self._get(f"{question}{after}")
-            if not results:
+            results, answered, removed, reached = self._get(f"{question}{after}")
+            if reached <= after:
                 return answered
-            after = results[-1].sequence
+            after = reached
             if epoch is None:
                 others |= dict.fromkeys(r.epoch for r in results if self._progress.is_other_epoch(r))
                 results = [r for r in results if r.epoch not in others]
@@ -214,7 +230,7 @@ class Consumer:
         other = next((r.epoch for r in held if self._progress.is_other_epoch(r)), None)
         if other is None:
             return
-        results, _, removed = self._get(f"{selector}?after={known - 1}")
+        results, _, removed, _ = self._get(f"{selector}?after={known - 1}")
         if results and results[0].sequence == known:
             self._progress.adopt(source, results[0].epoch, known)
         elif removed >= known:
@@ -259,22 +275,53 @@ class Consumer:
             memory_file.save(self._memory, self._done)
             self._saved, self._saved_s = dict(self._done), time.monotonic()
 
-    def _get(self, selector: str) -> tuple[list[Received], bool, int]:
-        """Query a gateway: (results in order, whether it answered, number up to which it has deleted results or 0)."""
+    def _get(self, selector: str) -> _Answer:
+        """Query a gateway."""
         with self._mutex:
             if self._closed:
-                return [], False, 0
+                return _Answer([], False, 0, 0)
             # With consolidation Zenoh would pass on only the last result of each key.
             replies = self._session.get(selector, consolidation=zenoh.ConsolidationMode.NONE, timeout=ANSWER_S)
-        answered, removed = False, 0
+        answered, removed, reached = False, 0, 0
         results = []
         for reply in replies:
             if reply.ok:
-                results.append(_received(reply.ok))
+                result, number = self._received(reply.ok)
+                results.append(result)
+                reached = max(reached, number)
             gone = _removed(reply.err) if reply.err else 0
             removed = max(removed, gone)
             answered |= reply.err is None or gone > 0 or reply.err.payload.to_bytes() == NOTHING
-        return sorted((r for r in results if r is not None), key=lambda r: r.sequence), answered, removed
+        in_order = sorted((r for r in results if r is not None), key=lambda r: r.sequence)
+        return _Answer(in_order, answered, removed, reached)
+
+    def _received(self, sample: zenoh.Sample) -> tuple[Received | None, int]:
+        """(the result, or None where it is none or is refused; its number, also where it is refused, otherwise 0)."""
+        attachment = sample.attachment.to_bytes() if sample.attachment is not None else None
+        parts = str(sample.key_expr), sample.payload.to_bytes(), attachment
+        try:
+            result = receive(*parts, self._verifier)
+        except UnverifiedError as error:
+            claimed = receive(*parts)
+            source = "/".join(parts[0].split("/")[2:4])
+            self._refusals.count(source, str(error))
+            return None, claimed.sequence if claimed else 0
+        if result is not None and result.altered:
+            what = "%s: the JSON of result %d says something else than its signed bytes: %s"
+            _log.warning(what, result.address.source, result.sequence, ", ".join(result.altered))
+        return result, result.sequence if result else 0
+
+
+class _Answer(NamedTuple):
+    """What a gateway answered. `results`: in order. `removed`: number up to which it has deleted results, or 0.
+
+    `reached`: the highest number in the answer, also of results that were refused; 0 where there is none.
+    """
+
+    results: list[Received]
+    answered: bool
+    removed: int
+    reached: int
 
 
 def _identity(result: Received) -> tuple[str, str, int]:
@@ -288,8 +335,3 @@ def _removed(error: zenoh.ReplyError) -> int:
     except zenoh.ZError:
         return 0
     return int(number) if number.isascii() and number.isdigit() and len(number) < 19 else 0
-
-
-def _received(sample: zenoh.Sample) -> Received | None:
-    attachment = sample.attachment.to_bytes() if sample.attachment is not None else None
-    return receive(str(sample.key_expr), sample.payload.to_bytes(), attachment)

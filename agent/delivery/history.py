@@ -39,7 +39,8 @@ class Record:
 
     `payload`: its JSON with two added fields: `recorded`, which is false where the result and its raw data are in no
     recording, and `epoch`, which names the numbering that `sequence` belongs to. `sensor`: empty for a result of the
-    gateway itself. `sequence`: rises over all runs of a gateway, with gaps.
+    gateway itself. `sequence`: rises over all runs of a gateway, with gaps. `signed`: the result as its gateway signed
+    it (agent.recording.result_signing), without `recorded`; empty where the gateway has no key.
     """
 
     sequence: int
@@ -51,29 +52,30 @@ class Record:
     recorded: bool
     recording: str  # name of the recording's file; "" where the result is in none
     identity: str = ""  # for a calibration, the identity of the device
+    signed: bytes = b""
 
     @staticmethod
-    def of(result: Result, *, recorded: bool, recording: str, epoch: str = "") -> Record:
-        """Make the record of a result. A number that is not finite becomes null in the JSON."""
-        fields = {**msgspec.structs.asdict(result), "recorded": recorded} | ({"epoch": epoch} if epoch else {})
+    def of(result: Result, *, recorded: bool, recording: str, epoch: str = "", signed: bytes = b"") -> Record:
+        """Make the record of a result."""
         identity = result.identity if isinstance(result, CalibrationUpdate) else ""
         return Record(
             result.sequence,
             result.run_id,
             result.sensor,
             result.what,
-            msgspec.json.encode(fields),
+            payload_of(result, recorded=recorded, epoch=epoch),
             result.t_utc_ns,
             recorded,
             recording,
             identity,
+            signed,
         )
 
     @staticmethod
-    def of_row(row: tuple[Any, ...]) -> Record:
+    def of_row(row: tuple[Any, ...], signed: bytes = b"") -> Record:
         """Make the record from a row: RESULT_COLUMNS and their CRC. Raises DamagedRow."""
         sequence, run_id, sensor, what, payload, t_utc_ns, recorded, recording, identity = checked(row)
-        return Record(sequence, run_id, sensor, what, payload, t_utc_ns, bool(recorded), recording, identity)
+        return Record(sequence, run_id, sensor, what, payload, t_utc_ns, bool(recorded), recording, identity, signed)
 
     @property
     def row(self) -> tuple[Any, ...]:
@@ -243,9 +245,10 @@ class History:
         return found[0]
 
     def _records(self, clause: str, *values: object) -> list[Record]:
-        rows = self._rows(f"SELECT {RESULT_COLUMNS}, crc FROM results {clause}", *values)
+        columns = f"{RESULT_COLUMNS}, crc, data, signed_crc"
+        rows = self._rows(f"SELECT {columns} FROM results LEFT JOIN signed USING (sequence) {clause}", *values)
         try:
-            return [Record.of_row(row) for row in rows]
+            return [Record.of_row(row[:-2], _signed(row)) for row in rows]
         except DamagedRow as error:
             raise StoreError(f"{self._path}: {error}") from None
 
@@ -262,6 +265,18 @@ class History:
                 return cursor.fetchall()
         except (sqlite3.Error, UnicodeDecodeError) as error:
             raise StoreError(f"{self._path}: {error}") from None
+
+
+def payload_of(result: Result, *, recorded: bool, epoch: str) -> bytes:
+    """The JSON of a result, as it is stored and published. A number that is not finite becomes null."""
+    fields = {**msgspec.structs.asdict(result), "recorded": recorded} | ({"epoch": epoch} if epoch else {})
+    return msgspec.json.encode(fields)
+
+
+def _signed(row: tuple[Any, ...]) -> bytes:
+    """The signed result at the end of a row; empty where it has none. Raises DamagedRow."""
+    data = row[-2]
+    return bytes(checked((row[0], *row[-2:]))[1]) if data is not None else b""
 
 
 def result_of(what: str, fields: dict[str, Any]) -> Result | None:

@@ -15,7 +15,7 @@ import zenoh
 from zenoh.ext import AdvancedPublisher, CacheConfig, MissDetectionConfig, declare_advanced_publisher
 
 from agent.config.tls import TlsFiles, expiry_warning
-from agent.delivery.answers import answer_queries
+from agent.delivery.answers import answer_queries, attachment_of
 from agent.delivery.history import History, Record, StoreError
 from agent.delivery.keys import gateway_key, result_key
 from agent.delivery.session import session_config
@@ -51,9 +51,9 @@ class Publisher:
     The store is the outbox. Zenoh does not acknowledge, so a result counts as published when it was put while a router
     was connected. Results lost with a broken connection are still in the publisher's cache, and consumers can query
     them (`?after=<sequence>`, see agent.delivery.answers).
-    The attachment of each sample is the number of the result put before it, or "0" where this number has no meaning:
-    for a result that is put again at the start, or that the store could not write. A consumer that has another last
-    number has missed results, or must ask.
+    The attachment of each sample begins with the number of the result put before it, or "0" where this number has no
+    meaning: for a result that is put again at the start, or that the store could not write. A consumer that has another
+    last number has missed results, or must ask. Where the gateway has a key, a line break and the signed result follow.
 
     `site`, `gateway`: names. `connect`: endpoints of routers. The session is a peer that does not listen; it connects
     when a router appears. `tls`: certificates, for endpoints tls/... `serve(session, open_things)` is called with each
@@ -226,7 +226,8 @@ class Publisher:
 
     def _put(self, session: zenoh.Session, record: Record, previous: int) -> None:
         key = result_key(self._key, record.sensor, record.what)
-        self._publisher(session, key, cached=CACHE_SAMPLES).put(record.payload, attachment=str(previous))
+        attachment = attachment_of(record, str(previous))
+        self._publisher(session, key, cached=CACHE_SAMPLES).put(record.payload, attachment=attachment)
         self._previous = max(self._previous, record.sequence)
 
     def _publisher(self, session: zenoh.Session, key: str, cached: int) -> AdvancedPublisher:

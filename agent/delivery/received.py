@@ -11,6 +11,7 @@ import msgspec
 from agent.core.events import CalibrationUpdate, Estimate
 from agent.delivery.history import result_of
 from agent.delivery.keys import Address, parse_key
+from agent.delivery.verifying import Verifier, differing, signer_of
 
 LARGEST_RESULT = 256 << 10  # bytes; the largest result, a calibration, has 5 kB
 LARGEST_NUMBER = 2**63 - 1
@@ -20,7 +21,10 @@ _EPOCH = re.compile(r"(?:[0-9a-f]{16})?")
 
 @dataclass(frozen=True, slots=True)
 class Received:
-    """One result. `fields`: its JSON, with the fields of its kind in agent.core.events and the field `recorded`."""
+    """One result. `fields`: its JSON, with the fields of its kind in agent.core.events and the field `recorded`.
+
+    Where the consumer has a list of keys, the fields come from the bytes that the gateway signed, except `recorded`.
+    """
 
     key: str
     address: Address
@@ -35,17 +39,49 @@ class Received:
     # False: the gateway's store does not have this result. It may not have been able to write it; or a stranger
     # published it.
     confirmed: bool = True
+    signed: bytes = b""  # as the gateway signed it (docs/audit.md), evidence for others; empty where it has no key
+    signed_by: str = ""  # identifier of the key; "" where the consumer has no list of keys, so nothing was verified
+    altered: tuple[str, ...] = ()  # fields of which the JSON said something else than the signed bytes
 
 
-def receive(key: str, payload: bytes, attachment: bytes | None) -> Received | None:
+def receive(key: str, payload: bytes, attachment: bytes | None, verifier: Verifier | None = None) -> Received | None:
     """Decode a sample; returns None where it is not a result of a gateway, for any bytes.
 
     A result of a known kind must have all its fields, of the right types and shapes. Of a kind that this version does
-    not know, only the fields `sequence` and `sensor` are checked.
+    not know, only the fields `sequence` and `sensor` are checked. With a `verifier` only a result that its gateway
+    signed is returned, and a result that is not verified raises UnverifiedError.
     """
     address = parse_key(key)
-    if address is None or len(payload) > LARGEST_RESULT:
+    before, _, signed = (attachment or b"").partition(b"\n")
+    if address is None or len(payload) > LARGEST_RESULT or len(signed) > LARGEST_RESULT:
         return None
+    if len(before) > _DIGITS_MAX or not (before.isdigit() or not before):
+        return None
+    previous = int(before) if before else None
+    if verifier is None:
+        return _plain(key, address, payload, previous, signed)
+    if not address.sensor or address.what == "acceleration":
+        return None  # not a result, so it is not signed
+    return _verified(key, address, payload, previous, signed, verifier)
+
+
+def _verified(
+    key: str, address: Address, payload: bytes, previous: int | None, data: bytes, verifier: Verifier
+) -> Received:
+    signed, fields = verifier.verify(address, data)
+    try:
+        told = msgspec.json.decode(payload)
+    except (msgspec.DecodeError, ValueError, RecursionError):
+        told = None
+    altered = differing(told, fields)
+    fields["recorded"] = isinstance(told, dict) and told.get("recorded") is True
+    by = signer_of(signed)
+    return Received(
+        key, address, signed.sequence, fields, previous, epoch=signed.epoch, signed=data, signed_by=by, altered=altered
+    )
+
+
+def _plain(key: str, address: Address, payload: bytes, previous: int | None, signed: bytes) -> Received | None:
     try:
         fields = msgspec.json.decode(payload, type=dict[str, Any])
         result = result_of(address.what, fields)
@@ -60,11 +96,7 @@ def receive(key: str, payload: bytes, attachment: bytes | None) -> Received | No
     epoch = fields.get("epoch", "")
     if not isinstance(epoch, str) or not _EPOCH.fullmatch(epoch):
         return None
-    if attachment is None:
-        return Received(key, address, sequence, fields, None, epoch=epoch)
-    if len(attachment) > _DIGITS_MAX or not attachment.isdigit():
-        return None
-    return Received(key, address, sequence, fields, int(attachment), epoch=epoch)
+    return Received(key, address, sequence, fields, previous, epoch=epoch, signed=signed)
 
 
 def _has_its_shapes(calibration: CalibrationUpdate) -> bool:

@@ -11,10 +11,20 @@ from pathlib import Path
 
 from agent.core.memory import Memory
 from agent.delivery.history import Record
-from agent.delivery.schema import RESULT_COLUMNS, checked, insert_results, withdraw, write_latest, write_memory
+from agent.delivery.schema import (
+    RESULT_COLUMNS,
+    checked,
+    insert_results,
+    insert_signed,
+    withdraw,
+    write_latest,
+    write_memory,
+)
 from agent.recording.files import final_name, recordings
+from agent.recording.reading import first_event
+from agent.recording.result_signing import PUBLIC_KEY, recorded_result
 from agent.recording.results_chain import EPOCH, FILE_METADATA
-from agent.recording.scan import scan
+from agent.recording.scan import ScannedFile, scan
 
 _log = logging.getLogger(__name__)
 
@@ -57,11 +67,10 @@ def recover(connection: sqlite3.Connection, directory: Path, *, everything: bool
         if not recovered.file_sequence:
             recovered.file_sequence = number
             recovered.published = _published(found.metadata.get(FILE_METADATA, {}))
-        epoch = found.metadata.get(FILE_METADATA, {}).get(EPOCH, "")
-        name = final_name(path)
-        records = [Record.of(result, recorded=True, recording=name, epoch=epoch) for result in found.results]
+        records = _records(path, found)
         missing = [r for r in _missing(connection, records) if r.sequence > removed.get((r.sensor, r.what), 0)]
         insert_results(connection, [record.row for record in missing])
+        insert_signed(connection, _signed(path, found, {record.sequence for record in missing}))
         recovered.results += len(missing)
         recovered.files += bool(missing)
         if found.results and not missing and not everything:
@@ -69,6 +78,22 @@ def recover(connection: sqlite3.Connection, directory: Path, *, everything: bool
     if recovered.results:
         name_latest(connection)
     return recovered
+
+
+def _records(path: Path, found: ScannedFile) -> list[Record]:
+    epoch = found.metadata.get(FILE_METADATA, {}).get(EPOCH, "")
+    return [Record.of(r, recorded=True, recording=final_name(path), epoch=epoch) for r in found.results]
+
+
+def _signed(path: Path, found: ScannedFile, sequences: set[int]) -> list[tuple[int, bytes]]:
+    """(sequence, signed result) of these results of a recording. Signatures are not verified: consumers do that."""
+    origin = found.metadata.get(FILE_METADATA, {})
+    start = first_event(path) if sequences and PUBLIC_KEY in origin else None
+    if start is None:
+        return []
+    each = zip(found.results, found.messages, strict=True)
+    signed = [recorded_result(*one, f"{start.site}/{start.gateway}", origin) for one in each]
+    return [(one.sequence, one.data) for one in signed if one and one.sequence in sequences and one.is_written]
 
 
 def recover_memories(connection: sqlite3.Connection, directory: Path, recall: Recall) -> int:

@@ -111,7 +111,8 @@ def _delete(connection: sqlite3.Connection, result: _Result) -> bool:
         values = (result.sensor, result.sequence, result.identity)
     if connection.execute(newer, values).fetchone() is None:
         return False
-    connection.execute("DELETE FROM results WHERE sequence = ?", (result.sequence,))
+    for table in ("results", "signed"):
+        connection.execute(f"DELETE FROM {table} WHERE sequence = ?", (result.sequence,))
     _count(connection, result.sensor, result.what, result.sequence)
     return True
 

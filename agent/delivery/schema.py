@@ -15,7 +15,7 @@ import msgspec
 
 from agent.core.memory import MOST_MEMORIES
 
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 # `epoch` names the numbering of the results. Version 2 had the same tables without this mark; a start adds it.
 EPOCH = "epoch"
 MARKS = frozenset({"floor", "published", "clean", "file", EPOCH})
@@ -29,6 +29,8 @@ _LATEST = """CREATE TABLE latest (
     sensor TEXT NOT NULL, what TEXT NOT NULL, sequence INTEGER NOT NULL, withdrawn INTEGER NOT NULL,
     crc INTEGER NOT NULL, PRIMARY KEY (sensor, what)) STRICT"""
 _MARKS = "CREATE TABLE marks (name TEXT PRIMARY KEY, value INTEGER NOT NULL, crc INTEGER NOT NULL) STRICT"
+# The results as their gateway signed them (agent.recording.result_signing), where it has a key.
+_SIGNED = "CREATE TABLE signed (sequence INTEGER PRIMARY KEY, data BLOB NOT NULL, signed_crc INTEGER NOT NULL) STRICT"
 # What retention deleted, by channel: the number of results, and the sequence number of the last of them.
 _REMOVED = """CREATE TABLE removed (
     sensor TEXT NOT NULL, what TEXT NOT NULL, count INTEGER NOT NULL, up_to INTEGER NOT NULL, crc INTEGER NOT NULL,
@@ -41,7 +43,7 @@ _INDEXES = (
     "CREATE INDEX results_of_channel ON results (sensor, what, sequence)",
     "CREATE INDEX calibrations_of_device ON results (sensor, identity, sequence) WHERE what = 'calibration'",
 )
-_STATEMENTS = (_RESULTS, _LATEST, _MARKS, _REMOVED, _MEMORY, *_INDEXES)
+_STATEMENTS = (_RESULTS, _LATEST, _MARKS, _REMOVED, _MEMORY, _SIGNED, *_INDEXES)
 
 
 class StoreError(Exception):
@@ -104,6 +106,12 @@ def insert_results(connection: sqlite3.Connection, rows: Iterable[tuple[object, 
     """Insert rows of RESULT_COLUMNS and CRC. Raises sqlite3.IntegrityError where a sequence number exists already."""
     places = ", ".join("?" * 10)
     connection.executemany(f"INSERT INTO results ({RESULT_COLUMNS}, crc) VALUES ({places})", rows)
+
+
+def insert_signed(connection: sqlite3.Connection, rows: Iterable[tuple[int, bytes]]) -> None:
+    """Insert signed results: (sequence, data)."""
+    with_crc = [(*row, row_crc(*row)) for row in rows]
+    connection.executemany("INSERT INTO signed (sequence, data, signed_crc) VALUES (?, ?, ?)", with_crc)
 
 
 def write_memory(connection: sqlite3.Connection, row: tuple[str, str, int, bytes]) -> None:
@@ -171,7 +179,11 @@ _WITHDRAWN_IN_1 = """
 SELECT DISTINCT status.sensor FROM results AS status JOIN latest ON latest.sensor = status.sensor
 WHERE latest.what = 'calibration' AND status.what = 'status' AND status.sequence > latest.sequence
 AND json_extract(CAST(status.payload AS TEXT), '$.status') = 'UNCALIBRATED'"""
-_MIGRATIONS: dict[int, Callable[[sqlite3.Connection], None]] = {1: _add_crcs, 2: lambda _: None}
+_MIGRATIONS: dict[int, Callable[[sqlite3.Connection], object]] = {
+    1: _add_crcs,
+    2: lambda _: None,
+    3: lambda connection: connection.execute(_SIGNED),
+}
 
 
 def damage(connection: sqlite3.Connection) -> str:
@@ -188,6 +200,7 @@ def damage(connection: sqlite3.Connection) -> str:
     try:
         read_marks(connection)
         _check_all(connection.execute(f"SELECT {RESULT_COLUMNS}, crc FROM results"))
+        _check_all(connection.execute("SELECT sequence, data, signed_crc FROM signed"))
         _check_all(connection.execute("SELECT sensor, what, count, up_to, crc FROM removed"))
         _check_all(connection.execute("SELECT sensor, identity, sequence, state, crc FROM memory"))
         named = {checked(row)[:3] for row in connection.execute("SELECT * FROM latest")}

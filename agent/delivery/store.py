@@ -21,6 +21,7 @@ from agent.delivery.schema import (
     StoreError,
     create_tables,
     insert_results,
+    insert_signed,
     read_marks,
     version_of,
     withdraw,
@@ -158,6 +159,7 @@ class Store:
 
     def _write(self, records: list[Record]) -> None:
         insert_results(self._connection, [record.row for record in records])
+        insert_signed(self._connection, [(record.sequence, record.signed) for record in records if record.signed])
         for record in records:
             write_latest(self._connection, record.sensor, record.what, record.sequence, withdrawn=False)
             if record.is_withdrawal:

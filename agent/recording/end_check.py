@@ -18,7 +18,7 @@ from agent.recording.signed_text import SignedText, SignedTextError
 from agent.recording.signing import prefix_sha256
 
 if TYPE_CHECKING:
-    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+    from agent.config.known_keys import KnownKeys
 
 NO_HEAD = (
     "that no recording is missing at the end: there is no head of these recordings; give one that was kept elsewhere "
@@ -28,7 +28,7 @@ BESIDE = (
     "that no recording is missing after that head: it lies beside the recordings, and whoever deletes recordings can "
     "put an older head there; give one that was kept elsewhere (--head, --witness)"
 )
-NO_KEY = "who made these recordings and heads: give the gateway's key (--public-key)"
+NO_KEY = "who made these recordings and heads: give the gateway's key (--public-key) or a list of keys (--keys)"
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,11 +71,11 @@ class End(msgspec.Struct, kw_only=True):
 
 
 def check_end(
-    heads: Sequence[GivenHead], links: Sequence[Link], deleted: Ranges, key: Ed25519PublicKey | None, now_ns: int
+    heads: Sequence[GivenHead], links: Sequence[Link], deleted: Ranges, keys: KnownKeys | None, now_ns: int
 ) -> End:
     """Compare recordings with all given heads. `deleted`: numbers that retention deleted. `now_ns`: UTC.
 
-    With a `key` the heads must be signed by it. Raises OSError.
+    With `keys` each head must be signed by a key of the gateway that it names. Raises OSError.
     """
     end = End(reasons=[], unproven=[])
     newest: tuple[Head, GivenHead] | None = None
@@ -88,8 +88,9 @@ def check_end(
         except SignedTextError as error:
             end.reasons.append(f"{given.source}: not a head: {error}")
             continue
-        if signed.fault(key):
-            end.reasons.append(f"{given.source}: its signature is not by the given key")
+        wrong = signed.fault_by(keys, head.statement.gateway) if keys is not None else signed.fault()
+        if wrong:
+            end.reasons.append(f"{given.source}: its signature is not by the given key: {wrong}")
             continue
         if gateway and head.statement.gateway != gateway:
             fault = f"it is a head of {head.statement.gateway!r:.130}, the recordings are of {gateway!r:.130}"
@@ -107,7 +108,7 @@ def check_end(
         end.unproven.append(BESIDE)
     else:
         end.unproven.append(f"whether more was recorded after {when(end.utc_ns)}")
-    if key is None:
+    if keys is None:
         end.unproven.append(NO_KEY)
     return end
 

@@ -26,9 +26,13 @@ _CHANNEL_ID = struct.Struct("<H")
 
 @dataclass(slots=True)
 class ScannedFile:
-    """What is read from a recording without replaying it: results in order, metadata, and what could not be read."""
+    """What is read from a recording without replaying it: results in order, metadata, and what could not be read.
+
+    `messages`: of each result, the bytes that are stored of it.
+    """
 
     results: list[Result] = field(default_factory=list)
+    messages: list[bytes] = field(default_factory=list)
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)  # by name; of one name, the last record
     faults: list[str] = field(default_factory=list)
 
@@ -121,3 +125,4 @@ class _Scan:
         elif part.channel_id in self._results:
             _, result = decode(self._results[part.channel_id], part.data)
             self._found.results.append(result)  # type: ignore[arg-type]
+            self._found.messages.append(part.data)

@@ -22,8 +22,7 @@ from agent.recording.retention import is_kept
 from agent.recording.signed_text import LARGEST, SignedText, SignedTextError, values_of, written
 
 if TYPE_CHECKING:
-    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
-
+    from agent.config.known_keys import KnownKeys
     from agent.recording.signing import Signer
 
 _PURPOSE = "fieldcal deletion, version 1"
@@ -60,15 +59,15 @@ def finish(directory: Path) -> None:
         path.rename(directory / f"fieldcal-{number:06d}.mcap")
 
 
-def deleted(directory: Path, gateway: str, key: Ed25519PublicKey | None) -> tuple[Ranges, list[str]]:
+def deleted(directory: Path, gateway: str, keys: KnownKeys | None) -> tuple[Ranges, list[str]]:
     """(numbers that statements here name as deleted, why the other statements are not believed). Raises OSError.
 
-    A statement must be of this `gateway` and number. With a `key` it must be signed by it.
+    A statement must be of this `gateway` and number. With `keys` it must be signed by one of the gateway's.
     """
     numbers, faults = [], []
     for number, path in _files(directory):
         with open(path, "rb") as file:
-            fault = _fault(file.read(LARGEST), number, gateway, key)
+            fault = _fault(file.read(LARGEST), number, gateway, keys)
         if fault:
             faults.append(f"{path} does not show that retention deleted this recording: {fault}")
         else:
@@ -88,7 +87,7 @@ def remove_statements(directory: Path, ranges: Ranges) -> None:
             path.unlink(missing_ok=True)
 
 
-def _fault(data: bytes, number: int, gateway: str, key: Ed25519PublicKey | None) -> str:
+def _fault(data: bytes, number: int, gateway: str, keys: KnownKeys | None) -> str:
     try:
         statement = SignedText.read(data.partition(b"\n")[0])
         of, what = values_of(statement.text, _PURPOSE, ["gateway", "recording"])
@@ -96,7 +95,7 @@ def _fault(data: bytes, number: int, gateway: str, key: Ed25519PublicKey | None)
         return str(error)
     if (of, what) != (gateway, str(number)):
         return f"it is about recording {what!r:.20} of {of!r:.130}"
-    return statement.fault(key) if key is not None else ""
+    return statement.fault_by(keys, gateway) if keys is not None else ""
 
 
 def _files(directory: Path) -> Iterator[tuple[int, Path]]:

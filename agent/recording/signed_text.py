@@ -8,15 +8,17 @@ from __future__ import annotations
 
 import base64
 import binascii
-import hashlib
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import msgspec
 
+from agent.config.known_keys import KnownKeys, identifier
+
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 
+_NO_KEY = "its public key is not 32 bytes in base64"
 LARGEST = 4 << 10  # bytes of a signed text with its signature, in JSON; a head has 900
 
 
@@ -56,7 +58,15 @@ class SignedText(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raw = base64.b64decode(self.public_key, validate=True)
         except (binascii.Error, ValueError):
             return ""
-        return hashlib.sha256(raw).hexdigest()[:16] if len(raw) == 32 else ""
+        return identifier(raw) if len(raw) == 32 else ""
+
+    def fault_by(self, keys: KnownKeys, gateway: str) -> str:
+        """Why this is not a text signed with a known key of a gateway (`<site>/<gateway>`); "" where it is."""
+        return self.key_fault(keys, gateway) or self.fault()
+
+    def key_fault(self, keys: KnownKeys, gateway: str) -> str:
+        """Why the stated key is none of the gateway's; "" where it is one. The signature is not verified."""
+        return keys.fault(gateway, base64.b64decode(self.public_key)) if self.key_id else _NO_KEY
 
     def fault(self, key: Ed25519PublicKey | None = None) -> str:
         """Why this is not a text signed with `key`, or with the stated key where `key` is None; "" where it is."""
@@ -64,7 +74,7 @@ class SignedText(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
         if key is None:
             if not self.key_id:
-                return "its public key is not 32 bytes in base64"
+                return _NO_KEY
             key = Ed25519PublicKey.from_public_bytes(base64.b64decode(self.public_key))
         elif self.key_id != key_id(key):
             return f"signed with the key {self.key_id!r}, not with {key_id(key)}"
@@ -90,7 +100,7 @@ def signature_fault(signature: str, message: bytes, key: Ed25519PublicKey) -> st
 
 def key_id(key: Ed25519PublicKey) -> str:
     """The first 16 hexadecimal digits of the SHA-256 of the 32 bytes of a public key."""
-    return hashlib.sha256(key.public_bytes_raw()).hexdigest()[:16]
+    return identifier(key.public_bytes_raw())
 
 
 def written(purpose: str, values: Mapping[str, str]) -> str:

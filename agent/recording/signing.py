@@ -7,6 +7,7 @@ layout. Files of version 1 have a signature over the SHA-256 of the content alon
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import struct
 from dataclasses import dataclass, replace
@@ -16,11 +17,11 @@ from typing import TYPE_CHECKING, BinaryIO
 from mcap.opcode import Opcode
 
 from agent.config.key_file import KeyFileError, load_private_key, read_key_file
+from agent.config.known_keys import KnownKeys
 from agent.recording.signed_text import (
     SignedText,
     SignedTextError,
     count,
-    key_id,
     sign,
     signature_fault,
     values_of,
@@ -79,6 +80,8 @@ class Signer:
     def __init__(self, key: Ed25519PrivateKey) -> None:
         self._key = key
         self.public_key = key.public_key()
+        self.known = KnownKeys(anywhere=(self.public_key.public_bytes_raw(),))  # a list of this key alone
+        self.public_base64 = base64.b64encode(self.public_key.public_bytes_raw()).decode()
 
     @staticmethod
     def load(path: Path) -> Signer:
@@ -88,6 +91,10 @@ class Signer:
     def sign(self, text: str) -> SignedText:
         """Sign a text of `signed_text.written`."""
         return sign(self._key, text)
+
+    def sign_bytes(self, data: bytes) -> bytes:
+        """The signature of bytes that begin with the line of their purpose."""
+        return self._key.sign(data)
 
     def metadata(self, statement: Statement) -> dict[str, str]:
         """The metadata record with the signature of a recording."""
@@ -122,10 +129,8 @@ def signed_results(metadata: dict[str, str] | None) -> str | None:
         return None
 
 
-def verify_file(
-    file: BinaryIO, size: int, metadata: dict[str, str] | None, key: Ed25519PublicKey, found: Statement
-) -> str:
-    """Why an MCAP file is not signed with `key` up to its summary; "" where it is. Raises OSError.
+def verify_file(file: BinaryIO, size: int, metadata: dict[str, str] | None, keys: KnownKeys, found: Statement) -> str:
+    """Why an MCAP file is not signed up to its summary with one of its gateway's keys; "" where it is. Raises OSError.
 
     `size`: of the file in bytes. `metadata`: its signature record, None where it has none. `found`: what its signature
     must say, as its other records do; length and SHA-256 are computed here.
@@ -146,8 +151,8 @@ def verify_file(
     if opcode != Opcode.METADATA or file.read(1) != bytes([Opcode.DATA_END]):
         return "unsigned data follow its signature"
     if not said:
-        return _fault_1(metadata, digest, key)
-    return _fault_2(metadata, replace(found, length=length, sha256=digest.hex()), said, key)
+        return _fault_1(metadata, digest, keys, found.gateway)
+    return _fault_2(metadata, replace(found, length=length, sha256=digest.hex()), said, keys)
 
 
 def prefix_sha256(file: BinaryIO, length: int) -> bytes:
@@ -160,22 +165,29 @@ def prefix_sha256(file: BinaryIO, length: int) -> bytes:
     return digest.digest()
 
 
-def _fault_1(metadata: dict[str, str], sha256: bytes, key: Ed25519PublicKey) -> str:
-    if metadata.get("key_id") != key_id(key):
-        return f"signed with the key {metadata.get('key_id', '')!r:.40}, not with {key_id(key)}"
+def _fault_1(metadata: dict[str, str], sha256: bytes, keys: KnownKeys, gateway: str) -> str:
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+
+    key_id = metadata.get("key_id", "")
+    public_key = keys.named(gateway, key_id)
+    if public_key is None:
+        return keys.other_key(gateway, key_id)
+    if fault := keys.fault(gateway, public_key):
+        return fault
     if metadata.get("sha256") != sha256.hex():
         return _OTHER_BYTES
+    key = Ed25519PublicKey.from_public_bytes(public_key)
     return signature_fault(metadata.get("signature", ""), _CONTEXT_1 + sha256, key)
 
 
-def _fault_2(metadata: dict[str, str], found: Statement, said: list[str], key: Ed25519PublicKey) -> str:
+def _fault_2(metadata: dict[str, str], found: Statement, said: list[str], keys: KnownKeys) -> str:
     signed = SignedText(metadata["text"], metadata.get("public_key", ""), metadata.get("signature", ""))
-    if signed.key_id != key_id(key):
-        return signed.fault(key)
+    if fault := signed.key_fault(keys, found.gateway):
+        return fault
     values = found.values
     if said[5] != values["content"]:
         return _OTHER_BYTES
     for name, value in zip(values, said, strict=True):
         if value != values[name]:
             return f"its signature says {name} {value!r:.80}, its content {values[name]!r:.80}"
-    return signed.fault(key)
+    return signed.fault()

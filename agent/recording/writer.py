@@ -16,9 +16,10 @@ from typing import Protocol
 from agent.core.events import RESULTS, Event, Output, Pruned, RunStart
 from agent.recording.files import RecordingFile, newest, recordings, sync_directory
 from agent.recording.head import HeadKeeper, Tell
-from agent.recording.messages import EVENTS_TOPIC, encode, topic_of
+from agent.recording.messages import EVENTS_TOPIC, topic_of
 from agent.recording.pruned_ranges import PRUNED_METADATA, Ranges, from_metadata, merged, to_metadata
 from agent.recording.repair import close_torn
+from agent.recording.result_signing import PUBLIC_KEY, ResultSigner
 from agent.recording.results_chain import EPOCH, PREVIOUS_RESULTS
 from agent.recording.retention import FOR_EVER, KeepFiles, delete, due, free_bytes
 from agent.recording.scan import metadata_of
@@ -55,8 +56,9 @@ class Recorder:
     `retry_s`: seconds of event time until the first attempt after a failure; the time doubles with each failure.
     `keep`: limits beyond which old recordings are deleted.
     `ledger`: the store, which remembers the highest file number also when all files are deleted; without it the numbers
-    go on from the files in the directory. `signer`: signs each file and the head; None: nothing is signed.
-    `tell_head`: gets each new head (agent.recording.head), to publish it. `epoch`: of the store; each file names it.
+    go on from the files in the directory. `signer`: signs each result, each file and the head; None:
+    nothing is signed. `tell_head`: gets each new head (agent.recording.head), to publish it. `epoch`: of the store;
+    each file names it. `results`: gives the signed results, also those that could not be recorded.
     """
 
     def __init__(
@@ -85,7 +87,7 @@ class Recorder:
         self._signer = signer
         self._head = HeadKeeper(directory, signer, tell_head) if signer is not None else None
         self._epoch = epoch
-        self._gateway = ""  # of the newest RunStart
+        self.results = ResultSigner(epoch, signer)
         self._file: RecordingFile | None = None
         self._failures = 0  # since the last file that was written without a failure
         self._utc_minus_monotonic_ns = 0
@@ -163,7 +165,7 @@ class Recorder:
         """
         log_time, publish_time = self._stamp(event)
         try:
-            messages = [(topic_of(item), encode(event_sequence, item)) for item in (event, *results)]
+            messages = [(topic_of(item), self.results.encode(event_sequence, item)) for item in (event, *results)]
             if isinstance(event, RunStart):
                 self._begin(event)
             if isinstance(event, Pruned):
@@ -221,7 +223,6 @@ class Recorder:
             self._file = None
 
     def _begin(self, start: RunStart) -> None:
-        self._gateway = f"{start.site}/{start.gateway}"
         self.close()
         if free_bytes(self._directory) < 2 * LEAST_ROOM:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self._directory))
@@ -231,8 +232,9 @@ class Recorder:
         origin = {"previous_file": name, "previous_sha256": digest} | ({EPOCH: self._epoch} if self._epoch else {})
         if self._ledger is not None:
             origin["published"] = str(self._ledger.published())
-        if self._signer is not None and name:
-            origin[PREVIOUS_RESULTS] = _signed_results(self._directory / name)
+        if self._signer is not None:
+            origin[PUBLIC_KEY] = self._signer.public_base64
+            origin |= {PREVIOUS_RESULTS: _signed_results(self._directory / name)} if name else {}
         self._pruned = merged([*self._pruned, *self._set_aside()])
         self._since_ns = self._now_ns
         self._file = RecordingFile(self._directory, start, self._topics, origin, self._signer)
@@ -241,7 +243,7 @@ class Recorder:
 
     def _set_aside(self) -> Ranges:
         """The recordings that were deleted while nothing could be recorded."""
-        ranges, faults = deleted(self._directory, self._gateway, self._signer.public_key if self._signer else None)
+        ranges, faults = deleted(self._directory, self.results.gateway, self._signer.known if self._signer else None)
         for fault in faults:
             log.warning("%s", fault)
         return ranges
@@ -280,7 +282,7 @@ class Recorder:
         """
         try:
             if self._file is None:
-                set_aside(self._directory, pruned.first_file, pruned.last_file, self._gateway, self._signer)
+                set_aside(self._directory, pruned.first_file, pruned.last_file, self.results.gateway, self._signer)
             else:
                 delete(self._directory, pruned)
         except OSError as error:

@@ -14,6 +14,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
 from agent.cli.audit import run_audit
 from agent.cli.given import recordings_of
+from agent.config.known_keys import KnownKeys
 from agent.delivery.store import Store
 from agent.recording.end_check import GivenHead
 from agent.recording.files import recordings
@@ -72,8 +73,13 @@ def _run(directory: Path, *, heads: Sequence[GivenHead] = (), **options: Any) ->
     with runner.isolation() as (out, _, _):
         given = recordings_of([directory])
         given.heads.extend(heads)
-        status = run_audit(given, StandIn.restore, **{"strict": True, "key": KEY.public_key()} | options)
+        status = run_audit(given, StandIn.restore, **{"strict": True, "keys": known(KEY)} | options)
         return status, out.getvalue().decode()
+
+
+def known(*keys: Ed25519PrivateKey) -> KnownKeys:
+    """A list by which these keys count for every gateway."""
+    return KnownKeys(anywhere=tuple(key.public_key().public_bytes_raw() for key in keys))
 
 
 def public_pem(key: Ed25519PrivateKey = KEY) -> bytes:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import base64
 import hashlib
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from agent.recording.head import Head
+from agent.recording.result_signing import SignedResult
 from agent.recording.results_chain import ResultsChain
 from agent.recording.signed_text import key_id, sign
 from agent.recording.signing import Statement
@@ -34,6 +36,17 @@ def test_the_texts_and_signatures_of_the_page(title: str, text: str) -> None:
     assert sign(KEY, text).signature == signature.strip()
     assert sign(KEY, text).fault(KEY.public_key()) == ""
     assert Head.of(sign(KEY, HEAD.text)) == HEAD
+
+
+def test_the_signed_result_of_the_page() -> None:
+    header, message, signature = blocks("Result, with the three bytes `abc` as its message, without a line break:")[:3]
+    key = KEY.public_key().public_bytes_raw()
+    result = SignedResult("workshop/gateway-1", "00c0ffee00c0ffee", 4711, "/mems/status", key, b"abc")
+    assert (header + "\n" + message.rstrip("\n")).encode() == result.data
+    KEY.public_key().verify(base64.b64decode(signature), result.data)
+    whole = replace(result, message=b"abc\xc2\x3e\x40" + base64.b64decode(signature))
+    assert whole.fault == ""
+    assert SignedResult.read(whole.data) == whole
 
 
 def test_the_key_and_the_chain_of_the_page() -> None:

@@ -11,6 +11,9 @@ import pytest
 
 from agent.cli.audit import Given, audit_files, run_audit
 from agent.core.events import CalibrationUpdate, Output, RunStart, WindowReport
+from agent.core.pipeline import Pipeline
+from agent.recording.reading import RecordingReader
+from tests.replay.golden_files import FORMATS, RECORDING
 from tests.replay.stand_in import Recorded, StandIn, record_run
 from tests.replay.test_replay import record_again
 
@@ -79,6 +82,25 @@ def test_a_statistic_set_to_its_threshold_does_not_pass(
     [file] = audit_files(Given([path]), StandIn.restore)
     assert file.replay.undecidable == 0
     assert file.replay.different > 1, "the calibrations after it are compared too"
+    assert file.reasons[0].startswith("the results do not follow from the data")
+
+
+@pytest.mark.parametrize("statistic", ["none", "coherence", "clipped_points"])
+def test_no_window_of_the_real_pipeline_is_on_the_edge_by_its_counts(tmp_path: Path, statistic: str) -> None:
+    """Each real window has 0 clipped points, and 0 are allowed: no other CPU counts these otherwise."""
+
+    def change(window: WindowReport) -> WindowReport:
+        numbers = dict(window.numbers)
+        if statistic != "none":
+            numbers[statistic] = numbers[f"{statistic}_threshold"]
+        return msgspec.structs.replace(window, left_out=window.left_out + 1, numbers=numbers)
+
+    steps = RecordingReader(FORMATS[-1] / RECORDING).steps()
+    recorded: list[Any] = [(step.event_sequence, step.event, step.results) for step in steps]
+    path = record_again(tmp_path / "again", recorded, forged(change))
+    [file] = audit_files(Given([path]), Pipeline.restore)
+    assert file.replay.undecidable == 0, file.replay.notes
+    assert file.replay.different == 4, "each of the forged calibrations is compared"
     assert file.reasons[0].startswith("the results do not follow from the data")
 
 

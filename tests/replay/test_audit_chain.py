@@ -13,6 +13,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption,
 
 from agent.cli.audit import audit, audit_files, recordings_of, run_audit
 from agent.config.key_file import KeyFileError
+from agent.config.known_keys import KnownKeys
 from agent.delivery.store import Store
 from agent.recording.files import recordings
 from agent.recording.retention import KeepFiles
@@ -58,6 +59,11 @@ def record(directory: Path, *, keep: KeepFiles | None = None, signer: Signer | N
 
 def names(directory: Path) -> list[int]:
     return [number for number, _ in recordings(directory)]
+
+
+def listed(public: Path) -> KnownKeys:
+    """A list of this key alone, which counts for every gateway."""
+    return KnownKeys(anywhere=(load_public_key(public).public_bytes_raw(),))
 
 
 def said(directory: Path, **options: object) -> tuple[int, str]:
@@ -169,16 +175,16 @@ def test_signatures_are_required_with_a_key(tmp_path: Path) -> None:
     data = tmp_path / "data"
     data.mkdir()
     record(data, signer=Signer.load(private))
-    status, text = said(data, key=load_public_key(public))
+    status, text = said(data, keys=listed(public))
     assert status == 0, text
     assert said(data)[0] == 0
-    other = load_public_key(write_keys(tmp_path)[1])
-    status, text = said(data, key=other)
-    assert (status, text.count("signed with the key")) == (3, len(names(data)))
+    other = listed(write_keys(tmp_path)[1])
+    status, text = said(data, keys=other)
+    assert (status, text.count("signed with the key")) == (3, len(names(data)) + 1)  # the files and the head
     unsigned = tmp_path / "unsigned"
     unsigned.mkdir()
     record(unsigned)
-    status, text = said(unsigned, key=other)
+    status, text = said(unsigned, keys=other)
     assert (status, text.count("no signature in this file")) == (3, len(names(unsigned)))
 
 
@@ -192,7 +198,7 @@ def test_a_file_closed_after_a_crash_is_signed_then(tmp_path: Path) -> None:
     path.unlink()
     (data / "head.json").unlink()  # a head is written only after the bytes that it names
     Recorder(data, [], [], signer=Signer.load(private)).close_torn()
-    status, text = said(data, key=load_public_key(public))
+    status, text = said(data, keys=listed(public))
     assert status == 0, text
     assert text.count("unsealed") == 1
 
@@ -203,7 +209,7 @@ def test_every_signed_byte_counts_though_the_sums_fit(tmp_path: Path) -> None:
     data.mkdir()
     record(data, signer=Signer.load(private))
     path = recordings(data)[0][1]
-    whole, key = path.read_bytes(), load_public_key(public)
+    whole, keys = path.read_bytes(), listed(public)
     signature = next(r for r in records(whole) if r.name == "Metadata" and b"fieldcal.signature" in r.body)
     at = whole.index(b"file_sequence")
     forgeries = {
@@ -218,11 +224,11 @@ def test_every_signed_byte_counts_though_the_sums_fit(tmp_path: Path) -> None:
         if forged == whole:
             continue
         path.write_bytes(with_sums(forged))
-        status, text = said_of([path], key=key)
+        status, text = said_of([path], keys=keys)
         assert status == 3, name
         assert words in text, (name, text)
     path.write_bytes(with_sums(whole))
-    assert said_of([path], key=key)[0] == 0
+    assert said_of([path], keys=keys)[0] == 0
 
 
 @pytest.mark.parametrize("content", ["", "-----BEGIN PRIVATE KEY-----\nrubbish\n-----END PRIVATE KEY-----\n"])

@@ -8,6 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from agent.cli.audit import recordings_of, run_audit
+from agent.config.known_keys import KnownKeys
 from agent.recording.signing import load_public_key
 from tests.replay.forgery import with_sums
 from tests.replay.stand_in import StandIn
@@ -20,7 +21,9 @@ def audited(files: list[Path], key: Path) -> tuple[int, str]:
     runner = CliRunner()
     with runner.isolation() as (out, _, _):
         given, public = recordings_of(files), load_public_key(key)
-        return run_audit(given, StandIn.restore, as_json=False, key=public), out.getvalue().decode()
+        return run_audit(
+            given, StandIn.restore, as_json=False, keys=KnownKeys(anywhere=(public.public_bytes_raw(),))
+        ), out.getvalue().decode()
 
 
 @pytest.mark.parametrize("version", VERSIONS, ids=lambda path: path.name)
@@ -29,6 +32,7 @@ def test_a_recording_of_each_version_of_the_signature_passes(version: Path, tmp_
     for given in (files, [version]):
         status, text = audited(given, version / "gateway.pub")
         assert status == 0, text
+    assert ("results signed" in text) == version.name.endswith("-results")
     data = files[0].read_bytes()
     at = data.index(b"previous_sha256")
     forged = tmp_path / files[0].name

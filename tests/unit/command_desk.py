@@ -26,17 +26,17 @@ OTHER = Ed25519PrivateKey.from_private_bytes(bytes(range(1, 33)))
 RIGHTS = ("pose", "hold", "rollback")  # of anna, for the sensor mems alone
 
 
-def settings(*, enabled: bool = True) -> Commands:
+def settings(*, enabled: bool = True, **more: Any) -> Commands:
     """Commands of anna, who may do RIGHTS with mems."""
     public = b64encode(ANNA.public_key().public_bytes(Encoding.Raw, PublicFormat.Raw)).decode()
     key = {"id": "anna", "public_key": public, "verbs": RIGHTS, "sensors": ["mems"]}
-    return Commands.model_validate({"enabled": enabled, "keys": [key]})
+    return Commands.model_validate({"enabled": enabled, "keys": [key], **more})
 
 
 class DeskSite:
     """A desk in a data directory, and what it told of."""
 
-    def __init__(self, directory: Path) -> None:
+    def __init__(self, directory: Path, **more: Any) -> None:
         self.directory = directory
         self.events: list[Command] = []
         store = directory / FILE_NAME
@@ -44,7 +44,7 @@ class DeskSite:
             made = Store(directory, count_from=100)
             made.commit([record(101, "calibration"), record(102, "window")])
             made.close()
-        self.desk = CommandDesk(GATEWAY, ["mems", "spare"], settings(), directory, store, self.events.append)
+        self.desk = CommandDesk(GATEWAY, ["mems", "spare"], settings(**more), directory, store, self.events.append)
 
     def send(self, data: bytes, sensor: str = "mems", verb: str = "hold") -> Answer:
         """The answer to bytes on the address of a sensor and a verb."""
