@@ -22,6 +22,7 @@ COMMANDS = {
     "audit": ("agent.cli.audit", "Check recordings: every byte, and that the results follow from the data."),
     "show": ("agent.cli.show", "Show the calibration in force, status and history of a data directory."),
     "report": ("agent.cli.report", "Make figures and a one-page report of a calibration."),
+    "certificate": ("agent.cli.certificate", "Make a calibration certificate: PDF, HTML, DCC XML and JSON."),
     "sensors": ("agent.cli.sensors", "List the drivers with their options."),
     "probe": ("agent.cli.probe", "Find and self-test the devices on this machine's buses and ports."),
     "command": ("agent.cli.command", "Send a signed command to an agent: pose, hold, accept, rollback."),
