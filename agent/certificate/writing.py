@@ -11,6 +11,7 @@ from agent.certificate.content import Certificate, as_object
 from agent.certificate.dcc import dcc
 from agent.certificate.html import page
 from agent.certificate.pdf import pdf
+from agent.certificate.schema import check_schema
 from agent.certificate.signing import Signer, as_json
 
 if TYPE_CHECKING:
@@ -19,13 +20,16 @@ if TYPE_CHECKING:
 NAME = "certificate"
 
 
-def write(c: Certificate, directory: Path, key: Ed25519PrivateKey | None) -> list[Path]:
+def write(c: Certificate, directory: Path, key: Ed25519PrivateKey | None, xsd: Path | None = None) -> list[Path]:
     """Write the certificate in all forms into `directory`, which is created if needed, and its signature with a key.
 
-    Raises OSError and CertificateError; with the latter nothing is written.
+    With `xsd`, the schema of the DCC, the XML must be valid. Raises OSError, CertificateError and SchemaError; with the
+    latter two nothing is written.
     """
     signer = Signer(key, c.number)
     xml = dcc(c, signer)  # the only form that can refuse a content, so it is made first
+    if xsd is not None:
+        check_schema(xml, xsd)
     files = {
         f"{NAME}.pdf": pdf(c, signer.words),
         f"{NAME}.html": page(c, signer.words).encode(),

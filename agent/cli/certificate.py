@@ -20,8 +20,11 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
 @click.option("-o", "--output", type=click.Path(path_type=Path, file_okay=False), required=True, metavar="DIR",
               help="Directory for certificate.pdf, .html, .xml and .json.")  # fmt: skip
 @click.option("--key", type=_FILE, help="Ed25519 private key (PEM) that signs the certificate.")
+@click.option("--xsd", type=_FILE, help="dcc.xsd of PTB, with SI_Format.xsd beside it: the XML is checked against it.")
 @click.option("--sensor", metavar="NAME", help="The sensor, if the input has several.")
-def certificate(inputs: tuple[Path, ...], stated: Path, output: Path, key: Path | None, sensor: str | None) -> int:
+def certificate(
+    inputs: tuple[Path, ...], stated: Path, output: Path, key: Path | None, xsd: Path | None, sensor: str | None
+) -> int:
     """Make a calibration certificate.
 
     INPUT is RESULT.json of `fieldcal calibrate --json RESULT.json`, a recording (several of one sensor are read one
@@ -35,6 +38,7 @@ def certificate(inputs: tuple[Path, ...], stated: Path, output: Path, key: Path 
         say("fieldcal certificate: the PDF needs matplotlib; install it with: pip install 'fieldcal[report]'", err=True)
         return 1
     from agent.certificate.content import CertificateError, certificate_of
+    from agent.certificate.schema import SchemaError
     from agent.certificate.statements import Statements
     from agent.certificate.writing import write
     from agent.report.material import MaterialError, gather
@@ -50,8 +54,8 @@ def certificate(inputs: tuple[Path, ...], stated: Path, output: Path, key: Path 
             for reason in material.results[0].reasons:
                 say(f"refused: {reason}", err=True)
             return 3
-        written = write(certificate_of(material, told, stated.parent, left_over(material)), output, private)
-    except (ConfigError, KeyFileError, MaterialError) as error:
+        written = write(certificate_of(material, told, stated.parent, left_over(material)), output, private, xsd)
+    except (ConfigError, KeyFileError, MaterialError, SchemaError) as error:
         for line in str(error).splitlines():
             say(f"fieldcal certificate: {line}", err=True)
         return 2

@@ -20,6 +20,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption,
 
 from agent.calibrate.earlier import DCC, PARAMETER_LIST, SI, read_earlier
 from agent.certificate.content import as_object, certificate_of
+from agent.certificate.schema import SchemaError, check_schema
 from agent.certificate.signing import PURPOSE, signed_json
 from agent.certificate.statements import Statements
 from agent.cli.main import run_cli
@@ -314,3 +315,30 @@ def test_the_decision_rule_takes_u_into_account(tmp_path: Path) -> None:
         told = content([tmp_path / "result.json"], path)
         found[rule] = [entry["conforms"] for entry in told["conformity"]]
     assert found == {"simple acceptance": [True, True, True], "guard band": [False, True, True]}
+
+
+SCHEMA = """<xs:schema xmlns:xs="http://www.w3.org/2001/XMLSchema" targetNamespace="https://ptb.de/dcc"
+ elementFormDefault="qualified"><xs:import namespace="https://ptb.de/si" schemaLocation="https://ptb.de/si/SI.xsd"/>
+ <xs:element name="digitalCalibrationCertificate"><xs:complexType><xs:sequence>
+ <xs:any processContents="skip" minOccurs="{count}" maxOccurs="{count}"/></xs:sequence>
+ <xs:attribute name="schemaVersion" use="required"/></xs:complexType></xs:element></xs:schema>"""
+
+
+@pytest.mark.parametrize(("count", "words"), [(2, ""), (3, "the DCC is not valid: /"), (None, "SI_Format.xsd must be")])
+def test_the_dcc_is_checked_against_a_schema_that_the_user_has(
+    count: int | None, words: str, made: Path, tmp_path: Path
+) -> None:
+    """A schema that wants two parts, as DCC has them, accepts it; one that wants three does not. Nothing is fetched."""
+    pytest.importorskip("xmlschema", reason="the extra dcc is not installed")
+    (tmp_path / "dcc.xsd").write_text(SCHEMA.format(count=count or 2))
+    if count is not None:
+        namespace = "http://www.w3.org/2001/XMLSchema"
+        (tmp_path / "SI_Format.xsd").write_text(
+            f'<s:schema xmlns:s="{namespace}" targetNamespace="https://ptb.de/si"/>'
+        )
+    xml = re.sub(rb"<dcc:comment.*</dcc:comment>", b"", (made / "certificate.xml").read_bytes(), flags=re.DOTALL)
+    if not words:
+        check_schema(xml, tmp_path / "dcc.xsd")
+        return
+    with pytest.raises(SchemaError, match=words):
+        check_schema(xml, tmp_path / "dcc.xsd")
