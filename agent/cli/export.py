@@ -13,7 +13,9 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
 
 @click.command()
 @click.argument("recordings", nargs=-1, required=True, type=_FILE, metavar="RECORDING...")
-@click.option("--to", type=_FILE, metavar="FILE", help="Table of samples: .csv, .parquet or .wav; it must not exist.")
+@click.option(
+    "--to", type=_FILE, metavar="FILE", help="Table of samples: .csv, .parquet, .wav or .mseed; it must not exist."
+)
 @click.option("--mcap", type=_FILE, metavar="FILE", help="Topics of ROS 2 for plot programs; it must not exist.")
 @click.option("--device", metavar="NAME", help="The device. Default: the only sensor of the recordings.")
 @click.option(
@@ -29,12 +31,14 @@ def export(recordings: tuple[Path, ...], to: Path | None, mcap: Path | None, dev
     """
     from agent.export.plots import write_plots
     from agent.export.samples import ExportError, content_of, samples
-    from agent.export.tables import FORMATS
+    from agent.export.seismic import write_mseed
+    from agent.export.tables import write_csv, write_parquet, write_wav
 
+    formats = {".csv": write_csv, ".parquet": write_parquet, ".wav": write_wav, ".mseed": write_mseed}
     if to is None and mcap is None:
         raise click.UsageError("nothing to write; add --to FILE, --mcap FILE, or both")
-    if to is not None and to.suffix not in FORMATS:
-        raise click.BadParameter(f"{to}: the ending must be one of {', '.join(FORMATS)}", param_hint="--to")
+    if to is not None and to.suffix not in formats:
+        raise click.BadParameter(f"{to}: the ending must be one of {', '.join(formats)}", param_hint="--to")
     try:
         content = content_of(recordings, device)
         for fault in content.faults:
@@ -42,7 +46,7 @@ def export(recordings: tuple[Path, ...], to: Path | None, mcap: Path | None, dev
         if not content.calibrations and content.axes == 3:
             say(f"fieldcal export: {content.device} has no calibration: no accelerations are written", err=True)
         if to is not None:
-            rows = FORMATS[to.suffix](to, content, samples(recordings, content))
+            rows = formats[to.suffix](to, content, samples(recordings, content))
             say(f"{to}: {rows} samples of {content.device}")
         if mcap is not None:
             count = write_plots(mcap, content, samples(recordings, content), rate_hz)

@@ -18,7 +18,10 @@ COMMANDS = {
     "run": ("agent.cli.run", "Run the agent: read devices, calibrate, record and publish."),
     "calibrate": ("agent.cli.calibrate", "Calibrate a sensor from recorded files."),
     "convert": ("agent.cli.convert", "Write a recorded file of another format as CSV."),
-    "export": ("agent.cli.export", "Write samples of recordings for other programs: CSV, Parquet, WAV, plots."),
+    "export": (
+        "agent.cli.export",
+        "Write samples of recordings for other programs: CSV, Parquet, WAV, MiniSEED, plots.",
+    ),
     "replay": ("agent.cli.replay", "Run recordings through the same pipeline and print the calibrations."),
     "audit": ("agent.cli.audit", "Check recordings: every byte, and that the results follow from the data."),
     "show": ("agent.cli.show", "Show the calibration in force, status and history of a data directory."),

@@ -15,6 +15,7 @@ from agent.export.samples import Content, Samples, new_file
 from calib.model import PARAMETERS, Array
 
 AXES = ("x", "y", "z")
+CHUNK_BYTES = 1 << 18
 NAMES = (*PARAMETERS, *(f"U_{name}" for name in PARAMETERS))
 
 
@@ -25,7 +26,7 @@ def write_plots(path: Path, content: Content, blocks: Iterable[Samples], rate_hz
     """
     device, count = content.device, 0
     with new_file(path) as file:
-        writer = Writer(file, compression=CompressionType.ZSTD)
+        writer = Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
         writer.start("ros2", f"fieldcal {__version__}")
         schemas = {kind: writer.register_schema(kind, "ros2msg", text.encode()) for kind, text in DEFINITIONS.items()}
         about = {"rate_hz": f"{rate_hz:g}", "of each message": "mean of the samples in its interval"}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
@@ -34,7 +34,7 @@ def write_csv(path: Path, content: Content, blocks: Iterable[Samples]) -> int:
         file.write((",".join(map(cell, ["time_s", *names_of(content)])) + "\n").encode())
         for block in blocks:
             times = (f"{t // 10**9}.{t % 10**9:09d}" for t in block.t_utc_ns.tolist())
-            values = _columns(content, block).tolist()
+            values = columns(content, block).tolist()
             lines = (f"{t},{','.join(map(repr, row))}\n" for t, row in zip(times, values, strict=True))
             file.writelines(map(str.encode, lines))
             rows += len(values)
@@ -81,7 +81,7 @@ def write_wav(path: Path, content: Content, blocks: Iterable[Samples]) -> int:
                 raise ExportError(
                     f"{path}: {hole} samples are missing in one place; WAV has no times; write it as .csv"
                 )
-            values = np.vstack([np.full((hole, channels), np.nan), _columns(content, block)])
+            values = np.vstack([np.full((hole, channels), np.nan), columns(content, block)])
             if (frames + len(values)) * channels * 8 > LARGEST_WAV:
                 raise ExportError(
                     f"{path}: a WAV file has 4 GB at most; export fewer recordings at once, or to .parquet"
@@ -100,7 +100,7 @@ def _wav_head(file: BinaryIO, channels: int, rate_hz: int, frames: int) -> None:
     file.write(struct.pack("<4sI4s", b"RIFF", 36 + size, b"WAVE") + form + struct.pack("<4sI", b"data", size))
 
 
-def _columns(content: Content, block: Samples) -> Array:
+def columns(content: Content, block: Samples) -> Array:
     """The columns (n, k) in the order of `names_of`."""
     if content.axes != 3 or not content.calibrations:
         return block.values
@@ -116,13 +116,9 @@ def _gathered(
     values: list[Array] = []
     for block in blocks:
         times.append(block.t_utc_ns)
-        values.append(_columns(content, block))
+        values.append(columns(content, block))
         if sum(map(len, values)) >= rows:
             yield np.concatenate(times), np.concatenate(values)
             times, values = [], []
     if values:
         yield np.concatenate(times), np.concatenate(values)
-
-
-Write = Callable[[Path, Content, Iterable[Samples]], int]
-FORMATS: dict[str, Write] = {".csv": write_csv, ".parquet": write_parquet, ".wav": write_wav}
