@@ -7,7 +7,7 @@ import json
 import re
 import struct
 import tracemalloc
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -264,19 +264,20 @@ def test_the_unit_of_a_device_is_no_formula_in_a_header(tmp_path: Path) -> None:
 def test_memory_does_not_grow_with_the_length(tmp_path: Path) -> None:
     """Three times as many blocks, both more than a chunk of MCAP: the same memory."""
 
-    def blocks(count: int) -> Iterator[Samples]:
-        values, times = np.zeros((5, 3)), np.arange(5) * 100_000_000
+    def blocks(count: int, rows: int) -> Iterator[Samples]:
         for k in range(count):
-            yield Samples(EPOCH_NS + times + k * 500_000_000, values, values, 5 * k, 10.0, None)
+            times = EPOCH_NS + (np.arange(rows) + rows * k) * 100_000_000
+            yield Samples(times, np.zeros((rows, 3)), np.zeros((rows, 3)), rows * k, 10.0, None)
 
-    peaks = []
-    for count in (150, 400):
+    def peak(write: Callable[..., int], count: int, rows: int, *more: float) -> int:
         tracemalloc.start()
-        write_csv(tmp_path / f"{count}.csv", Content("a", "count", 3), blocks(count))
-        write_plots(tmp_path / f"{count}.mcap", Content("a", "count", 3), blocks(count), 10.0)
-        peaks.append(tracemalloc.get_traced_memory()[1])
+        write(tmp_path / f"{write.__name__}{count}", Content("a", "count", 3), blocks(count, rows), *more)
+        top = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
-    assert peaks[1] < 1.3 * peaks[0]
+        return top
+
+    assert peak(write_csv, 120, 100) < 1.3 * peak(write_csv, 40, 100)
+    assert peak(write_plots, 450, 5, 10.0) < 1.3 * peak(write_plots, 150, 5, 10.0)
 
 
 def test_samples_are_those_of_the_recording_once_each(recorded: Path) -> None:
