@@ -13,6 +13,7 @@ import numpy as np
 
 from agent import __version__
 from agent.calibrate.origin import SourceFile, source_file
+from agent.certificate.provenance import graph
 from agent.certificate.statements import Decision, Statements
 from agent.core.events import CalibrationUpdate
 from agent.report.material import Material
@@ -104,6 +105,13 @@ def as_object(certificate: Certificate) -> dict[str, Any]:
     """The member `certificate` of certificate.json."""
     c, result = certificate, certificate.result
     told = result.fields
+    measured = plain(
+        {name: told.get(name) for name in
+         ("sensitivity", "offset", "standard_uncertainty", "expanded_uncertainty", "covariance", "determined",
+          "response", "budget", "lag_s", "frame", "method", "uncertainty_kind", "identity")}
+        | {"parameters": PARAMETERS, "output_unit": result.unit, "degrees_of_freedom": result.degrees_of_freedom,
+           "coverage_probability": COVERAGE_PROBABILITY, "expanded_uncertainty_pct": c.relative_pct}
+    )  # fmt: skip
     return {
         "format": FORMAT,
         "number": c.number,
@@ -123,19 +131,14 @@ def as_object(certificate: Certificate) -> dict[str, Any]:
                 "windows": sum(w.used for w in result.windows),
             }
         ),
-        "result": plain(
-            {name: told.get(name) for name in
-             ("sensitivity", "offset", "standard_uncertainty", "expanded_uncertainty", "covariance", "determined",
-              "response", "budget", "lag_s", "frame", "method", "uncertainty_kind", "identity")}
-            | {"parameters": PARAMETERS, "output_unit": result.unit, "degrees_of_freedom": result.degrees_of_freedom,
-               "coverage_probability": COVERAGE_PROBABILITY, "expanded_uncertainty_pct": c.relative_pct}
-        ),
+        "result": measured,
         "conformity": plain([{
             "parameter": v.parameter, "deviation_pct": v.deviation_pct,
             "expanded_uncertainty_pct": v.expanded_uncertainty_pct, "limit_pct": v.limit_pct, "conforms": v.conforms,
         } for v in c.verdicts]),
         "made_from": [msgspec.structs.asdict(file) for file in c.files],
         "made_by": {"fieldcal": __version__, "calibrated_with": told.get("version")},
+        "provenance": graph(c, measured),
     }  # fmt: skip
 
 

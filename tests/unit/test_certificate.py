@@ -249,6 +249,30 @@ def test_a_data_directory_and_a_recording(tmp_path: Path) -> None:
     assert found[0]["made_from"][0]["sha256"] == hashlib.sha256(recordings[0].read_bytes()).hexdigest()
 
 
+def test_the_graph_leads_from_the_certificate_to_the_files_and_the_reference(tmp_path: Path) -> None:
+    """Every name that a relation uses is there, and each file is named by its hash."""
+    windows = [{"start_s": k, "stop_s": k + 1.0, "used": k != 1, "reason": "", "points": 9, "position": f"p{k}"}
+               for k in range(3)]  # fmt: skip
+    path = tmp_path / "result.json"
+    path.write_text(json.dumps(fields(windows=windows)))
+    held = content([path], stated(tmp_path))
+    graph = held["provenance"]
+    names = {*graph["entity"], *graph["activity"], *graph["agent"]}
+    relations = [r for kind in graph if kind.startswith(("was", "used")) for r in graph[kind].values()]
+    assert {name for relation in relations for name in relation.values()} == names
+    assert all(name.partition(":")[0] in graph["prefix"] for name in names)
+    sources: dict[str, set[str]] = {}
+    for relation in graph["wasDerivedFrom"].values():
+        sources.setdefault(relation["prov:generatedEntity"], set()).add(relation["prov:usedEntity"])
+    [result] = sources[f"fieldcal:certificate/Structures Laboratory/{held['number']}"]
+    canonical = msgspec.json.encode(held["result"])
+    assert result == f"sha256:{hashlib.sha256(canonical).hexdigest()}"
+    assert len(sources[result]) == 2
+    file = f"sha256:{hashlib.sha256(path.read_bytes()).hexdigest()}"
+    assert {source for window in sources[result] for source in sources[window]} == {file}
+    assert sources["fieldcal:instrument/PCB/393B12/LW-1234"] == {"fieldcal:certificate/Accredited Laboratory/2026-0815"}
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
