@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -69,7 +69,7 @@ def _response(on: FigureBase, c: Certificate) -> None:
         shift = 1.0 + 0.02 * (k - 1)  # so that the bars of three axes can be told apart
         axes.errorbar(middle * shift, 100 * relative[:, k], 100 * U[:, k], **_series(k))
     axes.axhline(0, color=style.INK, linewidth=0.6)
-    at = c.result.fields.get("reference_frequency_hz")
+    at = c.told.reference_frequency_hz
     if at:
         axes.axvline(at, color=style.INK, linewidth=0.8, linestyle=":")
     axes.set_xscale("log")
@@ -86,21 +86,17 @@ def _has_response(c: Certificate) -> bool:
 
 def _bands(c: Certificate) -> tuple[Array, Array, Array]:
     """Middles (B,) of the bands in Hz; deviation of |S_ii| from S_ii, and U, (B, 3), as shares; NaN: not known."""
-    told = c.result.fields.get("response")
-    bands = [band for band in told if isinstance(band, dict)] if isinstance(told, list) else []
+    bands = c.told.bands
     if not bands:
         return np.empty(0), np.empty((0, 3)), np.empty((0, 3))
-    values = [_diagonals(bands, name) for name in ("sensitivity_re", "sensitivity_im", "standard_uncertainty")]
+    values = [
+        np.array([np.diag(np.array(matrix, dtype=float)) for matrix in matrices])
+        for matrices in zip(*((b.sensitivity_re, b.sensitivity_im, b.standard_uncertainty) for b in bands), strict=True)
+    ]
     S, k = c.result.values[MAIN], c.result.coverage_factor[MAIN]
-    edges = np.array([[band["low_hz"], band["high_hz"]] for band in bands], dtype=float)
+    edges = np.array([[band.low_hz, band.high_hz] for band in bands])
     size = np.hypot(values[0], values[1])
     return np.sqrt(edges.prod(axis=1)), size / np.abs(S) - 1.0, k * values[2] / np.abs(S)
-
-
-def _diagonals(bands: Sequence[dict[str, Any]], name: str) -> Array:
-    """(B, 3) of the main elements; NaN where there are none."""
-    held = [np.full((3, 3), np.nan) if band.get(name) is None else np.array(band[name], dtype=float) for band in bands]
-    return np.array([np.diag(S) for S in held])
 
 
 def _history(on: FigureBase, c: Certificate) -> None:

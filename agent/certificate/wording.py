@@ -108,14 +108,13 @@ def _dates(c: Certificate) -> str:
 
 
 def _conditions(c: Certificate) -> Iterator[tuple[str, str]]:
-    told = c.result.fields
     yield "method", c.method
     yield "equation", f"{EQUATION}; V indication, a acceleration, S sensitivity, Q offset"
     t = c.temperature_degc
     yield "temperature", f"{t[0]:g} to {t[1]:g} °C" if t else "not recorded"
-    if told.get("valid_band_hz"):
-        low, high = told["valid_band_hz"]
-        at = told["reference_frequency_hz"]
+    band, at = c.told.valid_band_hz, c.told.reference_frequency_hz
+    if band is not None and at is not None:
+        low, high = band
         yield "frequencies", f"S at {at:.3g} Hz; right within U/3 from {low:.3g} to {high:.3g} Hz"
     elif c.frequency_hz:
         yield "frequencies", f"mean frequency of the motion {c.frequency_hz[0]:.3g} to {c.frequency_hz[1]:.3g} Hz"

@@ -6,8 +6,6 @@ import base64
 import hashlib
 import json
 import re
-import tomllib
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -19,65 +17,14 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 
 from agent.calibrate.earlier import DCC, PARAMETER_LIST, SI, read_earlier
-from agent.certificate.content import as_object, certificate_of
 from agent.certificate.schema import SchemaError, check_schema
 from agent.certificate.signing import PURPOSE, signed_json
-from agent.certificate.statements import Statements
 from agent.cli.main import run_cli
-from agent.config.reading import load_model
-from agent.reading.source import TableError
 from agent.recording.signed_text import SignedText, values_of
-from agent.report.material import gather
-from agent.report.writing import left_over
+from tests.unit.certificates import content, run, stated, uneven
 from tests.unit.recorded_bench import record
 from tests.unit.test_report import Page
 from tests.unit.test_report_numbers import fields
-
-STATED = Path(__file__).parents[2] / "examples" / "certificate.toml"
-BANDS = [
-    {"low_hz": low, "high_hz": 1.26 * low, "sensitivity_re": (np.eye(3) * (10.0 + low / 7.0)).tolist(),
-     "sensitivity_im": (np.eye(3) * low / 3.0).tolist(), "standard_uncertainty": np.full((3, 3), 0.1 / 3.0).tolist()}
-    for low in (1.0, 1.26)
-]  # fmt: skip
-
-
-def uneven(seed: int = 5) -> dict[str, Any]:
-    """A result whose numbers need all their digits."""
-    rng = np.random.default_rng(seed)
-    A = rng.normal(size=(12, 12)) * 1e-3
-    covariance = A @ A.T
-    u, k = np.sqrt(np.diag(covariance)), 2.0 + 1.0 / 3.0
-    return fields(
-        sensitivity=(10.0 * np.eye(3) + rng.normal(size=(3, 3)) / 3.0).tolist(), offset=rng.normal(size=3).tolist(),
-        covariance=covariance.tolist(), degrees_of_freedom=121.0 / 7.0, method="3 (adjustment)", response=BANDS,
-        standard_uncertainty={"sensitivity": u[:9].reshape(3, 3).tolist(), "offset": u[9:].tolist()},
-        expanded_uncertainty={"sensitivity": (k * u[:9]).reshape(3, 3).tolist(), "offset": (k * u[9:]).tolist(),
-                              "coverage_factor": k},
-        reference_frequency_hz=2.7, valid_band_hz=[0.9, 8.1],
-    )  # fmt: skip
-
-
-def stated(folder: Path, **changes: str) -> Path:
-    """The example's statements; each change is a section of lines that replaces or adds to it."""
-    text = STATED.read_text().replace("nominal = 26104.7", "nominal = 10.0")
-    for section, lines in changes.items():
-        text = re.sub(rf"\[{section}\]\n(?:[^\[\n].*\n|\n)*", "", text) + (f"\n[{section}]\n{lines}\n" if lines else "")
-    path = folder / "certificate.toml"
-    path.write_text(text)
-    return path
-
-
-def run(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> tuple[int, str]:
-    status = run_cli(["certificate", *map(str, arguments)])
-    return status, capsys.readouterr().err
-
-
-def content(inputs: Sequence[Path], path: Path) -> dict[str, Any]:
-    """What certificate.json would hold, without drawing."""
-    material = gather(inputs, None)
-    found = certificate_of(material, load_model(path, Statements), path.parent, left_over(material))
-    held: dict[str, Any] = json.loads(msgspec.json.encode(as_object(found)))
-    return held
 
 
 @pytest.fixture(scope="module")
@@ -273,72 +220,23 @@ def test_the_graph_leads_from_the_certificate_to_the_files_and_the_reference(tmp
     assert sources["fieldcal:instrument/PCB/393B12/LW-1234"] == {"fieldcal:certificate/Accredited Laboratory/2026-0815"}
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ('<!DOCTYPE x [<!ENTITY a "aaaa">]><x>&a;</x>', "document type"),
-        ('<!DOCTYPE x SYSTEM "file:///etc/passwd"><x/>', "document type"),
-        ("<x/>", "no digital calibration certificate"),
-        (f'<d:digitalCalibrationCertificate xmlns:d="{DCC}"/>', "--nominal"),
-        ("<x", "broken"),
-        ('{"certificate": []}', "neither a result"),
-    ],
-)
-def test_what_is_no_certificate_is_refused(text: str, words: str, tmp_path: Path) -> None:
-    path = tmp_path / "prior"
-    for encoding in ("utf-8", "utf-16") if text.startswith("<!") else ("utf-8",):
-        path.write_text(text, encoding=encoding)
-        with pytest.raises(TableError, match=words if encoding == "utf-8" else "prior: "):
-            read_earlier(path)
-
-
-@pytest.mark.parametrize(
-    ("section", "lines", "words"),
-    [
-        ("operator", "", "operator: is missing; add it"),
-        ("operator", 'name = " A"', "operator.name: must be one line of visible characters"),
-        ("place", 'description = "x"\nkind = "moon"', "place.kind"),
-        ("dates", "begun = 2026-02-01\nended = 2026-01-01\nissued = 2026-03-01", "dates.ended: 2026-01-01 is before"),
-        ("dates", 'begun = "soon"\nended = 2026-01-01\nissued = 2026-03-01', "dates.begun: must be a date"),
-        ("customer", 'name = "x"\ncity = "y"\ncountry = "Italy"', "customer.country: must be the two capital letters"),
-        ("conditions", "temperature_low_degc = 3", "must be given together"),
-        ("seal", "x = 1", "seal: there is no such setting"),
-        ("instrument", 'manufacturer = "a"\nmodel = "b"\nserial_number = "c"', "instrument.output_unit: is missing"),
-        ("instrument", 'manufacturer = "a"\nmodel = "b"\nserial_number = "c"\noutput_unit = "furlong"',
-         "output unit 'furlong': a DCC cannot say it"),
-    ],
-)  # fmt: skip
-def test_a_fault_of_the_statements_is_named(
-    section: str, lines: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "result.json").write_text(json.dumps(fields()))
-    path = stated(tmp_path, **{section: lines})
-    tomllib.loads(path.read_text())
-    status, told = run(capsys, tmp_path / "result.json", "--stated", path, "-o", tmp_path / "out")
-    assert status == 2
-    assert len(told.splitlines()) == 1
-    assert str(path) in told
-    assert words in told
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_refused_result_has_no_certificate(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "result.json").write_text(json.dumps(fields(status="refused", reasons=["too little motion"])))
-    status = run(capsys, tmp_path / "result.json", "--stated", stated(tmp_path), "-o", tmp_path / "out")
-    assert status == (3, "refused: too little motion\n")
-    assert not (tmp_path / "out").exists()
-
-
-def test_the_decision_rule_takes_u_into_account(tmp_path: Path) -> None:
-    """S_xx is 1.0 % from 10 with U 0.2 %: a limit of 1.1 % is kept without U, and not kept with it."""
-    S = [[10.1, 0.0, 0.0], [0.0, 10.0, 0.0], [0.0, 0.0, 10.0]]
-    (tmp_path / "result.json").write_text(json.dumps(fields(sensitivity=S)))
-    found = {}
-    for rule in ("simple acceptance", "guard band"):
-        path = stated(tmp_path, decision=f'nominal = 10.0\nlimit_pct = 1.1\nrule = "{rule}"')
-        told = content([tmp_path / "result.json"], path)
-        found[rule] = [entry["conforms"] for entry in told["conformity"]]
-    assert found == {"simple acceptance": [True, True, True], "guard band": [False, True, True]}
+def test_what_is_not_known_is_left_out(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """S_xy and Q are null: the DCC has the other eight parameters with their covariance, and so has the prior."""
+    told = uneven()
+    told["sensitivity"][0][1], told["offset"], told["degrees_of_freedom"] = None, None, None
+    for place in (1, 9, 10, 11):
+        told["covariance"][place] = [None] * 12
+        for row in told["covariance"]:
+            row[place] = None
+    (tmp_path / "result.json").write_text(json.dumps(told))
+    out = tmp_path / "out"
+    assert run(capsys, tmp_path / "result.json", "--stated", stated(tmp_path), "-o", out) == (0, "")
+    values, covariance = read_earlier(out / "certificate.xml")
+    known = [0, 2, 3, 4, 5, 6, 7, 8]
+    assert np.flatnonzero(np.isfinite(values)).tolist() == known
+    whole = read_earlier(made / "certificate.xml")[1]
+    np.testing.assert_array_equal(covariance[np.ix_(known, known)], whole[np.ix_(known, known)])
+    assert np.isnan(covariance[1]).all()
 
 
 SCHEMA = """<xs:schema xmlns:xs="http://www.w3.org/2001/XMLSchema" targetNamespace="https://ptb.de/dcc"
