@@ -121,8 +121,11 @@ def certificate_of(material: Material, stated: Statements, beside: Path, seen: I
         told = msgspec.convert(result.fields, Frequencies)
     except msgspec.ValidationError as error:
         raise MaterialError(f"{source}: {error}; make the result again with `fieldcal calibrate`") from None
-    if not np.isfinite(np.diag(result.covariance)).any():
-        raise MaterialError(f"{source}: covariance: the result has none; make it again with `fieldcal calibrate`")
+    known = np.isfinite(result.values) & np.isfinite(result.expanded_uncertainty)
+    if not any(np.isfinite(result.covariance[k][known]).all() for k in np.flatnonzero(known)):
+        raise MaterialError(
+            f"{source}: expanded_uncertainty, covariance: the result has none; make it again with `fieldcal calibrate`"
+        )
     found = Certificate(
         stated=stated, number=stated.number, sensor=material.sensor, result=result,
         reference_file=_reference_file(stated.reference.certificate_file, beside), files=tuple(material.files),

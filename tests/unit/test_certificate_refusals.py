@@ -79,6 +79,7 @@ def test_a_refused_result_has_no_certificate(tmp_path: Path, capsys: pytest.Capt
         ({"response": [{"low_hz": 1.0}]}, "response"),
         ({"response": [BANDS[0] | {"sensitivity_re": [1.0]}]}, "response"),
         ({"covariance": None}, "covariance: the result has none"),
+        ({"expanded_uncertainty": {"coverage_factor": None}}, "expanded_uncertainty, covariance"),
     ],
 )
 def test_a_fault_of_the_result_is_named(
