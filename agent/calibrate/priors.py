@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from agent.config.files import read_file
+from agent.calibrate.earlier import read_earlier
 from agent.reading.source import TableError
 from calib.estimate.nuisances import Priors
 from calib.estimate.quantities import PRIORS
@@ -62,19 +61,9 @@ def _known(options: dict[str, Any]) -> tuple[Array | None, Array | None]:
     return None, None
 
 
-LARGEST_PRIOR = 64 << 20  # bytes; a result lists all its windows, each with 0.3 kB
-
-
 def _read_prior(path: Path) -> tuple[Array, Array]:
-    """Values and covariance from a result of this command. A value that is null there is not known."""
-    try:
-        told = json.loads(read_file(path, LARGEST_PRIOR))
-        values = np.append(np.array(told["sensitivity"], dtype=float).ravel(), np.array(told["offset"], dtype=float))
-        covariance = np.array(told["covariance"], dtype=float)
-    except OSError as error:
-        raise TableError(f"{path}: {error.strerror}") from None
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise TableError(f"{path}: the file is not a result of `fieldcal calibrate --json -`: {error}") from None
+    """Values and covariance from an earlier result or certificate. What is null there is not known."""
+    values, covariance = read_earlier(path)
     if values.shape != (12,) or covariance.shape != (12, 12):
         raise TableError(f"{path}: sensitivity must be 3 x 3, offset 3, covariance 12 x 12")
     unknown = ~(np.isfinite(values) & np.isfinite(np.diag(covariance)))

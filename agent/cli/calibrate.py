@@ -99,7 +99,7 @@ _U = _Finite(0)
 )
 @click.option("--nominal", type=_Finite(min=0, min_open=True), help="Nominal sensitivity, output unit per m/s2.")
 @click.option("--u-nominal-pct", type=_Finite(0, min_open=True), help="Its standard uncertainty.")
-@click.option("--prior", type=_FILE, help="Earlier result of this command (JSON), used as prior.")
+@click.option("--prior", type=_FILE, help="Earlier result (JSON) or certificate (JSON, DCC XML), as prior.")
 @click.option(
     "--reference-frequency-hz",
     type=_Finite(min=0, min_open=True),

@@ -36,7 +36,7 @@ def faults_of(raw: Mapping[str, Any]) -> tuple[Config | None, list[Told]]:
         config = Config.model_validate(raw)
     except ValidationError as error:
         # The model looks at its names only when all else is sound; they are named here, and only once.
-        faults += _told(error, raw, but_of_the_whole=bool(named))
+        faults += told(error, raw, but_of_the_whole=bool(named))
     faults += named
     options = list(_options(raw, faults))
     faults += _unknown_sensitivities(raw, dict(options))
@@ -61,7 +61,7 @@ def _options(raw: Mapping[str, Any], faults: list[Told]) -> Iterator[tuple[str, 
         except DeviceError as error:
             faults.append((("devices", i, "driver"), str(error)))
         except ValidationError as error:
-            faults += [(("devices", i, "options", *path), what) for path, what in _told(error, options)]
+            faults += [(("devices", i, "options", *path), what) for path, what in told(error, options)]
         except (Exception, SystemExit) as error:  # of a plug-in
             fault = f"driver {driver!r} fails on its options: {type(error).__name__}: {error}"
             faults.append((("devices", i, "driver"), fault))
@@ -110,7 +110,8 @@ def _entries(raw: Mapping[str, Any], section: str) -> list[Mapping[str, Any]]:
     return [entry if isinstance(entry, Mapping) else {} for entry in held] if isinstance(held, list) else []
 
 
-def _told(error: ValidationError, raw: Any, *, but_of_the_whole: bool = False) -> Iterator[Told]:
+def told(error: ValidationError, raw: Any, *, but_of_the_whole: bool = False) -> Iterator[Told]:
+    """The faults that a model found in the values of a TOML file: where, and what is wrong."""
     faults = [fault for fault in error.errors() if fault["loc"] or not but_of_the_whole]
     # A list that is too short only because what is in it was refused is no fault of its own.
     around = {fault["loc"][:n] for fault in faults for n in range(len(fault["loc"]))}

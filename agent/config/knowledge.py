@@ -72,7 +72,7 @@ def _quantity(name: str) -> str:
     return name
 
 
-def _iso_date(value: object) -> str:
+def iso_date(value: object) -> str:
     """A date in ISO form from the text, or from the date that TOML knows; "" is no date."""
     if isinstance(value, datetime):
         raise ValueError("must be a date without a time, as in 2026-03-01")
@@ -82,7 +82,7 @@ def _iso_date(value: object) -> str:
         raise ValueError("must be a date: year, month and day, as in 2026-03-01") from None
 
 
-IsoDate = Annotated[str, BeforeValidator(_iso_date)]
+IsoDate = Annotated[str, BeforeValidator(iso_date)]
 
 
 class Certificate(Section):

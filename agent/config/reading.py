@@ -5,9 +5,11 @@ from __future__ import annotations
 import re
 import tomllib
 from pathlib import Path as FilePath
-from typing import Any
+from typing import Any, TypeVar
 
-from agent.config.faults import faults_of, shown
+from pydantic import BaseModel, ValidationError
+
+from agent.config.faults import faults_of, shown, told
 from agent.config.files import read_file
 from agent.config.lines import lines_of
 from agent.config.names import Told
@@ -23,6 +25,9 @@ _LINE = re.compile(r"\(at line (\d+), column \d+\)")  # as in the messages of to
 _LONG_KEY = re.compile(rf"(?<![\w.-]){_PART}(?:\.[ \t]*+{_PART}){{{DEEPEST_KEY},}}+")
 
 
+Model = TypeVar("Model", bound=BaseModel)
+
+
 class ConfigError(Exception):
     """The faults of a configuration, one line each, with file, line, setting, value and what to do."""
 
@@ -33,6 +38,21 @@ class ConfigError(Exception):
 
 def load_config(path: FilePath) -> Config:
     """Read and check a TOML file, and the files it names. Raises ConfigError with all faults."""
+    raw, text = _read_toml(path)
+    return parse_config(raw, str(path), text)
+
+
+def load_model(path: FilePath, kind: type[Model]) -> Model:
+    """Read and check a TOML file that holds one model. Raises ConfigError with all faults."""
+    raw, text = _read_toml(path)
+    try:
+        return kind.model_validate(raw)
+    except ValidationError as error:
+        raise _refused(list(told(error, raw)), str(path), text) from None
+
+
+def _read_toml(path: FilePath) -> tuple[dict[str, Any], str]:
+    """The values of a TOML file, and its text. Raises ConfigError."""
     try:
         text = read_file(path, LARGEST_FILE).decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -52,7 +72,7 @@ def load_config(path: FilePath) -> Config:
         raise ConfigError([f"{path}: its tables or lists are nested too deep to be read"]) from None
     if too_large := size_faults(raw):
         raise _refused(too_large, str(path), text)
-    return parse_config(raw, str(path), text)
+    return raw, text
 
 
 def parse_config(raw: dict[str, Any], origin: str, text: str = "") -> Config:
@@ -69,9 +89,9 @@ def parse_config(raw: dict[str, Any], origin: str, text: str = "") -> Config:
 def _refused(faults: list[Told], origin: str, text: str) -> ConfigError:
     some = faults[:SHOWN_FAULTS]
     lines = lines_of(text, {path for path, _ in some}) if text else {}
-    told = []
+    words = []
     for path, what in some:
         place = f"line {lines[path]}: " if text else ""
-        told.append(f"{origin}: {place}{f'{shown(path)}: ' if path else ''}{what}")
+        words.append(f"{origin}: {place}{f'{shown(path)}: ' if path else ''}{what}")
     more = len(faults) - SHOWN_FAULTS
-    return ConfigError(told + ([f"{origin}: and {more} more faults, not shown"] if more > 0 else []))
+    return ConfigError(words + ([f"{origin}: and {more} more faults, not shown"] if more > 0 else []))

@@ -69,25 +69,31 @@ def figure(height_in: float) -> Figure:
 
 def save(drawn: Figure, directory: Path, name: str) -> str:
     """Write NAME.svg, .png and .pdf; gives the SVG for the page, with its own ids. Raises OSError."""
+    text = svg(drawn)
+    (directory / f"{name}.svg").write_text(text, encoding="utf-8")
+    drawn.savefig(directory / f"{name}.png", dpi=160)
+    drawn.savefig(directory / f"{name}.pdf", metadata={"CreationDate": None})
+    return _inline(text, name)
+
+
+def svg(drawn: Figure) -> str:
+    """The figure as the text of an SVG file."""
     drawn.draw_without_rendering()
     drawn.set_layout_engine("none")  # the layout is computed once, not for each format
     buffer = io.StringIO()
     drawn.savefig(buffer, format="svg", metadata={"Date": None})
-    (directory / f"{name}.svg").write_text(buffer.getvalue(), encoding="utf-8")
-    drawn.savefig(directory / f"{name}.png", dpi=160)
-    drawn.savefig(directory / f"{name}.pdf", metadata={"CreationDate": None})
-    return _inline(buffer.getvalue(), name)
+    return buffer.getvalue()
 
 
-def _inline(svg: str, name: str) -> str:
+def _inline(text: str, name: str) -> str:
     """The svg element only, with colours from the page and with ids that no other figure of the page has."""
-    svg = svg[svg.index("<svg") :]
-    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
-    svg = re.sub(r"<svg [^>]*?>", lambda m: re.sub(r' (width|height)="[^"]*"', "", m[0]), svg, count=1)
-    svg = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{name}-", svg)
+    text = text[text.index("<svg") :]
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    text = re.sub(r"<svg [^>]*?>", lambda m: re.sub(r' (width|height)="[^"]*"', "", m[0]), text, count=1)
+    text = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{name}-", text)
     for colour, variable in _VARIABLES.items():
-        svg = svg.replace(colour, f"var({variable})")
-    return svg
+        text = text.replace(colour, f"var({variable})")
+    return text
 
 
 def bare(axes: Axes) -> None:

@@ -24,7 +24,7 @@ from tests.unit.recorded_bench import record
 from tests.unit.test_report_numbers import fields, moving
 
 SECONDS = 41.0  # three positions of the bench
-VOID = {"meta", "br", "use", "path", "image", "rect", "circle", "line"}
+VOID = {"meta", "img", "br", "use", "path", "image", "rect", "circle", "line"}
 
 
 class Page(HTMLParser):

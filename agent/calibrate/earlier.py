@@ -1,0 +1,88 @@
+"""Reads S, Q and their covariance of an earlier calibration: a result, a certificate in JSON, or a DCC of ours in XML.
+
+XML is read without document types and entities: nothing in it can name another file, and nothing in it expands.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET
+from xml.parsers import expat
+
+import numpy as np
+
+from agent.config.files import read_file
+from agent.reading.source import TableError
+from calib.model import PARAMETERS, Array
+
+LARGEST = 64 << 20  # bytes; a result lists all its windows, each with 0.3 kB
+DCC, SI = "https://ptb.de/dcc", "https://ptb.de/si"  # namespaces
+PARAMETER_LIST, COVARIANCE = "fieldcal_parameters", "fieldcal_covariance"  # refType of what is ours in a DCC
+
+
+def read_earlier(path: Path) -> tuple[Array, Array]:
+    """S row by row and Q (12,), and their covariance (12, 12); NaN where nothing is known. Raises TableError."""
+    try:
+        data = read_file(path, LARGEST)
+        return _from_xml(data) if data.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<") else _from_json(data)
+    except OSError as error:
+        raise TableError(f"{path}: {error.strerror}") from None
+    except _OtherXmlError as error:
+        raise TableError(f"{path}: {error}") from None
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise TableError(
+            f"{path}: the file is neither a result of `fieldcal calibrate --json -` "
+            f"nor a certificate of `fieldcal certificate`: {error}"
+        ) from None
+
+
+class _OtherXmlError(Exception):
+    """XML without S and Q as this program writes them."""
+
+
+def _from_json(data: bytes) -> tuple[Array, Array]:
+    told: dict[str, Any] = json.loads(data)
+    if "certificate" in told:
+        told = told["certificate"]["result"]
+    values = np.append(np.array(told["sensitivity"], dtype=float).ravel(), np.array(told["offset"], dtype=float))
+    return values, np.array(told["covariance"], dtype=float)
+
+
+def _from_xml(data: bytes) -> tuple[Array, Array]:
+    _refuse_document_type(data)
+    root = ET.fromstring(data)
+    if root.tag != f"{{{DCC}}}digitalCalibrationCertificate":
+        raise _OtherXmlError("the XML is no digital calibration certificate (DCC)")
+    quantity = root.find(f".//{{{DCC}}}quantity[@refType='{COVARIANCE}']/{{{SI}}}realListXMLList")
+    if quantity is None:
+        raise _OtherXmlError(
+            f"the DCC has no quantity with refType {COVARIANCE}, so it is not from `fieldcal certificate`; "
+            "state its sensitivity with --nominal"
+        )
+    labels = (quantity.findtext(f"{{{SI}}}labelXMLList") or "").split()
+    columns = quantity.findall(f".//{{{SI}}}column")
+    told = [[float(entry.text or "") for entry in column.iter(f"{{{SI}}}value")] for column in columns]
+    read = np.array((quantity.findtext(f"{{{SI}}}valueXMLList") or "").split(), dtype=float)
+    if len(set(labels)) != len(labels) or read.shape != (len(labels),) or np.shape(told) != (len(labels), len(labels)):
+        raise _OtherXmlError(f"{COVARIANCE}: there must be as many values, columns and rows as labels, each label once")
+    places = [PARAMETERS.index(label) for label in labels]
+    values, covariance = np.full(12, np.nan), np.full((12, 12), np.nan)
+    values[places] = read
+    covariance[np.ix_(places, places)] = np.transpose(told)
+    return values, covariance
+
+
+def _refuse_document_type(data: bytes) -> None:
+    """Raises _OtherXmlError where the XML has a document type, which entities need, or where it is broken."""
+
+    def refuse(*_: object) -> None:
+        raise _OtherXmlError("the XML has a document type (DOCTYPE), which is not read; remove it")
+
+    parser = expat.ParserCreate()
+    parser.StartDoctypeDeclHandler = refuse
+    try:
+        parser.Parse(data, True)
+    except expat.ExpatError as error:
+        raise _OtherXmlError(f"the XML is broken: {error}") from None

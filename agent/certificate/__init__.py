@@ -1,0 +1,1 @@
+"""The calibration certificate: what it states, and its forms PDF, HTML, DCC XML and JSON."""

@@ -1,0 +1,254 @@
+"""The content of a certificate: what was stated, what was measured, and what follows from both."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from agent import __version__
+from agent.calibrate.origin import SourceFile, source_file
+from agent.certificate.provenance import graph
+from agent.certificate.statements import Decision, Statements
+from agent.core.events import CalibrationUpdate
+from agent.report.material import Material, MaterialError
+from agent.report.result import CalibrationResult, plain
+from agent.report.trace import Residuals
+from calib.distributions import NORMAL
+from calib.model import PARAMETERS, Array
+
+COVERAGE_PROBABILITY = NORMAL.cdf(2.0) - NORMAL.cdf(-2.0)  # 95.45 %, for which `coverage_factor` gives k
+MAIN = [0, 4, 8]
+EQUATION = "V(t) = S a(t − lag) + Q"
+FORMAT = 1  # of certificate.json
+
+
+Row = tuple[float | None, float | None, float | None]
+Matrix = tuple[Row, Row, Row]
+
+
+class CertificateError(Exception):
+    """No certificate can be made with these statements. The message names the field and the remedy."""
+
+
+class Band(msgspec.Struct, frozen=True):
+    """The complex sensitivity in one third octave; None where it is not known."""
+
+    low_hz: float
+    high_hz: float
+    sensitivity_re: Matrix | None
+    sensitivity_im: Matrix | None
+    standard_uncertainty: Matrix | None
+
+
+class Frequencies(msgspec.Struct, frozen=True):
+    """Where S holds, as the result tells it; None where it does not."""
+
+    reference_frequency_hz: float | None = None
+    valid_band_hz: tuple[float, float] | None = None
+    response: tuple[Band, ...] | None = None
+
+    @property
+    def bands(self) -> tuple[Band, ...]:
+        """Those that are known."""
+        known = self.response or ()
+        return tuple(b for b in known if b.sensitivity_re and b.sensitivity_im and b.standard_uncertainty)
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """One main sensitivity against the limit: deviation from the nominal one and U, both in %."""
+
+    parameter: str
+    deviation_pct: float
+    expanded_uncertainty_pct: float
+    limit_pct: float
+    conforms: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Certificate:
+    """All that the forms of a certificate show. `relative_pct` (12,): U of S in % of the main sensitivity of its row,
+    NaN for Q. `levels_mps2`: least and largest rms of the motion in a used window. `seen`: residuals for the figure."""
+
+    stated: Statements
+    number: str
+    sensor: str
+    result: CalibrationResult
+    reference_file: SourceFile | None
+    files: tuple[SourceFile, ...]
+    temperature_degc: tuple[float, float] | None
+    told: Frequencies
+    frequency_hz: tuple[float, ...]
+    levels_mps2: tuple[float, float] | None
+    positions: tuple[str, ...]
+    relative_pct: Array
+    verdicts: tuple[Verdict, ...]
+    history: tuple[CalibrationUpdate, ...]
+    seen: tuple[Residuals, ...]
+
+    @property
+    def statement(self) -> str:
+        """Whether the calibration is accredited."""
+        accredited = self.stated.accreditation
+        if accredited is None:
+            return (
+                "This is a field calibration: the sensor was calibrated where it is used. It is not accredited. "
+                "It does not claim conformity with ISO/IEC 17025."
+            )
+        return f"The organisation states that {accredited.body} accredited it for this, number {accredited.number}."
+
+    @property
+    def method(self) -> str:
+        """The method in words."""
+        told = str(self.result.fields.get("method") or "3")
+        return f"In-place comparison with a reference, method {told} of D'Emilia et al. (2018)"
+
+
+def certificate_of(material: Material, stated: Statements, beside: Path, seen: Iterable[Residuals]) -> Certificate:
+    """The certificate of the first result. `beside`: directory of certificate.toml. Raises CertificateError and
+    MaterialError."""
+    result = material.results[0]
+    result = replace(result, unit=_unit(result.unit, stated.instrument.output_unit))
+    residuals, levels = tuple(seen), _levels(material)
+    source = material.files[0].path if material.files else "the input"
+    try:
+        told = msgspec.convert(result.fields, Frequencies)
+    except msgspec.ValidationError as error:
+        raise MaterialError(f"{source}: {error}; make the result again with `fieldcal calibrate`") from None
+    known = np.isfinite(result.values) & np.isfinite(result.expanded_uncertainty)
+    if not any(np.isfinite(result.covariance[k][known]).all() for k in np.flatnonzero(known)):
+        raise MaterialError(
+            f"{source}: expanded_uncertainty, covariance: the result has none; make it again with `fieldcal calibrate`"
+        )
+    found = Certificate(
+        stated=stated, number=stated.number, sensor=material.sensor, result=result,
+        reference_file=_reference_file(stated.reference.certificate_file, beside), files=tuple(material.files),
+        temperature_degc=_temperature(stated, material.history), told=told, frequency_hz=_frequencies(residuals),
+        levels_mps2=(min(levels), max(levels)) if levels else None,
+        positions=tuple(dict.fromkeys(w.position for w in result.windows if w.used and w.position)),
+        relative_pct=_relative(result), verdicts=_verdicts(result, stated.decision),
+        history=tuple(material.history), seen=residuals,
+    )  # fmt: skip
+    if found.number:
+        return found
+    digest = hashlib.sha256(msgspec.json.encode(as_object(found))).hexdigest()
+    return replace(found, number=f"FC-{stated.dates.issued}-{digest[:12]}")
+
+
+def as_object(certificate: Certificate) -> dict[str, Any]:
+    """The member `certificate` of certificate.json."""
+    c, result = certificate, certificate.result
+    told = result.fields
+    measured = plain(
+        {name: told.get(name) for name in
+         ("sensitivity", "offset", "standard_uncertainty", "expanded_uncertainty", "covariance", "determined",
+          "response", "budget", "lag_s", "frame", "method", "uncertainty_kind", "identity")}
+        | {"parameters": PARAMETERS, "output_unit": result.unit, "degrees_of_freedom": result.degrees_of_freedom,
+           "coverage_probability": COVERAGE_PROBABILITY, "expanded_uncertainty_pct": c.relative_pct}
+    )  # fmt: skip
+    return {
+        "format": FORMAT,
+        "number": c.number,
+        "statement": c.statement,
+        "stated": c.stated.model_dump(mode="json"),
+        "sensor": c.sensor,
+        "reference_certificate": None if c.reference_file is None else msgspec.structs.asdict(c.reference_file),
+        "method": {"name": c.method, "equation": EQUATION},
+        "conditions": plain(
+            {
+                "temperature_degc": c.temperature_degc,
+                "reference_frequency_hz": c.told.reference_frequency_hz,
+                "valid_band_hz": c.told.valid_band_hz,
+                "motion_frequency_hz": c.frequency_hz,
+                "levels_mps2": c.levels_mps2,
+                "positions": c.positions,
+                "windows": sum(w.used for w in result.windows),
+            }
+        ),
+        "result": measured,
+        "conformity": plain([{
+            "parameter": v.parameter, "deviation_pct": v.deviation_pct,
+            "expanded_uncertainty_pct": v.expanded_uncertainty_pct, "limit_pct": v.limit_pct, "conforms": v.conforms,
+        } for v in c.verdicts]),
+        "made_from": [msgspec.structs.asdict(file) for file in c.files],
+        "made_by": {"fieldcal": __version__, "calibrated_with": told.get("version")},
+        "provenance": graph(c, measured),
+    }  # fmt: skip
+
+
+def _unit(told: str, stated: str) -> str:
+    if told and stated and told != stated:
+        raise CertificateError(
+            f"instrument.output_unit: the result is in {told}, not in {stated}; correct it, or leave it out"
+        )
+    if not told and not stated:
+        raise CertificateError(
+            "instrument.output_unit: is missing, and the result does not state it; add it, for example mV or count"
+        )
+    return told or stated
+
+
+def _reference_file(name: str, beside: Path) -> SourceFile | None:
+    if not name:
+        return None
+    path = beside / name
+    try:
+        return replace_path(source_file(path), name)
+    except OSError as error:
+        raise CertificateError(f"reference.certificate_file: {path}: {error.strerror or error}") from None
+
+
+def replace_path(file: SourceFile, name: str) -> SourceFile:
+    """The same file under the name that was stated for it."""
+    return SourceFile(name, file.size_bytes, file.sha256)
+
+
+def _temperature(stated: Statements, history: list[CalibrationUpdate]) -> tuple[float, float] | None:
+    low, high = stated.conditions.temperature_low_degc, stated.conditions.temperature_high_degc
+    if low is not None and high is not None:
+        return low, high
+    newest = history[-1] if history else None
+    if newest is None or not np.isfinite([newest.temperature_low_degc, newest.temperature_high_degc]).all():
+        return None
+    return newest.temperature_low_degc, newest.temperature_high_degc
+
+
+def _frequencies(seen: tuple[Residuals, ...]) -> tuple[float, ...]:
+    """Least and largest mean frequency of the motion in the windows that can be shown point by point."""
+    found = [r.frequency_hz for r in seen if r.frequency_hz is not None]
+    return (min(found), max(found)) if found else ()
+
+
+def _levels(material: Material) -> list[float]:
+    """Root mean square of the reference's motion in each used window, as far as it is known."""
+    windows = material.results[0].fields.get("windows")
+    entries = [w for w in windows if isinstance(w, dict) and w.get("used")] if isinstance(windows, list) else []
+    numbers = [entry.get("numbers") for entry in entries]
+    told = [n.get("reference_rms_mps2") for n in numbers if isinstance(n, dict)]
+    moved = [trace.reference for trace in material.traces.values() if trace.reference.size]
+    rms = [float(np.sqrt(np.mean(np.var(reference, axis=0)))) for reference in moved]
+    return [float(level) for level in told if isinstance(level, int | float)] or rms
+
+
+def _relative(result: CalibrationResult) -> Array:
+    main = np.repeat(np.abs(result.values[MAIN]), 3)
+    return np.append(100.0 * result.expanded_uncertainty[:9] / main, np.full(3, np.nan))
+
+
+def _verdicts(result: CalibrationResult, decision: Decision | None) -> tuple[Verdict, ...]:
+    if decision is None:
+        return ()
+    found = []
+    for k in MAIN:
+        value, expanded = result.values[k], result.expanded_uncertainty[k]
+        deviation, U = 100.0 * (value / decision.nominal - 1.0), 100.0 * expanded / decision.nominal
+        guard = U if decision.rule == "guard band" else 0.0
+        conforms = bool(abs(deviation) + guard <= decision.limit_pct)  # NaN, for what is not known, does not conform
+        found.append(Verdict(PARAMETERS[k], float(deviation), float(U), decision.limit_pct, conforms))
+    return tuple(found)

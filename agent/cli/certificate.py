@@ -1,0 +1,72 @@
+"""`fieldcal certificate`: a calibration certificate as PDF, HTML, DCC XML and JSON. It needs the extra `report`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from agent.config.key_file import KeyFileError, load_private_key
+from agent.config.reading import ConfigError, load_model
+from agent.terminal.text import say
+
+_FILE = click.Path(path_type=Path, dir_okay=False)
+
+
+@click.command()
+@click.argument("inputs", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="INPUT...")
+@click.option("--stated", type=_FILE, required=True, metavar="certificate.toml",
+              help="What only people know: organisation, customer, serial numbers, dates.")  # fmt: skip
+@click.option("-o", "--output", type=click.Path(path_type=Path, file_okay=False), required=True, metavar="DIR",
+              help="Directory for certificate.pdf, .html, .xml and .json.")  # fmt: skip
+@click.option("--key", type=_FILE, help="Ed25519 private key (PEM) that signs the certificate.")
+@click.option("--xsd", type=_FILE, help="dcc.xsd of PTB, with SI_Format.xsd beside it: the XML is checked against it.")
+@click.option("--sensor", metavar="NAME", help="The sensor, if the input has several.")
+def certificate(
+    inputs: tuple[Path, ...], stated: Path, output: Path, key: Path | None, xsd: Path | None, sensor: str | None
+) -> int:
+    """Make a calibration certificate.
+
+    INPUT is RESULT.json of `fieldcal calibrate --json RESULT.json`, a recording (several of one sensor are read one
+    after the other), or the data directory of an agent: its calibration in force.
+
+    Exit status 3 if the data were refused: then there is no certificate. 2 if the input cannot be used.
+    """
+    try:
+        import matplotlib  # noqa: F401 - imported to check for it before any other work
+    except ImportError:
+        say("fieldcal certificate: the PDF needs matplotlib; install it with: pip install 'fieldcal[report]'", err=True)
+        return 1
+    from agent.certificate.content import CertificateError, certificate_of
+    from agent.certificate.schema import SchemaError
+    from agent.certificate.statements import Statements
+    from agent.certificate.writing import write
+    from agent.report.material import MaterialError, gather
+    from agent.report.writing import left_over
+
+    try:
+        told = load_model(stated, Statements)
+        private = None if key is None else load_private_key(key)
+        material = gather(inputs, sensor)
+        if len(material.results) > 1:
+            raise MaterialError("a certificate is of one result; give one RESULT.json")
+        if material.results[0].refused:
+            for reason in material.results[0].reasons:
+                say(f"refused: {reason}", err=True)
+            return 3
+        written = write(certificate_of(material, told, stated.parent, left_over(material)), output, private, xsd)
+    except (ConfigError, KeyFileError, MaterialError, SchemaError) as error:
+        for line in str(error).splitlines():
+            say(f"fieldcal certificate: {line}", err=True)
+        return 2
+    except CertificateError as error:
+        say(f"fieldcal certificate: {stated}: {error}", err=True)
+        return 2
+    except OSError as error:
+        say(f"fieldcal certificate: {error.filename or output}: {error.strerror}", err=True)
+        return 2
+    for notice in material.notices:
+        say(f"fieldcal certificate: {notice}", err=True)
+    for path in written:
+        say(str(path))
+    return 0

@@ -1,0 +1,1 @@
+"""Samples and results of recordings in the formats of other programs."""

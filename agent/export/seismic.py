@@ -1,0 +1,51 @@
+"""MiniSEED of samples, written by ObsPy in records of 512 bytes as 64-bit numbers."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from agent.export.samples import Content, ExportError, Samples, new_file
+from agent.export.tables import columns
+
+NETWORK = "XX"  # of the FDSN: for data that belong to no registered network
+INDICATION, ACCELERATION = "00", "10"  # location codes
+# Band codes of SEED for instruments that respond down to 10 s and below, each from this rate on in Hz.
+BANDS = ((1000.0, "F"), (250.0, "C"), (80.0, "H"), (10.0, "B"), (1.0, "M"), (0.0, "L"))
+
+
+def write_mseed(path: Path, content: Content, blocks: Iterable[Samples]) -> int:
+    """Write a channel for each axis: indications at location 00, accelerations in m/s2 at location 10.
+
+    Each block begins with its own time; the rate is that of the first block. Raises ExportError without ObsPy.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # ObsPy's own, about packages that it uses
+        try:
+            from obspy import Stream, Trace, UTCDateTime
+        except ImportError:
+            raise ExportError(
+                f"{path}: MiniSEED needs ObsPy; install it with: pip install 'fieldcal[seismic]'"
+            ) from None
+        rows, rate_hz = 0, 0.0
+        station = re.sub("[^A-Z0-9]", "", content.device.upper())[:5] or "FIELD"
+        with new_file(path) as file:
+            for block in blocks:
+                rate_hz = rate_hz or float(np.float32(block.rate_hz))  # as precise as a record has it
+                code = next(letter for least_hz, letter in BANDS if rate_hz >= least_hz)
+                about = {
+                    "network": NETWORK, "station": station, "sampling_rate": rate_hz,
+                    "starttime": UTCDateTime(ns=int(block.t_utc_ns[0])),
+                }  # fmt: skip
+                stream = Stream()
+                for k, values in enumerate(columns(content, block).T):
+                    location = INDICATION if k < content.axes else ACCELERATION
+                    names = {"location": location, "channel": f"{code}N{k % content.axes + 1}"}
+                    stream.append(Trace(np.ascontiguousarray(values), about | names))
+                stream.write(file, format="MSEED", encoding="FLOAT64", reclen=512)
+                rows += len(block.values)
+    return rows

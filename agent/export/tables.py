@@ -1,0 +1,124 @@
+"""Tables of samples: CSV, Parquet, WAV. Each is written piece by piece, so memory does not grow with the length."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.export.samples import Content, ExportError, Samples, new_file
+from calib.model import Array
+
+QUANTITIES = {"m/s2": "a", "m/s": "v", "m": "d"}  # name of the column of a uniaxial device, by its unit
+FORMULA = ("=", "+", "-", "@", "\t", "\r")  # with which a cell begins that a spreadsheet would calculate
+LARGEST_WAV = 0xFFFFFFFF - 4096  # bytes: its sizes have 32 bits
+LONGEST_HOLE = 1_000_000  # samples that are filled up in a WAV file
+WAV_FLOAT = 3
+
+
+def names_of(content: Content) -> list[str]:
+    """Columns without the time: indications as `fieldcal calibrate` names them, then accelerations in m/s2."""
+    if content.axes == 3:
+        return ["vx", "vy", "vz", *(["ax", "ay", "az"] if content.calibrations else [])]
+    return [QUANTITIES.get(content.unit, f"indication_{content.unit}")]
+
+
+def write_csv(path: Path, content: Content, blocks: Iterable[Samples]) -> int:
+    """Write `time_s` (UTC since 1970, all nine digits) and the columns; `nan` is a value that is not there."""
+    rows = 0
+    with new_file(path) as file:
+        file.write((",".join(map(cell, ["time_s", *names_of(content)])) + "\n").encode())
+        for block in blocks:
+            times = (f"{t // 10**9}.{t % 10**9:09d}" for t in block.t_utc_ns.tolist())
+            values = columns(content, block).tolist()
+            lines = (f"{t},{','.join(map(repr, row))}\n" for t, row in zip(times, values, strict=True))
+            file.writelines(map(str.encode, lines))
+            rows += len(values)
+    return rows
+
+
+def cell(text: str) -> str:
+    """A text as a cell of CSV that no spreadsheet takes for a formula."""
+    text = f"'{text}" if text.startswith(FORMULA) else text
+    return '"' + text.replace('"', '""') + '"' if set(text) & set(',"\r\n') else text
+
+
+def write_parquet(path: Path, content: Content, blocks: Iterable[Samples]) -> int:
+    """Write `time` (a date of UTC in ns) and the columns as float64. Raises ExportError without pyarrow."""
+    try:
+        import pyarrow as pa
+        from pyarrow import parquet
+    except ImportError:
+        raise ExportError(f"{path}: Parquet needs pyarrow; install it with: pip install 'fieldcal[files]'") from None
+    names = names_of(content)
+    time = pa.timestamp("ns", tz="UTC")
+    about = {"device": content.device, "unit": content.unit, "ax, ay, az": "m/s2"}
+    schema = pa.schema([("time", time), *((name, pa.float64()) for name in names)], metadata=about)
+    rows = 0
+    with new_file(path) as file, parquet.ParquetWriter(file, schema) as writer:
+        for t_utc_ns, values in _gathered(content, blocks):
+            arrays = [pa.array(t_utc_ns, time), *(pa.array(column) for column in values.T)]
+            writer.write_table(pa.table(arrays, schema=schema))
+            rows += len(values)
+    return rows
+
+
+def write_wav(path: Path, content: Content, blocks: Iterable[Samples]) -> int:
+    """Write a channel of 64-bit floating-point numbers for each column; a lost sample is a frame of NaN.
+
+    The rate is that of the clock, rounded to whole Hz, as the format wants it. Raises ExportError.
+    """
+    channels, frames, following, rate_hz = len(names_of(content)), 0, None, 0.0
+    with new_file(path) as file:
+        _wav_head(file, channels, 1, 0)
+        for block in blocks:
+            hole = 0 if following is None else max(block.first_index - following, 0)
+            if hole > LONGEST_HOLE:
+                raise ExportError(
+                    f"{path}: {hole} samples are missing in one place; WAV has no times; write it as .csv"
+                )
+            values = np.vstack([np.full((hole, channels), np.nan), columns(content, block)])
+            if (frames + len(values)) * channels * 8 > LARGEST_WAV:
+                raise ExportError(
+                    f"{path}: a WAV file has 4 GB at most; export fewer recordings at once, or to .parquet"
+                )
+            file.write(values.astype("<f8").tobytes())
+            frames, following, rate_hz = frames + len(values), block.first_index + len(block.values), block.rate_hz
+        file.seek(0)
+        _wav_head(file, channels, max(round(rate_hz), 1), frames)
+    return frames
+
+
+def _wav_head(file: BinaryIO, channels: int, rate_hz: int, frames: int) -> None:
+    frame = channels * 8
+    size = frames * frame
+    form = struct.pack("<4sIHHIIHH", b"fmt ", 16, WAV_FLOAT, channels, rate_hz, rate_hz * frame, frame, 64)
+    file.write(struct.pack("<4sI4s", b"RIFF", 36 + size, b"WAVE") + form + struct.pack("<4sI", b"data", size))
+
+
+def columns(content: Content, block: Samples) -> Array:
+    """The columns (n, k) in the order of `names_of`."""
+    if content.axes != 3 or not content.calibrations:
+        return block.values
+    none = np.full((len(block.values), 3), np.nan)
+    return np.hstack([block.values, none if block.acceleration is None else block.acceleration])
+
+
+def _gathered(
+    content: Content, blocks: Iterable[Samples], rows: int = 1 << 16
+) -> Iterator[tuple[NDArray[np.int64], Array]]:
+    """Blocks put together to pieces of about so many rows: a file with a part for each block would be slow to read."""
+    times: list[NDArray[np.int64]] = []
+    values: list[Array] = []
+    for block in blocks:
+        times.append(block.t_utc_ns)
+        values.append(columns(content, block))
+        if sum(map(len, values)) >= rows:
+            yield np.concatenate(times), np.concatenate(values)
+            times, values = [], []
+    if values:
+        yield np.concatenate(times), np.concatenate(values)
