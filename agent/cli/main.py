@@ -15,6 +15,7 @@ from agent import __version__
 
 INTERRUPTED = 130  # exit status after Ctrl-C: 128 and the number of SIGINT
 COMMANDS = {
+    "init": ("agent.cli.init", "Write a configuration for the devices of this machine."),
     "run": ("agent.cli.run", "Run the agent: read devices, calibrate, record and publish."),
     "calibrate": ("agent.cli.calibrate", "Calibrate a sensor from recorded files."),
     "convert": ("agent.cli.convert", "Write a recorded file of another format as CSV."),
