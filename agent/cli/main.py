@@ -33,6 +33,8 @@ COMMANDS = {
         "agent.cli.simulate",
         "Serve virtual devices on pseudo-terminals, or write a recording with known true values.",
     ),
+    "doctor": ("agent.cli.doctor", "Check this gateway: clock, devices, disk, certificates; with remedies."),
+    "extras": ("agent.cli.extras", "List the optional parts, and install them, also without network."),
     "check": ("agent.cli.check", "List all faults of a configuration."),
 }
 

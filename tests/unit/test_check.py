@@ -159,7 +159,7 @@ def test_a_driver_whose_library_is_missing_is_a_fault(
     text = text.replace('port = "/dev/ttyUSB1"\nrate_hz = 100\naxes = 1\n', f"options = {options}\n")
     [line] = checked(tmp_path / "f.toml", text, capsys)
     assert line.startswith(
-        f"line 9: devices.1.driver: driver {driver} needs {module} (pip install 'fieldcal[{extra}]')"
+        f"line 9: devices.1.driver: driver {driver} needs {module} (fieldcal extras --install {extra})"
     )
 
 
