@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import subprocess
 from dataclasses import asdict
-from importlib.util import find_spec
 from pathlib import Path
 
 import click
@@ -56,10 +55,10 @@ def extras(names: tuple[str, ...], wheels: Path | None, index: bool, json_to: st
 
 def _install(chosen: list[Extra], wheels: Path | None) -> bool:
     """Run pip; says what it does. Whether it succeeded."""
-    if find_spec("pip") is None:
-        say("fieldcal extras: this Python has no pip; install it first: python3 -m ensurepip", err=True)
-        return False
     command = install_command(chosen, wheels)
+    if command is None:
+        say("fieldcal extras: there is no pip; install it first: sudo apt-get install python3-pip", err=True)
+        return False
     say(" ".join(command), err=True)
     done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
     if done.returncode != 0:

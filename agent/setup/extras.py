@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import importlib.metadata as metadata
 import re
+import shutil
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
 # What each part is for. Parts that only serve the work on fieldcal itself have no line here and are not listed.
@@ -59,11 +61,20 @@ def extras() -> list[Extra]:
     ]
 
 
-def install_command(chosen: Sequence[Extra], wheels: Path | None) -> list[str]:
-    """The command that installs the parts: from the wheels in a directory alone, or (None) from the package index."""
+def install_command(chosen: Sequence[Extra], wheels: Path | None) -> list[str] | None:
+    """The command that installs the parts: from the wheels in a directory alone, or (None) from the package index.
+
+    Without a pip of its own, as in the Debian package, the one of the system is used. None where there is none.
+    """
+    if find_spec("pip") is not None:
+        pip = [sys.executable, "-m", "pip"]
+    elif shared := shutil.which("pip3"):
+        pip = [shared, "--python", sys.executable]
+    else:
+        return None
     source = [] if wheels is None else ["--no-index", "--find-links", str(wheels)]
     needed = [requirement for extra in chosen for requirement in extra.requirements]
-    return [sys.executable, "-m", "pip", "install", "--disable-pip-version-check", *source, *needed]
+    return [*pip, "install", "--disable-pip-version-check", *source, *needed]
 
 
 def _is_installed(package: str) -> bool:

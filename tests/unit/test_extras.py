@@ -47,6 +47,7 @@ def test_wheels_beside_it_are_enough(tmp_path: Path) -> None:
         file.writestr(f"{information}/RECORD", "")
     part = parts.Extra("test", "", ("fieldcal-test-part<2,>=1",), ("fieldcal-test-part",))
     command = parts.install_command([part], tmp_path)
+    assert command is not None
     assert command[:3] == [sys.executable, "-m", "pip"]
     if find_spec("pip") is None:
         pytest.skip("this Python has no pip")
