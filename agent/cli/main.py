@@ -25,6 +25,7 @@ COMMANDS = {
     "show": ("agent.cli.show", "Show the calibration in force, status and history of a data directory."),
     "report": ("agent.cli.report", "Make figures and a one-page report of a calibration."),
     "sensors": ("agent.cli.sensors", "List the drivers with their options."),
+    "new-driver": ("agent.cli.new_driver", "Write the skeleton of a driver package, with the contract test."),
     "probe": ("agent.cli.probe", "Find and self-test the devices on this machine's buses and ports."),
     "command": ("agent.cli.command", "Send a signed command to an agent: pose, hold, accept, rollback."),
     "keys": ("agent.cli.keys", "Make certificates for Zenoh over TLS, and keys that sign commands."),
@@ -41,6 +42,8 @@ COMMANDS = {
     "check": ("agent.cli.check", "List all faults of a configuration."),
 }
 
+EVERYWHERE = ("calibrate", "convert", "report", "replay", "audit", "show")  # the others need Linux
+
 
 class LazyGroup(click.Group):
     """Loads a command's module only when the command is called, so that `fieldcal show` does not load Zenoh."""
@@ -51,6 +54,8 @@ class LazyGroup(click.Group):
     def get_command(self, _: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in COMMANDS:
             return None
+        if sys.platform != "linux" and cmd_name not in EVERYWHERE:
+            raise click.ClickException(f"{cmd_name} needs Linux; {', '.join(EVERYWHERE)} work here too")
         command = getattr(importlib.import_module(COMMANDS[cmd_name][0]), cmd_name.replace("-", "_"))
         assert isinstance(command, click.Command)
         return command
