@@ -96,7 +96,8 @@ def _told_rates(config: Config, data_dir: Path) -> Iterator[Finding]:
         with History(data_dir / FILE_NAME) as history:
             for channel in config.channels:
                 for record in history.newest(channel.sensor, "clock", limit=NEWEST):
-                    told.setdefault(record.fields["device"], record.fields)
+                    if record.fields["rate_hz"] is not None:  # null: not known in this minute
+                        told.setdefault(record.fields["device"], record.fields)
     except (StoreError, sqlite3.Error) as error:
         yield Finding("throughput", "fault", f"the store cannot be read: {error}", "look at the log of the agent")
         return

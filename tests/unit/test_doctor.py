@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import socket
 import time
@@ -16,6 +17,9 @@ import pytest
 
 from agent.cli.main import run_cli
 from agent.config import Config, parse_config
+from agent.core.events import ClockReport
+from agent.delivery.history import Record
+from agent.delivery.store import Store
 from agent.setup import device_checks, machine_checks
 from agent.setup.finding import Finding
 from hw.adxl355 import Adxl355Options
@@ -147,6 +151,36 @@ def test_the_rate_that_a_device_delivers(rate_hz: float, verdict: str) -> None:
         device.stop()
     assert found[0] == verdict, found
     assert "nominal 200" in found[1]
+
+
+def test_the_rates_that_a_running_agent_has_measured(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, data_dir = tmp_path / "gateway.toml", tmp_path / "data"
+    assert run_cli(["init", str(path), "--sensor", "adxl355", "--no-reference"]) == 0
+
+    def clock(sequence: int, rate_hz: float) -> Record:
+        return Record.of(
+            ClockReport(
+                run_id="run", sequence=sequence, sensor="sensor", t_utc_ns=sequence, device="sensor", role="sensor",
+                nominal_rate_hz=1000.0, rate_hz=rate_hz, u_rate_hz=0.1, offset_s=0.0, u_offset_s=0.0, jitter_s=0.0,
+                lag_s=math.nan, u_lag_s=math.nan, arrivals=100,
+            ),
+            recorded=True, recording="",
+        )  # fmt: skip
+
+    def throughput() -> list[tuple[str, str]]:
+        capsys.readouterr()
+        run_cli(["doctor", str(path), "--data-dir", str(data_dir), "--json", "-"])
+        found = json.loads(capsys.readouterr().out)["findings"]
+        return [(f["verdict"], f["says"]) for f in found if f["check"] == "throughput"]
+
+    store = Store(data_dir, 0)  # holds the lock, as an agent does
+    assert throughput() == [("good", "the agent runs; it tells the rates after its first minute")]
+    store.commit([clock(1, 903.0), clock(2, 1003.0), clock(3, math.nan)])
+    assert throughput() == [("good", "sensor: 1003 samples a second, nominal 1000")]
+    store.commit([clock(4, 903.0)])
+    assert throughput() == [("fault", "sensor: 903 samples a second, nominal 1000")]
+    store.close()
+    assert throughput() == [("good", "not measured")]
 
 
 def test_the_command_tells_all_and_its_status(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
