@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PRESET ?= plain
 
-.PHONY: run test nightly lint bench faults faults-short soak lock clean
+.PHONY: run test nightly lint bench faults faults-short soak lock deb clean
 
 $(VENV)/runtime: requirements.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "fieldcal needs Python 3.11 or later, this is " + sys.version)'
@@ -55,6 +55,9 @@ faults-short: $(VENV)/development  ## the same in a few minutes; skips what this
 soak: $(VENV)/development  ## 24 h in 72 min, then an hour in real time; writes docs/reliability.md
 	$(BIN)/python -m benchmarks.soak --part soak-day
 	$(BIN)/python -m benchmarks.soak --hours 1 --speed 1 --rate-hz 1000 --part soak-hour
+
+deb: $(VENV)/runtime  ## the Debian package, into dist/; ARCH=arm64 for that architecture
+	deploy/debian/build.sh $(if $(ARCH),--arch $(ARCH))
 
 lock:  ## make the lock files anew (needs uv)
 	uv pip compile --universal --python-version 3.11 --generate-hashes --no-annotate --extra build pyproject.toml -o requirements.lock

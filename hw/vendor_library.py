@@ -18,5 +18,5 @@ def vendor_library(module: str, driver: str, extra: str, besides: str) -> Any:
     except (ImportError, OSError) as error:  # OSError: the Python package is installed, its C library is not
         package = module.partition(".")[0]
         raise ConfigurationError(
-            f"driver {driver} needs {package} (pip install 'fieldcal[{extra}]') and {besides}: {error}"
+            f"driver {driver} needs {package} (fieldcal extras --install {extra}) and {besides}: {error}"
         ) from error

@@ -2,34 +2,61 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
 import click
 
-from agent.config import ConfigError, load_config
+from agent.config import Config, ConfigError, load_config
 from agent.config.tls import expiry_warning
 from agent.terminal.text import say
 
 
 @click.command()
 @click.argument("config", type=click.Path(path_type=Path))
-def check(config: Path) -> int:
-    """Report every fault in CONFIG, with its line, its setting and what to do. Exit status 2 if there is a fault."""
+@click.option("--json", "json_to", type=click.Choice(["-"]), help="One JSON object on standard output.")
+def check(config: Path, json_to: str | None) -> int:
+    """Report every fault in CONFIG, with its line, its setting and what to do. Exit status 2 if there is a fault.
+
+    JSON: `good`, `faults` and `warnings` (lists of texts), and of a good one `devices`, `channels`, `poses` and
+    `positions` (their numbers).
+    """
     try:
         loaded = load_config(config)
     except ConfigError as error:
-        for fault in error.faults:
-            say(fault, err=True)
+        if json_to:
+            click.echo(json.dumps({"good": False, "faults": error.faults, "warnings": []}))
+        else:
+            for fault in error.faults:
+                say(fault, err=True)
         return 2
-    poses = sum(len(channel.poses) for channel in loaded.channels)
-    stops = sum(len(channel.positions) for channel in loaded.channels if isinstance(channel.positions, tuple))
-    if loaded.zenoh.tls and (warning := expiry_warning(loaded.zenoh.tls.files, datetime.now(UTC))):
-        say(f"{config}: zenoh.tls.{warning}", err=True)
-    for i, channel in enumerate(loaded.channels):
-        for section, beside in zip(("", "check_reference."), channel.by_reference, strict=False):
-            if overdue := beside.certificate.overdue(datetime.now(UTC)):
-                say(f"{config}: channels.{i}.{section}certificate.{overdue}", err=True)
-    told = f"{poses} poses" + (f", {stops} positions that the agent finds" if stops else "")
-    say(f"{config}: good; {len(loaded.devices)} devices, {len(loaded.channels)} channels, {told}")
+    warnings = list(_warnings(config, loaded))
+    counts = {
+        "devices": len(loaded.devices),
+        "channels": len(loaded.channels),
+        "poses": sum(len(channel.poses) for channel in loaded.channels),
+        "positions": sum(len(channel.stops) for channel in loaded.channels),
+    }
+    if json_to:
+        click.echo(json.dumps({"good": True, "faults": [], "warnings": warnings, **counts}))
+        return 0
+    for warning in warnings:
+        say(warning, err=True)
+    told = f"{counts['poses']} poses" + (
+        f", {stops} positions that the agent finds" if (stops := counts["positions"]) else ""
+    )
+    say(f"{config}: good; {counts['devices']} devices, {counts['channels']} channels, {told}")
     return 0
+
+
+def _warnings(path: Path, config: Config) -> Iterator[str]:
+    """What does not keep the agent from running: certificates that end."""
+    now = datetime.now(UTC)
+    if config.zenoh.tls and (warning := expiry_warning(config.zenoh.tls.files, now)):
+        yield f"{path}: zenoh.tls.{warning}"
+    for i, channel in enumerate(config.channels):
+        for section, beside in zip(("", "check_reference."), channel.by_reference, strict=False):
+            if overdue := beside.certificate.overdue(now):
+                yield f"{path}: channels.{i}.{section}certificate.{overdue}"

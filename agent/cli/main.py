@@ -14,7 +14,9 @@ import click
 from agent import __version__
 
 INTERRUPTED = 130  # exit status after Ctrl-C: 128 and the number of SIGINT
+COMPLETION = "_FIELDCAL_COMPLETE"  # set by the completion files in deploy/completion
 COMMANDS = {
+    "init": ("agent.cli.init", "Write a configuration for the devices of this machine."),
     "run": ("agent.cli.run", "Run the agent: read devices, calibrate, record and publish."),
     "calibrate": ("agent.cli.calibrate", "Calibrate a sensor from recorded files."),
     "convert": ("agent.cli.convert", "Write a recorded file of another format as CSV."),
@@ -28,6 +30,7 @@ COMMANDS = {
     "report": ("agent.cli.report", "Make figures and a one-page report of a calibration."),
     "certificate": ("agent.cli.certificate", "Make a calibration certificate: PDF, HTML, DCC XML and JSON."),
     "sensors": ("agent.cli.sensors", "List the drivers with their options."),
+    "new-driver": ("agent.cli.new_driver", "Write the skeleton of a driver package, with the contract test."),
     "probe": ("agent.cli.probe", "Find and self-test the devices on this machine's buses and ports."),
     "command": ("agent.cli.command", "Send a signed command to an agent: pose, hold, accept, rollback."),
     "keys": ("agent.cli.keys", "Make certificates for Zenoh over TLS, and keys that sign commands."),
@@ -37,8 +40,14 @@ COMMANDS = {
         "agent.cli.simulate",
         "Serve virtual devices on pseudo-terminals, or write a recording with known true values.",
     ),
+    "doctor": ("agent.cli.doctor", "Check this gateway: clock, devices, disk, certificates; with remedies."),
+    "install-service": ("agent.cli.install_service", "Install the systemd unit, its user and rules; or remove them."),
+    "backup": ("agent.cli.backup", "Copy a data directory, also while the agent runs."),
+    "extras": ("agent.cli.extras", "List the optional parts, and install them, also without network."),
     "check": ("agent.cli.check", "List all faults of a configuration."),
 }
+
+EVERYWHERE = ("calibrate", "convert", "report", "replay", "audit", "show")  # the others need Linux
 
 
 class LazyGroup(click.Group):
@@ -50,7 +59,9 @@ class LazyGroup(click.Group):
     def get_command(self, _: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in COMMANDS:
             return None
-        command = getattr(importlib.import_module(COMMANDS[cmd_name][0]), cmd_name)
+        if sys.platform != "linux" and cmd_name not in EVERYWHERE:
+            raise click.ClickException(f"{cmd_name} needs Linux; {', '.join(EVERYWHERE)} work here too")
+        command = getattr(importlib.import_module(COMMANDS[cmd_name][0]), cmd_name.replace("-", "_"))
         assert isinstance(command, click.Command)
         return command
 
@@ -94,7 +105,10 @@ def run_cli(arguments: list[str] | None = None) -> int:
         _discard_output()
         click.echo(f"fieldcal: {error}", err=True)
         return 1
-    except SystemExit as error:  # of a plug-in: no command of ours raises it
+    except SystemExit as error:
+        if COMPLETION in os.environ:  # click ends so after it has answered the shell
+            return int(error.code or 0)
+        # of a plug-in: no command of ours raises it
         click.echo(f"fieldcal: a plug-in or library asked the program to end: SystemExit: {error}", err=True)
         return 1
     except Exception as error:

@@ -37,7 +37,7 @@ def report(inputs: tuple[Path, ...], output: Path, unit: str | None, sensor: str
     try:
         import matplotlib  # noqa: F401 - imported to check for it before any other work
     except ImportError:
-        say("fieldcal report: the figures need matplotlib; install it with: pip install 'fieldcal[report]'", err=True)
+        say("fieldcal report: the figures need matplotlib; install it with: fieldcal extras --install report", err=True)
         return 1
     from agent.report.material import MaterialError, gather
     from agent.report.writing import write

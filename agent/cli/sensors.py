@@ -3,28 +3,13 @@
 from __future__ import annotations
 
 import json
-import sys
-from dataclasses import dataclass
 from typing import Any
 
 import click
 
+from agent.setup.drivers import Driver, describe, unit_of
 from agent.terminal.text import say
-from hw.sensor import BUILT_IN, ConfigurationError, DriverFactory, driver_names, load_driver
-
-# unit by the ending of the option's name
-UNITS = {"_hz": "Hz", "_khz": "kHz", "_s": "s", "_g": "g", "_mps2": "m/s2", "_degc": "degC", "baud_rate": "bit/s"}
-
-
-@dataclass(frozen=True, slots=True)
-class Driver:
-    """One driver. `options` is the JSON schema of its options; `fault` tells why the driver cannot be loaded."""
-
-    name: str
-    built_in: bool
-    description: str
-    options: dict[str, Any]
-    fault: str = ""
+from hw.sensor import driver_names
 
 
 @click.command()
@@ -50,22 +35,6 @@ def sensors(names: tuple[str, ...], json_to: str | None) -> int:
     return 0
 
 
-def describe(name: str) -> Driver:
-    """Description of a driver. If the driver cannot be loaded, the description holds the reason."""
-    try:
-        factory = load_driver(name)
-    except ConfigurationError as error:
-        return Driver(name, name in BUILT_IN, "", {}, str(error))
-    return Driver(name, name in BUILT_IN, _first_line(factory), factory.options_model.model_json_schema())
-
-
-def _first_line(factory: DriverFactory) -> str:
-    """First line of the module's docstring without the prefix "Driver `x`: "."""
-    module = sys.modules[getattr(factory, "__module__", "")]
-    line = (module.__doc__ or "").strip().partition("\n")[0]
-    return line.partition(": ")[2] or line
-
-
 def as_object(driver: Driver) -> dict[str, Any]:
     """Description for JSON; `units` is by option."""
     units = {option: unit_of(option) for option in driver.options.get("properties", {}) if unit_of(option)}
@@ -73,11 +42,6 @@ def as_object(driver: Driver) -> dict[str, Any]:
     if driver.fault:
         return found | {"fault": driver.fault}
     return found | {"options": driver.options, "units": units}
-
-
-def unit_of(option: str) -> str:
-    """Unit of an option, from its name; "" if the name has none."""
-    return next((unit for end, unit in UNITS.items() if option.endswith(end)), "")
 
 
 def as_lines(driver: Driver) -> list[str]:

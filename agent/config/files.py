@@ -11,10 +11,13 @@ import stat
 from io import BufferedReader
 from pathlib import Path
 
+# A pipe without a writer would wait without O_NONBLOCK. Windows has neither of the first two, and needs the third.
+_FLAGS = sum(getattr(os, name, 0) for name in ("O_NONBLOCK", "O_CLOEXEC", "O_BINARY"))
+
 
 def open_file(path: Path) -> BufferedReader:
     """Open a regular file for reading. Raises OSError, also where `path` is a pipe, a device or a directory."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe without a writer would wait here
+    descriptor = os.open(path, os.O_RDONLY | _FLAGS)
     mode = os.fstat(descriptor).st_mode
     if stat.S_ISREG(mode):
         return open(descriptor, "rb")

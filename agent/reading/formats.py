@@ -55,7 +55,8 @@ def open_source(path: Path) -> Source:
         return opened(path)
     except ImportError as error:
         raise TableError(
-            f"{path}: {form.name} files need {error.name}, which is not installed: pip install 'fieldcal[{form.extra}]'"
+            f"{path}: {form.name} files need {error.name}, which is not installed: "
+            f"fieldcal extras --install {form.extra}"
         ) from None
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import io
 import os
-import resource
 import subprocess
 import sys
 import zlib
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal
 
@@ -50,7 +50,10 @@ def main(path: str, memory_bytes: str) -> None:
     """Write the arrays of numbers in the file to standard output, as npz without objects."""
     from scipy.io import loadmat
 
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    with suppress(ImportError):  # Windows has none
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     found: dict[tuple[str, str], NDArray[Any]] = {}
     try:
         with bounded_memory(int(memory_bytes)):  # scipy allots what a cell array announces

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -141,8 +140,14 @@ def check_announced(path: Path, size_bytes: int) -> None:
 @contextmanager
 def bounded_memory(size_bytes: int) -> Iterator[None]:
     """Let this process take at most so many more bytes of memory, so that a library that trusts a file raises
-    MemoryError."""
-    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    MemoryError. Only Linux can limit it so; elsewhere nothing is limited."""
+    try:
+        import resource
+
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+    except (ImportError, OSError):
+        yield
+        return
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     limits = [pages * resource.getpagesize() + size_bytes, *(limit for limit in (soft, hard) if limit >= 0)]
     resource.setrlimit(resource.RLIMIT_AS, (min(limits), hard))

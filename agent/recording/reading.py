@@ -7,7 +7,6 @@ incomplete record at the end, reading ends after the last good record.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -120,7 +119,9 @@ def open_recording(path: Path) -> BufferedReader:
     Raises OSError, also where `path` is a pipe or a device: reading from one could wait or last for ever.
     """
     file = open_file(path)
-    with contextlib.suppress(OSError):  # the file system has no locks
+    with contextlib.suppress(ImportError, OSError):  # the system has no such locks, or the file system
+        import fcntl
+
         fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
     return file
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import hashlib
 import logging
 import os
@@ -112,6 +111,8 @@ def _excess(directory: Path, keep: KeepFiles, total: int) -> int:
 
 def is_kept(path: Path) -> bool:
     """Whether a recording is pinned, or open in a program that reads it."""
+    import fcntl  # only the agent deletes recordings; `fieldcal audit` imports this module where there is no fcntl
+
     if path.with_name(path.name + PIN_SUFFIX).exists():
         return True
     with contextlib.suppress(FileNotFoundError), open(path, "rb") as file:

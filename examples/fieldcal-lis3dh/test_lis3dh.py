@@ -27,7 +27,7 @@ class TestLis3dh(I2cContract):
     trimmed = {0x21: 0xFF, 0x22: 0xFF}  # noqa: RUF012 - high-pass filter, interrupts
     late_s = 0.3
     temperature = None
-    million = 50_000
+    samples = 50_000
 
     @pytest.fixture
     def rig(self) -> Iterator[Lis3dhRig]:

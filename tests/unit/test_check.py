@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import signal
@@ -159,7 +160,7 @@ def test_a_driver_whose_library_is_missing_is_a_fault(
     text = text.replace('port = "/dev/ttyUSB1"\nrate_hz = 100\naxes = 1\n', f"options = {options}\n")
     [line] = checked(tmp_path / "f.toml", text, capsys)
     assert line.startswith(
-        f"line 9: devices.1.driver: driver {driver} needs {module} (pip install 'fieldcal[{extra}]')"
+        f"line 9: devices.1.driver: driver {driver} needs {module} (fieldcal extras --install {extra})"
     )
 
 
@@ -226,3 +227,17 @@ def test_names_come_with_all_other_faults(tmp_path: Path, capsys: pytest.Capture
             "line 26: commands.keys.0.sensors.0",
         ]
     )
+
+
+def test_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "gateway.toml"
+    path.write_text(GOOD)
+    assert run_cli(["check", str(path), "--json", "-"]) == 0
+    counts = {"devices": 2, "channels": 1, "poses": 0, "positions": 0}
+    assert json.loads(capsys.readouterr().out) == {"good": True, "faults": [], "warnings": [], **counts}
+    path.write_text(GOOD.replace("bridge", "a bridge").replace("axes = 1", "axes = 2"))
+    assert run_cli(["check", str(path), "--json", "-"]) == 2
+    said = capsys.readouterr()
+    found = json.loads(said.out)
+    assert (found["good"], len(found["faults"]), said.err) == (False, 2, "")
+    assert f"{path}: line 2: gateway.site" in found["faults"][0]

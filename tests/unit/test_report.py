@@ -295,7 +295,7 @@ def test_without_matplotlib_the_extra_is_named(
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     status, said = run(capsys, write(tmp_path / "r.json"), "-o", tmp_path / "out")
     assert status == 1
-    assert said == "fieldcal report: the figures need matplotlib; install it with: pip install 'fieldcal[report]'\n"
+    assert said == "fieldcal report: the figures need matplotlib; install it with: fieldcal extras --install report\n"
 
 
 def test_what_stands_in_the_data_cannot_break_the_page(tmp_path: Path) -> None:

@@ -1,0 +1,306 @@
+"""`fieldcal init`: writes a configuration for the devices of this machine."""
+
+from __future__ import annotations
+
+import tomllib
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, get_args
+
+import click
+
+from agent.cli.probe import i2c_buses, i2c_drivers, on_bus, serial_ports
+from agent.config import ConfigError
+from agent.config.channel import Channel
+from agent.config.devices import Gateway
+from agent.config.knowledge import Certificate, Prior
+from agent.config.reading import parse_config
+from agent.config.sinks import Zenoh
+from agent.setup import channel as tables
+from agent.setup.asking import Asking, Stated, driver_options
+from agent.setup.devices import TEXT_LINES, Chosen, Found, Role, complete, listen, tables_of
+from agent.setup.toml import written
+from agent.terminal.text import say
+from calib.signal.instrument import QUANTITIES
+from hw.fifo_sensor import FifoSensor
+from hw.sensor import load_driver
+
+ALPHAS_DEG = (0.0, 120.0, 240.0)  # three different ones determine all twelve parameters
+POSITIVE = click.FloatRange(min=0, min_open=True)
+PERCENT = click.FloatRange(0, 50, min_open=True)
+
+
+def numbers(value: str | tuple[float, ...]) -> tuple[float, ...]:
+    """Numbers between commas; a tuple stays as it is. Raises click.BadParameter."""
+    if isinstance(value, tuple):
+        return value
+    try:
+        return tuple(float(part) for part in value.strip("() ").split(","))
+    except ValueError:
+        raise click.BadParameter(f"{value!r} is not a list of numbers between commas") from None
+
+
+def nine_numbers(value: str | tuple[float, ...]) -> tuple[float, ...]:
+    """A matrix, row by row. Raises click.BadParameter."""
+    found = numbers(value)
+    if len(found) != 9:
+        raise click.BadParameter(f"{len(found)} numbers, 9 are needed")
+    return found
+
+
+@click.command()
+@click.argument("config", type=click.Path(path_type=Path), default=Path("gateway.toml"))
+@click.option("--site", metavar="NAME", help="Name of the site.")
+@click.option("--gateway", metavar="NAME", help="Name of this gateway.")
+@click.option("--sensor", metavar="DRIVER", help="Driver of the sensor; default: what the probe finds.")
+@click.option(
+    "--sensor-port",
+    metavar="PORT",
+    help="Serial port of the sensor; its driver is then serial-csv by default.",
+)
+@click.option(
+    "--sensor-option",
+    "sensor_options",
+    multiple=True,
+    metavar="NAME=VALUE",
+    help="An option of the sensor's driver; repeat it for more.",
+)
+@click.option("--sensitivity", type=POSITIVE, help="Nominal sensitivity of the sensor, output unit per m/s2.")
+@click.option("--u-sensitivity-pct", type=PERCENT, help="Standard uncertainty of the main sensitivities, %.")
+@click.option("--reference", metavar="DRIVER", help="Driver of the reference; default: what the probe finds.")
+@click.option("--no-reference", is_flag=True, help="There is none: gravity is the excitation, at rests.")
+@click.option(
+    "--reference-port",
+    metavar="PORT",
+    help="Serial port of the reference; its driver is then serial-csv by default.",
+)
+@click.option(
+    "--reference-option",
+    "reference_options",
+    multiple=True,
+    metavar="NAME=VALUE",
+    help="An option of the reference's driver; repeat it for more.",
+)
+@click.option("--reference-quantity", type=click.Choice(list(QUANTITIES)), help="What the reference measures.")
+@click.option("--reference-sensitivity", type=POSITIVE, help="Indication of the reference per SI unit.")
+@click.option("--u-reference-pct", type=PERCENT, help="Standard uncertainty of the sensitivity of the reference, %.")
+@click.option("--reference-serial", metavar="TEXT", help="Serial number in the certificate of the reference.")
+@click.option("--calibrated", metavar="YYYY-MM-DD", help="Date of this certificate.")
+@click.option(
+    "--mount",
+    type=click.Choice(get_args(tables.Mount)),
+    help="clamp: on a slide; beside: fixed beside a tri-axial reference; rests: turned by hand, no reference.",
+)
+@click.option("--theta-deg", type=click.FloatRange(-90, 90), help="Inclination of the clamp.")
+@click.option("--alpha-deg", type=numbers, metavar="A,B,...", help="Turns of the clamp.")
+@click.option("--rotation", type=nine_numbers, metavar="R11,...,R33", help="Rotation R of a = R a_ref, row by row.")
+@click.option(
+    "--gravity",
+    type=click.FloatRange(9.7, 9.9, min_open=True, max_open=True),
+    help="Local gravity, m/s2.",
+)
+@click.option("--connect", multiple=True, metavar="ENDPOINT", help="Zenoh router, as tcp/192.0.2.1:7447.")
+def init(config: Path, **given: Any) -> int:
+    """Write a configuration to CONFIG (default gateway.toml) that `fieldcal check` passes and `fieldcal run` uses.
+
+    Devices are those that `fieldcal probe` finds, or those of the options. A serial port is listened to for some
+    seconds: its lines tell axes, sequence numbers and rate. Each value has a comment with unit, default and source. On
+    a terminal, what is not given is asked. An existing file is never overwritten.
+
+    Exit status 2 if something is missing; each line on standard error names an option.
+    """
+    if config.exists():
+        say(f"fieldcal init: {config}: the file exists; remove it, or choose another name", err=True)
+        return 2
+    asking = Asking()
+    devices = _devices(asking, given)
+    listen(devices, asking.faults)
+    for device in devices:
+        complete(device, asking)
+    answers = None if asking.faults else _answers(asking, devices, given)
+    if asking.faults or answers is None:
+        for fault in asking.faults:
+            say(f"fieldcal init: {fault}", err=True)
+        return 2
+    today = f"{datetime.now(UTC):%Y-%m-%d}"
+    text = written(
+        f"Written by `fieldcal init` on {today}. `fieldcal check {config}` names every fault at once.",
+        [
+            tables.gateway_table(answers),
+            *(table for device in devices for table in tables_of(device)),
+            *tables.channel_tables(answers),
+            *tables.sink_tables(answers),
+        ],
+    )
+    return _write(config, text)
+
+
+def _write(path: Path, text: str) -> int:
+    """Check the text as `fieldcal check` does, and write it to a new file."""
+    try:
+        parse_config(tomllib.loads(text), "what init would write", text)
+    except ConfigError as error:
+        for fault in error.faults:
+            say(f"fieldcal init: {fault}", err=True)
+        return 2
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except OSError as error:
+        say(f"fieldcal init: {path}: {error.strerror}", err=True)
+        return 2
+    say(f"{path}: written; read it, then:")
+    say(f"  fieldcal check {path}")
+    say(f"  fieldcal run {path} --data-dir data")
+    return 0
+
+
+def _devices(asking: Asking, given: dict[str, Any]) -> list[Chosen]:
+    """The sensor, and the reference if there is one."""
+    roles: list[Role] = ["sensor"] if given["no_reference"] or given["mount"] == "rests" else ["sensor", "reference"]
+    open_roles = [role for role in roles if not given[role] and not given[f"{role}_port"]]
+    found = _found() if open_roles else []
+    used = {given[f"{role}_port"] for role in roles}
+    chosen = []
+    for role in roles:
+        stated = driver_options(given[f"{role}_options"], f"--{role}-option")
+        options = {name: Stated(value, f"option --{role}-option") for name, value in stated.items()}
+        if port := given[f"{role}_port"]:
+            options["port"] = Stated(port, f"option --{role}-port")
+        if role not in open_roles:
+            driver, source = given[role] or TEXT_LINES, f"option --{role}" if given[role] else "default for a port"
+            chosen.append(Chosen(role, Stated(driver, source), options))
+            continue
+        candidates = [
+            device for device in found if device.options.get("port") not in used or not device.options.get("port")
+        ]
+        device = _pick(asking, role, candidates)
+        if device is not None:
+            found.remove(device)
+            options = {
+                name: Stated(value, f"probe: {device.label}") for name, value in device.options.items()
+            } | options
+            chosen.append(Chosen(role, Stated(device.driver, f"probe: {device.label}"), options))
+    return chosen
+
+
+def _found() -> list[Found]:
+    """What the probe finds: chips on I2C, then serial ports of which the system knows something."""
+    drivers = i2c_drivers()
+    chips = [
+        Found(answer.drivers[0], {"bus": bus.number, "address": answer.address},
+              f"{answer.identity} at 0x{answer.address:02X} on /dev/i2c-{bus.number}")
+        for bus in (on_bus(number, drivers, self_test=False) for number in i2c_buses())
+        for answer in bus.answers
+        if answer.drivers
+    ]  # fmt: skip
+    ports = [
+        Found(TEXT_LINES, {"port": port["port"]}, f"{port['port']} ({port['description']})")
+        for port in serial_ports()
+        if port["description"] not in ("", "n/a")
+    ]
+    return chips + ports
+
+
+def _pick(asking: Asking, role: Role, candidates: list[Found]) -> Found | None:
+    """The device of this role among those that were found: the only one, or the answer of the user."""
+    stating = f"state --{role} DRIVER, or --{role}-port PORT"
+    if role == "reference":
+        stating += ", or --no-reference"
+    if not candidates:
+        asking.faults.append(f"no {role} was found; connect it, or {stating}")
+        return None
+    if asking.interactive:
+        for number, device in enumerate(candidates, 1):
+            say(f"  {number}: {device.label}")
+        answer = click.prompt(f"Which one is the {role}", type=click.IntRange(1, len(candidates)), default=1)
+        return candidates[answer - 1]
+    if len(candidates) > 1:
+        labels = "; ".join(device.label for device in candidates)
+        asking.faults.append(f"several devices may be the {role} ({labels}); {stating}")
+        return None
+    return candidates[0]
+
+
+def _answers(asking: Asking, devices: list[Chosen], given: dict[str, Any]) -> tables.Answers:
+    sensor = devices[0]
+    reference = devices[1] if len(devices) > 1 else None
+    mount = _mount(given, reference)
+    theta: Stated[Any]
+    alphas: Stated[Any]
+    theta = alphas = Stated(None, "not used")
+    if mount.value == "clamp":
+        theta = asking.value("--theta-deg", given["theta_deg"], "inclination theta of the clamp, deg", kind=float)
+        question = "turns alpha of the clamp, deg, with commas"
+        alphas = asking.value("--alpha-deg", given["alpha_deg"], question, ALPHAS_DEG, kind=numbers)
+
+    def of(model: Any, name: str, option: str) -> Stated[Any]:
+        value = given[option]
+        return Stated(value, f"option --{option.replace('_', '-')}") if value else _default(model, name)
+
+    return tables.Answers(
+        site=asking.value("--site", given["site"], "Name of the site", _default(Gateway, "site").value),
+        gateway=asking.value("--gateway", given["gateway"], "Name of this gateway", _default(Gateway, "name").value),
+        mount=mount,
+        theta_deg=theta,
+        alpha_deg=alphas,
+        rotation=Stated(given["rotation"], "option --rotation")
+        if given["rotation"]
+        else Stated(tables.IDENTITY, "init"),
+        gravity_mps2=of(Channel, "gravity_mps2", "gravity"),
+        sensitivity=_sensitivity(asking, sensor, given["sensitivity"]),
+        u_main_pct=of(Prior, "u_main_pct", "u_sensitivity_pct"),
+        quantity=_quantity(given["reference_quantity"], reference),
+        reference_sensitivity=of(Certificate, "sensitivity", "reference_sensitivity"),
+        u_reference_pct=of(Certificate, "u_sensitivity_pct", "u_reference_pct"),
+        reference_serial=of(Certificate, "serial_number", "reference_serial"),
+        calibrated=of(Certificate, "calibrated", "calibrated"),
+        connect=of(Zenoh, "connect", "connect"),
+    )
+
+
+def _default(model: Any, name: str) -> Stated[Any]:
+    return Stated(model.model_fields[name].default, "default")
+
+
+def _mount(given: dict[str, Any], reference: Chosen | None) -> Stated[tables.Mount]:
+    """How the sensor stands: as stated, or by the axes of the reference."""
+    if given["mount"]:
+        return Stated(given["mount"], "option --mount")
+    if reference is None:
+        return Stated("rests", "option --no-reference")
+    if given["rotation"] or (_axes(reference) == 3 and given["theta_deg"] is None):
+        return Stated("beside", "the reference has three axes")
+    return Stated("clamp", "the reference has one axis")
+
+
+def _axes(device: Chosen) -> int:
+    """Number of axes: as an option states it; otherwise 3 of a chip or of another device with all its axes."""
+    if (axes := device.value("axes")) is not None:
+        return int(axes)
+    driver = load_driver(device.driver.value)
+    chip = isinstance(driver, type) and issubclass(driver, FifoSensor)
+    return 3 if chip or device.driver.value in ("iio", "witmotion") else 1
+
+
+def _sensitivity(asking: Asking, sensor: Chosen, given: float | None) -> Stated[Any]:
+    """The sensor's nominal sensitivity; None where its driver knows it."""
+    if given is not None:
+        return Stated(given, "option --sensitivity")
+    model = load_driver(sensor.driver.value).options_model
+    try:
+        options = model.model_validate({n: held.value for n, held in sensor.options.items() if held.value is not None})
+    except ValueError:
+        return Stated(None, "missing")  # the check of the whole configuration names the fault
+    if options.tells_sensitivity:
+        return Stated(None, "the driver knows it")
+    question = f"nominal sensitivity of the sensor, {sensor.value('unit') or 'output unit'} per m/s2, of its data sheet"
+    return asking.value("--sensitivity", None, question + sensor.hint, kind=float)
+
+
+def _quantity(given: str | None, reference: Chosen | None) -> Stated[str]:
+    if given:
+        return Stated(given, "option --reference-quantity")
+    if reference is not None and reference.value("unit") == "m/s":
+        return Stated("velocity", "unit of the reference")
+    return _default(Certificate, "quantity")

@@ -1,0 +1,1 @@
+"""What is done beside the agent on a gateway: set it up, check it, install it, copy its data."""

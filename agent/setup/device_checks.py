@@ -1,0 +1,139 @@
+"""Checks of the devices of a gateway: rights, bus clock, and whether they deliver the samples that they should."""
+
+from __future__ import annotations
+
+import grp
+import os
+import pwd
+import time
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from agent.config import Config
+from agent.setup.buses import bus_clock_khz
+from agent.setup.finding import Finding
+from hw.block import BlockFlags
+from hw.fifo_options import FifoOptions
+from hw.sensor import DeviceError, Options, Sensor, load_driver
+
+RATE_WITHIN = 0.02  # relative; oscillators of MEMS are off by 1 % or less
+CPU_SHARE_MAX = 0.5  # of one core, for reading alone
+
+
+def loaded_options(config: Config) -> dict[str, Options]:
+    """The options of each device as its driver takes them. The configuration must have passed its check."""
+    return {
+        device.name: load_driver(device.driver).options_model.model_validate(device.options)
+        for device in config.devices
+    }
+
+
+def access_findings(options: Mapping[str, Options]) -> Iterator[Finding]:
+    """May this user read and write the devices?"""
+    for name, held in options.items():
+        if isinstance(held, FifoOptions):
+            node = Path(f"/dev/i2c-{held.bus}")
+        elif port := getattr(held, "port", None):
+            node = Path(port)
+        else:
+            continue
+        yield _access(name, node)
+
+
+def _access(name: str, node: Path) -> Finding:
+    user = pwd.getpwuid(os.getuid()).pw_name
+    try:
+        group = grp.getgrgid(node.stat().st_gid).gr_name
+    except FileNotFoundError:
+        remedy = "connect the device; `fieldcal probe` lists what there is"
+        if node.name.startswith("i2c-"):
+            remedy = "enable the I2C adapter, and load the kernel module: sudo modprobe i2c-dev"
+        return Finding("device", "fault", f"{name}: {node} does not exist", remedy)
+    except (OSError, KeyError) as error:
+        return Finding("device", "fault", f"{name}: {node}: {error}", "look at its rights with ls -l")
+    if not os.access(node, os.R_OK | os.W_OK):
+        return Finding(
+            "device", "fault", f"{name}: {node}: user {user} may not read and write it",
+            f"sudo usermod -aG {group} {user}, then log in anew (or restart the service)",
+        )  # fmt: skip
+    return Finding("device", "good", f"{name}: {user} may read and write {node}")
+
+
+def bus_findings(options: Mapping[str, Options], sysfs: Path = Path("/sys")) -> Iterator[Finding]:
+    """Is each I2C bus as fast as the configuration says, and fast enough for the rate?"""
+    for name, held in options.items():
+        if not isinstance(held, FifoOptions):
+            continue
+        clock_khz = bus_clock_khz(held.bus, sysfs)
+        if clock_khz is None:
+            says = f"{name}: the system does not tell the clock of /dev/i2c-{held.bus}; bus_khz states {held.bus_khz:g}"
+            yield Finding("bus", "good", says)
+            continue
+        remedy = (
+            "make the bus faster (on a Raspberry Pi dtparam=i2c_arm_baudrate=400000 in config.txt), or lower rate_hz; "
+            f"state bus_khz = {clock_khz:g}, so that `fieldcal check` counts with it"
+        )
+        try:
+            type(held).model_validate(held.model_dump() | {"bus_khz": clock_khz})
+        except ValidationError as error:
+            says = f"{name}: /dev/i2c-{held.bus} runs at {clock_khz:g} kHz: {error.errors()[0]['msg']}"
+            yield Finding("bus", "fault", says.replace("Value error, ", ""), remedy)
+            continue
+        if clock_khz < held.bus_khz:
+            says = f"{name}: /dev/i2c-{held.bus} runs at {clock_khz:g} kHz, bus_khz states {held.bus_khz:g}"
+            yield Finding("bus", "advice", says, remedy)
+        else:
+            yield Finding("bus", "good", f"{name}: /dev/i2c-{held.bus} runs at {clock_khz:g} kHz")
+
+
+def measured_findings(config: Config, options: Mapping[str, Options], duration_s: float) -> list[Finding]:
+    """Read all devices together for some seconds, as the agent does, and compare with their nominal rates."""
+    began_s, cpu_s = time.monotonic(), time.process_time()
+    with ThreadPoolExecutor(len(config.devices)) as pool:
+        sensors = {
+            device.name: load_driver(device.driver)(device.name, options[device.name]) for device in config.devices
+        }
+        found = list(pool.map(lambda name: _measured(name, sensors[name], duration_s), sensors))
+    share = (time.process_time() - cpu_s) / (time.monotonic() - began_s)
+    if share > CPU_SHARE_MAX:
+        remedy = "lower rate_hz, or use a faster computer: the estimation needs time too"
+        found.append(Finding("throughput", "advice", f"reading alone needs {share:.0%} of one core", remedy))
+    return found
+
+
+def rate_finding(device: str, rate_hz: float, nominal_hz: float, losses: str = "") -> Finding:
+    """The rate that was measured, compared with the nominal one. `losses`: what was lost meanwhile."""
+    says = f"{device}: {rate_hz:.4g} samples a second, nominal {nominal_hz:g}" + (f"; {losses}" if losses else "")
+    if losses or not abs(rate_hz - nominal_hz) <= RATE_WITHIN * nominal_hz:
+        remedy = "correct rate_hz, make the port or bus faster (baud_rate, bus clock), or stop other programs here"
+        return Finding("throughput", "fault", says, remedy)
+    return Finding("throughput", "good", says)
+
+
+def _measured(name: str, sensor: Sensor, duration_s: float) -> Finding:
+    samples, overruns, first_ns, last_ns = 0, 0, 0, 0
+    try:
+        nominal_hz = sensor.open().nominal_rate_hz
+        end_s = time.monotonic() + duration_s
+        while time.monotonic() < end_s:
+            block = sensor.read_block()
+            if block is None:
+                continue
+            overruns += bool(block.flags & BlockFlags.OVERRUN)
+            last_ns = block.t_monotonic_ns
+            if first_ns:  # counting begins after the first block
+                samples += block.n
+            first_ns = first_ns or last_ns
+    except DeviceError as error:
+        return Finding("throughput", "fault", f"{name}: {error}", "connect the device, or correct its options")
+    finally:
+        sensor.close()
+    if last_ns == first_ns:
+        remedy = "check its power, its cable and its options"
+        return Finding("throughput", "fault", f"{name}: no samples in {duration_s:g} s", remedy)
+    lost = [f"{overruns} overruns"] if overruns else []
+    lost += [f"{drop.count} {drop.unit}: {drop.reason}" for drop in sensor.take_drops()]
+    return rate_finding(name, samples / ((last_ns - first_ns) * 1e-9), nominal_hz, "; ".join(lost))

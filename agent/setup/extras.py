@@ -1,0 +1,85 @@
+"""The optional parts of the package: which there are, which are installed, and the command that installs one."""
+
+from __future__ import annotations
+
+import importlib.metadata as metadata
+import re
+import shutil
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+# What each part is for. Parts that only serve the work on fieldcal itself have no line here and are not listed.
+PURPOSES = {
+    "report": "figures of `fieldcal report`",
+    "files": "Parquet and Feather files, and large CSV files read faster",
+    "hdf5": "HDF5 and MATLAB 7.3 files",
+    "seismic": "MiniSEED files",
+    "tdms": "LabVIEW TDMS files",
+    "sound": "driver sound-card (needs PortAudio besides)",
+    "mcc": "drivers mcc172 and mcc-usb (need libdaqhats and libuldaq besides)",
+    "ni": "driver ni (needs NI-DAQmx besides; x86_64 only)",
+}
+WHEELS = Path(sys.prefix) / "wheels"  # where an installation without network keeps wheels of optional parts
+_REQUIREMENT = re.compile(r"""(?P<name>[\w.-]+)(?P<versions>[^;]*);.*\bextra\s*==\s*["'](?P<extra>[\w-]+)["']""")
+
+
+@dataclass(frozen=True, slots=True)
+class Extra:
+    """One optional part. `requirements`: names with their versions, as pip takes them; `missing`: names that are not
+    installed."""
+
+    name: str
+    purpose: str
+    requirements: tuple[str, ...]
+    missing: tuple[str, ...]
+
+    @property
+    def installed(self) -> bool:
+        """Whether all of it is installed."""
+        return not self.missing
+
+
+def extras() -> list[Extra]:
+    """The optional parts, as the metadata of the installed package lists them."""
+    found: dict[str, list[tuple[str, str]]] = {name: [] for name in PURPOSES}
+    for line in metadata.requires("fieldcal") or []:
+        match = _REQUIREMENT.match(line)
+        if match and match["extra"] in found:
+            found[match["extra"]].append((match["name"], match["name"] + match["versions"].strip()))
+    return [
+        Extra(
+            name,
+            PURPOSES[name],
+            tuple(requirement for _, requirement in needed),
+            tuple(package for package, _ in needed if not _is_installed(package)),
+        )
+        for name, needed in found.items()
+        if needed
+    ]
+
+
+def install_command(chosen: Sequence[Extra], wheels: Path | None) -> list[str] | None:
+    """The command that installs the parts: from the wheels in a directory alone, or (None) from the package index.
+
+    Without a pip of its own, as in the Debian package, the one of the system is used. None where there is none.
+    """
+    if find_spec("pip") is not None:
+        pip = [sys.executable, "-m", "pip"]
+    elif shared := shutil.which("pip3"):
+        pip = [shared, "--python", sys.executable]
+    else:
+        return None
+    source = [] if wheels is None else ["--no-index", "--find-links", str(wheels)]
+    needed = [requirement for extra in chosen for requirement in extra.requirements]
+    return [*pip, "install", "--disable-pip-version-check", *source, *needed]
+
+
+def _is_installed(package: str) -> bool:
+    try:
+        metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return False
+    return True

@@ -1,0 +1,116 @@
+"""`fieldcal backup` while the agent writes: the copy is whole, passes the audit, and an agent goes on with it."""
+
+from __future__ import annotations
+
+import itertools
+import shutil
+import stat
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from agent.cli.main import run_cli
+from agent.delivery.store import UNKEPT_MAX, Store
+from hw.virtual.serial_port import PtyDevice
+from tests.replay.test_audit_chain import write_keys
+from tests.scenarios.processes import interrupt, recordings, results, started, wait_until
+
+CONFIG = """
+[[devices]]
+name = "imu"
+driver = "serial-csv"
+options = {{ port = "{port}", rate_hz = 100, axes = 3, sequence = true, unit = "m/s2", serial_number = "A1" }}
+[[channels]]
+sensor = "imu"
+prior = {{}}
+guard_s = 0.1
+poses = [{{ start_s = 0, stop_s = 1, gravity_mps2 = [0, 0, 9.81] }}]
+poses_repeat_s = 1
+[recording]
+rotate_s = 1
+signing_key = "{key}"
+[zenoh]
+enabled = false
+"""
+
+
+@pytest.fixture
+def port(tmp_path: Path) -> Iterator[PtyDevice]:
+    numbers = itertools.count()
+    began_s, sent = time.monotonic(), 0
+
+    def text_due(t_s: float) -> bytes:
+        nonlocal sent
+        due = int((t_s - began_s) * 100) - sent
+        sent += due
+        return "".join(f"{next(numbers)},0.01,-0.02,9.81\n" for _ in range(due)).encode()
+
+    device = PtyDevice(text_due, link=tmp_path / "port")
+    device.start()
+    yield device
+    device.stop()
+
+
+def test_a_restored_directory_goes_on(tmp_path: Path, port: PtyDevice) -> None:
+    private, public = write_keys(tmp_path)
+    config, data_dir, copy = tmp_path / "gateway.toml", tmp_path / "data", tmp_path / "copy"
+    config.write_text(CONFIG.format(port=port.path, key=private))
+    with started("run", config, "--data-dir", data_dir, output=tmp_path / "output") as process:
+        wait_until(lambda: len(recordings(data_dir)) >= 4 and results(data_dir, "window"), 30, "recordings")
+        arguments = ["--data-dir", str(data_dir), "--config", str(config), "--with-keys"]
+        assert run_cli(["backup", str(copy), *arguments]) == 0
+        interrupt(process)
+    names = [path.name for path in recordings(copy / "data")]
+    assert len(names) >= 4
+    assert names[-1].endswith(".active"), "also the file that is being written"
+    assert (copy / "data" / "head.json").exists()
+    assert (copy / "gateway.toml").read_text() == config.read_text()
+    key = copy / "keys" / private.name
+    assert key.read_bytes() == private.read_bytes()
+    assert stat.S_IMODE(key.stat().st_mode) == 0o600
+    checked = subprocess.run(["sha256sum", "-c", "SHA256SUMS"], cwd=copy, capture_output=True, check=False)
+    assert checked.returncode == 0, checked.stdout
+    stored = results(copy / "data", "window")
+    assert stored
+    shutil.rmtree(data_dir)
+    shutil.copytree(copy / "data", data_dir)
+    with started("run", config, "--data-dir", data_dir, output=tmp_path / "output") as process:
+        wait_until(lambda: len(results(data_dir, "window")) > len(stored) + 1, 30, "new windows")
+        interrupt(process)
+    assert process.returncode == 0, (tmp_path / "output").read_text()
+    after = results(data_dir, "window")
+    assert after[: len(stored)] == stored
+    assert after[len(stored)]["epoch"] == stored[0]["epoch"], "the same gateway"
+    assert run_cli(["audit", str(data_dir), "--public-key", str(public)]) == 0
+
+
+def test_a_copy_never_uses_the_numbers_that_the_original_used_meanwhile(tmp_path: Path) -> None:
+    store = Store(tmp_path / "data", 1000)
+    store.close()
+    assert run_cli(["backup", str(tmp_path / "copy"), "--data-dir", str(tmp_path / "data")]) == 0
+    restored = Store(tmp_path / "copy" / "data")
+    assert restored.last_sequence() == 1000 + UNKEPT_MAX
+    restored.close()
+
+
+def test_keys_are_copied_only_if_that_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data_dir = tmp_path / "data"
+    data_dir.mkdir()
+    (data_dir / "command-counters.json").write_text("{}")
+    (data_dir / "link").symlink_to("/etc/passwd")
+    assert run_cli(["backup", str(tmp_path / "copy"), "--data-dir", str(data_dir)]) == 0
+    found = {str(path.relative_to(tmp_path / "copy")) for path in (tmp_path / "copy").rglob("*") if path.is_file()}
+    assert found == {"data/command-counters.json", "SHA256SUMS"}
+    assert stat.S_IMODE((tmp_path / "copy").stat().st_mode) == 0o700
+    capsys.readouterr()
+    assert run_cli(["backup", str(tmp_path / "copy"), "--data-dir", str(data_dir)]) == 2
+    assert "it exists; name a new directory" in capsys.readouterr().err
+    assert run_cli(["backup", str(tmp_path / "other"), "--data-dir", str(tmp_path / "none")]) == 2
+    assert run_cli(["backup", str(tmp_path / "other"), "--data-dir", str(data_dir), "--with-keys"]) == 2
+    (data_dir / "state.sqlite").write_bytes(b"no store" * 1000)
+    capsys.readouterr()
+    assert run_cli(["backup", str(tmp_path / "other"), "--data-dir", str(data_dir)]) == 2
+    assert "file is not a database" in capsys.readouterr().err
