@@ -36,6 +36,7 @@ COMMANDS = {
     "keys": ("agent.cli.keys", "Make certificates for Zenoh over TLS, and keys that sign commands."),
     "router": ("agent.cli.router", "Run a Zenoh router, for tests and small sites."),
     "witness": ("agent.cli.witness", "Keep the signed heads of recordings on another machine."),
+    "monitor": ("agent.cli.monitor", "Show all sensors of all gateways on one web page."),
     "simulate": (
         "agent.cli.simulate",
         "Serve virtual devices on pseudo-terminals, or write a recording with known true values.",

@@ -1,0 +1,82 @@
+"""Follows the gateways on the bus: their results into the database, and whether they are there."""
+
+from __future__ import annotations
+
+import logging
+import sqlite3
+import threading
+from collections.abc import Sequence
+from contextlib import ExitStack
+
+import zenoh
+
+from agent.config.tls import TlsFiles
+from agent.delivery.consumer import Consumer
+from agent.delivery.keys import PREFIX, parse_key
+from agent.delivery.session import session_config
+from agent.monitor.database import Database
+from agent.monitor.fleet import Fleet
+
+RECONNECT_S = 2.0  # s between two attempts to reach a router
+TOKENS = 10_000  # changes of presence that may wait
+
+_log = logging.getLogger(__name__)
+
+
+class Following:
+    """Takes all results from the routers at `endpoints`, in threads, until `close`.
+
+    `unconfirmed` counts results that were not kept, because the store of their gateway did not have them.
+    Raises EndpointError for an invalid endpoint.
+    """
+
+    def __init__(self, endpoints: Sequence[str], tls: TlsFiles | None, database: Database, fleet: Fleet) -> None:
+        self.unconfirmed = 0
+        self.fault = ""  # why nothing is received or kept; "" where all is well
+        self._endpoints, self._tls = endpoints, tls
+        self._config = session_config("client", connect=endpoints, tls=tls)
+        self._database, self._fleet = database, fleet
+        self._stop = threading.Event()
+        self._open = ExitStack()
+        for place in database.newest():
+            fleet.take(*place)
+        self._thread = threading.Thread(target=self._run, name="following", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the threads."""
+        self._stop.set()
+        self._open.close()
+        self._thread.join(RECONNECT_S)
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            try:
+                self._follow()
+            except (ConnectionError, zenoh.ZError, sqlite3.Error) as error:
+                self.fault = str(error)
+                _log.warning("monitor: %s", error)
+            self._stop.wait(RECONNECT_S)
+
+    def _follow(self) -> None:
+        consumer = Consumer(self._endpoints, last_sequence=self._database.last_sequence(), tls=self._tls)
+        with consumer, zenoh.open(self._config) as session:
+            self._open.callback(consumer.close)
+            tokens = session.liveliness().declare_subscriber(
+                f"{PREFIX}/*/*/alive", zenoh.handlers.FifoChannel(TOKENS), history=True
+            )
+            threading.Thread(target=self._watch, args=(tokens,), name="presence", daemon=True).start()
+            self.fault = ""
+            for result in consumer:
+                if not result.confirmed:
+                    self.unconfirmed += 1
+                    continue
+                self._database.add(result)
+                a = result.address
+                self._fleet.take(a.site, a.gateway, a.sensor, a.what, result.fields)
+            tokens.undeclare()
+
+    def _watch(self, tokens: zenoh.Subscriber[zenoh.Handler[zenoh.Sample]]) -> None:
+        for token in tokens:
+            if (address := parse_key(str(token.key_expr))) is not None:
+                self._fleet.set_alive(address.site, address.gateway, token.kind == zenoh.SampleKind.PUT)

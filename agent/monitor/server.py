@@ -1,0 +1,123 @@
+"""The web server of the fleet page. It needs the extra `monitor` of the package."""
+
+from __future__ import annotations
+
+import asyncio
+import csv
+import io
+import json
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response, StreamingResponse
+from starlette.routing import Route
+
+from agent.monitor.database import Database
+from agent.monitor.fleet import Fleet
+from agent.monitor.following import Following
+
+PAGE = Path(__file__).parent / "page"
+FILES = {
+    "": ("index.html", "text/html"),
+    "page.js": ("page.js", "text/javascript"),
+    "page.css": ("page.css", "text/css"),
+    "uPlot.iife.min.js": ("uPlot.iife.min.js", "text/javascript"),
+    "uPlot.min.css": ("uPlot.min.css", "text/css"),
+}
+HISTORY_MAX = 2000  # results of one kind that a page or a CSV file holds
+LISTENERS_MAX = 50  # pages that are told of changes at the same time
+TELL_S = 0.5  # s between two looks for a change
+HEADERS = {
+    "Content-Security-Policy": "default-src 'self'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+}
+
+
+def application(database: Database, fleet: Fleet, following: Following) -> Starlette:
+    """The page, its data as JSON and CSV, and the stream of changes (server-sent events)."""
+    data = _Data(database, fleet, following)
+    return Starlette(
+        routes=[
+            Route("/api/fleet", data.sensors),
+            Route("/api/history", data.history),
+            Route("/api/changes", data.changes),
+            Route("/fleet.csv", data.sensors_csv),
+            Route("/sensor.csv", data.history_csv),
+            Route("/", _file),
+            Route("/{name}", _file),
+        ]
+    )
+
+
+def _file(request: Request) -> Response:
+    found = FILES.get(request.path_params.get("name", ""))
+    if found is None:
+        return Response("no such page", 404, HEADERS)
+    return Response((PAGE / found[0]).read_bytes(), 200, HEADERS, found[1])
+
+
+class _Data:
+    """What the page asks for."""
+
+    def __init__(self, database: Database, fleet: Fleet, following: Following) -> None:
+        self._database, self._fleet, self._following = database, fleet, following
+        self._listeners: set[object] = set()
+
+    def sensors(self, _: Request) -> Response:
+        bus = {"fault": self._following.fault, "unconfirmed": self._following.unconfirmed}
+        return JSONResponse({"sensors": self._fleet.rows(), "bus": bus}, 200, HEADERS)
+
+    def sensors_csv(self, _: Request) -> Response:
+        return _csv("fleet.csv", self._fleet.rows())
+
+    def history(self, request: Request) -> Response:
+        return JSONResponse(self._history(request), 200, HEADERS)
+
+    def history_csv(self, request: Request) -> Response:
+        return _csv("sensor.csv", self._history(request))
+
+    def _history(self, request: Request) -> list[dict[str, Any]]:
+        asked = request.query_params
+        site, gateway, sensor = (asked.get(name, "") for name in ("site", "gateway", "sensor"))
+        rows = self._database.history(site, gateway, sensor, asked.get("what", ""), HISTORY_MAX)
+        return [{name: value for name, value in row.items() if name != "covariance"} for row in rows]
+
+    async def changes(self, _: Request) -> Response:
+        if len(self._listeners) >= LISTENERS_MAX:
+            return Response("too many pages are open", 503, HEADERS)
+        return StreamingResponse(self._tell(), 200, HEADERS, "text/event-stream")
+
+    async def _tell(self) -> AsyncIterator[str]:
+        me, told = object(), -1
+        self._listeners.add(me)
+        try:
+            while True:
+                if self._fleet.version != told:
+                    told = self._fleet.version
+                    yield f"data: {told}\n\n"
+                await asyncio.sleep(TELL_S)
+        finally:
+            self._listeners.discard(me)
+
+
+def _csv(name: str, rows: list[dict[str, Any]]) -> Response:
+    text = io.StringIO()
+    columns = list(dict.fromkeys(column for row in rows for column in row))
+    writer = csv.writer(text)
+    writer.writerow(columns)
+    writer.writerows([_cell(row.get(column)) for column in columns] for row in rows)
+    return Response(
+        text.getvalue(), 200, HEADERS | {"Content-Disposition": f'attachment; filename="{name}"'}, "text/csv"
+    )
+
+
+def _cell(value: Any) -> Any:
+    """A cell. A text that a spreadsheet would take for a formula gets an apostrophe before it."""
+    if isinstance(value, (list, dict)):
+        value = json.dumps(value)
+    return f"'{value}" if isinstance(value, str) and value[:1] in ("=", "+", "-", "@", "\t", "\r") else value

@@ -1,0 +1,117 @@
+"""The fleet page through a real bus and a real browser: what is shown, kept over a restart, and harmless."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+from urllib.request import urlopen
+
+import pytest
+
+from agent.delivery.publication import Publisher
+from agent.delivery.store import Store
+from tests.unit.zenoh_site import Site, record, wait_for
+
+pytest.importorskip("starlette", reason="the extra monitor is not installed")
+pytest.importorskip("uvicorn", reason="the extra monitor is not installed")
+COMMAND = "import sys; from agent.cli.main import run_cli; sys.exit(run_cli(sys.argv[1:]))"
+HOSTILE = "<img src=x onerror=\"document.title='owned'\">"
+CHROMIUM = shutil.which("chromium")
+
+
+class Monitor:
+    """`fieldcal monitor` in a process of its own."""
+
+    def __init__(self, site: Site, directory: Path) -> None:
+        with closing(socket.socket()) as free:
+            free.bind(("127.0.0.1", 0))
+            self.address = f"127.0.0.1:{free.getsockname()[1]}"
+        options = ["--connect", site.endpoint, "--listen", self.address, "--data-dir", str(directory)]
+        self._process = subprocess.Popen([sys.executable, "-c", COMMAND, "monitor", *options])
+        wait_for(self._answers)
+
+    def _answers(self) -> bool:
+        try:
+            self.get("api/fleet")
+        except OSError:
+            return False
+        return True
+
+    def get(self, path: str) -> Any:
+        with urlopen(f"http://{self.address}/{path}", timeout=5) as answer:
+            assert answer.headers["Content-Security-Policy"].startswith("default-src 'self'")
+            text = answer.read().decode()
+        return json.loads(text) if path.startswith("api") else text
+
+    def sensors(self) -> list[dict[str, Any]]:
+        rows: list[dict[str, Any]] = self.get("api/fleet")["sensors"]
+        return rows
+
+    def stop(self) -> None:
+        self._process.send_signal(signal.SIGINT)
+        self._process.wait(10)
+
+
+@pytest.fixture
+def gateway(site: Site, tmp_path: Path) -> Iterator[Publisher]:
+    store = Store(tmp_path / "gateway")
+    publisher = Publisher("site", "gw", [site.endpoint], store)
+    first = store.last_sequence() + 1
+    store.commit([record(first, "calibration"), record(first + 1, "status", status="HELD", reason=HOSTILE),
+                  record(first + 2, "window", used=True)])  # fmt: skip
+    publisher.start()
+    yield publisher
+    publisher.close()
+    store.close()
+
+
+def test_a_sensor_is_shown_with_why_and_kept_over_a_restart(site: Site, gateway: Publisher, tmp_path: Path) -> None:
+    monitor = Monitor(site, tmp_path / "monitor")
+    try:
+        wait_for(lambda: [r["status"] for r in monitor.sensors()] == ["HELD"])
+        (row,) = monitor.sensors()
+        assert (row["sensor"], row["alive"], row["why"]) == ("mems", True, f"HELD: {HOSTILE}")
+        gateway.close()
+        wait_for(lambda: "not on the bus" in monitor.sensors()[0]["why"])
+    finally:
+        monitor.stop()
+    monitor = Monitor(site, tmp_path / "monitor")  # now without the gateway
+    try:
+        (row,) = monitor.sensors()
+        assert row["why"] == f"HELD: {HOSTILE}; the gateway is not on the bus"
+        asked = "site=site&gateway=gw&sensor=mems&what="
+        assert len(monitor.get(f"api/history?{asked}calibration")) == 1
+        assert "count" in monitor.get(f"sensor.csv?{asked}calibration")
+    finally:
+        monitor.stop()
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium")
+@pytest.mark.usefixtures("gateway")
+def test_the_browser_shows_hostile_text_as_text(site: Site, tmp_path: Path) -> None:
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    monitor = Monitor(site, tmp_path / "monitor")
+    try:
+        wait_for(lambda: [r["status"] for r in monitor.sensors()] == ["HELD"])
+        with playwright.sync_playwright() as driver:
+            browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+            page = browser.new_page()
+            asked: list[str] = []
+            page.on("request", lambda request: asked.append(request.url))
+            for view in ("", "#site=site&gateway=gw&sensor=mems"):
+                page.goto(f"http://{monitor.address}/{view}")
+                page.locator("td:visible", has_text=HOSTILE).first.wait_for(timeout=10_000)
+                assert page.locator("img").count() == 0
+                assert page.title().startswith("fieldcal")
+            assert all(url.startswith(f"http://{monitor.address}/") for url in asked)
+            browser.close()
+    finally:
+        monitor.stop()
