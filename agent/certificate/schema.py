@@ -20,7 +20,7 @@ def check_schema(xml: bytes, xsd: Path) -> None:
     try:
         import xmlschema
     except ImportError:
-        raise SchemaError("--xsd needs xmlschema; install it with: pip install 'fieldcal[dcc]'") from None
+        raise SchemaError("--xsd needs xmlschema; install it with: fieldcal extras --install dcc") from None
     # The schema names its parts by addresses on the network. The files beside it are taken instead.
     own = Path(xmlschema.__file__).parent / SIGNATURE_FILE
     places = [(SI_NAMESPACE, str((xsd.parent / SI_FILE).resolve())), (SIGNATURE_NAMESPACE, str(own))]

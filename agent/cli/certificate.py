@@ -35,7 +35,10 @@ def certificate(
     try:
         import matplotlib  # noqa: F401 - imported to check for it before any other work
     except ImportError:
-        say("fieldcal certificate: the PDF needs matplotlib; install it with: pip install 'fieldcal[report]'", err=True)
+        say(
+            "fieldcal certificate: the PDF needs matplotlib; install it with: fieldcal extras --install report",
+            err=True,
+        )
         return 1
     from agent.certificate.content import CertificateError, certificate_of
     from agent.certificate.schema import SchemaError

@@ -39,7 +39,7 @@ def monitor(
         from agent.monitor.server import application
     except ImportError:
         say("fieldcal monitor: the page needs starlette and uvicorn; install them with: "
-            "pip install 'fieldcal[monitor]'", err=True)  # fmt: skip
+            "fieldcal extras --install monitor", err=True)  # fmt: skip
         return 1
     from agent.monitor.database import Database
     from agent.monitor.fleet import Fleet

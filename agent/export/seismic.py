@@ -29,7 +29,7 @@ def write_mseed(path: Path, content: Content, blocks: Iterable[Samples]) -> int:
             from obspy import Stream, Trace, UTCDateTime
         except ImportError:
             raise ExportError(
-                f"{path}: MiniSEED needs ObsPy; install it with: pip install 'fieldcal[seismic]'"
+                f"{path}: MiniSEED needs ObsPy; install it with: fieldcal extras --install seismic"
             ) from None
         rows, rate_hz = 0, 0.0
         station = re.sub("[^A-Z0-9]", "", content.device.upper())[:5] or "FIELD"

@@ -53,7 +53,7 @@ def write_parquet(path: Path, content: Content, blocks: Iterable[Samples]) -> in
         import pyarrow as pa
         from pyarrow import parquet
     except ImportError:
-        raise ExportError(f"{path}: Parquet needs pyarrow; install it with: pip install 'fieldcal[files]'") from None
+        raise ExportError(f"{path}: Parquet needs pyarrow; install it with: fieldcal extras --install files") from None
     names = names_of(content)
     time = pa.timestamp("ns", tz="UTC")
     about = {"device": content.device, "unit": content.unit, "ax, ay, az": "m/s2"}

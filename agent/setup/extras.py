@@ -18,6 +18,8 @@ PURPOSES = {
     "hdf5": "HDF5 and MATLAB 7.3 files",
     "seismic": "MiniSEED files",
     "tdms": "LabVIEW TDMS files",
+    "dcc": "check of digital calibration certificates against schemas (`fieldcal certificate --xsd`)",
+    "monitor": "the page of `fieldcal monitor`",
     "sound": "driver sound-card (needs PortAudio besides)",
     "mcc": "drivers mcc172 and mcc-usb (need libdaqhats and libuldaq besides)",
     "ni": "driver ni (needs NI-DAQmx besides; x86_64 only)",
