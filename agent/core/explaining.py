@@ -141,8 +141,8 @@ def _told(explanation: Explanation, scale: float) -> str:
     else:
         unit, factor = UNITS.get(kind.unit, (kind.unit, 1.0))
         size = f"{factor * change:+.3g} {unit}"
-    if kind is RESPONSE:
-        return f"another {explanation.line} ({size})"
+    if kind is RESPONSE:  # by how much, only windows tell that were made for the new response
+        return f"another {explanation.line} (S is {'larger' if change > 0.0 else 'smaller'} there)"
     return f"another {explanation.line} ({explanation.most.name} {size})"
 
 

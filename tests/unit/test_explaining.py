@@ -12,8 +12,9 @@ from agent.config import Config
 from agent.core.events import Result, StatusChange
 from benchmarks.online.node import Stated, Timing, node
 from benchmarks.online.runner import EPOCH_NS, Run, visits
-from hw.virtual.harm import Harm, KnockedOff, Transformed, Visit
+from hw.virtual.harm import Filtered, Harm, KnockedOff, Transformed, Visit
 from hw.virtual.schedule import rotation
+from tests.pair import Filter, lowpass, resonance
 
 WINDOWS, FROM, AFTER_S = 10, 4, 200.0
 HELD_S = FROM * 60.0 + 25.0  # end of the first held window, within a few seconds
@@ -69,6 +70,15 @@ def test_either_of_two_that_fit_alike_is_named() -> None:
     [told] = [s for s in statuses(Transformed("sensor", "sensor", np.diag([1.0, 1.08, 1.0]))) if s.before == "HELD"]
     assert "another reference sensitivity (reference_y -7" in told.reason
     assert "another sensitivity (Syy +7" in told.reason
+
+
+@pytest.mark.parametrize(("response", "change"), [(lowpass(1, 25.0), "smaller"), (resonance(25.0, 10.0), "larger")])
+def test_another_filter_is_named_with_its_frequency(response: Filter, change: str) -> None:
+    """At 12.8 Hz the low-pass filter of 25 Hz lets 0.890 pass, the resonance 1.355."""
+    found = statuses(Filtered("filter", "sensor", response))
+    [told] = [s for s in found if (s.status, s.before) == ("HELD", "HELD")]
+    assert f"another response at 12.8 Hz (S is {change} there)" in told.reason
+    assert "set it back, tighten the mount" in told.reason
 
 
 def test_nothing_is_explained_where_nothing_is_held() -> None:
