@@ -296,7 +296,7 @@ def test_without_the_library_it_says_what_to_install(
     driver: type[BufferedSensor], options: dict[str, Any], module: str, extra: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(ConfigurationError, match=rf"needs {module} \(pip install 'fieldcal\[{extra}\]'\) and "):
+    with pytest.raises(ConfigurationError, match=rf"needs {module} \(fieldcal extras --install {extra}\) and "):
         driver("sensor", driver.options_model.model_validate(options)).open()
 
 

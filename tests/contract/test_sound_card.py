@@ -114,7 +114,7 @@ class TestSoundCard(SensorContract):
 @pytest.mark.skipif("sounddevice" in sys.modules, reason="the library is installed")
 def test_without_the_library_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "sounddevice", None)
-    with pytest.raises(ConfigurationError, match=r"pip install 'fieldcal\[sound\]'"):
+    with pytest.raises(ConfigurationError, match=r"fieldcal extras --install sound"):
         SoundCard("sensor", SoundCardOptions()).open()
 
 

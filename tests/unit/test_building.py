@@ -13,7 +13,6 @@ from hw.block import BlockFlags, SampleBlock
 from hw.virtual.building import DAY_S, Building, BuildingParameters, Instrument, Weather
 from hw.virtual.building_motion import Band, BuildingMotion
 from hw.virtual.harm import (
-    KINDS,
     Clipped,
     ClockStep,
     DeadChannel,
@@ -24,6 +23,7 @@ from hw.virtual.harm import (
     Transformed,
     Unplugged,
 )
+from hw.virtual.harm_kinds import KINDS
 from hw.virtual.schedule import rotation
 from hw.virtual.timebase import Clock
 

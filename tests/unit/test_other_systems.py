@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from agent.cli.main import COMMANDS, EVERYWHERE, run_cli
+from agent.delivery.store import Store
 from tests.scenarios.processes import ROOT
 
 GOLDEN = ROOT / "tests" / "replay" / "golden"
@@ -22,6 +23,7 @@ def test_files_are_worked_on_everywhere(tmp_path: Path) -> None:
     assert run_cli(["simulate", "--preset", "plain", "--csv", str(example), "--duration", "42"]) == 0
     shutil.copytree(sorted(GOLDEN.glob("format-*"))[-1], data)
     (recording,) = data.glob("*.mcap")
+    Store(data).close()  # brings the store of an older version up to date, as `fieldcal run` does
     sensor = str(example / "sensor.csv")
     commands = [
         ["calibrate", "--plain", "--sensor", sensor, "--reference", str(example / "reference.csv"),

@@ -249,5 +249,5 @@ def test_a_directory_is_told(tmp_path: Path) -> None:
 def test_a_missing_library_names_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
     path = written(tmp_path, b"PAR1" + b"\0" * 40, "a.parquet")
-    fault(path, r"Parquet files need pyarrow, which is not installed: pip install 'fieldcal\[files\]'")
+    fault(path, r"Parquet files need pyarrow, which is not installed: fieldcal extras --install files")
     same(written(tmp_path, HEADER + table()))
