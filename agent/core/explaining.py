@@ -136,13 +136,13 @@ def _taken(recursion: Recursion, held: Sequence[Summary]) -> tuple[float, int, R
 
 def _told(explanation: Explanation, scale: float) -> str:
     kind, change = explanation.most.kind, explanation.change
+    if kind is RESPONSE:  # by how much, only windows tell that were made for the new response
+        return f"another {explanation.line} (S is {'larger' if change > 0.0 else 'smaller'} there)"
     if kind.in_output_unit:
         size = f"{change / scale:+.3g} m/s2" if kind is OFFSET else f"{100.0 * change / scale:+.3g} %"
     else:
         unit, factor = UNITS.get(kind.unit, (kind.unit, 1.0))
         size = f"{factor * change:+.3g} {unit}"
-    if kind is RESPONSE:  # by how much, only windows tell that were made for the new response
-        return f"another {explanation.line} (S is {'larger' if change > 0.0 else 'smaller'} there)"
     return f"another {explanation.line} ({explanation.most.name} {size})"
 
 

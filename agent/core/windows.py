@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -74,8 +73,9 @@ def windows_in(
 
     def made(limit_hz: float | None) -> list[Window]:
         settings = Settings(limits, bands=True, to_hz=limit_hz)
-        how: dict[str, Any] = {"settings": settings, "response": response}
-        return windows_of(piece.pose, sensor, reference, channel.instrument, span_s, lag_s, **how)
+        return windows_of(
+            piece.pose, sensor, reference, channel.instrument, span_s, lag_s, settings, response=response
+        )  # fmt: skip
 
     try:
         found = made(None)

@@ -15,19 +15,19 @@ from calib.estimate.nuisances import Priors
 from calib.estimate.quantities import RESPONSE
 from calib.estimate.response_told import ResponseTold, response_told
 from calib.model import Array
-from calib.signal.response import FLAT, Complex, Response, by_term, in_units
+from calib.signal.response import FLAT, NEAR, Complex, Response, by_term, in_units
 
 WIDER = 1.1  # later windows may move so much faster than the first one
 KNOWN = 0.03  # standard uncertainty of ln h
-LEFT, LEFT_U = 3e-3, 1.0  # of ln h, and of its standard uncertainty: so much may be left in a window
+LEFT_U = 1.0  # standard uncertainties of ln h that may be left in a window
 SURELY = 4.0  # standard uncertainties
-NEAR = 1e-2  # change of ln h from which the windows must be linearised again
+MOVED = 1e-2  # change of ln h from which the windows must be linearised again
 
 
 @dataclass(frozen=True, slots=True)
 class OverFrequency:
     """`motion_hz` is the band of the first window whose motion tells a response; None before. S means the same ever
-    after: it holds at one frequency, and motion above that band is not used. `deviations` of all windows from one
+    after: it holds at one frequency, and motion above `to_hz` is not used. `deviations` of all windows from one
     response."""
 
     motion_hz: tuple[float, float] | None = None
@@ -72,7 +72,7 @@ class OverFrequency:
         if not own:
             return True
         left = np.abs(_ends() @ (state.mean[own] - np.array(taken.terms) / in_units(self.to_hz)))
-        return bool(np.all(left < np.maximum(LEFT, LEFT_U * np.linalg.norm(_ends() @ state.factor[own], axis=1))))
+        return bool(np.all(left < np.maximum(NEAR, LEFT_U * np.linalg.norm(_ends() @ state.factor[own], axis=1))))
 
     def differs(self, state: JointState, earlier: JointState, reference: str) -> bool:
         """Whether the response beside a reference is surely another in `state` than in an earlier state."""
@@ -81,7 +81,7 @@ class OverFrequency:
             return False
         moved = np.abs(_ends() @ (state.mean[own] - earlier.mean[was]))
         u, u_was = (np.linalg.norm(_ends() @ one.factor[k], axis=1) for one, k in ((state, own), (earlier, was)))
-        return bool(np.any(moved > np.maximum(NEAR, SURELY * np.hypot(u, u_was))))
+        return bool(np.any(moved > np.maximum(MOVED, SURELY * np.hypot(u, u_was))))
 
     def factor(self, state: JointState) -> Array:
         """A factor of the covariance of a state (N, N) or (N, N + 1), with what the bands deviate from one response."""
@@ -132,7 +132,7 @@ def changed(state: JointState, point: Array) -> bool:
     """Whether a response in the state differs so much from the `point` (N,) that windows must be linearised again."""
     for owner in dict.fromkeys(q.owner for q in state.quantities if q.kind is RESPONSE):
         own = terms_of(state, owner)
-        if np.abs(_ends() @ (state.mean - point)[own]).max() > NEAR:
+        if np.abs(_ends() @ (state.mean - point)[own]).max() > MOVED:
             return True
     return False
 

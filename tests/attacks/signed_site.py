@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import threading
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ from agent.recording.result_signing import ResultSigner
 from agent.recording.signing import Signer
 from tests.attacks.chain_site import KEY
 from tests.unit.results import calibration
-from tests.unit.zenoh_site import Site, wait_for
+from tests.unit.zenoh_site import Site, taken_until, wait_for
 
 OTHER = Ed25519PrivateKey.from_private_bytes(bytes(range(1, 33)))
 PLACE = "fieldcal/v1/site/gw/mems/calibration"
@@ -81,17 +80,7 @@ class Gateway:
 
 def taken(consumer: Consumer, last: int) -> list[Received]:
     """The results up to number `last`; what has come where it never comes."""
-    timer = threading.Timer(20.0, consumer.close)
-    timer.start()
-    results: list[Received] = []
-    iterator = iter(consumer)
-    for result in iterator:
-        results.append(result)
-        if result.sequence >= last:
-            break
-    iterator.close()  # type: ignore[attr-defined]
-    timer.cancel()
-    return results
+    return taken_until(consumer, lambda result: result.sequence >= last)
 
 
 def numbers_of(results: Sequence[Received]) -> list[int]:

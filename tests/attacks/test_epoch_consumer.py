@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import threading
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
@@ -16,7 +15,7 @@ from agent.delivery.history import History
 from agent.delivery.publication import Publisher
 from agent.delivery.store import Store
 from tests.attacks.chain_site import record as record_run
-from tests.unit.zenoh_site import KEY, Site, record, wait_for
+from tests.unit.zenoh_site import KEY, Site, record, taken_until, wait_for
 
 AHEAD = 2_000_000_000_000  # a number of a gateway with the right clock; others are behind
 
@@ -51,18 +50,8 @@ def gateway(site: Site, tmp_path: Path) -> Iterator[Gateway]:
 
 
 def until(consumer: Consumer, last: int) -> list[Received]:
-    """The results up to number `last`. If it never comes, the session is closed after a while, and it is missing."""
-    timer = threading.Timer(20.0, consumer.close)
-    timer.start()
-    taken: list[Received] = []
-    results = iter(consumer)
-    for result in results:
-        taken.append(result)
-        if result.sequence == last and result.confirmed:
-            break
-    results.close()  # type: ignore[attr-defined]
-    timer.cancel()
-    return taken
+    """The results up to number `last`, confirmed; what has come where it never comes."""
+    return taken_until(consumer, lambda result: result.sequence == last and result.confirmed)
 
 
 def process(site: Site, memory: Path, last: int) -> list[Received]:

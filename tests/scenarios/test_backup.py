@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import itertools
 import shutil
 import stat
 import subprocess
-import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -17,47 +14,15 @@ from agent.delivery.store import UNKEPT_MAX, Store
 from hw.virtual.serial_port import PtyDevice
 from tests.replay.test_audit_chain import write_keys
 from tests.scenarios.processes import interrupt, recordings, results, started, wait_until
+from tests.scenarios.resting_sensor import config_text, port
 
-CONFIG = """
-[[devices]]
-name = "imu"
-driver = "serial-csv"
-options = {{ port = "{port}", rate_hz = 100, axes = 3, sequence = true, unit = "m/s2", serial_number = "A1" }}
-[[channels]]
-sensor = "imu"
-prior = {{}}
-guard_s = 0.1
-poses = [{{ start_s = 0, stop_s = 1, gravity_mps2 = [0, 0, 9.81] }}]
-poses_repeat_s = 1
-[recording]
-rotate_s = 1
-signing_key = "{key}"
-[zenoh]
-enabled = false
-"""
-
-
-@pytest.fixture
-def port(tmp_path: Path) -> Iterator[PtyDevice]:
-    numbers = itertools.count()
-    began_s, sent = time.monotonic(), 0
-
-    def text_due(t_s: float) -> bytes:
-        nonlocal sent
-        due = int((t_s - began_s) * 100) - sent
-        sent += due
-        return "".join(f"{next(numbers)},0.01,-0.02,9.81\n" for _ in range(due)).encode()
-
-    device = PtyDevice(text_due, link=tmp_path / "port")
-    device.start()
-    yield device
-    device.stop()
+__all__ = ["port"]  # a fixture
 
 
 def test_a_restored_directory_goes_on(tmp_path: Path, port: PtyDevice) -> None:
     private, public = write_keys(tmp_path)
     config, data_dir, copy = tmp_path / "gateway.toml", tmp_path / "data", tmp_path / "copy"
-    config.write_text(CONFIG.format(port=port.path, key=private))
+    config.write_text(config_text(port, private))
     with started("run", config, "--data-dir", data_dir, output=tmp_path / "output") as process:
         wait_until(lambda: len(recordings(data_dir)) >= 4 and results(data_dir, "window"), 30, "recordings")
         arguments = ["--data-dir", str(data_dir), "--config", str(config), "--with-keys"]

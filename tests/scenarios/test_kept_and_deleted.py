@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
 import json
-import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -13,43 +10,11 @@ import pytest
 from hw.virtual.serial_port import PtyDevice
 from tests.replay.test_audit_chain import write_keys
 from tests.scenarios.processes import fieldcal, interrupt, recordings, results, started, wait_until
+from tests.scenarios.resting_sensor import config_text, port
 
-CONFIG = """
-[[devices]]
-name = "imu"
-driver = "serial-csv"
-options = {{ port = "{port}", rate_hz = 100, axes = 3, sequence = true, unit = "m/s2", serial_number = "A1" }}
-[[channels]]
-sensor = "imu"
-prior = {{}}
-guard_s = 0.1
-poses = [{{ start_s = 0, stop_s = 1, gravity_mps2 = [0, 0, 9.81] }}]
-poses_repeat_s = 1
-[recording]
-rotate_s = 1
-keep_days = 0.00003
-signing_key = "{key}"
-[zenoh]
-enabled = false
-"""
+__all__ = ["port"]  # a fixture
 
-
-@pytest.fixture
-def port(tmp_path: Path) -> Iterator[PtyDevice]:
-    numbers = itertools.count()
-    began_s = time.monotonic()
-    sent = 0
-
-    def text_due(t_s: float) -> bytes:
-        nonlocal sent
-        due = int((t_s - began_s) * 100) - sent
-        sent += due
-        return "".join(f"{next(numbers)},0.01,-0.02,9.81\n" for _ in range(due)).encode()
-
-    device = PtyDevice(text_due, link=tmp_path / "port")
-    device.start()
-    yield device
-    device.stop()
+KEPT = "keep_days = 0.00003"
 
 
 def number(path: Path) -> int:
@@ -60,7 +25,7 @@ def number(path: Path) -> int:
 def test_a_life_of_recordings(tmp_path: Path, port: PtyDevice) -> None:
     private, public = write_keys(tmp_path)
     config, data, output = tmp_path / "config.toml", tmp_path / "data", tmp_path / "output"
-    config.write_text(CONFIG.format(port=port.path, key=private))
+    config.write_text(config_text(port, private, KEPT))
 
     def up_to(least: int) -> None:
         wait_until(
@@ -114,7 +79,7 @@ def test_a_life_of_recordings(tmp_path: Path, port: PtyDevice) -> None:
 def test_a_signing_key_that_is_none_is_bad_input(tmp_path: Path, port: PtyDevice) -> None:
     key, config = tmp_path / "key", tmp_path / "config.toml"
     key.write_text("no key")
-    config.write_text(CONFIG.format(port=port.path, key=key))
+    config.write_text(config_text(port, key, KEPT))
     done = fieldcal("run", config, "--data-dir", tmp_path / "data")
     assert done.returncode == 2
     line = config.read_text().splitlines().index(f'signing_key = "{key}"') + 1

@@ -266,7 +266,7 @@ from agent.delivery.consumer import Consumer
 
 def interrupt_while_it_waits(main=threading.main_thread().ident):
     while "get" not in [f.name for f in traceback.extract_stack(sys._current_frames()[main])]:
-        time.sleep(0.01)  # polls; the condition decides, not the time
+        time.sleep(0.01)  # polls; the condition decides, and the test ends the process after 30 s
     os.kill(os.getpid(), signal.SIGINT)
 
 consumer = Consumer([sys.argv[1]])

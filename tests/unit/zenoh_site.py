@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 import msgspec
 import zenoh
 
+from agent.delivery.consumer import Consumer, Received
 from agent.delivery.history import Record
 from agent.delivery.router import open_router
 from agent.delivery.session import session_config
@@ -66,3 +68,18 @@ def wait_for(condition: Callable[[], bool], timeout_s: float = 10.0) -> None:
     while not condition():
         assert time.monotonic() < end, f"{condition} did not come true within {timeout_s} s"
         time.sleep(0.01)  # polls; the condition decides, not the time
+
+
+def taken_until(consumer: Consumer, done: Callable[[Received], bool], timeout_s: float = 20.0) -> list[Received]:
+    """The results up to the first for which `done` holds; those that came within `timeout_s` where it never does."""
+    timer = threading.Timer(timeout_s, consumer.close)
+    timer.start()
+    taken: list[Received] = []
+    results = iter(consumer)
+    for result in results:
+        taken.append(result)
+        if done(result):
+            break
+    results.close()  # type: ignore[attr-defined]
+    timer.cancel()
+    return taken
