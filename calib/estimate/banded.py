@@ -120,7 +120,7 @@ def banded(windows: Sequence[Window], channels: int, to_hz: float) -> Banded:
         if kept.size:
             factors = _Factors(window.bands, kept)
             projected[w] = _projected(factors)
-            found += [_told(factors, axis) for axis in range(3)]
+            found.append(_told(factors))
     if not found:
         return Banded(projected, np.zeros(0), np.zeros((0, len(POWERS))), Deviations())
     residual, moves = np.concatenate([t.residual for t in found]), np.vstack([t.moves for t in found])
@@ -163,20 +163,20 @@ class _Factors:
         freedom = bands.points[kept] - np.count_nonzero(live, axis=1) - 2.0
         self.noise = np.maximum(np.sqrt(left / freedom[:, None] / bands.independent), TINY)
 
-    def seen(self, response: Complex, axis: int) -> Array:
-        """(2 M B, M) whitened slopes of an axis, by channel, if V is `response` (B,) times u."""
+    def seen(self, response: Complex) -> Array:
+        """(3, 2 M B, M) whitened slopes of each axis, by channel, if V is `response` (B,) times u."""
         m = self.root.shape[2] // 2
         rows = response.real[:, None, None] * self.root[..., :m]
         rows += (response.imag / self.omega)[:, None, None] * self.root[..., m:]
-        return np.asarray((rows / self.noise[:, axis, None, None]).reshape(-1, m))
+        return np.asarray((rows / self.noise.T[:, :, None, None]).reshape(3, -1, m))
 
-    def observed(self, axis: int) -> Array:
-        """(2 M B,) whitened slopes of an axis."""
-        return np.asarray((self.slopes[..., axis] / self.noise[:, axis, None]).ravel())
+    def observed(self) -> Array:
+        """(3, 2 M B) whitened slopes of each axis."""
+        return np.asarray((self.slopes / self.noise[:, None, :]).transpose(2, 0, 1).reshape(3, -1))
 
     def by_row(self, values: Array) -> Array:
-        """Values of the bands (B,) for each of the rows (2 M B,)."""
-        return np.repeat(values, self.root.shape[1])
+        """Values of the bands (..., B) for each of the rows (..., 2 M B)."""
+        return np.repeat(values, self.root.shape[1], axis=-1)
 
 
 def _unit(powers: Array) -> Array:
@@ -197,7 +197,7 @@ def _projected(factors: _Factors) -> Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Told:
-    """What one axis of a window says of the terms, whatever its row of B and its lag are.
+    """What the three axes of a window say of the terms, whatever their rows of B and their lags are.
 
     `residual` (R,) and `moves` (R, K) are whitened, and orthogonal to all that B and the lag can do. `signal` (R,) is
     the row without that projection, `at_hz` (R,) its frequency, `noise` (R,) what it was divided by, `free` the number
@@ -212,29 +212,34 @@ class _Told:
     free: int
 
 
-def _told(factors: _Factors, axis: int) -> _Told:
+def _told(factors: _Factors) -> _Told:
     terms = by_term(factors.omega)
-    own = factors.seen(np.ones(len(terms), dtype=complex), axis)
-    lagged = factors.seen(-1j * factors.omega, axis)
-    observed = factors.observed(axis)
-    live = own.any(axis=0)
-    moving = own[:, live] / _unit(np.sum(own[:, live] ** 2, axis=0))
-    gain = np.zeros(own.shape[1])
-    gain[live] = _fitted(own[:, live], observed)
+    own = factors.seen(np.ones(len(terms), dtype=complex))
+    lagged = factors.seen(-1j * factors.omega)
+    observed = factors.observed()
+    live = own.any(axis=(0, 1))
+    moving = own[..., live]
+    gain = np.zeros((3, own.shape[2], 1))
+    gain[:, live] = _fitted(moving, observed)
     # With the lag in the fit, a lag that is left does not reduce the gain.
-    gain[live] = _fitted(np.column_stack([own[:, live], lagged @ gain]), observed)[:-1]
-    free, _ = np.linalg.qr(np.column_stack([moving, lagged @ gain]))
-    rows = np.column_stack([observed, *(factors.seen(terms[:, k], axis) @ gain for k in range(len(POWERS)))])
-    rows -= free @ (free.T @ rows)
-    at_hz, noise = factors.by_row(factors.middle_hz), factors.by_row(factors.noise[:, axis])
-    return _Told(rows[:, 0], rows[:, 1:], observed, at_hz, noise, free.shape[1])
+    gain[:, live] = _fitted(np.concatenate([moving, lagged @ gain], axis=2), observed)[:, :-1]
+    free = np.concatenate([moving / _length(moving), lagged @ gain], axis=2)
+    ways, _ = np.linalg.qr(free)
+    rows = np.concatenate([observed[..., None], *(factors.seen(term) @ gain for term in terms.T)], axis=2)
+    rows = (rows - ways @ (ways.transpose(0, 2, 1) @ rows)).reshape(-1, 1 + len(POWERS))
+    at_hz, noise = np.tile(factors.by_row(factors.middle_hz), 3), factors.by_row(factors.noise.T).ravel()
+    return _Told(rows[:, 0], rows[:, 1:], observed.ravel(), at_hz, noise, 3 * free.shape[2])
+
+
+def _length(columns: Array) -> Array:
+    """(A, 1, p) length of each column (A, R, p), 1 where it is zero."""
+    return _unit(np.sum(columns**2, axis=1, keepdims=True))
 
 
 def _fitted(columns: Array, observed: Array) -> Array:
-    """Least squares of `observed` (R,) on columns (R, p)."""
-    unit = _unit(np.sum(columns**2, axis=0))
-    solution, *_ = np.linalg.lstsq(columns / unit, observed, rcond=RELATED)
-    return np.asarray(solution / unit)
+    """(A, p, 1) least squares of `observed` (A, R) on columns (A, R, p)."""
+    unit = _length(columns)
+    return np.asarray((np.linalg.pinv(columns / unit, RELATED) @ observed[..., None]) / unit.transpose(0, 2, 1))
 
 
 def _deviations(found: Sequence[_Told], left: Array) -> Deviations:

@@ -56,22 +56,16 @@ def response_told(
     """
     S, z = estimate[:9], estimate[9:]
 
-    def at(frequency_hz: float) -> tuple[Complex, Array]:
-        by_unknown = effects @ _log_h(frequency_hz, reference_hz)
-        h: Complex = np.exp(z @ by_unknown)
-        moves = np.column_stack([np.eye(9) * h, np.outer(S * h, by_unknown)])
-        variance = np.einsum("pa,ab,pb->p", moves, covariance, moves.conj()).real
-        return (S * h).reshape(3, 3), np.sqrt(np.maximum(variance, 0.0)).reshape(3, 3)
-
-    at_0hz, u_at_0hz = at(0.0)
     largest = float(np.abs(S).max())
     u = np.sqrt(np.diag(covariance)[:9]) / np.maximum(np.abs(S), LARGE * largest)
     count = max(1, round(per_octave * np.log2(band_hz[1] / band_hz[0])))
     edges = np.geomspace(*band_hz, count + 1)
-    bands = [
-        BandSensitivity(low, high, *at(float(np.sqrt(low * high))))
-        for low, high in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)
-    ]
+    by_unknown = _log_h(np.append(0.0, np.sqrt(edges[:-1] * edges[1:])), reference_hz) @ effects.T  # (F, J)
+    h = np.exp(by_unknown @ z)[:, None]
+    moves = np.concatenate([h[..., None] * np.eye(9), (S * h)[..., None] * by_unknown[:, None, :]], axis=2)  # (F, 9, .)
+    variance = np.sum((moves @ covariance) * moves.conj(), axis=2).real
+    at, u_at = (S * h).reshape(-1, 3, 3), np.sqrt(np.maximum(variance, 0.0)).reshape(-1, 3, 3)
+    ends = zip(edges[:-1].tolist(), edges[1:].tolist(), at[1:], u_at[1:], strict=True)
     grid = np.geomspace(*band_hz, GRID)
     away = np.abs(np.exp(_log_h(grid, reference_hz) @ (z @ effects))) - 1.0
     limit = coverage_factor * float(u.min()) / 3.0
@@ -79,9 +73,9 @@ def response_told(
         Response(tuple((z @ effects).tolist()), band_hz[1]),
         reference_hz,
         _around(grid, np.abs(away) <= limit, reference_hz),
-        at_0hz.real,
-        u_at_0hz,
-        tuple(bands),
+        at[0].real,
+        u_at[0],
+        tuple(BandSensitivity(*end) for end in ends),
     )
 
 

@@ -100,17 +100,23 @@ def passed(u: Array, rate_hz: float, response: Response) -> Array:
 
 @lru_cache(maxsize=8)
 def _taps(response: Response, rate_hz: float) -> Array:
-    """Least-squares taps (2 half + 1,) of a filter that is the response in the motion, and no more than alike above."""
+    """Taps (2 half + 1,) of a filter that is the response in the motion, and no more than alike above."""
     half = int(np.ceil(CYCLES * rate_hz / response.to_hz))
     frequency_hz = np.linspace(0.0, 0.5 * rate_hz, FINER * half + 1)
     end_hz = min(HELD * response.to_hz, 0.5 * rate_hz)
     beyond = np.clip((frequency_hz - end_hz) / max(0.5 * rate_hz - end_hz, 1e-9 * rate_hz), 0.0, 1.0)
     wanted = np.exp(response.at(np.minimum(frequency_hz, end_hz)) * (0.5 + 0.5 * np.cos(np.pi * beyond)))
-    weight = np.where(frequency_hz <= HELD * response.to_hz, 1.0, WEIGHT_ABOVE)
-    rows = np.exp(-2j * np.pi / rate_hz * frequency_hz[:, None] * np.arange(-half, half + 1)) * weight[:, None]
-    target = wanted * weight
-    taps, *_ = np.linalg.lstsq(
-        np.vstack([rows.real, rows.imag]), np.concatenate([target.real, target.imag]), rcond=1e-6
-    )
+    within = int(np.count_nonzero(frequency_hz <= HELD * response.to_hz))
+    taps = _least_squares(half, within) @ np.concatenate([wanted.real, wanted.imag])
     taps.flags.writeable = False
     return np.asarray(taps)
+
+
+@lru_cache(maxsize=4)
+def _least_squares(half: int, within: int) -> Array:
+    """(2 half + 1, 2 L) what makes taps of the real and imaginary parts wanted at L frequencies from 0 to half the
+    rate, of which the first `within` have full weight."""
+    frequency = np.linspace(0.0, 0.5, FINER * half + 1)
+    weight = np.where(np.arange(len(frequency)) < within, 1.0, WEIGHT_ABOVE)
+    rows = np.exp(-2j * np.pi * frequency[:, None] * np.arange(-half, half + 1)) * weight[:, None]
+    return np.asarray(np.linalg.pinv(np.vstack([rows.real, rows.imag]), rcond=1e-6) * np.tile(weight, 2))
