@@ -14,6 +14,7 @@ from agent.calibrate.outcome import NuisanceValue, Outcome, nothing_used
 from agent.calibrate.priors import priors_of, row_contradictions, u_gravity_mps2
 from agent.calibrate.tables import SensorTable
 from calib.estimate.adjustment import Adjustment, adjust
+from calib.estimate.condense import mean_frequency_hz
 from calib.estimate.lag_search import starts, without_lag
 from calib.estimate.norm_fit import norm_fit
 from calib.estimate.nuisances import Applied, Priors
@@ -59,6 +60,8 @@ def adjusted(files: Files, priors: Priors) -> Outcome:
         if not _used(windows):
             break
         found = at(windows, replace(applied, lag_s=lag_s))
+        if not stated.response:
+            return _outcome(_at_one_frequency(found, windows, priors, applied, lag_s), windows, files.rate_hz)
         if found.response is None or found.response.terms.is_near(applied.response):
             return _outcome(found, windows, files.rate_hz)
         if found.reasons and turn >= HOPELESS:
@@ -93,6 +96,17 @@ def with_response(priors: Priors, windows: Sequence[Window]) -> Priors:
     """The priors with those of the response, where the motion covers a band that is wide enough to tell it."""
     band_hz = motion_band_hz(_used(windows))
     return priors if band_hz is None else priors.with_response(band_hz)
+
+
+def _at_one_frequency(
+    found: Adjustment, windows: Sequence[Window], priors: Priors, applied: Applied, lag_s: float
+) -> Adjustment:
+    """The adjustment with the attenuation at the motion's frequency as an unknown; unchanged where nothing moved."""
+    motion_hz = mean_frequency_hz(_used(windows))
+    if not motion_hz:
+        return found
+    late_s = lag_s if found.lag_s is None else found.lag_s
+    return adjust(_used(windows), priors.at_one_frequency(motion_hz, late_s), replace(applied, lag_s=lag_s))
 
 
 def _used(windows: Sequence[Window]) -> list[Window]:
@@ -155,7 +169,8 @@ def _response(found: Adjustment) -> dict[str, Any]:
     """The members of the JSON object that tell the response over frequency."""
     told = found.response
     if told is None:
-        return dict.fromkeys(("reference_frequency_hz", "valid_band_hz", "sensitivity_at_0hz", "response"))
+        nothing = dict.fromkeys(("valid_band_hz", "sensitivity_at_0hz", "response"))
+        return {"reference_frequency_hz": 0.0, **nothing}  # only rests
     return {
         "reference_frequency_hz": told.reference_frequency_hz,
         "valid_band_hz": list(told.valid_band_hz),

@@ -21,7 +21,7 @@ from calib.estimate.fixed_mount import mean_input, never_turned
 from calib.estimate.gauss_newton import Solution, slope_residuals, solve
 from calib.estimate.nuisances import Applied, Nuisances, Priors
 from calib.estimate.quantities import LAG, RESPONSE, Kind
-from calib.estimate.response_told import ResponseTold, response_told
+from calib.estimate.response_told import ResponseTold, response_told, told_at_one_frequency
 from calib.estimate.slope_scatter import SlopeScatter, estimated
 from calib.estimate.verdict import misfit, nuisance_pull, reasons, turned_windows
 from calib.excitation.bands import motion_band_hz
@@ -104,7 +104,8 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
         priors = _without_offset(priors)
     found = [excited(w) for w in used]
     plain = not any(priors.values.values())  # with every nuisance fixed it is Method 3: all points weigh the same
-    data = condense([e.window for e in found], alike=plain, response_hz=priors.response_hz)
+    windows, one_frequency = [e.window for e in found], priors.response_terms == 1.0
+    data = condense(windows, alike=plain, response_hz=priors.response_hz, one_frequency=one_frequency)
     if not plain:
         data = effective(data, np.array([w.independent for w in used]))
     u_lag_s = [max(w.u_lag_s, priors.lag_window_s) if priors.lag_s > 0.0 else 0.0 for w in used]
@@ -157,14 +158,16 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
 def _response(
     solution: Solution, covariance: Array, priors: Priors, windows: Sequence[Window], k: float
 ) -> ResponseTold | None:
-    band_hz = motion_band_hz(windows)
+    one_frequency = priors.response_terms == 1.0
+    band_hz = (priors.response_hz,) * 2 if one_frequency else motion_band_hz(windows)
     if not priors.response or band_hz is None:
         return None
     nuisances = solution.equations.nuisances
     own = np.flatnonzero([t.kind is RESPONSE for t in nuisances.terms])
     applied = np.array([nuisances.terms[j].applied for j in own])
     chosen = np.concatenate([np.arange(9), 12 + own])
-    return response_told(
+    told = told_at_one_frequency if one_frequency else response_told
+    return told(
         np.append(solution.x[:9], solution.x[12 + own] + applied),
         covariance[np.ix_(chosen, chosen)],
         nuisances.response[own],

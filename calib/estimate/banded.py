@@ -109,9 +109,12 @@ class Banded:
         return self.deviations.between
 
 
-def banded(windows: Sequence[Window], channels: int, to_hz: float) -> Banded:
-    """The bands up to `to_hz` of windows with `channels` reference channels at most; some windows may have none."""
-    projected = np.zeros((len(windows), len(POWERS), 2 * channels, channels))
+def banded(windows: Sequence[Window], channels: int, to_hz: float, omega2: Array) -> Banded:
+    """The bands up to `to_hz` of W windows with `channels` reference channels at most.
+
+    A window without such bands moves at one frequency: `omega2` (W,) in rad2/s2.
+    """
+    projected = np.array([_at_one_frequency(np.sqrt(square), channels) for square in omega2.tolist()])
     found = []
     for w, window in enumerate(windows):
         if window.bands is None or window.bands.reference_channels != channels:
@@ -182,6 +185,12 @@ class _Factors:
 def _unit(powers: Array) -> Array:
     """The root of each power, 1 where there is none: a unit in which no column is much larger than the others."""
     return np.where(powers > 0.0, np.sqrt(np.maximum(powers, 0.0)), 1.0)
+
+
+def _at_one_frequency(omega: float, channels: int) -> Array:
+    """(K, 2M, M) see Banded."""
+    terms, per_omega = by_term(np.array(omega)), 1.0 / omega if omega else 0.0
+    return np.stack([np.vstack([h.real * np.eye(channels), h.imag * per_omega * np.eye(channels)]) for h in terms])
 
 
 def _projected(factors: _Factors) -> Array:

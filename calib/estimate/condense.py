@@ -44,11 +44,13 @@ class Condensed:
     bands: Banded | None = None
 
 
-def condense(windows: Sequence[Window], *, alike: bool = False, response_hz: float = 0.0) -> Condensed:
+def condense(
+    windows: Sequence[Window], *, alike: bool = False, response_hz: float = 0.0, one_frequency: bool = False
+) -> Condensed:
     """Condense the windows' sums; M is the largest number of reference channels among them.
 
     `alike` as in calib.estimate.type_a.pooled. `response_hz`: upper end of the motion that is to tell the response
-    over frequency; 0 where that is no unknown.
+    over frequency; 0 where that is no unknown. `one_frequency`: the bands of the windows tell nothing of it.
     """
     channels = max(w.sums.reference_channels for w in windows)
     segments = [_segments(w, channels) for w in windows]
@@ -63,8 +65,15 @@ def condense(windows: Sequence[Window], *, alike: bool = False, response_hz: flo
         mean_v=np.array([s.mean[-3:] for s in segments]),
         count=np.array([s.count.sum() for s in segments]),
         type_a=pooled(segments, roots, whiteners, alike=alike),
-        bands=banded(windows, channels, response_hz) if response_hz and any(w.bands for w in windows) else None,
+        bands=banded(windows, channels, 0.0 if one_frequency else response_hz, omega2) if response_hz else None,
     )
+
+
+def mean_frequency_hz(windows: Sequence[Window]) -> float:
+    """The mean frequency of the motion of these windows, by power; 0 where nothing moves."""
+    channels = max((w.sums.reference_channels for w in windows), default=0)
+    power = [_segments(w, channels).xx.sum(0) for w in windows if w.kind == "motion"]
+    return float(np.sqrt(_omega2(np.sum(power, axis=0), channels))) / (2.0 * np.pi) if power else 0.0
 
 
 def effective(data: Condensed, independent: Array) -> Condensed:

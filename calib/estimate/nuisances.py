@@ -37,6 +37,9 @@ from calib.signal.response import FLAT, POWERS, Response, by_term
 # Standard uncertainty of a term of the response, relative to that of a low-pass filter at the upper end of the motion.
 # It is honest for filters, means and resonances from 1.5 times that frequency on (shown by benchmarks.response).
 RESPONSE_U = 10.0
+# Of ln |h| at one frequency: what resonances at 30 times this frequency add, which cause hardly a lag; the most that
+# a lag says, because clocks that differ cause larger lags than filters do.
+ATTENUATED_U, MOST_ATTENUATED = 1e-3, 2e-2
 
 
 @dataclass(frozen=True, init=False)
@@ -72,6 +75,24 @@ class Priors(Stated):
         """
         stated_hz = self.reference_frequency_hz or float(np.sqrt(band_hz[0] * band_hz[1]))
         told = {"response": RESPONSE_U, "response_hz": to_hz or band_hz[1], "reference_frequency_hz": stated_hz}
+        return Priors({**self.values, **told}, self.parameters, self.covariance)
+
+    def at_one_frequency(self, motion_hz: float, lag_s: float) -> Priors:
+        """These and the prior of the response at `motion_hz`, the only frequency of the motion, where the sensor's
+        indications come after the reference's by `lag_s`. S holds at the frequency that is stated, or at this one.
+
+        One frequency cannot tell how much an instrument's filter attenuates it. A causal low-pass filter that delays by
+        L attenuates by nothing if it is a pure delay, and by (omega L)^2 / 2 if it is of first order; others lie
+        between these two. The prior has its mean in the middle of the two and both at one standard uncertainty.
+        """
+        late_s = lag_s - self.lag_at_s
+        most = min(0.5 * (2.0 * np.pi * motion_hz * late_s) ** 2, MOST_ATTENUATED)
+        attenuated = 0.5 * most * float(np.sign(late_s))  # a reference that comes late is the one that attenuates
+        told = {
+            "response": 2.0 * float(np.hypot(0.5 * most, ATTENUATED_U)), "response_at": 2.0 * attenuated,
+            "response_terms": 1.0, "response_hz": motion_hz,
+            "reference_frequency_hz": self.reference_frequency_hz or motion_hz,
+        }  # fmt: skip
         return Priors({**self.values, **told}, self.parameters, self.covariance)
 
 

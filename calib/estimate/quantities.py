@@ -295,10 +295,9 @@ REFERENCE_CORNER = Kind(
     of_reference=True,
 )  # fmt: skip
 RESPONSE = Kind(
-    # Of both instruments together, as the lag is. A standard uncertainty of 30 at the upper end of the motion is honest
-    # for low-pass filters, means and resonances from 1.5 times that frequency on.
+    # Of both instruments together, as the lag is.
     "response", "1", "response over frequency",
-    prior=Statement("response"),
+    prior=Statement("response"), mean=Statement("response_at"),
     of_reference=True, straight=LINEAR, stated=False,  # calib.estimate.over_frequency sees whether it changed
     loosened_by=("filter",),
 )  # fmt: skip
@@ -327,6 +326,7 @@ BETWEEN_WINDOWS = (
 OF_SENSOR = (SENSITIVITY, SENSITIVITY_RATE, OFFSET, OFFSET_RATE, SENSITIVITY_TEMPERATURE, OFFSET_TEMPERATURE)
 FREQUENCIES = (
     Statement("response_hz"),  # to which the terms of the response are scaled
+    Statement("response_terms", 5.0),  # how many of them are unknowns: one frequency tells c_2 alone
     Statement(  # at which S holds
         "reference_frequency_hz",
         configuration=("prior.reference_frequency_hz",),

@@ -54,29 +54,66 @@ def response_told(
 
     `effects` (J, 5): what a unit of each of the J unknowns adds to the terms in s^k. The motion was in `band_hz`.
     """
-    S, z = estimate[:9], estimate[9:]
-
-    largest = float(np.abs(S).max())
-    u = np.sqrt(np.diag(covariance)[:9]) / np.maximum(np.abs(S), LARGE * largest)
     count = max(1, round(per_octave * np.log2(band_hz[1] / band_hz[0])))
     edges = np.geomspace(*band_hz, count + 1)
-    by_unknown = _log_h(np.append(0.0, np.sqrt(edges[:-1] * edges[1:])), reference_hz) @ effects.T  # (F, J)
-    h = np.exp(by_unknown @ z)[:, None]
-    moves = np.concatenate([h[..., None] * np.eye(9), (S * h)[..., None] * by_unknown[:, None, :]], axis=2)  # (F, 9, .)
-    variance = np.sum((moves @ covariance) * moves.conj(), axis=2).real
-    at, u_at = (S * h).reshape(-1, 3, 3), np.sqrt(np.maximum(variance, 0.0)).reshape(-1, 3, 3)
+    middles_hz = np.append(0.0, np.sqrt(edges[:-1] * edges[1:]))
+    at, u_at = _sensitivities(estimate, covariance, effects, middles_hz, reference_hz)
     ends = zip(edges[:-1].tolist(), edges[1:].tolist(), at[1:], u_at[1:], strict=True)
-    grid = np.geomspace(*band_hz, GRID)
-    away = np.abs(np.exp(_log_h(grid, reference_hz) @ (z @ effects))) - 1.0
-    limit = coverage_factor * float(u.min()) / 3.0
+    terms, grid = estimate[9:] @ effects, np.geomspace(*band_hz, GRID)
+    away = np.abs(np.exp(_log_h(grid, reference_hz) @ terms)) - 1.0
+    limit = coverage_factor * _least_u(estimate[:9], covariance) / 3.0
     return ResponseTold(
-        Response(tuple((z @ effects).tolist()), band_hz[1]),
+        Response(tuple(terms.tolist()), band_hz[1]),
         reference_hz,
         _around(grid, np.abs(away) <= limit, reference_hz),
         at[0].real,
         u_at[0],
         tuple(BandSensitivity(*end) for end in ends),
     )
+
+
+def told_at_one_frequency(
+    estimate: Array,
+    covariance: Array,
+    effects: Array,
+    reference_hz: float,
+    band_hz: tuple[float, float],
+    coverage_factor: float,
+) -> ResponseTold:
+    """The same where all motion has one frequency, both ends of `band_hz`, and J = 1: the term in s^2 alone.
+
+    The valid band follows from the largest such term, in size, that the data and its prior allow.
+    """
+    motion_hz = band_hz[1]
+    at, u_at = _sensitivities(estimate, covariance, effects, np.array([0.0, motion_hz]), reference_hz)
+    most = (abs(estimate[9]) + coverage_factor * np.sqrt(covariance[9, 9])) * abs(effects[0, 0])
+    away = coverage_factor * _least_u(estimate[:9], covariance) / 3.0 / most / (2.0 * np.pi) ** 2  # in Hz^2
+    return ResponseTold(
+        Response(tuple((estimate[9:] @ effects).tolist()), motion_hz),
+        reference_hz,
+        (float(np.sqrt(max(reference_hz**2 - away, 0.0))), float(np.sqrt(reference_hz**2 + away))),
+        at[0].real,
+        u_at[0],
+        (BandSensitivity(motion_hz, motion_hz, at[1], u_at[1]),),
+    )
+
+
+def _least_u(S: Array, covariance: Array) -> float:
+    """The smallest relative standard uncertainty of an element of S (9,); small elements count as LARGE ones."""
+    largest = float(np.abs(S).max())
+    return float((np.sqrt(np.diag(covariance)[:9]) / np.maximum(np.abs(S), LARGE * largest)).min())
+
+
+def _sensitivities(
+    estimate: Array, covariance: Array, effects: Array, frequency_hz: Array, reference_hz: float
+) -> tuple[Complex, Array]:
+    """Complex sensitivities (F, 3, 3) at F frequencies, the lag taken out, and their standard uncertainties."""
+    S, z = estimate[:9], estimate[9:]
+    by_unknown = _log_h(frequency_hz, reference_hz) @ effects.T  # (F, J)
+    h = np.exp(by_unknown @ z)[:, None]
+    moves = np.concatenate([h[..., None] * np.eye(9), (S * h)[..., None] * by_unknown[:, None, :]], axis=2)
+    variance = np.sum((moves @ covariance) * moves.conj(), axis=2).real
+    return np.asarray((S * h).reshape(-1, 3, 3)), np.sqrt(np.maximum(variance, 0.0)).reshape(-1, 3, 3)
 
 
 def _log_h(frequency_hz: float | Array, reference_hz: float) -> Complex:

@@ -124,7 +124,8 @@ def _terms(
     for name, k in zip(_axes("lag"), np.eye(3), strict=True):
         yield _term(name, kinds.LAG_OF_AXIS, priors, owner=reference, lag=k)
     if priors.response > 0.0:
-        for n, (power, unit) in enumerate(zip(POWERS, in_units(priors.response_hz).tolist(), strict=True)):
+        units = in_units(priors.response_hz)[: int(priors.response_terms)].tolist()
+        for n, (power, unit) in enumerate(zip(POWERS, units, strict=False)):
             taken = {kinds.RESPONSE: [applied[kinds.RESPONSE][n] / unit]}
             term = unit * np.eye(len(POWERS))[n]
             yield _term(f"response_{power}", kinds.RESPONSE, priors, taken, reference, response=term)
