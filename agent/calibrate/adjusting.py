@@ -14,7 +14,7 @@ from agent.calibrate.outcome import NuisanceValue, Outcome, nothing_used
 from agent.calibrate.priors import priors_of, row_contradictions, u_gravity_mps2
 from agent.calibrate.tables import SensorTable
 from calib.estimate.adjustment import Adjustment, adjust
-from calib.estimate.condense import mean_frequency_hz
+from calib.estimate.condense import condense, mean_frequency_hz
 from calib.estimate.lag_search import starts, without_lag
 from calib.estimate.norm_fit import norm_fit
 from calib.estimate.nuisances import Applied, Priors
@@ -102,7 +102,8 @@ def _at_one_frequency(
     found: Adjustment, windows: Sequence[Window], priors: Priors, applied: Applied, lag_s: float
 ) -> Adjustment:
     """The adjustment with the attenuation at the motion's frequency as an unknown; unchanged where nothing moved."""
-    motion_hz = mean_frequency_hz(_used(windows))
+    moved = [w for w in _used(windows) if w.kind == "motion"]
+    motion_hz = mean_frequency_hz(condense(moved, response_hz=np.inf, one_frequency=True)) if moved else 0.0
     if not motion_hz:
         return found
     late_s = lag_s if found.lag_s is None else found.lag_s

@@ -189,8 +189,16 @@ def from_version_3(state: dict[str, Any]) -> None:
                 summary["data"]["type_a"][of] = summary["data"]["type_a"][of] * summary["independent"]
 
 
+def from_version_4(state: dict[str, Any]) -> None:
+    """Version 4 knew no attenuation at one frequency: motion of one frequency was taken to show both alike."""
+    for estimation in _estimations(state):
+        for holder in (estimation, *estimation["proposed"]):
+            holder["recursion"]["over"]["late_s"] = None
+
+
 MIGRATIONS: Mapping[int, Callable[[dict[str, Any]], None]] = {
     1: from_version_1,
     2: from_version_2,
     3: from_version_3,
+    4: from_version_4,
 }

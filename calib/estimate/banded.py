@@ -109,10 +109,13 @@ class Banded:
         return self.deviations.between
 
 
-def banded(windows: Sequence[Window], channels: int, to_hz: float, omega2: Array) -> Banded:
+def banded(
+    windows: Sequence[Window], channels: int, to_hz: float, omega2: Array, *, one_frequency: bool = False
+) -> Banded:
     """The bands up to `to_hz` of W windows with `channels` reference channels at most.
 
-    A window without such bands moves at one frequency: `omega2` (W,) in rad2/s2.
+    A window without such bands moves at the frequency of `omega2` (W,) in rad2/s2. `one_frequency`: the bands are
+    those of a few sines and of their harmonics, which tell no term of the response.
     """
     projected = np.array([_at_one_frequency(np.sqrt(square), channels) for square in omega2.tolist()])
     found = []
@@ -123,7 +126,7 @@ def banded(windows: Sequence[Window], channels: int, to_hz: float, omega2: Array
         if kept.size:
             factors = _Factors(window.bands, kept)
             projected[w] = _projected(factors)
-            found.append(_told(factors))
+            found += [] if one_frequency else [_told(factors)]
     if not found:
         return Banded(projected, np.zeros(0), np.zeros((0, len(POWERS))), Deviations())
     residual, moves = np.concatenate([t.residual for t in found]), np.vstack([t.moves for t in found])

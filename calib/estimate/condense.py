@@ -50,7 +50,7 @@ def condense(
     """Condense the windows' sums; M is the largest number of reference channels among them.
 
     `alike` as in calib.estimate.type_a.pooled. `response_hz`: upper end of the motion that is to tell the response
-    over frequency; 0 where that is no unknown. `one_frequency`: the bands of the windows tell nothing of it.
+    over frequency; 0 where that is no unknown. `one_frequency`: see calib.estimate.banded.
     """
     channels = max(w.sums.reference_channels for w in windows)
     segments = [_segments(w, channels) for w in windows]
@@ -65,15 +65,18 @@ def condense(
         mean_v=np.array([s.mean[-3:] for s in segments]),
         count=np.array([s.count.sum() for s in segments]),
         type_a=pooled(segments, roots, whiteners, alike=alike),
-        bands=banded(windows, channels, 0.0 if one_frequency else response_hz, omega2) if response_hz else None,
+        bands=banded(windows, channels, response_hz, omega2, one_frequency=one_frequency) if response_hz else None,
     )
 
 
-def mean_frequency_hz(windows: Sequence[Window]) -> float:
-    """The mean frequency of the motion of these windows, by power; 0 where nothing moves."""
-    channels = max((w.sums.reference_channels for w in windows), default=0)
-    power = [_segments(w, channels).xx.sum(0) for w in windows if w.kind == "motion"]
-    return float(np.sqrt(_omega2(np.sum(power, axis=0), channels))) / (2.0 * np.pi) if power else 0.0
+def mean_frequency_hz(data: Condensed) -> float:
+    """The mean frequency of the motion, by power; 0 where nothing moves, or where the response is no unknown."""
+    real = range(own_channels(data.channels))
+    power = np.sum(data.root[:, :, real] ** 2, axis=1)
+    if data.bands is None or not power.any():
+        return 0.0
+    square = -data.bands.projected[:, 0, real, real]  # by c_2, the slopes on u move by -omega^2
+    return float(np.sqrt(np.sum(power * square) / power.sum())) / (2.0 * np.pi)
 
 
 def effective(data: Condensed, independent: Array) -> Condensed:

@@ -74,7 +74,10 @@ class Priors(Stated):
         S holds at the frequency that is stated, or in the middle of the band.
         """
         stated_hz = self.reference_frequency_hz or float(np.sqrt(band_hz[0] * band_hz[1]))
-        told = {"response": RESPONSE_U, "response_hz": to_hz or band_hz[1], "reference_frequency_hz": stated_hz}
+        told = {
+            "response": RESPONSE_U, "response_at": 0.0, "response_terms": float(len(POWERS)),
+            "response_hz": to_hz or band_hz[1], "reference_frequency_hz": stated_hz,
+        }  # fmt: skip
         return Priors({**self.values, **told}, self.parameters, self.covariance)
 
     def at_one_frequency(self, motion_hz: float, lag_s: float) -> Priors:

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, Self
 
 import numpy as np
 
 from calib.estimate.banded import Deviations
-from calib.estimate.condense import Condensed
+from calib.estimate.condense import Condensed, mean_frequency_hz
 from calib.estimate.joint_state import JointState
 from calib.estimate.nuisances import Priors
-from calib.estimate.quantities import RESPONSE
-from calib.estimate.response_told import ResponseTold, response_told
+from calib.estimate.quantities import RESPONSE, Quantity
+from calib.estimate.response_told import ResponseTold, response_told, told_at_one_frequency
 from calib.model import Array
-from calib.signal.response import FLAT, NEAR, Complex, Response, by_term, in_units
+from calib.signal.response import FLAT, NEAR, POWERS, Complex, Response, by_term, in_units
 
 WIDER = 1.1  # later windows may move so much faster than the first one
 KNOWN = 0.03  # standard uncertainty of ln h
@@ -33,6 +33,7 @@ class OverFrequency:
     motion_hz: tuple[float, float] | None = None
     deviations: Deviations = field(default_factory=Deviations)
     first_hz: float = 0.0  # mean frequency of the first window with motion; 0 before
+    late_s: float | None = None  # the lag at this frequency, where it was the only one; None where a band told more
 
     @property
     def to_hz(self) -> float:
@@ -41,13 +42,27 @@ class OverFrequency:
 
     def stated(self, priors: Priors) -> Priors:
         """The priors with those of the response, once it is an unknown."""
+        if self.late_s is not None:
+            priors = priors.at_one_frequency(self.first_hz, self.late_s)
         return priors if self.motion_hz is None else priors.with_response(self.motion_hz, self.to_hz)
+
+    def begun(self, motion_hz: tuple[float, float] | None, data: Condensed, lag_s: float) -> Self:
+        """The same when a window comes whose motion is in the band `motion_hz`, or has one frequency (None).
+
+        `data` are the window's; `lag_s` was taken out of it.
+        """
+        if self.motion_hz is not None:
+            return self
+        moving_hz = mean_frequency_hz(data)
+        if motion_hz is not None:
+            return replace(self, motion_hz=motion_hz, first_hz=self.first_hz or moving_hz)
+        if self.late_s is None and moving_hz:
+            return replace(self, first_hz=moving_hz, late_s=lag_s)
+        return self
 
     def taken(self, data: Condensed) -> Self:
         """After a window with these data."""
-        moving_hz = float(np.sqrt(data.omega2[0])) / (2.0 * np.pi)
-        deviations = self.deviations if data.bands is None else self.deviations.plus(data.bands.deviations)
-        return replace(self, deviations=deviations, first_hz=self.first_hz or moving_hz)
+        return self if data.bands is None else replace(self, deviations=self.deviations.plus(data.bands.deviations))
 
     def reference_hz(self, priors: Priors) -> float:
         """The frequency at which S holds; 0 if nothing moved yet."""
@@ -95,7 +110,9 @@ class OverFrequency:
     def told(self, state: JointState, reference: str, priors: Priors, coverage_factor: float) -> ResponseTold | None:
         """The response beside a reference; None where it is no unknown."""
         own = terms_of(state, reference)
-        if self.motion_hz is None or not own:
+        if self.motion_hz is None:
+            return self._told_at_one_frequency(state, reference, priors, coverage_factor)
+        if not own:
             return None
         chosen, effects = [*range(9), *own], np.diag(in_units(self.to_hz))
         factor, hz = self.factor(state)[chosen], self.stated(priors).reference_frequency_hz
@@ -106,33 +123,66 @@ class OverFrequency:
     def steady(self, state: JointState, reference: str, priors: Priors) -> dict[str, float]:
         """Derivatives, by the key of each term, of the logarithm of the sensitivity at 0 Hz over that at the reference
         frequency."""
-        if self.motion_hz is None:
-            return {}
         at_reference = by_term(np.array(2.0 * np.pi * self.stated(priors).reference_frequency_hz)).real
-        moved = -at_reference * in_units(self.to_hz)
-        return {state.keys[k]: float(by) for k, by in zip(terms_of(state, reference), moved, strict=False)}
+        own, unit = self._unknowns(state, reference)
+        return {state.keys[k]: float(by) for k, by in zip(own, -(at_reference * unit)[: len(own)], strict=True)}
+
+    def log_h(self, state: JointState, reference: str, frequency_hz: float) -> float:
+        """ln |h| beside a reference at a frequency, 0 at 0 Hz."""
+        own, unit = self._unknowns(state, reference)
+        moved = by_term(np.array(2.0 * np.pi * frequency_hz)).real * unit
+        return float(moved[: len(own)] @ state.mean[own])
+
+    def _unknowns(self, state: JointState, reference: str) -> tuple[list[int], Array]:
+        """Where the first terms of the response beside a reference are in a state, and the units (5,) of all terms."""
+        if self.motion_hz is not None:
+            return terms_of(state, reference), in_units(self.to_hz)
+        own = attenuation_of(state, reference)
+        return own, in_units(self.first_hz) if own else np.zeros(len(POWERS))
+
+    def _told_at_one_frequency(
+        self, state: JointState, reference: str, priors: Priors, coverage_factor: float
+    ) -> ResponseTold | None:
+        own = attenuation_of(state, reference)
+        if not own:
+            return None
+        chosen, effects = [*range(9), *own], in_units(self.first_hz) * np.eye(1, len(POWERS))
+        factor, hz = self.factor(state)[chosen], self.stated(priors).reference_frequency_hz
+        band_hz = (self.first_hz, self.first_hz)
+        return told_at_one_frequency(state.mean[chosen], factor @ factor.T, effects, hz, band_hz, coverage_factor)
 
     def snapshot(self) -> dict[str, Any]:
         """Plain values, for `load`."""
-        return {"motion_hz": self.motion_hz, "deviations": asdict(self.deviations), "first_hz": self.first_hz}
+        return {f.name: getattr(self, f.name) for f in fields(self)} | {"deviations": asdict(self.deviations)}
 
     @classmethod
     def load(cls, state: Mapping[str, Any]) -> OverFrequency:
         """The object whose snapshot this is."""
         band = state["motion_hz"]
-        return cls(None if band is None else (band[0], band[1]), Deviations(**state["deviations"]), state["first_hz"])
+        motion_hz = None if band is None else (band[0], band[1])
+        return cls(**{**state, "motion_hz": motion_hz, "deviations": Deviations(**state["deviations"])})
 
 
 def terms_of(state: JointState, reference: str) -> list[int]:
     """Where the terms of the response beside a reference are in a state, in the order of POWERS."""
-    return [k for k, q in enumerate(state.quantities) if q.kind is RESPONSE and q.owner == reference and not q.first]
+    return _named(state, reference, [f"response_{power}" for power in POWERS])
+
+
+def attenuation_of(state: JointState, reference: str) -> list[int]:
+    """Where the attenuation at the one frequency beside a reference is in a state; empty where it is no unknown."""
+    return _named(state, reference, ["attenuation"])
+
+
+def _named(state: JointState, reference: str, names: Sequence[str]) -> list[int]:
+    keys = [Quantity(name, RESPONSE, owner=reference).key for name in names]
+    return [state.index(key) for key in keys if key in state]
 
 
 def changed(state: JointState, point: Array) -> bool:
     """Whether a response in the state differs so much from the `point` (N,) that windows must be linearised again."""
     for owner in dict.fromkeys(q.owner for q in state.quantities if q.kind is RESPONSE):
         own = terms_of(state, owner)
-        if np.abs(_ends() @ (state.mean - point)[own]).max() > MOVED:
+        if own and np.abs(_ends() @ (state.mean - point)[own]).max() > MOVED:
             return True
     return False
 

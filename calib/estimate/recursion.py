@@ -81,8 +81,8 @@ class Recursion(WindowState):
 
     def response_change(self, since: Recursion) -> tuple[float, float]:
         """The upper end of the motion in Hz, and by how much S is larger there than it was, relative."""
-        to_hz = self._over.motion_hz[1] if self._over.motion_hz else 0.0
-        now, before = (one.response.at(np.array([to_hz])).real[0] for one in (self, since))
+        to_hz = self._over.motion_hz[1] if self._over.motion_hz else self._over.first_hz
+        now, before = (one._over.log_h(one._joint.state, self.reference, to_hz) for one in (self, since))
         return to_hz, float(np.expm1(now - before))
 
     def has_another_response(self, than: Recursion) -> bool:

@@ -125,10 +125,11 @@ def _terms(
         yield _term(name, kinds.LAG_OF_AXIS, priors, owner=reference, lag=k)
     if priors.response > 0.0:
         units = in_units(priors.response_hz)[: int(priors.response_terms)].tolist()
-        for n, (power, unit) in enumerate(zip(POWERS, units, strict=False)):
+        names = ["attenuation"] if len(units) == 1 else [f"response_{power}" for power in POWERS]
+        for n, (name, unit) in enumerate(zip(names, units, strict=True)):
             taken = {kinds.RESPONSE: [applied[kinds.RESPONSE][n] / unit]}
             term = unit * np.eye(len(POWERS))[n]
-            yield _term(f"response_{power}", kinds.RESPONSE, priors, taken, reference, response=term)
+            yield _term(name, kinds.RESPONSE, priors, taken, reference, response=term)
     turn = np.full(1, 2.0 * np.pi)
     yield _term("reference_corner", kinds.REFERENCE_CORNER, priors, applied, reference, reference_corner=turn)
     yield _term("sensor_corner", kinds.SENSOR_CORNER, priors, applied, sensor_corner=turn)

@@ -90,11 +90,12 @@ class Summary:
         found, sums, m = excited(window), window.sums, window.pose.direction.shape[1]
         mean = sums.count @ sums.mean[:, :m] / sums.count.sum()
         held = window.pose.gravity_mps2 + window.pose.direction @ mean
-        data = condense([found.window], response_hz=to_hz)
+        motion_hz = motion_band_hz([window])
+        data = condense([found.window], response_hz=to_hz, one_frequency=motion_hz is None)
         moved = found.window.pose
         return cls(
             window.pose, moved, held, data, found.directions, found.attenuation, day, lag_s, temperature_degc,
-            window.u_lag_s, window.independent, reference, window.response, motion_band_hz([window]),
+            window.u_lag_s, window.independent, reference, window.response, motion_hz,
         )  # fmt: skip
 
     def with_gravity(self, ratio: float) -> Summary:

@@ -167,16 +167,17 @@ class WindowState:
         if self._held is not None and not never_turned(np.array([self._held.mps2, summary.held_mps2])):
             self._unmount(self._held)
         day = summary.day if self._day is None else self._day  # from which the state will wander on
-        first = self._over.motion_hz is None and summary.motion_hz is not None
+        over = self._over.begun(summary.motion_hz, summary.data, summary.lag_s)
+        first = over is not self._over
         if first:
-            self._over = replace(self._over, motion_hz=summary.motion_hz)
+            self._over = over
             self._state_response()
         self._mount(summary, day)
         rows = self._rows(summary)
         new = self._joint.append(rows.terms, day)
         if new and self._held is not None:
             self._held = self._held.moved_by(held_at(summary, self._priors(summary))[0], new)
-        if self._held is not None and not self._held.steady:
+        if self._held is not None and (first or not self._held.steady):
             steady = self._over.steady(self._joint.state, summary.reference, self._priors(summary))
             self._held = replace(self._held, steady=steady)
         if first and self._joint.recent:

@@ -52,7 +52,8 @@ class Life:
         type_a = replace(summary.data.type_a, degrees_of_freedom=0.0)
         summary = replace(summary, data=replace(summary.data, type_a=type_a))
         self.recursion.update(summary)
-        rows = WindowRows(summary, Priors(self._values()), 1.0, 20.0, None, (np.nan, np.nan))
+        priors = Priors(self._values()).at_one_frequency(self.recursion.reference_frequency_hz, 0.0)
+        rows = WindowRows(summary, priors, 1.0, 20.0, None, (np.nan, np.nan))
         state = JointState(S_AND_Q, MEAN, U)
         for term in rows.terms:
             state.append(term.quantity, term.expected, term.uncertainty)

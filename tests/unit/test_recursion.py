@@ -50,7 +50,8 @@ def test_on_a_clamp_it_gives_what_all_windows_at_once_give(seed: int) -> None:
     found = turned(Priors())
     for k, window in enumerate(windows):
         found.update(Summary.of(window, k * 1e-3))
-    at_once = adjust(windows, Priors(parameters=MEAN, covariance=np.diag(U**2)))
+    priors = Priors(parameters=MEAN, covariance=np.diag(U**2)).at_one_frequency(found.reference_frequency_hz, 0.0)
+    at_once = adjust(windows, priors)
     u = np.sqrt(np.diag(at_once.covariance)[:12])
     # Both weigh each window by its own noise; what differs is which windows that noise was learned from.
     np.testing.assert_array_less(np.abs(values(found.result()) - at_once.mean[:12]) / u, 0.2)
