@@ -134,7 +134,10 @@ def norm_fitted(sensor: SensorTable, options: dict[str, Any]) -> Outcome:
         None if reasons else found.calibration, reasons, windows, clock.rate_hz, "norm fit",
         coverage_factor=found.coverage_factor,
         uncertainty_kind="scatter of the rests and u of gravity",
-        more={"frame": "free", "residual_mps2": found.residual_mps2},
+        more={
+            "frame": "free", "residual_mps2": found.residual_mps2, "offset_drift_mps2": found.drift_mps2,
+            "reference_frequency_hz": 0.0,
+        },
     )  # fmt: skip
 
 

@@ -54,7 +54,7 @@ def test_norm_fit_gives_the_published_table(sensor: str, source: str) -> None:
     assert found.reasons == ()
     np.testing.assert_allclose(found.calibration.sensitivity, S, rtol=0, atol=LIMIT_S)
     np.testing.assert_allclose(found.calibration.offset, Q, rtol=0, atol=LIMIT_Q_MPS2)
-    # What it says of itself is of the size of what it is off by: 0.02 % and 2 mm/s2 at k = 2, not a hundred times more.
+    # What it says of itself is of the size of what it is off by: 0.02 % at k = 2, and 2 mm/s2 beside the drift of Q.
     u = found.calibration.standard_uncertainty
     assert 1e-5 < u[0] < 3e-4
-    assert 1e-4 < u[9] < 3e-3
+    assert 1e-4 < u[9] < 5e-3
