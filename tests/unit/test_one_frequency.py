@@ -7,76 +7,29 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from agent.calibrate.adjusting import adjusted
-from agent.calibrate.files import Files, Options
-from agent.calibrate.outcome import Outcome
-from agent.calibrate.poses import PoseInterval
-from agent.calibrate.tables import ReferenceTable, SensorTable
 from agent.core.events import CalibrationUpdate
 from agent.core.pipeline import Pipeline
-from calib.estimate.nuisances import Priors
-from calib.excitation.front_end import Settings
-from calib.geometry import clamp
 from calib.model import Array
-from calib.signal.instrument import Instrument
 from hw.virtual.bench import Bench
 from hw.virtual.motion import sine
-from hw.virtual.parameters import BenchParameters, SensorParameters
 from hw.virtual.presets import COUNTS_PER_MPS2, plain
-from hw.virtual.schedule import Schedule, clamped
 from hw.virtual.spread import Spread, drawn
+from tests.one_frequency import ANGLES, S_TRUE, at_frequency, bench, calibrated, stated
 from tests.unit.recorded_bench import _config, _events
 
-S_TRUE = np.array([[1.02, 0.01, -0.02], [0.015, 0.98, 0.005], [-0.01, 0.02, 1.01]])
-Q_TRUE = np.array([0.36, -0.06, 0.165])
-DEGREE = float(np.deg2rad(1.0))
-ANGLES = {"angle_rad": 0.2 * DEGREE, "theta_rad": 0.2 * DEGREE, "offset_mps2": 0.05}
-EXACT = Priors(**{**Priors.none().values, "lag_s": 0.02})
 SEEDS = range(8)
 LIMIT_Z2 = 2.0  # mean of z^2 over 8 runs of 12 parameters; 0.9 to 1.3 are found, 5 to 20 without the unknown
-
-
-def bench(motion_hz: float, **sensor: object) -> BenchParameters:
-    stands = tuple(clamped(35.0, alpha, 2.0) for alpha in (0.0, 30.0, 120.0, 210.0))
-    made = SensorParameters(sensitivity=S_TRUE, offset=Q_TRUE, noise_mps2=0.02, **sensor)  # type: ignore[arg-type]
-    return BenchParameters(schedule=Schedule(stands, turn_s=1.0), motion=sine(motion_hz, 10.0), sensor=made)
-
-
-def calibrated(parameters: BenchParameters, seed: int, priors: Priors) -> Outcome:
-    recording = Bench(parameters, seed).recording(parameters.schedule.duration_s(3))
-    poses = [
-        PoseInterval(p.start_s, p.stop_s, clamp(p.theta_deg * DEGREE, p.alpha_deg * DEGREE, position=p.position))
-        for p in recording.poses
-        if p.theta_deg is not None and p.alpha_deg is not None
-    ]
-    return adjusted(
-        Files(
-            SensorTable(Path("sensor.csv"), recording.sensor_stamp_s, recording.v, None),
-            ReferenceTable(Path("r.csv"), recording.reference_stamp_s, recording.reference, "acceleration", "a"),
-            poses,
-            Instrument(),
-            Options(Settings(bands=True)),
-        ),
-        priors,
-    )
-
-
-def at_frequency(motion_hz: float, corner_hz: float, order: int) -> Array:
-    s = 1j * motion_hz / corner_hz
-    h = 1.0 / (1.0 + s) if order == 1 else 1.0 / (1.0 + np.sqrt(2.0) * s + s**2)
-    return np.append((abs(h) * S_TRUE).ravel(), Q_TRUE)
 
 
 @pytest.mark.parametrize(("motion_hz", "corner_hz", "order"), [(6.0, 31.0, 1), (3.0, 31.0, 1), (6.0, 31.0, 2)])
 def test_with_a_filter_s_is_right_at_its_frequency_and_q_is_right(
     motion_hz: float, corner_hz: float, order: int
 ) -> None:
-    priors, z = replace_exact(**ANGLES), []
+    priors, z = stated(**ANGLES), []
     for seed in SEEDS:
         random = np.random.default_rng([7, seed])
         drawn_bench = drawn(
@@ -92,10 +45,6 @@ def test_with_a_filter_s_is_right_at_its_frequency_and_q_is_right(
     assert np.abs(z).max() < 4.0
 
 
-def replace_exact(**stated: float) -> Priors:
-    return Priors({**EXACT.values, **stated})
-
-
 def test_a_pure_delay_costs_little_and_no_lag_costs_nothing() -> None:
     u = {lag_s: _u_main(lag_s) for lag_s in (0.0, 0.005)}
     assert u[0.0] < 0.0027  # 0.0025 if both instruments were known to respond alike
@@ -103,13 +52,13 @@ def test_a_pure_delay_costs_little_and_no_lag_costs_nothing() -> None:
 
 
 def _u_main(lag_s: float) -> float:
-    found = calibrated(bench(3.0, lag_s=(lag_s,) * 3), 3, replace_exact(**ANGLES)).calibration
+    found = calibrated(bench(3.0, lag_s=(lag_s,) * 3), 3, stated(**ANGLES)).calibration
     assert found is not None
     return float(found.standard_uncertainty[[0, 4, 8]].max())
 
 
 def test_the_result_says_at_which_frequency_it_holds() -> None:
-    more = calibrated(bench(6.0, lowpass_hz=31.0), 1, replace_exact(**ANGLES)).more
+    more = calibrated(bench(6.0, lowpass_hz=31.0), 1, stated(**ANGLES)).more
     assert more["reference_frequency_hz"] == pytest.approx(6.0, rel=1e-3)
     low_hz, high_hz = more["valid_band_hz"]
     assert 0.0 <= low_hz < 6.0 < high_hz < 12.0
