@@ -1,0 +1,103 @@
+"""Which device of a site contradicts the others: the largest normalised estimated bias, with a stated false-alarm rate.
+
+For each device there is one alternative (Baarda 1968; Teunissen 2006, ch. 4: testing for one outlying group):
+
+- a reference: what it indicates has a constant error beyond its certificate, in all its links. The statistic is
+  b' V^-1 b of the estimated error b with its covariance V.
+- a sensor: it is not the same in all its links, or not as stated. The statistic is by how much chi-squared of the site
+  falls if this sensor is left out.
+
+Each statistic is chi-squared if no device is bad. References share half of the false-alarm rate, sensors the other
+half, each by Bonferroni, so that a sound site names a device with that probability at most.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.estimate.site import Message, Site
+from calib.model import Array
+
+FALSE_ALARM = 0.05  # probability that a device of a sound site is named
+LEAST_SHOWN = 0.01  # a bias is tested only in directions in which an error of one stated u gives this non-centrality
+LEAST_FREEDOM = 0.5  # of a sensor: with fewer degrees of freedom nothing can contradict it
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Verdict:
+    """One device against all others.
+
+    `statistic` is chi-squared with `degrees_of_freedom` if the device is sound. `probability` is that of a site in
+    which all devices are sound to show as much in any device of this kind. `bias` (n,) is the estimated error of the
+    reference's parameters beyond its certificate; NaN for a sensor.
+    """
+
+    device: str
+    is_reference: bool
+    statistic: float
+    degrees_of_freedom: float
+    probability: float
+    bias: Array
+
+
+def verdicts(site: Site) -> list[Verdict]:
+    """All devices that can be tested, the most contradictory first."""
+    of: dict[str, list[Message]] = {name: [] for name in site.core}
+    for message in site.messages():
+        for name in site.core_of(message):
+            of[name].append(message)
+    references = [v for v in (_reference(site, name, of[name]) for name in site.core) if v is not None]
+    sensors = [v for v in (_sensor(site, name) for name in site.leaves) if v is not None]
+    families = [family for family in (references, sensors) if family]
+    found = [_among(v, len(families) * len(family)) for family in families for v in family]
+    return sorted(found, key=lambda v: (v.probability, -v.statistic / v.degrees_of_freedom))
+
+
+def named(found: list[Verdict], false_alarm: float = FALSE_ALARM) -> Verdict | None:
+    """The one device that contradicts the others, None if none does; `found` is from `verdicts`."""
+    return found[0] if found and found[0].probability <= false_alarm else None
+
+
+def _reference(site: Site, name: str, messages: Sequence[Message]) -> Verdict | None:
+    """A constant error of what the device indicates as a reference, in units of its stated uncertainty."""
+    own = site.place(name)
+    index = np.unique(np.concatenate([own, *(m.index for m in messages)]))
+    by_error, pull = np.zeros((len(own), len(index))), np.zeros(len(own))
+    for message in messages:
+        mine = message.rows[:, np.isin(message.index, own) & message.by_reference]
+        if mine.shape[1]:
+            by_error[:, np.searchsorted(index, message.index)] += mine.T @ message.rows
+            pull += mine.T @ (message.told - message.rows @ site.z_core[message.index])
+    shown, ways = np.linalg.eigh(
+        by_error[:, np.searchsorted(index, own)] - site.core_covariance(by_error, index, by_error, index)
+    )
+    tested = shown > LEAST_SHOWN
+    if not tested.any():
+        return None
+    error = (ways.T @ pull)[tested] / shown[tested]
+    bias = site.devices[name].root @ ways[:, tested] @ error
+    return Verdict(name, True, float(np.sum(error**2 * shown[tested])), float(tested.sum()), 1.0, bias)
+
+
+def _sensor(site: Site, name: str) -> Verdict | None:
+    """The sensor left out: its rows against what all others say."""
+    leaf = site.leaf(name)
+    if leaf.observed < LEAST_FREEDOM:
+        return None
+    message = leaf.message
+    left = message.told - message.rows @ site.z_core[message.index]
+    given = message.rows, message.index
+    free = np.eye(len(left)) - site.core_covariance(*given, *given)
+    statistic = float(left @ np.linalg.solve(free, left)) + message.left
+    return Verdict(name, False, statistic, leaf.observed, 1.0, np.full(len(site.devices[name].mean), np.nan))
+
+
+def _among(verdict: Verdict, number: int) -> Verdict:
+    """With its probability among so many tests."""
+    from scipy.special import gammaincc  # its import takes 0.2 s
+
+    single = float(gammaincc(0.5 * verdict.degrees_of_freedom, 0.5 * verdict.statistic))
+    return replace(verdict, probability=min(1.0, number * single))
