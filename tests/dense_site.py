@@ -37,13 +37,15 @@ class Stated:
 class Meeting:
     """A sensor beside a reference, or on the clamp of a uniaxial one: windows, and their samples.
 
-    `felt` (n, 3) of each window is what a tri-axial reference indicates, or (n, 1) along the clamp's motion.
+    `felt` (n, 3) of each window is what a tri-axial reference indicates, or (n, 1) along the clamp's motion. `rotation`
+    is as stated, `turn` its error.
     """
 
     sensor: str
     reference: str
     clamped: bool
     rotation: Array
+    turn: Array
     windows: list[Window] = field(default_factory=list)
     felt: list[Array] = field(default_factory=list)
     output: list[Array] = field(default_factory=list)
@@ -83,13 +85,14 @@ class SimulatedSite:
         self.gain = {f"r{k}": self.stated.reference * random.normal(size=3) for k in range(references)}
         self.gravity_error = self.stated.gravity_mps2 * random.normal()
         self.noise_mps2 = 1e-4
+        self.offset_mps2 = 0.0  # SD between windows
         self.meetings: list[Meeting] = []
 
     def meet(self, sensor: str, reference: str, windows: int = 5, rotation: Array | None = None) -> Meeting:
         """A sensor turned through drawn positions beside a tri-axial reference, or beside another sensor."""
         R = np.eye(3) if rotation is None else rotation
-        meeting = Meeting(sensor, reference, False, R)
-        true = turned(self.stated.rotation_rad * self.random.normal(size=3)) @ R
+        meeting = Meeting(sensor, reference, False, R, turned(self.stated.rotation_rad * self.random.normal(size=3)))
+        true = meeting.turn @ R
         for _ in range(windows):
             a, da = motion(self.random, 3)
             down = self.random.normal(size=3)
@@ -105,7 +108,7 @@ class SimulatedSite:
 
     def clamp(self, sensor: str, reference: str) -> Meeting:
         """A sensor on the clamp of a uniaxial reference, in four positions; gravity is as stated but for its error."""
-        meeting = Meeting(sensor, reference, True, np.eye(3))
+        meeting = Meeting(sensor, reference, True, np.eye(3), np.eye(3))
         for alpha in ALPHAS_RAD:
             a, da = motion(self.random, 1)
             d, e = frame(THETA_RAD, alpha)
@@ -119,7 +122,8 @@ class SimulatedSite:
         return meeting
 
     def _noise(self) -> Array:
-        return self.noise_mps2 * self.random.normal(size=(SAMPLES, 3))
+        noise = self.noise_mps2 * self.random.normal(size=(SAMPLES, 3))
+        return noise + self.offset_mps2 * self.random.normal(size=3)
 
     def _add(self, meeting: Meeting, pose: Pose, u: Array, du: Array, V: Array) -> None:
         window = Window(0.0, SAMPLES / RATE_HZ, pose, sums_of(u, du, V, SEGMENTS), True, "", SAMPLES, 0)

@@ -20,6 +20,10 @@ from calib.estimate.nuisances import rotations
 from calib.model import Array
 
 FIXED = 1e-14  # part of a covariance's largest eigenvalue: below, a direction has no uncertainty
+# Of the vector product of each axis with another vector.
+CROSS = np.array(
+    [[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 0]]], float
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,13 +86,18 @@ def beside(
     seen, offset = turned @ true @ rotation.T, inverse @ (Q_r - Q_0)
     S_l, at = S @ seen, rotation @ offset
     by_sensor, by_reference, by_turn = np.eye(12), np.zeros((12, 12)), np.zeros((12, 3))
-    by_sensor[:9, :9] = np.kron(np.eye(3), seen.T)
-    by_sensor[9:, :9] = -np.kron(np.eye(3), seen @ at)
-    before = S @ turned @ true @ inverse
-    by_reference[:9, :9] = -np.kron(before, (true @ rotation.T).T)
-    by_reference[9:, :9] = np.kron(before, true @ offset)
+    before, after = S @ turned @ true @ inverse, true @ rotation.T
+    for i in range(3):
+        row = slice(3 * i, 3 * i + 3)
+        by_sensor[row, row], by_sensor[9 + i, row] = seen.T, -seen @ at
+        for j in range(3):
+            column = slice(3 * j, 3 * j + 3)
+            by_reference[row, column], by_reference[9 + i, column] = (
+                -before[i, j] * after.T,
+                before[i, j] * true @ offset,
+            )
     by_reference[9:, 9:] = -S_l @ rotation @ inverse
-    for k, axis in enumerate(np.eye(3)):
-        moved = S @ np.cross(axis, seen.T).T
-        by_turn[:, k] = np.append(moved.ravel(), -moved @ at)
+    for k, cross in enumerate(CROSS):
+        moved = S @ cross @ seen
+        by_turn[:9, k], by_turn[9:, k] = moved.ravel(), -moved @ at
     return np.append(S_l.ravel(), Q - S_l @ at), by_sensor, by_reference, by_turn

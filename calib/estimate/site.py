@@ -22,7 +22,7 @@ from calib.model import Array
 
 Index = NDArray[np.intp]
 MAX_STEPS = 10
-CONVERGED = 1e-4  # of the standard uncertainty that the priors state
+CONVERGED = 1e-3  # of the standard uncertainty that the priors state
 
 
 @dataclass(frozen=True, slots=True, eq=False)
