@@ -59,6 +59,13 @@ def read_files(options: dict[str, Any], instrument: Instrument | None = None) ->
         sensor = sensor_of(options["sensor"], options.get("columns"), bar)
         stated = (options.get("reference_columns"), options.get("sensitivity"))
         reference = reference_of(options["reference"], *stated, bar) if options["reference"] else None
+    return files_of(options, sensor, reference, instrument)
+
+
+def files_of(
+    options: dict[str, Any], sensor: SensorTable, reference: ReferenceTable | None, instrument: Instrument | None = None
+) -> Files:
+    """What was read, with its poses and as the options say. Raises TableError and click.UsageError."""
     instrument = instrument or Instrument()
     if reference is not None:
         instrument = replace(instrument, quantity=reference.quantity)
