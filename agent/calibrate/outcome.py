@@ -58,7 +58,7 @@ def nothing_used(windows: Sequence[Window], rate_hz: float, method: str) -> Outc
 
 def as_json(outcome: Outcome) -> str:
     """One JSON object, with null for values that are not known."""
-    return msgspec.json.encode(_plain(as_object(outcome))).decode()
+    return msgspec.json.encode(plain(as_object(outcome))).decode()
 
 
 def as_object(outcome: Outcome) -> dict[str, Any]:
@@ -113,14 +113,14 @@ def _window(window: Window) -> dict[str, Any]:
     }
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Converts to types that JSON has. A number that is not finite becomes null."""
     if isinstance(value, Mapping):
-        return {key: _plain(item) for key, item in value.items()}
+        return {key: plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):
-        return _plain(value.tolist())
+        return plain(value.tolist())
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

@@ -1,0 +1,84 @@
+"""`fieldcal fleet adjust`: all sensors and references of a site in one adjustment."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from agent.cli.calibrate import calibrate
+from agent.config.reading import ConfigError
+from agent.fleet.adjusting import Adjusted, adjusted
+from agent.fleet.meeting import Meeting, device, met, stated
+from agent.fleet.site_file import SiteSection, arguments_of, load_site
+from agent.fleet.telling import as_json, as_object, reasons, show, write
+from agent.reading.source import TableError
+from agent.terminal.text import say
+
+
+@click.command()
+@click.argument("site", type=click.Path(path_type=Path, dir_okay=False))
+@click.option("-o", "directory", type=click.Path(path_type=Path, file_okay=False), metavar="DIR",
+              help="Write site.json and one result for each device here.")  # fmt: skip
+@click.option("--between", nargs=2, multiple=True, metavar="A B",
+              help="Tell the covariance of two devices in the JSON object; may be given several times.")  # fmt: skip
+@click.option(
+    "--json", "json_to", type=click.Path(path_type=Path, allow_dash=True, dir_okay=False, writable=True),
+    help="Write one JSON object to this file; -: print it, and nothing else, on standard output.",
+)  # fmt: skip
+def adjust(site: Path, directory: Path | None, between: tuple[tuple[str, str], ...], json_to: Path | None) -> int:
+    """Adjust all sensors and references of SITE.toml together (docs/fleet.md); name the one that contradicts the
+    others.
+
+    Exit status 0 if no device contradicts the others, 2 on bad input, 3 if one does, or if no link can be used.
+    """
+    try:
+        found = _adjusted(load_site(site), site.parent)
+    except ConfigError as error:
+        for fault in error.faults:
+            say(fault, err=True)
+        return 2
+    except TableError as error:
+        say(f"fieldcal fleet adjust: {error}", err=True)
+        return 2
+    except _NothingError as error:
+        for line in error.args[0]:
+            say(f"refused: {line}", err=True)
+        return 3
+    for name in (name for pair in between for name in pair):
+        if name not in found.linked:
+            raise click.BadParameter(f"{name!r} is in no link that was used", param_hint="--between")
+    told = as_object(found, between)
+    if directory is not None:
+        write(told, directory)
+    if json_to is not None:
+        with click.open_file(str(json_to), "w") as file:
+            file.write(as_json(told) + "\n")
+    if json_to != Path("-"):
+        show(found)
+    for reason in reasons(found):
+        say(f"refused: {reason}", err=True)
+    return 3 if found.bad is not None else 0
+
+
+class _NothingError(Exception):
+    """No meeting can be used; one line for each."""
+
+
+def _adjusted(site: SiteSection, directory: Path) -> Adjusted:
+    meetings = [_met(site, k, directory) for k in range(len(site.links))]
+    if all(m.found is None for m in meetings):
+        raise _NothingError([f"{m.sensor} beside {m.reference or 'gravity'}: {m.reasons[0]}" for m in meetings])
+    return adjusted([device(name, section, directory, meetings) for name, section in site.devices.items()], meetings)
+
+
+def _met(site: SiteSection, k: int, directory: Path) -> Meeting:
+    one = site.links[k]
+    try:
+        context = calibrate.make_context(f"links.{k}", arguments_of(site, one, directory))
+        known = stated(site.devices[one.reference], directory) if one.reference else None
+        return met(one.sensor, one.reference, context.params, known)
+    except click.ClickException as error:
+        raise TableError(f"links.{k}: {error.format_message()}") from None
+    except TableError as error:
+        raise TableError(f"links.{k}: {error}") from None

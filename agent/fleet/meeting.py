@@ -1,0 +1,106 @@
+"""One meeting of a sensor with a reference: its files become windows, and the windows a link of the site."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from agent.calibrate.adjusting import adjusted, with_response
+from agent.calibrate.calibrating import files_of, reference_of, sensor_of
+from agent.calibrate.earlier import read_earlier
+from agent.calibrate.files import Files
+from agent.calibrate.priors import instrument_of, priors_of
+from agent.calibrate.tables import ReferenceTable
+from agent.fleet.site_file import DeviceSection
+from agent.reading.source import TableError
+from calib.estimate.device import Device
+from calib.estimate.link import Link, link
+from calib.estimate.nuisances import Applied, Priors
+from calib.model import Array, own_channels
+from calib.signal.response import FLAT, Response
+
+NOMINAL_TRANSVERSE = 0.03  # of the nominal sensitivity, as in `fieldcal calibrate`
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Meeting:
+    """What came of one meeting: a link, or the reasons why there is none.
+
+    `used` windows of `windows`; `channels` of the reference; `u_gravity_mps2` as stated for the link.
+    """
+
+    sensor: str
+    reference: str
+    found: Link | None
+    reasons: tuple[str, ...]
+    windows: int
+    used: int
+    channels: int
+    u_gravity_mps2: float
+
+
+def stated(section: DeviceSection, directory: Path) -> tuple[Array, Array] | None:
+    """Mean (12,) and covariance (12, 12) of S and Q by a certificate or a nominal sensitivity; None without one.
+
+    Raises TableError.
+    """
+    if section.certificate is not None:
+        path = directory / section.certificate
+        mean, covariance = read_earlier(path)
+        if not (np.isfinite(mean).all() and np.isfinite(covariance).all()):
+            raise TableError(f"{path}: not all parameters and covariances are known, so it is no certificate of a site")
+        return mean, covariance
+    if section.nominal is not None and section.u_nominal_pct is not None:
+        u = section.nominal * np.where(np.eye(3).ravel() > 0, section.u_nominal_pct / 100.0, NOMINAL_TRANSVERSE)
+        mean = np.append(section.nominal * np.eye(3).ravel(), np.zeros(3))
+        return mean, np.diag(np.append(u**2, np.full(3, np.inf)))
+    return None
+
+
+def read(options: dict[str, Any], known: tuple[Array, Array] | None) -> Files:
+    """The files of a meeting. `known` is of a reference whose file holds its own indications. Raises TableError."""
+    sensor = sensor_of(options["sensor"], options["columns"])
+    reference = None
+    if options["reference"] and known is None:
+        reference = reference_of(options["reference"], options["reference_columns"], options["sensitivity"])
+    elif options["reference"] and known is not None:
+        table, (mean, _) = sensor_of(options["reference"], options["reference_columns"]), known
+        a = (np.asarray(table.v) - mean[9:]) @ np.linalg.inv(mean[:9].reshape(3, 3)).T
+        reference = ReferenceTable(table.path, table.time_s, a, "acceleration", "by its own S and Q", table.said)
+    return files_of(options, sensor, reference, instrument_of(options))
+
+
+def meeting(sensor: str, reference: str, files: Files, priors: Priors) -> Meeting:
+    """Calibrate the sensor beside the reference alone; what is not refused becomes a link."""
+    outcome = adjusted(files, priors)
+    used = [w for w in outcome.windows if w.used]
+    channels = max((own_channels(w.sums.reference_channels) for w in used), default=0)
+    told = len(outcome.windows), len(used), channels, priors.gravity_mps2
+    if outcome.reasons:
+        return Meeting(sensor, reference, None, outcome.reasons, *told)
+    taken = next((Response(w.response) for w in used if w.response), FLAT)
+    corners = priors.reference_corner_at_hz, priors.sensor_corner_at_hz
+    applied = Applied(outcome.lag_s or 0.0, *corners, taken)
+    found = link(sensor, reference, used, with_response(priors, used), applied)
+    return Meeting(sensor, reference, found, (), *told)
+
+
+def met(sensor: str, reference: str, options: dict[str, Any], known: tuple[Array, Array] | None) -> Meeting:
+    """A meeting by its files and options. Raises TableError."""
+    return meeting(sensor, reference, read(options, known), priors_of(options))
+
+
+def device(name: str, section: DeviceSection, directory: Path, meetings: list[Meeting]) -> Device:
+    """What is known of a device before any link. Raises TableError."""
+    known = stated(section, directory)
+    if known is not None:
+        return Device.known(name, *known)
+    if section.u_sensitivity_pct is not None:
+        channels = max((m.channels for m in meetings if m.reference == name), default=3)
+        return Device.reference(name, section.u_sensitivity_pct / 100.0, channels)
+    first = next((m.found for m in meetings if m.found is not None and m.sensor == name), None)
+    mean = np.append(np.eye(3).ravel(), np.zeros(3)) if first is None else first.adjustment.mean[:12]
+    return Device.known(name, mean, np.diag(np.full(12, np.inf)))

@@ -1,0 +1,137 @@
+"""`fieldcal fleet adjust` as a user calls it: files of a small site, its result, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from agent.calibrate.earlier import read_earlier
+from agent.cli.main import run_cli
+
+RATE_HZ, SECONDS = 50.0, 30.0
+S_TRUE = np.array([[204.0, 2.0, -3.0], [1.0, 212.0, 2.0], [-2.0, 1.0, 208.0]])
+Q_TRUE = np.array([40.0, -20.0, 10.0])
+GAINS = {"ref 1": 1.0005, "ref 2": 0.9995, "ref 3": 1.02}
+SITE = """
+gravity_mps2 = 9.81
+[devices.s1]
+nominal = 208
+u_nominal_pct = 10
+[devices."ref 1"]
+u_sensitivity_pct = 0.1
+[devices."ref 2"]
+u_sensitivity_pct = 0.1
+[devices."ref 3"]
+u_sensitivity_pct = 0.1
+"""
+LINK = """
+[[links]]
+sensor = "s1"
+sensor_file = "s1-{k}.csv"
+reference = "ref {k}"
+reference_file = "ref-{k}.csv"
+options = {{ rotation = "1,0,0,0,1,0,0,0,1", u-rotation-deg = 0.05 }}
+"""
+
+
+@pytest.fixture(scope="module")
+def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sensor beside three references, the third of which indicates 2 % too much."""
+    made = tmp_path_factory.mktemp("site")
+    random = np.random.default_rng(3)
+    t = np.arange(round(RATE_HZ * SECONDS)) / RATE_HZ
+    for k, gain in enumerate(GAINS.values(), start=1):
+        a = np.tile([0.0, 0.0, 9.81], (len(t), 1))
+        for axis in range(3):
+            for f in (0.7, 1.3, 2.1, 3.7):
+                a[:, axis] += np.sin(2.0 * np.pi * f * t + random.uniform(0.0, 2.0 * np.pi))
+        v = a @ S_TRUE.T + Q_TRUE + 0.2 * random.normal(size=a.shape)
+        _write(made / f"s1-{k}.csv", "time_s,vx,vy,vz", t, v)
+        _write(made / f"ref-{k}.csv", "time_s,ax,ay,az", t, gain * a)
+    (made / "sound.toml").write_text(SITE + "".join(LINK.format(k=k) for k in (1, 2)))
+    (made / "bad.toml").write_text(SITE + "".join(LINK.format(k=k) for k in (1, 2, 3)))
+    return made
+
+
+def _write(path: Path, header: str, time_s: np.ndarray, values: np.ndarray) -> None:
+    np.savetxt(path, np.column_stack([time_s, values]), delimiter=",", header=header, comments="", fmt="%.10g")
+
+
+def test_a_sensor_beside_two_references_gets_one_calibration(
+    directory: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["fleet", "adjust", str(directory / "sound.toml"), "--json", "-", "-o", str(tmp_path / "out")]
+    assert run_cli([*arguments, "--between", "s1", "ref 1"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["status"] == "valid"
+    assert told["contradicts"] is None
+    sensor = told["devices"]["s1"]
+    assert np.array(sensor["determined"]["sensitivity"]).all()
+    mean_gain = np.mean([GAINS["ref 1"], GAINS["ref 2"]])
+    found, u = (np.array(part)[[0, 1, 2], [0, 1, 2]] for part in (
+        sensor["sensitivity"], sensor["standard_uncertainty"]["sensitivity"]))  # fmt: skip
+    assert found == pytest.approx(np.diag(S_TRUE) / mean_gain, rel=2e-4)
+    assert u / found == pytest.approx(1e-3 / np.sqrt(2.0), rel=0.15)  # two references of 0.1 %
+    errors = [np.diag(told["devices"][name]["sensitivity"]) - 1.0 for name in ("ref 1", "ref 2")]
+    assert errors[0] - errors[1] == pytest.approx(1e-3, abs=2e-4)
+    # Nothing tells the error that both references share; it is all that is left in S and in each of them.
+    cross = np.array(told["between"][0]["covariance"])[0, 0]
+    u_reference = told["devices"]["ref 1"]["standard_uncertainty"]["sensitivity"][0][0]
+    assert cross / (u[0] * u_reference) == pytest.approx(1.0, abs=0.02)
+    values, covariance = read_earlier(tmp_path / "out" / "device-1.json")
+    assert values[:9] == pytest.approx(np.ravel(sensor["sensitivity"]))
+    assert covariance == pytest.approx(np.array(sensor["covariance"]))
+    assert json.loads((tmp_path / "out" / "site.json").read_text()) == told
+
+
+def test_the_reference_that_contradicts_the_others_is_named(
+    directory: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run_cli(["fleet", "adjust", str(directory / "bad.toml")]) == 3
+    out, err = capsys.readouterr()
+    assert "refused: ref 3 contradicts the other devices: it indicates otherwise than its certificate says" in err
+    assert "most suspect: ref 3" in out
+
+
+@pytest.mark.parametrize(
+    ("changed", "by", "fault"),
+    [
+        ('reference = "ref 1"', 'reference = "ref 9"', "links.0.reference: there is no device 'ref 9'"),
+        ("u_nominal_pct = 10", "", "nominal and u_nominal_pct must be given together"),
+        ("u-rotation-deg = 0.05", "u-reference-pct = 1", "options.u-reference-pct: is a statement on a device"),
+        ("u-rotation-deg = 0.05", "gravity = 9.8", "options.gravity: is the same in the whole site"),
+        ("u-rotation-deg = 0.05", "u-rotatoin-deg = 1", "links.0: No such option"),
+        ('"s1-1.csv"', '"nowhere.csv"', "nowhere.csv"),
+        ('[devices."ref 1"]\nu_sensitivity_pct = 0.1', '[devices."ref 1"]', "nothing is stated of 'ref 1'"),
+    ],
+)
+def test_faults_of_the_file_are_named(
+    directory: Path, capsys: pytest.CaptureFixture[str], changed: str, by: str, fault: str
+) -> None:
+    text = (directory / "sound.toml").read_text()
+    assert changed in text
+    path = directory / "faulty.toml"
+    path.write_text(text.replace(changed, by, 1))
+    assert run_cli(["fleet", "adjust", str(path), "--json", "-"]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert fault in err
+    assert "Traceback" not in err
+
+
+def test_a_link_that_is_refused_is_left_out_with_its_reason(
+    directory: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    time_s = np.arange(1500) / RATE_HZ
+    dead = np.random.default_rng(1).normal(size=(1500, 3)) * 0.01 + [0.0, 0.0, 9.81]
+    _write(directory / "ref-dead.csv", "time_s,ax,ay,az", time_s, dead)
+    text = (directory / "sound.toml").read_text()
+    (directory / "dead.toml").write_text(text.replace("ref-2.csv", "ref-dead.csv"))
+    assert run_cli(["fleet", "adjust", str(directory / "dead.toml"), "--json", "-"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert [link["used"] for link in told["links"]] == [True, False]
+    assert told["links"][1]["reasons"]
+    assert "ref 2" not in told["devices"]
