@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import click
@@ -10,14 +11,17 @@ from agent.cli.calibrate import calibrate
 from agent.config.reading import ConfigError
 from agent.fleet.adjusting import Adjusted, adjusted
 from agent.fleet.meeting import Meeting, device, met, stated
+from agent.fleet.recorded import meetings_in
 from agent.fleet.site_file import SiteSection, arguments_of, load_site
 from agent.fleet.telling import as_json, as_object, reasons, show, write
 from agent.reading.source import TableError
 from agent.terminal.text import say
+from calib.estimate.device import Device
 
 
 @click.command()
-@click.argument("site", type=click.Path(path_type=Path, dir_okay=False))
+@click.argument("sources", nargs=-1, required=True, type=click.Path(path_type=Path, dir_okay=False),
+                metavar="SITE.toml | RECORDING...")  # fmt: skip
 @click.option("-o", "directory", type=click.Path(path_type=Path, file_okay=False), metavar="DIR",
               help="Write site.json and one result for each device here.")  # fmt: skip
 @click.option("--between", nargs=2, multiple=True, metavar="A B",
@@ -26,14 +30,17 @@ from agent.terminal.text import say
     "--json", "json_to", type=click.Path(path_type=Path, allow_dash=True, dir_okay=False, writable=True),
     help="Write one JSON object to this file; -: print it, and nothing else, on standard output.",
 )  # fmt: skip
-def adjust(site: Path, directory: Path | None, between: tuple[tuple[str, str], ...], json_to: Path | None) -> int:
-    """Adjust all sensors and references of SITE.toml together (docs/fleet.md); name the one that contradicts the
-    others.
+def adjust(
+    sources: tuple[Path, ...], directory: Path | None, between: tuple[tuple[str, str], ...], json_to: Path | None
+) -> int:
+    """Adjust all sensors and references of a site together, and name the one that contradicts the others.
+
+    SITE.toml lists who met whom, with files (docs/fleet.md). Recordings of gateways need no such list.
 
     Exit status 0 if no device contradicts the others, 2 on bad input, 3 if one does, or if no link can be used.
     """
     try:
-        found = _adjusted(load_site(site), site.parent)
+        found = _adjusted(*_met_in(sources))
     except ConfigError as error:
         for fault in error.faults:
             say(fault, err=True)
@@ -65,11 +72,22 @@ class _NothingError(Exception):
     """No meeting can be used; one line for each."""
 
 
-def _adjusted(site: SiteSection, directory: Path) -> Adjusted:
+def _met_in(sources: Sequence[Path]) -> tuple[list[Device], list[Meeting]]:
+    """The devices and meetings of a site, from its file or from recordings."""
+    described = [path for path in sources if path.suffix == ".toml"]
+    if not described:
+        return meetings_in(sources)
+    if len(sources) > 1:
+        raise TableError(f"{described[0]}: the file of a site stands alone; name the recordings in it")
+    site, directory = load_site(described[0]), described[0].parent
     meetings = [_met(site, k, directory) for k in range(len(site.links))]
+    return [device(name, section, directory, meetings) for name, section in site.devices.items()], meetings
+
+
+def _adjusted(devices: Sequence[Device], meetings: Sequence[Meeting]) -> Adjusted:
     if all(m.found is None for m in meetings):
         raise _NothingError([f"{m.sensor} beside {m.reference or 'gravity'}: {m.reasons[0]}" for m in meetings])
-    return adjusted([device(name, section, directory, meetings) for name, section in site.devices.items()], meetings)
+    return adjusted(devices, meetings)
 
 
 def _met(site: SiteSection, k: int, directory: Path) -> Meeting:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from agent.reading.source import TableError
 from calib.estimate.device import Device
 from calib.estimate.link import Link, link
 from calib.estimate.nuisances import Applied, Priors
-from calib.model import Array, own_channels
+from calib.model import Array, Window, own_channels
 from calib.signal.response import FLAT, Response
 
 NOMINAL_TRANSVERSE = 0.03  # of the nominal sensitivity, as in `fieldcal calibrate`
@@ -27,7 +28,7 @@ NOMINAL_TRANSVERSE = 0.03  # of the nominal sensitivity, as in `fieldcal calibra
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Meeting:
-    """What came of one meeting: a link, or the reasons why there is none.
+    """What came of one meeting: a link, or the reasons why there is none, or why a part of it was left out.
 
     `used` windows of `windows`; `channels` of the reference; `u_gravity_mps2` as stated for the link.
     """
@@ -73,24 +74,34 @@ def read(options: dict[str, Any], known: tuple[Array, Array] | None) -> Files:
     return files_of(options, sensor, reference, instrument_of(options))
 
 
-def meeting(sensor: str, reference: str, files: Files, priors: Priors) -> Meeting:
-    """Calibrate the sensor beside the reference alone; what is not refused becomes a link."""
-    outcome = adjusted(files, priors)
-    used = [w for w in outcome.windows if w.used]
+def meeting(sensor: str, reference: str, stretches: Sequence[Files], priors: Priors) -> Meeting:
+    """Calibrate the sensor beside the reference alone; what is not refused becomes a link.
+
+    `stretches`: files of one mounting, one or several. A stretch that is refused is left out.
+    """
+    used: list[Window] = []
+    reasons: list[str] = []
+    seen, lag_s = 0, 0.0
+    for files in stretches:
+        outcome = adjusted(files, priors)
+        seen += len(outcome.windows)
+        reasons += outcome.reasons
+        if not outcome.reasons:
+            used += [w for w in outcome.windows if w.used]
+            lag_s = outcome.lag_s or 0.0
     channels = max((own_channels(w.sums.reference_channels) for w in used), default=0)
-    told = len(outcome.windows), len(used), channels, priors.gravity_mps2
-    if outcome.reasons:
-        return Meeting(sensor, reference, None, outcome.reasons, *told)
+    told = seen, len(used), channels, priors.gravity_mps2
+    if not used:
+        return Meeting(sensor, reference, None, tuple(reasons), *told)
     taken = next((Response(w.response) for w in used if w.response), FLAT)
-    corners = priors.reference_corner_at_hz, priors.sensor_corner_at_hz
-    applied = Applied(outcome.lag_s or 0.0, *corners, taken)
+    applied = Applied(lag_s, priors.reference_corner_at_hz, priors.sensor_corner_at_hz, taken)
     found = link(sensor, reference, used, with_response(priors, used), applied)
-    return Meeting(sensor, reference, found, (), *told)
+    return Meeting(sensor, reference, found, tuple(reasons), *told)
 
 
 def met(sensor: str, reference: str, options: dict[str, Any], known: tuple[Array, Array] | None) -> Meeting:
     """A meeting by its files and options. Raises TableError."""
-    return meeting(sensor, reference, read(options, known), priors_of(options))
+    return meeting(sensor, reference, [read(options, known)], priors_of(options))
 
 
 def device(name: str, section: DeviceSection, directory: Path, meetings: list[Meeting]) -> Device:

@@ -141,7 +141,7 @@ def show(found: Adjusted) -> None:
             say(_reference_line(found, name))
         for line in _sensor_lines(found, name) if roles["sensor"] else ():
             say(line)
-    if found.tests:
+    if found.tests and found.tests[0].probability < 1.0:
         first = found.tests[0]
         say(
             f"most suspect: {first.device}, probability {first.probability:.2g} that a sound site shows as much "

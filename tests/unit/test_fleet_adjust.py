@@ -10,6 +10,7 @@ import pytest
 
 from agent.calibrate.earlier import read_earlier
 from agent.cli.main import run_cli
+from tests.unit.recorded_bench import record
 
 RATE_HZ, SECONDS = 50.0, 30.0
 S_TRUE = np.array([[204.0, 2.0, -3.0], [1.0, 212.0, 2.0], [-2.0, 1.0, 208.0]])
@@ -135,3 +136,26 @@ def test_a_link_that_is_refused_is_left_out_with_its_reason(
     assert [link["used"] for link in told["links"]] == [True, False]
     assert told["links"][1]["reasons"]
     assert "ref 2" not in told["devices"]
+
+
+def test_recordings_need_no_list_of_meetings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    truth = record(tmp_path, 130.0)
+    (recording,) = tmp_path.glob("*.mcap")
+    assert run_cli(["fleet", "adjust", str(recording), "--json", "-"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    (link,) = told["links"]
+    assert link["sensor"].startswith("virtual mems-1")
+    assert link["reference"].startswith("virtual reference-1")
+    sensor = told["devices"][link["sensor"]]
+    off = np.array(sensor["sensitivity"]) - truth.sensitivity
+    expanded = np.array(sensor["expanded_uncertainty"]["sensitivity"])
+    assert (np.abs(off) < expanded).all()
+    assert expanded.max() < 0.03 * truth.sensitivity.max()
+    assert run_cli(["fleet", "adjust", str(recording), str(recording)]) == 2
+    assert "give each recording once" in capsys.readouterr().err
+
+
+def test_a_file_that_is_no_recording_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "a.mcap").write_bytes(b"no recording")
+    assert run_cli(["fleet", "adjust", str(tmp_path / "a.mcap")]) == 2
+    assert "a.mcap: this is no recording of fieldcal" in capsys.readouterr().err
