@@ -13,7 +13,7 @@ from agent.calibrate.adjusting import adjusted, with_response
 from agent.calibrate.calibrating import files_of, reference_of, sensor_of
 from agent.calibrate.earlier import read_earlier
 from agent.calibrate.files import Files
-from agent.calibrate.priors import instrument_of, priors_of
+from agent.calibrate.priors import NOMINAL_TRANSVERSE, instrument_of, priors_of
 from agent.calibrate.tables import ReferenceTable
 from agent.fleet.site_file import DeviceSection
 from agent.reading.source import TableError
@@ -23,7 +23,8 @@ from calib.estimate.nuisances import Applied, Priors
 from calib.model import Array, Window, own_channels
 from calib.signal.response import FLAT, Response
 
-NOMINAL_TRANSVERSE = 0.03  # of the nominal sensitivity, as in `fieldcal calibrate`
+WORST_CONDITION = 1e3  # of S: a dead output makes it infinite
+ROUNDING = 1e-9  # of the largest eigenvalue of a covariance
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,7 +53,12 @@ def stated(section: DeviceSection, directory: Path) -> tuple[Array, Array] | Non
         path = directory / section.certificate
         mean, covariance = read_earlier(path)
         if not (np.isfinite(mean).all() and np.isfinite(covariance).all()):
-            raise TableError(f"{path}: not all parameters and covariances are known, so it is no certificate of a site")
+            raise TableError(f"{path}: not all parameters and covariances are known; they are needed of a reference")
+        if np.linalg.cond(mean[:9].reshape(3, 3)) > WORST_CONDITION:
+            raise TableError(f"{path}, sensitivity: the matrix cannot be inverted, so it does not give accelerations")
+        values = np.linalg.eigvalsh(covariance)
+        if values[0] < -ROUNDING * values[-1] or not np.allclose(covariance, covariance.T):
+            raise TableError(f"{path}, covariance: the matrix is not symmetric and positive, so it is no covariance")
         return mean, covariance
     if section.nominal is not None and section.u_nominal_pct is not None:
         u = section.nominal * np.where(np.eye(3).ravel() > 0, section.u_nominal_pct / 100.0, NOMINAL_TRANSVERSE)

@@ -71,11 +71,15 @@ def meetings_in(paths: Sequence[Path]) -> tuple[list[Device], list[Meeting]]:
             "are not of one site; adjust them apart"
         )
     meetings, devices = [], dict[str, Device]()
+    sensors = {one.sensor for one in found if one.files is not None}
     for (sensor, reference), own in together.items():
         files = [one.files for one in own if one.files is not None]
-        first = own[0]
-        if not files:
-            meetings.append(Meeting(sensor, reference, None, (first.reason,), 0, 0, 0, 0.0))
+        first = next((one for one in own if one.files is not None), own[0])
+        reason = first.reason
+        if reference in sensors:
+            reason = f"{reference} is a sensor of another channel too; describe such a site in a TOML file"
+        if reason:
+            meetings.append(Meeting(sensor, reference, None, (reason,), 0, 0, 0, 0.0))
             continue
         meetings.append(meeting(sensor, reference, files, first.priors))
         mean, covariance = first.priors.parameters, first.priors.covariance

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,7 +16,8 @@ Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 OF_DEVICE = ("u-reference-pct", "nominal", "u-nominal-pct", "prior")
 OF_SITE = ("gravity", "u-gravity-mps2")
-NOT_HERE = ("sensor", "reference", "method", "plain", "json")  # the files are keys of the link itself
+NOT_HERE = ("sensor", "reference", "method", "plain", "json", "help")  # the files are keys of the link itself
+OPTION = re.compile(r"[a-z0-9]+(?:-[a-z0-9]+)*")
 MOST = 100_000  # devices, or links
 
 
@@ -61,7 +63,7 @@ class LinkSection(Section):
                 raise ValueError(f"options.{name}: is a statement on a device; move it to the section of the device")
             if name in OF_SITE:
                 raise ValueError(f"options.{name}: is the same in the whole site; state it once, at the top")
-            if name in NOT_HERE:
+            if name in NOT_HERE or not OPTION.fullmatch(name):
                 raise ValueError(f"options.{name}: is no option of a link; remove it")
         return self
 
@@ -80,6 +82,11 @@ class SiteSection(Section):
             for role, name in (("sensor", link.sensor), ("reference", link.reference)):
                 if name and name not in self.devices:
                     raise ValueError(f"links.{k}.{role}: there is no device {name!r}; add a section for it to devices")
+            if self.devices[link.sensor].u_sensitivity_pct is not None:
+                raise ValueError(
+                    f"links.{k}.sensor: {link.sensor!r} states u_sensitivity_pct, which is for references in SI units; "
+                    "state nominal or certificate of a sensor, or nothing"
+                )
             stated = self.devices.get(link.reference)
             if stated is not None and not any((stated.u_sensitivity_pct, stated.certificate, stated.nominal)):
                 raise ValueError(

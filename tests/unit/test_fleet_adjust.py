@@ -52,6 +52,8 @@ def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
         v = a @ S_TRUE.T + Q_TRUE + 0.2 * random.normal(size=a.shape)
         _write(made / f"s1-{k}.csv", "time_s,vx,vy,vz", t, v)
         _write(made / f"ref-{k}.csv", "time_s,ax,ay,az", t, gain * a)
+    singular = {"sensitivity": [[1.0, 0.0, 0.0]] * 3, "offset": [0.0] * 3, "covariance": np.eye(12).tolist()}
+    (made / "singular.json").write_text(json.dumps(singular))
     (made / "sound.toml").write_text(SITE + "".join(LINK.format(k=k) for k in (1, 2)))
     (made / "bad.toml").write_text(SITE + "".join(LINK.format(k=k) for k in (1, 2, 3)))
     return made
@@ -106,6 +108,10 @@ def test_the_reference_that_contradicts_the_others_is_named(
         ("u-rotation-deg = 0.05", "gravity = 9.8", "options.gravity: is the same in the whole site"),
         ("u-rotation-deg = 0.05", "u-rotatoin-deg = 1", "links.0: No such option"),
         ('"s1-1.csv"', '"nowhere.csv"', "nowhere.csv"),
+        ("u-rotation-deg = 0.05", '"prior=x" = 1', "options.prior=x: is no option of a link"),
+        ("u-rotation-deg = 0.05", "help = 1", "options.help: is no option of a link"),
+        ("nominal = 208\nu_nominal_pct = 10", "u_sensitivity_pct = 1", "which is for references in SI units"),
+        ("nominal = 208\nu_nominal_pct = 10", 'certificate = "singular.json"', "cannot be inverted"),
         ('[devices."ref 1"]\nu_sensitivity_pct = 0.1', '[devices."ref 1"]', "nothing is stated of 'ref 1'"),
     ],
 )

@@ -1,0 +1,84 @@
+"""Eight IMUs on one board, turned by hand through some 22 rests; the norm fit of IMU 1 is its certificate.
+
+Truth is each IMU's own norm fit of the same recording. A rotation of the frame is free there, so singular values of S
+are compared, and Q.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from agent.cli.main import run_cli
+from calib.estimate.norm_fit import norm_fit
+from calib.excitation.windows import rests_anywhere
+from tests.realdata.datasets import dataset
+
+GRAVITY_MPS2, RESTS_END_S = 9.81898, 490.0
+ROTATIONS = ("0,-1,0,-1,0,0,0,0,-1", "1,0,0,0,1,0,0,0,1")  # of even and of odd numbers
+LINK = """
+[devices."IMU {k}"]
+[[links]]
+sensor = "IMU {k}"
+sensor_file = "imu{k}.csv"
+reference = "IMU 1"
+reference_file = "imu1.csv"
+options = {{ rotation = "{rotation}", u-rotation-deg = 0.5, u-offset-mps2 = 0.005 }}
+"""
+
+
+def deviations(recording: int, imus: tuple[int, ...], directory: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Of each IMU: relative deviations of the singular values (n, 3), and of Q in m/s2 (n, 3)."""
+    held = np.load(dataset("imu_array") / f"recording{recording}.npz")
+    still = held["time_s"] < RESTS_END_S
+    time_s, counts = held["time_s"][still], held["acceleration_count"][still].astype(float)
+    for k in (1, *imus):
+        table = np.column_stack([time_s, counts[:, k - 1]])
+        header = "time_s,vx,vy,vz"
+        np.savetxt(directory / f"imu{k}.csv", table, delimiter=",", header=header, comments="", fmt="%.9g")
+    first = ["--sensor", str(directory / "imu1.csv"), "--gravity", str(GRAVITY_MPS2)]
+    assert run_cli(["calibrate", *first, "--json", str(directory / "imu1.json")]) == 0
+    site = f'gravity_mps2 = {GRAVITY_MPS2}\n[devices."IMU 1"]\ncertificate = "imu1.json"\n'
+    (directory / "site.toml").write_text(site + "".join(LINK.format(k=k, rotation=ROTATIONS[k % 2]) for k in imus))
+    assert run_cli(["fleet", "adjust", str(directory / "site.toml"), "--json", str(directory / "site.json")]) == 0
+    told = json.loads((directory / "site.json").read_text())
+    singular, offset = [], []
+    for k in imus:
+        own = norm_fit(rests_anywhere(time_s, counts[:, k - 1], GRAVITY_MPS2), GRAVITY_MPS2).calibration
+        found = told["devices"][f"IMU {k}"]
+        singular.append(np.linalg.svd(np.array(found["sensitivity"]))[1] / np.linalg.svd(own.sensitivity)[1] - 1.0)
+        offset.append((np.array(found["offset"]) - own.offset) / np.linalg.norm(own.sensitivity, axis=1))
+    return np.array(singular), np.array(offset)
+
+
+def test_an_imu_gets_s_and_q_from_the_certificate_of_another(tmp_path: Path) -> None:
+    """IMU 4 of recording 1 deviates most. `python -m tests.realdata.test_imu_array_site` tells all of them."""
+    singular, offset = deviations(1, (4,), tmp_path)
+    assert np.abs(singular).max() < 1e-3
+    assert np.abs(offset).max() < 5e-3
+
+
+def main() -> None:
+    """The figures of docs/fleet.md: all IMUs, all recordings."""
+    import tempfile
+
+    every = []
+    for recording in (1, 2, 3):
+        with tempfile.TemporaryDirectory() as directory:
+            singular, offset = deviations(recording, tuple(range(2, 9)), Path(directory))
+        every.append((singular, offset))
+        _tell(f"recording {recording}", singular, offset)
+    _tell("all three", *(np.concatenate(part) for part in zip(*every, strict=True)))
+
+
+def _tell(name: str, singular: np.ndarray, offset: np.ndarray) -> None:
+    rms, largest = 100.0 * np.sqrt(np.mean(singular**2)), 100.0 * np.abs(singular).max()
+    within, worst = np.mean(np.abs(offset) <= 2e-3), 1e3 * np.abs(offset).max()
+    print(f"{name}: singular values rms {rms:.3f} %, at most {largest:.3f} %; "
+          f"Q within 2 mm/s2 {within:.0%}, at most {worst:.1f} mm/s2")  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
