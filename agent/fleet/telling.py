@@ -27,6 +27,7 @@ def reasons(found: Adjusted) -> list[str]:
     if bad is None:
         return []
     what = "indicates otherwise than its certificate says" if bad.is_reference else "is not the same in all its links"
+    what = "is not what was stated" if bad.device == GRAVITY_NAME else what
     return [
         f"{bad.device} contradicts the other devices: it {what}{_size(found, bad)} (chi-squared {bad.statistic:.4g}, "
         f"{bad.degrees_of_freedom:.3g} degrees of freedom, probability {bad.probability:.2g}, limit {FALSE_ALARM:g}); "

@@ -10,11 +10,13 @@ import pytest
 
 from agent.calibrate.earlier import read_earlier
 from agent.cli.main import run_cli
+from tests.unit.drawn_recording import Devices, Recording
 from tests.unit.recorded_bench import record
 
 RATE_HZ, SECONDS = 50.0, 30.0
 S_TRUE = np.array([[204.0, 2.0, -3.0], [1.0, 212.0, 2.0], [-2.0, 1.0, 208.0]])
 Q_TRUE = np.array([40.0, -20.0, 10.0])
+S_OTHER = np.array([[95.0, 1.0, 0.0], [-1.0, 102.0, 1.0], [0.0, 2.0, 99.0]])
 GAINS = {"ref 1": 1.0005, "ref 2": 0.9995, "ref 3": 1.02}
 SITE = """
 gravity_mps2 = 9.81
@@ -37,6 +39,20 @@ reference_file = "ref-{k}.csv"
 options = {{ rotation = "1,0,0,0,1,0,0,0,1", u-rotation-deg = 0.05 }}
 """
 
+ONE_LINK = """
+[devices.s]
+nominal = 1
+u_nominal_pct = 5
+[devices.r]
+u_sensitivity_pct = 0.1
+[[links]]
+sensor = "s"
+sensor_file = "sensor.csv"
+reference = "r"
+reference_file = "reference.csv"
+options = { poses = "poses.csv" }
+"""
+
 
 @pytest.fixture(scope="module")
 def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -51,6 +67,9 @@ def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 a[:, axis] += np.sin(2.0 * np.pi * f * t + random.uniform(0.0, 2.0 * np.pi))
         v = a @ S_TRUE.T + Q_TRUE + 0.2 * random.normal(size=a.shape)
         _write(made / f"s1-{k}.csv", "time_s,vx,vy,vz", t, v)
+        if k == 1:
+            other = a @ S_OTHER.T + 0.2 * random.normal(size=a.shape)
+            _write(made / "s2.csv", "time_s,vx,vy,vz", t, other)
         _write(made / f"ref-{k}.csv", "time_s,ax,ay,az", t, gain * a)
     singular = {"sensitivity": [[1.0, 0.0, 0.0]] * 3, "offset": [0.0] * 3, "covariance": np.eye(12).tolist()}
     (made / "singular.json").write_text(json.dumps(singular))
@@ -142,6 +161,37 @@ def test_a_link_that_is_refused_is_left_out_with_its_reason(
     assert [link["used"] for link in told["links"]] == [True, False]
     assert told["links"][1]["reasons"]
     assert "ref 2" not in told["devices"]
+
+
+def test_a_sensor_is_the_reference_of_another_by_its_own_indications(
+    directory: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    chain = LINK.format(k=1) + LINK.format(k=1).replace('"s1"', '"s2"').replace("s1-1", "s2").replace(
+        '"ref 1"', '"s1"').replace("ref-1.csv", "s1-1.csv")  # fmt: skip
+    (directory / "chain.toml").write_text(SITE.replace('[devices."ref 1"]', '[devices.s2]\n[devices."ref 1"]') + chain)
+    assert run_cli(["fleet", "adjust", str(directory / "chain.toml"), "--json", "-", "--between", "s1", "s2"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["devices"]["s1"]["used_as"] == ["sensor", "reference"]
+    main, u = np.array(told["devices"]["s2"]["sensitivity"]), np.array(
+        told["devices"]["s2"]["standard_uncertainty"]["sensitivity"])  # fmt: skip
+    assert np.diag(main) == pytest.approx(np.diag(S_OTHER) / GAINS["ref 1"], rel=3e-4)
+    assert np.diag(u / main) == pytest.approx(1e-3, rel=0.1)  # the 0.1 % of the only reference, through s1
+    between = np.array(told["between"][0]["covariance"])[0, 0]
+    u_first = told["devices"]["s1"]["standard_uncertainty"]["sensitivity"][0][0]
+    assert between / (u_first * u[0, 0]) == pytest.approx(1.0, abs=0.05)
+
+
+def test_one_link_alone_is_what_calibrate_finds(tmp_path: Path) -> None:
+    recording = Recording(5, Devices(), bench=True, stand_s=12.0)
+    _, alone = recording.through_files(tmp_path, "--nominal", "1", "--u-nominal-pct", "5")
+    (tmp_path / "site.toml").write_text(ONE_LINK)
+    assert run_cli(["fleet", "adjust", str(tmp_path / "site.toml"), "--json", str(tmp_path / "site.json")]) == 0
+    found = json.loads((tmp_path / "site.json").read_text())["devices"]["s"]
+    u = np.array(alone["standard_uncertainty"]["sensitivity"] + [alone["standard_uncertainty"]["offset"]])
+    for away in ("sensitivity", "offset"):
+        scale = u[:3] if away == "sensitivity" else u[3]
+        assert np.array(found[away]) / scale == pytest.approx(np.array(alone[away]) / scale, abs=1e-3)
+    assert np.array(found["covariance"]) == pytest.approx(np.array(alone["covariance"]), rel=1e-3, abs=1e-9)
 
 
 def test_recordings_need_no_list_of_meetings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
