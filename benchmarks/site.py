@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.page import machine, write_part
-from calib.estimate.contradiction import FALSE_ALARM, named, verdicts
+from calib.estimate.contradiction import FALSE_ALARM, suspects, verdicts
 from calib.estimate.device import Device
 from calib.estimate.link import Link, link
 from calib.estimate.nuisances import Priors
@@ -103,13 +103,13 @@ def one(seed: int, site: SimulatedSite, links: Sequence[Link]) -> dict[str, floa
     gain = {f"r{k}": u * random.normal(size=3) for k in range(REFERENCES)}
     sound = Site(devices, beside(perfect, gain))
     bad, sign = f"r{random.integers(REFERENCES)}", random.choice((-1.0, 1.0))
-    told: dict[str, float] = {"false alarms": float(named(verdicts(sound)) is not None)}
+    told: dict[str, float] = {"false alarms": float(bool(suspects(verdicts(sound))))}
     for case, axes in (("three axes", np.ones(3)), ("one axis", np.array([1.0, 0.0, 0.0]))):
         off = np.where(axes > 0.0, sign * BAD_U * u, gain[bad])
         found = verdicts(Site(devices, beside(perfect, gain | {bad: off})))
-        who = named(found)
-        told[f"{case} off by 3 u: named"] = float(who is not None and who.device == bad)
-        told[f"{case} off by 3 u: another named"] = float(who is not None and who.device != bad)
+        who = [verdict.device for verdict in suspects(found)]
+        told[f"{case} off by 3 u: named alone"] = float(who == [bad])
+        told[f"{case} off by 3 u: another named alone"] = float(len(who) == 1 and who != [bad])
         told[f"{case} off by 3 u: most suspect"] = float(next(v for v in found if v.is_reference).device == bad)
     truth = {f"s{k}": np.append(site.S[f"s{k}"].ravel(), site.Q[f"s{k}"]) for k in range(SENSORS)}
     alone, between = [], []

@@ -65,7 +65,7 @@ def adjust(
         show(found)
     for reason in reasons(found):
         say(f"refused: {reason}", err=True)
-    return 3 if found.bad is not None else 0
+    return 3 if found.suspects else 0
 
 
 class _NothingError(Exception):

@@ -9,7 +9,7 @@ import numpy as np
 
 from agent.fleet.meeting import Meeting
 from calib.distributions import coverage_factor
-from calib.estimate.contradiction import Verdict, named, verdicts
+from calib.estimate.contradiction import Verdict, suspects, verdicts
 from calib.estimate.determined import determined
 from calib.estimate.device import Device
 from calib.estimate.link import GRAVITY_NAME
@@ -19,12 +19,15 @@ from calib.model import Array
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Adjusted:
-    """The adjustment of a site, its meetings, the test of each device, and the one that contradicts the others."""
+    """The adjustment of a site, its meetings, the test of each device, and the one that contradicts the others.
+
+    `suspects` are several devices if these cannot be told apart, and empty if no device contradicts the others.
+    """
 
     site: Site
     meetings: Sequence[Meeting]
     tests: Sequence[Verdict]
-    bad: Verdict | None
+    suspects: Sequence[Verdict]
 
     def coverage_factor(self, name: str) -> float:
         """For about 95 % coverage, by the fewest degrees of freedom among the links of a device."""
@@ -57,4 +60,4 @@ def adjusted(devices: Sequence[Device], meetings: Sequence[Meeting]) -> Adjusted
         devices = [*devices, Device.gravity(max(m.u_gravity_mps2 for m in meetings))]
     site = Site(devices, links)
     tests = verdicts(site)
-    return Adjusted(site, meetings, tests, named(tests))
+    return Adjusted(site, meetings, tests, suspects(tests))

@@ -23,9 +23,16 @@ METHOD = "site adjustment"
 
 def reasons(found: Adjusted) -> list[str]:
     """Why the result is refused; empty if no device contradicts the others."""
-    bad = found.bad
-    if bad is None:
+    if not found.suspects:
         return []
+    bad = found.suspects[0]
+    if len(found.suspects) > 1:
+        names = " and ".join(v.device for v in found.suspects)
+        return [
+            f"{names} contradict each other (chi-squared {bad.statistic:.4g}, {bad.degrees_of_freedom:.3g} degrees of "
+            f"freedom, probability {bad.probability:.2g}, limit {FALSE_ALARM:g}), and the links do not tell which "
+            "of them is wrong; let a sensor that met them meet another reference too"
+        ]
     what = "indicates otherwise than its certificate says" if bad.is_reference else "is not the same in all its links"
     what = "is not what was stated" if bad.device == GRAVITY_NAME else what
     return [
@@ -51,7 +58,7 @@ def as_object(found: Adjusted, between: Sequence[tuple[str, str]]) -> dict[str, 
         "reasons": refused,
         "devices": {name: device_object(found, name) for name in found.linked},
         "gravity_error": _gravity(found),
-        "contradicts": None if found.bad is None else found.bad.device,
+        "contradicts": [v.device for v in found.suspects],
         "false_alarm_probability": FALSE_ALARM,
         "tests": [_test(verdict) for verdict in found.tests],
         "links": [

@@ -23,6 +23,7 @@ from calib.model import Array
 
 FALSE_ALARM = 0.05  # probability that a device of a sound site is named
 LEAST_SHOWN = 0.01  # a bias is tested only in directions in which an error of one stated u gives this non-centrality
+DECISIVE_CHI2 = 4.0  # by which chi-squared of the worst device must exceed that of another one: odds of 7 to 1
 LEAST_FREEDOM = 0.5  # of a sensor: with fewer degrees of freedom nothing can contradict it
 
 
@@ -56,9 +57,22 @@ def verdicts(site: Site) -> list[Verdict]:
     return sorted(found, key=lambda v: (v.probability, -v.statistic / v.degrees_of_freedom))
 
 
-def named(found: list[Verdict], false_alarm: float = FALSE_ALARM) -> Verdict | None:
-    """The one device that contradicts the others, None if none does; `found` is from `verdicts`."""
-    return found[0] if found and found[0].probability <= false_alarm else None
+def suspects(found: list[Verdict], false_alarm: float = FALSE_ALARM) -> list[Verdict]:
+    """The device that contradicts the others; `found` is from `verdicts`. Empty if none does.
+
+    Several devices, the worst first, if the links cannot tell them apart: two references that disagree beside one
+    sensor accuse each other.
+    """
+    if not found or found[0].probability > false_alarm:
+        return []
+    first = found[0]
+    return [
+        v
+        for v in found
+        if v.probability <= false_alarm
+        and v.is_reference == first.is_reference
+        and v.statistic > first.statistic - DECISIVE_CHI2
+    ]
 
 
 def _reference(site: Site, name: str, messages: Sequence[Message]) -> Verdict | None:

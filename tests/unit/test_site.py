@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.estimate.contradiction import named, verdicts
+from calib.estimate.contradiction import suspects, verdicts
 from calib.estimate.device import Device
 from calib.estimate.link import Link, link
 from calib.estimate.nuisances import Priors
@@ -96,8 +96,7 @@ def test_a_bad_reference_is_named_and_its_bias_told() -> None:
         site.meet(f"s{k}", f"r{k % 4}", windows=4)
         site.meet(f"s{k}", f"r{(k + 1) % 4}", windows=4)
     found = verdicts(adjusted(site))
-    bad = named(found)
-    assert bad is not None
+    (bad,) = suspects(found)
     assert bad.device == "r2"
     assert bad.is_reference
     assert bad.degrees_of_freedom == 3.0
@@ -113,8 +112,7 @@ def test_a_sensor_that_changed_between_two_references_is_named() -> None:
     site.S["s4"] = site.S["s4"] * 0.97
     for k in range(6):
         site.meet(f"s{k}", f"r{(k + 1) % 3}", windows=4)
-    bad = named(verdicts(adjusted(site)))
-    assert bad is not None
+    (bad,) = suspects(verdicts(adjusted(site)))
     assert bad.device == "s4"
     assert not bad.is_reference
     assert np.isnan(bad.bias).all()
@@ -128,8 +126,7 @@ def test_a_sensor_that_is_wrong_as_a_reference_is_named() -> None:
     for k in (1, 2, 3):
         site.meet(f"s{k}", "s0", windows=4)
         site.meet(f"s{k}", f"r{k - 1}", windows=4)
-    bad = named(verdicts(adjusted(site)))
-    assert bad is not None
+    (bad,) = suspects(verdicts(adjusted(site)))
     assert bad.device == "s0"
     assert bad.is_reference
 
@@ -147,3 +144,12 @@ def test_a_sound_site_names_nobody_and_statistics_are_chi_squared() -> None:
         statistics += [v.statistic for v in found]
     # Two pairs of references: within a pair both statistics are the same number, so 24 independent ones.
     assert np.mean(statistics) == pytest.approx(3.0, abs=4.0 * np.sqrt(6.0 / 24.0))
+
+
+def test_two_references_that_accuse_each_other_are_both_told() -> None:
+    site = SimulatedSite(14, sensors=2, references=2)
+    site.gain["r1"] = site.gain["r0"] + 8.0 * site.stated.reference
+    for k in range(2):
+        site.meet(f"s{k}", "r0", windows=4)
+        site.meet(f"s{k}", "r1", windows=4)
+    assert {v.device for v in suspects(verdicts(adjusted(site)))} == {"r0", "r1"}
