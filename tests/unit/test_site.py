@@ -153,3 +153,15 @@ def test_two_references_that_accuse_each_other_are_both_told() -> None:
         site.meet(f"s{k}", "r0", windows=4)
         site.meet(f"s{k}", "r1", windows=4)
     assert {v.device for v in suspects(verdicts(adjusted(site)))} == {"r0", "r1"}
+
+
+def test_a_sensor_of_which_nothing_was_known_is_tested_by_its_second_link_alone() -> None:
+    site = SimulatedSite(15, sensors=2, references=2)
+    for sensor, reference in (("s0", "r0"), ("s1", "r0"), ("s1", "r1")):
+        site.meet(sensor, reference, windows=4)
+    devices = [Device.known(name, NOMINAL, np.diag(np.full(12, np.inf))) for name in site.S]
+    devices += [Device.reference(name, site.stated.reference, 3) for name in site.gain]
+    found = {v.device: v for v in verdicts(Site(devices, [linked(site, m) for m in site.meetings]))}
+    assert "s0" not in found
+    assert found["s1"].degrees_of_freedom == pytest.approx(12.0, abs=0.01)
+    assert found["s1"].statistic < 33.0  # chi-squared of 12 at 0.999
