@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -107,7 +107,14 @@ def meeting(sensor: str, reference: str, stretches: Sequence[Files], priors: Pri
 
 def met(sensor: str, reference: str, options: dict[str, Any], known: tuple[Array, Array] | None) -> Meeting:
     """A meeting by its files and options. Raises TableError."""
-    return meeting(sensor, reference, [read(options, known)], priors_of(options))
+    found = meeting(sensor, reference, [read(options, known)], priors_of(options))
+    if known is None or found.found is None or found.found.rotation is not None:
+        return found
+    reason = (
+        f"{reference} states S and Q of all its axes, which needs a reference that measures gravity itself, in one "
+        "rotation to the sensor; state u_sensitivity_pct and a file in SI units"
+    )
+    return replace(found, found=None, reasons=(reason,))
 
 
 def device(name: str, section: DeviceSection, directory: Path, meetings: list[Meeting]) -> Device:

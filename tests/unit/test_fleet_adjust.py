@@ -39,6 +39,8 @@ reference_file = "ref-{k}.csv"
 options = {{ rotation = "1,0,0,0,1,0,0,0,1", u-rotation-deg = 0.05 }}
 """
 
+SECOND = LINK.replace('"s1"', '"s2"').replace("s1-{k}", "s2").replace('"ref {k}"', '"s1"').replace("ref-{k}", "s1-{k}")
+CHAIN = SITE.replace("[devices.s1]", "[devices.s2]\n[devices.s1]") + LINK.format(k=1) + SECOND.format(k=1)
 ONE_LINK = """
 [devices.s]
 nominal = 1
@@ -166,9 +168,7 @@ def test_a_link_that_is_refused_is_left_out_with_its_reason(
 def test_a_sensor_is_the_reference_of_another_by_its_own_indications(
     directory: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    chain = LINK.format(k=1) + LINK.format(k=1).replace('"s1"', '"s2"').replace("s1-1", "s2").replace(
-        '"ref 1"', '"s1"').replace("ref-1.csv", "s1-1.csv")  # fmt: skip
-    (directory / "chain.toml").write_text(SITE.replace('[devices."ref 1"]', '[devices.s2]\n[devices."ref 1"]') + chain)
+    (directory / "chain.toml").write_text(CHAIN)
     assert run_cli(["fleet", "adjust", str(directory / "chain.toml"), "--json", "-", "--between", "s1", "s2"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["devices"]["s1"]["used_as"] == ["sensor", "reference"]
@@ -179,6 +179,17 @@ def test_a_sensor_is_the_reference_of_another_by_its_own_indications(
     between = np.array(told["between"][0]["covariance"])[0, 0]
     u_first = told["devices"]["s1"]["standard_uncertainty"]["sensitivity"][0][0]
     assert between / (u_first * u[0, 0]) == pytest.approx(1.0, abs=0.05)
+
+
+def test_a_certificate_of_all_axes_needs_a_reference_that_measures_gravity(
+    directory: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    head, _, tail = CHAIN.rpartition("u-rotation-deg = 0.05")
+    (directory / "ac.toml").write_text(f'{head}u-rotation-deg = 0.05, reference-coupling = "ac"{tail}')
+    assert run_cli(["fleet", "adjust", str(directory / "ac.toml"), "--json", "-"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert [link["used"] for link in told["links"]] == [True, False]
+    assert "needs a reference that measures gravity itself" in told["links"][1]["reasons"][0]
 
 
 def test_one_link_alone_is_what_calibrate_finds(tmp_path: Path) -> None:
