@@ -174,7 +174,7 @@ def dense(site: SimulatedSite) -> Dense:
         return np.concatenate([*_left(site, x, where), (mean - x) / sd])
 
     x = mean.copy()
-    for _ in range(4):
+    for _ in range(3):
         jacobian = _derivatives(residuals, x, sd)
         x = x - np.linalg.lstsq(jacobian, residuals(x), rcond=None)[0]
     jacobian = _derivatives(residuals, x, sd)
