@@ -61,7 +61,11 @@ def adjusted(files: Files, priors: Priors) -> Outcome:
             break
         found = at(windows, replace(applied, lag_s=lag_s))
         if not stated.response:
-            return _outcome(_at_one_frequency(found, windows, priors, applied, lag_s), windows, files.rate_hz)
+            late_s = lag_s if found.lag_s is None else found.lag_s
+            known = at_one_frequency(priors, windows, late_s)
+            if known.response:
+                found = adjust(_used(windows), known, replace(applied, lag_s=lag_s))
+            return _outcome(found, windows, files.rate_hz)
         if found.response is None or found.response.terms.is_near(applied.response):
             return _outcome(found, windows, files.rate_hz)
         if found.reasons and turn >= HOPELESS:
@@ -98,16 +102,11 @@ def with_response(priors: Priors, windows: Sequence[Window]) -> Priors:
     return priors if band_hz is None else priors.with_response(band_hz)
 
 
-def _at_one_frequency(
-    found: Adjustment, windows: Sequence[Window], priors: Priors, applied: Applied, lag_s: float
-) -> Adjustment:
-    """The adjustment with the attenuation at the motion's frequency as an unknown; unchanged where nothing moved."""
+def at_one_frequency(priors: Priors, windows: Sequence[Window], lag_s: float) -> Priors:
+    """The priors with that of the attenuation at the frequency of the motion; unchanged where nothing moved."""
     moved = [w for w in _used(windows) if w.kind == "motion"]
     motion_hz = mean_frequency_hz(condense(moved, response_hz=np.inf, one_frequency=True)) if moved else 0.0
-    if not motion_hz:
-        return found
-    late_s = lag_s if found.lag_s is None else found.lag_s
-    return adjust(_used(windows), priors.at_one_frequency(motion_hz, late_s), replace(applied, lag_s=lag_s))
+    return priors.at_one_frequency(motion_hz, lag_s) if motion_hz else priors
 
 
 def _used(windows: Sequence[Window]) -> list[Window]:
