@@ -1,0 +1,119 @@
+"""A session at the bench: the stops taken so far, what is known after them, and which stop to take next."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from agent.bench.stops import Stop
+from calib.distributions import chi2_quantile
+from calib.estimate.adjustment import Adjustment, adjust
+from calib.estimate.next_stop import Expected, Joint, Plan, Suggestion, Told, Wanted
+from calib.estimate.nuisances import Priors
+from calib.estimate.stop_order import stops_ahead
+from calib.excitation.sums import factor
+from calib.model import Window
+
+# Probability that a right stop is called wrong, though every stated standard uncertainty were twice as large.
+FALSE_ALARM = 1e-5
+STATED_TIMES = 2.0
+# Another stop fits decisively better if it is e^12.5 = 3e5 times as likely (as in calib.estimate.verdict). This shows
+# a wrong turn before S is known well enough for the test above.
+DECISIVE_CHI2 = 25.0
+MOST_AHEAD = 100  # stops that are planned ahead
+START = Expected(5.0, 0.02, 1000.0)  # before the first window: 5 m/s2 of motion, 2 mg of noise, a second at 1 kHz
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """Whether a window fits the stop that was told: chi2, its limit, and the stop that fits instead, if any does."""
+
+    fits: bool
+    chi2: float
+    limit: float
+    instead: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class Outlook:
+    """How many stops are still needed, None if MOST_AHEAD do not reach what is wanted.
+
+    `best` is the uncertainty (main, transverse) after the stops that were planned. `floor` (main, transverse) is left
+    after any number of stops, and `because` names the quantity behind it; "" if what is wanted can be reached.
+    """
+
+    stops: int | None
+    best: tuple[float, float]
+    floor: tuple[float, float]
+    because: str
+
+
+class Session:
+    """`take` changes it; everything else reads."""
+
+    def __init__(
+        self,
+        stops: Sequence[Stop],
+        priors: Priors,
+        wanted: Wanted,
+        scale: float = 1.0,
+        expected: Expected = START,
+    ) -> None:
+        """`scale`: the nominal sensitivity in output unit per m/s2. `expected`: of the first window."""
+        self.stops = tuple(stops)
+        self.wanted = wanted
+        self.priors = priors
+        self.plan = Plan([s.pose for s in stops], priors, np.array([s.reference_mps2 for s in stops]))
+        self.joint = Joint.before(priors, scale)
+        self.expected = expected if stops[0].pose.direction.shape[1] == 1 else replace(expected, rms_mps2=0.0)
+        self.windows: list[Window] = []
+        self.found: Adjustment | None = None
+
+    @property
+    def reached(self) -> bool:
+        """Whether all uncertainties are as wanted."""
+        return self.wanted.reached(self.joint.expanded)
+
+    def suggestion(self) -> Suggestion:
+        """The stop to take next: the first of as few as reach what is wanted, or the one that gains most."""
+        ahead = stops_ahead(self.plan, self.joint, self.expected, self.wanted, MOST_AHEAD)
+        return ahead[0] if ahead else self.plan.suggestions(self.joint, self.expected, self.wanted)[0]
+
+    def outlook(self) -> Outlook:
+        """How far it is to what is wanted, with the best stop each time."""
+        ahead = stops_ahead(self.plan, self.joint, self.expected, self.wanted, MOST_AHEAD)
+        last = Suggestion(0, ahead[-1].expanded if ahead else self.joint.expanded)
+        stops = len(ahead) if self.wanted.reached(last.expanded) else None
+        left, without = self.plan.floor(self.joint, self.expected)
+        floor, because = Suggestion(0, left), ""
+        if not self.wanted.reached(left):
+            over = {name: float(np.max(each / self.wanted.by_parameter)) for name, each in without.items()}
+            because = min(over, key=lambda name: over[name]) if over else ""
+        return Outlook(stops, (last.main, last.transverse), (floor.main, floor.transverse), because)
+
+    def fit(self, stop: int, window: Window) -> Fit:
+        """Whether a window fits this stop, by all that is known before it."""
+        expected = expected_of(window, self.joint.scale)
+        chi2 = self.plan.surprise(self.joint, Told.of(window), expected)
+        limit = STATED_TIMES**2 * chi2_quantile(1.0 - FALSE_ALARM, 3.0 if window.kind == "rest" else 6.0)
+        best = int(np.argmin(chi2))
+        fits = bool(chi2[stop] <= min(limit, chi2[best] + DECISIVE_CHI2))
+        return Fit(fits, float(chi2[stop]), limit, None if fits or chi2[best] > limit else best)
+
+    def take(self, windows: Sequence[Window], priors: Priors | None = None) -> None:
+        """Adjust all windows of the session, the newest included. `priors`: with what the motion has shown."""
+        self.windows = list(windows)
+        self.found = adjust(self.windows, priors or self.priors)
+        self.joint = Joint.after(self.found)
+        self.expected = expected_of(self.windows[-1], self.joint.scale)
+
+
+def expected_of(window: Window, scale: float) -> Expected:
+    """What a further window will hold that is like this one. `scale`: output unit per m/s2."""
+    m, whole = window.sums.reference_channels, factor(window.sums, derivative=window.kind != "rest")
+    power = np.diag(window.sums.scatter.sum(axis=0))[:m] / whole.count
+    moved = float(np.sqrt(power.max(initial=0.0))) if window.kind != "rest" else 0.0
+    noise = float(np.sqrt(np.trace(whole.residual) / 3.0 / whole.count)) / scale
+    return Expected(moved, noise, max(whole.count * window.independent, 1.0))
