@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from agent.bench.stops import Stop
+from agent.bench.stops import Stop, angles_of, like
 from calib.distributions import chi2_quantile
 from calib.estimate.adjustment import Adjustment, adjust
 from calib.estimate.next_stop import Expected, Joint, Plan, Suggestion, Told, Wanted
@@ -22,8 +22,11 @@ STATED_TIMES = 2.0
 # Another stop fits decisively better if it is e^12.5 = 3e5 times as likely (as in calib.estimate.verdict). This shows
 # a wrong turn before S is known well enough for the test above.
 DECISIVE_CHI2 = 25.0
+DOUBTED = 2.5  # standard uncertainties by which a stated value may be off before it is doubted
 MOST_AHEAD = 100  # stops that are planned ahead
-START = Expected(5.0, 0.02, 1000.0)  # before the first window: 5 m/s2 of motion, 2 mg of noise, a second at 1 kHz
+# Before the first window: 5 m/s2 of motion and 2 mg of noise, in so many points that the noise does not matter, since
+# a stay lasts until it does not.
+START = Expected(5.0, 0.02, 1e5)
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +68,8 @@ class Session:
         self.stops = tuple(stops)
         self.wanted = wanted
         self.priors = priors
-        self.plan = Plan([s.pose for s in stops], priors, np.array([s.reference_mps2 for s in stops]))
+        self.plan = _plan(stops, priors)
+        self._scale = scale
         self.joint = Joint.before(priors, scale)
         self.expected = expected if stops[0].pose.direction.shape[1] == 1 else replace(expected, rms_mps2=0.0)
         self.windows: list[Window] = []
@@ -75,6 +79,25 @@ class Session:
     def reached(self) -> bool:
         """Whether all uncertainties are as wanted."""
         return self.wanted.reached(self.joint.expanded)
+
+    def index_of(self, stop: Stop) -> int:
+        """The number of a stop among `stops`."""
+        return next(k for k, each in enumerate(self.stops) if each.name == stop.name)
+
+    def named(self, text: str) -> Stop | None:
+        """The stop that a person typed; a position of the clamp that was not among `stops` is from now on.
+
+        None where the text is no position.
+        """
+        name = " ".join(text.replace(",", " ").split())
+        found = next((stop for stop in self.stops if stop.name == name), None)
+        if found is None and (angles := angles_of(name)) is not None and self.stops[0].pose.theta_rad is not None:
+            found = next((stop for stop in self.stops if stop.name == f"{angles[0]:g} {angles[1]:g}"), None)
+            if found is None:
+                found = like(self.stops[0], *angles)
+                self.stops = (*self.stops, found)
+                self.plan = _plan(self.stops, self.priors)
+        return found
 
     def suggestion(self) -> Suggestion:
         """The stop to take next: the first of as few as reach what is wanted, or the one that gains most."""
@@ -102,12 +125,32 @@ class Session:
         fits = bool(chi2[stop] <= min(limit, chi2[best] + DECISIVE_CHI2))
         return Fit(fits, float(chi2[stop]), limit, None if fits or chi2[best] > limit else best)
 
+    def restart(self) -> None:
+        """Forget all stops."""
+        self.windows, self.found, self.joint = [], None, Joint.before(self.priors, self._scale)
+
+    def doubts(self) -> list[str]:
+        """Stated values that the stops contradict, one line each, for a person."""
+        if self.found is None:
+            return []
+        lines = []
+        for n in self.found.nuisances:
+            if n.kind.stated and n.prior_uncertainty and abs(n.value) > DOUBTED * n.prior_uncertainty:
+                by = f"{np.degrees(n.value):+.2g} deg" if n.unit == "rad" else f"{n.value:+.2g} {n.unit}"
+                u = f"{np.degrees(n.prior_uncertainty):.2g} deg" if n.unit == "rad" else f"{n.prior_uncertainty:.2g}"
+                lines.append(f"{n.name} seems off by {by}, and u {u} was stated: check it")
+        return lines
+
     def take(self, windows: Sequence[Window], priors: Priors | None = None) -> None:
         """Adjust all windows of the session, the newest included. `priors`: with what the motion has shown."""
         self.windows = list(windows)
         self.found = adjust(self.windows, priors or self.priors)
         self.joint = Joint.after(self.found)
         self.expected = expected_of(self.windows[-1], self.joint.scale)
+
+
+def _plan(stops: Sequence[Stop], priors: Priors) -> Plan:
+    return Plan([s.pose for s in stops], priors, np.array([s.reference_mps2 for s in stops]))
 
 
 def expected_of(window: Window, scale: float) -> Expected:

@@ -12,6 +12,7 @@ from calib.geometry import at_rest, beside, clamp
 from calib.model import Array, Pose
 
 AXES = "xyz"
+GRAVITY = ("gx", "gy", "gz")  # columns of poses.csv
 FACE, CORNER = 1, 3  # how many axes point up equally, at most
 
 
@@ -45,6 +46,23 @@ def on_clamp(
     ]
 
 
+def angles_of(text: str) -> tuple[float, float] | None:
+    """theta and alpha in deg as a person types them; None for other texts."""
+    try:
+        theta_deg, alpha_deg = (float(part) for part in text.split())
+    except ValueError:
+        return None
+    return (theta_deg, alpha_deg) if abs(theta_deg) <= 90.0 and abs(alpha_deg) <= 360.0 else None
+
+
+def like(stop: Stop, theta_deg: float, alpha_deg: float) -> Stop:
+    """Another position of the clamp on which `stop` is one."""
+    gravity_mps2 = float(np.linalg.norm(stop.pose.gravity_mps2))
+    upright = clamp(stop.pose.theta_rad or 0.0, stop.pose.alpha_rad or 0.0, 1.0).gravity_mps2
+    sign = -1 if float(upright @ stop.pose.gravity_mps2) < 0.0 else 1
+    return on_clamp([theta_deg], [alpha_deg % 360.0], gravity_mps2, sign)[0]
+
+
 def turned_by_hand(rotation: Array, gravity_mps2: float) -> list[Stop]:
     """Rests of a sensor that is fixed to a calibrated triad: axes, edges and corners up. The triad tells how it stands.
 
@@ -56,7 +74,7 @@ def turned_by_hand(rotation: Array, gravity_mps2: float) -> list[Stop]:
             f"turn sensor and reference together, until {told} up, and put them down",
             name,
             Pose(pose.position, pose.direction, np.zeros(3)),
-            {},
+            dict(zip(GRAVITY, (gravity_mps2 * up).tolist(), strict=True)),
             np.asarray(rotation).T @ (gravity_mps2 * up),
         )
         for told, name, up in _ways(CORNER)
@@ -68,7 +86,7 @@ def on_faces(gravity_mps2: float) -> list[Stop]:
     found = []
     for told, name, up in _ways(FACE):
         felt = gravity_mps2 * up
-        columns = dict(zip(("gx", "gy", "gz"), felt.tolist(), strict=True))
+        columns = dict(zip(GRAVITY, felt.tolist(), strict=True))
         found.append(
             Stop(f"put the sensor on a level table, {told} up", name, at_rest(felt, name), columns, np.zeros(0))
         )

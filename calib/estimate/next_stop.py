@@ -66,6 +66,10 @@ class Expected:
     noise_mps2: float
     points: float
 
+    def longer(self, times: float) -> Expected:
+        """The same of a stay that is so many times as long."""
+        return replace(self, points=times * self.points)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Joint:
