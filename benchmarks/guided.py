@@ -131,23 +131,32 @@ def _session(stops: Sequence[Stop], stated: Priors, wanted: Wanted) -> Session:
     )  # fmt: skip
 
 
-def wrong_turns(seed: int, stops: Sequence[Stop], stated: Priors) -> tuple[int, int, int]:
-    """A user whose clamp is turned wrong once: (right stops refused, wrong ones noticed, and named)."""
+def wrong_turns(seed: int, stops: Sequence[Stop], stated: Priors) -> tuple[int, int, int, int]:
+    """A user whose clamp is turned wrong once.
+
+    Whether a right stop was called wrong, and whether the wrong one was noticed at once, was named, or was noticed at a
+    later stop only.
+    """
     user, session = User.drawn(seed, OFFSET_MPS2), _session(stops, stated, Wanted())
     wrong_at, off = int(user.random.integers(0, 6)), float(user.random.choice(WRONG_DEG))
-    refused = noticed = named = 0
-    for k in range(6):
+    refused = noticed = named = later = 0
+    for k in range(8):
         best = session.suggestion().stop
-        if k == wrong_at:
-            fit = session.fit(best, user.on_clamp(stops[best], off))
-            noticed = int(not fit.fits)
+        window = user.on_clamp(stops[best], off if k == wrong_at else 0.0)
+        fit = session.fit(best, window)
+        if k == wrong_at and not fit.fits:
+            noticed = 1
             if fit.instead is not None:
                 away = stops[fit.instead].columns["alpha_deg"] - stops[best].columns["alpha_deg"] - off
                 named = int(abs((away + 180.0) % 360.0 - 180.0) < 1.0)
-        window = user.on_clamp(stops[best])
-        refused += int(not session.fit(best, window).fits)
+            window = user.on_clamp(stops[best])
+        elif not fit.fits:
+            late = k > wrong_at and not noticed
+            refused, later = refused + (not late), int(late)
+            if late:
+                break
         session.take([*session.windows, window])
-    return refused, noticed, named
+    return refused, noticed, named, later
 
 
 def _line(name: str, ended: Sequence[Ended], group: np.ndarray, wanted_pct: float) -> str:
@@ -188,11 +197,14 @@ def figures(users: int) -> list[str]:
         at_triad.append(guided(session, user, user.beside_triad))
     lines.append(_line("rests beside a triad, offsets 2.5 mm/s²: main", at_triad, MAIN, 0.05))
     every = [*ended["main"], *ended["all"], *at_triad]
+    five = sum(e.all_stops <= 5 and e.all_stops > 0 for e in at_triad)
+    lines.append(f"\nBeside the triad {five} of {users} users needed 5 stops at most.")
     lines.append(f"\nRefused by the adjustment: {sum(e.refused for e in every)} of {len(every)} sessions.")
     turned = np.array([wrong_turns(seed, two, stated) for seed in range(users)]).sum(axis=0)
     lines.append(
-        f"\nOne wrong turn of 15 to 180 deg a user: {turned[1]} of {users} noticed, {turned[2]} named rightly; "
-        f"{turned[0]} of {6 * users} right turns called wrong."
+        f"\nOne wrong turn of 15 to 180 deg a user, among eight stops: {turned[1]} of {users} noticed at once, "
+        f"{turned[2]} of them with the position that was taken; {turned[3]} more noticed at a later stop; "
+        f"{turned[0]} right turns called wrong."
     )
     return lines
 

@@ -16,6 +16,7 @@ from calib.model import Array
 
 LOOK_S = 1.0  # from one look at the samples to the next
 FIT_FROM_S = 2.0  # of samples; in fewer a slow motion tells no slopes
+REST_TOLD_FROM_S = 8.0  # before that a rest cannot be told from slow motion
 SETTLED_S = 1.0  # after a turn by hand a clamp vibrates for about a second
 GAIN = 1.02  # a longer stay would reduce U by less than 2 %
 BEFORE_S = 5.0  # of samples before a stop: for its clock, and for the ends of filters
@@ -51,6 +52,7 @@ class Dialogue:
         self._mind, self._capture = mind, capture
         self._stay, self._ask, self._say, self._progress, self._turn = stay, ask, say, progress, turn
         self._taken: list[Taken] = []
+        self._refused: tuple[str, ...] = ()
         self._standing: Stop | None = None  # where the sensor was put last
 
     @property
@@ -60,7 +62,7 @@ class Dialogue:
     def run(self) -> list[Taken]:
         """Take stops until all is as wanted, or until the person ends the session."""
         self._begin()
-        while not self._session.reached or not self._taken:
+        while not self._session.reached or not self._taken or self._refused:
             stop = self._next_stop()
             if stop is None:
                 break
@@ -127,7 +129,7 @@ class Dialogue:
             return
         gone = self._taken.pop()
         self._say(f"  stop {len(self._taken) + 1} ({gone.stop.name}) is not used")
-        self._mind.take(self._capture.record(), self._taken)
+        self._refused = self._mind.take(self._capture.record(), self._taken)
 
     def _take(self, stop: Stop) -> None:
         """Stay at a stop, and use it if it is sound."""
@@ -151,10 +153,12 @@ class Dialogue:
             if self._turn is not None:
                 self._put(stop)
         self._taken.append(Taken(stop, start_s, stop_s))
-        self._mind.take(self._capture.record(), self._taken)
+        self._refused = self._mind.take(self._capture.record(), self._taken)
         self._say(f"  stop {len(self._taken)}, {stop.name}: U is now {_told(self._session.joint.expanded)}")
         for line in self._session.doubts():
             self._say(f"  {line}")
+        for reason in self._refused:
+            self._say(f"  U is as wanted, but the result would be refused: {reason}")
 
     def _misfit(self, stop: Stop, fit: Fit) -> str:
         self._say(f"  this does not look like {stop.name}: chi2 {fit.chi2:.4g}, {fit.limit:.4g} at most")
@@ -172,6 +176,7 @@ class Dialogue:
     def _watch(self, stop: Stop, start_s: float) -> tuple[Fit | None, float]:
         """How a stay fits its stop, None where it cannot be used; and when it ended. Says at once what is wrong."""
         reason, knocked = "", 0
+        told_from_s = REST_TOLD_FROM_S if self._session.expected.rms_mps2 == 0.0 else FIT_FROM_S
         while True:
             time.sleep(LOOK_S)
             now_s = self._capture.now_s
@@ -185,7 +190,7 @@ class Dialogue:
                 continue
             look = self._mind.look(self._capture.record(start_s - BEFORE_S), Taken(stop, start_s, now_s))
             if look.reason:
-                if look.reason.translate(NO_DIGITS) != reason:
+                if stayed_s >= told_from_s and look.reason.translate(NO_DIGITS) != reason:
                     self._say(f"  {look.reason}")
                     reason = look.reason.translate(NO_DIGITS)
                 if stayed_s > self._stay.most_s:

@@ -12,7 +12,7 @@ import numpy as np
 
 from agent.bench.capture import DeviceSamples
 from agent.bench.stops import Stop
-from agent.calibrate.adjusting import with_response
+from agent.calibrate.adjusting import adjusted, with_response
 from agent.calibrate.files import Files, Options
 from agent.calibrate.poses import PoseInterval
 from agent.calibrate.priors import instrument_of, priors_of
@@ -72,6 +72,10 @@ class Measuring:
 
         windows, self.lag_s = without_lag(self.lag_s, self._files(record, taken).windows, _used, lag_of)
         return _used(windows), with_response(self.priors, windows)
+
+    def refused(self, record: Record, taken: Sequence[Taken]) -> tuple[str, ...]:
+        """Why `fieldcal calibrate` would refuse these stops; empty if it would not."""
+        return adjusted(self._files(record, taken), self.priors).reasons
 
     def moved_mps2(self, record: Record) -> float:
         """The rms of the reference's motion; 0 where there is no reference."""

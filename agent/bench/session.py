@@ -23,6 +23,7 @@ STATED_TIMES = 2.0
 # a wrong turn before S is known well enough for the test above.
 DECISIVE_CHI2 = 25.0
 DOUBTED = 2.5  # standard uncertainties by which a stated value may be off before it is doubted
+SCATTERED = 1.3  # times the stated scatter of the offset from which a person is told
 MOST_AHEAD = 100  # stops that are planned ahead
 # Before the first window: 5 m/s2 of motion and 2 mg of noise, in so many points that the noise does not matter, since
 # a stay lasts until it does not.
@@ -133,7 +134,12 @@ class Session:
         """Stated values that the stops contradict, one line each, for a person."""
         if self.found is None:
             return []
-        lines = []
+        lines, scatter, stated = [], self.found.offset_scatter_mps2, self.priors.offset_mps2
+        if scatter > SCATTERED * stated:
+            lines.append(
+                f"the offset scatters by {1e3 * scatter:.2g} mm/s2 between stops, "
+                f"{1e3 * stated:.2g} mm/s2 were stated: U grows with it"
+            )
         for n in self.found.nuisances:
             if n.kind.stated and n.prior_uncertainty and abs(n.value) > DOUBTED * n.prior_uncertainty:
                 by = f"{np.degrees(n.value):+.2g} deg" if n.unit == "rad" else f"{n.value:+.2g} {n.unit}"

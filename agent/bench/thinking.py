@@ -57,9 +57,11 @@ class Thinking:
         """Look at the stop that is being taken."""
         return self._pool.submit(_look, self.session, self.measuring, record, taken).result()
 
-    def take(self, record: Record, taken: Sequence[Taken]) -> None:
-        """Adjust all stops; none at all begins anew."""
-        self.session, self.measuring = self._pool.submit(_take, self.session, self.measuring, record, taken).result()
+    def take(self, record: Record, taken: Sequence[Taken]) -> tuple[str, ...]:
+        """Adjust all stops; none at all begins anew. Where all is as wanted: why the result would be refused."""
+        future = self._pool.submit(_take, self.session, self.measuring, record, taken)
+        self.session, self.measuring, refused = future.result()
+        return refused
 
 
 def _next_stop(session: Session) -> tuple[Suggestion, Outlook]:
@@ -79,9 +81,11 @@ def _look(session: Session, measuring: Measuring, record: Record, taken: Taken) 
     return Look("", window.points, window.left_out, expanded, float(gain), session.fit(k, window))
 
 
-def _take(session: Session, measuring: Measuring, record: Record, taken: Sequence[Taken]) -> tuple[Session, Measuring]:
-    if taken:
-        session.take(*measuring.all(record, taken))
-    else:
+def _take(
+    session: Session, measuring: Measuring, record: Record, taken: Sequence[Taken]
+) -> tuple[Session, Measuring, tuple[str, ...]]:
+    if not taken:
         session.restart()
-    return session, measuring
+        return session, measuring, ()
+    session.take(*measuring.all(record, taken))
+    return session, measuring, measuring.refused(record, taken) if session.reached else ()

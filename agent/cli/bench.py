@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 import numpy as np
 
+from agent.cli.finite import Finite
 from agent.config import Channel, Config, ConfigError, load_config, parse_config
 from agent.terminal.text import for_drawing, say
 
@@ -44,17 +45,17 @@ class _Angles(click.ParamType):  # type: ignore[type-arg]
 @click.option("-o", "--output", type=click.Path(path_type=Path, file_okay=False), default=Path("bench"),
               show_default=True, help="Directory for samples, positions and result; must not exist.")  # fmt: skip
 @click.option("--sensor", metavar="NAME", help="The sensor, if the configuration has several.")
-@click.option("--u-main-pct", type=click.FloatRange(0.001, 10), default=U_MAIN_PCT, show_default=True,
+@click.option("--u-main-pct", type=Finite(0.001, 10), default=U_MAIN_PCT, show_default=True,
               help="Wanted U (k = 2) of the main sensitivities, apart from the reference's own error.")  # fmt: skip
-@click.option("--u-transverse-pct", type=click.FloatRange(0.001, 100), default=U_TRANSVERSE_PCT, show_default=True,
+@click.option("--u-transverse-pct", type=Finite(0.001, 100), default=U_TRANSVERSE_PCT, show_default=True,
               help="Wanted U (k = 2) of the transverse sensitivities, relative to the main one.")  # fmt: skip
 @click.option("--thetas", type=_Angles(), default=THETAS_DEG, show_default=True,
               help="Inclinations that the clamp can take, deg.")  # fmt: skip
 @click.option("--alphas", type=_Angles(), default=",".join(map(str, range(0, 360, ALPHA_STEP_DEG))),
               help="Rotations on the clamp, deg; default: every 15 deg.")  # fmt: skip
-@click.option("--stay-s", type=click.FloatRange(2, 600), default=5.0, show_default=True,
+@click.option("--stay-s", type=Finite(2, 600), default=5.0, show_default=True,
               help="Stay at a position for so long at least.")  # fmt: skip
-@click.option("--most-s", type=click.FloatRange(5, 3600), default=60.0, show_default=True,
+@click.option("--most-s", type=Finite(5, 3600), default=60.0, show_default=True,
               help="Stay at a position for so long at most.")  # fmt: skip
 @click.option("--stated", type=click.Path(path_type=Path, dir_okay=False), metavar="certificate.toml",
               help="Make the certificate at the end (`fieldcal certificate`); what only people know.")  # fmt: skip

@@ -30,6 +30,11 @@ THETA_DEG = 35.0
 ALPHAS_DEG = (0.0, 30.0, 120.0, 210.0)
 HOLD_S = 10.0
 BY_HAND_HZ = 250.0
+# Four positions at one inclination, then four at another.
+GUIDED_DEG = (
+    *((35.0, alpha) for alpha in (0.0, 90.0, 180.0, 270.0)),
+    *((55.0, alpha) for alpha in (45.0, 135.0, 225.0, 315.0)),
+)
 TURN_S = 3.0
 START_S = 3.0  # the gateway has opened its devices by then; four positions are complete after 52 s
 # 22.5 ug/sqrt(Hz) over a quarter of 1 kHz (ADXL355 data sheet: bandwidth ODR / 4)
@@ -135,4 +140,17 @@ def by_hand(kind: Literal["clamp", "triad", "gravity"], seed: int) -> BenchParam
     return replace(bench, schedule=schedule, sensor=sensor, reference=reference)
 
 
-PRESETS: dict[str, Callable[[int], BenchParameters]] = {"plain": plain, "faulty": faulty}
+def guided(seed: int) -> BenchParameters:
+    """The bench `plain` with a second inclination, in the order of `fieldcal bench`; its errors are drawn with `seed`.
+
+    Theta and each alpha are known to 0.2 deg, and the offset differs by 0.05 m/s2 between windows: with one inclination
+    the main sensitivities stay uncertain by some tenths of a per cent, however long it takes.
+    """
+    bench = plain(seed)
+    stands = tuple(clamped(theta, alpha, HOLD_S) for theta, alpha in GUIDED_DEG)
+    bench = replace(bench, schedule=replace(bench.schedule, stands=stands))
+    spread = Spread(angle_deg=0.2, theta_deg=0.2, offset_mps2=0.05)
+    return drawn(bench, spread, np.random.default_rng([seed, Stream.PRESET]))
+
+
+PRESETS: dict[str, Callable[[int], BenchParameters]] = {"plain": plain, "faulty": faulty, "guided": guided}
