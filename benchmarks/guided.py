@@ -134,7 +134,7 @@ def _session(stops: Sequence[Stop], stated: Priors, wanted: Wanted) -> Session:
 def wrong_turns(seed: int, stops: Sequence[Stop], stated: Priors) -> tuple[int, int, int, int]:
     """A user whose clamp is turned wrong once.
 
-    Whether a right stop was called wrong, and whether the wrong one was noticed at once, was named, or was noticed at a
+    Whether a right stop was called wrong, and whether the wrong one was noticed at once, was named, or was found at a
     later stop only.
     """
     user, session = User.drawn(seed, OFFSET_MPS2), _session(stops, stated, Wanted())
@@ -151,9 +151,10 @@ def wrong_turns(seed: int, stops: Sequence[Stop], stated: Priors) -> tuple[int, 
                 named = int(abs((away + 180.0) % 360.0 - 180.0) < 1.0)
             window = user.on_clamp(stops[best])
         elif not fit.fits:
-            late = k > wrong_at and not noticed
-            refused, later = refused + (not late), int(late)
-            if late:
+            hidden = k > wrong_at and not noticed  # the wrong one is among those that were taken
+            refused += not hidden
+            if hidden and fit.earlier is not None:
+                later = 1
                 break
         session.take([*session.windows, window])
     return refused, noticed, named, later
@@ -203,7 +204,7 @@ def figures(users: int) -> list[str]:
     turned = np.array([wrong_turns(seed, two, stated) for seed in range(users)]).sum(axis=0)
     lines.append(
         f"\nOne wrong turn of 15 to 180 deg a user, among eight stops: {turned[1]} of {users} noticed at once, "
-        f"{turned[2]} of them with the position that was taken; {turned[3]} more noticed at a later stop; "
+        f"{turned[2]} of them with the position that was taken; {turned[3]} more found by later stops; "
         f"{turned[0]} right turns called wrong."
     )
     return lines

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from agent.bench.capture import Capture
 from agent.bench.measuring import Taken
@@ -33,7 +33,7 @@ class Stay:
 
 
 class Dialogue:
-    """Leads a person through a session. `run` returns the stops that were taken.
+    """Leads a person through a session. `taken` are the stops that are used.
 
     `ask` gives the answer to a prompt, None at the end of input. `say` shows a line, `progress` one that the next
     replaces. `turn` turns a virtual sensor and gives the seconds that it takes; None where a person turns the sensor.
@@ -51,7 +51,7 @@ class Dialogue:
     ) -> None:
         self._mind, self._capture = mind, capture
         self._stay, self._ask, self._say, self._progress, self._turn = stay, ask, say, progress, turn
-        self._taken: list[Taken] = []
+        self.taken: list[Taken] = []
         self._refused: tuple[str, ...] = ()
         self._standing: Stop | None = None  # where the sensor was put last
 
@@ -59,17 +59,16 @@ class Dialogue:
     def _session(self) -> Session:
         return self._mind.session
 
-    def run(self) -> list[Taken]:
+    def run(self) -> None:
         """Take stops until all is as wanted, or until the person ends the session."""
         self._begin()
-        while not self._session.reached or not self._taken or self._refused:
+        while not self._session.reached or not self.taken or self._refused:
             stop = self._next_stop()
             if stop is None:
                 break
             self._take(stop)
         else:
-            self._say(f"reached after {_count(len(self._taken))}: U {_told(self._session.joint.expanded)}")
-        return self._taken
+            self._say(f"reached after {_count(len(self.taken))}: U {_told(self._session.joint.expanded)}")
 
     def _begin(self) -> None:
         wanted, (_, outlook) = self._session.wanted, self._mind.next_stop()
@@ -92,7 +91,7 @@ class Dialogue:
         """The stop that the person takes; None to end the session."""
         best, outlook = self._mind.next_stop()
         stop, left = self._session.stops[best.stop], outlook.stops
-        self._say(f"stop {len(self._taken) + 1}: {stop.told}")
+        self._say(f"stop {len(self.taken) + 1}: {stop.told}")
         more = "" if left is None or left < 2 else f"; {_count(left - 1)} more then to what is wanted"
         self._say(f"  U will be {_told(best.expanded)}{more}")
         while True:
@@ -124,12 +123,12 @@ class Dialogue:
         self._standing = stop
 
     def _undo(self) -> None:
-        if not self._taken:
+        if not self.taken:
             self._say("  no stop was taken yet")
             return
-        gone = self._taken.pop()
-        self._say(f"  stop {len(self._taken) + 1} ({gone.stop.name}) is not used")
-        self._refused = self._mind.take(self._capture.record(), self._taken)
+        gone = self.taken.pop()
+        self._say(f"  stop {len(self.taken) + 1} ({gone.stop.name}) is not used")
+        self._refused = self._mind.take(self._capture.record(), self.taken)
 
     def _take(self, stop: Stop) -> None:
         """Stay at a stop, and use it if it is sound."""
@@ -147,26 +146,43 @@ class Dialogue:
                 break
             if answer == "k":
                 break
+            if answer == "c" and fit.earlier is not None:
+                self._correct(*fit.earlier)
+                break
             if answer is None or answer == "q":
                 self._say("  this stop is not used")
                 return
             if self._turn is not None:
                 self._put(stop)
-        self._taken.append(Taken(stop, start_s, stop_s))
-        self._refused = self._mind.take(self._capture.record(), self._taken)
-        self._say(f"  stop {len(self._taken)}, {stop.name}: U is now {_told(self._session.joint.expanded)}")
+        self.taken.append(Taken(stop, start_s, stop_s))
+        self._refused = self._mind.take(self._capture.record(), self.taken)
+        self._say(f"  stop {len(self.taken)}, {stop.name}: U is now {_told(self._session.joint.expanded)}")
         for line in self._session.doubts():
             self._say(f"  {line}")
         for reason in self._refused:
             self._say(f"  U is as wanted, but the result would be refused: {reason}")
 
+    def _earlier(self, start_s: float) -> int:
+        """The number of the stop in which a window began at this time."""
+        return next(k for k, each in enumerate(self.taken) if each.start_s <= start_s <= each.stop_s)
+
+    def _correct(self, start_s: float, instead: int) -> None:
+        k = self._earlier(start_s)
+        self.taken[k] = replace(self.taken[k], stop=self._session.stops[instead])
+
     def _misfit(self, stop: Stop, fit: Fit) -> str:
         self._say(f"  this does not look like {stop.name}: chi2 {fit.chi2:.4g}, {fit.limit:.4g} at most")
+        if fit.earlier is not None:
+            start_s, instead = fit.earlier
+            k, name = self._earlier(start_s), self._session.stops[instead].name
+            self._say(f"  stop {k + 1} ({self.taken[k].stop.name}) may be the wrong one: it looks like {name}")
+            again = f"c: stop {k + 1} is at {name}, keep both; Enter: measure this one again"
+            return f"  {again}; k: keep it as told; q: leave it out > "
         if fit.instead is None:
             self._say("  it fits no position: is the sensor loose, or turned another way?")
             return "  Enter: measure again after turning it; k: keep it as told; q: leave it out > "
         like = self._session.stops[fit.instead]
-        last = self._taken[-1].stop.name if self._taken else ""
+        last = self.taken[-1].stop.name if self.taken else ""
         why = "the sensor was not turned" if like.name == last else "it looks turned"
         self._say(f"  {why}: it stands as at {like.name}")
         return (

@@ -24,6 +24,7 @@ STATED_TIMES = 2.0
 DECISIVE_CHI2 = 25.0
 DOUBTED = 2.5  # standard uncertainties by which a stated value may be off before it is doubted
 SCATTERED = 1.3  # times the stated scatter of the offset from which a person is told
+FEWEST_WITNESSES = 3  # stops from which on one of them can be found to be wrong, and not the newest
 MOST_AHEAD = 100  # stops that are planned ahead
 # Before the first window: 5 m/s2 of motion and 2 mg of noise, in so many points that the noise does not matter, since
 # a stay lasts until it does not.
@@ -32,12 +33,17 @@ START = Expected(5.0, 0.02, 1e5)
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """Whether a window fits the stop that was told: chi2, its limit, and the stop that fits instead, if any does."""
+    """Whether a window fits the stop that was told: chi2, its limit, and the stop that fits instead, if any does.
+
+    `earlier`: an earlier window, without which this one fits, while the earlier one then fits another stop only: when
+    that window began, and this stop.
+    """
 
     fits: bool
     chi2: float
     limit: float
     instead: int | None
+    earlier: tuple[float, int] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +76,7 @@ class Session:
         self.wanted = wanted
         self.priors = priors
         self.plan = _plan(stops, priors)
-        self._scale = scale
+        self._scale, self._priors_now = scale, priors
         self.joint = Joint.before(priors, scale)
         self.expected = expected if stops[0].pose.direction.shape[1] == 1 else replace(expected, rms_mps2=0.0)
         self.windows: list[Window] = []
@@ -119,12 +125,28 @@ class Session:
 
     def fit(self, stop: int, window: Window) -> Fit:
         """Whether a window fits this stop, by all that is known before it."""
-        expected = expected_of(window, self.joint.scale)
-        chi2 = self.plan.surprise(self.joint, Told.of(window), expected)
+        found = self._fit(self.joint, stop, window)
+        return found if found.fits else replace(found, earlier=self._earlier(stop, window))
+
+    def _fit(self, known: Joint, stop: int, window: Window) -> Fit:
+        chi2 = self.plan.surprise(known, Told.of(window), expected_of(window, known.scale))
         limit = STATED_TIMES**2 * chi2_quantile(1.0 - FALSE_ALARM, 3.0 if window.kind == "rest" else 6.0)
         best = int(np.argmin(chi2))
         fits = bool(chi2[stop] <= min(limit, chi2[best] + DECISIVE_CHI2))
         return Fit(fits, float(chi2[stop]), limit, None if fits or chi2[best] > limit else best)
+
+    def _earlier(self, stop: int, window: Window) -> tuple[float, int] | None:
+        """The earlier window that is wrong rather than this one, by leaving out each in turn."""
+        suspects = []
+        for k, each in enumerate(self.windows if len(self.windows) >= FEWEST_WITNESSES else ()):
+            own = next((n for n, s in enumerate(self.stops) if s.pose.position == each.pose.position), None)
+            known = Joint.after(adjust([*self.windows[:k], *self.windows[k + 1 :]], self._priors_now))
+            if own is None or not self._fit(known, stop, window).fits:
+                continue
+            found = self._fit(known, own, each)
+            if not found.fits and found.instead is not None:
+                suspects.append((found.chi2, each.start_s, found.instead))
+        return max(suspects)[1:] if suspects else None
 
     def restart(self) -> None:
         """Forget all stops."""
@@ -150,7 +172,8 @@ class Session:
     def take(self, windows: Sequence[Window], priors: Priors | None = None) -> None:
         """Adjust all windows of the session, the newest included. `priors`: with what the motion has shown."""
         self.windows = list(windows)
-        self.found = adjust(self.windows, priors or self.priors)
+        self._priors_now = priors or self.priors
+        self.found = adjust(self.windows, self._priors_now)
         self.joint = Joint.after(self.found)
         self.expected = expected_of(self.windows[-1], self.joint.scale)
 

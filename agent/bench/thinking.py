@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -43,7 +44,7 @@ class Thinking:
 
     def __enter__(self) -> Thinking:
         spawn = multiprocessing.get_context("spawn")
-        self._pool = ProcessPoolExecutor(1, mp_context=spawn, initializer=os.nice, initargs=(NICE,))
+        self._pool = ProcessPoolExecutor(1, mp_context=spawn, initializer=_modest)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -62,6 +63,12 @@ class Thinking:
         future = self._pool.submit(_take, self.session, self.measuring, record, taken)
         self.session, self.measuring, refused = future.result()
         return refused
+
+
+def _modest() -> None:
+    """Leave the processor to the reading of devices, and Ctrl-C to the process that has the session."""
+    os.nice(NICE)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _next_stop(session: Session) -> tuple[Suggestion, Outlook]:

@@ -115,14 +115,18 @@ def _session(settings: Config, channel: Channel, output: Path, options: dict[str
     from agent.bench.session import START, Session
     from agent.bench.thinking import Thinking
     from calib.estimate.next_stop import Wanted
-    from calib.excitation.front_end import LEAST_MARGIN_S
+    from calib.excitation.front_end import most_margin_s
     from calib.excitation.windows import LEAST_MOTION_MPS2
 
     stops = stops_of(channel, options["thetas"], options["alphas"])
     devices = [channel.sensor, *([channel.reference] if channel.reference else [])]
-    output.mkdir(parents=True)
+    if output.exists():
+        raise FileExistsError
+    if options["stated"] is not None:
+        _check_stated(options["stated"])
     with Capture(settings, devices) as capture:
         info = _opened(capture, devices)
+        output.mkdir(parents=True)
         scale = write_prior(channel, info.get("nominal_sensitivity"), output / "prior.json")
         arguments = [*stated(channel, output), f"--json={output / 'result.json'}"]
         told = _parsed(arguments)
@@ -133,13 +137,20 @@ def _session(settings: Config, channel: Channel, output: Path, options: dict[str
         expected = replace(START, rms_mps2=moved) if moved > LEAST_MOTION_MPS2 else START
         stay = Stay(options["stay_s"], max(options["most_s"], options["stay_s"]))
         with Thinking(Session(stops, measuring.priors, wanted, scale, expected), measuring) as mind:
-            taken = Dialogue(mind, capture, stay, _ask, say, _progress, turn).run()
-        if not taken:
+            dialogue = Dialogue(mind, capture, stay, _ask, say, _progress, turn)
+            try:
+                dialogue.run()
+            finally:  # also after Ctrl-C: what was measured is kept
+                if dialogue.taken:
+                    time.sleep(most_margin_s(channel.instrument))  # for the samples that filters need after a stop
+                    measuring.write(capture.record(), dialogue.taken, output)
+                    say("the samples are kept; the result is made by: fieldcal calibrate " + " ".join(arguments))
+        if not dialogue.taken:
+            (output / "prior.json").unlink()
+            output.rmdir()
             say("no stop was taken, so there is no result", err=True)
             return 3
-        time.sleep(LEAST_MARGIN_S)  # for the samples after the last stop, which filters need
-        measuring.write(capture.record(), taken, output)
-    return _result(told, arguments, output, options["stated"])
+    return _result(told, output, options["stated"])
 
 
 def _opened(capture: Any, devices: list[str]) -> dict[str, Any]:
@@ -163,12 +174,19 @@ def _parsed(arguments: list[str]) -> dict[str, Any]:
         return dict(context.params)
 
 
-def _result(options: dict[str, Any], arguments: list[str], output: Path, stated: Path | None) -> int:
+def _check_stated(path: Path) -> None:
+    """Raises ConfigError before the session rather than after it."""
+    from agent.certificate.statements import Statements
+    from agent.config.reading import load_model
+
+    load_model(path, Statements)
+
+
+def _result(options: dict[str, Any], output: Path, stated: Path | None) -> int:
     """Make the result from the files as `fieldcal calibrate` does, and the certificate."""
     from agent.cli.calibrate import calibrate
     from agent.cli.certificate import certificate
 
-    say("the result, made by: fieldcal calibrate " + " ".join(arguments))
     assert calibrate.callback is not None
     assert certificate.callback is not None
     status = int(calibrate.callback(**options))

@@ -77,7 +77,9 @@ def test_a_clamp_with_a_wrong_turn(tmp_path):
     assert "stands as at 35 60" in told
     assert re.search(r"reached after [3-5] stops", told)
     assert np.abs(_errors_over_u(tmp_path / "out", "clamp", 3)).max() < 1.5
-    command = next(line for line in told.splitlines() if "fieldcal calibrate" in line).split("fieldcal ")[1].split()
+    command = (
+        next(line for line in told.splitlines() if "made by: fieldcal calibrate" in line).split("fieldcal ")[1].split()
+    )
     before = (tmp_path / "out" / "result.json").read_bytes()
     assert fieldcal(*command).returncode == 0
     assert (tmp_path / "out" / "result.json").read_bytes() == before

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -86,7 +88,7 @@ def test_six_faces_are_repeated_where_offsets_scatter():
 
 
 def test_wrong_turns_are_noticed_and_named_and_right_ones_are_not_called_wrong():
-    for seed in range(3):
+    for seed in range(2):
         user, session = User.drawn(seed, OFFSET_MPS2), Session(TWO, STATED, Wanted())
         for known, off_deg in enumerate((45.0, -45.0, 180.0, 15.0)):
             stop = session.suggestion().stop
@@ -117,3 +119,20 @@ def test_what_is_wanted_is_the_only_measure():
     """With S wanted no better than it is, nothing is needed."""
     assert Session(TWO, STATED, Wanted(1.0, 1.0)).outlook().stops == 0
     assert not Wanted(5e-4, 1.0).reached(np.where(MAIN, 6e-4, 0.0))
+
+
+def test_a_first_stop_that_was_wrong_is_found_by_the_later_ones():
+    """A turn of 15 deg at the first stop, where S is not known yet, looks possible; a later stop finds it by name."""
+    user, session = User.drawn(0, OFFSET_MPS2), _session(TWO, STATED)
+    first = session.suggestion().stop
+    window = replace(user.on_clamp(TWO[first], 15.0), start_s=-1.0)
+    for _ in range(5):
+        session.take([*session.windows, window])
+        stop = session.suggestion().stop
+        window = user.on_clamp(TWO[stop])
+        if (found := session.fit(stop, window).earlier) is not None:
+            break
+    assert found is not None
+    start_s, instead = found
+    away = TWO[instead].columns["alpha_deg"] - TWO[first].columns["alpha_deg"]
+    assert (start_s, away % 360.0) == (-1.0, 15.0)
