@@ -20,6 +20,7 @@ from agent.calibrate.tables import ReferenceTable, SensorTable
 from agent.config import Channel
 from agent.reading.source import TableError
 from calib.estimate.adjustment import adjust
+from calib.estimate.condense import condense, mean_frequency_hz
 from calib.estimate.lag_search import without_lag
 from calib.estimate.nuisances import Applied, Priors
 from calib.excitation.front_end import Settings
@@ -71,7 +72,15 @@ class Measuring:
             )
 
         windows, self.lag_s = without_lag(self.lag_s, self._files(record, taken).windows, _used, lag_of)
-        return _used(windows), with_response(self.priors, windows)
+        return _used(windows), self._over_frequency(_used(windows))
+
+    def _over_frequency(self, windows: Sequence[Window]) -> Priors:
+        """The priors with those of the response: of a band, or of the only frequency at which something moved."""
+        told, moved = with_response(self.priors, windows), [w for w in windows if w.kind == "motion"]
+        if told.response or not moved:
+            return told
+        motion_hz = mean_frequency_hz(condense(moved, response_hz=np.inf, one_frequency=True))
+        return self.priors.at_one_frequency(motion_hz, self.lag_s) if motion_hz else told
 
     def refused(self, record: Record, taken: Sequence[Taken]) -> tuple[str, ...]:
         """Why `fieldcal calibrate` would refuse these stops; empty if it would not."""

@@ -186,8 +186,11 @@ class Plan:
         self._common = np.array([t.quantity.position == "" for t in nuisances.terms], dtype=bool)
         self._offset_u = given.offset_mps2
         # (P, 3, m + 1) inputs per unit motion of each channel, then of the mean; derivatives (J, P, 3, m + 1).
-        steady = at.gravity + np.einsum("pkm,pm->pk", at.mean_direction, mean)
-        d_steady = at.d_gravity + np.einsum("jpkm,pm->jpk", at.d_mean_direction, mean)
+        # The mean is felt with the sensitivity at 0 Hz, the motion with that at its frequency.
+        ratio, d_ratio = nuisances.steady(np.zeros(len(nuisances)))
+        steady = ratio * (at.gravity + np.einsum("pkm,pm->pk", at.mean_direction, mean))
+        d_steady = ratio * (at.d_gravity + np.einsum("jpkm,pm->jpk", at.d_mean_direction, mean))
+        d_steady += d_ratio[:, None, None] * steady
         self._felt = np.concatenate([at.direction, steady[..., None]], axis=2)
         self._d_felt = np.concatenate([at.d_direction, d_steady[..., None]], axis=3)
         self._offset = nuisances.offset
