@@ -198,8 +198,11 @@ def figures(users: int) -> list[str]:
         at_triad.append(guided(session, user, user.beside_triad))
     lines.append(_line("rests beside a triad, offsets 2.5 mm/s²: main", at_triad, MAIN, 0.05))
     every = [*ended["main"], *ended["all"], *at_triad]
-    five = sum(e.all_stops <= 5 and e.all_stops > 0 for e in at_triad)
-    lines.append(f"\nBeside the triad {five} of {users} users needed 5 stops at most.")
+    five = [sum(0 < e.all_stops <= 5 for e in some) for some in (ended["main"], at_triad)]
+    lines.append(
+        f"\nFor the main sensitivities {five[0]} of {users} users needed 5 stops at most on the clamp, "
+        f"{five[1]} beside the triad."
+    )
     lines.append(f"\nRefused by the adjustment: {sum(e.refused for e in every)} of {len(every)} sessions.")
     turned = np.array([wrong_turns(seed, two, stated) for seed in range(users)]).sum(axis=0)
     lines.append(
