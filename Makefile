@@ -17,7 +17,7 @@ $(VENV)/development: requirements-dev.lock $(VENV)/runtime
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements-dev.lock
 	touch $@
 
-run: $(VENV)/runtime  ## the agent on the virtual bench, with a router beside it; PRESET=faulty for the other one
+run: $(VENV)/runtime  ## the agent on the virtual bench, with a router beside it; PRESET=faulty or guided for others
 	$(BIN)/fieldcal run --preset $(PRESET) --with-router
 
 # Tests of running programs against the clock can fail where other work delays them. What failed runs once more, alone.

@@ -61,11 +61,7 @@ def adjusted(files: Files, priors: Priors) -> Outcome:
             break
         found = at(windows, replace(applied, lag_s=lag_s))
         if not stated.response:
-            late_s = lag_s if found.lag_s is None else found.lag_s
-            known = at_one_frequency(priors, windows, late_s)
-            if known.response:
-                found = adjust(_used(windows), known, replace(applied, lag_s=lag_s))
-            return _outcome(found, windows, files.rate_hz)
+            return _outcome(_attenuated(found, windows, priors, replace(applied, lag_s=lag_s)), windows, files.rate_hz)
         if found.response is None or found.response.terms.is_near(applied.response):
             return _outcome(found, windows, files.rate_hz)
         if found.reasons and turn >= HOPELESS:
@@ -102,11 +98,22 @@ def with_response(priors: Priors, windows: Sequence[Window]) -> Priors:
     return priors if band_hz is None else priors.with_response(band_hz)
 
 
-def at_one_frequency(priors: Priors, windows: Sequence[Window], lag_s: float) -> Priors:
-    """The priors with that of the attenuation at the frequency of the motion; unchanged where nothing moved."""
-    moved = [w for w in _used(windows) if w.kind == "motion"]
-    motion_hz = mean_frequency_hz(condense(moved, response_hz=np.inf, one_frequency=True)) if moved else 0.0
+def over_frequency(priors: Priors, windows: Sequence[Window], lag_s: float) -> Priors:
+    """The priors with those of the response: of a band, or of the attenuation at the only frequency of the motion.
+
+    The sensor comes late by `lag_s`. Unchanged where nothing moved.
+    """
+    told, moved = with_response(priors, windows), [w for w in _used(windows) if w.kind == "motion"]
+    if told.response or not moved:
+        return told
+    motion_hz = mean_frequency_hz(condense(moved, response_hz=np.inf, one_frequency=True))
     return priors.at_one_frequency(motion_hz, lag_s) if motion_hz else priors
+
+
+def _attenuated(found: Adjustment, windows: Sequence[Window], priors: Priors, applied: Applied) -> Adjustment:
+    """The adjustment with the attenuation at one frequency as an unknown; unchanged where nothing moved."""
+    known = over_frequency(priors, windows, applied.lag_s if found.lag_s is None else found.lag_s)
+    return adjust(_used(windows), known, applied) if known.response else found
 
 
 def _used(windows: Sequence[Window]) -> list[Window]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,25 +12,14 @@ from agent.calibrate.calibrating import calibrated
 from agent.calibrate.origin import origin
 from agent.calibrate.outcome import as_json, print_outcome
 from agent.calibrate.tables import REFERENCES
+from agent.cli.finite import Finite
 from agent.reading.source import TableError
 from agent.terminal.text import say
 from calib.signal.instrument import QUANTITIES
 
 _REFERENCES = " or ".join(",".join(("time_s", *names)) for names in REFERENCES)
 _FILE = click.Path(path_type=Path, dir_okay=False)
-
-
-class _Finite(click.FloatRange):
-    """A range of finite numbers. click alone would accept nan and inf."""
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        number = super().convert(value, param, ctx)
-        if not math.isfinite(number):
-            self.fail(f"{value!r} is not a finite number.", param, ctx)
-        return number
-
-
-_U = _Finite(0)
+_U = Finite(0)
 
 
 @click.command()
@@ -88,7 +76,7 @@ _U = _Finite(0)
 @click.option("--u-tilt-deg", type=_U, default=0.0, show_default=True, help="u of the mount's tilt.")
 @click.option("--rotation", metavar="R11,...,R33", help="Rotation of a tri-axial reference: a = R a_ref.")
 @click.option("--u-rotation-deg", type=_U, default=0.2, show_default=True, help="u of the rotation, about each axis.")
-@click.option("--gravity", "gravity_mps2", type=_Finite(9.7, 9.9), help="Local gravity in m/s2.")
+@click.option("--gravity", "gravity_mps2", type=Finite(9.7, 9.9), help="Local gravity in m/s2.")
 @click.option("--u-gravity-mps2", type=_U, help="u of gravity. Default: 0.03, or 0 with --gravity.")
 @click.option(
     "--static-sign",
@@ -97,12 +85,12 @@ _U = _Finite(0)
     show_default=True,
     help="Sign of gravity in a pose; +1 as in Eqs. (9)-(11).",
 )
-@click.option("--nominal", type=_Finite(min=0, min_open=True), help="Nominal sensitivity, output unit per m/s2.")
-@click.option("--u-nominal-pct", type=_Finite(0, min_open=True), help="Its standard uncertainty.")
+@click.option("--nominal", type=Finite(min=0, min_open=True), help="Nominal sensitivity, output unit per m/s2.")
+@click.option("--u-nominal-pct", type=Finite(0, min_open=True), help="Its standard uncertainty.")
 @click.option("--prior", type=_FILE, help="Earlier result (JSON) or certificate (JSON, DCC XML), as prior.")
 @click.option(
     "--reference-frequency-hz",
-    type=_Finite(min=0, min_open=True),
+    type=Finite(min=0, min_open=True),
     help="The frequency at which S holds. Default: the geometric middle of the motion's band.",
 )
 @click.option("--plain", is_flag=True, help="Method 3 exactly as in the paper, without nuisances.")

@@ -17,6 +17,7 @@ INTERRUPTED = 130  # exit status after Ctrl-C: 128 and the number of SIGINT
 COMPLETION = "_FIELDCAL_COMPLETE"  # set by the completion files in deploy/completion
 COMMANDS = {
     "init": ("agent.cli.init", "Write a configuration for the devices of this machine."),
+    "bench": ("agent.cli.bench", "Calibrate at a bench, led from position to position to a wanted uncertainty."),
     "run": ("agent.cli.run", "Run the agent: read devices, calibrate, record and publish."),
     "calibrate": ("agent.cli.calibrate", "Calibrate a sensor from recorded files."),
     "convert": ("agent.cli.convert", "Write a recorded file of another format as CSV."),

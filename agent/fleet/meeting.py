@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from agent.calibrate.adjusting import adjusted, at_one_frequency, with_response
+from agent.calibrate.adjusting import adjusted, over_frequency
 from agent.calibrate.calibrating import files_of, reference_of, sensor_of
 from agent.calibrate.earlier import read_earlier
 from agent.calibrate.files import Files
@@ -101,10 +101,7 @@ def meeting(sensor: str, reference: str, stretches: Sequence[Files], priors: Pri
         return Meeting(sensor, reference, None, tuple(reasons), *told)
     taken = next((Response(w.response) for w in used if w.response), FLAT)
     applied = Applied(lag_s, priors.reference_corner_at_hz, priors.sensor_corner_at_hz, taken)
-    known = with_response(priors, used)
-    if not known.response:
-        known = at_one_frequency(priors, used, lag_s)
-    found = link(sensor, reference, used, known, applied)
+    found = link(sensor, reference, used, over_frequency(priors, used, lag_s), applied)
     return Meeting(sensor, reference, found, tuple(reasons), *told)
 
 

@@ -64,8 +64,15 @@ def window_span(window: WindowReport) -> str:
 
 
 def uncertainty_words(calibration: CalibrationUpdate) -> str:
-    """The meaning of the number after ±."""
-    return f"U with k = {calibration.coverage_factor:.3g}, {calibration.uncertainty_kind}"
+    """The meaning of the number after ±, and the largest of main and transverse sensitivities, relative to the main
+    one of the row."""
+    words = f"U with k = {calibration.coverage_factor:.3g}, {calibration.uncertainty_kind}"
+    if not all(calibration.determined[:9]):
+        return words
+    main = np.abs(np.diag(np.array(calibration.sensitivity)))
+    u = np.reshape(calibration.standard_uncertainty[:9], (3, 3)) / main[:, None]
+    largest = (100.0 * calibration.coverage_factor * np.max(u[found]) for found in (np.eye(3) > 0, np.eye(3) == 0))
+    return words + ": main {:.2g} %, transverse {:.2g} %".format(*largest)
 
 
 def calibration_cells(calibration: CalibrationUpdate) -> list[list[str]]:

@@ -100,6 +100,11 @@ class Bench:
         """Nominal positions of the first repetition; the schedule repeats every `parameters.schedule.period_s`."""
         return self.parameters.schedule.poses(self.parameters.schedule.duration_s(1))
 
+    def forget(self) -> None:
+        """Compute all samples anew, after the schedule has changed what comes."""
+        self._sensor_block.cache_clear()
+        self._reference_block.cache_clear()
+
     def sensor_times(self, first: int, n: int) -> Array:
         """True times (n,) of samples first .. first + n - 1, s."""
         return self.parameters.sensor.clock.times(first, n)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 
+from hw.virtual.hand import ByHand
 from hw.virtual.motion import multisine
 from hw.virtual.noise import Stream, generator
 from hw.virtual.parameters import (
@@ -16,7 +18,7 @@ from hw.virtual.parameters import (
     SensorParameters,
     Temperature,
 )
-from hw.virtual.schedule import STANDARD_GRAVITY_MPS2, Schedule, clamped
+from hw.virtual.schedule import STANDARD_GRAVITY_MPS2, Schedule, clamped, resting
 from hw.virtual.spread import Spread, drawn
 from hw.virtual.timebase import Bursts, Clock
 
@@ -27,6 +29,12 @@ LARGEST_COUNT = 2**19 - 1
 THETA_DEG = 35.0
 ALPHAS_DEG = (0.0, 30.0, 120.0, 210.0)
 HOLD_S = 10.0
+BY_HAND_HZ = 250.0
+# Four positions at one inclination, then four at another.
+GUIDED_DEG = (
+    *((35.0, alpha) for alpha in (0.0, 90.0, 180.0, 270.0)),
+    *((55.0, alpha) for alpha in (45.0, 135.0, 225.0, 315.0)),
+)
 TURN_S = 3.0
 START_S = 3.0  # the gateway has opened its devices by then; four positions are complete after 52 s
 # 22.5 ug/sqrt(Hz) over a quarter of 1 kHz (ADXL355 data sheet: bandwidth ODR / 4)
@@ -102,4 +110,47 @@ def faulty(seed: int) -> BenchParameters:
     return drawn(bench, spread, np.random.default_rng([seed, Stream.PRESET]))
 
 
-PRESETS: dict[str, Callable[[int], BenchParameters]] = {"plain": plain, "faulty": faulty}
+def by_hand(kind: Literal["clamp", "triad", "gravity"], seed: int) -> BenchParameters:
+    """A bench for `fieldcal bench`, turned by hand, whose errors are drawn with `seed` from what such a bench states.
+
+    - "clamp": theta and each alpha are known to 0.2 deg, the offset differs by 0.05 m/s2 between positions.
+    - "triad": the sensor rests beside a calibrated triad; offsets differ by 2.5 mm/s2; a person puts them down within
+      5 deg of what was told.
+    - "gravity": the sensor rests on the faces of its housing, known to 0.2 deg; offsets differ by 2.5 mm/s2.
+    """
+    bench = plain(seed)
+    random = np.random.default_rng([seed, Stream.PRESET])
+    on_clamp = kind == "clamp"
+    schedule = ByHand(
+        (clamped(THETA_DEG, ALPHAS_DEG[0], np.inf) if on_clamp else resting(np.array([0.0, 0.0, 1.0]), np.inf),),
+        turn_s=1.0,
+        start_s=1.0,
+        seed=seed,
+        theta_deg=0.2 * random.normal(),
+        alpha_deg=0.2,
+        tilt_deg=5.0 if kind == "triad" else 0.2,
+    )
+    reference = bench.reference
+    if kind == "triad":
+        reference = replace(reference, rotation=np.eye(3))
+    # Serial devices of 250 Hz, of which a busy computer loses no samples.
+    clocks = [replace(device.clock, nominal_rate_hz=BY_HAND_HZ) for device in (bench.sensor, reference)]
+    sensor = replace(bench.sensor, clock=clocks[0], offset_by_window_mps2=0.05 if on_clamp else 0.0025)
+    reference = replace(reference, clock=clocks[1])
+    return replace(bench, schedule=schedule, sensor=sensor, reference=reference)
+
+
+def guided(seed: int) -> BenchParameters:
+    """The bench `plain` with a second inclination, in the order of `fieldcal bench`; its errors are drawn with `seed`.
+
+    Theta and each alpha are known to 0.2 deg, and the offset differs by 0.05 m/s2 between windows: with one inclination
+    the main sensitivities stay uncertain by some tenths of a per cent, however long it takes.
+    """
+    bench = plain(seed)
+    stands = tuple(clamped(theta, alpha, HOLD_S) for theta, alpha in GUIDED_DEG)
+    bench = replace(bench, schedule=replace(bench.schedule, stands=stands))
+    spread = Spread(angle_deg=0.2, theta_deg=0.2, offset_mps2=0.05)
+    return drawn(bench, spread, np.random.default_rng([seed, Stream.PRESET]))
+
+
+PRESETS: dict[str, Callable[[int], BenchParameters]] = {"plain": plain, "faulty": faulty, "guided": guided}

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from hw.virtual.hand import ByHand
 from hw.virtual.motion import ComplexArray
 from hw.virtual.noise import Stream, generator
 from hw.virtual.parameters import BenchParameters
@@ -124,6 +125,8 @@ def true_schedule(parameters: BenchParameters) -> Schedule:
     Raises ValueError if an angle error is given for a position without a clamp, or if the number of errors is wrong.
     """
     nominal = parameters.schedule
+    if isinstance(nominal, ByHand):
+        return nominal  # its stands have their errors
     theta_deg, alpha_deg = parameters.clamp.of_positions(len(nominal.stands))
     stands = tuple(map(_displaced, nominal.stands, theta_deg, alpha_deg))
     return Schedule(stands, nominal.turn_s, nominal.start_s)

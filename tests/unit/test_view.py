@@ -148,7 +148,7 @@ def test_lines_tell_each_thing_once() -> None:
         "mems: window 7.0 to 13.0 s at 30 deg: used, 6000 points",
         "mems: window 14.0 to 20.0 s at 30 deg: used, 6000 points",
         "mems: VALID, 8 windows",
-        "mems: calibration from 8 windows, U with k = 2, type A, white",
+        "mems: calibration from 8 windows, U with k = 2, type A, white: main 0.046 %, transverse 0.046 %",
         "  Sxx 26154 ± 12  Sxy 120 ± 12  Sxz 50 ± 12  Qx 250 ± 80",
         "  Syx -195 ± 12  Syy 26123 ± 12  Syz 67 ± 12  Qy 250 ± 80",
         "  Szx -81 ± 12  Szy 87 ± 12  Szz 26295 ± 12  Qz 250 ± 80",

@@ -1,0 +1,242 @@
+"""The dialogue: says where to turn the sensor, watches it there, and asks again where something is wrong."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from agent.bench.capture import Capture
+from agent.bench.measuring import Taken
+from agent.bench.session import Fit, Session
+from agent.bench.stops import Stop
+from agent.bench.thinking import Thinking
+from calib.estimate.next_stop import MAIN
+from calib.model import Array
+
+LOOK_S = 1.0  # from one look at the samples to the next
+FIT_FROM_S = 2.0  # of samples; in fewer a slow motion tells no slopes
+REST_TOLD_FROM_S = 8.0  # before that a rest cannot be told from slow motion
+SETTLED_S = 1.0  # after a turn by hand a clamp vibrates for about a second
+GAIN = 1.02  # a longer stay would reduce U by less than 2 %
+BEFORE_S = 5.0  # of samples before a stop: for its clock, and for the ends of filters
+NO_DIGITS = str.maketrans("", "", "0123456789.")  # a reason is said once, not with each new number
+STALE_S = 3.0  # without samples of a device for so long the session says so
+
+
+@dataclass(frozen=True, slots=True)
+class Stay:
+    """How long to stay at a stop, s."""
+
+    least_s: float = 5.0
+    most_s: float = 60.0
+
+
+class Dialogue:
+    """Leads a person through a session. `taken` are the stops that are used.
+
+    `ask` gives the answer to a prompt, None at the end of input. `say` shows a line, `progress` one that the next
+    replaces. `turn` turns a virtual sensor and gives the seconds that it takes; None where a person turns the sensor.
+    """
+
+    def __init__(
+        self,
+        mind: Thinking,
+        capture: Capture,
+        stay: Stay,
+        ask: Callable[[str], str | None],
+        say: Callable[[str], None],
+        progress: Callable[[str], None],
+        turn: Callable[[Stop], float] | None = None,
+    ) -> None:
+        self._mind, self._capture = mind, capture
+        self._stay, self._ask, self._say, self._progress, self._turn = stay, ask, say, progress, turn
+        self.taken: list[Taken] = []
+        self._refused: tuple[str, ...] = ()
+        self._standing: Stop | None = None  # where the sensor was put last
+
+    @property
+    def _session(self) -> Session:
+        return self._mind.session
+
+    def run(self) -> None:
+        """Take stops until all is as wanted, or until the person ends the session."""
+        self._begin()
+        while not self._session.reached or not self.taken or self._refused:
+            stop = self._next_stop()
+            if stop is None:
+                break
+            self._take(stop)
+        else:
+            self._say(f"reached after {_count(len(self.taken))}: U {_told(self._session.joint.expanded)}")
+
+    def _begin(self) -> None:
+        wanted, (_, outlook) = self._session.wanted, self._mind.next_stop()
+        self._say(f"wanted: U (k = 2) {_pair(wanted.main, wanted.transverse)}, apart from the reference's own error")
+        if outlook.stops is not None:
+            self._say(f"this takes about {_count(outlook.stops)}")
+            return
+        self._say(f"this bench does not reach it: after 100 stops U would still be {_pair(*outlook.best)}")
+        if outlook.because:
+            self._say(
+                f"the reason is {outlook.because}, which all stops share: U never becomes less than "
+                f"{_pair(*outlook.floor)}; state a smaller uncertainty of it if you know it better, or end with q"
+            )
+        elif len({s.pose.theta_rad for s in self._session.stops}) == 1 and self._session.stops[0].columns.get(
+            "theta_deg"
+        ):
+            self._say("one inclination does not tell theta from the sensitivities: add a second one with --thetas")
+
+    def _next_stop(self) -> Stop | None:
+        """The stop that the person takes; None to end the session."""
+        best, outlook = self._mind.next_stop()
+        stop, left = self._session.stops[best.stop], outlook.stops
+        self._say(f"stop {len(self.taken) + 1}: {stop.told}")
+        more = "" if left is None or left < 2 else f"; {_count(left - 1)} more then to what is wanted"
+        self._say(f"  U will be {_told(best.expanded)}{more}")
+        while True:
+            answer = self._ask(f"  Enter when it stands ({stop.name}); another position as typed; u: undo; q: end > ")
+            for line in self._capture.said():
+                self._say(line)
+            if answer is None or answer == "q":
+                return None
+            if answer == "u":
+                self._undo()
+                return self._next_stop()
+            if answer.startswith("hand ") and self._turn is not None:
+                stood = self._session.named(answer.removeprefix("hand "))
+                if stood is not None:
+                    self._put(stood)
+                    return stop
+            chosen = stop if answer == "" else self._session.named(answer)
+            if chosen is not None:
+                if self._turn is not None:
+                    self._put(chosen)
+                return chosen
+            self._say(f"  {answer!r} is no position; type it as {stop.name!r}")
+
+    def _put(self, stop: Stop) -> None:
+        """Turn the virtual sensor, unless it stands there already."""
+        assert self._turn is not None
+        if self._standing is None or self._standing.name != stop.name:
+            time.sleep(self._turn(stop))
+        self._standing = stop
+
+    def _undo(self) -> None:
+        if not self.taken:
+            self._say("  no stop was taken yet")
+            return
+        gone = self.taken.pop()
+        self._say(f"  stop {len(self.taken) + 1} ({gone.stop.name}) is not used")
+        self._refused = self._mind.take(self._capture.record(), self.taken)
+
+    def _take(self, stop: Stop) -> None:
+        """Stay at a stop, and use it if it is sound."""
+        while True:
+            start_s = self._capture.now_s + SETTLED_S
+            fit, stop_s = self._watch(stop, start_s)
+            if fit is None:
+                self._say("  this stop is not used")
+                return
+            if fit.fits:
+                break
+            answer = self._ask(self._misfit(stop, fit))
+            if answer == "y" and fit.instead is not None:
+                stop = self._session.stops[fit.instead]
+                break
+            if answer == "k":
+                break
+            if answer == "c" and fit.earlier is not None:
+                self._correct(*fit.earlier)
+                break
+            if answer is None or answer == "q":
+                self._say("  this stop is not used")
+                return
+            if self._turn is not None:
+                self._put(stop)
+        self.taken.append(Taken(stop, start_s, stop_s))
+        self._refused = self._mind.take(self._capture.record(), self.taken)
+        self._say(f"  stop {len(self.taken)}, {stop.name}: U is now {_told(self._session.joint.expanded)}")
+        for line in self._session.doubts():
+            self._say(f"  {line}")
+        for reason in self._refused:
+            self._say(f"  U is as wanted, but the result would be refused: {reason}")
+
+    def _earlier(self, start_s: float) -> int:
+        """The number of the stop in which a window began at this time."""
+        return next(k for k, each in enumerate(self.taken) if each.start_s <= start_s <= each.stop_s)
+
+    def _correct(self, start_s: float, instead: int) -> None:
+        k = self._earlier(start_s)
+        self.taken[k] = replace(self.taken[k], stop=self._session.stops[instead])
+
+    def _misfit(self, stop: Stop, fit: Fit) -> str:
+        self._say(f"  this does not look like {stop.name}: chi2 {fit.chi2:.4g}, {fit.limit:.4g} at most")
+        if fit.earlier is not None:
+            start_s, instead = fit.earlier
+            k, name = self._earlier(start_s), self._session.stops[instead].name
+            self._say(f"  stop {k + 1} ({self.taken[k].stop.name}) may be the wrong one: it looks like {name}")
+            again = f"c: stop {k + 1} is at {name}, keep both; Enter: measure this one again"
+            return f"  {again}; k: keep it as told; q: leave it out > "
+        if fit.instead is None:
+            self._say("  it fits no position: is the sensor loose, or turned another way?")
+            return "  Enter: measure again after turning it; k: keep it as told; q: leave it out > "
+        like = self._session.stops[fit.instead]
+        last = self.taken[-1].stop.name if self.taken else ""
+        why = "the sensor was not turned" if like.name == last else "it looks turned"
+        self._say(f"  {why}: it stands as at {like.name}")
+        return (
+            f"  Enter: measure again after turning it; y: it is at {like.name}; k: keep it as told; q: leave it out > "
+        )
+
+    def _watch(self, stop: Stop, start_s: float) -> tuple[Fit | None, float]:
+        """How a stay fits its stop, None where it cannot be used; and when it ended. Says at once what is wrong."""
+        reason, knocked = "", 0
+        told_from_s = REST_TOLD_FROM_S if self._session.expected.rms_mps2 == 0.0 else FIT_FROM_S
+        while True:
+            time.sleep(LOOK_S)
+            now_s = self._capture.now_s
+            stayed_s = now_s - start_s
+            for line in self._capture.said():
+                self._say(f"  {line}")
+            if (dumb := self._silent(now_s)) is not None:
+                self._say(f"  no samples of {dumb} for {STALE_S:g} s: check its cable")
+                return None, now_s
+            if stayed_s < FIT_FROM_S:
+                continue
+            look = self._mind.look(self._capture.record(start_s - BEFORE_S), Taken(stop, start_s, now_s))
+            if look.reason:
+                if stayed_s >= told_from_s and look.reason.translate(NO_DIGITS) != reason:
+                    self._say(f"  {look.reason}")
+                    reason = look.reason.translate(NO_DIGITS)
+                if stayed_s > self._stay.most_s:
+                    return None, now_s
+                continue
+            assert look.fit is not None
+            assert look.expanded is not None
+            if look.left_out > knocked:
+                self._say(f"  knocks: {look.left_out} of {look.points} samples are left out; do not touch the table")
+                knocked = 2 * look.left_out
+            self._progress(f"  {stayed_s:3.0f} s: U will be {_told(look.expanded)}")
+            enough = stayed_s >= self._stay.least_s and look.gain < GAIN
+            if enough or not look.fit.fits or stayed_s > self._stay.most_s:
+                return look.fit, now_s
+
+    def _silent(self, now_s: float) -> str | None:
+        for device in self._mind.measuring.devices:
+            newest_s = self._capture.newest_s(device)
+            if newest_s is None or now_s - newest_s > STALE_S:
+                return device
+        return None
+
+
+def _count(stops: int) -> str:
+    return f"{stops} stop{'' if stops == 1 else 's'}"
+
+
+def _pair(main: float, transverse: float) -> str:
+    return f"{100.0 * main:.2g} % (main), {100.0 * transverse:.2g} % (transverse)"
+
+
+def _told(expanded: Array) -> str:
+    return _pair(float(expanded[MAIN].max()), float(expanded[~MAIN].max()))

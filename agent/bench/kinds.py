@@ -1,0 +1,85 @@
+"""Which kind of bench a channel of the configuration is, its positions, and its statements for `fieldcal calibrate`."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from functools import reduce
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from agent.bench.stops import Stop, on_clamp, on_faces, turned_by_hand
+from agent.config import Channel
+from calib.estimate.quantities import PRIORS, REFERENCE, YEAR_DAYS
+
+Kind = Literal["clamp", "triad", "gravity"]
+
+
+def kind_of(channel: Channel) -> Kind:
+    """A clamp on a shaker, rests beside a calibrated triad, or rests under gravity alone."""
+    if channel.reference is None:
+        return "gravity"
+    return "clamp" if channel.rotation is None else "triad"
+
+
+def stops_of(channel: Channel, thetas_deg: Sequence[float], alphas_deg: Sequence[float]) -> list[Stop]:
+    """The positions that can be taken. Raises ValueError where an AC-coupled sensor has none."""
+    kind = kind_of(channel)
+    if kind == "clamp":
+        felt = channel.gravity_mps2 if channel.coupling == "dc" else 0.0
+        return on_clamp(thetas_deg, alphas_deg, felt, channel.static_sign)
+    if channel.coupling == "ac":
+        raise ValueError('a sensor with coupling = "ac" does not feel gravity, so that rests tell nothing of it')
+    if channel.rotation is None:
+        return on_faces(channel.gravity_mps2)
+    return turned_by_hand(np.reshape(channel.rotation, (3, 3)), channel.gravity_mps2)
+
+
+def stated(channel: Channel, directory: Path) -> list[str]:
+    """The options of `fieldcal calibrate` that state what the configuration states, with files of `directory`."""
+    kind = kind_of(channel)
+    options = [f"--sensor={directory / 'sensor.csv'}", f"--poses={directory / 'poses.csv'}"]
+    options += [f"--prior={directory / 'prior.json'}", f"--coupling={channel.coupling}"]
+    options += [f"--gravity={channel.gravity_mps2!r}", f"--static-sign={channel.static_sign:+d}"]
+    if kind != "gravity":
+        options.append(f"--reference={directory / 'reference.csv'}")
+    if channel.rotation is not None:
+        options += ["--rotation=" + ",".join(map(repr, channel.rotation)), "--reference-coupling=dc"]
+    one_each = {s.option: s for s in PRIORS.values() if s.option and s.configuration}
+    for statement in one_each.values():
+        value = float(reduce(np.hypot, [_at(channel, place) for place in statement.configuration]))
+        if statement is REFERENCE.prior:
+            value = math.hypot(value, _drifted_pct(channel))
+        if value or statement.default:
+            options.append(f"--{statement.option.replace('_', '-')}={value!r}")
+    return options
+
+
+def write_prior(channel: Channel, nominal: float | None, path: Path) -> float:
+    """Write S and Q as known before, for --prior; gives the nominal sensitivity in output unit per m/s2.
+
+    Raises ValueError where neither configuration nor device tells a sensitivity.
+    """
+    mean = channel.prior.mean(nominal)
+    u = channel.prior.standard_uncertainty(mean)
+    known = {"sensitivity": mean[:9].reshape(3, 3).tolist(), "offset": mean[9:].tolist()}
+    path.write_text(json.dumps(known | {"covariance": np.diag(u**2).tolist()}) + "\n")
+    return float(np.sqrt(np.mean(mean[[0, 4, 8]] ** 2)))
+
+
+def _drifted_pct(channel: Channel) -> float:
+    """What the reference may have drifted by since its certificate; 0 where that has no date."""
+    dated = channel.certificate.date
+    if dated is None:
+        return 0.0
+    years = max((datetime.now(UTC) - dated).days, 0) / YEAR_DAYS
+    return channel.certificate.stability_pct * math.sqrt(years)
+
+
+def _at(channel: Channel, place: str) -> Any:
+    section, field = place.split(".")
+    return getattr(getattr(channel, section), field)

@@ -1,0 +1,130 @@
+"""From the samples of a session to windows: of the stop that is being taken, and of all stops together."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from agent.bench.capture import DeviceSamples
+from agent.bench.stops import Stop
+from agent.calibrate.adjusting import adjusted, over_frequency, with_response
+from agent.calibrate.files import Files, Options
+from agent.calibrate.poses import PoseInterval
+from agent.calibrate.priors import instrument_of, priors_of
+from agent.calibrate.tables import ReferenceTable, SensorTable
+from agent.config import Channel
+from agent.reading.source import TableError
+from calib.estimate.adjustment import adjust
+from calib.estimate.lag_search import without_lag
+from calib.estimate.nuisances import Applied, Priors
+from calib.excitation.front_end import Settings
+from calib.excitation.window_verdict import Limits
+from calib.model import Array, Window
+
+FEWEST = 10  # samples of a device that make a clock
+Record = Mapping[str, DeviceSamples]
+QUANTITY = {"acceleration": ("a",), "velocity": ("v",), "displacement": ("d",)}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Taken:
+    """A stop from `start_s` to `stop_s`."""
+
+    stop: Stop
+    start_s: float
+    stop_s: float
+
+
+class Measuring:
+    """The windows of a session's samples. `lag_s` is the sensor's lag behind the reference, as far as it is known."""
+
+    def __init__(self, channel: Channel, options: dict[str, Any]) -> None:
+        """`options` are those of `fieldcal calibrate` by which the result will be made."""
+        self._channel, self._options = channel, options
+        self.priors: Priors = priors_of(options)
+        self.lag_s = 0.0
+
+    @property
+    def devices(self) -> list[str]:
+        """The sensor, and its reference if it has one."""
+        return [self._channel.sensor, *([self._channel.reference] if self._channel.reference else [])]
+
+    def newest(self, record: Record, taken: Taken) -> list[Window]:
+        """The windows of the stop that is being taken, used or not; empty where there are too few samples yet."""
+        try:
+            return self._files(record, [taken]).windows(self.lag_s)
+        except (ValueError, TableError):
+            return []
+
+    def all(self, record: Record, taken: Sequence[Taken]) -> tuple[list[Window], Priors]:
+        """The used windows of all stops, with their lag taken out, and the priors for them."""
+        applied = Applied.of(self.priors, 0.0)
+
+        def lag_of(windows: Sequence[Window], lag_s: float) -> float:
+            return (
+                adjust(_used(windows), with_response(self.priors, windows), replace(applied, lag_s=lag_s)).lag_s or 0.0
+            )
+
+        windows, self.lag_s = without_lag(self.lag_s, self._files(record, taken).windows, _used, lag_of)
+        return _used(windows), over_frequency(self.priors, windows, self.lag_s)
+
+    def refused(self, record: Record, taken: Sequence[Taken]) -> tuple[str, ...]:
+        """Why `fieldcal calibrate` would refuse these stops; empty if it would not."""
+        return adjusted(self._files(record, taken), self.priors).reasons
+
+    def moved_mps2(self, record: Record) -> float:
+        """The rms of the reference's motion; 0 where there is no reference."""
+        if self._channel.reference is None or not len(record[self._channel.reference].values):
+            return 0.0
+        return float(np.nanstd(self._reference_si(record), axis=0).max())
+
+    def _reference_si(self, record: Record) -> Array:
+        assert self._channel.reference is not None
+        return np.asarray(record[self._channel.reference].values / self._channel.certificate.sensitivity)
+
+    def _files(self, record: Record, taken: Sequence[Taken]) -> Files:
+        """Raises ValueError or TableError where there are too few samples."""
+        own, name = record[self._channel.sensor], self._channel.sensor
+        sensor = SensorTable(Path(name), own.time_s, own.values, None)
+        instrument, reference = instrument_of(self._options), None
+        if self._channel.reference is not None:
+            name, quantity = self._channel.reference, self._channel.certificate.quantity
+            reference = ReferenceTable(Path(name), record[name].time_s, self._reference_si(record), quantity, name)
+            instrument = replace(instrument, quantity=quantity)
+        if min(len(samples.time_s) for samples in record.values()) < FEWEST:
+            raise ValueError("too few samples")
+        intervals = [PoseInterval(each.start_s, each.stop_s, each.stop.pose) for each in taken]
+        limits = Limits.of(self._options["u_offset_mps2"], math.radians(self._options["u_angle_deg"]))
+        return Files(sensor, reference, intervals, instrument, Options(Settings(limits, bands=True)))
+
+    def write(self, record: Record, taken: Sequence[Taken], directory: Path) -> None:
+        """Write sensor.csv, reference.csv and poses.csv for `fieldcal calibrate`. Raises OSError."""
+        own = record[self._channel.sensor]
+        columns, header = [own.time_s, *own.values.T], "time_s,vx,vy,vz"
+        if np.isfinite(own.temperature_degc).all():
+            columns, header = [*columns, own.temperature_degc], f"{header},temperature_degc"
+        _write(directory / "sensor.csv", header, np.column_stack(columns))
+        if self._channel.reference is not None:
+            x = self._reference_si(record)
+            names = ("ax", "ay", "az") if x.shape[1] == 3 else QUANTITY[self._channel.certificate.quantity]
+            rows = np.column_stack([record[self._channel.reference].time_s, x])
+            _write(directory / "reference.csv", ",".join(("time_s", *names)), rows)
+        poses = np.array([[each.start_s, each.stop_s, *each.stop.columns.values()] for each in taken])
+        _write(directory / "poses.csv", ",".join(("start_s", "stop_s", *taken[0].stop.columns)), poses)
+
+
+def _used(windows: Sequence[Window]) -> list[Window]:
+    return [w for w in windows if w.used]
+
+
+def _write(path: Path, header: str, rows: Array) -> None:
+    """Write numbers so that they are read back exactly as they are."""
+    with path.open("w") as file:
+        file.write(header + "\n")
+        for row in rows.tolist():
+            file.write(",".join("" if math.isnan(value) else repr(value) for value in row) + "\n")

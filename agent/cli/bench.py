@@ -1,0 +1,250 @@
+"""`fieldcal bench`: leads a person through positions of the sensor to a wanted uncertainty."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import click
+import numpy as np
+
+from agent.cli.finite import Finite
+from agent.config import Channel, Config, ConfigError, load_config, parse_config
+from agent.terminal.text import for_drawing, say
+
+if TYPE_CHECKING:
+    from agent.bench.stops import Stop
+
+OPEN_S = 20.0  # for the devices to be opened and to send their first block
+FIRST_S = 2.0  # of samples that tell how much the shaker moves
+THETAS_DEG, ALPHA_STEP_DEG = "35,55", 15
+U_MAIN_PCT, U_TRANSVERSE_PCT = 0.05, 0.25
+Turn = Callable[["Stop"], float]
+
+
+class _Angles(click.ParamType):  # type: ignore[type-arg]
+    name = "angles"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, ...]:
+        try:
+            found = tuple(float(part) for part in str(value).split(","))
+        except ValueError:
+            self.fail(f"{value!r} must be angles in degrees, with commas between them", param, ctx)
+        if not all(-360.0 <= angle <= 360.0 for angle in found):
+            self.fail(f"{value!r}: angles lie between -360 and 360 deg", param, ctx)
+        return found
+
+
+@click.command()
+@click.argument("config", required=False, type=click.Path(path_type=Path))
+@click.option("-o", "--output", type=click.Path(path_type=Path, file_okay=False), default=Path("bench"),
+              show_default=True, help="Directory for samples, positions and result; must not exist.")  # fmt: skip
+@click.option("--sensor", metavar="NAME", help="The sensor, if the configuration has several.")
+@click.option("--u-main-pct", type=Finite(0.001, 10), default=U_MAIN_PCT, show_default=True,
+              help="Wanted U (k = 2) of the main sensitivities, apart from the reference's own error.")  # fmt: skip
+@click.option("--u-transverse-pct", type=Finite(0.001, 100), default=U_TRANSVERSE_PCT, show_default=True,
+              help="Wanted U (k = 2) of the transverse sensitivities, relative to the main one.")  # fmt: skip
+@click.option("--thetas", type=_Angles(), default=THETAS_DEG, show_default=True,
+              help="Inclinations that the clamp can take, deg.")  # fmt: skip
+@click.option("--alphas", type=_Angles(), default=",".join(map(str, range(0, 360, ALPHA_STEP_DEG))),
+              help="Rotations on the clamp, deg; default: every 15 deg.")  # fmt: skip
+@click.option("--stay-s", type=Finite(2, 600), default=5.0, show_default=True,
+              help="Stay at a position for so long at least.")  # fmt: skip
+@click.option("--most-s", type=Finite(5, 3600), default=60.0, show_default=True,
+              help="Stay at a position for so long at most.")  # fmt: skip
+@click.option("--stated", type=click.Path(path_type=Path, dir_okay=False), metavar="certificate.toml",
+              help="Make the certificate at the end (`fieldcal certificate`); what only people know.")  # fmt: skip
+@click.option("--virtual", type=click.Choice(["clamp", "triad", "gravity"]), default="clamp", show_default=True,
+              help="The virtual bench, without CONFIG.")  # fmt: skip
+@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=1, show_default=True,
+              help="Seed of the virtual bench's random numbers.")  # fmt: skip
+def bench(config: Path | None, output: Path, sensor: str | None, virtual: str, seed: int, **options: Any) -> int:
+    """Calibrate at a bench, led from position to position to a wanted uncertainty.
+
+    \b
+    The channel of CONFIG tells the kind of bench:
+    with a uniaxial reference            a clamp on a shaker, theta and alpha (Eqs. 9-11)
+    with a tri-axial one and a rotation  rests beside it, turned by hand
+    without a reference                  rests on the faces of the sensor, on a level table
+
+    Without CONFIG a virtual bench is used, and the sensor turns by itself when you press Enter.
+
+    Exit status 3 if the data are refused, 2 on bad input.
+    """
+    try:
+        if config is None:
+            with _virtual_bench(virtual, seed) as (settings, turn):  # type: ignore[arg-type]
+                return _session(settings, settings.channels[0], output, options, turn)
+        settings = load_config(config)
+        return _session(settings, _channel(settings, sensor, config), output, options, None)
+    except ConfigError as error:
+        for fault in error.faults:
+            say(fault, err=True)
+        return 2
+    except ValueError as error:
+        say(f"fieldcal bench: {error}", err=True)
+        return 2
+    except FileExistsError:
+        say(f"fieldcal bench: {output} exists; name a new directory with -o", err=True)
+        return 2
+    except OSError as error:
+        say(f"fieldcal bench: {error.filename or output}: {error.strerror}", err=True)
+        return 2
+
+
+def _channel(settings: Config, sensor: str | None, path: Path) -> Channel:
+    names = [channel.sensor for channel in settings.channels]
+    if sensor is None and len(names) > 1:
+        raise ValueError(f"{path} has several sensors: name one with --sensor: {', '.join(names)}")
+    found = [channel for channel in settings.channels if sensor in (None, channel.sensor)]
+    if not found:
+        raise ValueError(f"{path} has no channel with the sensor {sensor!r}, but {', '.join(names)}")
+    return found[0]
+
+
+def _session(settings: Config, channel: Channel, output: Path, options: dict[str, Any], turn: Turn | None) -> int:
+    from agent.bench.capture import Capture
+    from agent.bench.dialogue import Dialogue, Stay
+    from agent.bench.kinds import stated, stops_of, write_prior
+    from agent.bench.measuring import Measuring
+    from agent.bench.session import START, Session
+    from agent.bench.thinking import Thinking
+    from calib.estimate.next_stop import Wanted
+    from calib.excitation.front_end import most_margin_s
+    from calib.excitation.windows import LEAST_MOTION_MPS2
+
+    stops = stops_of(channel, options["thetas"], options["alphas"])
+    devices = [channel.sensor, *([channel.reference] if channel.reference else [])]
+    if output.exists():
+        raise FileExistsError
+    if options["stated"] is not None:
+        _check_stated(options["stated"])
+    with Capture(settings, devices) as capture:
+        info = _opened(capture, devices)
+        output.mkdir(parents=True)
+        scale = write_prior(channel, info.get("nominal_sensitivity"), output / "prior.json")
+        arguments = [*stated(channel, output), f"--json={output / 'result.json'}"]
+        told = _parsed(arguments)
+        measuring = Measuring(channel, told)
+        wanted = Wanted(options["u_main_pct"] / 100.0, options["u_transverse_pct"] / 100.0)
+        time.sleep(FIRST_S)
+        moved = measuring.moved_mps2(capture.record(capture.now_s - FIRST_S))
+        expected = replace(START, rms_mps2=moved) if moved > LEAST_MOTION_MPS2 else START
+        stay = Stay(options["stay_s"], max(options["most_s"], options["stay_s"]))
+        with Thinking(Session(stops, measuring.priors, wanted, scale, expected), measuring) as mind:
+            dialogue = Dialogue(mind, capture, stay, _ask, say, _progress, turn)
+            try:
+                dialogue.run()
+            finally:  # also after Ctrl-C: what was measured is kept
+                if dialogue.taken:
+                    time.sleep(most_margin_s(channel.instrument))  # for the samples that filters need after a stop
+                    measuring.write(capture.record(), dialogue.taken, output)
+                    say("the samples are kept; the result is made by: fieldcal calibrate " + " ".join(arguments))
+        if not dialogue.taken:
+            (output / "prior.json").unlink()
+            output.rmdir()
+            say("no stop was taken, so there is no result", err=True)
+            return 3
+    return _result(told, output, options["stated"])
+
+
+def _opened(capture: Any, devices: list[str]) -> dict[str, Any]:
+    """What the sensor's driver read of it, when all devices send. Raises ValueError where one does not."""
+    end = time.monotonic() + OPEN_S
+    while time.monotonic() < end:
+        for line in capture.said():
+            say(line, err=True)
+        if all(capture.newest_s(device) is not None for device in devices):
+            return dict(capture.info(devices[0]) or {})
+        time.sleep(0.1)
+    silent = [device for device in devices if capture.newest_s(device) is None]
+    raise ValueError(f"no samples of {', '.join(silent)} within {OPEN_S:g} s; `fieldcal probe` shows what answers")
+
+
+def _parsed(arguments: list[str]) -> dict[str, Any]:
+    """The options of `fieldcal calibrate` by these arguments."""
+    from agent.cli.calibrate import calibrate
+
+    with calibrate.make_context("calibrate", list(arguments)) as context:
+        return dict(context.params)
+
+
+def _check_stated(path: Path) -> None:
+    """Raises ConfigError before the session rather than after it."""
+    from agent.certificate.statements import Statements
+    from agent.config.reading import load_model
+
+    load_model(path, Statements)
+
+
+def _result(options: dict[str, Any], output: Path, stated: Path | None) -> int:
+    """Make the result from the files as `fieldcal calibrate` does, and the certificate."""
+    from agent.cli.calibrate import calibrate
+    from agent.cli.certificate import certificate
+
+    assert calibrate.callback is not None
+    assert certificate.callback is not None
+    status = int(calibrate.callback(**options))
+    if status or stated is None:
+        return status
+    return int(
+        certificate.callback(
+            inputs=(output / "result.json",), stated=stated, output=output / "certificate", key=None, xsd=None,
+            sensor=None,
+        )
+    )  # fmt: skip
+
+
+def _ask(prompt: str) -> str | None:
+    """An answer from standard input, None at its end."""
+    sys.stdout.write(prompt)
+    sys.stdout.flush()
+    line = sys.stdin.readline()
+    if not sys.stdin.isatty():
+        sys.stdout.write("\n")
+    return line.strip() if line else None
+
+
+def _progress(line: str) -> None:
+    """Show how a stay goes on, on a terminal only."""
+    if sys.stdout.isatty():
+        stream = for_drawing(sys.stdout)
+        stream.write(f"\r{line:<100}\r")
+        stream.flush()
+
+
+@contextmanager
+def _virtual_bench(kind: Literal["clamp", "triad", "gravity"], seed: int) -> Iterator[tuple[Config, Turn]]:
+    """A bench of virtual devices under the real drivers, and what turns its sensor."""
+    from hw.virtual.hand_bench import HandBench
+    from hw.virtual.presets import by_hand
+    from hw.virtual.schedule import clamped, resting
+
+    with HandBench(by_hand(kind, seed), seed) as live:
+        on_clamp, nominal = kind == "clamp", live.bench.parameters.sensor.nominal_sensitivity
+        channel: dict[str, Any] = {
+            "sensor": "mems",
+            "prior": {"sensitivity": nominal},
+            "uncertainty": {
+                "alpha_common_deg": 0.0, "transverse_motion_pct": 0.0, "rotation_deg": 0.0, "gravity_mps2": 0.0,
+                "offset_mps2": 0.05 if on_clamp else 0.0025,
+            },
+        }  # fmt: skip
+        devices = [{"name": "mems", "driver": "serial-csv", "options": live.options["sensor"]}]
+        if kind != "gravity":
+            devices.append({"name": "reference", "driver": "serial-csv", "options": live.options["reference"]})
+            channel["reference"] = "reference"
+        if kind == "triad":
+            channel["rotation"] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+        raw = {"gateway": {"site": "virtual", "name": "bench"}, "devices": devices, "channels": [channel]}
+
+        def turn(stop: Stop) -> float:
+            held_s, columns = float("inf"), np.array(list(stop.columns.values()))
+            return live.turn(clamped(columns[0], columns[1], held_s) if on_clamp else resting(columns, held_s))
+
+        yield parse_config(raw, "virtual bench"), turn
