@@ -37,7 +37,7 @@ COMMANDS = {
     "router": ("agent.cli.router", "Run a Zenoh router, for tests and small sites."),
     "witness": ("agent.cli.witness", "Keep the signed heads of recordings on another machine."),
     "monitor": ("agent.cli.monitor", "Show all sensors of all gateways on one web page."),
-    "fleet": ("agent.cli.fleet", "Adjust all devices of a site together."),
+    "fleet": ("agent.cli.fleet", "Adjust all devices of a site together, or recompute its recordings."),
     "simulate": (
         "agent.cli.simulate",
         "Serve virtual devices on pseudo-terminals, or write a recording with known true values.",
