@@ -40,7 +40,7 @@ COMMANDS = {
     "fleet": ("agent.cli.fleet", "Adjust all devices of a site together, or recompute its recordings."),
     "simulate": (
         "agent.cli.simulate",
-        "Serve virtual devices on pseudo-terminals, or write a recording with known true values.",
+        "Serve virtual devices, write a recording with known true values, or act as many gateways.",
     ),
     "doctor": ("agent.cli.doctor", "Check this gateway: clock, devices, disk, certificates; with remedies."),
     "install-service": ("agent.cli.install_service", "Install the systemd unit, its user and rules; or remove them."),
