@@ -5,7 +5,7 @@ The numbers are drawn, so nothing is calibrated here; kinds, fields and sizes ar
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from agent.core.events import (
 )
 
 Behaviour = Literal["sound", "drifting", "silent", "wrong", "hostile"]
+Status = Literal["VALID", "HELD", "INVALID"]
 NOMINAL = 26154.0  # counts per m/s2, as an ADXL355 in its range of 2 g
 U_MAIN, U_TRANSVERSE = 5e-4, 1e-3  # standard uncertainties, relative to NOMINAL
 U_OFFSET = 130.0  # counts, 5 mm/s2
@@ -37,13 +38,13 @@ class SimulatedSensor:
         main, other = 0.01 * self._random.normal(size=3), 0.005 * self._random.normal(size=(3, 3))
         self._S = NOMINAL * (np.eye(3) + np.where(np.eye(3) > 0, np.diag(main), other))
         self._Q = NOMINAL * 0.1 * self._random.normal(size=3)
-        self._status = ""
+        self._status: Status | Literal[""] = ""
         self._begun_utc_ns = 0
 
     def results(self, number: int, t_utc_ns: int, first_sequence: int) -> list[Result]:
         """The results of round `number` (from 0), numbered from `first_sequence`."""
         self._begun_utc_ns = self._begun_utc_ns or t_utc_ns
-        self._common = {"run_id": "simulated", "sensor": self.name, "t_utc_ns": t_utc_ns}
+        self._common: dict[str, Any] = {"run_id": "simulated", "sensor": self.name, "t_utc_ns": t_utc_ns}
         self._sequence = first_sequence
         odd = number >= WRONG_FROM
         if self.behaviour == "silent" and odd:
@@ -58,13 +59,13 @@ class SimulatedSensor:
             return [*found, *self._changed("VALID", f"{number + 1} windows")]
         return [*found, self._drift(number, change), *self._changed("HELD", f"Sxx drifts, {change:.1f} U so far")]
 
-    def _next(self) -> dict[str, object]:
+    def _next(self) -> dict[str, Any]:
         self._sequence += 1
         return {**self._common, "sequence": self._sequence - 1}
 
-    def _changed(self, status: str, reason: str) -> list[Result]:
+    def _changed(self, status: Status, reason: str) -> list[Result]:
         before, self._status = self._status, status
-        return [StatusChange(**self._next(), status=status, before=before, reason=reason)] if before != status else []  # type: ignore[arg-type]
+        return [StatusChange(**self._next(), status=status, before=before, reason=reason)] if before != status else []
 
     def _contradicts(self) -> str:
         return f"the window contradicts the calibration: statistic 812.4 above {THRESHOLD}; Syy may have moved by 3.1 %"
@@ -75,7 +76,7 @@ class SimulatedSensor:
             **self._next(), start_s=60.0 * number, stop_s=60.0 * (number + 1), position="30 deg", used=used,
             reason="" if used else self._contradicts(), points=60_000, left_out=0,
             numbers={"statistic": statistic, "statistic_threshold": THRESHOLD, "coherence": 0.998},
-        )  # type: ignore[arg-type]  # fmt: skip
+        )  # fmt: skip
 
     def _calibration(self, number: int, change: float) -> CalibrationUpdate:
         narrow = 1.0 / np.sqrt(1.0 + min(number, 20))  # what is known grows with the windows
@@ -89,14 +90,14 @@ class SimulatedSensor:
             residual_sd=[40.0] * 3, output_unit="count", identity=f"simulated {self.name}",
             reference_temperature_degc=TEMPERATURE_DEGC, temperature_low_degc=15.0, temperature_high_degc=25.0,
             references=["simulated reference"], reference_frequency_hz=8.0, valid_band_hz=[1.0, 40.0],
-        )  # type: ignore[arg-type]  # fmt: skip
+        )  # fmt: skip
 
     def _drift(self, number: int, change_in_u: float) -> DriftReport:
         change = change_in_u * 2 * U_MAIN * NOMINAL
-        days = max((self._common["t_utc_ns"] - self._begun_utc_ns) / 86400e9, 1e-6)  # type: ignore[operator]
+        days = max((self._common["t_utc_ns"] - self._begun_utc_ns) / 86400e9, 1e-6)
         return DriftReport(
             **self._next(), parameter="Sxx", verdict="drifting", change=change, u_change=U_MAIN * NOMINAL,
             rate=change / days, u_rate=U_MAIN * NOMINAL / days, onset_utc_ns=self._begun_utc_ns,
             statistic=10.0 + number, threshold=9.2, false_alarms_a_year=0.1,
             reason="the sensor or the reference changes steadily; compare with another reference",
-        )  # type: ignore[arg-type]  # fmt: skip
+        )  # fmt: skip
