@@ -17,11 +17,16 @@ import pytest
 from click.testing import CliRunner
 
 from agent.cli.fleet_replay import replay
+from agent.config import recorded_config
+from agent.core.anew import anew
+from agent.core.events import CalibrationUpdate, RunStart, WindowReport
+from agent.core.pipeline import Pipeline
 from agent.fleet.results import Summary, results_of
 from agent.fleet.settings import Setting, SettingError
 from agent.fleet.sources import SourceError, found, local
 from agent.fleet.task import Task, run_task
 from agent.fleet.workers import LocalWorkers, outcome
+from agent.recording.reading import RecordingReader
 from tests.unit.recorded_bench import record
 from tests.unit.zenoh_site import wait_for
 
@@ -182,6 +187,19 @@ def test_a_reference_04_percent_low_makes_s_04_percent_low() -> None:
     for axis in range(3):
         ratio = after["sensitivity"][axis][axis] / before["sensitivity"][axis][axis]
         assert ratio == pytest.approx(0.996, abs=2e-4)
+
+
+def test_a_recording_that_continues_another_is_recomputed_from_its_own_windows_alone() -> None:
+    """A snapshot in the middle holds what the windows before it taught; anew, only the later windows count."""
+    start, *steps = RecordingReader(GOLDEN).steps()
+    assert isinstance(start.event, RunStart)
+    config = start.event.config_json
+    pipeline = Pipeline.restore(config, start.event.snapshot)
+    before = [result for step in steps[:10] for result in pipeline.step(step.event)]
+    assert sum(isinstance(result, WindowReport) and result.used for result in before) == 2
+    again = Pipeline.restore(config, anew(recorded_config(config), pipeline.snapshot()))
+    after = [result for step in steps[10:] for result in again.step(step.event)]
+    assert [result.windows for result in after if isinstance(result, CalibrationUpdate)] == [1, 2]
 
 
 @pytest.mark.parametrize(
