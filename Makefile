@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PRESET ?= plain
 
-.PHONY: run test nightly lint bench faults faults-short soak lock deb clean
+.PHONY: run fleet test nightly lint bench faults faults-short soak lock deb clean
 
 $(VENV)/runtime: requirements.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "fieldcal needs Python 3.11 or later, this is " + sys.version)'
@@ -19,6 +19,12 @@ $(VENV)/development: requirements-dev.lock $(VENV)/runtime
 
 run: $(VENV)/runtime  ## the agent on the virtual bench, with a router beside it; PRESET=faulty or guided for others
 	$(BIN)/fieldcal run --preset $(PRESET) --with-router
+
+# A shell ignores SIGINT in what it runs in the background, so the monitor is ended with SIGTERM.
+fleet: $(VENV)/development  ## router, fleet page and a simulated fleet of 40 sensors, of a year in six minutes; until Ctrl-C
+	@directory=$$(mktemp -d); $(BIN)/fieldcal monitor --router --data-dir $$directory & monitor=$$!; \
+	trap 'kill $$monitor 2>/dev/null; wait $$monitor; rm -r $$directory' EXIT; trap : INT TERM; \
+	$(BIN)/fieldcal simulate --fleet 10 --sensors 4 --every 1 --age 365 --speed 86400
 
 # Tests of running programs against the clock can fail where other work delays them. What failed runs once more, alone.
 once_more = { test $$? = 1 && $(BIN)/python -m pytest --last-failed --last-failed-no-failures none $(1); }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
 from contextlib import ExitStack
 from dataclasses import replace
@@ -14,44 +13,19 @@ import msgspec
 
 from agent.cli.given import Given, add_witnessed, read_head, recordings_of
 from agent.delivery.history import StoreError
+from agent.recording.auditing import AuditedFile, audit_file
 from agent.recording.chain import Link, chain_faults, missing_after
 from agent.recording.comparison import OTHER_CPU
 from agent.recording.end_check import check_end
 from agent.recording.head import HEAD_NAME
-from agent.recording.integrity import Integrity, check_integrity
-from agent.recording.pruned_ranges import PRUNED_METADATA, Ranges, from_metadata, merged
+from agent.recording.pruned_ranges import Ranges, merged
 from agent.recording.reading import open_recording
-from agent.recording.records import Fault
-from agent.recording.repair import REPAIR_METADATA
-from agent.recording.replaying import Replay, ReplayedFile, Restore
-from agent.recording.result_check import check_results
-from agent.recording.results_chain import EPOCH, FILE_METADATA, PREVIOUS_RESULTS
+from agent.recording.replaying import Replay, Restore
 from agent.recording.set_aside import deleted as statements
-from agent.recording.signing import SIGNATURE_METADATA, Statement, signed_results, verify_file
 from agent.terminal.text import say
 
 if TYPE_CHECKING:
     from agent.config.known_keys import KnownKeys
-
-
-class AuditedFile(msgspec.Struct, kw_only=True):
-    """The verdict on one file. `reasons` why it failed, empty where it passed; `notes`: what could not be decided."""
-
-    path: str
-    ok: bool
-    incomplete: bool
-    repaired: bool  # a crash left it open, and a later start closed it
-    reasons: list[str]
-    notes: list[str]
-    size: int
-    sha256: str
-    good_bytes: int
-    faults: list[Fault]  # the first ones of `fault_count` faults
-    fault_count: int
-    chunks: int
-    messages: int
-    signed_results: int = 0  # results with a valid signature of their own
-    replay: ReplayedFile
 
 
 @click.command()
@@ -180,27 +154,10 @@ def _audited(
     with ExitStack() as held:  # kept open to the end, so that retention deletes none meanwhile
         files = [held.enter_context(open_recording(path)) for path in given.paths]
         for path, file in zip(given.paths, files, strict=True):
-            sha256 = hashlib.file_digest(file, "sha256").hexdigest()
-            size = file.tell()
-            file.seek(0)
-            integrity = check_integrity(file, size)
-            verdict = _verdict(path, sha256, size, integrity, replayed.run(path))
-            fault = ""
-            if keys is not None:
-                signature = integrity.metadata.get(SIGNATURE_METADATA)
-                fault = verify_file(file, size, signature, keys, _statement(verdict, integrity))
-                verdict.reasons += [fault] if fault else []
-            results = check_results(path, verdict.replay.gateway, None if fault else keys)
-            verdict.signed_results = results.signed
-            if results.fault:
-                verdict.reasons.append(
-                    f"{results.faults} results without a valid signature; the first: {results.fault}"
-                )
-            if strict:
-                verdict.reasons += verdict.notes
-            audited.append(verdict)
-            links.append(_link(verdict, integrity))
-            said += from_metadata(integrity.metadata.get(PRUNED_METADATA))
+            checked = audit_file(path, file, replayed, strict=strict, keys=keys)
+            audited.append(checked.verdict)
+            links.append(checked.link)
+            said += checked.deleted
     pruned = [event for verdict in audited for event in verdict.replay.pruned]
     if given.directory is not None:
         gateway = next((link.gateway for link in links if link.gateway), "")
@@ -211,86 +168,6 @@ def _audited(
     for verdict in audited:
         verdict.ok = not verdict.reasons
     return audited, links, gone
-
-
-def _verdict(path: Path, sha256: str, size: int, integrity: Integrity, replay: ReplayedFile) -> AuditedFile:
-    repair = integrity.metadata.get(REPAIR_METADATA)
-    notes = list(replay.notes)
-    if repair is not None:
-        torn = repair.get("torn_bytes")
-        notes.append(f"unsealed: left open by a crash, closed later; the last {torn} bytes, incomplete, were set aside")
-    return AuditedFile(
-        path=str(path),
-        ok=False,
-        incomplete=not integrity.finished and all(fault.kind == "torn" for fault in integrity.faults),
-        repaired=repair is not None,
-        reasons=_reasons(integrity, replay) + _metadata_reasons(integrity, replay),
-        notes=notes,
-        size=size,
-        sha256=sha256,
-        good_bytes=integrity.good_bytes,
-        faults=integrity.faults,
-        fault_count=integrity.fault_count,
-        chunks=integrity.chunks,
-        messages=integrity.messages,
-        replay=replay,
-    )
-
-
-def _statement(verdict: AuditedFile, integrity: Integrity) -> Statement:
-    """What the signature of a file must say of it; its content is hashed when the signature is checked."""
-    origin, replay = integrity.metadata.get(FILE_METADATA, {}), verdict.replay
-    epoch, previous_sha256 = origin.get(EPOCH, ""), origin.get("previous_sha256", "")
-    return Statement(replay.gateway, epoch, replay.file_sequence, previous_sha256, integrity.results.text, 0, "")
-
-
-def _link(verdict: AuditedFile, integrity: Integrity) -> Link:
-    return Link(
-        path=verdict.path,
-        gateway=verdict.replay.gateway,
-        file_sequence=verdict.replay.file_sequence,
-        sha256=verdict.sha256,
-        incomplete=verdict.incomplete,
-        repaired=verdict.repaired,
-        previous_sha256=integrity.metadata.get(FILE_METADATA, {}).get("previous_sha256", ""),
-        previous_results=integrity.metadata.get(FILE_METADATA, {}).get(PREVIOUS_RESULTS, ""),
-        signed_results=signed_results(integrity.metadata.get(SIGNATURE_METADATA)),
-    )
-
-
-def _reasons(integrity: Integrity, replay: ReplayedFile) -> list[str]:
-    reasons = []
-    for fault in integrity.faults:
-        incomplete = f"incomplete, last good byte {integrity.good_bytes}: " if fault.kind == "torn" else ""
-        reasons.append(f"{incomplete}{fault}")
-    if integrity.fault_count > len(integrity.faults):
-        reasons.append(f"{integrity.fault_count - len(integrity.faults)} more faults")
-    if replay.fault is not None and not integrity.faults:
-        reasons.append(str(replay.fault))
-    if replay.refused:
-        reasons.append(f"cannot be replayed: {replay.refused}")
-    if replay.first_difference is not None:
-        reasons.append(f"the results do not follow from the data: {replay.first_difference}")
-    if replay.undecidable:
-        reasons.append(
-            "not decided: a decision is so close that this CPU takes another one than was recorded, so what follows in "
-            "this file is not checked; audit the file on a CPU like the one that recorded it"
-        )
-    if replay.different > 1:
-        reasons.append(f"results differ after {replay.different} events")
-    if not replay.events:
-        reasons.append("it holds no events")
-    return reasons
-
-
-def _metadata_reasons(integrity: Integrity, replay: ReplayedFile) -> list[str]:
-    """The contradictions between a file's events and its own metadata."""
-    metadata = integrity.metadata.get(FILE_METADATA)
-    if metadata is None:
-        return [f"no metadata record {FILE_METADATA}"] if replay.events else []
-    if replay.events and metadata.get("file_sequence") != str(replay.file_sequence):
-        return [f"its metadata says file number {metadata.get('file_sequence')}, its RunStart {replay.file_sequence}"]
-    return []
 
 
 def describe(file: AuditedFile) -> list[str]:

@@ -6,7 +6,7 @@ import importlib
 
 import click
 
-COMMANDS = {"adjust": "agent.cli.fleet_adjust"}
+COMMANDS = {"adjust": "agent.cli.fleet_adjust", "replay": "agent.cli.fleet_replay"}
 
 
 class _Commands(click.Group):

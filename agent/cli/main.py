@@ -38,10 +38,10 @@ COMMANDS = {
     "router": ("agent.cli.router", "Run a Zenoh router, for tests and small sites."),
     "witness": ("agent.cli.witness", "Keep the signed heads of recordings on another machine."),
     "monitor": ("agent.cli.monitor", "Show all sensors of all gateways on one web page."),
-    "fleet": ("agent.cli.fleet", "Adjust all devices of a site together."),
+    "fleet": ("agent.cli.fleet", "Adjust all devices of a site together, or recompute its recordings."),
     "simulate": (
         "agent.cli.simulate",
-        "Serve virtual devices on pseudo-terminals, or write a recording with known true values.",
+        "Serve virtual devices, write a recording with known true values, or act as many gateways.",
     ),
     "doctor": ("agent.cli.doctor", "Check this gateway: clock, devices, disk, certificates; with remedies."),
     "install-service": ("agent.cli.install_service", "Install the systemd unit, its user and rules; or remove them."),

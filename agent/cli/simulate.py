@@ -1,4 +1,4 @@
-"""`fieldcal simulate`: virtual devices on pseudo-terminals, a recording played back, or files with known truth."""
+"""`fieldcal simulate`: virtual devices on pseudo-terminals, files with known truth, a recording played, or a fleet."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ from typing import Any
 
 import click
 import numpy as np
+from click.core import ParameterSource
 from numpy.typing import NDArray
 
+from agent.cli.simulate_fleet import fleet_options, serve_fleet
 from agent.terminal.text import say
 from hw.virtual.bench import Bench, Truth
 from hw.virtual.playback import PlaybackError, Player, read_track
@@ -31,6 +33,7 @@ LINGER_S = 1.0  # s; the port stays open this long after the last sample, so tha
 
 
 @click.command()
+@fleet_options
 @click.option("--preset", type=click.Choice(list(PRESETS)), help="Virtual bench with sensor and reference.")
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=1, show_default=True, help="Seed of the bench.")
 @click.option(
@@ -60,24 +63,33 @@ def simulate(
     sequence: bool,
     loop: bool,
     link: Path | None,
+    **fleet: Any,
 ) -> int:
-    """Serve virtual devices on pseudo-terminals, or write a recording with known truth.
+    """Serve virtual devices on pseudo-terminals, write a recording with known truth, or act as many gateways.
 
     \b
     --preset plain --csv DIR   sensor.csv, reference.csv, poses.csv and truth.json for `fieldcal calibrate`
     --preset plain             sensor and reference, each on its own port, until Ctrl-C
     --play FILE                a recording on a port, at its own speed, to its end
+    --fleet N                  N gateways on the bus, some of which drift, fall silent, are wrong or hostile
 
     Nothing is sent until a reader opens the port; the first sample is sent then.
     """
+    if fleet["fleet"] is not None:
+        if any(value is not None for value in (preset, directory, play, rate_hz, axes, link)) or sequence or loop:
+            raise click.UsageError("--fleet goes with --connect, --sensors, --every, --speed, --age, --keys, --seed "
+                                   "and --duration only")  # fmt: skip
+        return serve_fleet(seed=seed, duration_s=duration_s, **fleet)
+    if any(name in _given() for name in fleet):
+        raise click.UsageError("--connect, --sensors, --every, --speed, --age and --keys need --fleet")
     if (preset is None) == (play is None):
-        raise click.UsageError("give either --preset or --play")
+        raise click.UsageError("give --preset, --play or --fleet")
     if preset is not None and (rate_hz or axes or sequence or loop):
         raise click.UsageError("--rate-hz, --axes, --sequence and --loop need --play")
     if play is not None and directory is not None:
         raise click.UsageError("--csv needs --preset")
     if duration_s is not None and directory is None:
-        raise click.UsageError("--duration needs --csv")
+        raise click.UsageError("--duration needs --csv or --fleet")
     try:
         if play is not None:
             track = read_track(play, tuple(axes.split(",")) if axes else None, rate_hz)
@@ -98,6 +110,12 @@ def simulate(
         f" --poses {directory}/poses.csv --nominal {bench.parameters.sensor.nominal_sensitivity:.6g} --u-nominal-pct 20"
     )
     return 0
+
+
+def _given() -> set[str]:
+    """The names of the options on the command line."""
+    context = click.get_current_context()
+    return {name for name in context.params if context.get_parameter_source(name) == ParameterSource.COMMANDLINE}
 
 
 def write_files(bench: Bench, directory: Path, duration_s: float | None, origin: dict[str, Any]) -> None:

@@ -20,6 +20,7 @@ PURPOSES = {
     "tdms": "LabVIEW TDMS files",
     "dcc": "check of digital calibration certificates against schemas (`fieldcal certificate --xsd`)",
     "monitor": "the page of `fieldcal monitor`",
+    "fleet": "`fieldcal fleet` on many machines (Dask), and recordings in an object store",
     "sound": "driver sound-card (needs PortAudio besides)",
     "mcc": "drivers mcc172 and mcc-usb (need libdaqhats and libuldaq besides)",
     "ni": "driver ni (needs NI-DAQmx besides; x86_64 only)",

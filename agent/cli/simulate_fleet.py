@@ -1,0 +1,121 @@
+"""`fieldcal simulate --fleet`: many gateways on the bus, until Ctrl-C."""
+
+from __future__ import annotations
+
+import resource
+import signal
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import click
+
+from agent.terminal.text import say
+
+FILES_PER_GATEWAY = 40  # open files: the store, its readers, and Zenoh
+ROUTER_S = 30.0  # s to wait for a router
+STEP_S = 0.5
+DAY_S = 86400.0
+NAMES_SHOWN = 5
+
+
+def fleet_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options of a simulated fleet."""
+    for option in (
+        click.option("--keys", type=click.Path(dir_okay=False, path_type=Path), metavar="F",
+                     help="Fleet: add the gateways' public keys to this list of known keys."),
+        click.option("--age", "age_days", type=click.FloatRange(0, 3650), default=0.0, show_default=True,
+                     metavar="DAYS", help="Fleet: how long ago the first results were made."),
+        click.option("--speed", type=click.FloatRange(1, 1e6), default=1.0, show_default=True,
+                     help="Fleet: its time runs so much faster, until it has reached the present."),
+        click.option("--every", "every_s", type=click.FloatRange(0.1, 86400), default=60.0, show_default=True,
+                     metavar="S", help="Fleet: time between two results of a sensor."),
+        click.option("--sensors", type=click.IntRange(1, 100), default=4, show_default=True,
+                     help="Fleet: sensors of each gateway."),
+        click.option("--connect", metavar="ENDPOINT", help="Fleet: the router.  [default: tcp/127.0.0.1:7447]"),
+        click.option("--fleet", type=click.IntRange(1, 10_000), metavar="N", help="Act as N gateways on the bus."),
+    ):  # fmt: skip
+        command = option(command)
+    return command
+
+
+def serve_fleet(
+    *, fleet: int, connect: str | None, sensors: int, every_s: float, speed: float, age_days: float,
+    keys: Path | None, seed: int, duration_s: float | None,
+) -> int:  # fmt: skip
+    """Act as `fleet` gateways, whose results have the time that runs `speed` times faster from `age_days` ago.
+
+    Until Ctrl-C, or for `duration_s`. Returns the exit status: 1 without router or with too few files, 2 bad endpoint.
+    """
+    from agent.config.key_file import KeyFileError
+    from agent.config.known_keys import add_key
+    from agent.delivery.router import DEFAULT_ENDPOINT
+    from agent.delivery.session import EndpointError
+    from agent.fleet.simulated import ODD, SimulatedFleet
+
+    endpoint, stop = connect or DEFAULT_ENDPOINT, threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    try:
+        if fault := _files_fault(fleet) or _router_fault(endpoint, stop):
+            say(f"fieldcal simulate: {fault}", err=True)
+            return 1
+        with TemporaryDirectory(prefix="fieldcal-fleet-") as directory:
+            with SimulatedFleet(fleet, sensors, seed, [endpoint], Path(directory)) as simulated:
+                if simulated.unconnected:
+                    say(f"fieldcal simulate: {simulated.unconnected} gateways found no router yet", err=True)
+                if keys is not None:
+                    for gateway in simulated.gateways:
+                        add_key(keys, gateway.source, gateway.public_key)
+                say(f"{fleet} gateways with {sensors} sensors each at {endpoint}, seed {seed}")
+                for behaviour in ODD:
+                    names = simulated.names_of(behaviour)
+                    more = f" and {len(names) - NAMES_SHOWN} more" if len(names) > NAMES_SHOWN else ""
+                    say(f"{behaviour}: {', '.join(names[:NAMES_SHOWN]) or 'none'}{more}")
+                results = _run(simulated.step, stop, every_s, speed, age_days, duration_s)
+            say(f"{results} results sent")
+    except (EndpointError, KeyFileError) as error:
+        say(f"fieldcal simulate: {error}", err=True)
+        return 2
+    return 0
+
+
+def _run(
+    step: Callable[[int], int], stop: threading.Event, every_s: float, speed: float, age_days: float,
+    duration_s: float | None,
+) -> int:  # fmt: skip
+    """Step until it is to stop; returns the number of results."""
+    begun, results, rounds = time.monotonic(), 0, 0
+    first_utc_ns = time.time_ns() - round(age_days * DAY_S * 1e9)
+    while not stop.is_set():
+        passed_s = time.monotonic() - begun
+        if duration_s is not None and passed_s > duration_s:
+            break
+        results += step(min(first_utc_ns + round(passed_s * speed * 1e9), time.time_ns()))
+        rounds += 1
+        stop.wait(max(0.0, begun + rounds * every_s - time.monotonic()))
+    return results
+
+
+def _files_fault(fleet: int) -> str:
+    """Allow as many open files as the fleet needs; why that cannot be, "" if it can."""
+    needed, (soft, hard) = 256 + FILES_PER_GATEWAY * fleet, resource.getrlimit(resource.RLIMIT_NOFILE)
+    if hard != resource.RLIM_INFINITY and needed > hard:
+        return f"{fleet} gateways need {needed} open files, and this system allows {hard}; set `ulimit -Hn {needed}`"
+    if soft != resource.RLIM_INFINITY:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, needed), hard))
+    return ""
+
+
+def _router_fault(endpoint: str, stop: threading.Event) -> str:
+    """Wait for the router; why there is none, "" if there is one. Raises EndpointError."""
+    from agent.delivery.router import router_running
+
+    end = time.monotonic() + ROUTER_S
+    while not router_running(endpoint):
+        if time.monotonic() > end or stop.wait(STEP_S):
+            return f"no router answers at {endpoint}; start one with `fieldcal router` or `fieldcal monitor --router`"
+    return ""

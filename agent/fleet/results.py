@@ -1,0 +1,119 @@
+"""The results of a fleet's recordings in a directory: one file for each recording, complete or not there at all."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import msgspec
+
+from agent.config.files import read_file
+from agent.fleet.task import UNCHANGED, Task
+from agent.fleet.workers import DaskWorkers, LocalWorkers
+
+LARGEST_RESULT = 1 << 30  # bytes of a result that is read again; a larger one is computed anew
+SHOWN = ("sensor", "sequence", "windows", "sensitivity", "offset", "standard_uncertainty", "coverage_factor",
+         "output_unit")  # fmt: skip
+
+
+class Summary(msgspec.Struct, kw_only=True):
+    """What is said of one recording. `reasons`: why it is refused, empty where it is not.
+
+    `unchanged`: the result was there already. `calibrations`: the last one of each sensor, without its covariance.
+    """
+
+    place: str
+    sha256: str = ""
+    reasons: list[str] = []
+    unchanged: bool = False
+    events: int = 0
+    results: int = 0
+    windows: int = 0
+    calibrations: list[dict[str, Any]] = []
+
+
+class _Read(msgspec.Struct):
+    """A FileResult as JSON gives it: a number that is not known is null there."""
+
+    place: str
+    sha256: str
+    made_by: str
+    reasons: list[str]
+    replayed: dict[str, Any] | None
+    calibrations: list[dict[str, Any]]
+    windows: list[dict[str, Any]]
+
+
+def results_of(
+    places: Iterable[str], settings: Sequence[str], workers: LocalWorkers | DaskWorkers, directory: Path | None,
+    *, audit: bool,
+) -> Iterator[Summary]:  # fmt: skip
+    """Compute each recording that has no valid result in `directory`, and write its result there. In any order.
+
+    Raises OSError where a result cannot be written.
+    """
+    known: dict[str, Summary] = {}  # of the tasks that are given out
+
+    def tasks() -> Iterator[Task]:
+        for place in places:
+            before = _read(directory, place) if directory is not None else None
+            if before is not None:
+                known[place] = _summary(before)
+            made = (before.sha256, before.made_by) if before is not None else ("", "")
+            yield Task(place=place, settings=tuple(settings), audit=audit, known=made)
+
+    for task, result in workers.run(tasks()):
+        before = known.pop(task.place, None)
+        if isinstance(result, str):
+            yield Summary(place=task.place, reasons=[result])
+        elif result == UNCHANGED and before is not None:
+            before.unchanged = True
+            yield before
+        else:
+            read = msgspec.json.decode(result, type=_Read)
+            if directory is not None and read.sha256:  # of a recording that could not be read there is nothing to keep
+                _write(result_path(directory, task.place), result)
+            yield _summary(read)
+
+
+def result_path(directory: Path, place: str) -> Path:
+    """The file of the result of the recording at `place`: its name, and a digest of its whole path."""
+    name = re.sub(r"[^A-Za-z0-9_.-]", "_", PurePosixPath(place).name)[:80]
+    return directory / f"{name}.{hashlib.sha256(os.fsencode(place)).hexdigest()[:16]}.json"
+
+
+def _read(directory: Path, place: str) -> _Read | None:
+    """The result that is there; None where there is none, or none that can be read."""
+    try:
+        found = msgspec.json.decode(read_file(result_path(directory, place), LARGEST_RESULT), type=_Read)
+    except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return None
+    return found if found.place == place else None
+
+
+def _write(path: Path, result: bytes) -> None:
+    """Write the result under a temporary name, bring it to the disk and rename it. Raises OSError."""
+    new = path.with_name(path.name + ".new")
+    with open(new, "wb") as file:
+        file.write(result)
+        file.flush()
+        os.fsync(file.fileno())
+    new.replace(path)
+
+
+def _summary(read: _Read) -> Summary:
+    last = {str(update.get("sensor")): update for update in read.calibrations}
+    replayed = read.replayed or {}
+    return Summary(
+        place=read.place,
+        sha256=read.sha256,
+        reasons=read.reasons,
+        events=replayed.get("events", 0),
+        results=replayed.get("results", 0),
+        windows=len(read.windows),
+        calibrations=[{name: update.get(name) for name in SHOWN} for update in last.values()],
+    )

@@ -1,0 +1,144 @@
+"""What is done with one recording. It runs in a worker, which may be another process or another machine."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from agent import __version__
+from agent.core.events import CalibrationUpdate, WindowReport
+from agent.fleet.settings import Setting, SettingError, changed_config
+from agent.fleet.sources import SourceError, local
+from agent.recording.auditing import AuditedFile, audit_file
+from agent.recording.comparison import OTHER_CPU
+from agent.recording.reading import open_recording
+from agent.recording.replaying import PipelineLike, Replay, ReplayedFile
+
+UNCHANGED = b""  # in place of a result: the one that is known still holds
+
+
+class Task(msgspec.Struct, frozen=True, kw_only=True):
+    """What is to be done. Everything in it may be written to a log: it holds no credentials.
+
+    `place`: a path or an address. `settings`: as `Setting.of` reads them. `known`: the fields `sha256` and `made_by`
+    of a result that is there already.
+    """
+
+    place: str
+    settings: tuple[str, ...] = ()
+    audit: bool = False
+    known: tuple[str, str] = ("", "")
+
+
+class FileResult(msgspec.Struct, kw_only=True):
+    """What came out of one recording. `reasons`: why it is refused, empty where it is not.
+
+    `made_by`: digest of settings, version of the program and kernels that computed it.
+    """
+
+    place: str
+    sha256: str = ""
+    made_by: str = ""
+    fingerprint: dict[str, str] = {}
+    settings: tuple[str, ...] = ()
+    reasons: list[str] = []
+    audited: AuditedFile | None = None
+    replayed: ReplayedFile | None = None
+    calibrations: list[CalibrationUpdate] = []
+    windows: list[WindowReport] = []
+
+
+def run_task(task: Task) -> bytes:
+    """The FileResult of a recording as JSON; UNCHANGED where the known result holds. The same bytes on every worker
+    that has the same fingerprint. What is wrong with the recording is in the result; a MemoryError is raised."""
+    from threadpoolctl import threadpool_limits
+
+    threadpool_limits(1)  # a sum over several threads has other last bits
+    return msgspec.json.encode(found) if (found := _result(task)) is not None else UNCHANGED
+
+
+def _result(task: Task) -> FileResult | None:
+    from agent.recording.fingerprint import fingerprint
+
+    here = fingerprint()
+    result = FileResult(place=task.place, fingerprint=here, settings=task.settings, made_by=_made_by(task, here))
+    try:
+        with local(task.place) as path, open_recording(path) as file:
+            result.sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+            if (result.sha256, result.made_by) == task.known:
+                return None
+            settings = [Setting.of(text) for text in task.settings]
+            if task.audit:
+                file.seek(0)
+                replayed = Replay(_recorded, here, elsewhere=OTHER_CPU)
+                verdict = audit_file(path, file, replayed).verdict
+                verdict.ok, verdict.path = not verdict.reasons, task.place
+                result.audited, result.reasons = verdict, list(verdict.reasons)
+            if settings:
+                replayed = _recomputed(path, settings, here, result)
+            elif not task.audit:
+                replayed = Replay(_recorded, here, elsewhere=OTHER_CPU)
+                result.reasons += _reasons(replayed.run(path))
+    except (SourceError, SettingError) as error:
+        result.reasons.append(str(error).removeprefix(f"{task.place}: "))
+        return result
+    except OSError as error:
+        result.reasons.append(f"cannot be read: {error.strerror or error}")
+        return result
+    result.replayed = replayed.files[-1]
+    result.replayed.path = task.place
+    if result.replayed.first_difference is not None:
+        result.replayed.first_difference = msgspec.structs.replace(result.replayed.first_difference, file=task.place)
+    result.calibrations, result.windows = replayed.calibrations, replayed.windows
+    return result
+
+
+def _recomputed(path: Path, settings: Sequence[Setting], here: dict[str, str], result: FileResult) -> Replay:
+    """The replay under changed settings: other results than the recorded ones are what was asked for."""
+    from agent.core.anew import anew
+    from agent.core.pipeline import Pipeline
+
+    refused: list[SettingError] = []
+
+    def restore(config_json: str, snapshot: bytes) -> PipelineLike:
+        try:
+            config = changed_config(config_json, settings)
+        except SettingError as error:
+            refused.append(error)
+            raise
+        return Pipeline.restore(config.model_dump_json(), anew(config, snapshot))
+
+    replayed = Replay(restore, here, elsewhere=0.0)
+    file = replayed.run(path)
+    if refused:
+        raise refused[0]
+    file.different, file.first_difference = 0, None
+    result.reasons += _reasons(file)
+    return replayed
+
+
+def _recorded(config_json: str, snapshot: bytes) -> PipelineLike:
+    from agent.core.pipeline import Pipeline
+
+    return Pipeline.restore(config_json, snapshot)
+
+
+def _reasons(file: ReplayedFile) -> list[str]:
+    """Why the replay of a file is refused, as `fieldcal replay` refuses it."""
+    if not file.events:
+        return [str(file.fault or "not a recording made by fieldcal")]
+    reasons = [f"cannot be replayed: {file.refused}"] if file.refused else []
+    if file.first_difference is not None:
+        reasons.append(f"results differ after {file.different} events, first {file.first_difference}")
+    if file.fault is not None and file.fault.kind == "corrupt":
+        reasons.append(f"damaged at {file.fault}")
+    return reasons
+
+
+def _made_by(task: Task, here: dict[str, str]) -> str:
+    held: list[Any] = [__version__, task.audit, list(task.settings), sorted(here.items())]
+    return hashlib.sha256(msgspec.json.encode(held)).hexdigest()

@@ -1,0 +1,164 @@
+"""The audit of one recording: is every byte as written, and do its results follow from its data?
+
+How recordings continue each other is not looked at here; `fieldcal audit` does that with the links.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from io import BufferedReader
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from agent.recording.chain import Link
+from agent.recording.integrity import Integrity, check_integrity
+from agent.recording.pruned_ranges import PRUNED_METADATA, Ranges, from_metadata
+from agent.recording.records import Fault
+from agent.recording.repair import REPAIR_METADATA
+from agent.recording.replaying import Replay, ReplayedFile
+from agent.recording.result_check import check_results
+from agent.recording.results_chain import EPOCH, FILE_METADATA, PREVIOUS_RESULTS
+from agent.recording.signing import SIGNATURE_METADATA, Statement, signed_results, verify_file
+
+if TYPE_CHECKING:
+    from agent.config.known_keys import KnownKeys
+
+
+class AuditedFile(msgspec.Struct, kw_only=True):
+    """The verdict on one file. `reasons` why it failed, empty where it passed; `notes`: what could not be decided."""
+
+    path: str
+    ok: bool
+    incomplete: bool
+    repaired: bool  # a crash left it open, and a later start closed it
+    reasons: list[str]
+    notes: list[str]
+    size: int
+    sha256: str
+    good_bytes: int
+    faults: list[Fault]  # the first ones of `fault_count` faults
+    fault_count: int
+    chunks: int
+    messages: int
+    signed_results: int = 0  # results with a valid signature of their own
+    replay: ReplayedFile
+
+
+@dataclass(frozen=True, slots=True)
+class Audited:
+    """The verdict on one file, without `ok`; its link in the chain; the file numbers that retention deleted."""
+
+    verdict: AuditedFile
+    link: Link
+    deleted: Ranges
+
+
+def audit_file(
+    path: Path, file: BufferedReader, replayed: Replay, *, strict: bool = False, keys: KnownKeys | None = None
+) -> Audited:
+    """Audit the recording at `path`, open as `file`, which is read from its beginning.
+
+    `replayed`: runs it too. With `keys`, the file must be signed by a key of its gateway. `strict`: what could not be
+    decided is a reason to fail. Raises OSError.
+    """
+    sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+    size = file.tell()
+    file.seek(0)
+    integrity = check_integrity(file, size)
+    verdict = _verdict(path, sha256, size, integrity, replayed.run(path))
+    fault = ""
+    if keys is not None:
+        signature = integrity.metadata.get(SIGNATURE_METADATA)
+        fault = verify_file(file, size, signature, keys, _statement(verdict, integrity))
+        verdict.reasons += [fault] if fault else []
+    results = check_results(path, verdict.replay.gateway, None if fault else keys)
+    verdict.signed_results = results.signed
+    if results.fault:
+        verdict.reasons.append(f"{results.faults} results without a valid signature; the first: {results.fault}")
+    if strict:
+        verdict.reasons += verdict.notes
+    deleted = from_metadata(integrity.metadata.get(PRUNED_METADATA))
+    return Audited(verdict, _link(verdict, integrity), deleted)
+
+
+def _verdict(path: Path, sha256: str, size: int, integrity: Integrity, replay: ReplayedFile) -> AuditedFile:
+    repair = integrity.metadata.get(REPAIR_METADATA)
+    notes = list(replay.notes)
+    if repair is not None:
+        torn = repair.get("torn_bytes")
+        notes.append(f"unsealed: left open by a crash, closed later; the last {torn} bytes, incomplete, were set aside")
+    return AuditedFile(
+        path=str(path),
+        ok=False,
+        incomplete=not integrity.finished and all(fault.kind == "torn" for fault in integrity.faults),
+        repaired=repair is not None,
+        reasons=_reasons(integrity, replay) + _metadata_reasons(integrity, replay),
+        notes=notes,
+        size=size,
+        sha256=sha256,
+        good_bytes=integrity.good_bytes,
+        faults=integrity.faults,
+        fault_count=integrity.fault_count,
+        chunks=integrity.chunks,
+        messages=integrity.messages,
+        replay=replay,
+    )
+
+
+def _statement(verdict: AuditedFile, integrity: Integrity) -> Statement:
+    """What the signature of a file must say of it; its content is hashed when the signature is checked."""
+    origin, replay = integrity.metadata.get(FILE_METADATA, {}), verdict.replay
+    epoch, previous_sha256 = origin.get(EPOCH, ""), origin.get("previous_sha256", "")
+    return Statement(replay.gateway, epoch, replay.file_sequence, previous_sha256, integrity.results.text, 0, "")
+
+
+def _link(verdict: AuditedFile, integrity: Integrity) -> Link:
+    return Link(
+        path=verdict.path,
+        gateway=verdict.replay.gateway,
+        file_sequence=verdict.replay.file_sequence,
+        sha256=verdict.sha256,
+        incomplete=verdict.incomplete,
+        repaired=verdict.repaired,
+        previous_sha256=integrity.metadata.get(FILE_METADATA, {}).get("previous_sha256", ""),
+        previous_results=integrity.metadata.get(FILE_METADATA, {}).get(PREVIOUS_RESULTS, ""),
+        signed_results=signed_results(integrity.metadata.get(SIGNATURE_METADATA)),
+    )
+
+
+def _reasons(integrity: Integrity, replay: ReplayedFile) -> list[str]:
+    reasons = []
+    for fault in integrity.faults:
+        incomplete = f"incomplete, last good byte {integrity.good_bytes}: " if fault.kind == "torn" else ""
+        reasons.append(f"{incomplete}{fault}")
+    if integrity.fault_count > len(integrity.faults):
+        reasons.append(f"{integrity.fault_count - len(integrity.faults)} more faults")
+    if replay.fault is not None and not integrity.faults:
+        reasons.append(str(replay.fault))
+    if replay.refused:
+        reasons.append(f"cannot be replayed: {replay.refused}")
+    if replay.first_difference is not None:
+        reasons.append(f"the results do not follow from the data: {replay.first_difference}")
+    if replay.undecidable:
+        reasons.append(
+            "not decided: a decision is so close that this CPU takes another one than was recorded, so what follows in "
+            "this file is not checked; audit the file on a CPU like the one that recorded it"
+        )
+    if replay.different > 1:
+        reasons.append(f"results differ after {replay.different} events")
+    if not replay.events:
+        reasons.append("it holds no events")
+    return reasons
+
+
+def _metadata_reasons(integrity: Integrity, replay: ReplayedFile) -> list[str]:
+    """The contradictions between a file's events and its own metadata."""
+    metadata = integrity.metadata.get(FILE_METADATA)
+    if metadata is None:
+        return [f"no metadata record {FILE_METADATA}"] if replay.events else []
+    if replay.events and metadata.get("file_sequence") != str(replay.file_sequence):
+        return [f"its metadata says file number {metadata.get('file_sequence')}, its RunStart {replay.file_sequence}"]
+    return []
