@@ -7,17 +7,21 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from agent.calibrate.files import Files
 from agent.calibrate.outcome import NuisanceValue, Outcome, nothing_used
 from agent.calibrate.priors import priors_of, row_contradictions, u_gravity_mps2
+from agent.calibrate.reference_certificate import ReferenceCertificate
 from agent.calibrate.tables import SensorTable
+from agent.core.outcome import shared_error
 from calib.estimate.adjustment import Adjustment, adjust
 from calib.estimate.condense import condense, mean_frequency_hz
 from calib.estimate.lag_search import starts, without_lag
 from calib.estimate.norm_fit import norm_fit
 from calib.estimate.nuisances import Applied, Priors
+from calib.estimate.reference_share import ReferenceShare
 from calib.excitation.bands import motion_band_hz
 from calib.excitation.windows import rests_anywhere
 from calib.geometry import STANDARD_GRAVITY_MPS2
@@ -32,7 +36,19 @@ RESPONSE_TURNS = 6
 HOPELESS = 2  # turns after which a refusal no longer comes from the response that is not yet taken out
 
 
-def adjusted(files: Files, priors: Priors) -> Outcome:
+def adjusted(files: Files, priors: Priors, certificate: ReferenceCertificate | None = None) -> Outcome:
+    """The outcome for these files and priors. `certificate` is that of the reference, if it is given."""
+    outcome, share = _adjusted(files, priors)
+    if share is None:
+        return outcome
+    if certificate is not None:
+        share = replace(share, sensitivity=certificate.sensitivity)
+    told = ("", "") if certificate is None else (certificate.serial_number, certificate.sha256)
+    shared = msgspec.structs.asdict(shared_error(share, *told))
+    return replace(outcome, more={**outcome.more, "shared_errors": [shared]})
+
+
+def _adjusted(files: Files, priors: Priors) -> tuple[Outcome, ReferenceShare | None]:
     """Make windows with the lag and the response over frequency taken out, and adjust them."""
     applied = Applied(0.0, priors.reference_corner_at_hz, priors.sensor_corner_at_hz)
     stated = priors  # later with the response, whose scale is that of the motion
@@ -61,15 +77,16 @@ def adjusted(files: Files, priors: Priors) -> Outcome:
             break
         found = at(windows, replace(applied, lag_s=lag_s))
         if not stated.response:
-            return _outcome(_attenuated(found, windows, priors, replace(applied, lag_s=lag_s)), windows, files.rate_hz)
+            found = _attenuated(found, windows, priors, replace(applied, lag_s=lag_s))
+            return _outcome(found, windows, files.rate_hz), found.share
         if found.response is None or found.response.terms.is_near(applied.response):
-            return _outcome(found, windows, files.rate_hz)
+            return _outcome(found, windows, files.rate_hz), found.share
         if found.reasons and turn >= HOPELESS:
-            return _outcome(found, windows, files.rate_hz)
+            return _outcome(found, windows, files.rate_hz), found.share
         applied = replace(applied, lag_s=lag_s, response=found.response.terms.modest)
     if applied.response.is_flat:
-        return nothing_used(windows, files.rate_hz, METHOD)
-    return Outcome(None, (UNSETTLED,), windows, files.rate_hz, METHOD)
+        return nothing_used(windows, files.rate_hz, METHOD), None
+    return Outcome(None, (UNSETTLED,), windows, files.rate_hz, METHOD), None
 
 
 def _hardly_used(windows: Sequence[Window]) -> tuple[str, ...]:

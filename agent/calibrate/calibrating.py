@@ -19,6 +19,7 @@ from agent.calibrate.files import Files, Options
 from agent.calibrate.outcome import Outcome, nothing_used
 from agent.calibrate.poses import PoseInterval, Setting, beside_reference, read_poses
 from agent.calibrate.priors import contradictions, instrument_of, priors_of
+from agent.calibrate.reference_certificate import read_reference_certificate
 from agent.calibrate.tables import ReferenceTable, SensorTable, read_reference, read_sensor
 from agent.calibrate.wrong_unit import check_gravity
 from agent.reading.source import Progress, TableError
@@ -45,7 +46,11 @@ def calibrated(options: dict[str, Any]) -> Outcome:
         return by_amplitudes(read_files(options), options)
     if options["plain"]:
         return _plain(read_files(options), priors_of(options))
-    return adjusted(read_files(options, instrument_of(options)), priors_of(options))
+    stated = options.get("reference_certificate")
+    certificate = None if stated is None else read_reference_certificate(stated)
+    if certificate is not None:
+        options = options | {"u_reference_pct": 100.0 * float(np.max(certificate.u_relative))}
+    return adjusted(read_files(options, instrument_of(options)), priors_of(options), certificate)
 
 
 def read_files(options: dict[str, Any], instrument: Instrument | None = None) -> Files:

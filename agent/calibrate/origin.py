@@ -11,7 +11,13 @@ import msgspec
 
 from agent.config.files import open_file
 
-FILES = ("sensor", "reference", "poses", "prior")  # options of `fieldcal calibrate` that name a file
+FILES = (
+    "sensor",
+    "reference",
+    "poses",
+    "prior",
+    "reference_certificate",
+)  # options of `fieldcal calibrate` that name a file
 
 
 class SourceFile(msgspec.Struct, frozen=True):
@@ -34,5 +40,5 @@ def origin(options: Mapping[str, Any]) -> dict[str, Any]:
     kept.pop("json_to", None)
     return {
         "options": kept,
-        "files": [msgspec.structs.asdict(source_file(options[name])) for name in FILES if options[name]],
+        "files": [msgspec.structs.asdict(source_file(options[name])) for name in FILES if options.get(name)],
     }

@@ -148,7 +148,7 @@ def as_object(certificate: Certificate) -> dict[str, Any]:
     measured = plain(
         {name: told.get(name) for name in
          ("sensitivity", "offset", "standard_uncertainty", "expanded_uncertainty", "covariance", "determined",
-          "response", "budget", "lag_s", "frame", "method", "uncertainty_kind", "identity")}
+          "response", "budget", "lag_s", "frame", "method", "uncertainty_kind", "identity", "shared_errors")}
         | {"parameters": PARAMETERS, "output_unit": result.unit, "degrees_of_freedom": result.degrees_of_freedom,
            "coverage_probability": COVERAGE_PROBABILITY, "expanded_uncertainty_pct": c.relative_pct}
     )  # fmt: skip

@@ -43,7 +43,13 @@ def graph(c: Certificate, result: dict[str, Any]) -> dict[str, Any]:
         if w.used
     }
     made_of = [(window, file) for window in windows for file in files]
-    derived = [(reference, issued), *made_of, *((found, source) for source in windows or files), (own, found)]
+    derived = [
+        (reference, issued),
+        (found, reference),
+        *made_of,
+        *((found, source) for source in windows or files),
+        (own, found),
+    ]
     organisation, operator = f"fieldcal:organisation/{s.organisation.name}", f"fieldcal:person/{s.operator.name}"
     return {
         "prefix": PREFIX,

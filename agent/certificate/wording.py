@@ -49,6 +49,8 @@ def before_results(c: Certificate, signature: str) -> Iterator[Section]:
         ("reference", f"{r.name}: {r.manufacturer} {r.model}, serial number {r.serial_number}"),
         ("traceability", f"certificate {r.certificate_number} of {r.certificate_issuer}, {r.calibrated}"),
         ("its file", _file(c.reference_file) if c.reference_file else "not given"),
+        *([("its error", "all results of this reference share it; certificate.json has the derivatives by it")]
+          if c.result.fields.get("shared_errors") else []),
     ])  # fmt: skip
     yield Section("Method and conditions", list(_conditions(c)))
 

@@ -54,6 +54,9 @@ _U = Finite(0)
     "--u-offset-position-mps2", type=_U, default=0.0, show_default=True, help="u of the offset, for each position."
 )
 @click.option("--u-reference-pct", type=_U, default=0.1, show_default=True, help="u of the reference's sensitivity.")
+@click.option("--reference-certificate", type=_FILE, metavar="FILE",
+              help="The reference's certificate (TOML with [certificate], or JSON or DCC of `fieldcal certificate`). "
+              "Its u counts in the place of --u-reference-pct.")  # fmt: skip
 @click.option(
     "--u-transverse-motion-pct",
     type=_U,

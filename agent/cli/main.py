@@ -30,6 +30,7 @@ COMMANDS = {
     "show": ("agent.cli.show", "Show the calibration in force, status and history of a data directory."),
     "report": ("agent.cli.report", "Make figures and a one-page report of a calibration."),
     "certificate": ("agent.cli.certificate", "Make a calibration certificate: PDF, HTML, DCC XML and JSON."),
+    "recall": ("agent.cli.recall", "Correct the results of a reference by its new certificate."),
     "sensors": ("agent.cli.sensors", "List the drivers with their options."),
     "new-driver": ("agent.cli.new_driver", "Write the skeleton of a driver package, with the contract test."),
     "probe": ("agent.cli.probe", "Find and self-test the devices on this machine's buses and ports."),

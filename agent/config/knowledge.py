@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterable
 from datetime import UTC, date, datetime, timedelta
 from functools import reduce
 from typing import Annotated
 
+import msgspec
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
@@ -116,6 +118,12 @@ class Certificate(Section):
     def date(self) -> datetime | None:
         """The date `calibrated`, midnight UTC; None where it is not stated."""
         return datetime.fromisoformat(self.calibrated).replace(tzinfo=UTC) if self.calibrated else None
+
+    @property
+    def sha256(self) -> str:
+        """SHA-256 of what is stated: the JSON of all fields that have not their default, by name, without blanks."""
+        stated = self.model_dump(mode="json", exclude_defaults=True)
+        return hashlib.sha256(msgspec.json.encode(stated, order="deterministic")).hexdigest()
 
     def overdue(self, now: datetime) -> str:
         """Why the certificate does not hold at `now`, with the remedy; "" if it holds or states no date."""

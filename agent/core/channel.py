@@ -22,7 +22,7 @@ from agent.core.references import References
 from agent.core.run_time import RunTime
 from agent.core.streams import Streams, Verdict
 from agent.core.windows import refused
-from calib.model import Pose, Window
+from calib.model import Calibration, Pose, Window
 from hw.block import SampleBlock
 
 REFUSED_IN_A_ROW = 3
@@ -255,8 +255,7 @@ class ChannelState:
         for drift in judged.drift:
             yield drift_report(source, drift, self._channel.drift.false_alarms_a_year, origin_utc_ns)
         if decision.proposal is not None:
-            update = calibration_update(source, decision.proposal, self._estimation.recursion)
-            yield estimate(source, decision.reason, update)
+            yield estimate(source, decision.reason, self._update(decision.proposal))
         if decision.in_force:
             yield self._put_in_force()
         yield from self._say_status(decision.reason)
@@ -265,9 +264,14 @@ class ChannelState:
         """The update that puts the estimation's calibration in force. `earlier` is the update that made this
         calibration, if it was made before."""
         assert self._estimation is not None
-        update = calibration_update(self._source(), self._estimation.in_force, self._estimation.recursion)
+        update = self._update(self._estimation.in_force)
         self._in_force = update if earlier is None else again(update, earlier)
         return self._in_force
+
+    def _update(self, calibration: Calibration) -> CalibrationUpdate:
+        assert self._estimation is not None
+        state, made_by = self._estimation.recursion, self._estimation.maker_of(calibration)
+        return calibration_update(self._source(), calibration, state, made_by, self._references.certificate_of)
 
     def number(self, results: Sequence[Result]) -> None:
         """Take the numbers that the results got, so that the calibration in force and waiting estimates have theirs."""

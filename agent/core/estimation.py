@@ -62,9 +62,8 @@ class Estimation:
         """
         self._channel = channel
         self._beside, self._place = channel.by_reference, 0
-        mean = channel.prior.mean(nominal)
+        mean, fixed = channel.prior.mean(nominal), channel.fixed_mount
         u = channel.prior.standard_uncertainty(mean)
-        fixed = channel.fixed_mount
         priors, *check = (beside.priors(fixed_mount=fixed) for beside in self._beside)
         walks, temperature = channel.wander(), channel.temperature_model()
         self.recursion = Recursion(mean, u, priors, walks, temperature, fixed=fixed, check=check)
@@ -154,8 +153,7 @@ class Estimation:
             tried = Tried(window.sums, summary, *self.recursion.with_window(summary, at_its_lag=True))
         self._tried = None
         summary, innovation, trial = tried.summary, tried.innovation, tried.after
-        candidate = trial.result()
-        confirm = self._channel.gate.confirm_windows
+        candidate, confirm = trial.result(), self._channel.gate.confirm_windows
         held = [*self._held, summary][-confirm:]
         agree = len(held) == confirm and not self.lag_watch.beyond
         stability = self._beside[self._place].certificate.stability_pct / 100.0
@@ -220,11 +218,15 @@ class Estimation:
         summary = self._summary(window, day, lag_s, temperature_degc)
         return Tried(window.sums, summary, *self.recursion.with_window(summary))
 
+    def maker_of(self, calibration: Calibration) -> Recursion:
+        """The state that made a proposal; that of the estimation for what is no proposal."""
+        same = (r for c, r in self._proposed if np.array_equal(c.covariance, calibration.covariance))
+        return next(same, self.recursion)
+
     def accept(self, calibration: Calibration) -> None:
         """An operator put a proposal in force. The state continues from the one that made the proposal."""
-        proposed = next((r for c, r in self._proposed if np.array_equal(c.covariance, calibration.covariance)), None)
-        if proposed is not None:  # else the state has taken the windows of the proposal already
-            self.recursion = proposed
+        if (proposed := self.maker_of(calibration)) is not self.recursion:
+            self.recursion = proposed  # else the state has taken the windows of the proposal already
             self.use(self._place)
             self.drift.restart(np.ones(12, dtype=bool))
         self._put_in_force(calibration)

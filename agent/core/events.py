@@ -150,6 +150,37 @@ class SteadySensitivity(msgspec.Struct, frozen=True, kw_only=True):
     standard_uncertainty: list[list[float]] = []
 
 
+class SharedError(msgspec.Struct, frozen=True, kw_only=True):
+    """What S and Q owe to the errors of one reference, which all results of this reference share.
+
+    `serial_number` and `certificate_sha256` (of the stated certificate) are "" where they are not known. `unknowns`
+    are n errors of the reference; each entered with the mean `stated` and the standard uncertainty `u_stated` once, and
+    `value` is its estimate. A row of `derivative` (n, 12) has the derivatives of S row by row and Q by one of `stated`,
+    a row of `own_derivative` (n, n) those of `value`.
+    """
+
+    reference: str
+    serial_number: str
+    certificate_sha256: str
+    sensitivity: list[float]  # by the certificate, indication per SI unit: one, or one for each channel
+    unknowns: list[str]
+    kinds: list[str]
+    stated: list[float]
+    u_stated: list[float]
+    value: list[float]
+    own_derivative: list[list[float]]
+    derivative: list[list[float]]
+
+    @property
+    def has_its_shapes(self) -> bool:
+        """Whether the lists have the lengths that `unknowns` says."""
+        n, lists = len(self.unknowns), (self.kinds, self.stated, self.u_stated, self.value, self.derivative)
+        rows = [len(row) for row in self.derivative] == [12] * n and [len(row) for row in self.own_derivative] == [
+            n
+        ] * n
+        return rows and all(len(values) == n for values in lists)
+
+
 class CalibrationUpdate(Result, frozen=True, kw_only=True):
     """S and Q that are in force from `t_utc_ns` on.
 
@@ -191,6 +222,7 @@ class CalibrationUpdate(Result, frozen=True, kw_only=True):
     valid_band_hz: list[float] = []  # [low, high]; empty where it is not known
     sensitivity_at_0hz: SteadySensitivity = msgspec.field(default_factory=SteadySensitivity)
     response: list[BandResponse] = []
+    shared_errors: list[SharedError] = []  # by reference; empty where they are not known, as in older results
     # If the calibration comes into force again, after a restart or by a rollback: the result that first put it in
     # force.
     made_run_id: str = ""

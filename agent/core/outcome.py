@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import msgspec
 import numpy as np
 
+from agent.config.knowledge import Certificate
 from agent.core.events import (
     BandResponse,
     CalibrationUpdate,
     DriftReport,
     Estimate,
+    SharedError,
     StatusChange,
     SteadySensitivity,
     WindowReport,
@@ -20,6 +23,7 @@ from agent.core.events import (
 from calib.estimate.drift import DriftVerdict
 from calib.estimate.quantities import MAIN_TEMPERATURE, RATES, offset_temperature
 from calib.estimate.recursion import Recursion
+from calib.estimate.reference_share import ReferenceShare
 from calib.estimate.response_told import ResponseTold
 from calib.model import Array, Calibration, Window
 
@@ -37,8 +41,19 @@ class Source:
     t_utc_ns: int
 
 
-def calibration_update(source: Source, calibration: Calibration, recursion: Recursion) -> CalibrationUpdate:
-    """S and Q with temperature coefficients, drift rates and the number of windows."""
+def calibration_update(
+    source: Source,
+    calibration: Calibration,
+    recursion: Recursion,
+    made_by: Recursion,
+    certificate_of: Callable[[str], Certificate | None],
+) -> CalibrationUpdate:
+    """S and Q with temperature coefficients, drift rates and the number of windows.
+
+    `made_by` is the state that made the calibration, where that is known: what S and Q owe to the references is stated
+    only if this state still has these S and Q. `certificate_of` a reference: None if it is not connected.
+    """
+    known = np.array_equal(made_by.result().covariance, calibration.covariance)
     powers = [k for k in range(1, MOST_TEMPERATURE_ORDER + 1) if offset_temperature(k)[0] in recursion.names]
     by_power = [_both(recursion, offset_temperature(k)) for k in powers]
     S_temperature = _both(recursion, MAIN_TEMPERATURE) if MAIN_TEMPERATURE[0] in recursion.names else ([], [])
@@ -57,7 +72,27 @@ def calibration_update(source: Source, calibration: Calibration, recursion: Recu
         sensitivity_temperature=S_temperature[0], u_sensitivity_temperature=S_temperature[1],
         offset_rate=rate, u_offset_rate=u_rate, references=[name for name in recursion.references if name],
         reference_frequency_hz=recursion.reference_frequency_hz, **_over_frequency(recursion.response_told),
+        shared_errors=_shared_errors(made_by, certificate_of) if known else [],
     )  # fmt: skip
+
+
+def shared_error(share: ReferenceShare, serial_number: str, certificate_sha256: str) -> SharedError:
+    """What S and Q owe to a reference, as results state it."""
+    return SharedError(
+        reference=share.reference, serial_number=serial_number, certificate_sha256=certificate_sha256,
+        sensitivity=share.sensitivity.tolist(), unknowns=list(share.unknowns), kinds=list(share.kinds),
+        stated=share.stated.tolist(), u_stated=share.u_stated.tolist(), value=share.value.tolist(),
+        own_derivative=share.own_derivative.T.tolist(), derivative=share.derivative.T.tolist(),
+    )  # fmt: skip
+
+
+def _shared_errors(recursion: Recursion, certificate_of: Callable[[str], Certificate | None]) -> list[SharedError]:
+    found = []
+    for share in recursion.shares:
+        certificate = certificate_of(share.reference)
+        told = ("", "") if certificate is None else (certificate.serial_number, certificate.sha256)
+        found.append(shared_error(share, *told))
+    return found
 
 
 def _over_frequency(told: ResponseTold | None) -> dict[str, Any]:
@@ -85,10 +120,13 @@ def _over_frequency(told: ResponseTold | None) -> dict[str, Any]:
 def again(update: CalibrationUpdate, before: CalibrationUpdate) -> CalibrationUpdate:
     """`update` for a calibration that comes into force again.
 
-    It keeps the identity and date that it has in `before`.
+    It keeps the identity, the date and the shared errors that it has in `before`.
     """
     run_id, sequence = before.made
-    return msgspec.structs.replace(update, made_run_id=run_id, made_sequence=sequence, made_utc_ns=before.date_utc_ns)
+    return msgspec.structs.replace(
+        update, made_run_id=run_id, made_sequence=sequence, made_utc_ns=before.date_utc_ns,
+        shared_errors=before.shared_errors,
+    )  # fmt: skip
 
 
 def calibration_of(update: CalibrationUpdate) -> Calibration:

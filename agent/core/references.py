@@ -6,8 +6,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from agent.config import Channel
+from agent.config.knowledge import Certificate
 from agent.core.estimation import Estimation
 from agent.core.identity import identity_of, not_certified
+from calib.estimate.recursion import DATED
 
 
 class References:
@@ -41,6 +43,15 @@ class References:
                 changed |= estimation.meet(self.identities[place], certificate.calibrated, certificate.sensitivity)
                 estimation.use(0)
         return changed
+
+    def certificate_of(self, reference: str) -> Certificate | None:
+        """The certificate of a reference by its name in a state; None if it is not connected."""
+        identity, _, calibrated = reference.partition(DATED)
+        for place, beside in enumerate(self._beside):
+            same_date = "" in (calibrated, beside.certificate.calibrated) or calibrated == beside.certificate.calibrated
+            if identity and identity == self.identities[place] and same_date:
+                return beside.certificate
+        return None
 
     def snapshot(self) -> dict[str, Any]:
         """State for `load`, bit-exact."""

@@ -109,5 +109,6 @@ def _has_its_shapes(calibration: CalibrationUpdate) -> bool:
     return (
         len(calibration.valid_band_hz) in (0, 2)
         and all(len(values) == n for values, n in lengths)
+        and all(shared.has_its_shapes for shared in calibration.shared_errors)
         and all(len(rows) == n and all(len(row) == n for row in rows) for rows, n in squares)
     )

@@ -264,7 +264,7 @@ class Window(_message.Message):
     def __init__(self, event_sequence: _Optional[int] = ..., run_id: _Optional[str] = ..., sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., start_s: _Optional[float] = ..., stop_s: _Optional[float] = ..., position: _Optional[str] = ..., used: _Optional[bool] = ..., reason: _Optional[str] = ..., points: _Optional[int] = ..., left_out: _Optional[int] = ..., numbers: _Optional[_Mapping[str, float]] = ..., fault: _Optional[str] = ..., signature: _Optional[bytes] = ...) -> None: ...
 
 class Calibration(_message.Message):
-    __slots__ = ("event_sequence", "run_id", "sequence", "sensor", "t_utc_ns", "sxx", "sxy", "sxz", "syx", "syy", "syz", "szx", "szy", "szz", "qx", "qy", "qz", "u_sxx", "u_sxy", "u_sxz", "u_syx", "u_syy", "u_syz", "u_szx", "u_szy", "u_szz", "u_qx", "u_qy", "u_qz", "coverage_factor", "residual_sd_x", "residual_sd_y", "residual_sd_z", "windows", "method", "uncertainty_kind", "output_unit", "identity", "determined", "covariance", "reference_temperature_degc", "temperature_low_degc", "temperature_high_degc", "offset_temperature", "u_offset_temperature", "sensitivity_temperature", "u_sensitivity_temperature", "offset_rate", "u_offset_rate", "made_run_id", "made_sequence", "made_utc_ns", "references", "reference_frequency_hz", "valid_band_hz", "sensitivity_at_0hz", "response", "signature")
+    __slots__ = ("event_sequence", "run_id", "sequence", "sensor", "t_utc_ns", "sxx", "sxy", "sxz", "syx", "syy", "syz", "szx", "szy", "szz", "qx", "qy", "qz", "u_sxx", "u_sxy", "u_sxz", "u_syx", "u_syy", "u_syz", "u_szx", "u_szy", "u_szz", "u_qx", "u_qy", "u_qz", "coverage_factor", "residual_sd_x", "residual_sd_y", "residual_sd_z", "windows", "method", "uncertainty_kind", "output_unit", "identity", "determined", "covariance", "reference_temperature_degc", "temperature_low_degc", "temperature_high_degc", "offset_temperature", "u_offset_temperature", "sensitivity_temperature", "u_sensitivity_temperature", "offset_rate", "u_offset_rate", "made_run_id", "made_sequence", "made_utc_ns", "references", "reference_frequency_hz", "valid_band_hz", "sensitivity_at_0hz", "response", "shared_errors", "signature")
     class Steady(_message.Message):
         __slots__ = ("sensitivity", "standard_uncertainty")
         SENSITIVITY_FIELD_NUMBER: _ClassVar[int]
@@ -285,6 +285,31 @@ class Calibration(_message.Message):
         sensitivity_im: _containers.RepeatedScalarFieldContainer[float]
         standard_uncertainty: _containers.RepeatedScalarFieldContainer[float]
         def __init__(self, low_hz: _Optional[float] = ..., high_hz: _Optional[float] = ..., sensitivity_re: _Optional[_Iterable[float]] = ..., sensitivity_im: _Optional[_Iterable[float]] = ..., standard_uncertainty: _Optional[_Iterable[float]] = ...) -> None: ...
+    class SharedError(_message.Message):
+        __slots__ = ("reference", "serial_number", "certificate_sha256", "sensitivity", "unknowns", "stated", "u_stated", "value", "own_derivative", "derivative", "kinds")
+        REFERENCE_FIELD_NUMBER: _ClassVar[int]
+        SERIAL_NUMBER_FIELD_NUMBER: _ClassVar[int]
+        CERTIFICATE_SHA256_FIELD_NUMBER: _ClassVar[int]
+        SENSITIVITY_FIELD_NUMBER: _ClassVar[int]
+        UNKNOWNS_FIELD_NUMBER: _ClassVar[int]
+        STATED_FIELD_NUMBER: _ClassVar[int]
+        U_STATED_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        OWN_DERIVATIVE_FIELD_NUMBER: _ClassVar[int]
+        DERIVATIVE_FIELD_NUMBER: _ClassVar[int]
+        KINDS_FIELD_NUMBER: _ClassVar[int]
+        reference: str
+        serial_number: str
+        certificate_sha256: str
+        sensitivity: _containers.RepeatedScalarFieldContainer[float]
+        unknowns: _containers.RepeatedScalarFieldContainer[str]
+        stated: _containers.RepeatedScalarFieldContainer[float]
+        u_stated: _containers.RepeatedScalarFieldContainer[float]
+        value: _containers.RepeatedScalarFieldContainer[float]
+        own_derivative: _containers.RepeatedScalarFieldContainer[float]
+        derivative: _containers.RepeatedScalarFieldContainer[float]
+        kinds: _containers.RepeatedScalarFieldContainer[str]
+        def __init__(self, reference: _Optional[str] = ..., serial_number: _Optional[str] = ..., certificate_sha256: _Optional[str] = ..., sensitivity: _Optional[_Iterable[float]] = ..., unknowns: _Optional[_Iterable[str]] = ..., stated: _Optional[_Iterable[float]] = ..., u_stated: _Optional[_Iterable[float]] = ..., value: _Optional[_Iterable[float]] = ..., own_derivative: _Optional[_Iterable[float]] = ..., derivative: _Optional[_Iterable[float]] = ..., kinds: _Optional[_Iterable[str]] = ...) -> None: ...
     EVENT_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     RUN_ID_FIELD_NUMBER: _ClassVar[int]
     SEQUENCE_FIELD_NUMBER: _ClassVar[int]
@@ -342,6 +367,7 @@ class Calibration(_message.Message):
     VALID_BAND_HZ_FIELD_NUMBER: _ClassVar[int]
     SENSITIVITY_AT_0HZ_FIELD_NUMBER: _ClassVar[int]
     RESPONSE_FIELD_NUMBER: _ClassVar[int]
+    SHARED_ERRORS_FIELD_NUMBER: _ClassVar[int]
     SIGNATURE_FIELD_NUMBER: _ClassVar[int]
     event_sequence: int
     run_id: str
@@ -400,8 +426,9 @@ class Calibration(_message.Message):
     valid_band_hz: _containers.RepeatedScalarFieldContainer[float]
     sensitivity_at_0hz: Calibration.Steady
     response: _containers.RepeatedCompositeFieldContainer[Calibration.Band]
+    shared_errors: _containers.RepeatedCompositeFieldContainer[Calibration.SharedError]
     signature: bytes
-    def __init__(self, event_sequence: _Optional[int] = ..., run_id: _Optional[str] = ..., sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., sxx: _Optional[float] = ..., sxy: _Optional[float] = ..., sxz: _Optional[float] = ..., syx: _Optional[float] = ..., syy: _Optional[float] = ..., syz: _Optional[float] = ..., szx: _Optional[float] = ..., szy: _Optional[float] = ..., szz: _Optional[float] = ..., qx: _Optional[float] = ..., qy: _Optional[float] = ..., qz: _Optional[float] = ..., u_sxx: _Optional[float] = ..., u_sxy: _Optional[float] = ..., u_sxz: _Optional[float] = ..., u_syx: _Optional[float] = ..., u_syy: _Optional[float] = ..., u_syz: _Optional[float] = ..., u_szx: _Optional[float] = ..., u_szy: _Optional[float] = ..., u_szz: _Optional[float] = ..., u_qx: _Optional[float] = ..., u_qy: _Optional[float] = ..., u_qz: _Optional[float] = ..., coverage_factor: _Optional[float] = ..., residual_sd_x: _Optional[float] = ..., residual_sd_y: _Optional[float] = ..., residual_sd_z: _Optional[float] = ..., windows: _Optional[int] = ..., method: _Optional[str] = ..., uncertainty_kind: _Optional[str] = ..., output_unit: _Optional[str] = ..., identity: _Optional[str] = ..., determined: _Optional[_Iterable[bool]] = ..., covariance: _Optional[_Iterable[float]] = ..., reference_temperature_degc: _Optional[float] = ..., temperature_low_degc: _Optional[float] = ..., temperature_high_degc: _Optional[float] = ..., offset_temperature: _Optional[_Iterable[float]] = ..., u_offset_temperature: _Optional[_Iterable[float]] = ..., sensitivity_temperature: _Optional[_Iterable[float]] = ..., u_sensitivity_temperature: _Optional[_Iterable[float]] = ..., offset_rate: _Optional[_Iterable[float]] = ..., u_offset_rate: _Optional[_Iterable[float]] = ..., made_run_id: _Optional[str] = ..., made_sequence: _Optional[int] = ..., made_utc_ns: _Optional[int] = ..., references: _Optional[_Iterable[str]] = ..., reference_frequency_hz: _Optional[float] = ..., valid_band_hz: _Optional[_Iterable[float]] = ..., sensitivity_at_0hz: _Optional[_Union[Calibration.Steady, _Mapping]] = ..., response: _Optional[_Iterable[_Union[Calibration.Band, _Mapping]]] = ..., signature: _Optional[bytes] = ...) -> None: ...
+    def __init__(self, event_sequence: _Optional[int] = ..., run_id: _Optional[str] = ..., sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., sxx: _Optional[float] = ..., sxy: _Optional[float] = ..., sxz: _Optional[float] = ..., syx: _Optional[float] = ..., syy: _Optional[float] = ..., syz: _Optional[float] = ..., szx: _Optional[float] = ..., szy: _Optional[float] = ..., szz: _Optional[float] = ..., qx: _Optional[float] = ..., qy: _Optional[float] = ..., qz: _Optional[float] = ..., u_sxx: _Optional[float] = ..., u_sxy: _Optional[float] = ..., u_sxz: _Optional[float] = ..., u_syx: _Optional[float] = ..., u_syy: _Optional[float] = ..., u_syz: _Optional[float] = ..., u_szx: _Optional[float] = ..., u_szy: _Optional[float] = ..., u_szz: _Optional[float] = ..., u_qx: _Optional[float] = ..., u_qy: _Optional[float] = ..., u_qz: _Optional[float] = ..., coverage_factor: _Optional[float] = ..., residual_sd_x: _Optional[float] = ..., residual_sd_y: _Optional[float] = ..., residual_sd_z: _Optional[float] = ..., windows: _Optional[int] = ..., method: _Optional[str] = ..., uncertainty_kind: _Optional[str] = ..., output_unit: _Optional[str] = ..., identity: _Optional[str] = ..., determined: _Optional[_Iterable[bool]] = ..., covariance: _Optional[_Iterable[float]] = ..., reference_temperature_degc: _Optional[float] = ..., temperature_low_degc: _Optional[float] = ..., temperature_high_degc: _Optional[float] = ..., offset_temperature: _Optional[_Iterable[float]] = ..., u_offset_temperature: _Optional[_Iterable[float]] = ..., sensitivity_temperature: _Optional[_Iterable[float]] = ..., u_sensitivity_temperature: _Optional[_Iterable[float]] = ..., offset_rate: _Optional[_Iterable[float]] = ..., u_offset_rate: _Optional[_Iterable[float]] = ..., made_run_id: _Optional[str] = ..., made_sequence: _Optional[int] = ..., made_utc_ns: _Optional[int] = ..., references: _Optional[_Iterable[str]] = ..., reference_frequency_hz: _Optional[float] = ..., valid_band_hz: _Optional[_Iterable[float]] = ..., sensitivity_at_0hz: _Optional[_Union[Calibration.Steady, _Mapping]] = ..., response: _Optional[_Iterable[_Union[Calibration.Band, _Mapping]]] = ..., shared_errors: _Optional[_Iterable[_Union[Calibration.SharedError, _Mapping]]] = ..., signature: _Optional[bytes] = ...) -> None: ...
 
 class Status(_message.Message):
     __slots__ = ("event_sequence", "run_id", "sequence", "sensor", "t_utc_ns", "status", "before", "reason", "signature")

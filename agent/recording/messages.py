@@ -27,6 +27,7 @@ from agent.core.events import (
     Pruned,
     Result,
     RunStart,
+    SharedError,
     Tick,
 )
 from agent.proto import fieldcal_pb2 as pb
@@ -51,6 +52,8 @@ _S_AND_Q = [name.lower() for name in PARAMETERS]
 _U = [f"u_{name}" for name in _S_AND_Q]
 _BY_POWER = ["offset_temperature", "u_offset_temperature"]
 _BY_AXIS = ["sensitivity_temperature", "u_sensitivity_temperature", "offset_rate", "u_offset_rate"]
+_BY_UNKNOWN = ["derivative", "own_derivative"]
+_LISTS = ["sensitivity", "unknowns", "kinds", "stated", "u_stated", "value"]
 _RESIDUALS = ["residual_sd_x", "residual_sd_y", "residual_sd_z"]
 
 
@@ -182,6 +185,7 @@ def _calibration_message(event_sequence: int, update: CalibrationUpdate) -> pb.C
     values |= {name: np.ravel(values[name]) for name in _BY_POWER}
     values["sensitivity_at_0hz"] = pb.Calibration.Steady(**_flat(values["sensitivity_at_0hz"]))
     values["response"] = [pb.Calibration.Band(**_flat(band)) for band in values["response"]]
+    values["shared_errors"] = [_shared_message(error) for error in values["shared_errors"]]
     return pb.Calibration(event_sequence=event_sequence, covariance=covariance.ravel(), **values)
 
 
@@ -196,6 +200,7 @@ def _decode_calibration(data: bytes) -> tuple[int, Result]:
     values |= {name: np.reshape(values[name], (-1, 3)).tolist() for name in _BY_POWER}
     values |= {name: list(values[name]) for name in ("determined", "references", "valid_band_hz", *_BY_AXIS)}
     values["response"] = [_square(band) for band in values["response"]]
+    values["shared_errors"] = [_shared_values(error) for error in values["shared_errors"]]
     if "sensitivity_at_0hz" in values:
         values["sensitivity_at_0hz"] = _square(values["sensitivity_at_0hz"])
     return values.pop("event_sequence"), msgspec.convert(values, CalibrationUpdate)
@@ -213,6 +218,17 @@ def _square(part: Message) -> dict[str, Any]:
         name: value if isinstance(value, float) else np.reshape(value, (-1, 3)).tolist()
         for name, value in _values(part).items()
     }
+
+
+def _shared_message(error: SharedError) -> pb.Calibration.SharedError:
+    values = msgspec.structs.asdict(error)
+    return pb.Calibration.SharedError(**values | {name: np.ravel(values[name]) for name in _BY_UNKNOWN})
+
+
+def _shared_values(error: Message) -> dict[str, Any]:
+    values = {name: list(value) if name in _LISTS else value for name, value in _values(error).items()}
+    n = len(values["unknowns"])
+    return values | {name: np.reshape(values[name], (n, -1 if n else 0)).tolist() for name in _BY_UNKNOWN}
 
 
 def _estimate_message(event_sequence: int, estimate: Estimate) -> pb.Estimate:

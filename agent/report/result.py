@@ -23,6 +23,7 @@ SHOWN = frozenset(
     {
         "sensitivity", "offset", "standard_uncertainty", "expanded_uncertainty", "covariance", "determined",
         "degrees_of_freedom", "nuisances", "budget", "status", "reasons", "windows", "statistics", "options", "files",
+        "shared_errors",
     }
 )  # fmt: skip
 
@@ -152,6 +153,7 @@ def from_update(
         "sensor": update.sensor,
         "windows_in_solution": update.windows,
         "residual_sd": update.residual_sd,
+        "shared_errors": [msgspec.structs.asdict(error) for error in update.shared_errors],
         "run_id": update.made[0],
         "sequence": update.made[1],
     }

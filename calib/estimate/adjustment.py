@@ -21,6 +21,7 @@ from calib.estimate.fixed_mount import mean_input, never_turned
 from calib.estimate.gauss_newton import Solution, slope_residuals, solve
 from calib.estimate.nuisances import Applied, Nuisances, Priors
 from calib.estimate.quantities import LAG, RESPONSE, Kind
+from calib.estimate.reference_share import ReferenceShare, share_after
 from calib.estimate.response_told import ResponseTold, response_told, told_at_one_frequency
 from calib.estimate.slope_scatter import SlopeScatter, estimated
 from calib.estimate.verdict import misfit, nuisance_pull, reasons, turned_windows
@@ -54,7 +55,7 @@ class Adjustment:
     most. `offset_scatter_mps2`, `slope_scatter` (relative) and `lag_scatter_s`: between windows, as estimated.
     `misfit`: what S a + Q leaves of the signal. `nuisance_pull`: how far the nuisances moved from what was stated, in
     standard deviations, worst direction. `mean` (N,) and `covariance` (N, N): joint state of [S, Q, nuisances], nothing
-    blanked. `response`: over frequency; None where it is no unknown.
+    blanked. `response`: over frequency; None where it is no unknown. `share`: what S and Q owe to the reference.
     """
 
     calibration: Calibration
@@ -73,6 +74,7 @@ class Adjustment:
     mean: Array
     covariance: Array
     response: ResponseTold | None
+    share: ReferenceShare | None
 
     @property
     def expanded_uncertainty(self) -> Array:
@@ -153,6 +155,7 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
         mean=solution.x,
         covariance=shares.covariance,
         response=_response(solution, shares.covariance, priors, used, k),
+        share=share_after(solution),
     )
 
 

@@ -128,12 +128,6 @@ class Recursion(WindowState):
         mean, factor = self._parameters_factor()
         return mean, np.asarray(factor @ factor.T)
 
-    def _parameters_factor(self) -> tuple[Array, Array]:
-        state, factor = self._joint.state, self._over.factor(self._joint.state)
-        if self._held is not None:
-            return self._held.parameters(state, factor)
-        return state.mean[:12].copy(), factor[:12].copy()
-
     def law(self, day: float | None = None) -> Law:
         """S and Q over temperature, with all that their covariance knows of each other; `day`: wandered on until it."""
         if day is not None:

@@ -28,6 +28,7 @@ from calib.estimate.joint_state import JointState, gain_of
 from calib.estimate.linearised import Linearised
 from calib.estimate.nuisances import Priors
 from calib.estimate.over_frequency import OverFrequency, changed
+from calib.estimate.reference_share import ReferenceShare, share_in
 from calib.estimate.wander import TemperatureModel, Wander, wandered
 from calib.estimate.window_rows import Noise, Summary, WindowRows
 from calib.model import Array
@@ -83,6 +84,19 @@ class WindowState:
     def reference(self) -> str:
         """The reference in use: that of the next windows."""
         return self._mounted[self._place]
+
+    def _parameters_factor(self) -> tuple[Array, Array]:
+        """S and Q (12,) and a factor of their covariance."""
+        state, factor = self._joint.state, self._over.factor(self._joint.state)
+        if self._held is not None:
+            return self._held.parameters(state, factor)
+        return state.mean[:12].copy(), factor[:12].copy()
+
+    @property
+    def shares(self) -> list[ReferenceShare]:
+        """What S and Q owe to the errors of each reference; that of the newest window is the last."""
+        state, (_, factor) = self._joint.state, self._parameters_factor()
+        return [share_in(state, factor, *reference) for reference in self._references.items()]
 
     def settled(self) -> Self:
         """A copy in which all windows are in the base: it holds no summary of a window."""

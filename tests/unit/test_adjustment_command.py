@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
 
@@ -215,3 +216,17 @@ def test_a_parameter_that_the_prior_tells_has_its_posterior_and_a_star(session, 
     (row,) = [line for line in result.stdout.splitlines() if line.strip().startswith("x ")]
     assert row.split()[4] == "*", row
     assert "* known before: the data do not halve its uncertainty" in result.stdout
+
+
+def test_the_certificate_of_the_reference_is_in_the_result_and_tells_its_u(session: Path, tmp_path: Path) -> None:
+    certificate = tmp_path / "reference.toml"
+    certificate.write_text('[certificate]\nserial_number = "R-9"\nsensitivity = 10.2\nu_sensitivity_pct = 0.3\n')
+    result = _run(session, "--reference-certificate", str(certificate), "--json", "-")
+    assert result.return_value == 0, result.output
+    told = json.loads(result.stdout)
+    (shared,) = told["shared_errors"]
+    assert (shared["serial_number"], shared["sensitivity"], shared["u_stated"]) == ("R-9", [10.2], [0.003])
+    assert shared["certificate_sha256"] == hashlib.sha256(certificate.read_bytes()).hexdigest()
+    assert told["files"][-1]["sha256"] == shared["certificate_sha256"]
+    # It would be S if nothing but the reference told S; gravity tells a part of it.
+    assert 0.2 * told["sensitivity"][0][0] < shared["derivative"][0][0] < told["sensitivity"][0][0]

@@ -214,10 +214,11 @@ def test_the_graph_leads_from_the_certificate_to_the_files_and_the_reference(tmp
     [result] = sources[f"fieldcal:certificate/Structures Laboratory/{held['number']}"]
     canonical = msgspec.json.encode(held["result"])
     assert result == f"sha256:{hashlib.sha256(canonical).hexdigest()}"
-    assert len(sources[result]) == 2
+    reference = "fieldcal:instrument/PCB/393B12/LW-1234"
+    assert len(sources[result]) == 3
     file = f"sha256:{hashlib.sha256(path.read_bytes()).hexdigest()}"
-    assert {source for window in sources[result] for source in sources[window]} == {file}
-    assert sources["fieldcal:instrument/PCB/393B12/LW-1234"] == {"fieldcal:certificate/Accredited Laboratory/2026-0815"}
+    assert {source for window in sources[result] - {reference} for source in sources[window]} == {file}
+    assert sources[reference] == {"fieldcal:certificate/Accredited Laboratory/2026-0815"}
 
 
 def test_what_is_not_known_is_left_out(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -32,7 +32,8 @@ def channel(*stances: dict[str, Any], **more: Any) -> Channel:
 def state_of(made_with: Channel) -> bytes:
     """A state with a calibration in force."""
     estimation = Estimation(made_with, None)
-    in_force = calibration_update(Source("s", "A", "m/s2", 5), estimation.in_force, estimation.recursion)
+    state = estimation.recursion
+    in_force = calibration_update(Source("s", "A", "m/s2", 5), estimation.in_force, state, state, lambda _: None)
     return keep(made_with, estimation, in_force, 0.0, 5)
 
 

@@ -1,0 +1,79 @@
+"""Reads the certificate of a reference: TOML as in a configuration, or a certificate of `fieldcal certificate`."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import numpy as np
+
+from agent.calibrate.earlier import DCC, read_earlier
+from agent.calibrate.origin import source_file
+from agent.config.files import read_file
+from agent.config.knowledge import Certificate
+from agent.config.reading import ConfigError, load_model
+from agent.config.section import Section
+from agent.reading.source import TableError
+from calib.model import Array
+
+MAIN = [0, 4, 8]
+LARGEST = 64 << 20  # bytes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReferenceCertificate:
+    """What it states. `sensitivity` and its relative standard uncertainty `u_relative`: (1,), or (3,) by channel, as
+    indication per SI unit. `corner_hz`: of an AC-coupled reference, with its u; None where it is not stated. `sha256`
+    of the file."""
+
+    path: str
+    sha256: str
+    serial_number: str
+    sensitivity: Array
+    u_relative: Array
+    corner_hz: tuple[float, float] | None = None
+
+
+class _Toml(Section):
+    certificate: Certificate
+
+
+def read_reference_certificate(path: Path) -> ReferenceCertificate:
+    """Read it. Raises TableError."""
+    try:
+        sha256 = source_file(path).sha256
+        if path.suffix != ".toml":
+            return _of_ours(path, sha256)
+        stated = load_model(path, _Toml).certificate
+    except ConfigError as error:
+        raise TableError(str(error)) from None
+    except OSError as error:
+        raise TableError(f"{path}: {error.strerror or error}") from None
+    return ReferenceCertificate(
+        str(path),
+        sha256,
+        stated.serial_number,
+        np.array([stated.sensitivity]),
+        np.array([stated.u_sensitivity_pct / 100.0]),
+        (stated.corner_hz, stated.u_corner_hz) if stated.u_corner_hz else None,
+    )
+
+
+def _of_ours(path: Path, sha256: str) -> ReferenceCertificate:
+    """A certificate by `fieldcal certificate`, of the main sensitivities of a tri-axial reference."""
+    values, covariance = read_earlier(path)
+    sensitivity, variance = values[MAIN], np.diag(covariance)[MAIN]
+    if not np.isfinite([sensitivity, variance]).all() or (sensitivity <= 0.0).any():
+        raise TableError(f"{path}: a main sensitivity of the reference is not known or not above 0")
+    return ReferenceCertificate(str(path), sha256, _serial_number(path), sensitivity, np.sqrt(variance) / sensitivity)
+
+
+def _serial_number(path: Path) -> str:
+    """The serial number of the calibrated instrument; "" in the JSON of a result. After `read_earlier`."""
+    data = read_file(path, LARGEST)
+    if data.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<"):
+        where = f".//{{{DCC}}}item/{{{DCC}}}identifications/{{{DCC}}}identification/{{{DCC}}}value"
+        return ET.fromstring(data).findtext(where) or ""
+    return str(json.loads(data).get("certificate", {}).get("stated", {}).get("instrument", {}).get("serial_number", ""))
