@@ -106,9 +106,9 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
         priors = _without_offset(priors)
     found = [excited(w) for w in used]
     plain = not any(priors.values.values())  # with every nuisance fixed it is Method 3: all points weigh the same
-    windows, one_frequency = [e.window for e in found], priors.response_terms == 1.0
+    one_frequency = priors.response_terms == 1.0
     to_hz = np.inf if one_frequency else priors.response_hz
-    data = condense(windows, alike=plain, response_hz=to_hz, one_frequency=one_frequency)
+    data = condense([e.window for e in found], alike=plain, response_hz=to_hz, one_frequency=one_frequency)
     if not plain:
         data = effective(data, np.array([w.independent for w in used]))
     u_lag_s = [max(w.u_lag_s, priors.lag_window_s) if priors.lag_s > 0.0 else 0.0 for w in used]

@@ -92,7 +92,7 @@ class Priors(Stated):
         most = min(0.5 * (2.0 * np.pi * motion_hz * late_s) ** 2, MOST_ATTENUATED)
         attenuated = 0.5 * most * float(np.sign(late_s))  # a reference that comes late is the one that attenuates
         told = {
-            "response": 2.0 * float(np.hypot(0.5 * most, ATTENUATED_U)), "response_at": 2.0 * attenuated,
+            "response": float(np.hypot(0.5 * most, ATTENUATED_U)), "response_at": attenuated,
             "response_terms": 1.0, "response_hz": motion_hz,
             "reference_frequency_hz": self.reference_frequency_hz or motion_hz,
         }  # fmt: skip

@@ -15,7 +15,7 @@ from calib.estimate.nuisances import Priors
 from calib.estimate.quantities import RESPONSE, Quantity
 from calib.estimate.response_told import ResponseTold, response_told, told_at_one_frequency
 from calib.model import Array
-from calib.signal.response import FLAT, NEAR, POWERS, Complex, Response, by_term, in_units
+from calib.signal.response import FLAT, NEAR, POWERS, Complex, Response, attenuating, by_term, in_units
 
 WIDER = 1.1  # later windows may move so much faster than the first one
 KNOWN = 0.03  # standard uncertainty of ln h
@@ -138,7 +138,7 @@ class OverFrequency:
         if self.motion_hz is not None:
             return terms_of(state, reference), in_units(self.to_hz)
         own = attenuation_of(state, reference)
-        return own, in_units(self.first_hz) if own else np.zeros(len(POWERS))
+        return own, attenuating(self.first_hz) if own else np.zeros(len(POWERS))
 
     def _told_at_one_frequency(
         self, state: JointState, reference: str, priors: Priors, coverage_factor: float
@@ -146,7 +146,7 @@ class OverFrequency:
         own = attenuation_of(state, reference)
         if not own:
             return None
-        chosen, effects = [*range(9), *own], in_units(self.first_hz) * np.eye(1, len(POWERS))
+        chosen, effects = [*range(9), *own], attenuating(self.first_hz)[None]
         factor, hz = self.factor(state)[chosen], self.stated(priors).reference_frequency_hz
         band_hz = (self.first_hz, self.first_hz)
         return told_at_one_frequency(state.mean[chosen], factor @ factor.T, effects, hz, band_hz, coverage_factor)

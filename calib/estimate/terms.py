@@ -16,7 +16,7 @@ import numpy as np
 from calib.estimate import quantities as kinds
 from calib.estimate.quantities import Kind, Quantity, Stated
 from calib.model import Array, Pose, own_channels
-from calib.signal.response import POWERS, in_units
+from calib.signal.response import POWERS, attenuating, in_units
 
 PARALLEL = 1e-3  # rad; if motion and gravity are parallel within this angle, there is no horizontal normal
 AXES = "xyz"
@@ -124,9 +124,10 @@ def _terms(
     for name, k in zip(_axes("lag"), np.eye(3), strict=True):
         yield _term(name, kinds.LAG_OF_AXIS, priors, owner=reference, lag=k)
     if priors.response > 0.0:
-        units = in_units(priors.response_hz)[: int(priors.response_terms)].tolist()
-        names = ["attenuation"] if len(units) == 1 else [f"response_{power}" for power in POWERS]
-        for n, (name, unit) in enumerate(zip(names, units, strict=True)):
+        names, units = [f"response_{power}" for power in POWERS], in_units(priors.response_hz)
+        if priors.response_terms == 1.0:
+            names, units = ["attenuation"], attenuating(priors.response_hz)[:1]  # -ln |h| at the one frequency
+        for n, (name, unit) in enumerate(zip(names, units.tolist(), strict=True)):
             taken = {kinds.RESPONSE: [applied[kinds.RESPONSE][n] / unit]}
             term = unit * np.eye(len(POWERS))[n]
             yield _term(name, kinds.RESPONSE, priors, taken, reference, response=term)

@@ -79,6 +79,11 @@ def in_units(to_hz: float) -> Array:
     return np.array([1.0 / (k * (2.0 * np.pi * to_hz) ** k) for k in POWERS])
 
 
+def attenuating(frequency_hz: float) -> Array:
+    """(5,) the terms of a response that attenuates by a factor of e at this frequency: that in s^2 alone."""
+    return np.asarray(np.eye(1, len(POWERS))[0] / (2.0 * np.pi * frequency_hz) ** 2)
+
+
 def by_term(omega: Array) -> Complex:
     """(i omega)^k (..., 5) for angular frequencies (...,): the derivatives of ln h by the terms."""
     return np.stack([(1j * omega) ** k for k in POWERS], axis=-1)

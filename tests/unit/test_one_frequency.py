@@ -95,3 +95,11 @@ def test_the_agent_is_right_at_that_frequency_as_well(seed: int) -> None:
     assert np.sqrt(np.diag(np.array(update.covariance)))[[0, 4, 8]].max() < 0.015 * COUNTS_PER_MPS2
     assert update.reference_frequency_hz == pytest.approx(6.0, rel=0.01)
     assert update.valid_band_hz[0] < 6.0 < update.valid_band_hz[1]
+
+
+def test_the_attenuation_is_told_as_such() -> None:
+    """The paper's bench with exact angles: a filter of first order at 31 Hz attenuates 3 Hz by 0.47 %."""
+    outcome = calibrated(bench(3.0, lowpass_hz=31.0), 2, stated())
+    told = next(nuisance for nuisance in outcome.nuisances if nuisance.name == "attenuation")
+    assert told.value == pytest.approx(0.00467, abs=3.0 * told.standard_uncertainty)
+    assert told.standard_uncertainty < 2e-4
