@@ -22,7 +22,7 @@ import numpy as np
 from agent.calibrate.adjusting import adjusted
 from benchmarks.page import machine, write_part
 from calib.estimate.nuisances import Priors
-from tests.pair import Filter, lowpass, moving_mean, pair, resonance
+from tests.pair import Filter, decimator, lowpass, moving_mean, pair, resonance, sinc3
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "response.md"
 U_REFERENCE = 1e-3
@@ -33,6 +33,8 @@ FILTERS: dict[str, Callable[[float], Filter]] = {
     "low-pass, order 2": lambda f: lowpass(2, f),
     "low-pass, order 4": lambda f: lowpass(4, f),
     "moving mean": lambda f: moving_mean(0.443 / f),  # 3 dB down at f
+    "sinc3": lambda f: sinc3(0.2625 / f),
+    "FIR decimator": decimator,
     "resonance, Q 5": lambda f: resonance(f, 5.0),
     "resonance, Q 50": lambda f: resonance(f, 50.0),
 }

@@ -18,7 +18,7 @@ from agent.calibrate.tables import SensorTable
 from agent.core.outcome import shared_error
 from calib.estimate.adjustment import Adjustment, adjust
 from calib.estimate.condense import condense, mean_frequency_hz
-from calib.estimate.lag_search import starts, without_lag
+from calib.estimate.lag_search import correlated_lag_s, largest_omega, without_lag
 from calib.estimate.norm_fit import norm_fit
 from calib.estimate.nuisances import Applied, Priors
 from calib.estimate.reference_share import ReferenceShare
@@ -30,7 +30,7 @@ from calib.signal.response import UNSETTLED
 from calib.signal.stamps import clock_from_stamps
 
 METHOD = "3 (adjustment)"
-LAG_SD = 3.0  # how far a lag is searched, in its stated standard uncertainties
+LAG_SD, LAG_PERIODS = 3.0, 3.0  # how far a lag is searched: stated standard uncertainties, periods of the motion
 LEAST_USED = 0.05  # of the points in motion
 RESPONSE_TURNS = 6
 HOPELESS = 2  # turns after which a refusal no longer comes from the response that is not yet taken out
@@ -50,43 +50,72 @@ def adjusted(files: Files, priors: Priors, certificate: ReferenceCertificate | N
 
 def _adjusted(files: Files, priors: Priors) -> tuple[Outcome, ReferenceShare | None]:
     """Make windows with the lag and the response over frequency taken out, and adjust them."""
-    applied = Applied(0.0, priors.reference_corner_at_hz, priors.sensor_corner_at_hz)
-    stated = priors  # later with the response, whose scale is that of the motion
-    latest: dict[Applied, Adjustment] = {}
-
-    def at(windows: Sequence[Window], taken: Applied) -> Adjustment:
-        nonlocal stated
-        if not stated.response and (told := with_response(priors, windows)).response:
-            stated = told
-            latest.clear()
-        if taken not in latest:
-            latest.clear()
-            latest[taken] = adjust(_used(windows), stated, taken)
-        return latest[taken]
-
-    def lag_of(taken: Applied, made: Sequence[Window], lag_s: float) -> float:
-        return at(made, replace(taken, lag_s=lag_s)).lag_s or 0.0
-
+    search = _Search(files, priors)
+    applied, judged = search.begun()
+    windows = judged
     for turn in range(RESPONSE_TURNS):
-        make = partial(files.windows, response=applied.response)
-        windows, lag_s = without_lag(applied.lag_s, make, _used, partial(lag_of, applied))
-        if turn == 0 and not _used(windows):
-            lag_s = _usable_lag_s(files, priors, windows)
-            windows, lag_s = without_lag(lag_s, make, _used, partial(lag_of, applied))
+        if turn or not _used(judged):
+            windows, applied = search.without_lag(applied)
         if not _used(windows):
             break
-        found = at(windows, replace(applied, lag_s=lag_s))
-        if not stated.response:
-            found = _attenuated(found, windows, priors, replace(applied, lag_s=lag_s))
+        found = search.at(windows, applied)
+        if not search.stated.response:
+            found = _attenuated(found, windows, priors, applied)
             return _outcome(found, windows, files.rate_hz), found.share
         if found.response is None or found.response.terms.is_near(applied.response):
             return _outcome(found, windows, files.rate_hz), found.share
         if found.reasons and turn >= HOPELESS:
             return _outcome(found, windows, files.rate_hz), found.share
-        applied = replace(applied, lag_s=lag_s, response=found.response.terms.modest)
-    if applied.response.is_flat:
-        return nothing_used(windows, files.rate_hz, METHOD), None
+        applied = replace(applied, response=found.response.terms.modest)
+    if not _used(windows) and not _used(judged):
+        return nothing_used(judged, files.rate_hz, METHOD), None
     return Outcome(None, (UNSETTLED,), windows, files.rate_hz, METHOD), None
+
+
+class _Search:
+    """Adjustments of the windows of files from which a lag and a response are taken out.
+
+    `stated` are the priors, later with those of the response, whose scale is that of the motion.
+    """
+
+    def __init__(self, files: Files, priors: Priors) -> None:
+        self._files, self._priors = files, priors
+        self.stated = priors
+        self._latest: tuple[Sequence[Window], Applied, Adjustment] | None = None
+
+    def begun(self) -> tuple[Applied, list[Window]]:
+        """What the search begins with, and the windows as judged there.
+
+        If none can be used the sensor may be far too late, or a response may look like a mean that changes.
+        """
+        flat = Applied(0.0, self._priors.reference_corner_at_hz, self._priors.sensor_corner_at_hz)
+        windows, applied = self.without_lag(flat)
+        if not _used(windows):
+            likely = replace(flat, lag_s=_likely_lag_s(self._files, self._priors, windows))
+            windows, applied = self.without_lag(likely)
+        if _used(windows):
+            return applied, windows
+        unsteady, taken = self.without_lag(applied, steady=False)
+        response = self.at(unsteady, taken).response if _used(unsteady) else None
+        return (applied if response is None else replace(taken, response=response.terms.modest)), windows
+
+    def at(self, windows: Sequence[Window], taken: Applied) -> Adjustment:
+        """The adjustment of windows from which this was taken out; the latest one is kept."""
+        if not self.stated.response and (told := with_response(self._priors, windows)).response:
+            self.stated, self._latest = told, None
+        if self._latest is None or self._latest[0] is not windows or self._latest[1] != taken:
+            self._latest = windows, taken, adjust(_used(windows), self.stated, taken)
+        return self._latest[2]
+
+    def without_lag(self, taken: Applied, *, steady: bool = True) -> tuple[list[Window], Applied]:
+        """The windows from which this response is taken out and whatever lag they show, and both."""
+
+        def lag_of(made: Sequence[Window], lag_s: float) -> float:
+            return self.at(made, replace(taken, lag_s=lag_s)).lag_s or 0.0
+
+        make = partial(self._files.windows, response=taken.response, steady=steady)
+        windows, lag_s = without_lag(taken.lag_s, make, _used, lag_of)
+        return windows, replace(taken, lag_s=lag_s)
 
 
 def _hardly_used(windows: Sequence[Window]) -> tuple[str, ...]:
@@ -102,11 +131,14 @@ def _hardly_used(windows: Sequence[Window]) -> tuple[str, ...]:
     )
 
 
-def _usable_lag_s(files: Files, priors: Priors, windows: Sequence[Window]) -> float:
-    """The lag nearest to 0 at which windows can be used: a sensor that is late seems not to follow its reference."""
-    furthest_s = LAG_SD * priors.lag_s
-    tried = sorted(starts(-furthest_s, furthest_s, windows), key=abs) if furthest_s else []
-    return next((lag_s for lag_s in tried if _used(files.windows(lag_s))), 0.0)
+def _likely_lag_s(files: Files, priors: Priors, windows: Sequence[Window]) -> float:
+    """Where the search for the lag begins if no window can be used: a sensor that is late seems not to follow its
+    reference. Steep filters with their corner above the motion delay by up to LAG_PERIODS periods of it."""
+    omega = largest_omega(windows)
+    if not (priors.lag_s and omega):
+        return 0.0
+    furthest_s = max(LAG_SD * priors.lag_s, LAG_PERIODS * 2.0 * np.pi / omega)
+    return correlated_lag_s(files.stretches(), files.rate_hz, furthest_s) or 0.0
 
 
 def with_response(priors: Priors, windows: Sequence[Window]) -> Priors:

@@ -73,28 +73,40 @@ class Files:
         return self._sensor.clock.rate_hz
 
     def windows(
-        self, lag_s: float = 0.0, response: Response = FLAT, progress: Callable[[float], Any] | None = None
+        self,
+        lag_s: float = 0.0,
+        response: Response = FLAT,
+        progress: Callable[[float], Any] | None = None,
+        *,
+        steady: bool = True,
     ) -> list[Window]:
         """All windows in the order of the poses, used or not. `lag_s` is the lag of the sensor's indications, and
         `response` their response over frequency.
 
         The first call finds whether the two clocks have different rates, and corrects that. `progress` is called with
-        the seconds of recording that were just done.
+        the seconds of recording that were just done. With `steady` False windows whose mean changes are used as well:
+        a response that is not yet taken out can look like it.
         """
-        found = self._made(lag_s, response, progress)
+        found = self._made(lag_s, response, progress, steady=steady)
         if self._options.align and self._reference is not None and self.drift is None:
             self.drift = drift(found)
             if self.drift is not None and self.drift.significant:
                 self._reference.stretch(self.drift.rate, self.drift.time_s)
-                found = self._made(lag_s, response, progress)
+                found = self._made(lag_s, response, progress, steady=steady)
         return found
 
-    def _made(self, lag_s: float, response: Response, progress: Callable[[float], Any] | None) -> list[Window]:
-        floor = self._rest_floor()
+    def _made(
+        self, lag_s: float, response: Response, progress: Callable[[float], Any] | None, *, steady: bool
+    ) -> list[Window]:
+        floor, settings = self._rest_floor(), self._options.settings
+        if not steady:
+            settings = replace(settings, limits=settings.limits.unsteady)
         windows: list[Window] = []
         for interval in self.poses:
             found = [
-                w for piece in self._pieces(interval) for w in self._windows(interval, *piece, lag_s, response, floor)
+                w
+                for piece in self._pieces(interval)
+                for w in self._windows(interval, *piece, lag_s, response, floor, settings)
             ]
             windows += found or [_nothing(interval, "no samples of the sensor, or none of the reference, in this pose")]
             if progress is not None:
@@ -113,26 +125,34 @@ class Files:
         lag_s: float,
         response: Response,
         floor: Array | None,
+        settings: Settings,
     ) -> list[Window]:
-        sensor, reference = self._cut(interval, start_s, stop_s, response)
+        sensor, reference = self._cut(interval, start_s, stop_s, lag_s, response)
         if sensor is None or (reference is None and interval.pose.direction.shape[1]):
             return []
-        span_s, settings = (start_s, stop_s), self._options.settings
         try:
             return windows_of(
-                interval.pose, sensor, reference, self._instrument, span_s, lag_s, settings, floor, response
+                interval.pose,
+                sensor,
+                reference,
+                self._instrument,
+                (start_s, stop_s),
+                lag_s,
+                settings,
+                floor,
+                response,
             )
         except Unusable as error:
             return [nothing_in(interval.pose, start_s, stop_s, str(error))]
 
     def _cut(
-        self, interval: PoseInterval, start_s: float, stop_s: float, response: Response = FLAT
+        self, interval: PoseInterval, start_s: float, stop_s: float, lag_s: float = 0.0, response: Response = FLAT
     ) -> tuple[Samples | None, Samples | None]:
         if self._reference is None or not interval.pose.direction.shape[1]:
             return self._sensor.cut(start_s, stop_s), None
         around_s = margin_s(self._instrument, self._reference.clock.rate_hz) + response.reach_s
         sensor = self._sensor.cut(start_s - 0.5 * around_s, stop_s + 0.5 * around_s)
-        return sensor, self._reference.cut(start_s - around_s, stop_s + around_s)
+        return sensor, self._reference.cut(start_s - lag_s - around_s, stop_s - lag_s + around_s)
 
     def runs(self) -> Iterator[tuple[Points, Window]]:
         """Windows with motion and all their samples, not filtered, for methods that need more than sums."""
@@ -148,6 +168,19 @@ class Files:
                     first = int(np.searchsorted(found.points.time_s, window.start_s, side="left"))
                     stop = int(np.searchsorted(found.points.time_s, window.stop_s, side="right"))
                     yield found.points.part(first, stop), window
+
+    def stretches(self) -> Iterator[tuple[Array, Array]]:
+        """Evenly spaced samples of the sensor (n, 3) and of the reference (n, m) where there is motion, not filtered.
+
+        Missing samples are interpolated.
+        """
+        for interval in self.poses:
+            for piece in self._pieces(interval):
+                found = self._aligned(interval, *piece, 0.0, limit_band=False)
+                if found is not None:
+                    t, V, u, _ = found.points
+                    even_s = np.arange(t[0], t[-1], 1.0 / self.rate_hz)
+                    yield _interpolated(even_s, t, V), _interpolated(even_s, t, u)
 
     def points(self, interval: PoseInterval, start_s: float, stop_s: float, lag_s: float = 0.0) -> Points | None:
         """Samples of the sensor from `start_s` to `stop_s`.
@@ -167,7 +200,7 @@ class Files:
     def _aligned(
         self, interval: PoseInterval, start_s: float, stop_s: float, lag_s: float, *, limit_band: bool
     ) -> Aligned | None:
-        sensor, reference = self._cut(interval, start_s, stop_s)
+        sensor, reference = self._cut(interval, start_s, stop_s, lag_s)
         if sensor is None or reference is None:
             return None
         settings = replace(self._options.settings, limit_band=limit_band)
@@ -193,6 +226,10 @@ def _check_overlap(sensor: SensorTable, reference: ReferenceTable | None, poses:
     if max(s for _, s, _ in spans) >= min(e for _, _, e in spans):
         told = ", ".join(f"{name} from {start:.10g} s to {stop:.10g} s" for name, start, stop in spans)
         raise TableError(f"the files do not overlap in time, so their times must be on one scale: {told}")
+
+
+def _interpolated(at_s: Array, time_s: Array, values: Array) -> Array:
+    return np.column_stack([np.interp(at_s, time_s, x) for x in values.T])
 
 
 def _nothing(interval: PoseInterval, reason: str) -> Window:

@@ -55,10 +55,12 @@ class Solution:
 
 
 def solve(equations: Equations, priors: Priors) -> Solution:
-    """Minimise chi2, starting at the priors' means. If every nuisance is fixed, the first step is the solution."""
+    """Minimise chi2, starting at the priors' means, and for what the data alone determine (lag, response) at what the
+    front end took out. If every nuisance is fixed, the first step is the solution."""
     scale, mean, precision, bounded = _priors(equations, priors)
     root: Array = np.asarray(np.linalg.cholesky(precision * np.outer(scale, scale)).T, dtype=np.float64)
     x = mean.copy()
+    x[12:][[not term.kind.stated for term in equations.nuisances.terms]] = 0.0
     residual, jacobian = _stacked(equations, x, mean, scale, root)
     for _ in range(MAX_STEPS):
         half, step = _step(jacobian, residual)

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import TypeVar
 
 import numpy as np
 
-from calib.model import Window
+from calib.model import Array, Window
 
 TURNS = 4  # each iteration leaves about a thousandth of the lag
 BASIN_RAD = 0.5  # of the motion's mean phase: from a start that is so near, the iterations lead to the lag
 # Limit of (omega lag)^3 / 6, the error of the window equations, which are of second order in the remaining lag.
 PHASE_LEFT = 1e-8
+AS_HIGH = 0.9  # of the highest peak of a correlation: peaks of motion with one frequency differ by less
 Made = TypeVar("Made")
 
 
@@ -58,3 +59,27 @@ def largest_omega(windows: Sequence[Window]) -> float:
         if m and power[:m].sum() > 0.0:
             largest = max(largest, float(np.sqrt(power[m : 2 * m].sum() / power[:m].sum())))
     return largest
+
+
+def correlated_lag_s(parts: Iterable[tuple[Array, Array]], rate_hz: float, furthest_s: float) -> float | None:
+    """The lag in s at which the outputs V follow the reference u best, from their cross-correlation.
+
+    `parts` are stretches of evenly spaced samples: V (n, 3) and u (n, m). Lags up to `furthest_s` to both sides are
+    compared. Where several peaks are almost equally high, as in motion of one frequency, the one nearest to 0 counts.
+    None if there is no motion. The lag is right to about a sample; `without_lag` leads from there to the lag.
+    """
+    size = int(np.ceil(furthest_s * rate_hz))
+    correlation = np.zeros(2 * size + 1)
+    for V, u in parts:
+        length = 1 << (len(V) + size).bit_length()
+        out, moved = (np.fft.rfft(x - x.mean(axis=0), length, axis=0) for x in (V, u))
+        power = np.outer(*(np.var(x, axis=0) * len(x) for x in (V, u)))
+        both = np.fft.irfft(out[:, :, None] * moved[:, None, :].conj(), length, axis=0)
+        both = np.concatenate([both[length - size :], both[: size + 1]])
+        correlation += np.sum(np.divide(both**2, power, out=np.zeros_like(both), where=power > 0.0), axis=(1, 2))
+    around = np.concatenate([[-np.inf], correlation, [-np.inf]])
+    peaks = np.flatnonzero((correlation >= around[:-2]) & (correlation >= around[2:]))
+    high = peaks[correlation[peaks] >= AS_HIGH * correlation.max()]
+    if not correlation.max() > 0.0:
+        return None
+    return float((high[np.argmin(np.abs(high - size))] - size) / rate_hz)

@@ -115,17 +115,28 @@ def motion_band_hz(windows: Sequence[Window]) -> tuple[float, float] | None:
     if not bands:
         return None
     low, high = (np.concatenate([getattr(b, name) for b in bands]) for name in ("low_hz", "high_hz"))
-    power = np.concatenate(
-        [np.trace(b.products[:, : b.reference_channels, : b.reference_channels], axis1=1, axis2=2) for b in bands]
-    )
+    power, square = (np.concatenate(part) for part in zip(*map(_powers, bands), strict=True))
     if not power.sum() > 0.0:
         return None
     third = np.round(3.0 * np.log2(np.sqrt(low * high))).astype(int)
     shares = np.array([power[third == k].sum() for k in np.unique(third)]) / power.sum()
     if np.count_nonzero(shares > LEAST_SHARE) < FEWEST_THIRDS:
         return None
-    ends = []
-    for edge, order, outside in ((low, np.argsort(low), BELOW), (high, np.argsort(-high), ABOVE)):
-        share = np.cumsum(power[order]) / power.sum()
-        ends.append(float(edge[order][np.searchsorted(share, outside)]))
-    return ends[0], ends[1]
+    # A wide band of a short window may end far above its motion, whose frequency the derivative tells.
+    mean_hz = np.sqrt(np.divide(square, power, out=np.zeros_like(power), where=power > 0.0)) / (2.0 * np.pi)
+    narrow = np.minimum(high, np.maximum(mean_hz, low) * 2.0 ** (1.0 / BANDS_AN_OCTAVE))
+    least = min(_end(b.high_hz, -b.high_hz, _powers(b)[0], ABOVE) for b in bands)
+    return _end(low, low, power, BELOW), max(_end(narrow, -narrow, power, ABOVE), least)
+
+
+def _end(edge: Array, order: Array, power: Array, outside: float) -> float:
+    """The edge of the first band, in rising order, up to which more than the share `outside` of the power lies."""
+    sequence = np.argsort(order)
+    share = np.cumsum(power[sequence]) / max(power.sum(), np.finfo(float).tiny)
+    return float(edge[sequence][min(int(np.searchsorted(share, outside)), len(edge) - 1)])
+
+
+def _powers(bands: BandSums) -> tuple[Array, Array]:
+    """The power of the motion and of its derivative, in each band of a window."""
+    m, powers = bands.reference_channels, np.diagonal(bands.products, axis1=1, axis2=2)
+    return powers[:, :m].sum(axis=1), powers[:, m : 2 * m].sum(axis=1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +41,11 @@ class Limits:
         """
         stated = float(np.hypot(offset_mps2, STANDARD_GRAVITY_MPS2 * angle_rad))
         return cls(longest_s=longest_s, most_step_mps2=max(2.0 * stated, LEAST_STEP_MPS2))
+
+    @property
+    def unsteady(self) -> Limits:
+        """The same without limits of how the mean may change."""
+        return replace(self, most_drift_mps2=np.inf, most_step_mps2=np.inf)
 
 
 DEFAULT_LIMITS = Limits()
