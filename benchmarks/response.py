@@ -13,6 +13,7 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import argparse
+import itertools
 import multiprocessing
 from collections.abc import Callable
 from pathlib import Path
@@ -22,12 +23,13 @@ import numpy as np
 from agent.calibrate.adjusting import adjusted
 from benchmarks.page import machine, write_part
 from calib.estimate.nuisances import Priors
-from tests.pair import Filter, decimator, lowpass, moving_mean, pair, resonance, sinc3
+from tests.pair import Filter, decimator, highpass, lowpass, moving_mean, pair, resonance, sinc3
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "response.md"
 U_REFERENCE = 1e-3
 BANDS_HZ = ((0.3, 2.0), (0.5, 20.0), (1.0, 40.0))
 RATIOS = (1.5, 2.0, 5.0, 20.0)  # of a filter's corner over the upper end of the motion
+BELOW = (5.0, 10.0, 20.0)  # of the lower end of the motion over the corner of an AC-coupled instrument
 FILTERS: dict[str, Callable[[float], Filter]] = {
     "low-pass, order 1": lambda f: lowpass(1, f),
     "low-pass, order 2": lambda f: lowpass(2, f),
@@ -38,6 +40,10 @@ FILTERS: dict[str, Callable[[float], Filter]] = {
     "resonance, Q 5": lambda f: resonance(f, 5.0),
     "resonance, Q 50": lambda f: resonance(f, 50.0),
 }
+CORNERS: dict[str, Callable[[float], Filter]] = {
+    "AC corner, order 1": highpass,
+    "AC corner, order 2": lambda f: highpass(f, 2),
+}
 Job = tuple[str, float, tuple[float, float], bool, int]
 Result = tuple[bool, float, float]  # refused; relative error of S_xx without the reference's, over its u with it
 
@@ -45,14 +51,17 @@ Result = tuple[bool, float, float]  # refused; relative error of S_xx without th
 def one(job: Job) -> Result:
     """One run: whether it was refused, the relative error of S_xx besides the reference's, and error over u."""
     name, ratio, band_hz, in_reference, seed = job
-    made_of = FILTERS[name](ratio * band_hz[1])
+    made_of = CORNERS[name](band_hz[0] / ratio) if name in CORNERS else FILTERS[name](ratio * band_hz[1])
     response: Filter = (lambda f: 1.0 / made_of(f)) if in_reference else made_of
-    key = [seed, list(FILTERS).index(name), round(10.0 * ratio), round(band_hz[1]), int(in_reference)]
+    key = [seed, [*FILTERS, *CORNERS].index(name), round(10.0 * ratio), round(band_hz[1]), int(in_reference)]
     error = U_REFERENCE * np.random.default_rng(key).normal()
     made = pair(seed, response, band_hz=band_hz, rate_hz=10.0 * band_hz[1], seconds=300.0, reference_error=float(error))
-    found = adjusted(
-        made.files, Priors(reference=U_REFERENCE, reference_frequency_hz=made.reference_frequency_hz)
-    ).calibration
+    stated = Priors(
+        reference=U_REFERENCE,
+        reference_frequency_hz=made.reference_frequency_hz,
+        corner_unknown=float(name in CORNERS),
+    )
+    found = adjusted(made.files, stated).calibration
     if found is None:
         return True, 0.0, 0.0
     away = found.sensitivity[0, 0] / made.sensitivity[0, 0] - 1.0
@@ -63,10 +72,11 @@ def one(job: Job) -> Result:
 def table(runs: int) -> list[str]:
     """The lines of the table, one for each filter, ratio and side; the three bands of motion are in each line."""
     lines = [
-        "| filter | corner over motion | in | refused | RMS of S less the reference's error, % | within 2 u | most |",
+        "| filter | corner over motion, or its inverse | in | refused | RMS of S less the reference's error, % | within 2 u | most |",
         "| --- | --- | --- | --- | --- | --- | --- |",
     ]
-    keys = [(name, ratio, side) for name in FILTERS for ratio in RATIOS for side in (False, True)]
+    cells = [*itertools.product(FILTERS, RATIOS), *itertools.product(CORNERS, BELOW)]
+    keys = [(name, ratio, side) for name, ratio in cells for side in (False, True)]
     with multiprocessing.Pool() as pool:
         for name, ratio, side in keys:
             jobs = [(name, ratio, band, side, seed) for band in BANDS_HZ for seed in range(runs)]

@@ -79,8 +79,8 @@ class _Search:
     """
 
     def __init__(self, files: Files, priors: Priors) -> None:
-        self._files, self._priors = files, priors
-        self.stated = priors
+        self._files, self._priors = files, priors.beside_unknown_corner if files.corner_unknown else priors
+        self.stated = self._priors
         self._latest: tuple[Sequence[Window], Applied, Adjustment] | None = None
 
     def begun(self) -> tuple[Applied, list[Window]]:

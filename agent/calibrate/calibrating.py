@@ -76,6 +76,7 @@ def files_of(
         instrument = replace(instrument, quantity=reference.quantity)
         _check_quantity(reference, instrument, options["reference_quantity"])
     setting = setting_of(options, reference)
+    instrument = replace(instrument, ac_coupled="ac" in (setting.coupling, setting.reference_coupling))
     if reference is not None and setting.reference_coupling == "dc":
         check_gravity(reference)
     poses = _poses(options, setting, reference)

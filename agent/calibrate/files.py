@@ -68,6 +68,11 @@ class Files:
         self.poses = poses
 
     @property
+    def corner_unknown(self) -> bool:
+        """Whether an instrument is AC-coupled, and nobody stated its corner."""
+        return self._reference is not None and self._instrument.corner_unknown
+
+    @property
     def rate_hz(self) -> float:
         """Rate of the sensor from its stamps."""
         return self._sensor.clock.rate_hz

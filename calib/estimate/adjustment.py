@@ -108,7 +108,8 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
     plain = not any(priors.values.values())  # with every nuisance fixed it is Method 3: all points weigh the same
     one_frequency = priors.response_terms == 1.0
     to_hz = np.inf if one_frequency else priors.response_hz
-    data = condense([e.window for e in found], alike=plain, response_hz=to_hz, one_frequency=one_frequency)
+    reduced, powers = [e.window for e in found], priors.response_powers
+    data = condense(reduced, alike=plain, response_hz=to_hz, one_frequency=one_frequency, powers=powers)
     if not plain:
         data = effective(data, np.array([w.independent for w in used]))
     u_lag_s = [max(w.u_lag_s, priors.lag_window_s) if priors.lag_s > 0.0 else 0.0 for w in used]

@@ -110,14 +110,20 @@ class Banded:
 
 
 def banded(
-    windows: Sequence[Window], channels: int, to_hz: float, omega2: Array, *, one_frequency: bool = False
+    windows: Sequence[Window],
+    channels: int,
+    to_hz: float,
+    omega2: Array,
+    *,
+    one_frequency: bool = False,
+    powers: int = len(POWERS),
 ) -> Banded:
     """The bands up to `to_hz` of W windows with `channels` reference channels at most.
 
     A window without such bands moves at the frequency of `omega2` (W,) in rad2/s2. `one_frequency`: the bands are
-    those of a few sines and of their harmonics, which tell no term of the response.
+    those of a few sines and of their harmonics, which tell no term of the response. `powers`: how many terms there are.
     """
-    projected = np.array([_at_one_frequency(np.sqrt(square), channels) for square in omega2.tolist()])
+    projected = np.array([_at_one_frequency(np.sqrt(square), channels, powers) for square in omega2.tolist()])
     found = []
     for w, window in enumerate(windows):
         if window.bands is None or window.bands.reference_channels != channels:
@@ -125,17 +131,17 @@ def banded(
         kept = np.flatnonzero(window.bands.high_hz <= HIGHEST * to_hz)
         if kept.size:
             factors = _Factors(window.bands, kept)
-            projected[w] = _projected(factors)
-            found += [] if one_frequency else [_told(factors)]
+            projected[w] = _projected(factors, powers)
+            found += [] if one_frequency else [_told(factors, powers)]
     if not found:
-        return Banded(projected, np.zeros(0), np.zeros((0, len(POWERS))), Deviations())
+        return Banded(projected, np.zeros(0), np.zeros((0, powers)), Deviations())
     residual, moves = np.concatenate([t.residual for t in found]), np.vstack([t.moves for t in found])
     # Only what the terms can change is kept: as many rows as there are terms.
     scale = _unit(np.sum(moves**2, axis=0))
     triangle = np.asarray(np.linalg.qr(np.column_stack([moves / scale, residual]), mode="r"), dtype=np.float64)
     fitted, *_ = np.linalg.lstsq(moves / scale, residual, rcond=None)
     left = residual - moves / scale @ fitted
-    size, deviations = len(POWERS), _deviations(found, left)
+    size, deviations = powers, _deviations(found, left, powers)
     triangle /= np.sqrt(deviations.times_noise)
     return Banded(projected, triangle[:size, size], triangle[:size, :size] * scale, deviations)
 
@@ -190,18 +196,18 @@ def _unit(powers: Array) -> Array:
     return np.where(powers > 0.0, np.sqrt(np.maximum(powers, 0.0)), 1.0)
 
 
-def _at_one_frequency(omega: float, channels: int) -> Array:
+def _at_one_frequency(omega: float, channels: int, powers: int) -> Array:
     """(K, 2M, M) see Banded."""
-    terms, per_omega = by_term(np.array(omega)), 1.0 / omega if omega else 0.0
+    terms, per_omega = by_term(np.array(omega), powers), 1.0 / omega if omega else 0.0
     return np.stack([np.vstack([h.real * np.eye(channels), h.imag * per_omega * np.eye(channels)]) for h in terms])
 
 
-def _projected(factors: _Factors) -> Array:
+def _projected(factors: _Factors, powers: int) -> Array:
     """(K, 2M, M) see Banded."""
     gram, m = factors.gram.sum(axis=0), factors.gram.shape[1] // 2
     scale = _unit(np.diag(gram))
     inverse = np.linalg.pinv(gram / np.outer(scale, scale), RELATED, hermitian=True) / np.outer(scale, scale)
-    terms = by_term(factors.omega)
+    terms = by_term(factors.omega, powers)
     moved = np.einsum("bk,brm->krm", terms.real, factors.gram[..., :m])
     moved += np.einsum("bk,brm->krm", terms.imag / factors.omega[:, None], factors.gram[..., m:])
     return np.asarray(inverse @ moved)
@@ -224,8 +230,8 @@ class _Told:
     free: int
 
 
-def _told(factors: _Factors) -> _Told:
-    terms = by_term(factors.omega)
+def _told(factors: _Factors, powers: int) -> _Told:
+    terms = by_term(factors.omega, powers)
     own = factors.seen(np.ones(len(terms), dtype=complex))
     lagged = factors.seen(-1j * factors.omega)
     observed = factors.observed()
@@ -238,7 +244,7 @@ def _told(factors: _Factors) -> _Told:
     free = np.concatenate([moving / _length(moving), lagged @ gain], axis=2)
     ways, _ = np.linalg.qr(free)
     rows = np.concatenate([observed[..., None], *(factors.seen(term) @ gain for term in terms.T)], axis=2)
-    rows = (rows - ways @ (ways.transpose(0, 2, 1) @ rows)).reshape(-1, 1 + len(POWERS))
+    rows = (rows - ways @ (ways.transpose(0, 2, 1) @ rows)).reshape(-1, 1 + powers)
     at_hz, noise = np.tile(factors.by_row(factors.middle_hz), 3), factors.by_row(factors.noise.T).ravel()
     return _Told(rows[:, 0], rows[:, 1:], observed.ravel(), at_hz, noise, 3 * free.shape[2])
 
@@ -254,14 +260,14 @@ def _fitted(columns: Array, observed: Array) -> Array:
     return np.asarray((np.linalg.pinv(columns / unit, RELATED) @ observed[..., None]) / unit.transpose(0, 2, 1))
 
 
-def _deviations(found: Sequence[_Told], left: Array) -> Deviations:
-    """The sums of what the best response leaves (R,)."""
+def _deviations(found: Sequence[_Told], left: Array, powers: int) -> Deviations:
+    """The sums of what the best response with so many terms leaves (R,)."""
     signal, at_hz, noise = (
         np.concatenate([getattr(part, of) for part in found]) for of in ("signal", "at_hz", "noise")
     )
     size, variance = signal**2, noise**2
     power = float(np.sum(size * variance))
-    freedom = float(np.count_nonzero(size) - sum(part.free for part in found) - len(POWERS))
+    freedom = float(np.count_nonzero(size) - sum(part.free for part in found) - powers)
     moved = left * signal * variance
     third: NDArray[np.int64] = np.round(3.0 * np.log2(at_hz)).astype(np.int64)
     own = {k: third == k for k in np.unique(third).tolist()}

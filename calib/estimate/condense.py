@@ -16,6 +16,7 @@ from calib.estimate.banded import Banded, banded
 from calib.estimate.type_a import FEWEST_FREEDOM, LEAST_INFLATION, Segments, TypeA, pooled
 from calib.excitation.excited import OF_STRONGEST
 from calib.model import Array, Window, own_channels
+from calib.signal.response import POWERS
 
 PIVOT_FLOOR = 1e-9  # of a channel's power: a smaller remainder, after the channels before it, is a rounding error
 # Least power of an excited direction, relative to that of the strongest channel. In a weaker direction the noise of the
@@ -45,12 +46,17 @@ class Condensed:
 
 
 def condense(
-    windows: Sequence[Window], *, alike: bool = False, response_hz: float = 0.0, one_frequency: bool = False
+    windows: Sequence[Window],
+    *,
+    alike: bool = False,
+    response_hz: float = 0.0,
+    one_frequency: bool = False,
+    powers: int = len(POWERS),
 ) -> Condensed:
     """Condense the windows' sums; M is the largest number of reference channels among them.
 
     `alike` as in calib.estimate.type_a.pooled. `response_hz`: upper end of the motion that is to tell the response
-    over frequency; 0 where that is no unknown. `one_frequency`: see calib.estimate.banded.
+    over frequency; 0 where that is no unknown. `one_frequency`, `powers`: see calib.estimate.banded.
     """
     channels = max(w.sums.reference_channels for w in windows)
     segments = [_segments(w, channels) for w in windows]
@@ -65,7 +71,9 @@ def condense(
         mean_v=np.array([s.mean[-3:] for s in segments]),
         count=np.array([s.count.sum() for s in segments]),
         type_a=pooled(segments, roots, whiteners, alike=alike),
-        bands=banded(windows, channels, response_hz, omega2, one_frequency=one_frequency) if response_hz else None,
+        bands=banded(windows, channels, response_hz, omega2, one_frequency=one_frequency, powers=powers)
+        if response_hz
+        else None,
     )
 
 

@@ -32,7 +32,7 @@ from calib.estimate.quantities import (
 )
 from calib.estimate.terms import terms
 from calib.model import Array, Pose, own_channels
-from calib.signal.response import FLAT, POWERS, Response, by_term
+from calib.signal.response import ALL_POWERS, FLAT, POWERS, Response, by_term
 
 # Standard uncertainty of a term of the response, relative to that of a low-pass filter at the upper end of the motion.
 # It is honest for filters, means and resonances from 1.5 times that frequency on (shown by benchmarks.response).
@@ -75,10 +75,22 @@ class Priors(Stated):
         """
         stated_hz = self.reference_frequency_hz or float(np.sqrt(band_hz[0] * band_hz[1]))
         told = {
-            "response": RESPONSE_U, "response_at": 0.0, "response_terms": float(len(POWERS)),
+            "response": RESPONSE_U, "response_at": 0.0,
+            "response_terms": float(len(ALL_POWERS if self.corner_unknown else POWERS)),
+            "response_from_hz": band_hz[0] if self.corner_unknown else 0.0,
             "response_hz": to_hz or band_hz[1], "reference_frequency_hz": stated_hz,
         }  # fmt: skip
         return Priors({**self.values, **told}, self.parameters, self.covariance)
+
+    @property
+    def beside_unknown_corner(self) -> Priors:
+        """These for instruments of which one is AC-coupled, and nobody stated its corner."""
+        return Priors({**self.values, "corner_unknown": 1.0}, self.parameters, self.covariance)
+
+    @property
+    def response_powers(self) -> int:
+        """How many powers of the frequency the terms of the response have: 5, or 9 with those below the motion."""
+        return len(ALL_POWERS if self.response_from_hz else POWERS)
 
     def at_one_frequency(self, motion_hz: float, lag_s: float) -> Priors:
         """These and the prior of the response at `motion_hz`, the only frequency of the motion, where the sensor's
@@ -132,7 +144,7 @@ class Inputs:
     for silent channels, which have no motion of their own, but whose means act on the sensor. `rate_direction`
     (P, 3, M) in s applies to the motion's derivative: it is the part of the silent channels' motion that is 90 deg
     ahead. `quadrature` (P, 3) is relative motion 90 deg ahead that the reference does not measure; `gravity` (P, 3) in
-    m/s2; `lag_s` (3,); `reference_corner` and `sensor_corner` in rad/s; `response` (5,) in s^k. The
+    m/s2; `lag_s` (3,); `reference_corner` and `sensor_corner` in rad/s; `response` (5,) or (9,) in s^k. The
     derivatives `d_...` have the same shapes with J in front.
     """
 
@@ -187,9 +199,10 @@ class Nuisances:
         self.lag = self._stacked("lag", (3,))
         self.reference_corner = self._stacked("reference_corner", (1,))[:, 0]
         self.sensor_corner = self._stacked("sensor_corner", (1,))[:, 0]
-        self.response = self._stacked("response", (len(POWERS),))
+        self.response = self._stacked("response", (priors.response_powers,))
         # Of ln |h| at the reference frequency by the terms, when the response is 1 at 0 Hz.
-        self._at_reference = by_term(np.array([2.0 * np.pi * priors.reference_frequency_hz]))[0].real
+        at = np.array([2.0 * np.pi * priors.reference_frequency_hz])
+        self._at_reference = by_term(at, priors.response_powers)[0].real
         self._applied_response = np.array([t.applied for t in self.terms]) @ self.response
         self._corner_hz = (self.reference_corner - self.sensor_corner) / (2.0 * np.pi)
 

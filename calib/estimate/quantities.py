@@ -239,8 +239,7 @@ DIRECTION = Kind("direction", "rad", "direction common", prior=ALPHA_COMMON, loo
 DIRECTION_BY_POSITION = Kind(
     "direction by position", "rad", "direction by position", prior=ANGLE, loosened_by=("remount",)
 )
-GRAVITY_DIRECTION = Kind(
-    # Only beside a tri-axial reference, whose rotation is an unknown of its own.
+GRAVITY_DIRECTION = Kind(  # only beside a tri-axial reference, whose rotation is an unknown of its own
     "gravity direction by position", "rad", "direction by position",
     prior=Statement(
         "gravity_direction_rad", _deg(0.2), ("uncertainty.angle_deg",), ("uncertainty.tilt_deg",),
@@ -281,8 +280,7 @@ REFERENCE = Kind(
     prior=Statement("reference", 1e-3, ("certificate.u_sensitivity_pct",), option="u_reference_pct", convert=_percent),
     of_reference=True,
 )  # fmt: skip
-REFERENCE_DRIFT = Kind(
-    # Beside the constant error of the certificate, so that the prior of the constant can be exchanged exactly.
+REFERENCE_DRIFT = Kind(  # beside the constant error of the certificate, whose prior can then be exchanged exactly
     "reference drift", "1", "reference drift",
     prior=Statement("reference_drift", 0.0, ("certificate.stability_pct",), convert=_percent),
     walk=Statement("reference_drift", 0.0, ("certificate.stability_pct",), convert=_percent_a_year),
@@ -321,11 +319,13 @@ KINDS: Mapping[str, Kind] = {kind.name: kind for kind in list(vars().values()) i
 # Scatter between windows is no unknown of a state: it is part of the weights of the windows.
 BETWEEN_WINDOWS = (
     Statement("offset_mps2", 0.05, ("uncertainty.offset_mps2",), option="u_offset_mps2"),
-    Statement("lag_window_s", 0.0, ("uncertainty.lag_window_s",)),  # least value; the data may show a larger one
+    Statement("lag_window_s", 0.0, ("uncertainty.lag_window_s",)),  # the data may show a larger one
 )
 OF_SENSOR = (SENSITIVITY, SENSITIVITY_RATE, OFFSET, OFFSET_RATE, SENSITIVITY_TEMPERATURE, OFFSET_TEMPERATURE)
 FREQUENCIES = (
     Statement("response_hz"),  # to which the terms of the response are scaled
+    Statement("response_from_hz"),  # to which those below the motion are scaled
+    Statement("corner_unknown"),  # 1 where an instrument is AC-coupled and nobody states its corner
     Statement("response_terms", 5.0),  # how many of them are unknowns: one frequency tells c_2 alone
     Statement(  # at which S holds
         "reference_frequency_hz",

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.model import Array
-from calib.signal.response import Complex, Response, by_term
+from calib.signal.response import POWERS, Complex, Response, by_term
 
 PER_OCTAVE = 3  # bands in which S is reported
 LARGE = 0.5  # of the largest element of S: the elements whose relative uncertainty counts
@@ -52,7 +52,8 @@ def response_told(
 ) -> ResponseTold:
     """The response from S row by row and J unknowns of the response: `estimate` (9 + J,), `covariance` (9 + J, 9 + J).
 
-    `effects` (J, 5): what a unit of each of the J unknowns adds to the terms in s^k. The motion was in `band_hz`.
+    `effects` (J, 5) or (J, 9): what a unit of each of the J unknowns adds to the terms in s^k. The motion was in
+    `band_hz`.
     """
     count = max(1, round(per_octave * np.log2(band_hz[1] / band_hz[0])))
     edges = np.geomspace(*band_hz, count + 1)
@@ -60,10 +61,10 @@ def response_told(
     at, u_at = _sensitivities(estimate, covariance, effects, middles_hz, reference_hz)
     ends = zip(edges[:-1].tolist(), edges[1:].tolist(), at[1:], u_at[1:], strict=True)
     terms, grid = estimate[9:] @ effects, np.geomspace(*band_hz, GRID)
-    away = np.abs(np.exp(_log_h(grid, reference_hz) @ terms)) - 1.0
+    away = np.abs(np.exp(_log_h(grid, reference_hz, len(terms)) @ terms)) - 1.0
     limit = coverage_factor * _least_u(estimate[:9], covariance) / 3.0
     return ResponseTold(
-        Response(tuple(terms.tolist()), band_hz[1]),
+        Response(tuple(terms.tolist()), band_hz[1], band_hz[0] if len(terms) > len(POWERS) else 0.0),
         reference_hz,
         _around(grid, np.abs(away) <= limit, reference_hz),
         at[0].real,
@@ -109,17 +110,20 @@ def _sensitivities(
 ) -> tuple[Complex, Array]:
     """Complex sensitivities (F, 3, 3) at F frequencies, the lag taken out, and their standard uncertainties."""
     S, z = estimate[:9], estimate[9:]
-    by_unknown = _log_h(frequency_hz, reference_hz) @ effects.T  # (F, J)
+    by_unknown = _log_h(frequency_hz, reference_hz, effects.shape[1]) @ effects.T  # (F, J)
     h = np.exp(by_unknown @ z)[:, None]
     moves = np.concatenate([h[..., None] * np.eye(9), (S * h)[..., None] * by_unknown[:, None, :]], axis=2)
     variance = np.sum((moves @ covariance) * moves.conj(), axis=2).real
     return np.asarray((S * h).reshape(-1, 3, 3)), np.sqrt(np.maximum(variance, 0.0)).reshape(-1, 3, 3)
 
 
-def _log_h(frequency_hz: float | Array, reference_hz: float) -> Complex:
-    """Derivatives (..., 5) of ln h at frequencies (...,) by the terms, where |h| is 1 at the reference frequency."""
-    at = by_term(2.0 * np.pi * np.asarray(frequency_hz, dtype=np.float64))
-    return np.asarray(at - by_term(np.array(2.0 * np.pi * reference_hz)).real)
+def _log_h(frequency_hz: float | Array, reference_hz: float, powers: int) -> Complex:
+    """Derivatives (..., powers) of ln h at frequencies (...,) by the terms, where |h| is 1 at the reference frequency.
+
+    At 0 Hz of an AC-coupled instrument see calib.signal.response.by_term.
+    """
+    at = by_term(2.0 * np.pi * np.asarray(frequency_hz, dtype=np.float64), powers)
+    return np.asarray(at - by_term(np.array(2.0 * np.pi * reference_hz), powers).real)
 
 
 def _around(grid: Array, good: NDArray[np.bool_], reference_hz: float) -> tuple[float, float]:

@@ -16,7 +16,7 @@ import numpy as np
 from calib.estimate import quantities as kinds
 from calib.estimate.quantities import Kind, Quantity, Stated
 from calib.model import Array, Pose, own_channels
-from calib.signal.response import POWERS, attenuating, in_units
+from calib.signal.response import ALL_POWERS, POWERS, attenuating, in_units
 
 PARALLEL = 1e-3  # rad; if motion and gravity are parallel within this angle, there is no horizontal normal
 AXES = "xyz"
@@ -29,7 +29,7 @@ class Term:
     Effects: `turn_direction`, `turn_gravity` (P, 3) rotation in rad; `transverse`, `quadrature` (P, 3) transverse
     motion in phase and 90 deg ahead, relative to the motion; `reference` (M,) relative error of the reference;
     `gravity` (1,) in m/s2; `offset` (P, 3) in m/s2; `lag` (3,) in s; `reference_corner`, `sensor_corner` (1,) in rad/s;
-    `response` (5,) the terms of the response in s^k (calib.estimate.response).
+    `response` (5,) or (9,) the terms of the response in s^k (calib.signal.response).
     None means no effect. `expected` is the prior's mean. `applied` is the part that the front end has already removed
     from the data; the remaining part is estimated.
     """
@@ -124,12 +124,14 @@ def _terms(
     for name, k in zip(_axes("lag"), np.eye(3), strict=True):
         yield _term(name, kinds.LAG_OF_AXIS, priors, owner=reference, lag=k)
     if priors.response > 0.0:
-        names, units = [f"response_{power}" for power in POWERS], in_units(priors.response_hz)
+        units = in_units(priors.response_hz, priors.response_from_hz)
+        names = [f"response_{power}" for power in ALL_POWERS[: len(units)]]
         if priors.response_terms == 1.0:
             names, units = ["attenuation"], attenuating(priors.response_hz)[:1]  # -ln |h| at the one frequency
+        removed = np.resize([*applied[kinds.RESPONSE], *[0.0] * len(names)], len(ALL_POWERS))
         for n, (name, unit) in enumerate(zip(names, units.tolist(), strict=True)):
-            taken = {kinds.RESPONSE: [applied[kinds.RESPONSE][n] / unit]}
-            term = unit * np.eye(len(POWERS))[n]
+            taken = {kinds.RESPONSE: [float(removed[n]) / unit]}
+            term = unit * np.eye(max(len(POWERS), len(units)))[n]
             yield _term(name, kinds.RESPONSE, priors, taken, reference, response=term)
     turn = np.full(1, 2.0 * np.pi)
     yield _term("reference_corner", kinds.REFERENCE_CORNER, priors, applied, reference, reference_corner=turn)

@@ -122,11 +122,14 @@ def motion_band_hz(windows: Sequence[Window]) -> tuple[float, float] | None:
     shares = np.array([power[third == k].sum() for k in np.unique(third)]) / power.sum()
     if np.count_nonzero(shares > LEAST_SHARE) < FEWEST_THIRDS:
         return None
-    # A wide band of a short window may end far above its motion, whose frequency the derivative tells.
+    # A wide band of a short window may end far from its motion, whose frequency the derivative tells.
     mean_hz = np.sqrt(np.divide(square, power, out=np.zeros_like(power), where=power > 0.0)) / (2.0 * np.pi)
-    narrow = np.minimum(high, np.maximum(mean_hz, low) * 2.0 ** (1.0 / BANDS_AN_OCTAVE))
-    least = min(_end(b.high_hz, -b.high_hz, _powers(b)[0], ABOVE) for b in bands)
-    return _end(low, low, power, BELOW), max(_end(narrow, -narrow, power, ABOVE), least)
+    wide, mean_hz = 2.0 ** (1.0 / BANDS_AN_OCTAVE), np.clip(mean_hz, low, high)
+    above, below = np.minimum(high, mean_hz * wide), np.maximum(low, mean_hz / wide)
+    surely_low = max(_end(b.low_hz, b.low_hz, _powers(b)[0], BELOW) for b in bands)
+    surely_high = min(_end(b.high_hz, -b.high_hz, _powers(b)[0], ABOVE) for b in bands)
+    low_hz, high_hz = _end(below, below, power, BELOW), _end(above, -above, power, ABOVE)
+    return min(low_hz, surely_low), max(high_hz, surely_high)
 
 
 def _end(edge: Array, order: Array, power: Array, outside: float) -> float:

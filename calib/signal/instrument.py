@@ -16,7 +16,7 @@ class Instrument:
     standard deviation of its own noise over its whole band, in that quantity's SI unit; 0 where nobody stated it: it is
     then found from the data. `corner_hz`, `u_corner_hz`: corner frequency of an AC-coupled reference (first order) and
     its standard uncertainty; both 0 where it responds to constants. `sensor_corner_hz`, `u_sensor_corner_hz`: the same
-    of the sensor beside it.
+    of the sensor beside it. `ac_coupled`: the reference or the sensor does not respond to constants.
     """
 
     quantity: str = "acceleration"
@@ -26,6 +26,7 @@ class Instrument:
     u_corner_hz: float = 0.0
     sensor_corner_hz: float = 0.0
     u_sensor_corner_hz: float = 0.0
+    ac_coupled: bool = False
 
     @property
     def derivatives(self) -> int:
@@ -36,3 +37,8 @@ class Instrument:
     def has_corner(self) -> bool:
         """Whether a corner of the reference or of the sensor is stated, or unknown."""
         return any((self.corner_hz, self.u_corner_hz, self.sensor_corner_hz, self.u_sensor_corner_hz))
+
+    @property
+    def corner_unknown(self) -> bool:
+        """Whether there is a corner that nobody stated: the response below the motion is then an unknown."""
+        return self.ac_coupled and not self.has_corner

@@ -1,12 +1,13 @@
 """The response of the sensor over that of the reference: ln h(i omega) = -lag i omega + sum over k of c_k (i omega)^k.
 
 The c_k are real: they are the cumulants of the impulse response between the two instruments. A low-pass filter of first
-order at omega_0 has c_k = (-1)^k / (k omega_0^k).
+order at omega_0 has c_k = (-1)^k / (k omega_0^k). A corner omega_0 below the motion, as AC-coupled instruments have,
+gives the same terms in powers of omega_0 / (i omega): those of a high-pass filter.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -17,6 +18,12 @@ from calib.signal.band import convolved
 
 Complex = NDArray[np.complex128]
 POWERS = (2, 3, 4, 5, 6)  # fixed beforehand: if the data chose the number of terms, u would be too small
+BELOW = (-1, -2, -3, -4)  # where an instrument is AC-coupled and nobody states its corner
+ALL_POWERS = (*POWERS, *BELOW)
+LOWER = 5.0  # times the corner of an AC-coupled instrument: the motion's lower end from which on the terms explain it
+BELOW_UNIT = 0.2  # unit of a term below, in that of a filter of first order: its prior covers filters of order 4
+EDGE = 2.0  # cycles at the lower end of the motion, over which the terms below act
+UNSEEN = 0.45  # times the lower end of the motion: where the terms below begin to act; they do in full at twice that
 CYCLES = 3.0  # at the upper end of the motion, by which the taps of a filter reach to both sides
 SPACED = 6.0  # times the upper end of the motion: the rate of taps that is enough for it
 FINER = 8  # times the resolution of the taps, for the spectrum they are fitted to
@@ -33,10 +40,14 @@ HELD = 1.1  # times the upper end of the motion: above it the polynomial is not 
 
 @dataclass(frozen=True, slots=True)
 class Response:
-    """The terms c_k in s^k of a response, in the order of POWERS, and the upper end in Hz of the motion that told."""
+    """The terms c_k in s^k of a response, in the order of ALL_POWERS, and the ends in Hz of the motion that told.
+
+    Without terms below the motion there are as many as POWERS, and the lower end does not matter.
+    """
 
     terms: tuple[float, ...] = (0.0,) * len(POWERS)
     to_hz: float = 0.0
+    from_hz: float = 0.0
 
     @property
     def is_flat(self) -> bool:
@@ -45,38 +56,48 @@ class Response:
 
     def is_near(self, other: Response) -> bool:
         """Whether they differ by less than NEAR in the motion: what is left is estimated exactly."""
-        frequency_hz = np.linspace(0.0, max(self.to_hz, other.to_hz), 50)
+        frequency_hz = np.linspace(max(self.from_hz, other.from_hz), max(self.to_hz, other.to_hz), 50)
         return bool(np.abs(self.at(frequency_hz) - other.at(frequency_hz)).max() < NEAR)
 
     @property
     def modest(self) -> Response:
         """The same with terms so small that the instruments differ by no more than LARGEST in the motion: the first
         estimates, from a linear equation, may be much too large."""
-        size = float(np.abs(self.at(np.linspace(0.0, self.to_hz, 50))).max())
-        return self if size <= LARGEST else Response(tuple(c * LARGEST / size for c in self.terms), self.to_hz)
+        size = float(np.abs(self.at(np.linspace(self.from_hz, self.to_hz, 50))).max())
+        return self if size <= LARGEST else replace(self, terms=tuple(c * LARGEST / size for c in self.terms))
 
     @property
     def rounded(self) -> Response:
         """The same to 0.1 %: a filter for it serves many windows."""
-        unit = in_units(self.to_hz)
-        return Response(tuple((np.round(np.array(self.terms) / unit * ROUNDED) / ROUNDED * unit).tolist()), self.to_hz)
+        unit = in_units(self.to_hz, self.from_hz)[: len(self.terms)]
+        return replace(self, terms=tuple((np.round(np.array(self.terms) / unit * ROUNDED) / ROUNDED * unit).tolist()))
 
     @property
     def reach_s(self) -> float:
         """How far its filter reaches to each side, in s."""
-        return 0.0 if self.is_flat else (CYCLES + 1.0) / self.to_hz
+        if self.is_flat:
+            return 0.0
+        return (CYCLES + 1.0) / self.to_hz + (EDGE / self.from_hz if self.from_hz else 0.0)
 
     def at(self, frequency_hz: Array) -> Complex:
         """ln h at these frequencies, without the lag."""
-        return np.asarray(by_term(2.0 * np.pi * frequency_hz) @ np.array(self.terms))
+        return np.asarray(by_term(2.0 * np.pi * frequency_hz, len(self.terms)) @ np.array(self.terms))
+
+    def below_at(self, frequency_hz: Array) -> Complex:
+        """What the terms below the motion add to ln h."""
+        own = by_term(2.0 * np.pi * frequency_hz, len(self.terms))[..., len(POWERS) :]
+        return np.asarray(own @ np.array(self.terms[len(POWERS) :]))
 
 
 FLAT = Response()
 
 
-def in_units(to_hz: float) -> Array:
-    """(5,) the terms that a low-pass filter of first order at this frequency has, without their signs."""
-    return np.array([1.0 / (k * (2.0 * np.pi * to_hz) ** k) for k in POWERS])
+def in_units(to_hz: float, from_hz: float = 0.0) -> Array:
+    """The terms that a low-pass filter of first order at `to_hz` has, without their signs: (5,), or (9,) with those of
+    an AC-coupled instrument beside a motion from `from_hz` on."""
+    above = [1.0 / (k * (2.0 * np.pi * to_hz) ** k) for k in POWERS]
+    below = [BELOW_UNIT / -k * (2.0 * np.pi * from_hz / LOWER) ** -k for k in BELOW] if from_hz else []
+    return np.array([*above, *below])
 
 
 def attenuating(frequency_hz: float) -> Array:
@@ -84,9 +105,14 @@ def attenuating(frequency_hz: float) -> Array:
     return np.asarray(np.eye(1, len(POWERS))[0] / (2.0 * np.pi * frequency_hz) ** 2)
 
 
-def by_term(omega: Array) -> Complex:
-    """(i omega)^k (..., 5) for angular frequencies (...,): the derivatives of ln h by the terms."""
-    return np.stack([(1j * omega) ** k for k in POWERS], axis=-1)
+def by_term(omega: Array, count: int = len(POWERS)) -> Complex:
+    """(i omega)^k (..., count) for angular frequencies (...,): the derivatives of ln h by the first `count` terms.
+
+    At 0 Hz the terms below the motion count as 0: the instrument that is not AC-coupled is meant there.
+    """
+    rising, moving = [(1j * omega) ** k for k in POWERS], np.where(omega == 0.0, 1.0, omega)
+    falling = [(1j * moving) ** k * (omega != 0.0) for k in ALL_POWERS[len(POWERS) : count]]
+    return np.stack([*rising, *falling], axis=-1)
 
 
 def passed(u: Array, rate_hz: float, response: Response) -> Array:
@@ -96,11 +122,38 @@ def passed(u: Array, rate_hz: float, response: Response) -> Array:
     """
     if response.is_flat or not response.to_hz > 0.0:
         return u
+    above = response.terms[: len(POWERS)]
+    if response.from_hz:
+        u = _passed_below(u, rate_hz, response)
+    if not any(above):
+        return u
     step = max(1, int(rate_hz / (SPACED * response.to_hz)))
-    taps = _taps(response, rate_hz / step)
+    taps = _taps(Response(above, response.to_hz), rate_hz / step)
     spread = np.zeros((len(taps) - 1) * step + 1)
     spread[::step] = taps
     return convolved(u, spread)
+
+
+def _passed_below(u: Array, rate_hz: float, response: Response) -> Array:
+    """u (n, m) passed through the terms below the motion; NaN within EDGE cycles of an end or of a missing sample."""
+    out = np.full(u.shape, np.nan)
+    whole = np.isfinite(u).all(axis=1)
+    edges = np.flatnonzero(np.diff(whole.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
+    lost = int(np.ceil(EDGE * rate_hz / response.from_hz))
+    rise = 0.5 - 0.5 * np.cos(np.pi * (np.arange(lost) + 0.5) / lost)
+    for first, stop in edges.tolist():
+        if stop - first <= 2 * lost:
+            continue
+        tapered = u[first:stop] - u[first:stop].mean(axis=0)
+        tapered[:lost] *= rise[:, None]
+        tapered[-lost:] *= rise[::-1, None]
+        frequency_hz: Array = np.fft.rfftfreq(len(tapered), 1.0 / rate_hz).astype(np.float64)
+        acting_hz = np.maximum(frequency_hz, UNSEEN * response.from_hz)
+        share = np.minimum(np.log2(acting_hz / (UNSEEN * response.from_hz)), 1.0)
+        moves = (0.5 - 0.5 * np.cos(np.pi * share)) * np.expm1(response.below_at(acting_hz))
+        added = np.fft.irfft(moves[:, None] * np.fft.rfft(tapered, axis=0), len(tapered), axis=0)
+        out[first + lost : stop - lost] = (u[first:stop] + added)[lost:-lost]
+    return out
 
 
 @lru_cache(maxsize=8)
