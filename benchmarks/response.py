@@ -72,7 +72,8 @@ def one(job: Job) -> Result:
 def table(runs: int) -> list[str]:
     """The lines of the table, one for each filter, ratio and side; the three bands of motion are in each line."""
     lines = [
-        "| filter | corner over motion, or its inverse | in | refused | RMS of S less the reference's error, % | within 2 u | most |",
+        "| filter | corner over motion, or its inverse | in | refused | RMS of S less the reference's error, %"
+        " | within 2 u | most |",
         "| --- | --- | --- | --- | --- | --- | --- |",
     ]
     cells = [*itertools.product(FILTERS, RATIOS), *itertools.product(CORNERS, BELOW)]
