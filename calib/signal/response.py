@@ -74,9 +74,12 @@ class Response:
 FLAT = Response()
 
 
+@lru_cache(maxsize=16)
 def in_units(to_hz: float) -> Array:
-    """(5,) the terms that a low-pass filter of first order at this frequency has, without their signs."""
-    return np.array([1.0 / (k * (2.0 * np.pi * to_hz) ** k) for k in POWERS])
+    """(5,) the terms that a low-pass filter of first order at this frequency has, without their signs. Read-only."""
+    units = np.array([1.0 / (k * (2.0 * np.pi * to_hz) ** k) for k in POWERS])
+    units.flags.writeable = False
+    return units
 
 
 def attenuating(frequency_hz: float) -> Array:
@@ -86,7 +89,10 @@ def attenuating(frequency_hz: float) -> Array:
 
 def by_term(omega: Array) -> Complex:
     """(i omega)^k (..., 5) for angular frequencies (...,): the derivatives of ln h by the terms."""
-    return np.stack([(1j * omega) ** k for k in POWERS], axis=-1)
+    s = 1j * np.asarray(omega)  # products are three times as fast as complex powers
+    square = s * s
+    fourth = square * square
+    return np.stack([square, square * s, fourth, fourth * s, fourth * square], axis=-1)  # in the order of POWERS
 
 
 def passed(u: Array, rate_hz: float, response: Response) -> Array:
