@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib.model import Array
+from calib.signal.median import median
 
 IntArray = NDArray[np.int64]
 # A typical driver sends 3000 bursts in a minute. If the temperature changes the rate by 250 ppm in 30 min, a parabola
@@ -253,13 +254,6 @@ def _robust_line(design: Array, value: Array) -> tuple[Array, Array]:
         inverse = np.linalg.inv(weighted.T @ weighted)
         c = inverse @ (weighted.T @ (weight * value))
         rest = value - design @ c
-        sd = 1.4826 * _median(np.abs(rest)) + 1e-12
+        sd = 1.4826 * float(median(np.abs(rest))) + 1e-12
         weight = np.where(rest > sd, np.sqrt(sd / np.maximum(rest, sd)), 1.0)
     return c, np.asarray(inverse * sd**2)
-
-
-def _median(values: Array) -> float:
-    """The median of a few values; np.median needs ten times as long, most of it for checks."""
-    half = len(values) // 2
-    parted = np.partition(values, (half - 1, half))
-    return float(parted[half] if len(values) % 2 else 0.5 * (parted[half - 1] + parted[half]))
