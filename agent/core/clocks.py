@@ -12,6 +12,7 @@ from agent.core.events import ClockReport, Result
 from agent.core.outcome import Source
 from agent.core.stream import DeviceStream
 from calib.model import Array
+from calib.signal.median import median
 from calib.signal.timing import ClockFit
 
 EVERY_S = 60.0
@@ -72,8 +73,8 @@ def _report(
     source: Source, device: str, nominal_rate_hz: float, clock: ClockFit, lateness_s: Array, lag_s: tuple[float, float]
 ) -> ClockReport:
     """`lateness_s` (B,) of the bursts behind the clock; `lag_s` is the value and its standard uncertainty."""
-    offset_s = float(np.median(lateness_s))
-    jitter_s = MAD_TO_SD * float(np.median(np.abs(lateness_s - offset_s)))
+    offset_s = float(median(lateness_s))
+    jitter_s = MAD_TO_SD * float(median(np.abs(lateness_s - offset_s)))
     u_median_s = MEDIAN_TO_MEAN * jitter_s / np.sqrt(len(lateness_s))
     return ClockReport(
         run_id="", sequence=0, sensor=source.sensor, t_utc_ns=source.t_utc_ns,

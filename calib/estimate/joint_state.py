@@ -184,7 +184,12 @@ class JointState:
 
     def copy(self) -> JointState:
         """An independent copy."""
-        return JointState.load(self.snapshot())
+        other = object.__new__(JointState)
+        other.__dict__.update(self.__dict__)
+        other.quantities = list(self.quantities)  # names and keys are never changed, only replaced
+        for name in _ARRAYS:
+            setattr(other, name, getattr(self, name).copy())
+        return other
 
     def snapshot(self) -> dict[str, Any]:
         """The complete state, for `load`; bit for bit."""

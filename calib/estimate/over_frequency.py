@@ -22,6 +22,8 @@ KNOWN = 0.03  # standard uncertainty of ln h
 LEFT_U = 1.0  # standard uncertainties of ln h that may be left in a window
 SURELY = 4.0  # standard uncertainties
 MOVED = 1e-2  # change of ln h from which the windows must be linearised again
+# (2, 5) derivatives of ln h by the unknowns of the response, in the middle and at the upper end of the motion.
+_ENDS: Complex = by_term(np.array([0.5, 1.0]) / WIDER) * in_units(1.0 / (2.0 * np.pi))
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,23 +81,23 @@ class OverFrequency:
     def is_known(self, state: JointState, reference: str) -> bool:
         """Whether windows have told the response beside a reference: one more cannot change it much."""
         own = terms_of(state, reference)
-        return bool(own) and float(np.linalg.norm(_ends() @ state.factor[own], axis=1).max()) < KNOWN
+        return bool(own) and float(np.linalg.norm(_ENDS @ state.factor[own], axis=1).max()) < KNOWN
 
     def is_taken_out(self, taken: Response, state: JointState, reference: str) -> bool:
         """Whether `taken` is the response beside a reference, but for a part of its uncertainty."""
         own = terms_of(state, reference)
         if not own:
             return True
-        left = np.abs(_ends() @ (state.mean[own] - np.array(taken.terms) / in_units(self.to_hz)))
-        return bool(np.all(left < np.maximum(NEAR, LEFT_U * np.linalg.norm(_ends() @ state.factor[own], axis=1))))
+        left = np.abs(_ENDS @ (state.mean[own] - np.array(taken.terms) / in_units(self.to_hz)))
+        return bool(np.all(left < np.maximum(NEAR, LEFT_U * np.linalg.norm(_ENDS @ state.factor[own], axis=1))))
 
     def differs(self, state: JointState, earlier: JointState, reference: str) -> bool:
         """Whether the response beside a reference is surely another in `state` than in an earlier state."""
         own, was = terms_of(state, reference), terms_of(earlier, reference)
         if not own or len(own) != len(was):
             return False
-        moved = np.abs(_ends() @ (state.mean[own] - earlier.mean[was]))
-        u, u_was = (np.linalg.norm(_ends() @ one.factor[k], axis=1) for one, k in ((state, own), (earlier, was)))
+        moved = np.abs(_ENDS @ (state.mean[own] - earlier.mean[was]))
+        u, u_was = (np.linalg.norm(_ENDS @ one.factor[k], axis=1) for one, k in ((state, own), (earlier, was)))
         return bool(np.any(moved > np.maximum(MOVED, SURELY * np.hypot(u, u_was))))
 
     def factor(self, state: JointState) -> Array:
@@ -182,11 +184,6 @@ def changed(state: JointState, point: Array) -> bool:
     """Whether a response in the state differs so much from the `point` (N,) that windows must be linearised again."""
     for owner in dict.fromkeys(q.owner for q in state.quantities if q.kind is RESPONSE):
         own = terms_of(state, owner)
-        if own and np.abs(_ends() @ (state.mean - point)[own]).max() > MOVED:
+        if own and np.abs(_ENDS @ (state.mean - point)[own]).max() > MOVED:
             return True
     return False
-
-
-def _ends() -> Complex:
-    """(2, 5) derivatives of ln h by the unknowns of the response, in the middle and at the upper end of the motion."""
-    return by_term(np.array([0.5, 1.0]) / WIDER) * in_units(1.0 / (2.0 * np.pi))

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from calib.model import Array
 from calib.signal.band import hanning
+from calib.signal.median import median
 
 Mask = NDArray[np.bool_]
 Stretch = tuple[int, int]  # [first, stop) of samples
@@ -33,7 +34,7 @@ ROUNDING = 1e-9  # of the range: smaller residuals are rounding errors, not nois
 def moving(u: Array, rate_hz: float) -> list[Stretch]:
     """Stretches in which the reference u (n, m) moves: its level is high enough compared with its strongest part."""
     width = band_width(u, rate_hz, white_noise(u))
-    slow = averaged(u - np.median(u, axis=0), width) if len(u) else u
+    slow = averaged(u - median(u.T), width) if len(u) else u
     size = max(1, round(FRAME_S * rate_hz / width))
     frames = len(slow) // size
     if frames < 2:
@@ -55,7 +56,7 @@ def knocked(V: Array, basis: Array, finest: Array) -> tuple[Mask, Array]:
         kept = np.flatnonzero(~struck) if struck.any() else slice(None)
         residual = outputs - _regression(columns[:, kept], outputs[:, kept]) @ columns
         away = np.abs(residual)
-        limit = KNOCK_SD * np.maximum(1.4826 * np.median(away[:, kept], axis=1), 0.5 * finest)
+        limit = KNOCK_SD * np.maximum(1.4826 * median(away[:, kept]), 0.5 * finest)
         now = np.asarray((away > limit[:, None]).any(axis=0))
         if np.array_equal(now, struck):
             break
@@ -90,7 +91,7 @@ def clipped(V: Array, residual: Array, finest: Array) -> int:
             held = np.flatnonzero(v == end)
             if len(held) < CLIPPED_POINTS:
                 continue
-            noise = 1.4826 * float(np.median(np.abs(r)))
+            noise = 1.4826 * float(median(np.abs(r)))
             if _all_differ(v, noise) or -sign * float(r[held].mean()) > noise + finest[axis]:
                 points += len(held)
     return points
@@ -135,11 +136,11 @@ def white_noise(x: Array) -> Array:
     size = min(SPECTRUM_SAMPLES, 1 << max(len(x).bit_length() - 1, 0))
     if size < FEWEST_FOR_SPECTRUM:
         return np.zeros(x.shape[1])
-    starts = np.unique(np.linspace(0, len(x) - size, SPECTRA).astype(int))
-    parts = np.stack([x[k : k + size] for k in starts])
-    window = hanning(size)[:, None]
-    lines = np.fft.rfft((parts - parts.mean(axis=1, keepdims=True)) * window, axis=1)[:, 1:-1]
-    power = np.median(np.abs(lines) ** 2, axis=(0, 1)) / np.sum(window**2)
+    starts = sorted({k * (len(x) - size) // (SPECTRA - 1) for k in range(SPECTRA)})
+    rows, window = np.ascontiguousarray(x.T), hanning(size)
+    parts = np.stack([rows[:, k : k + size] for k in starts], axis=1)
+    lines = np.fft.rfft((parts - parts.mean(axis=2, keepdims=True)) * window)[..., 1:-1]
+    power = median((lines.real**2 + lines.imag**2).reshape(len(rows), -1)) / np.sum(window**2)
     # The power of a line of white noise is exponentially distributed: its mean is its median divided by ln 2.
     return np.asarray(np.sqrt(power / np.log(2.0)))
 

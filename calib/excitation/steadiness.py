@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from calib.model import Array
+from calib.signal.median import median
 
 # The change of the mean is searched at the edges of such blocks. The scatter of the blocks shows how well it is known.
 BLOCK_S = 1.0
@@ -32,14 +33,14 @@ def step(residual: Array, rate_hz: float) -> tuple[float, float]:
         return 0.0, 0.0
     # The samples of an axis lie side by side, so that a median is several times faster.
     samples = np.ascontiguousarray(residual[: blocks * size].T).reshape(3, blocks, size)
-    level = np.median(samples, axis=2)
-    spread = np.median(np.abs(samples - level[..., None]), axis=2).max(axis=0)
+    level = median(samples)
+    spread = median(np.abs(samples - level[..., None])).max(axis=0)
     level = level.T
-    weight = 1.0 / np.clip(spread / max(float(np.median(spread)), np.finfo(float).tiny), 1.0, 1e3) ** 2
+    weight = 1.0 / np.clip(spread / max(float(median(spread)), np.finfo(float).tiny), 1.0, 1e3) ** 2
     before, total = np.cumsum(weight)[:-1], float(weight.sum())
     per_block = total / (before * (total - before))  # variance of a difference of two means, over that of one block
     centred = weight[:, None] * (level - weight @ level / total)
     change = np.linalg.norm(np.cumsum(centred, axis=0)[:-1], axis=1) * per_block
     at = int(np.argmax(change**2 / per_block))
-    variance = 0.5 * np.median(np.sum(np.diff(level, axis=0) ** 2, axis=1)) / MEDIAN_OF_THREE
+    variance = 0.5 * float(median(np.sum(np.diff(level, axis=0) ** 2, axis=1))) / MEDIAN_OF_THREE
     return float(change[at]), float(np.sqrt(variance * per_block[at]))

@@ -22,6 +22,7 @@ from calib.excitation.steadiness import step
 from calib.excitation.sums import factor, pool, window_sums
 from calib.excitation.window_verdict import DEFAULT_LIMITS, Limits, Verdict, judge
 from calib.model import Array, Pose, Window, WindowSums
+from calib.signal.median import median
 
 # 1 % of gravity. A reference that moves by more beside a sensor does not rest.
 LEAST_MOTION_MPS2 = 0.1
@@ -332,7 +333,7 @@ def _unbroken(time_s: Array) -> Iterator[tuple[int, int]]:
     if len(time_s) < 2:
         return
     steps = np.diff(time_s)
-    cuts = np.flatnonzero(steps > 2.5 * np.median(steps)) + 1
+    cuts = np.flatnonzero(steps > 2.5 * median(steps)) + 1
     yield from ((a, b) for a, b in itertools.pairwise([0, *cuts.tolist(), len(time_s)]) if b - a > 1)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from calib.model import Array
 from calib.signal.holes import Mask, in_short_holes, short_holes_filled
+from calib.signal.median import median
 
 SEGMENT_S = 4.0  # length of a segment of a spectrum: lines 0.25 Hz apart, and many segments in a few minutes
 LEAST_SEGMENTS = 8  # fewer segments give spectra that are too uncertain to choose a band
@@ -63,7 +64,7 @@ def _floor(powers: Array, segments: int) -> Array:
 
     A line's power is the mean of `segments` exponential variables: its median is its mean times 1 - 1 / (3 segments).
     """
-    return np.asarray(np.median(powers, axis=1) / (1.0 - 1.0 / (3.0 * segments)))
+    return np.asarray(median(powers) / (1.0 - 1.0 / (3.0 * segments)))
 
 
 def _bridged(x: Array) -> Array:

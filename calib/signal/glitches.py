@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.model import Array
+from calib.signal.median import median
 
 # Curvature over the usual curvature nearby. Gaussian motion with noise reaches 7 in 3.6 million samples.
 LIMIT = 50.0
@@ -57,7 +58,7 @@ def _of_channel(x: Array) -> Mask:
 def _usual(bend: Array) -> Array:
     """(n,) the median curvature of the block of each sample or of a neighbouring block, whichever is largest."""
     blocks = len(bend) // BLOCK
-    medians = np.median(bend[: blocks * BLOCK].reshape(blocks, BLOCK), axis=1)
+    medians = median(bend[: blocks * BLOCK].reshape(blocks, BLOCK))
     padded = np.pad(medians, 1, mode="edge")
     largest = np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:])
     return np.repeat(np.append(largest, largest[-1]), BLOCK)[: len(bend)]

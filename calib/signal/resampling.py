@@ -16,6 +16,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from calib.model import Array
+from calib.signal.median import median
 from calib.signal.timing import ClockFit
 
 TAPS, DEGREE = 16, 7
@@ -58,7 +59,7 @@ def resample(x: Array, clock: ClockFit, time_s: Array, first_index: int = 0, mar
     usable = (start >= margin) & (start + TAPS + margin <= len(x))
     for gap in clock.gaps:
         usable &= np.abs(base - gap) > HALF + margin + NODES
-    middle = clock.index_of(np.median(time_s))
+    middle = clock.index_of(median(time_s))
     rate = 1.0 / float(clock.time_of(middle + 0.5) - clock.time_of(middle - 0.5))
     # A channel a row: what is done to a channel afterwards finds its samples side by side.
     u, du = np.zeros((x.shape[1], len(position))), np.zeros((x.shape[1], len(position)))

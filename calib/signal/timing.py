@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib.model import Array
+from calib.signal.median import median
 
 IntArray = NDArray[np.int64]
 # A typical driver sends 3000 bursts in a minute. If the temperature changes the rate by 250 ppm in 30 min, a parabola
@@ -59,12 +60,12 @@ class ClockFit:
         k = self._piece(self.knot_index, i)
         width = self.knot_index[k + 1] - self.knot_index[k]
         x = (i - self.knot_index[k]) / width
-        inside = np.clip(x, 0.0, 1.0)
+        inside = np.minimum(np.maximum(x, 0.0), 1.0)  # np.clip and np.where are slow for a few values
         y0, y1 = self.knot_time_s[k], self.knot_time_s[k + 1]
         d0, d1 = self.knot_period_s[k] * width, self.knot_period_s[k + 1] * width
         rise = y1 - y0
         cubic = y0 + inside * (d0 + inside * (3 * rise - 2 * d0 - d1 + inside * (d0 + d1 - 2 * rise)))
-        return np.asarray(cubic + (x - inside) * np.where(x < 0.0, d0, d1))
+        return np.asarray(cubic + np.minimum(x, 0.0) * d0 + np.maximum(x - 1.0, 0.0) * d1)
 
     def index_of(self, time_s: ArrayLike) -> Array:
         """Sample numbers (with fraction) at these times (n,) in s: the inverse of `time_of`."""
@@ -206,7 +207,7 @@ def parabola(index: IntArray, arrival_s: Array, nominal_rate_hz: float, edge: Ed
     The curvature is 0 if the arrivals span less than `CURVED_FROM_S`.
     """
     x, y = (index - index[-1]).astype(float), arrival_s - arrival_s[-1]
-    size = int(np.clip(len(x) // GROUPS, SMALLEST_GROUP, LARGEST_GROUP))
+    size = min(max(len(x) // GROUPS, SMALLEST_GROUP), LARGEST_GROUP)
     known = len(x) >= FEWEST_FOR_RATE
     c = np.array([0.0, y[0] / x[0] if known else 1.0 / nominal_rate_hz, 0.0])
     order = 3 if y[0] < -CURVED_FROM_S else 2
@@ -239,10 +240,8 @@ def _edges(x: Array, late: Array, edge: Edge) -> tuple[Array, Array]:
     """
     if edge == "mean":
         return x.mean(axis=1), late.mean(axis=1)
-    two = np.argpartition(late, 1, axis=1)[:, :2]
-    values = np.take_along_axis(late, two, axis=1)
-    earliest = two[np.arange(len(two)), values.argmin(axis=1)]
-    return x[np.arange(len(x)), earliest], 2 * values.min(axis=1) - values.max(axis=1)
+    two = np.partition(late, 1, axis=1)
+    return x[np.arange(len(x)), late.argmin(axis=1)], 2 * two[:, 0] - two[:, 1]
 
 
 def _robust_line(design: Array, value: Array) -> tuple[Array, Array]:
@@ -250,16 +249,28 @@ def _robust_line(design: Array, value: Array) -> tuple[Array, Array]:
     weight = np.ones(len(value))
     for _ in range(3):
         weighted = design * weight[:, None]
-        inverse = np.linalg.inv(weighted.T @ weighted)
+        inverse = _inverse(weighted.T @ weighted)
         c = inverse @ (weighted.T @ (weight * value))
         rest = value - design @ c
-        sd = 1.4826 * _median(np.abs(rest)) + 1e-12
-        weight = np.where(rest > sd, np.sqrt(sd / np.maximum(rest, sd)), 1.0)
+        sd = 1.4826 * float(median(np.abs(rest))) + 1e-12
+        weight = np.sqrt(sd / np.maximum(rest, sd))
     return c, np.asarray(inverse * sd**2)
 
 
-def _median(values: Array) -> float:
-    """The median of a few values; np.median needs ten times as long, most of it for checks."""
-    half = len(values) // 2
-    parted = np.partition(values, (half - 1, half))
-    return float(parted[half] if len(values) % 2 else 0.5 * (parted[half - 1] + parted[half]))
+def _inverse(normal: Array) -> Array:
+    """The inverse of a symmetric matrix (2, 2) or (3, 3) by its cofactors, in a third of the time of np.linalg.inv.
+
+    Raises numpy.linalg.LinAlgError for a singular matrix.
+    """
+    if len(normal) == 2:
+        (a, b), (_, d) = normal.tolist()
+        rows = [[d, -b], [-b, a]]
+        determinant = a * d - b * b
+    else:
+        (a, b, c), (_, d, e), (_, _, f) = normal.tolist()
+        first, second, third = d * f - e * e, c * e - b * f, b * e - c * d
+        rows = [[first, second, third], [second, a * f - c * c, b * c - a * e], [third, b * c - a * e, a * d - b * b]]
+        determinant = a * first + b * second + c * third
+    if determinant == 0.0:
+        raise np.linalg.LinAlgError("singular matrix")
+    return np.array(rows) / determinant
