@@ -135,9 +135,7 @@ class Row:
 class Cases:
     """Makes files and runs them. `directory`: for the files. `keep`: for those of faults, or None."""
 
-    def __init__(
-        self, directory: Path, *, program: bool, keep: Path | None = None, only: str = "", quick: bool = False
-    ) -> None:
+    def __init__(self, directory: Path, *, program: bool, keep: Path | None = None, quick: bool = False) -> None:
         if not program:
             guard_standard_streams()  # before a library keeps them for its warnings
         (directory / "site").mkdir()
