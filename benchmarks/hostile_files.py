@@ -252,7 +252,7 @@ def main(arguments: Sequence[str]) -> int:
     os.nice(10)
     end, faults = time.monotonic() + given.seconds, 0
     with tempfile.TemporaryDirectory(prefix="fieldcal-hostile-") as directory:
-        cases = Cases(Path(directory), program=given.program, keep=given.keep, only=given.kind, quick=given.quick)
+        cases = Cases(Path(directory), program=given.program, keep=given.keep, quick=given.quick)
         number = given.first
         while number < given.first + given.count and time.monotonic() < end:
             for told in cases.run(number) if given.kind in cases.kind(number).title else ():
