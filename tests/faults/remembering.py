@@ -208,7 +208,8 @@ def judge(outcome: Outcome, truth: dict[tuple[str, int], bool], given: list[Give
         first[name] = one
         outcome.require(one.sequence > newest.get(one.epoch, -1), f"result {name} came after {newest.get(one.epoch)}")
         newest[one.epoch] = one.sequence
-    missing = {name for name, signed in truth.items() if signed} - first.keys()
+    doubted = {(one.epoch, one.sequence) for one in given if not one.confirmed} - first.keys()
+    missing = {name for name, signed in truth.items() if signed} - first.keys() - doubted
     told_of = [one.epoch for one in given if one.new_epoch]
     order = list(dict.fromkeys(epoch for epoch, _ in first))
     for epoch, sequence in sorted(missing):
@@ -221,7 +222,7 @@ def judge(outcome: Outcome, truth: dict[tuple[str, int], bool], given: list[Give
     outcome.also = (
         f"{len(truth)} results of {epochs} stores, {len(first)} came, in order; {again} came again after a kill of the"
         f" consumer; {len(missing)} were lost with their stores, and {len(told_of)} times this was told;"
-        f" {sum(not one.confirmed for one in given)} came first as not confirmed"
+        f" {len(doubted)} came as not confirmed only"
     )
 
 

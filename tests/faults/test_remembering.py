@@ -18,7 +18,7 @@ TRUTH = {("a", 1): True, ("a", 2): True, ("a", 3): True, ("b", 1): True}
 
 def test_every_signed_result_comes_once_and_in_order(tmp_path: Path) -> None:
     require("gcc")
-    outcome = remembering.killed(tmp_path, 5)
+    outcome = remembering.killed(tmp_path, 3)
     assert outcome.good, outcome
 
 
