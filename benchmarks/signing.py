@@ -1,23 +1,41 @@
-"""What signed results cost: CPU time for each result at the gateway and at a consumer.
+"""What signed results cost: for each result, for a live agent, and for a replay of its recording.
 
-python -m benchmarks.signing
+    python -m benchmarks.signing [--seconds 120]
+
+Two agents run at the same time on ports that send the same 20 times as fast as in real time, one with a key and one
+without, so that other work on the machine slows both down alike; then again, begun in the other order.
 """
 
 from __future__ import annotations
 
+import argparse
+import os
+import subprocess
+import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
+
+import msgspec
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 
 from agent.config.known_keys import WatchedKeys
 from agent.delivery.received import receive
 from agent.delivery.verifying import Verifier
+from benchmarks.soak import ENDPOINT, ROLES, ROOT, SETTLE_S, configuration, process, slow_bench
+from hw.virtual.serial_bench import serial_lines
+from hw.virtual.serial_port import PtyDevice
+from hw.virtual.timebase import BenchTime
 from tests.attacks.chain_site import KEY
 from tests.attacks.signed_site import PLACE, listed, signed_record, signer_of
 from tests.unit.results import calibration
 
 COUNT = 2000
+SPEED, RATE_HZ = 20, 100
+WARM_UP_S = 10.0  # imports and the first fits are not part of the running cost
+PORT = 7460
 EPOCH = "00c0ffee00c0ffee"
 
 
@@ -29,8 +47,92 @@ def each_us(what: Callable[[int], object]) -> float:
     return (time.process_time() - began_s) / COUNT * 1e6
 
 
-def main() -> None:
-    """Measure, and print the table."""
+def cpu_s(pid: int) -> float:
+    """CPU time of all threads of a process until now, s."""
+    parts = Path(f"/proc/{pid}/task").glob("*/schedstat")
+    return sum(int(part.read_text().split()[0]) for part in parts) * 1e-9
+
+
+class Agent:
+    """An agent with its own ports in a directory of its own; with `key` it signs."""
+
+    def __init__(self, stack: ExitStack, directory: Path, key: Path | None) -> None:
+        directory.mkdir()
+        bench, self._time = slow_bench(RATE_HZ), BenchTime()
+        self._ports = [
+            PtyDevice(serial_lines(bench, role, self._time), lambda: SPEED * time.monotonic(), directory / role)
+            for role in ROLES
+        ]
+        for port in self._ports:
+            stack.callback(port.stop)
+            port.start()
+        text = configuration(bench, directory, SPEED, PORT)
+        signing = f'[recording]\nsigning_key = "{key}"\n' if key else "[recording]\n"
+        (directory / "config.toml").write_text(text.replace("[recording]\n", signing))
+        self.data = directory / "data"
+        command = ["run", str(directory / "config.toml"), "--data-dir", str(self.data)]
+        self.process = stack.enter_context(process(command, directory, SPEED))
+
+    def begin(self) -> None:
+        """Wait until it reads its ports, then let them send."""
+        while not all(port.has_reader() for port in self._ports):
+            time.sleep(0.05)
+        time.sleep(SETTLE_S)
+        self._time.begin(SPEED * time.monotonic())
+
+
+def live(directory: Path, seconds: float, order: Sequence[bool]) -> tuple[dict[bool, float], dict[bool, Path]]:
+    """(CPU time for a second, data directory) of two agents that run together, by whether they sign."""
+    key = directory / "recording.key"
+    key.touch(mode=0o600)
+    key.write_bytes(KEY.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))
+    with ExitStack() as stack:
+        router = ["router", "--listen", ENDPOINT.format(port=PORT)]
+        stack.enter_context(process(router, directory, SPEED))
+        agents = {signs: Agent(stack, directory / f"signs-{signs}", key if signs else None) for signs in order}
+        for agent in agents.values():
+            agent.begin()
+        time.sleep(WARM_UP_S)
+        before, began_s = {signs: cpu_s(a.process.pid) for signs, a in agents.items()}, time.monotonic()
+        time.sleep(seconds)
+        lasted_s = time.monotonic() - began_s
+        spent = {signs: (cpu_s(a.process.pid) - before[signs]) / lasted_s for signs, a in agents.items()}
+    return spent, {signs: agent.data for signs, agent in agents.items()}
+
+
+def replayed(data: Path) -> tuple[float, int, int]:
+    """(CPU time in s, events, results) of a replay of all recordings of a directory."""
+    files = sorted(map(str, data.glob("*.mcap")))
+    before = os.times()
+    run = [sys.executable, "-m", "agent", "replay", *files, "--json", "-"]
+    done = subprocess.run(run, capture_output=True, check=True, cwd=ROOT)
+    after = os.times()
+    told = msgspec.json.decode(done.stdout)
+    spent_s = after.children_user + after.children_system - before.children_user - before.children_system
+    return spent_s, told["events"], told["results"]
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Measure, and print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=120.0, help="that the agents run, twice")
+    given = parser.parse_args(arguments)
+    each_result()
+    print(f"\n| two agents together, {given.seconds:g} s, {SPEED} times real time | without a key | signed | more |")
+    print("| --- | --- | --- | --- |")
+    for number, order in enumerate(((False, True), (True, False)), start=1):
+        with tempfile.TemporaryDirectory() as directory:
+            spent, data = live(Path(directory), given.seconds, order)
+            found = {signs: replayed(data[signs]) for signs in order}
+        more = 100 * (spent[True] / spent[False] - 1)
+        print(f"| run {number}: CPU of the live agent | {spent[False]:.4f} | {spent[True]:.4f} | {more:+.1f} % |")
+        told = [f"{1e6 * found[s][0] / found[s][1]:.0f} us ({found[s][2]} results)" for s in (False, True)]
+        more = 100 * (found[True][0] / found[True][1] / (found[False][0] / found[False][1]) - 1)
+        print(f"| run {number}: CPU of a replay, for each event | {told[0]} | {told[1]} | {more:+.1f} % |", flush=True)
+
+
+def each_result() -> None:
+    """Measure encoding, signing and verifying a result, and print the table."""
     results = [calibration(number) for number in range(COUNT + 1)]
     plain, signer = signer_of("site/gw", EPOCH, None), signer_of("site/gw", EPOCH, KEY)
     encoded_us = each_us(lambda n: plain.encode(n, results[n]))
@@ -50,4 +152,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])

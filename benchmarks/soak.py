@@ -76,14 +76,7 @@ class Soaked:
 
 def soak(hours: float, speed: int, rate_hz: int, port: int) -> Soaked:
     """Run the agent for `hours` of its drivers' clock and observe it."""
-    parameters = plain(SEED)
-    sensor, reference = (replace(p.clock, nominal_rate_hz=rate_hz) for p in (parameters.sensor, parameters.reference))
-    parameters = replace(
-        parameters,
-        sensor=replace(parameters.sensor, clock=sensor),
-        reference=replace(parameters.reference, clock=reference),
-    )
-    bench, bench_time = Bench(parameters, SEED), BenchTime()
+    bench, bench_time = slow_bench(rate_hz), BenchTime()
     with ExitStack() as stack:
         directory = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         devices = [
@@ -94,11 +87,11 @@ def soak(hours: float, speed: int, rate_hz: int, port: int) -> Soaked:
             stack.callback(device.stop)
             device.start()
         config = directory / "config.toml"
-        config.write_text(_config(bench, directory, speed, port))
-        stack.enter_context(_process(["router", "--listen", ENDPOINT.format(port=port)], directory, speed))
+        config.write_text(configuration(bench, directory, speed, port))
+        stack.enter_context(process(["router", "--listen", ENDPOINT.format(port=port)], directory, speed))
         received = stack.enter_context(_received(ENDPOINT.format(port=port)))
         agent = stack.enter_context(
-            _process(["run", str(config), "--data-dir", str(directory / "data")], directory, speed)
+            process(["run", str(config), "--data-dir", str(directory / "data")], directory, speed)
         )
         while not all(device.has_reader() for device in devices):
             time.sleep(0.05)
@@ -116,7 +109,20 @@ def soak(hours: float, speed: int, rate_hz: int, port: int) -> Soaked:
         )
 
 
-def _config(bench: Bench, directory: Path, speed: int, port: int) -> str:
+def slow_bench(rate_hz: int) -> Bench:
+    """The plain bench with sensor and reference at this rate, in Hz."""
+    parameters = plain(SEED)
+    sensor, reference = (replace(p.clock, nominal_rate_hz=rate_hz) for p in (parameters.sensor, parameters.reference))
+    parameters = replace(
+        parameters,
+        sensor=replace(parameters.sensor, clock=sensor),
+        reference=replace(parameters.reference, clock=reference),
+    )
+    return Bench(parameters, SEED)
+
+
+def configuration(bench: Bench, directory: Path, speed: int, port: int) -> str:
+    """Configuration of an agent whose ports are named as the roles, in `directory`."""
     driver = "serial-csv" if speed == 1 else "serial-csv-fast"
     lines = [f'[zenoh]\nconnect = ["{ENDPOINT.format(port=port)}"]', ROTATION]
     for role in ROLES:
@@ -138,17 +144,18 @@ def _config(bench: Bench, directory: Path, speed: int, port: int) -> str:
 
 
 @contextmanager
-def _process(arguments: list[str], directory: Path, speed: int) -> Iterator[subprocess.Popen[bytes]]:
+def process(arguments: list[str], directory: Path, speed: int) -> Iterator[subprocess.Popen[bytes]]:
+    """Run a command of fieldcal whose clock, in fast drivers, runs `speed` times as fast."""
     variables = os.environ | environment(speed, directory / "site")
     with open(directory / f"{arguments[0]}.output", "wb") as output:
-        process = subprocess.Popen(
+        started = subprocess.Popen(
             [sys.executable, "-m", "agent", *arguments], stdout=output, stderr=subprocess.STDOUT, env=variables
         )
     try:
-        yield process
+        yield started
     finally:
-        process.terminate()
-        process.wait(20)
+        started.terminate()
+        started.wait(20)
 
 
 @contextmanager
@@ -170,13 +177,13 @@ def _received(endpoint: str) -> Iterator[list[int]]:
     thread.join(10)
 
 
-def _watched(process: subprocess.Popen[bytes], duration_s: float) -> Iterator[Sample]:
+def _watched(agent: subprocess.Popen[bytes], duration_s: float) -> Iterator[Sample]:
     began_s = time.monotonic()
-    while (elapsed_s := time.monotonic() - began_s) < duration_s and process.poll() is None:
+    while (elapsed_s := time.monotonic() - began_s) < duration_s and agent.poll() is None:
         status = dict(
-            line.split(":", 1) for line in Path(f"/proc/{process.pid}/status").read_text().splitlines() if ":" in line
+            line.split(":", 1) for line in Path(f"/proc/{agent.pid}/status").read_text().splitlines() if ":" in line
         )
-        descriptors = len(os.listdir(f"/proc/{process.pid}/fd"))
+        descriptors = len(os.listdir(f"/proc/{agent.pid}/fd"))
         sample = Sample(elapsed_s, int(status["VmRSS"].split()[0]) / 1024, int(status["Threads"]), descriptors)
         print(
             f"{elapsed_s:7.0f} s  {sample.memory_mb:6.1f} MB  {sample.threads} threads  {descriptors} fds", flush=True

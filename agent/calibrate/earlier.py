@@ -52,7 +52,10 @@ def _from_json(data: bytes) -> tuple[Array, Array]:
 
 def _from_xml(data: bytes) -> tuple[Array, Array]:
     _refuse_document_type(data)
-    root = ET.fromstring(data)
+    try:
+        root = ET.fromstring(data)
+    except ET.ParseError as error:  # also what the parser above does not look at, such as prefixes
+        raise _OtherXmlError(f"the XML is broken: {error}") from None
     if root.tag != f"{{{DCC}}}digitalCalibrationCertificate":
         raise _OtherXmlError("the XML is no digital calibration certificate (DCC)")
     quantity = root.find(f".//{{{DCC}}}quantity[@refType='{COVARIANCE}']/{{{SI}}}realListXMLList")

@@ -76,4 +76,7 @@ def _serial_number(path: Path) -> str:
     if data.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<"):
         where = f".//{{{DCC}}}item/{{{DCC}}}identifications/{{{DCC}}}identification/{{{DCC}}}value"
         return ET.fromstring(data).findtext(where) or ""
-    return str(json.loads(data).get("certificate", {}).get("stated", {}).get("instrument", {}).get("serial_number", ""))
+    told = json.loads(data)
+    for name in ("certificate", "stated", "instrument", "serial_number"):
+        told = told.get(name, "") if isinstance(told, dict) else ""
+    return told if isinstance(told, str) else ""

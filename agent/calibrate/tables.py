@@ -29,6 +29,7 @@ ELECTRICAL = ("indication", "count")
 # A stamp may be earlier than the previous one by up to this time, because of jitter or a burst that was read late
 # (delays are some tens of ms).
 LATEST_STAMP_S = 0.1
+LAST_S = 1e11  # in the year 5138; a later time is in another unit
 ROWS_AT_ONCE = 1 << 20
 # From these values on, a time without unit counts since 1970, in this part of a second: 1e9 s is the year 2001.
 SINCE_1970 = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
@@ -214,6 +215,12 @@ def _check_time(source: Source, time: Chosen, time_s: Array) -> None:
 
     Raises TableError.
     """
+    ends = float(time_s[0]), float(time_s[-1])
+    if max(map(abs, ends)) > LAST_S:
+        raise TableError(
+            f"{source.path}, column {time.column}: the time runs from {ends[0]:.10g} s to {ends[1]:.10g} s, which is "
+            "no time since 1970 in s; state its unit, for example --columns time=NAME:ms"
+        )
     try:
         allowed = 0.0 if kind_of(np.asarray(time_s[:ROWS_AT_ONCE])) == "grid" else LATEST_STAMP_S
     except ValueError:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import threading
 import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -15,10 +18,10 @@ from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
 from agent.cli.tls_options import tls_files, tls_options
 from agent.config.key_file import KeyFileError
+from agent.config.known_keys import KnownKeys, WatchedKeys
 from agent.delivery.keys import PREFIX, parse_key
 from agent.delivery.session import EndpointError, session_config
 from agent.keys.files import write_new
-from agent.recording.signed_text import key_id
 from agent.recording.signing import Signer, load_public_key
 from agent.recording.witness import KEY_NAME, PUBLIC_NAME, Witness, WitnessError
 from agent.terminal.text import say
@@ -26,6 +29,7 @@ from agent.terminal.text import say
 INBOX = 1000  # heads that may wait; the oldest are dropped, and each gateway publishes a new one within a minute
 CONNECT_MS = 10_000
 CLOSE_S = 2.0  # s to wait at the end until a head that has arrived is kept
+TOLD_S = 10.0  # s between two heads that are said to be refused, since strangers may publish them without end
 HEADS = f"{PREFIX}/*/*/head"
 
 
@@ -36,14 +40,18 @@ HEADS = f"{PREFIX}/*/*/head"
               metavar="ENDPOINT", help="Router; may be given several times.")  # fmt: skip
 @click.option("--key", default=HEADS, show_default=True, metavar="KEYEXPR", help="Which gateways.")
 @click.option("--public-key", "public_keys", multiple=True, type=click.Path(path_type=Path), metavar="K",
-              help="Key of a gateway (PEM); may be given several times. Then no other key is taken; without it, the "
-              "first key that is seen for a gateway.")  # fmt: skip
+              help="Key of a gateway (PEM); may be given several times. Then only these and those of --keys count; "
+              "without both, the first key that is seen for a gateway.")  # fmt: skip
+@click.option("--keys", "known_keys", type=click.Path(path_type=Path), metavar="F",
+              help="List of known keys (`fieldcal keys`): of each gateway only its own keys count, revoked ones never. "
+              "It is read again when it changes.")  # fmt: skip
 @tls_options
 def witness(
     directory: Path,
     endpoints: tuple[str, ...],
     key: str,
     public_keys: tuple[Path, ...],
+    known_keys: Path | None,
     ca: str | None,
     certificate: str | None,
     certificate_key: str | None,
@@ -58,8 +66,7 @@ def witness(
         signal.signal(number, lambda *_: stop.set())
     tls = tls_files(endpoints, ca, certificate, certificate_key)
     try:
-        trusted = {key_id(trusted): trusted for trusted in map(load_public_key, public_keys)}
-        kept = Witness(directory, _signer(directory), trusted, time.time_ns)
+        kept = Witness(directory, _signer(directory), _keys(public_keys, known_keys), time.time_ns)
         config = session_config("client", connect=endpoints, tls=tls)
     except (KeyFileError, EndpointError, WitnessError) as error:
         say(f"fieldcal witness: {error}", err=True)
@@ -74,6 +81,18 @@ def witness(
         return _follow(session, key, kept, stop)
 
 
+def _keys(public_keys: Sequence[Path], known_keys: Path | None) -> Callable[[], KnownKeys] | None:
+    """Gives the keys of both options as they are now; None where neither is given. Raises KeyFileError."""
+    if not public_keys and known_keys is None:
+        return None
+    anywhere = tuple(load_public_key(path).public_bytes_raw() for path in public_keys)
+    if known_keys is None:
+        return lambda: KnownKeys(anywhere=anywhere)
+    watched = WatchedKeys(known_keys)
+    watched.now()
+    return lambda: replace(watched.now(), anywhere=anywhere)
+
+
 def _follow(session: zenoh.Session, key: str, kept: Witness, stop: threading.Event) -> int:
     subscriber = declare_advanced_subscriber(
         session,
@@ -85,14 +104,19 @@ def _follow(session: zenoh.Session, key: str, kept: Witness, stop: threading.Eve
     faults: list[OSError] = []
 
     def take_all() -> None:
+        refused, silent_until_s = 0, -math.inf
         for sample in subscriber:
             address = parse_key(str(sample.key_expr))
             try:
-                _, said = kept.take(address.source if address else "", sample.payload.to_bytes())
+                taken, said = kept.take(address.source if address else "", sample.payload.to_bytes())
             except OSError as error:
                 faults.append(error)
                 stop.set()
                 return
+            if said and not taken:
+                refused += 1
+                said = f"{said} ({refused} refused so far)" if time.monotonic() > silent_until_s else ""
+                silent_until_s = time.monotonic() + TOLD_S if said else silent_until_s
             if said:
                 say(said)
 

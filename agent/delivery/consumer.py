@@ -8,7 +8,6 @@ import logging
 import queue
 import threading
 import time
-from collections import deque
 from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -22,15 +21,16 @@ from agent.config.known_keys import WatchedKeys
 from agent.config.tls import TlsFiles
 from agent.delivery import memory as memory_file
 from agent.delivery.answers import NOTHING, REMOVED
+from agent.delivery.holding import Held
 from agent.delivery.keys import PREFIX, narrow
 from agent.delivery.progress import Progress
 from agent.delivery.received import Received, receive
+from agent.delivery.seldom import Seldom
 from agent.delivery.session import session_config
 from agent.delivery.verifying import Refusals, UnverifiedError, Verifier
 
-INBOX = 1000  # samples that may wait or be held; further ones are dropped and later fetched from the gateway's store
+INBOX = 1000  # samples that may wait; further ones are dropped and later fetched from the gateway's store
 ANSWER_S = 5.0  # s that one query waits for its answer
-RETRY_S = 1.0  # s between two queries to a gateway whose results are held because an earlier one is missing
 CONNECT_S = 10.0
 CLOSE_S = 2.0  # that closing waits for the thread that takes samples; it ends at once unless the inbox is full
 SAVE_S = 1.0  # s between two writes of the memory file while results come without a pause; a pause writes it at once
@@ -56,7 +56,8 @@ class Consumer:
     consumer asks the gateway's store with `?after=` and holds later results until it answers. After a lost connection
     the newest results come again (history and recovery of Zenoh's advanced subscriber), so that a gap is seen at once.
     A result that is not the very next one counts only when the gateway's store has it too. Otherwise it is given with
-    `confirmed` false, and does not move the numbers, so that one message of a stranger cannot hide what follows. When
+    `confirmed` false, and does not move the numbers, so that one message of a stranger cannot hide what follows. So is
+    a result whose gateway does not answer for five minutes. What waits is bounded (agent.delivery.holding). When
     the gateway's store was made anew, its results have another epoch; the first of them has `new_epoch` true.
     `keys`: a list of known keys (agent.config.known_keys). Then only results are given that a key of their gateway
     signed, with the fields that were signed. Others are refused: logged, and counted by gateway in `refused`. The file
@@ -90,7 +91,8 @@ class Consumer:
         self._unconfirmed: dict[tuple[str, str, int], Received] = {}  # given already, although the store had them not
         self._key = key
         self._inbox: queue.Queue[zenoh.Sample | None] = queue.Queue(maxsize=INBOX)  # None: the session is closed
-        self._held: dict[str, deque[Received]] = {}
+        self._held = Held()
+        self._doubts = Seldom()
         self._mutex = threading.Lock()  # closing a session while another thread uses it raises an exception there
         self._closed = False
         config = session_config("client", connect=endpoints, tls=tls)
@@ -124,17 +126,18 @@ class Consumer:
             if self._inbox.empty():
                 self._remember()
             try:
-                sample = self._inbox.get(timeout=RETRY_S if self._held else None)
+                sample = self._inbox.get(timeout=self._held.wait_s())
             except queue.Empty:
-                for source in list(self._held):
-                    yield from self._ask(source)
-                continue
+                pass
             except KeyboardInterrupt:
                 return
-            if sample is None:
-                return
-            if (result := self._received(sample)[0]) is not None:
-                yield from self._follow(result)
+            else:
+                if sample is None:
+                    return
+                if (result := self._received(sample)[0]) is not None:
+                    yield from self._follow(result)
+            for source in self._held.due():
+                yield from self._ask(source)
 
     def close(self) -> None:
         """End the iteration and the session. May be called twice, from any thread."""
@@ -165,15 +168,18 @@ class Consumer:
         """The number of results that were not verified, by the gateway as one of which they were published."""
         return dict(self._refusals.counts)
 
+    @property
+    def dropped(self) -> dict[str, int]:
+        """The number of results that had to wait for earlier ones and found no place, by gateway; "": of too many."""
+        return dict(self._held.dropped)
+
     def _follow(self, result: Received) -> Iterator[Received]:
         if self._progress.has(result):
             return
         if self._progress.is_next(result):
             yield from self._deliver(result)
             return
-        source = result.address.source
-        self._held.setdefault(source, deque(maxlen=INBOX)).append(result)
-        yield from self._ask(source)
+        self._held.add(result)
 
     def _ask(self, source: str) -> Iterator[Received]:
         """Ask a gateway for what follows the last result known of it, then give what was held meanwhile."""
@@ -182,21 +188,23 @@ class Consumer:
             answer = self._get(selector)  # the values in force
             yield from self._deliver(*answer.results, first=True)
             if not answer.results or not self._held_is_new(source):
-                if answer.answered:
-                    yield from self._deliver_unconfirmed(*self._held.pop(source, ()))
+                yield from self._settle(source, answered=answer.answered)
                 return
         self._find_epoch(source, selector)
         epochs = self._other_epochs(source, selector)
         answered = yield from self._pages(source, f"{selector}?after=", self._progress.number(source) or 0, epochs)
         for epoch in epochs:
             yield from self._pages(source, f"{selector}?epoch={epoch};after=", 0, {}, epoch)
-        if answered:
-            held = self._held.pop(source, ())
-            yield from self._deliver_unconfirmed(*sorted(held, key=lambda r: r.sequence))
+        yield from self._settle(source, answered=answered)
+
+    def _settle(self, source: str, *, answered: bool) -> Iterator[Received]:
+        """Give what is still held of a gateway that answered, or that has not answered for too long."""
+        if self._held.asked(source, answered=answered, known=self._progress.number(source) is not None):
+            yield from self._deliver_unconfirmed(*self._held.pop(source))
 
     def _other_epochs(self, source: str, selector: str) -> dict[str, None]:
         """The epochs of held results that are not known yet and that the gateway's store has."""
-        held = {r.epoch for r in self._held.get(source, ()) if self._progress.is_other_epoch(r)}
+        held = {r.epoch for r in self._held.of(source) if self._progress.is_other_epoch(r)}
         return dict.fromkeys(r.epoch for r in self._get(selector).results if r.epoch in held) if held else {}
 
     def _pages(
@@ -224,7 +232,7 @@ class Consumer:
 
     def _find_epoch(self, source: str, selector: str) -> None:
         """Find the epoch of a number that was given without one: that of the result with this number in the store."""
-        known, held = self._progress.number(source), self._held.get(source, ())
+        known, held = self._progress.number(source), self._held.of(source)
         if known is None or not self._progress.without_epoch(source):
             return
         other = next((r.epoch for r in held if self._progress.is_other_epoch(r)), None)
@@ -237,7 +245,7 @@ class Consumer:
             self._progress.adopt(source, other, known)
 
     def _held_is_new(self, source: str) -> bool:
-        return not all(self._progress.has(result) for result in self._held.get(source, ()))
+        return not all(self._progress.has(result) for result in self._held.of(source))
 
     def _deliver(self, *results: Received, first: bool = False) -> Iterator[Received]:
         for result in results:
@@ -264,7 +272,9 @@ class Consumer:
             identity = _identity(result)
             if self._progress.has(result) or identity in self._unconfirmed:
                 continue
-            _log.warning("%s: result %d is not in its store", result.address.source, result.sequence)
+            self._doubts.warning(
+                "%s: result %d is not known to be in its store", result.address.source, result.sequence
+            )
             self._unconfirmed[identity] = result
             if len(self._unconfirmed) > INBOX:
                 self._unconfirmed.pop(next(iter(self._unconfirmed)))

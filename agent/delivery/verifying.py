@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-import math
-import time
 from collections import Counter
 from typing import Any
 
@@ -14,13 +11,12 @@ from agent.config.key_file import KeyFileError
 from agent.config.known_keys import KnownKeys, WatchedKeys, add_key, identifier
 from agent.delivery.history import payload_of
 from agent.delivery.keys import Address
+from agent.delivery.seldom import Seldom
 from agent.recording.messages import MessageError
 from agent.recording.result_signing import SignedResult
 from agent.recording.signed_text import SignedTextError
 
-LOG_S = 10.0
 GATEWAYS_MAX = 1000  # named in counts, and trusted at their first result; strangers may invent names for ever
-_log = logging.getLogger(__name__)
 
 
 class UnverifiedError(Exception):
@@ -28,19 +24,17 @@ class UnverifiedError(Exception):
 
 
 class Refusals:
-    """Counts results that were not verified, by gateway, and logs one each LOG_S seconds."""
+    """Counts results that were not verified, by gateway, and logs one of them in a while."""
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
-        self._silent_until = -math.inf
+        self._log = Seldom()
 
     def count(self, source: str, reason: str) -> None:
         """Count a result of a gateway. Of gateways beyond GATEWAYS_MAX the count is common, under the name ""."""
         self.counts[source if source in self.counts or len(self.counts) < GATEWAYS_MAX else ""] += 1
-        if time.monotonic() >= self._silent_until:
-            self._silent_until = time.monotonic() + LOG_S
-            total = self.counts.total()
-            _log.warning("a result published as one of %s is refused: %s (%d refused so far)", source, reason, total)
+        told = "a result published as one of %s is refused: %s (%d refused so far)"
+        self._log.warning(told, source, reason, self.counts.total())
 
 
 class Verifier:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from hw.block import BlockFlags, SampleBlock
 AXES = {1: ("a",), 3: ("x", "y", "z")}
 QUANTITIES = {"m/s2": "a", "m/s": "v", "m": "d"}  # name of the channel of a uniaxial device, by its unit
 LONGEST_HOLE_S = 10.0  # a longer one is left to the time stamps
+HOLES_MAX = 1_000_000  # rows of all holes; more only up to ten times the samples before, the rest is left to the stamps
 
 
 class Recording(Source):
@@ -30,17 +32,29 @@ class Recording(Source):
     def __init__(self, path: Path, start: RunStart) -> None:
         self.path = path
         self._utc_ns = start.t_utc_ns - start.t_monotonic_ns
-        devices = [device["name"] for device in json.loads(start.config_json)["devices"]]
+        if abs(self._utc_ns) >= 1 << 63:
+            raise self._fault(f"it begins {start.t_utc_ns} ns after 1970, {start.t_monotonic_ns} ns after a boot")
+        devices = self._told(start.config_json, "devices")
         units: dict[str, str] = {}
         columns: dict[str, list[Column]] = {}
         for event in self._events():
             if isinstance(event, DeviceChange) and event.info_json:
-                units[event.device] = json.loads(event.info_json)["unit"]
+                units[event.device] = str(self._told(event.info_json, "unit"))
             if isinstance(event, SampleBlock) and event.device not in columns:
                 columns[event.device] = _columns(event, units.get(event.device, "count"))
-                if len(columns) == len(devices):
+                if isinstance(devices, list) and len(columns) == len(devices):
                     break
         self.columns = [column for name in sorted(columns) for column in columns[name]]
+
+    def _told(self, text: str, name: str) -> Any:
+        """What the configuration or the description of a device says. Raises TableError."""
+        try:
+            return json.loads(text)[name]
+        except (ValueError, KeyError, TypeError, IndexError, RecursionError):
+            raise self._fault(f"what it says of its devices has no {name!r}") from None
+
+    def _fault(self, what: str) -> TableError:
+        return TableError(f"{self.path}: {what}; `fieldcal audit {self.path}` says more")
 
     def pieces(self, columns: Sequence[Column], progress: Progress | None) -> Iterator[Array]:
         """Yield the samples of one device. Raises TableError if the columns belong to several devices."""
@@ -48,18 +62,20 @@ class Recording(Source):
         if any(column.group != device for column in columns):
             raise TableError(f"{self.path}: the columns belong to several devices; add group=NAME of one device")
         names = [column.name for column in columns]
-        size, blocks, following = self.path.stat().st_size, 0, None
+        size, following, samples, rows = self.path.stat().st_size, None, 0, 0
         for event in self._events():
             if not isinstance(event, SampleBlock) or event.device != device:
                 continue
             table = self._table(event, names)
             missing = 0 if following is None else event.first_index - following
-            if 0 < missing < LONGEST_HOLE_S * event.nominal_rate_hz and not event.flags & BlockFlags.RESTART:
+            short = 0 < missing < LONGEST_HOLE_S * event.nominal_rate_hz and not event.flags & BlockFlags.RESTART
+            if short and rows + missing <= max(HOLES_MAX, 10 * samples):
+                rows += missing
                 hole = np.full((missing, len(names)), np.nan)
                 hole[:, names.index("time_s")] = table[0, names.index("time_s")]
                 yield hole
             following = event.first_index + event.n
-            blocks += 1
+            samples += event.n
             yield table
         if progress is not None:
             progress(size)
@@ -70,6 +86,10 @@ class Recording(Source):
         given = {"time_s": arrivals, "temperature_degc": np.full(block.n, block.temperature_degc or np.nan)}
         axes = [name for name in names if name not in given]
         known = [c.name for c in self.columns if c.group == block.device and c.name not in given]
+        if block.indications.shape[1] != len(known):
+            raise self._fault(
+                f"a block of {block.device!r:.70} has {block.indications.shape[1]} axes, not {len(known)}"
+            )
         given |= {name: block.indications[:, known.index(name)].astype(np.float64) for name in axes}
         return np.column_stack([given[name] for name in names])
 

@@ -9,17 +9,20 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from agent.config.key_file import KeyFileError
 from agent.recording.head import Head
 from agent.recording.signed_text import LARGEST, SignedText, SignedTextError, count, values_of, written
 from agent.recording.signing import Signer
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+
+    from agent.config.known_keys import KnownKeys
 
 KEY_NAME, PUBLIC_NAME, SUFFIX = "witness.key", "witness.pub", ".heads"
 KEEP_NS = 600_000_000_000  # between two heads of one recording that are kept, besides its first and its last
@@ -158,15 +161,16 @@ class HeadFile:
 
 
 class Witness:
-    """Keeps heads in a directory. `trusted`: keys of gateways by identifier; without any, a gateway's first key counts.
+    """Keeps heads in a directory. `clock`: UTC in ns.
 
-    `clock`: UTC in ns. Raises OSError or WitnessError where the files of the directory cannot be read.
+    `keys`: gives the list of known keys as it is now; without it, a gateway's first key counts.
+    Raises OSError or WitnessError where the files of the directory cannot be read.
     """
 
     def __init__(
-        self, directory: Path, signer: Signer, trusted: Mapping[str, Ed25519PublicKey], clock: Callable[[], int]
+        self, directory: Path, signer: Signer, keys: Callable[[], KnownKeys] | None, clock: Callable[[], int]
     ) -> None:
-        self._directory, self._signer, self._trusted, self._clock = directory, signer, trusted, clock
+        self._directory, self._signer, self._keys, self._clock = directory, signer, keys, clock
         self._files = {
             f"{path.parent.name}/{path.name.removesuffix(SUFFIX)}": HeadFile(path, signer.public_key, repair=True)
             for path in sorted(directory.glob(f"*/*{SUFFIX}"))
@@ -184,18 +188,25 @@ class Witness:
             return False, f"{gateway!r:.130}: refused, not a head: {error}"
         if head.statement.gateway != gateway or not _GATEWAY.fullmatch(gateway):
             return False, f"{gateway!r:.130}: refused, a head of {head.statement.gateway!r:.130}"
-        if self._trusted and signed.key_id not in self._trusted:
-            return False, f"{gateway}: refused, signed with the key {signed.key_id}, which is not in the list"
-        if fault := signed.fault():
+        if fault := self._fault(gateway, signed):
             return False, f"{gateway}: refused, {fault}"
         known = self._files.get(gateway)
         if known is None:
             if len(self._files) >= GATEWAYS_MAX:
                 return False, f"{gateway}: refused, heads of {GATEWAYS_MAX} gateways are kept already"
             known = self._new(gateway)
-        if known.public_key not in ("", signed.public_key) and not self._trusted:
+        if known.public_key not in ("", signed.public_key) and self._keys is None:
             return False, f"{gateway}: refused, signed with the key {signed.key_id}, not with the one seen first"
         return self._keep(gateway, known, signed, head)
+
+    def _fault(self, gateway: str, signed: SignedText) -> str:
+        """Why the signature of a head does not count; "" where it does."""
+        if self._keys is None:
+            return signed.fault()
+        try:
+            return signed.fault_by(self._keys(), gateway)
+        except KeyFileError as error:  # nobody knows which keys are revoked
+            return str(error)
 
     def _keep(self, gateway: str, file: HeadFile, signed: SignedText, head: Head) -> tuple[bool, str]:
         if not file.wants(head):

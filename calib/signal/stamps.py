@@ -202,7 +202,8 @@ def _piece(index: IntArray, arrival_s: Array, first: int, last: int, nominal_hz:
     begin, end = float(arrival_s[0]), float(arrival_s[-1])
     if end - begin <= HORIZON_S:
         return parabola(index, arrival_s, nominal_hz, edge).clock(first, last)
-    centres = np.linspace(begin, end, max(3, round(2 * (end - begin) / HORIZON_S) + 1))[1:-1]
+    knots = min(2.0 * (end - begin) / HORIZON_S, len(index))  # more than there are bursts would tell nothing new
+    centres = np.linspace(begin, end, max(3, round(knots) + 1))[1:-1]
     fits = []
     for centre in centres:
         a, b = np.searchsorted(arrival_s, [centre - HORIZON_S / 2, centre + HORIZON_S / 2])
@@ -210,11 +211,11 @@ def _piece(index: IntArray, arrival_s: Array, first: int, last: int, nominal_hz:
             a = max(int(np.searchsorted(arrival_s, centre)) - FEWEST_FOR_RATE // 2, 0)
             b = a + FEWEST_FOR_RATE
         fits.append(parabola(index[a:b], arrival_s[a:b], nominal_hz, edge))
-    knots = np.array([first, *np.interp(centres, arrival_s, index), last], dtype=float)
+    at_index = np.array([first, *np.interp(centres, arrival_s, index), last], dtype=float)
     at = [fits[0], *fits, fits[-1]]
     return replace(
         fits[-1].clock(first, last),
-        knot_index=knots,
-        knot_time_s=np.array([float(f.at(k)) for f, k in zip(at, knots, strict=True)]),
-        knot_period_s=np.array([float(f.period_at(k)) for f, k in zip(at, knots, strict=True)]),
+        knot_index=at_index,
+        knot_time_s=np.array([float(f.at(k)) for f, k in zip(at, at_index, strict=True)]),
+        knot_period_s=np.array([float(f.period_at(k)) for f, k in zip(at, at_index, strict=True)]),
     )

@@ -14,13 +14,14 @@ from click.testing import CliRunner
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from agent.cli.audit import audit
+from agent.config.known_keys import WatchedKeys, revoke_key
 from agent.delivery.publication import Publisher
 from agent.delivery.store import Store
 from agent.recording.head import HEAD_NAME
-from agent.recording.signed_text import key_id
 from agent.recording.signing import Signer
 from agent.recording.witness import KEY_NAME, PUBLIC_NAME, Witness, WitnessError
-from tests.attacks.chain_site import KEY, public_pem, record
+from tests.attacks.chain_site import KEY, known, public_pem, record
+from tests.attacks.signed_site import listed
 from tests.unit.zenoh_site import Site, wait_for
 
 ROOT = Path(__file__).parents[2]
@@ -31,7 +32,7 @@ OWN = Ed25519PrivateKey.from_private_bytes(bytes(32))
 def witness(directory: Path, **options: object) -> Witness:
     directory.mkdir(exist_ok=True)
     (directory / PUBLIC_NAME).write_bytes(public_pem(OWN))
-    return Witness(directory, Signer(OWN), options.get("trusted", {}), time.time_ns)  # type: ignore[arg-type]
+    return Witness(directory, Signer(OWN), options.get("keys"), time.time_ns)  # type: ignore[arg-type]
 
 
 def audited(data: Path, kept: Path, tmp_path: Path) -> tuple[int, str]:
@@ -87,7 +88,7 @@ def test_a_line_of_the_witness_cannot_be_changed(site: tuple[Path, Path], tmp_pa
     text = audited(data, kept, tmp_path)[1]
     assert f"FAILED: {path}: line" in text
     with pytest.raises(WitnessError):
-        Witness(kept, Signer(KEY if change == "other key" else OWN), {}, time.time_ns)
+        Witness(kept, Signer(KEY if change == "other key" else OWN), None, time.time_ns)
 
 
 def test_two_histories_under_one_key_are_proven(tmp_path: Path) -> None:
@@ -117,14 +118,29 @@ def test_heads_of_strangers_are_refused(tmp_path: Path) -> None:
     own = witness(tmp_path / "kept")
     assert own.take(GATEWAY, mine[0])[0]
     assert "not with the one seen first" in own.take(GATEWAY, theirs[-1])[1]
-    listed = witness(tmp_path / "listed", trusted={key_id(KEY.public_key()): KEY.public_key()})
-    assert "not in the list" in listed.take(GATEWAY, theirs[0])[1]
-    assert listed.take(GATEWAY, mine[0])[0]
+    strict = witness(tmp_path / "listed", keys=lambda: known(KEY))
+    assert "not with 56475aa75463474c" in strict.take(GATEWAY, theirs[0])[1]
+    assert strict.take(GATEWAY, mine[0])[0]
     forged = json.dumps(json.loads(mine[1]) | {"signature": json.loads(mine[0])["signature"]}).encode()
     for source, data in [(GATEWAY, forged), ("site/other", mine[1]), ("../..", mine[1]), (GATEWAY, b"\xff" * 99)]:
-        taken, said = listed.take(source, data)
+        taken, said = strict.take(source, data)
         assert (taken, "refused" in said) == (False, True)
     assert sorted(path.name for path in (tmp_path / "listed").iterdir()) == ["site", PUBLIC_NAME]
+
+
+def test_the_list_of_keys_counts_and_is_read_again(tmp_path: Path) -> None:
+    heads: list[bytes] = []
+    record(tmp_path / "a", blocks=6, heads=heads)
+    path = listed(tmp_path / "known.keys", KEY, gateway="site/other")
+    own = witness(tmp_path / "kept", keys=WatchedKeys(path).now)
+    assert "names no key of 'site/gateway'" in own.take(GATEWAY, heads[0])[1], "the key counts for its gateway only"
+    listed(path, KEY, gateway=GATEWAY)
+    assert own.take(GATEWAY, heads[0])[0]
+    path.unlink()
+    assert "known.keys: cannot be read" in own.take(GATEWAY, heads[-1])[1]
+    listed(path, KEY, gateway=GATEWAY)
+    revoke_key(path, KEY.public_key().public_bytes_raw(), "stolen")
+    assert "which is revoked: stolen" in own.take(GATEWAY, heads[-1])[1]
 
 
 def test_a_power_cut_in_the_last_line_costs_that_line(tmp_path: Path) -> None:
@@ -148,7 +164,8 @@ def test_a_head_reaches_the_witness_over_the_network(tmp_path: Path) -> None:
     site, store = Site(), Store(tmp_path / "a", 0)
     publisher = Publisher("site", "gateway", [site.endpoint], store)
     kept = tmp_path / "kept"
-    command = [sys.executable, "-m", "agent", "witness", "--dir", kept, "--connect", site.endpoint]
+    keys = listed(tmp_path / "known.keys", KEY, gateway=GATEWAY)
+    command = [sys.executable, "-m", "agent", "witness", "--dir", kept, "--connect", site.endpoint, "--keys", keys]
     try:
         publisher.tell_head(head)
         publisher.start()

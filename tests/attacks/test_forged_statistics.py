@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -123,7 +124,11 @@ def test_a_decision_on_the_edge_is_not_passed(tmp_path: Path, capsys: pytest.Cap
         return msgspec.structs.replace(window, used=not window.used, numbers=numbers)
 
     path = record_again(tmp_path / "again", record_run(tmp_path), forged(below))
-    assert run_audit(Given([path]), JustAbove.restore, as_json=False) == 3
-    told = capsys.readouterr().out
-    assert "passed" not in told
-    assert "not decided" in told
+    for strict in (False, True):
+        assert run_audit(Given([path]), JustAbove.restore, as_json=False, strict=strict) == 3
+        told = capsys.readouterr().out
+        assert "passed" not in told
+        assert "not decided: a decision is so close" in told
+    assert run_audit(Given([path]), JustAbove.restore, as_json=True) == 3
+    verdict = json.loads(capsys.readouterr().out)
+    assert (verdict["ok"], verdict["undecidable"]) == (False, 1)

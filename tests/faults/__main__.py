@@ -13,7 +13,7 @@ from pathlib import Path
 os.environ["OPENBLAS_NUM_THREADS"] = "1"  # as every entry point of the product, before numpy loads
 
 from benchmarks.page import machine, write_part
-from tests.faults import clock, disk, flips, kill, needs, routing, unplug
+from tests.faults import clock, disk, flips, kill, needs, remembering, routing, unplug
 from tests.faults.outcome import HEAD, Outcome, row
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "reliability.md"
@@ -30,6 +30,7 @@ LINES: dict[str, Callable[[Path], Outcome]] = {
     "slow-end": disk.slow_at_the_end,
     "unplug": partial(unplug.unplugged, times=100),
     "router": partial(routing.away, results=10_000, speed=50),
+    "consumer": partial(remembering.killed, kills=60),
     "clock": clock.stepped,
     "state": partial(flips.of_state, flips=10_000),
     "starts": partial(flips.at_starts, starts=20),

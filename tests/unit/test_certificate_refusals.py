@@ -23,6 +23,7 @@ from tests.unit.test_report_numbers import fields
         ("<x/>", "no digital calibration certificate"),
         (f'<d:digitalCalibrationCertificate xmlns:d="{DCC}"/>', "--nominal"),
         ("<x", "broken"),
+        ("<a:x/>", "broken: unbound prefix"),
         ('{"certificate": []}', "neither a result"),
     ],
 )

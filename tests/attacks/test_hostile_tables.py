@@ -1,0 +1,143 @@
+"""Faults that `benchmarks.hostile_files` found in what reads samples: each is one line, in bounded memory and time."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from agent.calibrate.reference_certificate import read_reference_certificate
+from agent.calibrate.tables import read_sensor
+from agent.proto import fieldcal_pb2 as pb
+from agent.reading.recording import HOLES_MAX
+from agent.reading.source import TableError
+from calib.signal.stamps import clock_from_stamps
+from tests.replay.forgery import Unpacked
+from tests.replay.golden_files import FORMATS, RECORDING
+from tests.unit.certificates import uneven
+
+
+def changed(path: Path, change: Callable[[str, Any], None]) -> Path:
+    """The golden recording, in which `change` was done to each event and block. All CRCs are right."""
+    found = Unpacked.of(FORMATS[-1] / RECORDING)
+    for at, (topic, schema, *times, data) in enumerate(found.messages):
+        if topic == "/events" or topic.endswith("/raw"):
+            message = getattr(pb, schema.rpartition(".")[2]).FromString(data)
+            change(topic, message)
+            found.messages[at] = (topic, schema, *times, message.SerializeToString())  # type: ignore[assignment]
+    found.write(path)
+    return path
+
+
+def configuration(text: str) -> Callable[[str, Any], None]:
+    def change(topic: str, message: Any) -> None:
+        if topic == "/events" and message.HasField("run_start"):
+            message.run_start.config_json = text
+
+    return change
+
+
+def device(text: str) -> Callable[[str, Any], None]:
+    def change(topic: str, message: Any) -> None:
+        if topic == "/events" and message.HasField("device_change"):
+            message.device_change.info_json = text
+
+    return change
+
+
+def times(topic: str, message: Any) -> None:
+    if topic == "/events" and message.HasField("run_start"):
+        message.run_start.t_utc_ns, message.run_start.t_monotonic_ns = 2**63 - 1, -(2**63)
+
+
+def axes() -> Callable[[str, Any], None]:
+    seen: list[int] = []
+
+    def change(topic: str, message: Any) -> None:
+        if topic == "/imu/raw":
+            seen.append(1)
+            if len(seen) == 3:
+                message.axes = 1
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (configuration("[1"), "has no 'devices'"),
+        (configuration("7"), "has no 'devices'"),
+        (configuration("[" * 100_000), "has no 'devices'"),
+        (device("{}"), "has no 'unit'"),
+        (device('"x"'), "has no 'unit'"),
+        (times, "ns after a boot"),
+        (axes(), "a block of 'imu' has 1 axes, not 3"),
+    ],
+)
+def test_a_recording_that_describes_itself_wrongly_is_told(
+    tmp_path: Path, change: Callable[[str, Any], None], words: str
+) -> None:
+    path = changed(tmp_path / "f.mcap", change)
+    with pytest.raises(TableError, match=re.escape(words)) as told:
+        read_sensor(path, columns="group=imu")
+    assert str(told.value).startswith(str(path))
+
+
+def test_missing_samples_that_a_recording_claims_take_a_bounded_place(tmp_path: Path) -> None:
+    """Each block claims that some millions are missing before it."""
+    jump: list[int] = []
+
+    def change(topic: str, message: Any) -> None:
+        if topic == "/imu/raw":
+            message.nominal_rate_hz = 1e6
+            message.first_index += 800_000 * len(jump)
+            jump.append(1)
+
+    path = changed(tmp_path / "f.mcap", change)
+    rows = len(read_sensor(path, columns="group=imu").time_s)
+    assert len(jump) > 5
+    assert 800_000 < rows < HOLES_MAX + 20_000
+
+
+@pytest.mark.parametrize("last", [1e18, 1e15, -1e18])
+def test_a_time_that_is_none_is_told(tmp_path: Path, last: float) -> None:
+    path = tmp_path / "sensor.csv"
+    stamps = [*(k / 100 for k in range(200)), last] if last > 0 else [last, *(k / 100 for k in range(200))]
+    path.write_text("time_s,vx,vy,vz\n" + "".join(f"{t!r},0,0,9.8\n" for t in stamps))
+    with pytest.raises(TableError, match="no time since 1970 in s; state its unit"):
+        read_sensor(path)
+
+
+def test_a_clock_has_no_more_pieces_than_stamps() -> None:
+    """A thousand years between two samples are no reason for a parabola each half minute."""
+    clock = clock_from_stamps(np.concatenate([np.arange(300) / 100.0, 3e10 + np.arange(3) / 100.0]))
+    assert clock.knot_index is not None
+    assert len(clock.knot_index) <= 305
+
+
+def test_the_configuration_of_the_golden_recording_is_read(tmp_path: Path) -> None:
+    """The changes above are what is refused, not the recording."""
+    told: list[str] = []
+
+    def change(topic: str, message: Any) -> None:
+        if topic == "/events" and message.HasField("run_start"):
+            told.append(message.run_start.config_json)
+
+    path = changed(tmp_path / "f.mcap", change)
+    assert [device["name"] for device in json.loads(told[0])["devices"]] == ["imu", "ref"]
+    assert len(read_sensor(path, columns="group=imu").time_s) > 100
+
+
+@pytest.mark.parametrize(
+    "stated", ['{"result": RESULT, "stated": []}', '{"result": RESULT, "stated": {"instrument": 7}}']
+)
+def test_a_certificate_of_a_reference_without_a_serial_number_is_read(tmp_path: Path, stated: str) -> None:
+    result = json.dumps(uneven())
+    path = tmp_path / "certificate.json"
+    path.write_text('{"certificate": ' + stated.replace("RESULT", result) + "}")
+    assert read_reference_certificate(path).serial_number == ""
