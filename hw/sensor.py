@@ -51,8 +51,13 @@ class Options(BaseModel):
 
     @property
     def tells_sensitivity(self) -> bool:
-        """Whether the opened device may tell its sensitivity: by its data sheet, or since it indicates m/s2."""
+        """Whether the opened device may tell its sensitivity: by its data sheet, or since it indicates m/s2 or g."""
         return True
+
+    @property
+    def asked_of_certificate(self) -> str:
+        """What the certificate's sensitivity must state where this device is a reference; "" where 1 may be right."""
+        return ""
 
 
 @runtime_checkable

@@ -118,6 +118,12 @@ def test_a_certificate_older_than_its_interval_is_told_and_is_no_fault(
             "line 20: recording.keep_day: there is no such setting; remove it or correct its name, not 30",
         ),
         ("port = \"/dev/ttyUSB1\"\n", "", "line 10: devices.1.options.port: is missing; add it"),
+        (
+            "axes = 1",
+            'axes = 1\nunit = "g"',
+            "line 15: channels.0.certificate.sensitivity: is missing for 'laser': it indicates g; state 0.101971621 "
+            "(1/9.80665), or its certificate's",
+        ),
         ("keep_days = 30", "keep_days = ", "line 20: not TOML: Invalid value (at line 20, column 13)"),
     ],
 )  # fmt: skip
