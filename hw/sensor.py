@@ -112,6 +112,7 @@ BUILT_IN: Mapping[str, str] = {
     "mcc172": "hw.mcc172:Mcc172",
     "mpu6050": "hw.mpu6050:Mpu6050",
     "ni": "hw.ni_daqmx:Ni",
+    "seedlink": "hw.seedlink:Seedlink",
     "serial-binary": "hw.serial_binary:SerialBinary",
     "serial-csv": "hw.serial_stream:SerialCsv",
     "sound-card": "hw.sound_card:SoundCard",

@@ -141,6 +141,19 @@ def test_a_device_that_tells_m_per_s2_needs_no_sensitivity(tmp_path: Path, capsy
     assert run_cli(["check", str(path)]) == 0, capsys.readouterr().err
 
 
+def test_a_reference_in_counts_states_its_sensitivity(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shake = '{ host = "rs.local", station = "R1234", channels = ["EHZ"] }'
+    text = GOOD.replace(
+        'name = "laser"\ndriver = "serial-csv"\n[devices.options]', 'name = "laser"\ndriver = "seedlink"'
+    )
+    text = text.replace('port = "/dev/ttyUSB1"\nrate_hz = 100\naxes = 1\n', f"options = {shake}\n")
+    (line,) = checked(tmp_path / "f.toml", text, capsys)
+    assert "channels.0.certificate.sensitivity: is missing for 'laser': it indicates counts" in line
+    path = tmp_path / "f.toml"
+    path.write_text(text + '[channels.certificate]\nquantity = "velocity"\nsensitivity = 4e8\n')
+    assert run_cli(["check", str(path)]) == 0, capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("driver", "options", "module", "extra"),
     [
