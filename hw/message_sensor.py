@@ -58,10 +58,13 @@ class MessageSensor(ABC):
         limit = options.full_scale or np.inf
         self._cutter = Cutter(name, options.rate_hz, -limit, limit)
         self._opened = False
+        self._pieces: list[Piece] = []  # less than a block
+        self._waiting = 0  # samples in them
         self._ready: deque[SampleBlock] = deque()
         self._loss: DeviceLost | None = None
         self._drops: Counter[tuple[str, str]] = Counter()
-        self._last_ns = 0
+        self._last_ns = 0  # time of the newest sample, CLOCK_MONOTONIC
+        self._utc_ns = 0  # UTC less CLOCK_MONOTONIC
         self._phase = 0.0
 
     @abstractmethod
@@ -119,44 +122,46 @@ class MessageSensor(ABC):
 
     def _gather(self) -> None:
         """Take messages until they hold BLOCK_S of samples, LONGEST_WAIT_S is over, or the device is lost."""
-        pieces: list[Piece] = []
-        samples, block = 0, BLOCK_S * self._options.rate_hz
         end_ns = self._clock()[0] + round(LONGEST_WAIT_S * 1e9)
         try:
-            while samples < block and self._clock()[0] < end_ns:
+            while not self._ready:
+                if self._clock()[0] >= end_ns:
+                    self._finish()
+                    return
                 self._phase = (self._phase + GOLDEN) % 1.0  # avoids a beat between polls and messages
                 self._sleep(POLL_S * (0.5 + self._phase))
                 for piece in self._receive():
                     if self._follows(piece):
-                        pieces.append(piece)
-                        samples += len(piece.indications)
-                        if samples >= block:
-                            self._finish(pieces)
-                            pieces, samples = [], 0
-                if self._ready:
-                    break
+                        self._pieces.append(piece)
+                        self._waiting += len(piece.indications)
+                        if self._waiting >= BLOCK_S * self._options.rate_hz:
+                            self._finish()
         except DeviceLost as error:
             self._loss = error  # raised after all earlier samples have been returned
-        self._finish(pieces)
+            self._finish()
 
-    def _timely(self, t_monotonic_ns: int, samples: int) -> bool:
-        """Whether a message whose last sample has this time may be right; if not, its samples are counted as lost."""
-        if -EARLIEST_S * 1e9 <= self._clock()[0] - t_monotonic_ns <= LATEST_S * 1e9:
-            return True
-        self._drops["samples", OUTSIDE] += samples
-        return False
+    def _is_timely(self, t_monotonic_ns: int) -> bool:
+        """Whether the last sample of a message that came now may have been taken at this time."""
+        return -EARLIEST_S * 1e9 <= self._clock()[0] - t_monotonic_ns <= LATEST_S * 1e9
+
+    def _follow_utc(self) -> bool:
+        """Follow the UTC of this computer. True where it stepped: stamps before and after cannot be compared."""
+        now_ns, utc_ns = self._clock()
+        moved, self._utc_ns = utc_ns - now_ns - self._utc_ns, utc_ns - now_ns
+        return abs(moved) > 0.5e9 / float(self._options.rate_hz)
 
     def _follows(self, piece: Piece) -> bool:
         """Whether time goes on; if not, the piece is counted as lost and the next block carries RESTART."""
-        if piece.t_monotonic_ns > self._last_ns:
+        if piece.t_monotonic_ns >= self._last_ns:
             self._last_ns = piece.t_monotonic_ns
             return True
         self._drops["samples", BACK] += len(piece.indications)
         self._cutter.flag(BlockFlags.RESTART)
         return False
 
-    def _finish(self, pieces: list[Piece]) -> None:
-        """Make blocks of the samples in `pieces`."""
+    def _finish(self) -> None:
+        """Make blocks of the pieces that wait."""
+        pieces, self._pieces, self._waiting = self._pieces, [], 0
         if not pieces:
             return
         count = np.cumsum([len(piece.indications) for piece in pieces])
@@ -166,5 +171,6 @@ class MessageSensor(ABC):
         ]
         arrivals_ns = np.array([piece.t_monotonic_ns for piece in pieces], np.int64)
         indications = np.ascontiguousarray(np.concatenate([piece.indications for piece in pieces]))
-        stretch = Stretch(indications, arrivals_ns, count, pieces[-1].t_utc_ns)
+        newest = np.append(np.diff(arrivals_ns) > 0, True)  # messages that came together are one burst
+        stretch = Stretch(indications, arrivals_ns[newest], count[newest], pieces[-1].t_utc_ns)
         self._ready.extend(self._cutter.cut(stretch, breaks))

@@ -10,7 +10,7 @@ from pydantic import Field, field_validator
 from hw import miniseed
 from hw.alignment import Alignment
 from hw.block import BlockFlags, DeviceInfo
-from hw.message_sensor import MessageSensor, Piece
+from hw.message_sensor import OUTSIDE, MessageSensor, Piece
 from hw.seedlink_link import Link
 from hw.sensor import DeviceLost, Options
 
@@ -67,7 +67,6 @@ class Seedlink(MessageSensor):
     options_model: ClassVar[type[Options]] = SeedlinkOptions
 
     _link: Link | None = None
-    _utc_ns = 0
 
     def _where(self) -> str:
         o = self._options
@@ -80,8 +79,7 @@ class Seedlink(MessageSensor):
         self._link = Link(self._where(), self._clock, self._sleep)
         selectors = [f"{o.location}{channel}.D" for channel in o.channels]
         self._link.connect(o.host, o.port, o.station, o.network, selectors)
-        now_ns, utc_ns = self._clock()
-        self._utc_ns = utc_ns - now_ns
+        self._follow_utc()
         return DeviceInfo(
             driver="seedlink",
             kind="SeedLink",
@@ -99,7 +97,8 @@ class Seedlink(MessageSensor):
 
     def _receive(self) -> Iterator[Piece]:
         assert self._link is not None
-        self._follow_utc()
+        if self._follow_utc():
+            self._alignment.restart()
         for data in self._link.records():
             self._add(data)
         for together in self._alignment.take():
@@ -116,13 +115,6 @@ class Seedlink(MessageSensor):
                 self._drops["samples", reason] += count
         self._alignment.alone = self._alignment.repeated = 0
 
-    def _follow_utc(self) -> None:
-        """Follow the UTC of this computer. Where it steps, the times before and after cannot be compared."""
-        now_ns, utc_ns = self._clock()
-        moved, self._utc_ns = utc_ns - now_ns - self._utc_ns, utc_ns - now_ns
-        if abs(moved) > 0.5e9 / self._options.rate_hz:
-            self._alignment.restart()
-
     def _add(self, data: bytes) -> None:
         """Take one record. Raises DeviceLost where its rate is not the configured one."""
         try:
@@ -138,5 +130,7 @@ class Seedlink(MessageSensor):
         if abs(record.rate_hz - rate_hz) > RATE_TOLERANCE * rate_hz:
             raise DeviceLost(f"{self._where()}: {record.channel} has {record.rate_hz:g} Hz, not rate_hz {rate_hz:g}")
         last_ns = record.start_ns + round((len(record.samples) - 1) / rate_hz * 1e9) - self._utc_ns
-        if self._timely(last_ns, len(record.samples)):
+        if self._is_timely(last_ns):
             self._alignment.add(axis, record.start_ns, record.samples)
+        else:
+            self._drops["samples", OUTSIDE] += len(record.samples)

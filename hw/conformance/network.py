@@ -32,7 +32,7 @@ class NetworkRig(Rig):
         self.server.serve()
         wanted = before + self.server.sent - sent
         deadline = time.monotonic() + 5.0
-        while self.waiting() < wanted and time.monotonic() < deadline:
+        while self.socket() is not None and self.waiting() < wanted and time.monotonic() < deadline:
             pass  # the kernel passes the bytes on within microseconds
 
     def waiting(self) -> int:
