@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PRESET ?= plain
 
-.PHONY: run fleet test nightly lint bench faults faults-short soak lock deb site clean
+.PHONY: run fleet test nightly lint bench faults faults-short soak lock deb container site clean
 
 $(VENV)/runtime: requirements.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "fieldcal needs Python 3.11 or later, this is " + sys.version)'
@@ -64,6 +64,9 @@ soak: $(VENV)/development  ## 24 h in 72 min, then an hour in real time; writes 
 
 deb: $(VENV)/runtime  ## the Debian package, into dist/; ARCH=arm64 for that architecture
 	deploy/debian/build.sh $(if $(ARCH),--arch $(ARCH))
+
+container: $(VENV)/runtime  ## the container image, as an OCI archive in dist/; BASE=IMAGE builds on that image; needs root and buildah
+	deploy/container/build.sh $(if $(BASE),--base $(BASE))
 
 $(VENV)-docs/done: requirements-docs.lock
 	test -x $(VENV)-docs/bin/python || $(PYTHON) -m venv $(VENV)-docs
