@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PRESET ?= plain
 
-.PHONY: run fleet test nightly lint bench faults faults-short soak lock deb clean
+.PHONY: run fleet test nightly lint bench faults faults-short soak lock deb container site clean
 
 $(VENV)/runtime: requirements.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "fieldcal needs Python 3.11 or later, this is " + sys.version)'
@@ -65,9 +65,21 @@ soak: $(VENV)/development  ## 24 h in 72 min, then an hour in real time; writes 
 deb: $(VENV)/runtime  ## the Debian package, into dist/; ARCH=arm64 for that architecture
 	deploy/debian/build.sh $(if $(ARCH),--arch $(ARCH))
 
+container: $(VENV)/runtime  ## the container image, as an OCI archive in dist/; BASE=IMAGE builds on that image; needs root and buildah
+	deploy/container/build.sh $(if $(BASE),--base $(BASE))
+
+$(VENV)-docs/done: requirements-docs.lock
+	test -x $(VENV)-docs/bin/python || $(PYTHON) -m venv $(VENV)-docs
+	$(VENV)-docs/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements-docs.lock
+	touch $@
+
+site: $(VENV)-docs/done  ## the documentation as a site, into dist/site; a warning is an error
+	NO_MKDOCS_2_WARNING=1 $(VENV)-docs/bin/mkdocs build --strict
+
 lock:  ## make the lock files anew (needs uv)
 	uv pip compile --universal --python-version 3.11 --generate-hashes --no-annotate --extra build pyproject.toml -o requirements.lock
 	uv pip compile --universal --python-version 3.11 --generate-hashes --no-annotate --extra build --extra dev --extra bench -c requirements.lock pyproject.toml -o requirements-dev.lock
+	echo 'mkdocs-material>=9.7,<10' | uv pip compile --universal --python-version 3.11 --generate-hashes --no-annotate - -o requirements-docs.lock
 
 clean:
-	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) $(VENV)-docs .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis

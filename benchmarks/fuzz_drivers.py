@@ -21,16 +21,18 @@ import numpy as np
 
 from agent.recording.messages import MessageError, decode
 from agent.recording.raw_block import encode_block
-from hw import adxl355_registers, iio_scan, lsm6dso_registers
+from hw import adxl355_registers, iio_scan, lsm6dso_registers, miniseed
 from hw.block import SampleBlock
 from hw.cutting import Cutter
 from hw.fifo import plain_samples
 from hw.line_stream import LineStream
+from hw.mqtt_payload import Json, PayloadError, Sparkplug
 from hw.sensor import ConfigurationError
 from hw.serial_binary import BinaryStream, SerialBinaryOptions
 from hw.serial_sensor import Stream
 from hw.sound_card import read_plate
-from hw.virtual import adxl355_twin, lsm6dso_twin, witmotion_twin
+from hw.sparkplug_pb2 import Payload
+from hw.virtual import adxl355_twin, lsm6dso_twin, seedlink_twin, witmotion_twin
 from hw.witmotion import WitStream
 
 STREAMS = 1_000_000
@@ -75,6 +77,9 @@ def parsers() -> dict[str, tuple[bytes, Parse]]:
         "witmotion": (wit, _fed(WitStream(Cutter("w", 200.0), 200.0))),
         "serial-binary": (frames, _fed(BinaryStream(Cutter("b", 100.0), binary))),
         "serial-csv": (lines, _fed(LineStream(Cutter("l", 100.0), 3, sequence=True, longest_gap=1000.0))),
+        "seedlink": (seedlink_twin.record("AM.R1.00.ENZ", 0, 100, COUNTS[:, 0]), _miniseed),
+        "mqtt, sparkplug-b": (_sparkplug(), _payload(Sparkplug(("x",), "n"))),
+        "mqtt, json": (b'{"x": [1, 2.5], "n": 7, "timestamp": 1e12}', _payload(Json(("x",), "n"))),
         "iio": (b"le:s20/32>>12", _iio),
         "sound-card": (
             b"333D01 1012345" + b"60540" * 2 + b"210517",
@@ -145,6 +150,30 @@ def _iio(data: bytes, i: int) -> None:  # noqa: ARG001 - all streams are treated
         element = iio_scan.Element.parse(0, _text(data))
         scan = iio_scan.layout({"timestamp": element})
         element.value(np.frombuffer(_whole(data, scan.itemsize), scan)["timestamp"])
+
+
+def _miniseed(data: bytes, i: int) -> None:
+    whole = bytearray((data + bytes(miniseed.RECORD_BYTES))[: miniseed.RECORD_BYTES])
+    whole[52] = (3, 4, 5, 10, 11)[i % 5]  # the encoding
+    with contextlib.suppress(miniseed.RecordError):
+        miniseed.decode(bytes(whole))
+
+
+def _payload(decoder: Sparkplug | Json) -> Parse:
+    def parse(data: bytes, i: int) -> None:
+        with contextlib.suppress(PayloadError):
+            if i % 3 == 0 and isinstance(decoder, Sparkplug):
+                decoder.learn(data)
+            decoder(data)
+
+    return parse
+
+
+def _sparkplug() -> bytes:
+    payload = Payload(timestamp=1)
+    payload.metrics.add(name="x", alias=3, datatype=31, bytes_value=bytes(24))
+    payload.metrics.add(name="n", datatype=8, long_value=7)
+    return bytes(payload.SerializeToString())
 
 
 def _replay(data: bytes, i: int) -> None:  # noqa: ARG001 - all streams are treated alike

@@ -76,7 +76,7 @@ class DeviceInfo:
     driver: str
     kind: str  # part or protocol, e.g. "ADXL355"
     serial_number: str  # "" where the device has none
-    unit: str  # of the indications: "count", "m/s2", "m/s", "mV"
+    unit: str  # of the indications: "count", "m/s2", "g", "m/s", "mV"
     axes: Literal[1, 3]
     nominal_rate_hz: float
     range_mps2: float | None = None

@@ -51,8 +51,13 @@ class Options(BaseModel):
 
     @property
     def tells_sensitivity(self) -> bool:
-        """Whether the opened device may tell its sensitivity: by its data sheet, or since it indicates m/s2."""
+        """Whether the opened device may tell its sensitivity: by its data sheet, or since it indicates m/s2 or g."""
         return True
+
+    @property
+    def asked_of_certificate(self) -> str:
+        """What the certificate's sensitivity must state where this device is a reference; "" where 1 may be right."""
+        return ""
 
 
 @runtime_checkable
@@ -105,8 +110,10 @@ BUILT_IN: Mapping[str, str] = {
     "lsm6dso": "hw.lsm6dso:Lsm6dso",
     "mcc-usb": "hw.mcc_usb:MccUsb",
     "mcc172": "hw.mcc172:Mcc172",
+    "mqtt": "hw.mqtt:Mqtt",
     "mpu6050": "hw.mpu6050:Mpu6050",
     "ni": "hw.ni_daqmx:Ni",
+    "seedlink": "hw.seedlink:Seedlink",
     "serial-binary": "hw.serial_binary:SerialBinary",
     "serial-csv": "hw.serial_stream:SerialCsv",
     "sound-card": "hw.sound_card:SoundCard",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from typing import Literal, Self
+from typing import Self
 
 import numpy as np
 import serial
@@ -16,6 +16,7 @@ from hw.cutting import Break, Cutter, follow
 from hw.frame_stream import Decoded, FrameStream
 from hw.frames import CHECKSUMS, WIDTH, ByteOrder, ChecksumName, Found, Layout, NumberType, numbers
 from hw.serial_sensor import LONGEST_GAP_S, SerialOptions, SerialSensor
+from hw.units import Unit, asked_of_certificate, nominal_sensitivity, tells_sensitivity
 
 BITS_A_BYTE = 10  # with start and stop bit
 
@@ -54,7 +55,7 @@ class SerialBinaryOptions(SerialOptions):
     checksum: ChecksumName = Field("none", description="kind of checksum in the last bytes of the frame")
     checksum_from: int = Field(0, ge=0, description="first byte that the checksum covers")
     checksum_order: ByteOrder = Field("little", description="byte order of a checksum of two bytes")
-    unit: Literal["count", "m/s2", "m/s", "mV"] = Field("count", description="of the indications")
+    unit: Unit = Field("count", description="of the indications")
     full_scale: float | None = Field(None, gt=0, description="indications of this size or more are saturated")
     serial_number: str = Field("", description="of the device, as on its label")
 
@@ -90,8 +91,13 @@ class SerialBinaryOptions(SerialOptions):
 
     @property
     def tells_sensitivity(self) -> bool:
-        """Whether it indicates m/s2: nothing else is known of such a device."""
-        return self.unit == "m/s2"
+        """Whether it indicates m/s2 or g: nothing else is known of such a device."""
+        return tells_sensitivity(self.unit)
+
+    @property
+    def asked_of_certificate(self) -> str:
+        """A reference that indicates g has not the sensitivity 1."""
+        return asked_of_certificate(self.unit)
 
     @property
     def layout(self) -> Layout:
@@ -176,5 +182,6 @@ class SerialBinary(SerialSensor):
             kind="serial-binary",
             serial_number=options.serial_number,
             unit=options.unit,
+            nominal_sensitivity=nominal_sensitivity(options.unit),
             axes=len(options.indications),
         )

@@ -12,6 +12,7 @@ from hw.block import DeviceInfo
 from hw.cutting import Cutter
 from hw.line_stream import LineStream
 from hw.serial_sensor import LONGEST_GAP_S, SerialOptions, SerialSensor
+from hw.units import Unit, asked_of_certificate, nominal_sensitivity, tells_sensitivity
 
 
 class SerialCsvOptions(SerialOptions):
@@ -22,14 +23,19 @@ class SerialCsvOptions(SerialOptions):
     sequence: bool = Field(
         False, description="each line begins with a sample counter; without it lost lines are not noticed"
     )
-    unit: Literal["count", "m/s2", "m/s", "mV"] = Field("m/s2", description="of the indications")
+    unit: Unit = Field("m/s2", description="of the indications")
     full_scale: float | None = Field(None, gt=0, description="indications of this size or more are saturated")
     serial_number: str = Field("", description="of the device, as on its label")
 
     @property
     def tells_sensitivity(self) -> bool:
-        """Whether it indicates m/s2: nothing else is known of such a device."""
-        return self.unit == "m/s2"
+        """Whether it indicates m/s2 or g: nothing else is known of such a device."""
+        return tells_sensitivity(self.unit)
+
+    @property
+    def asked_of_certificate(self) -> str:
+        """A reference that indicates g has not the sensitivity 1."""
+        return asked_of_certificate(self.unit)
 
 
 class SerialCsv(SerialSensor):
@@ -55,5 +61,6 @@ class SerialCsv(SerialSensor):
             kind="serial-csv",
             serial_number=options.serial_number,
             unit=options.unit,
+            nominal_sensitivity=nominal_sensitivity(options.unit),
             axes=options.axes,
         )

@@ -24,6 +24,7 @@ from agent.terminal.text import say
 from calib.signal.instrument import QUANTITIES
 from hw.fifo_sensor import FifoSensor
 from hw.sensor import load_driver
+from hw.units import nominal_sensitivity
 
 ALPHAS_DEG = (0.0, 120.0, 240.0)  # three different ones determine all twelve parameters
 POSITIVE = click.FloatRange(min=0, min_open=True)
@@ -251,7 +252,7 @@ def _answers(asking: Asking, devices: list[Chosen], given: dict[str, Any]) -> ta
         sensitivity=_sensitivity(asking, sensor, given["sensitivity"]),
         u_main_pct=of(Prior, "u_main_pct", "u_sensitivity_pct"),
         quantity=_quantity(given["reference_quantity"], reference),
-        reference_sensitivity=of(Certificate, "sensitivity", "reference_sensitivity"),
+        reference_sensitivity=_reference_sensitivity(given["reference_sensitivity"], reference),
         u_reference_pct=of(Certificate, "u_sensitivity_pct", "u_reference_pct"),
         reference_serial=of(Certificate, "serial_number", "reference_serial"),
         calibrated=of(Certificate, "calibrated", "calibrated"),
@@ -296,6 +297,15 @@ def _sensitivity(asking: Asking, sensor: Chosen, given: float | None) -> Stated[
         return Stated(None, "the driver knows it")
     question = f"nominal sensitivity of the sensor, {sensor.value('unit') or 'output unit'} per m/s2, of its data sheet"
     return asking.value("--sensitivity", None, question + sensor.hint, kind=float)
+
+
+def _reference_sensitivity(given: float | None, reference: Chosen | None) -> Stated[Any]:
+    """Indication of the reference per SI unit: as stated, or as its unit says."""
+    if given is not None:
+        return Stated(given, "option --reference-sensitivity")
+    if reference is not None and (known := nominal_sensitivity(reference.value("unit"))) is not None:
+        return Stated(known, "the unit of the reference is g")
+    return _default(Certificate, "sensitivity")
 
 
 def _quantity(given: str | None, reference: Chosen | None) -> Stated[str]:

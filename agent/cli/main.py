@@ -51,7 +51,7 @@ COMMANDS = {
     "check": ("agent.cli.check", "List all faults of a configuration."),
 }
 
-EVERYWHERE = ("calibrate", "convert", "report", "replay", "audit", "show")  # the others need Linux
+EVERYWHERE = ("calibrate", "convert", "report", "certificate", "replay", "audit", "show")  # the others need Linux
 
 
 class LazyGroup(click.Group):

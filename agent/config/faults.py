@@ -40,6 +40,7 @@ def faults_of(raw: Mapping[str, Any]) -> tuple[Config | None, list[Told]]:
     faults += named
     options = list(_options(raw, faults))
     faults += _unknown_sensitivities(raw, dict(options))
+    faults += _uncertified_references(raw, dict(options))
     faults += _file_faults(raw)
     return config, faults
 
@@ -78,6 +79,19 @@ def _unknown_sensitivities(raw: Mapping[str, Any], options: Mapping[str, Options
         if not options[sensor].tells_sensitivity:
             what = f"is missing: the device {sensor!r} tells none; state it in its unit per m/s2, from its data sheet"
             yield ("channels", i, "prior", "sensitivity"), what
+
+
+def _uncertified_references(raw: Mapping[str, Any], options: Mapping[str, Options]) -> Iterator[Told]:
+    """References that do not indicate SI units, without the sensitivity in their certificate: it would be 1."""
+    for i, channel in enumerate(_entries(raw, "channels")):
+        beside = channel.get("check_reference")
+        places: list[tuple[Path, Any, Any]] = [((), channel.get("reference"), channel.get("certificate"))]
+        if isinstance(beside, Mapping):
+            places.append((("check_reference",), beside.get("device"), beside.get("certificate")))
+        for path, device, certificate in places:
+            stated = certificate.get("sensitivity") if isinstance(certificate, Mapping) else None
+            if stated is None and device in options and (asked := options[str(device)].asked_of_certificate):
+                yield ("channels", i, *path, "certificate", "sensitivity"), f"is missing for {device!r}: {asked}"
 
 
 def _file_faults(raw: Mapping[str, Any]) -> Iterator[Told]:

@@ -15,14 +15,15 @@ from agent.setup.listening import Heard, hear
 from agent.setup.toml import Setting, Table
 from hw.fifo_options import FifoOptions
 from hw.sensor import ConfigurationError, load_driver
+from hw.units import STANDARD_GRAVITY_MPS2
 
 Role = Literal["sensor", "reference"]
 TEXT_LINES = "serial-csv"
 HEARD_OPTIONS = ("axes", "sequence", "rate_hz")  # what lines of text tell
 BAUD_RATE = 115200  # default of all serial drivers
-# A sensor at rest indicates gravity. m/s2 are recognised by this length of the mean; g would be ten times smaller.
+# A sensor at rest indicates gravity. m/s2 and g are recognised by this length of the mean.
 GRAVITY_MPS2 = (8.0, 12.0)
-STANDARD_GRAVITY_MPS2 = 9.80665
+GRAVITY_G = (0.8, 1.2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,9 +89,11 @@ def _state_heard(device: Chosen, heard: Heard, faults: list[str]) -> None:
         device.state("unit", "count", "all indications on the port are whole numbers")
     elif GRAVITY_MPS2[0] <= length <= GRAVITY_MPS2[1]:
         device.state("unit", "m/s2", f"the mean on the port has the length {length:.3g}, as gravity has")
+    elif GRAVITY_G[0] <= length <= GRAVITY_G[1]:
+        device.state("unit", "g", f"the mean on the port has the length {length:.3g}, as gravity has in g")
     else:
         faults.append(
-            f"{device.role}: the mean on the port has the length {length:.4g}, so its unit is not m/s2; "
+            f"{device.role}: the mean on the port has the length {length:.4g}, so its unit is neither m/s2 nor g; "
             f"state --{device.role}-option unit=... (count or mV), or let the device send m/s2"
         )
     device.hint = (

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Callable, Iterable, Iterator
-from typing import TYPE_CHECKING, get_args
+from typing import TYPE_CHECKING, Any, cast, get_args
 
 from agent.supervision.devices import ClockQuality, DeviceHealth
+from agent.supervision.front_page import HEADERS, front_page
 from agent.supervision.health import GatewayStatus, State
 
 if TYPE_CHECKING:
@@ -102,13 +104,35 @@ class StatusCollector:
 
 
 def serve_metrics(host: str, port: int, newest: Callable[[], GatewayStatus | None]) -> str:
-    """Serve the metrics over HTTP, in threads that end with the process; returns the address. Raises OSError."""
-    from prometheus_client import CollectorRegistry, ProcessCollector, start_http_server
+    """Serve the metrics and a front page over HTTP, in threads that end with the process; returns the address of the
+    metrics. Raises OSError."""
+    import socketserver
+    from threading import Thread
+    from wsgiref import simple_server
+
+    from prometheus_client import CollectorRegistry, ProcessCollector, make_wsgi_app
+
+    class Server(socketserver.ThreadingMixIn, simple_server.WSGIServer):
+        daemon_threads = True
+        address_family = socket.getaddrinfo(host, port)[0][0]
+
+    class Handler(simple_server.WSGIRequestHandler):
+        def log_message(self, format: str, *args: object) -> None:
+            """A scrape every few seconds is no news."""
 
     registry = CollectorRegistry()
     registry.register(StatusCollector(newest))
     ProcessCollector(registry=registry)
-    server, _ = start_http_server(port, host, registry)
+    metrics = make_wsgi_app(registry)
+
+    def answer(environ: Any, start_response: Any) -> Iterable[bytes]:
+        if environ.get("PATH_INFO", "/") != "/":
+            return cast(Iterable[bytes], metrics(environ, start_response))
+        start_response("200 OK", list(HEADERS))  # the server adds the length to the list
+        return [front_page(newest())]
+
+    server = simple_server.make_server(host, port, answer, Server, Handler)
+    Thread(target=server.serve_forever, name="metrics", daemon=True).start()
     return f"http://{host}:{server.server_port}/metrics"
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from agent.core.identity import nominal_of
 from hw.block import BlockFlags, DeviceInfo, Drop
 from hw.conformance.serial import SerialContract, SerialRig
 from hw.serial_stream import SerialCsv
@@ -79,6 +81,19 @@ class TestSerialCsv(SerialContract):
         rig.port.inject(b"\n")
         next(rig.blocks(0.1))
         assert rig.sensor.take_drops() == [Drop(noise + 1, "bytes", "no newline within 256 bytes")]
+
+
+@pytest.mark.parametrize(("unit", "nominal"), [("g", 1 / 9.80665), ("m/s2", None), ("count", None)])
+def test_a_unit_of_acceleration_tells_the_sensitivity(unit: str, nominal: float | None, tmp_path: Path) -> None:
+    rig = CsvRig(tmp_path / "port")
+    try:
+        sensor = rig.build(unit=unit)
+        info = sensor.open()
+        assert (info.unit, info.nominal_sensitivity) == (unit, nominal)
+        assert nominal_of(asdict(info)) == {"g": nominal, "m/s2": 1.0, "count": None}[unit]
+        sensor.close()
+    finally:
+        rig.close()
 
 
 class TestWithoutSequence:

@@ -118,6 +118,12 @@ def test_a_certificate_older_than_its_interval_is_told_and_is_no_fault(
             "line 20: recording.keep_day: there is no such setting; remove it or correct its name, not 30",
         ),
         ("port = \"/dev/ttyUSB1\"\n", "", "line 10: devices.1.options.port: is missing; add it"),
+        (
+            "axes = 1",
+            'axes = 1\nunit = "g"',
+            "line 15: channels.0.certificate.sensitivity: is missing for 'laser': it indicates g; state 0.101971621 "
+            "(1/9.80665), or its certificate's",
+        ),
         ("keep_days = 30", "keep_days = ", "line 20: not TOML: Invalid value (at line 20, column 13)"),
     ],
 )  # fmt: skip
@@ -132,6 +138,19 @@ def test_a_fault_names_line_path_and_remedy(
 def test_a_device_that_tells_m_per_s2_needs_no_sensitivity(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "f.toml"
     path.write_text(GOOD.replace('unit = "count"', 'unit = "m/s2"').replace("sensitivity = 26000", ""))
+    assert run_cli(["check", str(path)]) == 0, capsys.readouterr().err
+
+
+def test_a_reference_in_counts_states_its_sensitivity(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shake = '{ host = "rs.local", station = "R1234", channels = ["EHZ"] }'
+    text = GOOD.replace(
+        'name = "laser"\ndriver = "serial-csv"\n[devices.options]', 'name = "laser"\ndriver = "seedlink"'
+    )
+    text = text.replace('port = "/dev/ttyUSB1"\nrate_hz = 100\naxes = 1\n', f"options = {shake}\n")
+    (line,) = checked(tmp_path / "f.toml", text, capsys)
+    assert "channels.0.certificate.sensitivity: is missing for 'laser': it indicates counts" in line
+    path = tmp_path / "f.toml"
+    path.write_text(text + '[channels.certificate]\nquantity = "velocity"\nsensitivity = 4e8\n')
     assert run_cli(["check", str(path)]) == 0, capsys.readouterr().err
 
 

@@ -191,6 +191,23 @@ def test_lines_that_are_heard(
     assert heard.nominal_hz == 100
 
 
+@pytest.mark.parametrize(("line", "unit"), [(b"0.02,-0.01,1.003", "g"), (b"0.2,-0.1,9.81", "m/s2")])
+def test_a_device_at_rest_tells_its_unit(line: bytes, unit: str, tmp_path: Path) -> None:
+    path = tmp_path / "gateway.toml"
+    with sending(line + b"\n", 0.01) as port:
+        reference = ["--reference-port", "/dev/nowhere", *stated("reference", "rate_hz=100", "axes=3", "sequence=true")]
+        assert (
+            run_cli(["init", str(path), "--sensor-port", port, *reference, *stated("reference", f"unit={unit}")]) == 0
+        )
+    config = load_config(path)
+    assert config.devices[0].options["unit"] == unit
+    # 1 g is 9.80665 m/s2 (CGPM 1901); the unit of the sensor needs no statement of its sensitivity
+    sensitivity = config.channels[0].certificate.sensitivity
+    assert sensitivity == (pytest.approx(1 / 9.80665, rel=1e-12) if unit == "g" else 1.0)
+    assert config.channels[0].prior.sensitivity is None
+    assert run_cli(["check", str(path)]) == 0
+
+
 def test_ports_without_lines(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("agent.setup.listening.FIRST_LINE_S", 0.3)
     monkeypatch.setattr("agent.setup.listening.LISTEN_S", 0.3)

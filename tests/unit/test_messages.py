@@ -247,9 +247,11 @@ def test_the_generated_code_is_that_of_the_proto_file(tmp_path: Path) -> None:
         pytest.skip("grpcio-tools is not installed")
     import subprocess
 
-    target = [f"--python_out={tmp_path}", f"--pyi_out={tmp_path}", "agent/proto/fieldcal.proto"]
+    protos = ["agent/proto/fieldcal.proto", "hw/sparkplug.proto"]
+    target = [f"--python_out={tmp_path}", f"--pyi_out={tmp_path}", *protos]
     command = [sys.executable, "-m", "grpc_tools.protoc", "-I.", *target]
     subprocess.run(command, cwd=REPOSITORY, check=True, timeout=60)
-    for name in ("fieldcal_pb2.py", "fieldcal_pb2.pyi"):
-        committed = (REPOSITORY / "agent/proto" / name).read_text()
-        assert (tmp_path / "agent/proto" / name).read_text() == committed, "generate it again, see fieldcal.proto"
+    for proto in protos:
+        for suffix in ("_pb2.py", "_pb2.pyi"):
+            name = proto.removesuffix(".proto") + suffix
+            assert (tmp_path / name).read_text() == (REPOSITORY / name).read_text(), f"generate it again, see {proto}"

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import time
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
+import msgspec
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
@@ -66,6 +68,28 @@ def test_names_are_as_prometheus_wants_them() -> None:
         assert not any(name.endswith(end) for end in ("_ms", "_us", "_ns", "_hz", "_degc", "_mb", "_count")), name
 
 
+def test_a_browser_finds_a_front_page() -> None:
+    newest: list[GatewayStatus | None] = [None]
+    address = serve_metrics("127.0.0.1", 0, lambda: newest[-1]).removesuffix("metrics")
+
+    def read(path: str = "") -> tuple[str, str]:
+        with urllib.request.urlopen(address + path, timeout=5) as answer:
+            return answer.headers["Content-Type"], answer.read().decode()
+
+    assert "No status yet" in read()[1]
+    health = opened(block("mems", 0))
+    newest.append(msgspec.structs.replace(report(health, 30.0), reasons=["<b>mems</b> is silent"]))
+    kind, page = read()
+    assert kind == "text/html; charset=utf-8"
+    assert "<td>mems</td><td>open</td>" in page
+    assert '<a href="/metrics">' in page
+    assert "&lt;b&gt;mems" in page
+    assert "<b>mems" not in page
+    assert read("metrics")[0].startswith("text/plain")
+    for path in ("favicon.ico", "nothing?name[]=x", "%2e%2e/etc/passwd"):
+        assert "root:" not in read(path)[1]
+
+
 def test_a_port_that_is_taken_is_told() -> None:
     address = serve_metrics("127.0.0.1", 0, lambda: None)
     with pytest.raises(OSError, match="in use"):
@@ -97,7 +121,10 @@ metrics = {{ enabled = true, port = 0 }}
 def imu(tmp_path: Path) -> Iterator[PtyDevice]:
     import numpy as np
 
-    device = PtyDevice(SampleLines(lambda _, n: np.ones((n, 3)), lambda t_s: int(t_s * 100)), link=tmp_path / "imu")
+    # The time since the machine was started would make a line for every sample since then.
+    began_s = time.monotonic()
+    lines = SampleLines(lambda _, n: np.ones((n, 3)), lambda t_s: int((t_s - began_s) * 100))
+    device = PtyDevice(lines, link=tmp_path / "imu")
     device.start()
     yield device
     device.stop()

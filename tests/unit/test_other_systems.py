@@ -25,9 +25,11 @@ def test_files_are_worked_on_everywhere(tmp_path: Path) -> None:
     (recording,) = data.glob("*.mcap")
     Store(data).close()  # brings the store of an older version up to date, as `fieldcal run` does
     sensor = str(example / "sensor.csv")
+    stated = ["--stated", str(ROOT / "examples" / "certificate.toml")]
     commands = [
-        ["calibrate", "--plain", "--sensor", sensor, "--reference", str(example / "reference.csv"),
+        ["calibrate", "--sensor", sensor, "--reference", str(example / "reference.csv"),
          "--poses", str(example / "poses.csv"), "--json", str(tmp_path / "result.json")],
+        ["certificate", str(tmp_path / "result.json"), *stated, "-o", str(tmp_path / "certificate")],
         ["convert", sensor, "-o", str(tmp_path / "out.csv")],
         ["replay", str(recording)],
         ["audit", str(recording)],
@@ -44,7 +46,8 @@ def test_files_are_worked_on_everywhere(tmp_path: Path) -> None:
     # 3: the recording is of another version or CPU, so that the last digits may differ; it was read to its end.
     statuses = dict(zip([command[0] for command in commands], json.loads(done.stdout.splitlines()[-1]), strict=True))
     assert all(statuses[name] in (0, 3) for name in ("replay", "audit")), done.stderr
-    assert [statuses[name] for name in ("calibrate", "convert", "show", "report")] == [0, 0, 0, 2], done.stderr
+    made = ("calibrate", "certificate", "convert", "show")
+    assert [statuses[name] for name in (*made, "report")] == [0, 0, 0, 0, 2], done.stderr
     assert done.stderr.count("internal fault") == 0
     assert json.loads((tmp_path / "result.json").read_text())["status"] == "valid"
 

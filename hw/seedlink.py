@@ -1,0 +1,136 @@
+"""Driver `seedlink`: a seismometer or accelerometer on a SeedLink server, such as a Raspberry Shake."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import ClassVar
+
+from pydantic import Field, field_validator
+
+from hw import miniseed
+from hw.alignment import Alignment
+from hw.block import BlockFlags, DeviceInfo
+from hw.message_sensor import OUTSIDE, MessageSensor, Piece
+from hw.seedlink_link import Link
+from hw.sensor import DeviceLost, Options
+
+RATE_TOLERANCE = 0.01  # relative; records with another rate are another channel
+STEP_S = 0.1  # a record of several seconds becomes bursts of this length, whose times follow from its start time
+UNREADABLE = "bytes that are no record of miniSEED 2"
+ALONE = "samples that one axis had and another had not"
+REPEATED = "samples that came twice"
+
+
+class SeedlinkOptions(Options):
+    """Options of `seedlink`."""
+
+    host: str = Field(min_length=1, max_length=255, description="name or address of the SeedLink server")
+    port: int = Field(18000, ge=1, le=65535, description="its TCP port")
+    network: str = Field("AM", pattern=r"^[A-Z0-9]{1,2}$", description="code of the network; AM is Raspberry Shake")
+    station: str = Field(pattern=r"^[A-Z0-9]{1,5}$", description="code of the station, as R1234")
+    location: str = Field("00", pattern=r"^[A-Z0-9]{0,2}$", description="code of the location; may be empty")
+    channels: tuple[str, ...] = Field(description='one channel, or three for x, y, z: ["ENE", "ENN", "ENZ"]')
+    rate_hz: float = Field(100.0, gt=0, le=10_000, description="nominal rate of the samples")
+    full_scale: float | None = Field(None, gt=0, description="counts of this size or more are saturated")
+    serial_number: str = Field("", description="of the instrument, as on its label")
+
+    @field_validator("channels")
+    @classmethod
+    def _one_or_three(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        if len(value) not in (1, 3) or len(set(value)) != len(value):
+            raise ValueError(f"1 or 3 different channels are needed, not {', '.join(value)}")
+        if not all(len(channel) == 3 and channel.isascii() and channel.isalnum() for channel in value):
+            raise ValueError(f"each channel has three letters or digits, as in ENZ, not {', '.join(value)}")
+        return value
+
+    @property
+    def tells_sensitivity(self) -> bool:
+        """It tells counts; the metadata of the station state the sensitivity."""
+        return False
+
+    @property
+    def asked_of_certificate(self) -> str:
+        """It tells counts."""
+        return (
+            "it indicates counts; state counts per m/s2 (or per m/s, with quantity = velocity), "
+            "from the certificate or the metadata of the station"
+        )
+
+
+class Seedlink(MessageSensor):
+    """Counts of one channel or three, at the times that the station stamped on its records.
+
+    Station and gateway must both follow UTC (GPS, NTP or PTP): the times of the samples are the station's, so an error
+    of either clock is a lag.
+    """
+
+    options_model: ClassVar[type[Options]] = SeedlinkOptions
+
+    _link: Link | None = None
+
+    def _where(self) -> str:
+        o = self._options
+        return f"SeedLink {o.host}:{o.port}/{o.network}.{o.station}.{o.location}.{','.join(o.channels)}"
+
+    def _connect(self) -> DeviceInfo:
+        o = self._options
+        self._axis = {f"{o.network}.{o.station}.{o.location}.{channel}": k for k, channel in enumerate(o.channels)}
+        self._alignment = Alignment(len(o.channels), o.rate_hz)
+        self._link = Link(self._where(), self._clock, self._sleep)
+        selectors = [f"{o.location}{channel}.D" for channel in o.channels]
+        self._link.connect(o.host, o.port, o.station, o.network, selectors)
+        self._follow_utc()
+        return DeviceInfo(
+            driver="seedlink",
+            kind="SeedLink",
+            serial_number=o.serial_number,
+            unit="count",
+            axes=len(o.channels),  # type: ignore[arg-type] # 1 or 3
+            nominal_rate_hz=o.rate_hz,
+            settings={"port": f"{o.host}:{o.port}", "channels": ", ".join(self._axis)},
+        )
+
+    def _disconnect(self) -> None:
+        link, self._link = self._link, None
+        if link is not None:
+            link.close()
+
+    def _receive(self) -> Iterator[Piece]:
+        assert self._link is not None
+        if self._follow_utc():
+            self._alignment.restart()
+        for data in self._link.records():
+            self._add(data)
+        for together in self._alignment.take():
+            flags, missing = together.flags, together.missing
+            step = max(1, round(STEP_S * self._options.rate_hz))
+            for begin in range(0, len(together.indications), step):
+                part = together.indications[begin : begin + step]
+                last = (begin + len(part) - 1) / self._options.rate_hz
+                t_utc_ns = together.start_ns + round(last * 1e9)
+                yield Piece(part, t_utc_ns - self._utc_ns, t_utc_ns, flags, missing)
+                flags, missing = BlockFlags.NONE, 0
+        for reason, count in ((ALONE, self._alignment.alone), (REPEATED, self._alignment.repeated)):
+            if count:
+                self._drops["samples", reason] += count
+        self._alignment.alone = self._alignment.repeated = 0
+
+    def _add(self, data: bytes) -> None:
+        """Take one record. Raises DeviceLost where its rate is not the configured one."""
+        try:
+            record = miniseed.decode(data)
+        except miniseed.RecordError:
+            self._drops["bytes", UNREADABLE] += len(data)
+            return
+        axis = self._axis.get(record.channel)
+        if axis is None:
+            self._drops["samples", "samples of a channel that was not asked for"] += len(record.samples)
+            return
+        rate_hz = self._options.rate_hz
+        if abs(record.rate_hz - rate_hz) > RATE_TOLERANCE * rate_hz:
+            raise DeviceLost(f"{self._where()}: {record.channel} has {record.rate_hz:g} Hz, not rate_hz {rate_hz:g}")
+        last_ns = record.start_ns + round((len(record.samples) - 1) / rate_hz * 1e9) - self._utc_ns
+        if self._is_timely(last_ns):
+            self._alignment.add(axis, record.start_ns, record.samples)
+        else:
+            self._drops["samples", OUTSIDE] += len(record.samples)
