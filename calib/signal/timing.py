@@ -273,4 +273,4 @@ def _inverse(normal: Array) -> Array:
         determinant = a * first + b * second + c * third
     if determinant == 0.0:
         raise np.linalg.LinAlgError("singular matrix")
-    return np.array(rows) / determinant
+    return np.asarray(np.array(rows) / determinant)
