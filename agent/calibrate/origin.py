@@ -17,6 +17,8 @@ FILES = (
     "poses",
     "prior",
     "reference_certificate",
+    "sensor_metadata",
+    "reference_metadata",
 )  # options of `fieldcal calibrate` that name a file
 
 

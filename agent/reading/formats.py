@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import importlib
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from agent.config.files import open_file
+from agent.reading.ground_motion import GroundMotion, Role
+from agent.reading.seismic import MiniSeed
 from agent.reading.source import Source, TableError
+from agent.reading.stationxml import read_stationxml
 
 
 @dataclass(frozen=True, slots=True)
 class Format:
     """A format: its name, how a file of it ends and begins, and the function that opens it.
 
-    `begins`: the first bytes of every such file, () where a file has none that are sure. `opens`: "module:function".
+    `begins`: regular expressions of the first bytes of every such file. `opens`: "module:function".
     `extra`: the extra of fieldcal that has the libraries, "" where none is needed.
     """
 
@@ -26,23 +30,29 @@ class Format:
     extra: str = ""
 
 
+# A number of six digits and a letter (version 2, and SEED), or MS (version 3).
+MINISEED_BEGINS = (rb"\d{6}[DRQMV][ \x00]", rb"MS\x03")
+MINISEED = "agent.reading.seismic:open_miniseed"
 FORMATS = (
-    Format("MCAP", (".mcap",), (b"\x89MCAP0\r\n",), "agent.reading.recording:open_mcap"),
+    Format("MCAP", (".mcap",), (rb"\x89MCAP0\r\n",), "agent.reading.recording:open_mcap"),
     Format("Parquet", (".parquet",), (b"PAR1",), "agent.reading.arrow:Parquet", "files"),
     Format("Feather", (".feather", ".arrow"), (b"ARROW1",), "agent.reading.arrow:Feather", "files"),
     Format("WAV", (".wav",), (b"RIFF", b"RF64"), "agent.reading.wav:open_wav"),
-    Format("HDF5", (".h5", ".hdf5"), (b"\x89HDF\r\n\x1a\n",), "agent.reading.hdf5:open_hdf5", "hdf5"),
-    Format("MATLAB 7.3", (".mat",), (b"MATLAB 7.3",), "agent.reading.hdf5:open_hdf5", "hdf5"),
-    Format("MATLAB", (".mat",), (b"MATLAB 5.0",), "agent.reading.matlab:open_matlab"),
-    Format("MiniSEED", (".mseed", ".miniseed", ".msd"), (), "agent.reading.seismic:open_miniseed", "seismic"),
+    Format("HDF5", (".h5", ".hdf5"), (rb"\x89HDF\r\n\x1a\n",), "agent.reading.hdf5:open_hdf5", "hdf5"),
+    Format("MATLAB 7.3", (".mat",), (rb"MATLAB 7\.3",), "agent.reading.hdf5:open_hdf5", "hdf5"),
+    Format("MATLAB", (".mat",), (rb"MATLAB 5\.0",), "agent.reading.matlab:open_matlab"),
+    Format("MiniSEED", (".mseed", ".miniseed", ".msd"), MINISEED_BEGINS, MINISEED, "seismic"),
     Format("TDMS", (".tdms",), (b"TDSm",), "agent.reading.tdms:open_tdms", "tdms"),
 )
 TEXT = Format("CSV", (".csv", ".tsv", ".txt", ".dat"), (), "agent.reading.delimited:Delimited")
 LONGEST_BEGIN = 1024
 
 
-def open_source(path: Path) -> Source:
-    """Open a file in any of the formats; a file that begins like none of them is read as text. Raises TableError."""
+def open_source(path: Path, metadata: Path | None = None, role: Role = "sensor") -> Source:
+    """Open a file in any of the formats; a file that begins like none of them is read as text.
+
+    `metadata`: the StationXML of a MiniSEED file, which is then read as what `role` says. Raises TableError.
+    """
     try:
         with open_file(path) as file:
             begin = file.read(LONGEST_BEGIN)
@@ -51,8 +61,15 @@ def open_source(path: Path) -> Source:
     form = format_of(path, begin)
     module, _, name = form.opens.partition(":")
     opened: Callable[[Path], Source] = getattr(importlib.import_module(module), name)
+    if metadata is not None and form.name != "MiniSEED":
+        raise TableError(f"{metadata}: a StationXML describes MiniSEED, but {path} is {form.name}; leave it out")
     try:
-        return opened(path)
+        source = opened(path)
+        return (
+            GroundMotion(source, read_stationxml(metadata), role)
+            if isinstance(source, MiniSeed) and metadata
+            else source
+        )
     except ImportError as error:
         raise TableError(
             f"{path}: {form.name} files need {error.name}, which is not installed: "
@@ -63,7 +80,7 @@ def open_source(path: Path) -> Source:
 def format_of(path: Path, begin: bytes) -> Format:
     """The format of a file that begins with these bytes."""
     for form in FORMATS:
-        if any(begin.startswith(magic) for magic in form.begins):
+        if any(re.match(first, begin) for first in form.begins):
             return form
     suffix = path.suffix.lower()
-    return next((form for form in FORMATS if not form.begins and suffix in form.suffixes), TEXT)
+    return next((form for form in FORMATS if form.name == "MiniSEED" and suffix in form.suffixes), TEXT)
