@@ -23,6 +23,7 @@ from agent.calibrate.reference_certificate import read_reference_certificate
 from agent.calibrate.station import compared, coupling_of, frame_of, pose_of_station
 from agent.calibrate.tables import ReferenceTable, SensorTable, read_reference, read_sensor
 from agent.calibrate.wrong_unit import check_gravity
+from agent.reading.formats import NOT_DESCRIBED, Description
 from agent.reading.source import Progress, TableError
 from agent.reading.units import Sensitivity, sensitivity_of
 from agent.terminal.text import for_drawing, say
@@ -42,8 +43,8 @@ def calibrated(options: dict[str, Any]) -> Outcome:
     """The outcome for these options. Raises TableError and click.UsageError."""
     _check(options)
     if not options["reference"] and not options["poses"] and not options["plain"]:
-        sensor = sensor_of(options["sensor"], options.get("columns"), metadata=options.get("sensor_metadata"))
-        return norm_fitted(sensor, options)
+        described = _description(options, "sensor_metadata")
+        return norm_fitted(sensor_of(options["sensor"], options.get("columns"), None, described), options)
     if options["method"] != "3":
         return by_amplitudes(read_files(options), options)
     if options["plain"]:
@@ -67,10 +68,11 @@ def read_files(options: dict[str, Any], instrument: Instrument | None = None) ->
     paths = [options[name] for name in ("sensor", "reference") if options[name]]
     size = sum(path.stat().st_size for path in paths if path.is_file())
     with _bar("reading", size if size > BAR_FROM_BYTES else 0) as bar:
-        sensor = sensor_of(options["sensor"], options.get("columns"), bar, options.get("sensor_metadata"))
+        described = _description(options, "sensor_metadata")
+        sensor = sensor_of(options["sensor"], options.get("columns"), bar, described)
         stated = (options.get("reference_columns"), options.get("sensitivity"))
-        metadata: Path | None = options.get("reference_metadata")
-        reference = reference_of(options["reference"], *stated, bar, metadata) if options["reference"] else None
+        described = _description(options, "reference_metadata")
+        reference = reference_of(options["reference"], *stated, bar, described) if options["reference"] else None
     return files_of(options, sensor, reference, instrument)
 
 
@@ -92,11 +94,15 @@ def files_of(
     return Files(sensor, reference, poses, instrument, Options(settings, align=not plain))
 
 
+def _description(options: dict[str, Any], metadata: str) -> Description:
+    return Description(options.get(metadata), options.get("mapping"))
+
+
 def sensor_of(
-    path: Path, columns: str | None, progress: Progress | None = None, metadata: Path | None = None
+    path: Path, columns: str | None, progress: Progress | None = None, described: Description = NOT_DESCRIBED
 ) -> SensorTable:
     """Read a sensor's file, and print what was guessed. Raises TableError."""
-    table = read_sensor(path, progress, columns, metadata)
+    table = read_sensor(path, progress, columns, described)
     _say(table.said)
     return table
 
@@ -106,11 +112,11 @@ def reference_of(
     columns: str | None,
     sensitivity: str | None,
     progress: Progress | None = None,
-    metadata: Path | None = None,
+    described: Description = NOT_DESCRIBED,
 ) -> ReferenceTable:
     """Read a reference's file, and print what was guessed. Raises TableError and click.BadParameter."""
     stated = _sensitivity(sensitivity) if sensitivity else None
-    table = read_reference(path, progress, columns, stated, metadata)
+    table = read_reference(path, progress, columns, stated, described)
     _say(table.said)
     return table
 

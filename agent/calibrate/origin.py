@@ -19,6 +19,7 @@ FILES = (
     "reference_certificate",
     "sensor_metadata",
     "reference_metadata",
+    "mapping",
 )  # options of `fieldcal calibrate` that name a file
 
 

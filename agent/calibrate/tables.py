@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from agent.reading.choice import AXES, Choice, Chosen, quantity_of
-from agent.reading.formats import open_source
+from agent.reading.formats import NOT_DESCRIBED, Description, open_source
 from agent.reading.ground_motion import GroundMotion
 from agent.reading.source import Array, Progress, Source, TableError
 from agent.reading.stationxml import Component
@@ -69,13 +69,13 @@ class ReferenceTable:
 
 
 def read_sensor(
-    path: Path, progress: Progress | None = None, columns: str | None = None, metadata: Path | None = None
+    path: Path, progress: Progress | None = None, columns: str | None = None, described: Description = NOT_DESCRIBED
 ) -> SensorTable:
     """Read the samples of a sensor, in the unit of the file. Raises TableError.
 
-    `columns` is the option --columns, `metadata` a StationXML.
+    `columns` is the option --columns.
     """
-    with open_source(path, metadata, "sensor") as source:
+    with open_source(path, described, "sensor") as source:
         choice = Choice(source, columns, "--columns")
         chosen = choice.in_one_group(_sensor_columns)
         rows = _rows(source, chosen, progress, np.ones(len(chosen) - 1))
@@ -120,13 +120,13 @@ def read_reference(
     progress: Progress | None = None,
     columns: str | None = None,
     sensitivity: Sensitivity | None = None,
-    metadata: Path | None = None,
+    described: Description = NOT_DESCRIBED,
 ) -> ReferenceTable:
     """Read the samples of a reference in SI units. Raises TableError.
 
     `columns` is the option --reference-columns, `metadata` a StationXML.
     """
-    with open_source(path, metadata, "reference") as source:
+    with open_source(path, described, "reference") as source:
         choice = Choice(source, columns, "--reference-columns")
         chosen, quantity = choice.in_one_group(lambda choice: _reference_columns(choice, sensitivity))
         scale = np.array([_si(choice, c, sensitivity) for c in chosen[1:]])

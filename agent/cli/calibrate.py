@@ -31,6 +31,7 @@ _U = Finite(0)
     "--reference-columns", metavar="time=NAME,x=NAME,...", help="Columns of the reference; a unit as x=NAME:mg."
 )
 @click.option("--sensitivity", metavar="'100 mV/g'", help="Of a reference whose file has mV or counts.")
+@click.option("--mapping", type=_FILE, metavar="FILE", help="Fields of topics in recordings of ROS 2, in TOML.")
 @click.option("--sensor-metadata", type=_FILE, metavar="FILE", help="StationXML of a sensor in MiniSEED.")
 @click.option("--reference-metadata", type=_FILE, metavar="FILE", help="StationXML of a reference in MiniSEED.")
 @click.option("--stationxml-out", type=_FILE, metavar="FILE",

@@ -48,10 +48,21 @@ TEXT = Format("CSV", (".csv", ".tsv", ".txt", ".dat"), (), "agent.reading.delimi
 LONGEST_BEGIN = 1024
 
 
-def open_source(path: Path, metadata: Path | None = None, role: Role = "sensor") -> Source:
+@dataclass(frozen=True, slots=True)
+class Description:
+    """Files that describe another file: the StationXML of a MiniSEED file, and the mapping of a recording of ROS 2."""
+
+    metadata: Path | None = None
+    mapping: Path | None = None
+
+
+NOT_DESCRIBED = Description()
+
+
+def open_source(path: Path, described: Description = NOT_DESCRIBED, role: Role = "sensor") -> Source:
     """Open a file in any of the formats; a file that begins like none of them is read as text.
 
-    `metadata`: the StationXML of a MiniSEED file, which is then read as what `role` says. Raises TableError.
+    `role`: as what a MiniSEED file with metadata is read. Raises TableError.
     """
     try:
         with open_file(path) as file:
@@ -61,15 +72,18 @@ def open_source(path: Path, metadata: Path | None = None, role: Role = "sensor")
     form = format_of(path, begin)
     module, _, name = form.opens.partition(":")
     opened: Callable[[Path], Source] = getattr(importlib.import_module(module), name)
-    if metadata is not None and form.name != "MiniSEED":
-        raise TableError(f"{metadata}: a StationXML describes MiniSEED, but {path} is {form.name}; leave it out")
+    if described.metadata is not None and form.name != "MiniSEED":
+        raise TableError(f"{described.metadata}: it describes MiniSEED, but {path} is {form.name}; leave it out")
     try:
+        if described.mapping is not None and form.name == "MCAP":
+            from agent.reading.mapping import read_mapping
+            from agent.reading.ros2 import RosBag
+
+            return RosBag(path, read_mapping(described.mapping))
         source = opened(path)
-        return (
-            GroundMotion(source, read_stationxml(metadata), role)
-            if isinstance(source, MiniSeed) and metadata
-            else source
-        )
+        if described.metadata is not None and isinstance(source, MiniSeed):
+            return GroundMotion(source, read_stationxml(described.metadata), role)
+        return source
     except ImportError as error:
         raise TableError(
             f"{path}: {form.name} files need {error.name}, which is not installed: "

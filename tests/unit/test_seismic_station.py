@@ -12,6 +12,7 @@ from scipy.signal import butter, csd, sosfilt
 
 from agent.calibrate.tables import read_reference, read_sensor
 from agent.cli.main import run_cli
+from agent.reading.formats import Description
 from agent.reading.source import TableError
 from agent.reading.stationxml import read_stationxml
 from tests.unit.seismic_station import (
@@ -128,15 +129,15 @@ def test_the_pair_of_obspy(site: Path) -> None:
     data = Path(obspy.__file__).parent / "signal" / "tests" / "data"
     if not (data / "ref_STS2").is_file():
         pytest.skip("this ObsPy comes without its test data")
-    metadata = site / "station.xml"
+    metadata = Description(site / "station.xml")
     columns = "time=time_s,x=z,y=z,z=z"  # an instrument with one output
     sensor = read_sensor(data / "ref_unknown", None, columns, metadata)
-    reference = read_reference(data / "ref_STS2", metadata=metadata)
+    reference = read_reference(data / "ref_STS2", described=metadata)
     assert reference.quantity == "acceleration"
     assert reference.components[0].direction.tolist() == sensor.components[2].direction.tolist() == [0.0, 0.0, 1.0]
 
     trace = obspy.read(str(data / "ref_STS2"))[0]
-    trace.remove_response(obspy.read_inventory(str(metadata)), output="ACC", water_level=None)
+    trace.remove_response(obspy.read_inventory(str(metadata.metadata)), output="ACC", water_level=None)
     middle = slice(2**17, 2**18)
     np.testing.assert_allclose(
         lowpassed(reference.x[:, 0])[middle], lowpassed(trace.data)[middle], atol=2e-3 * trace.data[middle].std()
@@ -169,15 +170,15 @@ def lowpassed(x: np.ndarray) -> np.ndarray:
 def test_metadata_that_do_not_belong_to_the_data(station: str, message: str, site: Path, tmp_path: Path) -> None:
     write_mseed(tmp_path / "a.mseed", station, LEVEL, np.arange(300.0).reshape(100, 3), RATE_HZ)
     with pytest.raises(TableError, match=message) as told:
-        read_reference(tmp_path / "a.mseed", metadata=site / "station.xml")
+        read_reference(tmp_path / "a.mseed", described=Description(site / "station.xml"))
     assert str(told.value).startswith(str(site / "station.xml"))
     assert "\n" not in str(told.value)
 
 
 def test_metadata_are_for_miniseed(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("time_s,a\n0,1\n1,2\n")
-    with pytest.raises(TableError, match=r"describes MiniSEED, but .*a.csv is CSV; leave it out"):
-        read_reference(tmp_path / "a.csv", metadata=tmp_path / "b.xml")
+    with pytest.raises(TableError, match=r"it describes MiniSEED, but .*a.csv is CSV; leave it out"):
+        read_reference(tmp_path / "a.csv", described=Description(tmp_path / "b.xml"))
 
 
 @pytest.mark.parametrize(
