@@ -30,6 +30,7 @@ class Format:
     extra: str = ""
 
 
+IDE_BEGINS = rb"(?s)\x1aE\xdf\xa3.{0,60}mide"  # EBML, and the type of the document
 # A number of six digits and a letter (version 2, and SEED), or MS (version 3).
 MINISEED_BEGINS = (rb"\d{6}[DRQMV][ \x00]", rb"MS\x03")
 MINISEED = "agent.reading.seismic:open_miniseed"
@@ -42,6 +43,7 @@ FORMATS = (
     Format("MATLAB 7.3", (".mat",), (rb"MATLAB 7\.3",), "agent.reading.hdf5:open_hdf5", "hdf5"),
     Format("MATLAB", (".mat",), (rb"MATLAB 5\.0",), "agent.reading.matlab:open_matlab"),
     Format("MiniSEED", (".mseed", ".miniseed", ".msd"), MINISEED_BEGINS, MINISEED, "seismic"),
+    Format("IDE", (".ide",), (IDE_BEGINS,), "agent.reading.ide:open_ide", "endaq"),
     Format("TDMS", (".tdms",), (b"TDSm",), "agent.reading.tdms:open_tdms", "tdms"),
 )
 TEXT = Format("CSV", (".csv", ".tsv", ".txt", ".dat"), (), "agent.reading.delimited:Delimited")
