@@ -40,8 +40,8 @@ FORMATS = (
     Format("Feather", (".feather", ".arrow"), (b"ARROW1",), "agent.reading.arrow:Feather", "files"),
     Format("WAV", (".wav",), (b"RIFF", b"RF64"), "agent.reading.wav:open_wav"),
     Format("HDF5", (".h5", ".hdf5"), (rb"\x89HDF\r\n\x1a\n",), "agent.reading.hdf5:open_hdf5", "hdf5"),
-    Format("MATLAB 7.3", (".mat",), (rb"MATLAB 7\.3",), "agent.reading.hdf5:open_hdf5", "hdf5"),
     Format("MATLAB", (".mat",), (rb"MATLAB 5\.0",), "agent.reading.matlab:open_matlab"),
+    Format("MATLAB 7.3", (".mat",), (rb"MATLAB 7\.3",), "agent.reading.hdf5:open_hdf5", "hdf5"),
     Format("MiniSEED", (".mseed", ".miniseed", ".msd"), MINISEED_BEGINS, MINISEED, "seismic"),
     Format("IDE", (".ide",), (IDE_BEGINS,), "agent.reading.ide:open_ide", "endaq"),
     Format("TDMS", (".tdms",), (b"TDSm",), "agent.reading.tdms:open_tdms", "tdms"),
@@ -94,9 +94,10 @@ def open_source(path: Path, described: Description = NOT_DESCRIBED, role: Role =
 
 
 def format_of(path: Path, begin: bytes) -> Format:
-    """The format of a file that begins with these bytes."""
+    """The format of a file that begins with these bytes; for one that no format knows, and that is no text, by its
+    name: MATLAB 4 has no sure begin."""
     for form in FORMATS:
         if any(re.match(first, begin) for first in form.begins):
             return form
-    suffix = path.suffix.lower()
-    return next((form for form in FORMATS if form.name == "MiniSEED" and suffix in form.suffixes), TEXT)
+    suffix, is_text = path.suffix.lower(), b"\x00" not in begin
+    return TEXT if is_text else next((form for form in FORMATS if suffix in form.suffixes), TEXT)
