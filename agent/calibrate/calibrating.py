@@ -20,8 +20,10 @@ from agent.calibrate.outcome import Outcome, nothing_used
 from agent.calibrate.poses import PoseInterval, Setting, beside_reference, read_poses
 from agent.calibrate.priors import contradictions, instrument_of, priors_of
 from agent.calibrate.reference_certificate import read_reference_certificate
+from agent.calibrate.station import compared, coupling_of, frame_of, pose_of_station
 from agent.calibrate.tables import ReferenceTable, SensorTable, read_reference, read_sensor
 from agent.calibrate.wrong_unit import check_gravity
+from agent.reading.formats import NOT_DESCRIBED, Description
 from agent.reading.source import Progress, TableError
 from agent.reading.units import Sensitivity, sensitivity_of
 from agent.terminal.text import for_drawing, say
@@ -41,7 +43,8 @@ def calibrated(options: dict[str, Any]) -> Outcome:
     """The outcome for these options. Raises TableError and click.UsageError."""
     _check(options)
     if not options["reference"] and not options["poses"] and not options["plain"]:
-        return norm_fitted(sensor_of(options["sensor"], options.get("columns")), options)
+        described = _description(options, "sensor_metadata")
+        return norm_fitted(sensor_of(options["sensor"], options.get("columns"), None, described), options)
     if options["method"] != "3":
         return by_amplitudes(read_files(options), options)
     if options["plain"]:
@@ -50,7 +53,11 @@ def calibrated(options: dict[str, Any]) -> Outcome:
     certificate = None if stated is None else read_reference_certificate(stated)
     if certificate is not None:
         options = options | {"u_reference_pct": 100.0 * float(np.max(certificate.u_relative))}
-    return adjusted(read_files(options, instrument_of(options)), priors_of(options), certificate)
+    files = read_files(options, instrument_of(options))
+    outcome = adjusted(files, priors_of(options), certificate)
+    if not files.components:
+        return outcome
+    return replace(outcome, more={**outcome.more, "station": compared(outcome, files.components)})
 
 
 def read_files(options: dict[str, Any], instrument: Instrument | None = None) -> Files:
@@ -61,9 +68,11 @@ def read_files(options: dict[str, Any], instrument: Instrument | None = None) ->
     paths = [options[name] for name in ("sensor", "reference") if options[name]]
     size = sum(path.stat().st_size for path in paths if path.is_file())
     with _bar("reading", size if size > BAR_FROM_BYTES else 0) as bar:
-        sensor = sensor_of(options["sensor"], options.get("columns"), bar)
+        described = _description(options, "sensor_metadata")
+        sensor = sensor_of(options["sensor"], options.get("columns"), bar, described)
         stated = (options.get("reference_columns"), options.get("sensitivity"))
-        reference = reference_of(options["reference"], *stated, bar) if options["reference"] else None
+        described = _description(options, "reference_metadata")
+        reference = reference_of(options["reference"], *stated, bar, described) if options["reference"] else None
     return files_of(options, sensor, reference, instrument)
 
 
@@ -75,29 +84,40 @@ def files_of(
     if reference is not None:
         instrument = replace(instrument, quantity=reference.quantity)
         _check_quantity(reference, instrument, options["reference_quantity"])
-    setting = setting_of(options, reference)
+    setting = setting_of(options, sensor, reference)
     instrument = replace(instrument, ac_coupled="ac" in (setting.coupling, setting.reference_coupling))
     if reference is not None and setting.reference_coupling == "dc":
         check_gravity(reference)
-    poses = _poses(options, setting, reference)
+    poses = _poses(options, setting, sensor, reference)
     plain = options["plain"]
     limits = Limits.of(options["u_offset_mps2"], math.radians(options["u_angle_deg"]))
     settings = Settings(Limits() if plain else limits, leave_out=not plain, limit_band=not plain, bands=not plain)
     return Files(sensor, reference, poses, instrument, Options(settings, align=not plain))
 
 
-def sensor_of(path: Path, columns: str | None, progress: Progress | None = None) -> SensorTable:
+def _description(options: dict[str, Any], metadata: str) -> Description:
+    return Description(options.get(metadata), options.get("mapping"))
+
+
+def sensor_of(
+    path: Path, columns: str | None, progress: Progress | None = None, described: Description = NOT_DESCRIBED
+) -> SensorTable:
     """Read a sensor's file, and print what was guessed. Raises TableError."""
-    table = read_sensor(path, progress, columns)
+    table = read_sensor(path, progress, columns, described)
     _say(table.said)
     return table
 
 
 def reference_of(
-    path: Path, columns: str | None, sensitivity: str | None, progress: Progress | None = None
+    path: Path,
+    columns: str | None,
+    sensitivity: str | None,
+    progress: Progress | None = None,
+    described: Description = NOT_DESCRIBED,
 ) -> ReferenceTable:
     """Read a reference's file, and print what was guessed. Raises TableError and click.BadParameter."""
-    table = read_reference(path, progress, columns, _sensitivity(sensitivity) if sensitivity else None)
+    stated = _sensitivity(sensitivity) if sensitivity else None
+    table = read_reference(path, progress, columns, stated, described)
     _say(table.said)
     return table
 
@@ -126,26 +146,35 @@ def _check_quantity(reference: ReferenceTable, instrument: Instrument, stated: s
         )
 
 
-def setting_of(options: dict[str, Any], reference: ReferenceTable | None) -> Setting:
-    """The settings that apply to every pose."""
+def setting_of(options: dict[str, Any], sensor: SensorTable, reference: ReferenceTable | None) -> Setting:
+    """The settings that apply to every pose. What the metadata of a station say of coupling and rotation counts."""
     channels = 0 if reference is None else reference.x.shape[1]
+    told = None if reference is None else coupling_of(reference.components)
+    rotation = _rotation(options["rotation"])
+    if rotation is None and reference is not None and reference.components and channels == 3 and sensor.components:
+        rotation = frame_of(sensor.components)
     return Setting(
         gravity_mps2=options["gravity_mps2"] or STANDARD_GRAVITY_MPS2,
         static_sign=int(options["static_sign"]),
-        coupling=options["coupling"],
-        reference_coupling=options["reference_coupling"] or ("dc" if channels == 3 else "ac"),
+        coupling=coupling_of(sensor.components) or options["coupling"],
+        reference_coupling=options["reference_coupling"] or told or ("dc" if channels == 3 else "ac"),
         reference_channels=channels,
-        rotation=_rotation(options["rotation"]),
+        rotation=rotation,
     )
 
 
-def _poses(options: dict[str, Any], setting: Setting, reference: ReferenceTable | None) -> list[PoseInterval]:
+def _poses(
+    options: dict[str, Any], setting: Setting, sensor: SensorTable, reference: ReferenceTable | None
+) -> list[PoseInterval]:
     if options["rotation"] and setting.reference_channels != 3:
         raise click.UsageError(
             "--rotation is for a tri-axial --reference, but this one has one axis; remove --rotation"
         )
     if options["poses"]:
         return read_poses(options["poses"], setting)
+    if reference is not None and reference.components and sensor.components:
+        pose = pose_of_station(sensor.components, reference.components, setting)
+        return [PoseInterval(float(reference.time_s[0]), float(reference.time_s[-1]), pose)]
     if reference is None or setting.reference_channels != 3:
         raise click.UsageError(
             "--poses is missing; only a tri-axial --reference, or rests without a reference, need no poses"
@@ -165,6 +194,12 @@ def _check(options: dict[str, Any]) -> None:
         raise click.UsageError("give --nominal or --prior, not both")
     if options["rotation"] and not options["reference"]:
         raise click.UsageError("--rotation needs a tri-axial --reference")
+    if options.get("reference_metadata") and not options["reference"]:
+        raise click.UsageError("--reference-metadata needs --reference")
+    if options.get("stationxml_out") and not options.get("sensor_metadata"):
+        raise click.UsageError("--stationxml-out needs --sensor-metadata")
+    if options["rotation"] and options.get("reference_metadata") and options.get("sensor_metadata"):
+        raise click.UsageError("the metadata of both instruments state the rotation; remove --rotation")
     if options["method"] != "3" and not (options["reference"] and options["poses"]):
         raise click.UsageError(f"--method {options['method']} needs --reference and --poses")
 

@@ -9,12 +9,12 @@ import json
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
-from xml.parsers import expat
 
 import numpy as np
 
 from agent.config.files import read_file
 from agent.reading.source import TableError
+from agent.reading.xml import XmlError, check_xml
 from calib.model import PARAMETERS, Array
 
 LARGEST = 64 << 20  # bytes; a result lists all its windows, each with 0.3 kB
@@ -51,11 +51,10 @@ def _from_json(data: bytes) -> tuple[Array, Array]:
 
 
 def _from_xml(data: bytes) -> tuple[Array, Array]:
-    _refuse_document_type(data)
     try:
-        root = ET.fromstring(data)
-    except ET.ParseError as error:  # also what the parser above does not look at, such as prefixes
-        raise _OtherXmlError(f"the XML is broken: {error}") from None
+        root = ET.fromstring(check_xml(data))
+    except (XmlError, ET.ParseError) as error:
+        raise _OtherXmlError(f"{error}" if isinstance(error, XmlError) else f"the XML is broken: {error}") from None
     if root.tag != f"{{{DCC}}}digitalCalibrationCertificate":
         raise _OtherXmlError("the XML is no digital calibration certificate (DCC)")
     quantity = root.find(f".//{{{DCC}}}quantity[@refType='{COVARIANCE}']/{{{SI}}}realListXMLList")
@@ -75,17 +74,3 @@ def _from_xml(data: bytes) -> tuple[Array, Array]:
     values[places] = read
     covariance[np.ix_(places, places)] = np.transpose(told)
     return values, covariance
-
-
-def _refuse_document_type(data: bytes) -> None:
-    """Raises _OtherXmlError where the XML has a document type, which entities need, or where it is broken."""
-
-    def refuse(*_: object) -> None:
-        raise _OtherXmlError("the XML has a document type (DOCTYPE), which is not read; remove it")
-
-    parser = expat.ParserCreate()
-    parser.StartDoctypeDeclHandler = refuse
-    try:
-        parser.Parse(data, True)
-    except expat.ExpatError as error:
-        raise _OtherXmlError(f"the XML is broken: {error}") from None

@@ -66,6 +66,7 @@ class Files:
         self._instrument = instrument
         self.drift: Drift | None = None  # of the sensor's clock against the reference's; None until windows were made
         self.poses = poses
+        self.components = sensor.components
 
     @property
     def corner_unknown(self) -> bool:

@@ -17,6 +17,9 @@ FILES = (
     "poses",
     "prior",
     "reference_certificate",
+    "sensor_metadata",
+    "reference_metadata",
+    "mapping",
 )  # options of `fieldcal calibrate` that name a file
 
 

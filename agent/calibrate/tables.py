@@ -11,8 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from agent.reading.choice import AXES, Choice, Chosen, quantity_of
-from agent.reading.formats import open_source
+from agent.reading.formats import NOT_DESCRIBED, Description, open_source
+from agent.reading.ground_motion import GroundMotion
 from agent.reading.source import Array, Progress, Source, TableError
+from agent.reading.stationxml import Component
 from agent.reading.units import Sensitivity, unit_of
 from calib.signal.stamps import kind_of
 
@@ -39,7 +41,8 @@ SINCE_1970 = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
 class SensorTable:
     """Stamps (n,) in s, indications (n, 3), temperature (n,) in degC or None. The arrays are on disk.
 
-    A row of indications is NaN where one of them is missing. `said`: what was guessed, for the user.
+    A row of indications is NaN where one of them is missing. `said`: what was guessed, for the user. `components`: what
+    the metadata of a station say of the three outputs; empty where there are none.
     """
 
     path: Path
@@ -47,13 +50,14 @@ class SensorTable:
     v: Array
     temperature_degc: Array | None
     said: tuple[str, ...] = ()
+    components: tuple[Component, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReferenceTable:
     """Stamps (n,) in s, channels (n, 1 or 3) of a quantity of calib.signal.instrument in SI units.
 
-    `column` says where the file names the first channel. `said`: what was guessed, for the user.
+    `column` says where the file names the first channel. `said` and `components`: as those of a sensor.
     """
 
     path: Path
@@ -62,15 +66,31 @@ class ReferenceTable:
     quantity: str
     column: str
     said: tuple[str, ...] = ()
+    components: tuple[Component, ...] = ()
 
 
-def read_sensor(path: Path, progress: Progress | None = None, columns: str | None = None) -> SensorTable:
-    """Read the samples of a sensor, in the unit of the file. `columns` is the option --columns. Raises TableError."""
-    with open_source(path) as source:
+def read_sensor(
+    path: Path, progress: Progress | None = None, columns: str | None = None, described: Description = NOT_DESCRIBED
+) -> SensorTable:
+    """Read the samples of a sensor, in the unit of the file. Raises TableError.
+
+    `columns` is the option --columns.
+    """
+    with open_source(path, described, "sensor") as source:
         choice = Choice(source, columns, "--columns")
         chosen = choice.in_one_group(_sensor_columns)
         rows = _rows(source, chosen, progress, np.ones(len(chosen) - 1))
-    return SensorTable(path, rows[:, 0], rows[:, 1:4], rows[:, 4] if len(chosen) > 4 else None, tuple(choice.said))
+        said, components = _described(source, choice, chosen[1:4])
+    return SensorTable(path, rows[:, 0], rows[:, 1:4], rows[:, 4] if len(chosen) > 4 else None, said, components)
+
+
+def _described(
+    source: Source, choice: Choice, chosen: Sequence[Chosen]
+) -> tuple[tuple[str, ...], tuple[Component, ...]]:
+    """What the user is told, and what the metadata of a station say of the chosen channels."""
+    if not isinstance(source, GroundMotion):
+        return tuple(choice.said), ()
+    return (*source.said, *choice.said), tuple(source.components[c.column] for c in chosen)
 
 
 def _sensor_columns(choice: Choice) -> list[Chosen]:
@@ -97,17 +117,24 @@ def _sensor_columns(choice: Choice) -> list[Chosen]:
 
 
 def read_reference(
-    path: Path, progress: Progress | None = None, columns: str | None = None, sensitivity: Sensitivity | None = None
+    path: Path,
+    progress: Progress | None = None,
+    columns: str | None = None,
+    sensitivity: Sensitivity | None = None,
+    described: Description = NOT_DESCRIBED,
 ) -> ReferenceTable:
-    """Read the samples of a reference in SI units. `columns` is the option --reference-columns. Raises TableError."""
-    with open_source(path) as source:
+    """Read the samples of a reference in SI units. Raises TableError.
+
+    `columns` is the option --reference-columns, `metadata` a StationXML.
+    """
+    with open_source(path, described, "reference") as source:
         choice = Choice(source, columns, "--reference-columns")
         chosen, quantity = choice.in_one_group(lambda choice: _reference_columns(choice, sensitivity))
         scale = np.array([_si(choice, c, sensitivity) for c in chosen[1:]])
         rows = _rows(source, chosen, progress, scale)
-    return ReferenceTable(
-        path, rows[:, 0], rows[:, 1:], quantity, f"{source.header}: column {chosen[1].column}", tuple(choice.said)
-    )
+        said, components = _described(source, choice, chosen[1:])
+    column = f"{source.header}: column {chosen[1].column}"
+    return ReferenceTable(path, rows[:, 0], rows[:, 1:], quantity, column, said, components)
 
 
 def _reference_columns(choice: Choice, sensitivity: Sensitivity | None) -> tuple[list[Chosen], str]:

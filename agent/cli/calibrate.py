@@ -11,6 +11,7 @@ import click
 from agent.calibrate.calibrating import calibrated
 from agent.calibrate.origin import origin
 from agent.calibrate.outcome import as_json, print_outcome
+from agent.calibrate.station import differences, write_proposed
 from agent.calibrate.tables import REFERENCES
 from agent.cli.finite import Finite
 from agent.reading.source import TableError
@@ -30,6 +31,11 @@ _U = Finite(0)
     "--reference-columns", metavar="time=NAME,x=NAME,...", help="Columns of the reference; a unit as x=NAME:mg."
 )
 @click.option("--sensitivity", metavar="'100 mV/g'", help="Of a reference whose file has mV or counts.")
+@click.option("--mapping", type=_FILE, metavar="FILE", help="Fields of topics in recordings of ROS 2, in TOML.")
+@click.option("--sensor-metadata", type=_FILE, metavar="FILE", help="StationXML of a sensor in MiniSEED.")
+@click.option("--reference-metadata", type=_FILE, metavar="FILE", help="StationXML of a reference in MiniSEED.")
+@click.option("--stationxml-out", type=_FILE, metavar="FILE",
+              help="New file: the StationXML of the sensor with sensitivity and orientation as found.")  # fmt: skip
 @click.option(
     "--poses", type=_FILE, help="Columns start_s,stop_s and theta_deg,alpha_deg | dx,dy,dz | axis | gx,gy,gz."
 )
@@ -108,9 +114,14 @@ def calibrate(**options: Any) -> int:
     """
     try:
         outcome = calibrated(options)
+        proposed: Path | None = options["stationxml_out"]
+        if proposed is not None and outcome.calibration is not None:
+            write_proposed(options["sensor_metadata"], proposed, outcome.more["station"])
     except TableError as error:
         say(f"fieldcal calibrate: {error}", err=True)
         return 2
+    for line in differences(outcome.more.get("station", ())):
+        say(line, err=True)
     json_to: Path | None = options["json_to"]
     if json_to is not None:
         told = as_json(replace(outcome, more={**outcome.more, **origin(options)}))

@@ -9,6 +9,7 @@ import numpy as np
 
 from agent.calibrate.calibrating import reference_of, sensor_of
 from agent.calibrate.tables import REFERENCES, SENSOR, TEMPERATURE
+from agent.reading.formats import Description
 from agent.reading.source import ROWS_AT_ONCE, Array, TableError
 from agent.terminal.text import say
 
@@ -24,21 +25,24 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
 )  # fmt: skip
 @click.option("--columns", metavar="time=NAME,x=NAME,...", help="Columns to take; a unit as x=NAME:mg.")
 @click.option("--sensitivity", metavar="'100 mV/g'", help="Of a reference whose file has mV or counts.")
-def convert(file: Path, output: Path, role: str, columns: str | None, sensitivity: str | None) -> int:
+@click.option("--mapping", type=_FILE, metavar="FILE", help="Fields of topics in a recording of ROS 2, in TOML.")
+@click.option("--metadata", type=_FILE, metavar="FILE", help="StationXML of a file in MiniSEED.")
+def convert(file: Path, output: Path, role: str, columns: str | None, sensitivity: str | None, **beside: Path) -> int:
     """Write the samples of FILE as plain CSV: time_s,vx,vy,vz of a sensor; time_s,a of a reference, or ax,ay,az, v, d.
 
     Exit status 0 if it is written, 2 on bad input.
     """
     if sensitivity and role == "sensor":
         raise click.UsageError("--sensitivity is for --as reference")
+    described = Description(**beside)
     try:
         if role == "sensor":
-            sensor = sensor_of(file, columns)
+            sensor = sensor_of(file, columns, None, described)
             names, values = [*SENSOR], [sensor.time_s, sensor.v]
             if sensor.temperature_degc is not None:
                 names, values = [*names, TEMPERATURE], [*values, sensor.temperature_degc]
         else:
-            reference = reference_of(file, columns, sensitivity)
+            reference = reference_of(file, columns, sensitivity, None, described)
             names = ["time_s", *_names(reference.quantity, reference.x.shape[1])]
             values = [reference.time_s, reference.x]
         rows = _write(output, names, values)

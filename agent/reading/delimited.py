@@ -86,7 +86,9 @@ class Delimited(Source):
 def fields_of(path: Path, line: int, fields: list[str], header: Sequence[str]) -> list[str]:
     """The fields. Raises TableError if their number is not that of the header."""
     if len(fields) != len(header):
-        raise TableError(f"{path}, line {line}: {len(fields)} fields, but the header has {len(header)}")
+        raise TableError(
+            f"{path}, line {line}: {len(fields)} fields, but the header has {len(header)}; correct the line"
+        )
     return fields
 
 

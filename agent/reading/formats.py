@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import importlib
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from agent.config.files import open_file
+from agent.reading.ground_motion import GroundMotion, Role
+from agent.reading.seismic import MiniSeed
 from agent.reading.source import Source, TableError
+from agent.reading.stationxml import read_stationxml
 
 
 @dataclass(frozen=True, slots=True)
 class Format:
     """A format: its name, how a file of it ends and begins, and the function that opens it.
 
-    `begins`: the first bytes of every such file, () where a file has none that are sure. `opens`: "module:function".
+    `begins`: regular expressions of the first bytes of every such file. `opens`: "module:function".
     `extra`: the extra of fieldcal that has the libraries, "" where none is needed.
     """
 
@@ -26,23 +30,42 @@ class Format:
     extra: str = ""
 
 
+IDE_BEGINS = rb"(?s)\x1aE\xdf\xa3.{0,60}mide"  # EBML, and the type of the document
+# A number of six digits and a letter (version 2, and SEED), or MS (version 3).
+MINISEED_BEGINS = (rb"\d{6}[DRQMV][ \x00]", rb"MS\x03")
+MINISEED = "agent.reading.seismic:open_miniseed"
 FORMATS = (
-    Format("MCAP", (".mcap",), (b"\x89MCAP0\r\n",), "agent.reading.recording:open_mcap"),
+    Format("MCAP", (".mcap",), (rb"\x89MCAP0\r\n",), "agent.reading.recording:open_mcap"),
     Format("Parquet", (".parquet",), (b"PAR1",), "agent.reading.arrow:Parquet", "files"),
     Format("Feather", (".feather", ".arrow"), (b"ARROW1",), "agent.reading.arrow:Feather", "files"),
     Format("WAV", (".wav",), (b"RIFF", b"RF64"), "agent.reading.wav:open_wav"),
-    Format("HDF5", (".h5", ".hdf5"), (b"\x89HDF\r\n\x1a\n",), "agent.reading.hdf5:open_hdf5", "hdf5"),
-    Format("MATLAB 7.3", (".mat",), (b"MATLAB 7.3",), "agent.reading.hdf5:open_hdf5", "hdf5"),
-    Format("MATLAB", (".mat",), (b"MATLAB 5.0",), "agent.reading.matlab:open_matlab"),
-    Format("MiniSEED", (".mseed", ".miniseed", ".msd"), (), "agent.reading.seismic:open_miniseed", "seismic"),
+    Format("HDF5", (".h5", ".hdf5"), (rb"\x89HDF\r\n\x1a\n",), "agent.reading.hdf5:open_hdf5", "hdf5"),
+    Format("MATLAB", (".mat",), (rb"MATLAB 5\.0",), "agent.reading.matlab:open_matlab"),
+    Format("MATLAB 7.3", (".mat",), (rb"MATLAB 7\.3",), "agent.reading.hdf5:open_hdf5", "hdf5"),
+    Format("MiniSEED", (".mseed", ".miniseed", ".msd"), MINISEED_BEGINS, MINISEED, "seismic"),
+    Format("IDE", (".ide",), (IDE_BEGINS,), "agent.reading.ide:open_ide", "endaq"),
     Format("TDMS", (".tdms",), (b"TDSm",), "agent.reading.tdms:open_tdms", "tdms"),
 )
 TEXT = Format("CSV", (".csv", ".tsv", ".txt", ".dat"), (), "agent.reading.delimited:Delimited")
 LONGEST_BEGIN = 1024
 
 
-def open_source(path: Path) -> Source:
-    """Open a file in any of the formats; a file that begins like none of them is read as text. Raises TableError."""
+@dataclass(frozen=True, slots=True)
+class Description:
+    """Files that describe another file: the StationXML of a MiniSEED file, and the mapping of a recording of ROS 2."""
+
+    metadata: Path | None = None
+    mapping: Path | None = None
+
+
+NOT_DESCRIBED = Description()
+
+
+def open_source(path: Path, described: Description = NOT_DESCRIBED, role: Role = "sensor") -> Source:
+    """Open a file in any of the formats; a file that begins like none of them is read as text.
+
+    `role`: as what a MiniSEED file with metadata is read. Raises TableError.
+    """
     try:
         with open_file(path) as file:
             begin = file.read(LONGEST_BEGIN)
@@ -51,8 +74,18 @@ def open_source(path: Path) -> Source:
     form = format_of(path, begin)
     module, _, name = form.opens.partition(":")
     opened: Callable[[Path], Source] = getattr(importlib.import_module(module), name)
+    if described.metadata is not None and form.name != "MiniSEED":
+        raise TableError(f"{described.metadata}: it describes MiniSEED, but {path} is {form.name}; leave it out")
     try:
-        return opened(path)
+        if described.mapping is not None and form.name == "MCAP":
+            from agent.reading.mapping import read_mapping
+            from agent.reading.ros2 import RosBag
+
+            return RosBag(path, read_mapping(described.mapping))
+        source = opened(path)
+        if described.metadata is not None and isinstance(source, MiniSeed):
+            return GroundMotion(source, read_stationxml(described.metadata), role)
+        return source
     except ImportError as error:
         raise TableError(
             f"{path}: {form.name} files need {error.name}, which is not installed: "
@@ -61,9 +94,10 @@ def open_source(path: Path) -> Source:
 
 
 def format_of(path: Path, begin: bytes) -> Format:
-    """The format of a file that begins with these bytes."""
+    """The format of a file that begins with these bytes; for one that no format knows, and that is no text, by its
+    name: MATLAB 4 has no sure begin."""
     for form in FORMATS:
-        if any(begin.startswith(magic) for magic in form.begins):
+        if any(re.match(first, begin) for first in form.begins):
             return form
-    suffix = path.suffix.lower()
-    return next((form for form in FORMATS if not form.begins and suffix in form.suffixes), TEXT)
+    suffix, is_text = path.suffix.lower(), b"\x00" not in begin
+    return TEXT if is_text else next((form for form in FORMATS if suffix in form.suffixes), TEXT)

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import io
 import os
-import subprocess
 import sys
 import zlib
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.reading.hdf5 import RATES, columns_of, with_times
-from agent.reading.source import Arrays, Column, Slices, TableError, bounded_memory, check_announced
+from agent.reading.own_process import Name, arrays_of, write_arrays
+from agent.reading.source import Arrays, Column, Slices, check_announced
 
 HEADER_BYTES = 128
 COMPRESSED = 15  # data type of an element
@@ -29,48 +27,28 @@ def open_matlab(path: Path) -> Arrays:
     scipy reads the file in a process of its own, because a damaged file can end that process.
     """
     memory = LEAST_MEMORY + COPIES * _unpacked_bytes(path)
-    command = [sys.executable, "-m", "agent.reading.matlab", str(path), str(memory)]
-    done = subprocess.run(command, capture_output=True, check=False)
-    if done.returncode:
-        reason = done.stderr.decode("utf-8", "replace").strip().rpartition("\n")[2] or "its reader failed"
-        raise TableError(f"{path}: the file cannot be read: {reason}; save it with -v7 or -v7.3")
     values: dict[Column, Slices] = {}
     rates: dict[str, float] = {}
-    with np.load(io.BytesIO(done.stdout), allow_pickle=False) as found:
-        for k, (group, name) in enumerate(found["names"].tolist()):
-            array = found[str(k)]
-            if array.size == 1 and name.lower() in RATES:
-                rates[group] = float(array.ravel()[0])
-            elif array.size and array.ndim in (1, 2):
-                values |= columns_of(name, array, "", group)
+    for (group, name), array in arrays_of("agent.reading.matlab", path, memory, "save it with -v7 or -v7.3"):
+        if array.size == 1 and name.lower() in RATES:
+            rates[group] = float(array.ravel()[0])
+        elif array.size and array.ndim in (1, 2):
+            values |= columns_of(name, array, "", group)
     return Arrays(path, with_times(values, rates))
 
 
-def main(path: str, memory_bytes: str) -> None:
-    """Write the arrays of numbers in the file to standard output, as npz without objects."""
+def _arrays(path: str) -> dict[Name, NDArray[Any]]:
+    """The arrays of numbers in the file, each named by its structure and its name."""
     from scipy.io import loadmat
 
-    with suppress(ImportError):  # Windows has none
-        import resource
-
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    found: dict[tuple[str, str], NDArray[Any]] = {}
-    try:
-        with bounded_memory(int(memory_bytes)):  # scipy allots what a cell array announces
-            for name, value in loadmat(path, squeeze_me=True).items():
-                if not name.startswith("__"):
-                    _take(name, value, "", found)
-    except MemoryError:
-        sys.exit("the file announces more than it holds")
-    except Exception as error:  # scipy raises many kinds for broken files
-        sys.exit(str(error) or type(error).__name__)
-    whole = io.BytesIO()
-    names = np.array(list(found) or np.empty((0, 2)), dtype=str)
-    np.savez(whole, names=names, **{str(k): array for k, array in enumerate(found.values())})  # type: ignore[arg-type]
-    sys.stdout.buffer.write(whole.getbuffer())
+    found: dict[Name, NDArray[Any]] = {}
+    for name, value in loadmat(path, squeeze_me=True).items():
+        if not name.startswith("__"):
+            _take(name, value, "", found)
+    return found
 
 
-def _take(name: str, value: Any, group: str, found: dict[tuple[str, str], NDArray[Any]]) -> None:
+def _take(name: str, value: Any, group: str, found: dict[Name, NDArray[Any]]) -> None:
     """Take a variable with numbers, or the fields of a structure with one element."""
     array = np.asarray(value)
     if array.dtype.names and array.ndim == 0:
@@ -107,4 +85,4 @@ def _unpacked_bytes(path: Path) -> int:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    write_arrays(_arrays, *sys.argv[1:])

@@ -3,33 +3,44 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from agent.reading.source import Array, Arrays, Column, Grid, Slices, TableError
+from agent.reading.stationxml import import_obspy
 
 # The last letter of a channel's code names its component: east, north and up are x, y and z.
 AXES = {"E": "x", "N": "y", "Z": "z"}
 
 
-def open_miniseed(path: Path) -> Arrays:
+class MiniSeed(Arrays):
+    """A MiniSEED file. `seed_ids`: the channel of each column of samples; `values`: of each column."""
+
+    def __init__(self, path: Path, values: Mapping[Column, Slices], seed_ids: Mapping[Column, str]) -> None:
+        super().__init__(path, values)
+        self.values, self.seed_ids = values, seed_ids
+
+
+def open_miniseed(path: Path) -> MiniSeed:
     """Each sensor of a station is a group with `time_s` and its components.
 
     The group is named network.station.location.channel, without the last letter of the channel. A component that is
     missing for a time has gaps there. Raises TableError.
     """
+    obspy = import_obspy()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # ObsPy's own, about packages that it uses
-        import obspy
-
+        warnings.simplefilter("ignore")
         try:
             stream = obspy.read(str(path), format="MSEED")
             stream.merge(method=0)
         except Exception as error:  # ObsPy raises many kinds for broken files
             raise TableError(f"{path}: the file cannot be read: {error}; write it anew") from None
     values: dict[Column, Slices] = {}
-    groups: dict[str, list[obspy.Trace]] = {}
+    seed_ids: dict[Column, str] = {}
+    groups: dict[str, list[Any]] = {}
     for trace in stream:
         groups.setdefault(trace.id[:-1], []).append(trace)
     for group, traces in groups.items():
@@ -43,8 +54,9 @@ def open_miniseed(path: Path) -> Arrays:
         values[Column("time_s", "s", group)] = Grid(start.ns * 1e-9, rate_hz, length)
         for at, trace in zip(first, traces, strict=True):
             code = trace.stats.channel[-1:]
-            values[Column(AXES.get(code, code or "a"), "counts", group)] = _whole(trace.data, at, length)
-    return Arrays(path, values)
+            column = Column(AXES.get(code, code or "a"), "counts", group)
+            values[column], seed_ids[column] = _whole(trace.data, at, length), trace.id
+    return MiniSeed(path, values, seed_ids)
 
 
 def _whole(data: Array, first: int, length: int) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ def open_tdms(path: Path) -> Arrays:
     """Channels of numbers as columns, `time_s` of a group from the waveform properties. Raises TableError."""
     from nptdms import TdmsFile
 
+    logging.getLogger("nptdms.reader").setLevel(logging.ERROR)  # it would print a line of its own
     with ExitStack() as opened:
         stream = opened.enter_context(path.open("rb"))
         try:

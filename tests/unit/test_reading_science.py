@@ -242,6 +242,6 @@ def test_miniseed(tmp_path: Path) -> None:
 @pytest.mark.filterwarnings("default")
 def test_broken_miniseed(tmp_path: Path) -> None:
     pytest.importorskip("obspy", reason="ObsPy is not installed (extra seismic)")
-    fault(written(tmp_path, b"nothing of that kind" * 40, "a.mseed"), "cannot be read: .*; write it anew")
+    fault(written(tmp_path, b"nothing of that kind\0" * 40, "a.mseed"), "cannot be read: .*; write it anew")
     data = miniseed(tmp_path / "b.mseed", [("HNE", np.arange(300, dtype=np.int32), 0.0)]).read_bytes()
     fault(written(tmp_path, data[:30], "c.mseed"), "cannot be read: .*; write it anew")
