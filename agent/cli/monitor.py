@@ -10,6 +10,8 @@ from pathlib import Path
 import click
 
 from agent.cli.tls_options import tls_files, tls_options
+from agent.config.key_file import KeyFileError
+from agent.config.known_keys import read_known_keys
 from agent.delivery.router import DEFAULT_ENDPOINT, open_router, router_running
 from agent.delivery.session import EndpointError
 from agent.terminal.text import say
@@ -22,12 +24,22 @@ from agent.terminal.text import say
 @click.option("--router", "with_router", is_flag=True, help=f"Start a router at {DEFAULT_ENDPOINT} unless one runs.")
 @click.option("--data-dir", type=click.Path(file_okay=False, path_type=Path), default=Path("monitor"),
               show_default=True, help="Where the database is kept.")  # fmt: skip
+@click.option(
+    "--keys",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    metavar="F",
+    help="List of known keys; results that no key of their gateway signed are refused and counted.",
+)
+@click.option("--host", "names", multiple=True, metavar="NAME", help="Name by which browsers reach this server, "
+              "besides localhost and IP addresses; may be given several times.")  # fmt: skip
 @tls_options
 def monitor(
     endpoints: tuple[str, ...],
     listen: str,
     with_router: bool,
     data_dir: Path,
+    keys: Path | None,
+    names: tuple[str, ...],
     ca: str | None,
     certificate: str | None,
     certificate_key: str | None,
@@ -49,13 +61,15 @@ def monitor(
     tls = tls_files(endpoints, ca, certificate, certificate_key)
     with ExitStack() as stack:
         try:
+            if keys is not None:
+                read_known_keys(keys)
             if with_router and not router_running(DEFAULT_ENDPOINT):
                 stack.enter_context(open_router(None)[0])
             data_dir.mkdir(parents=True, exist_ok=True)
             database = stack.enter_context(closing(Database(data_dir / "monitor.sqlite")))
             fleet = Fleet()
-            following = stack.enter_context(closing(Following(endpoints, tls, database, fleet)))
-        except EndpointError as error:
+            following = stack.enter_context(closing(Following(endpoints, tls, database, fleet, keys)))
+        except (EndpointError, KeyFileError) as error:
             say(f"fieldcal monitor: {error}", err=True)
             return 2
         except sqlite3.Error as error:
@@ -64,7 +78,7 @@ def monitor(
         say(f"the fleet page is at http://{listen}")
         if not _is_loopback(host):
             say("anyone who reaches this address can read the page: it has no login", err=True)
-        app = application(database, fleet, following)
+        app = application(database, fleet, following, names)
         uvicorn.run(app, host=host, port=port, log_level="warning", timeout_graceful_shutdown=1, server_header=False)
     return 0
 

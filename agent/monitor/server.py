@@ -6,7 +6,7 @@ import asyncio
 import csv
 import io
 import json
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +14,12 @@ from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
+from starlette.types import ASGIApp
 
 from agent.monitor.database import Database
 from agent.monitor.fleet import Fleet
 from agent.monitor.following import Following
+from agent.monitor.guard import Guard
 
 PAGE = Path(__file__).parent / "page"
 FILES = {
@@ -30,18 +32,15 @@ FILES = {
 HISTORY_MAX = 2000  # results of one kind that a page or a CSV file holds
 LISTENERS_MAX = 50  # pages that are told of changes at the same time
 TELL_S = 0.5  # s between two looks for a change
-HEADERS = {
-    "Content-Security-Policy": "default-src 'self'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'",
-    "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",
-    "Cache-Control": "no-store",
-}
 
 
-def application(database: Database, fleet: Fleet, following: Following) -> Starlette:
-    """The page, its data as JSON and CSV, and the stream of changes (server-sent events)."""
+def application(database: Database, fleet: Fleet, following: Following, names: Sequence[str] = ()) -> ASGIApp:
+    """The page, its data as JSON and CSV, and the stream of changes (server-sent events).
+
+    `names`: host names by which browsers reach this server, besides localhost and IP addresses.
+    """
     data = _Data(database, fleet, following)
-    return Starlette(
+    app = Starlette(
         routes=[
             Route("/api/fleet", data.sensors),
             Route("/api/history", data.history),
@@ -52,13 +51,14 @@ def application(database: Database, fleet: Fleet, following: Following) -> Starl
             Route("/{name}", _file),
         ]
     )
+    return Guard(app, names)
 
 
 def _file(request: Request) -> Response:
     found = FILES.get(request.path_params.get("name", ""))
     if found is None:
-        return Response("no such page", 404, HEADERS)
-    return Response((PAGE / found[0]).read_bytes(), 200, HEADERS, found[1])
+        return Response("no such page", 404)
+    return Response((PAGE / found[0]).read_bytes(), 200, None, found[1])
 
 
 class _Data:
@@ -69,14 +69,16 @@ class _Data:
         self._listeners: set[object] = set()
 
     def sensors(self, _: Request) -> Response:
-        bus = {"fault": self._following.fault, "unconfirmed": self._following.unconfirmed}
-        return JSONResponse({"sensors": self._fleet.rows(), "bus": bus}, 200, HEADERS)
+        following, fleet = self._following, self._fleet
+        bus = {"fault": following.fault, "unconfirmed": following.unconfirmed, "left_out": fleet.left_out,
+               "verifies": following.keys is not None}  # fmt: skip
+        return JSONResponse({"sensors": fleet.rows(), "gateways": fleet.gateways(following.refused), "bus": bus})
 
     def sensors_csv(self, _: Request) -> Response:
         return _csv("fleet.csv", self._fleet.rows())
 
     def history(self, request: Request) -> Response:
-        return JSONResponse(self._history(request), 200, HEADERS)
+        return JSONResponse(self._history(request))
 
     def history_csv(self, request: Request) -> Response:
         return _csv("sensor.csv", self._history(request))
@@ -89,8 +91,8 @@ class _Data:
 
     async def changes(self, _: Request) -> Response:
         if len(self._listeners) >= LISTENERS_MAX:
-            return Response("too many pages are open", 503, HEADERS)
-        return StreamingResponse(self._tell(), 200, HEADERS, "text/event-stream")
+            return Response("too many pages are open", 503)
+        return StreamingResponse(self._tell(), 200, None, "text/event-stream")
 
     async def _tell(self) -> AsyncIterator[str]:
         me, told = object(), -1
@@ -111,9 +113,7 @@ def _csv(name: str, rows: list[dict[str, Any]]) -> Response:
     writer = csv.writer(text)
     writer.writerow(columns)
     writer.writerows([_cell(row.get(column)) for column in columns] for row in rows)
-    return Response(
-        text.getvalue(), 200, HEADERS | {"Content-Disposition": f'attachment; filename="{name}"'}, "text/csv"
-    )
+    return Response(text.getvalue(), 200, {"Content-Disposition": f'attachment; filename="{name}"'}, "text/csv")
 
 
 def _cell(value: Any) -> Any:

@@ -2,17 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import shutil
-import signal
-import socket
-import subprocess
-import sys
 from collections.abc import Iterator
-from contextlib import closing
 from pathlib import Path
-from typing import Any
-from urllib.request import urlopen
 
 import pytest
 
@@ -22,42 +14,10 @@ from tests.unit.zenoh_site import Site, record, wait_for
 
 pytest.importorskip("starlette", reason="the extra monitor is not installed")
 pytest.importorskip("uvicorn", reason="the extra monitor is not installed")
-COMMAND = "import sys; from agent.cli.main import run_cli; sys.exit(run_cli(sys.argv[1:]))"
+from tests.unit.monitor_site import Monitor
+
 HOSTILE = "<img src=x onerror=\"document.title='owned'\">"
 CHROMIUM = shutil.which("chromium")
-
-
-class Monitor:
-    """`fieldcal monitor` in a process of its own."""
-
-    def __init__(self, site: Site, directory: Path) -> None:
-        with closing(socket.socket()) as free:
-            free.bind(("127.0.0.1", 0))
-            self.address = f"127.0.0.1:{free.getsockname()[1]}"
-        options = ["--connect", site.endpoint, "--listen", self.address, "--data-dir", str(directory)]
-        self._process = subprocess.Popen([sys.executable, "-c", COMMAND, "monitor", *options])
-        wait_for(self._answers)
-
-    def _answers(self) -> bool:
-        try:
-            self.get("api/fleet")
-        except OSError:
-            return False
-        return True
-
-    def get(self, path: str) -> Any:
-        with urlopen(f"http://{self.address}/{path}", timeout=5) as answer:
-            assert answer.headers["Content-Security-Policy"].startswith("default-src 'self'")
-            text = answer.read().decode()
-        return json.loads(text) if path.startswith("api") else text
-
-    def sensors(self) -> list[dict[str, Any]]:
-        rows: list[dict[str, Any]] = self.get("api/fleet")["sensors"]
-        return rows
-
-    def stop(self) -> None:
-        self._process.send_signal(signal.SIGINT)
-        self._process.wait(10)
 
 
 @pytest.fixture

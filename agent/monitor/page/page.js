@@ -22,7 +22,7 @@ const COLUMNS = [
   ["why", "Why a person is needed", (r) => r.why],
 ];
 const NAMES = ["S_xx", "S_xy", "S_xz", "S_yx", "S_yy", "S_yz", "S_zx", "S_zy", "S_zz", "Q_x", "Q_y", "Q_z"];
-let sensors = [];
+let sensors = [], verifies = false;
 const view = () => new URLSearchParams(location.hash.slice(1));
 function go(changes) {
   const next = view();
@@ -42,7 +42,7 @@ function showFleet() {
   COLUMNS.forEach(([id], i) => $("heads").children[i].setAttribute("aria-sort", now.get("sort") !== id ? "none" : down ? "descending" : "ascending"));
   $("rows").replaceChildren(...rows.map((r) => make("tr", [
     make("td", make("a", `${r.site}/${r.gateway}/${r.sensor}`, { href: `#${place(r)}` })),
-    make("td", r.status),
+    make("td", r.status + (verifies && !r.verified ? " (not verified)" : "")),
     make("td", r.change_in_u === null ? "" : r.change_in_u.toFixed(1), { class: "number" }),
     make("td", ago(r.last_good_utc_ns), { class: "number" }),
     make("td", r.alive ? "on the bus" : "silent"),
@@ -94,8 +94,16 @@ async function load() {
   try {
     const answer = await (await fetch("api/fleet")).json();
     sensors = answer.sensors;
-    const need = sensors.filter((r) => r.why).length;
-    $("summary").replaceChildren(text(`${sensors.length} sensors, ${need} need a person; ${answer.bus.unconfirmed} unconfirmed results${answer.bus.fault ? `; ${answer.bus.fault}` : ""}`));
+    verifies = answer.bus.verifies;
+    const need = sensors.filter((r) => r.why).length, refused = answer.gateways.filter((g) => g.refused);
+    $("summary").replaceChildren(text([
+      `${sensors.length} sensors, ${need} need a person`,
+      `${answer.bus.unconfirmed} unconfirmed results`,
+      verifies ? "signatures are verified" : "signatures are not verified (option --keys)",
+      answer.bus.left_out ? `${answer.bus.left_out} results of names or numbers beyond the limits are not shown` : "",
+      ...refused.map((g) => `${g.site}/${g.gateway}: ${g.why}`),
+      answer.bus.fault,
+    ].filter(Boolean).join("; ")));
     show();
   } catch { $("summary").replaceChildren(text("the monitor does not answer")); }
   loading = false;

@@ -1,0 +1,132 @@
+"""What strangers on the web and on the bus may send to the fleet page: refused, bounded, or shown as text."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from agent.delivery.keys import Address
+from tests.attacks.signed_site import KEY, OTHER, Gateway, listed
+from tests.unit.zenoh_site import Site, record, wait_for
+
+pytest.importorskip("starlette", reason="the extra monitor is not installed")
+pytest.importorskip("uvicorn", reason="the extra monitor is not installed")
+from agent.monitor import fleet as fleet_module
+from agent.monitor.fleet import Fleet
+from tests.unit.monitor_site import Served
+
+
+@pytest.fixture
+def served(site: Site, tmp_path: Path) -> Iterator[Served]:
+    with Served(site, tmp_path / "monitor", names=["fleet.example.org"]) as server:
+        yield server
+
+
+def test_only_the_servers_own_names_are_answered(served: Served) -> None:
+    port = served.address.split(":")[1]
+    for host in (served.address, f"localhost:{port}", "LOCALHOST", "192.0.2.7", f"[::1]:{port}", "fleet.example.org"):
+        assert served.ask("/api/fleet", headers={"Host": host}).status == 200, host
+    hostile = ("evil.example.org", f"evil.example.org:{port}", "localhost.evil.org", "fleet.example.org.evil.org",
+               "user@127.0.0.1", "127.0.0.1#evil", "127.0.0.1/", "[evil]", "", "1.2.3", "localhost:1:2")  # fmt: skip
+    for host in hostile:
+        for path in ("/", "/api/fleet", "/api/changes", "/fleet.csv"):
+            answer = served.ask(path, headers={"Host": host})
+            assert (answer.status, "sensors" in answer.text) == (400, False), (host, path)
+
+
+def test_every_answer_forbids_other_origins_and_frames(served: Served) -> None:
+    for path in ("/", "/page.js", "/api/fleet", "/fleet.csv", "/nothing", "/api/nothing"):
+        headers = served.ask(path).headers
+        assert headers["content-security-policy"].startswith("default-src 'self';")
+        assert "frame-ancestors 'none'" in headers["content-security-policy"]
+        assert "unsafe" not in headers["content-security-policy"]
+        assert headers["x-content-type-options"] == "nosniff"
+        assert headers["cross-origin-resource-policy"] == "same-origin"
+        assert "access-control-allow-origin" not in headers
+
+
+def test_a_request_that_may_change_something_must_come_from_the_page_itself(served: Served) -> None:
+    port = served.address.split(":")[1]
+    for origin in ("http://evil.example.org", "null", "", f"http://localhost:{port}", "http://127.0.0.1:1",
+                   f"http://{served.address}.evil.org", f"http://{served.address}@evil.org"):  # fmt: skip
+        answer = served.ask("/api/fleet", "POST", headers={"Origin": origin} if origin else {})
+        assert (answer.status, "another page" in answer.text) == (400, True), origin
+    assert served.ask("/api/fleet", "POST", headers={"Origin": f"http://{served.address}"}).status == 405
+
+
+def test_no_path_leads_out_of_the_page(served: Served, tmp_path: Path) -> None:
+    assert served.ask("/page.js").status == 200
+    (tmp_path / "secret").write_text("secret")
+    ways = ("/../server.py", "/..%2fserver.py", "/%2e%2e/server.py", "/..%5cserver.py", "/page/../../server.py",
+            "/./page.js", "//etc/passwd", "/%2fetc%2fpasswd", "/page.js%00", "/monitor.sqlite",
+            "/server.py", "/..;/server.py", f"/{tmp_path}/secret")  # fmt: skip
+    for way in ways:
+        answer = served.ask(way)
+        assert (answer.status, answer.text) == (404, "no such page") or answer.text == "Not Found", way
+
+
+def test_invented_names_and_numbers_of_sensors_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fleet_module, "SENSORS_MAX", 3)
+    monkeypatch.setattr(fleet_module, "GATEWAYS_MAX", 2)
+    fleet = Fleet()
+
+    def takes(site: str, gateway: str, sensor: str) -> bool:
+        if admitted := fleet.admits(Address(site, gateway, sensor, "status")):
+            fleet.take(site, gateway, sensor, "status", {"status": "VALID", "reason": "x" * 10_000})
+        return admitted
+
+    refused = ("<script>", "..", "a/b", "é", "a" * 64, "")
+    assert not any(takes("site", "gw", name) or takes(name, "gw", "s") or takes("site", name, "s") for name in refused)
+    assert fleet.left_out == 3 * len(refused)
+    assert fleet.gateways({}) == []  # refused names have left nothing behind, except the gateways of valid names
+    assert all(takes("site", "gw", f"s{k}") for k in (0, 1))
+    assert takes("site", "gw2", "s0")
+    assert not takes("site", "gw", "s2")
+    assert takes("site", "gw", "s1")
+    for k in range(100):
+        fleet.take("site", "gw", "s0", "drift", {"parameter": f"S{k}", "verdict": "stepped", "reason": "", "change": 1})
+        fleet.set_alive("site", f"invented{k}", True)
+        fleet.set_told("site", "gw", b"[" * 100_000)
+        fleet.set_told("site", "gw", b'{"state": "running", "reasons": [], "t_utc_ns": 1' + b" " * 100_000 + b"}")
+    assert len(fleet.rows()) == 3
+    assert [row["gateway"] for row in fleet.gateways({})] == ["gw", "gw2"]
+    assert {row["state"] for row in fleet.gateways({})} == {""}
+    assert all(len(row["why"]) < 2 * fleet_module.TEXT_MAX for row in fleet.rows())
+
+
+def test_with_a_list_of_keys_only_signed_results_are_shown(site: Site, tmp_path: Path) -> None:
+    known = listed(tmp_path / "known.keys", KEY)
+    good, forger = Gateway(site, tmp_path / "gw"), Gateway(site, tmp_path / "forger", OTHER, "gw2")
+    try:
+        with Served(site, tmp_path / "monitor", known) as served:
+
+            def rows(what: str) -> list[tuple[str, object, str]]:
+                told = served.ask("/api/fleet").json
+                assert told["bus"]["verifies"]
+                return [(row["gateway"], row.get("verified", row.get("refused")), row["why"]) for row in told[what]]
+
+            good.send(1)
+            forger.send(1)
+            refusal = "1 results in its name were refused: no known key of this gateway signed them"
+            wait_for(lambda: rows("gateways") == [("gw2", 1, refusal), ("gw", 0, "")])
+            wait_for(lambda: rows("sensors") == [("gw", True, "")])
+    finally:
+        good.stop()
+        forger.stop()
+
+
+def test_without_a_list_results_are_shown_as_not_verified(site: Site, tmp_path: Path) -> None:
+    gateway = Gateway(site, tmp_path / "gw")
+    try:
+        with Served(site, tmp_path / "monitor") as served, site.client() as stranger:
+            gateway.send(1)
+            claims = record(9).payload.replace(b'"used"', b'"signed_by":"KNOWN","used"')
+            wait_for(lambda: [row["verified"] for row in served.ask("/api/fleet").json["sensors"]] == [False])
+            stranger.put("fieldcal/v1/site/gw/mems/window", claims, attachment=zenoh.ZBytes(b"1"))
+            wait_for(lambda: served.ask("/api/fleet").json["bus"]["unconfirmed"] == 1)
+            assert not any(row["verified"] for row in served.ask("/api/fleet").json["sensors"])
+    finally:
+        gateway.stop()
