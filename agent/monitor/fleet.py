@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Mapping
 from typing import Any
 
@@ -18,6 +18,7 @@ LARGEST = 1e6  # change in units of U; a stranger may send numbers whose quotien
 SENSORS_MAX = 40_000
 GATEWAYS_MAX = 10_000
 TEXT_MAX = 500  # characters of a reason that are shown; the program's own have some 100
+EVENTS_MAX = 500  # changes of status, verdicts and commands that the page lists, the newest
 LARGEST_TOLD = 16 << 10  # bytes of what a gateway says of itself; with four devices it has 2 kB
 
 Place = tuple[str, str, str]  # site, gateway, sensor
@@ -46,6 +47,8 @@ class Fleet:
         self._alive: set[tuple[str, str]] = set()
         self._told: dict[tuple[str, str], GatewayTold] = {}
         self._gateways: set[tuple[str, str]] = set()
+        self._changed: dict[Place, int] = {}  # `version` at the last change of each sensor
+        self._events: deque[dict[str, Any]] = deque(maxlen=EVENTS_MAX)
         self._mutex = threading.Lock()
 
     def admits(self, address: Address) -> bool:
@@ -60,13 +63,40 @@ class Fleet:
 
     def take(self, site: str, gateway: str, sensor: str, what: str, fields: dict[str, Any]) -> None:
         """Take a result of a sensor that is admitted; it must be newer than those of the same kind before."""
-        part = {"drift": f"drift {fields.get('parameter')}", "window": "good window"}.get(what, what)
-        if (what == "window" and not fields["used"]) or (what == "drift" and fields["parameter"] not in PARAMETERS):
+        part = {
+            "drift": f"drift {fields.get('parameter')}",
+            "window": "good window" if fields.get("used") else "refused window",
+        }.get(what, what)
+        if what == "drift" and fields["parameter"] not in PARAMETERS:
             return
         with self._mutex:
             self._knows((site, gateway))
             self._newest.setdefault((site, gateway, sensor), {})[part] = fields
             self.version += 1
+            self._changed[site, gateway, sensor] = self.version
+        if told := _told_of(what, fields):
+            self.note(site, gateway, sensor, what, fields["t_utc_ns"], told)
+
+    def note(self, site: str, gateway: str, sensor: str, what: str, t_utc_ns: int, told: str) -> None:
+        """Add an event to the list of the newest ones."""
+        event = {"t_utc_ns": t_utc_ns, "site": site, "gateway": gateway, "sensor": sensor, "what": what}
+        with self._mutex:
+            self._events.append(event | {"text": clipped(told)})
+            self.version += 1
+
+    def peers(self, place: Place, most: int) -> list[Place]:
+        """At most so many other sensors of the same kind of device (the first word of the identity)."""
+        with self._mutex:
+            kinds = {
+                p: n["calibration"]["identity"].split(" ")[0] for p, n in self._newest.items() if "calibration" in n
+            }
+        own = kinds.pop(place, "")
+        return sorted(p for p, kind in kinds.items() if kind == own and own)[:most]
+
+    def events(self) -> list[dict[str, Any]]:
+        """The newest events, the newest first."""
+        with self._mutex:
+            return list(reversed(self._events))
 
     def set_alive(self, site: str, gateway: str, alive: bool) -> None:
         """Whether the gateway is on the bus."""
@@ -94,7 +124,7 @@ class Fleet:
         """One row for each sensor; those that need a person first, then by the worst change."""
         with self._mutex:
             rows = [
-                _row(place, newest, place[:2] in self._alive)
+                _row(place, newest, self._state_of(place[:2])) | {"changed": self._changed[place]}
                 for place, newest in self._newest.items()
                 if newest.keys() & {"status", "calibration", "good window"}
                 or any(part.startswith("drift ") for part in newest)
@@ -114,13 +144,25 @@ class Fleet:
             ]  # fmt: skip
         return sorted(rows, key=lambda r: (not r["why"], r["site"], r["gateway"]))
 
+    def _state_of(self, gateway: tuple[str, str]) -> str:
+        if gateway not in self._alive:
+            return "silent"
+        return clipped(self._told[gateway].state) if gateway in self._told else ""
+
     def _knows(self, gateway: tuple[str, str]) -> bool:
         if gateway not in self._gateways and len(self._gateways) < GATEWAYS_MAX and all(map(CHUNK.fullmatch, gateway)):
             self._gateways.add(gateway)
         return gateway in self._gateways
 
 
-def _row(place: Place, newest: dict[str, dict[str, Any]], alive: bool) -> dict[str, Any]:
+def _told_of(what: str, fields: dict[str, Any]) -> str:
+    """What the list of events says of a result; "" where it is no event."""
+    if what == "status":
+        return f"{fields['status']}: {fields['reason']}"
+    return f"{fields['parameter']} {fields['verdict']}: {fields['reason']}" if what == "drift" else ""
+
+
+def _row(place: Place, newest: dict[str, dict[str, Any]], gateway_state: str) -> dict[str, Any]:
     status = newest.get("status", {})
     drifts = [f for part, f in newest.items() if part.startswith("drift ") and f["verdict"] != "stable"]
     calibration = newest.get("calibration", {})
@@ -129,7 +171,7 @@ def _row(place: Place, newest: dict[str, dict[str, Any]], alive: bool) -> dict[s
     why = [f"{drift['parameter']} {drift['verdict']}: {drift['reason']}" for _, drift in changes]
     if status.get("status") in NEEDS_A_PERSON:
         why.insert(0, f"{status['status']}: {status['reason']}")
-    if not alive:
+    if gateway_state == "silent":
         why.append("the gateway is not on the bus")
     good = newest.get("good window", {})
     return {
@@ -137,7 +179,7 @@ def _row(place: Place, newest: dict[str, dict[str, Any]], alive: bool) -> dict[s
         "gateway": place[1],
         "sensor": place[2],
         "status": status.get("status", ""),
-        "alive": alive,
+        "gateway_state": gateway_state,
         "change_in_u": None if worst is None else worst[0],
         "last_good_utc_ns": good.get("t_utc_ns"),
         "verified": bool(newest) and all(fields.get("signed_by") for fields in newest.values()),

@@ -16,25 +16,32 @@ from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
+from agent.monitor.advising import advice_of
 from agent.monitor.database import Database
-from agent.monitor.fleet import Fleet
+from agent.monitor.fleet import Fleet, Place
 from agent.monitor.following import Following
+from agent.monitor.forwarding import Forwarding
 from agent.monitor.guard import Guard
+from agent.monitor.live import Live
+from agent.monitor.login import Access
 
 PAGE = Path(__file__).parent / "page"
-FILES = {
-    "": ("index.html", "text/html"),
-    "page.js": ("page.js", "text/javascript"),
-    "page.css": ("page.css", "text/css"),
-    "uPlot.iife.min.js": ("uPlot.iife.min.js", "text/javascript"),
-    "uPlot.min.css": ("uPlot.min.css", "text/css"),
-}
+TYPES = {".html": "text/html", ".svg": "image/svg+xml", ".js": "text/javascript", ".css": "text/css"}
+FILES = {path.name: TYPES[path.suffix] for path in PAGE.iterdir() if path.suffix in TYPES}
 HISTORY_MAX = 2000  # results of one kind that a page or a CSV file holds
 LISTENERS_MAX = 50  # pages that are told of changes at the same time
 TELL_S = 0.5  # s between two looks for a change
 
 
-def application(database: Database, fleet: Fleet, following: Following, names: Sequence[str] = ()) -> ASGIApp:
+def application(
+    database: Database,
+    fleet: Fleet,
+    following: Following,
+    access: Access,
+    forwarding: Forwarding,
+    live: Live,
+    names: Sequence[str] = (),
+) -> ASGIApp:
     """The page, its data as JSON and CSV, and the stream of changes (server-sent events).
 
     `names`: host names by which browsers reach this server, besides localhost and IP addresses.
@@ -42,11 +49,20 @@ def application(database: Database, fleet: Fleet, following: Following, names: S
     data = _Data(database, fleet, following)
     app = Starlette(
         routes=[
-            Route("/api/fleet", data.sensors),
-            Route("/api/history", data.history),
-            Route("/api/changes", data.changes),
-            Route("/fleet.csv", data.sensors_csv),
-            Route("/sensor.csv", data.history_csv),
+            Route("/api/fleet", access.reading(data.sensors)),
+            Route("/api/history", access.reading(data.history)),
+            Route("/api/changes", access.reading_async(data.changes)),
+            Route("/fleet.csv", access.reading(data.sensors_csv)),
+            Route("/sensor.csv", access.reading(data.history_csv)),
+            Route("/api/live", access.reading_async(live.stream)),
+            Route("/api/advice", access.reading(data.advice)),
+            Route("/advice.csv", access.reading(data.advice_csv)),
+            Route("/api/events", access.reading(data.events)),
+            Route("/events.csv", access.reading(data.events_csv)),
+            Route("/api/me", access.me),
+            Route("/api/login", access.log_in, methods=["POST"]),
+            Route("/api/logout", access.log_out, methods=["POST"]),
+            Route("/api/command", forwarding.command, methods=["POST"]),
             Route("/", _file),
             Route("/{name}", _file),
         ]
@@ -55,10 +71,10 @@ def application(database: Database, fleet: Fleet, following: Following, names: S
 
 
 def _file(request: Request) -> Response:
-    found = FILES.get(request.path_params.get("name", ""))
-    if found is None:
+    name = request.path_params.get("name", "index.html")
+    if name not in FILES:
         return Response("no such page", 404)
-    return Response((PAGE / found[0]).read_bytes(), 200, None, found[1])
+    return Response((PAGE / name).read_bytes(), 200, None, FILES[name])
 
 
 class _Data:
@@ -77,6 +93,18 @@ class _Data:
     def sensors_csv(self, _: Request) -> Response:
         return _csv("fleet.csv", self._fleet.rows())
 
+    def events(self, _: Request) -> Response:
+        return JSONResponse(self._fleet.events())
+
+    def events_csv(self, _: Request) -> Response:
+        return _csv("events.csv", self._fleet.events())
+
+    def advice(self, request: Request) -> Response:
+        return JSONResponse(advice_of(_place(request), self._database, self._fleet))
+
+    def advice_csv(self, request: Request) -> Response:
+        return _csv("advice.csv", advice_of(_place(request), self._database, self._fleet))
+
     def history(self, request: Request) -> Response:
         return JSONResponse(self._history(request))
 
@@ -84,9 +112,7 @@ class _Data:
         return _csv("sensor.csv", self._history(request))
 
     def _history(self, request: Request) -> list[dict[str, Any]]:
-        asked = request.query_params
-        site, gateway, sensor = (asked.get(name, "") for name in ("site", "gateway", "sensor"))
-        rows = self._database.history(site, gateway, sensor, asked.get("what", ""), HISTORY_MAX)
+        rows = self._database.history(*_place(request), request.query_params.get("what", ""), HISTORY_MAX)
         return [{name: value for name, value in row.items() if name != "covariance"} for row in rows]
 
     async def changes(self, _: Request) -> Response:
@@ -105,6 +131,11 @@ class _Data:
                 await asyncio.sleep(TELL_S)
         finally:
             self._listeners.discard(me)
+
+
+def _place(request: Request) -> Place:
+    site, gateway, sensor = (request.query_params.get(name, "") for name in ("site", "gateway", "sensor"))
+    return site, gateway, sensor
 
 
 def _csv(name: str, rows: list[dict[str, Any]]) -> Response:

@@ -75,7 +75,7 @@ def test_invented_names_and_numbers_of_sensors_are_bounded(monkeypatch: pytest.M
 
     def takes(site: str, gateway: str, sensor: str) -> bool:
         if admitted := fleet.admits(Address(site, gateway, sensor, "status")):
-            fleet.take(site, gateway, sensor, "status", {"status": "VALID", "reason": "x" * 10_000})
+            fleet.take(site, gateway, sensor, "status", {"status": "VALID", "reason": "x" * 10_000, "t_utc_ns": 1})
         return admitted
 
     refused = ("<script>", "..", "a/b", "é", "a" * 64, "")

@@ -20,6 +20,9 @@ import uvicorn
 from agent.monitor.database import Database
 from agent.monitor.fleet import Fleet
 from agent.monitor.following import Following
+from agent.monitor.forwarding import Forwarding
+from agent.monitor.live import Live
+from agent.monitor.login import Access
 from agent.monitor.server import application
 from tests.unit.zenoh_site import Site, wait_for
 
@@ -40,12 +43,14 @@ class Answer:
 
 
 class Served(AbstractContextManager["Served"]):
-    """The server in a thread, on a free port of loopback, with a fleet that the test fills. `options`: of Following.
+    """The server in a thread, on a free port of loopback, with a fleet that the test fills.
 
-    `more`: of the application.
+    `keys`: known keys; `users`: who may log in; `more`: of the application.
     """
 
-    def __init__(self, site: Site, directory: Path, keys: Path | None = None, **more: Any) -> None:
+    def __init__(
+        self, site: Site, directory: Path, keys: Path | None = None, users: Path | None = None, **more: Any
+    ) -> None:
         self._open = ExitStack()
         directory.mkdir(exist_ok=True)
         self.database = self._open.enter_context(closing(Database(directory / "monitor.sqlite")))
@@ -53,7 +58,11 @@ class Served(AbstractContextManager["Served"]):
         self.following = self._open.enter_context(
             closing(Following([site.endpoint], None, self.database, self.fleet, keys))
         )
-        app = application(self.database, self.fleet, self.following, **more)
+        access = Access(users)
+        forwarding = Forwarding([site.endpoint], None, access, self.fleet)
+        app = application(
+            self.database, self.fleet, self.following, access, forwarding, Live([site.endpoint], None), **more
+        )
         listening = self._open.enter_context(closing(socket.create_server(("127.0.0.1", 0))))
         self.address = f"127.0.0.1:{listening.getsockname()[1]}"
         config = uvicorn.Config(app, log_level="error", server_header=False, timeout_graceful_shutdown=1)

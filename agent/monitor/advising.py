@@ -1,0 +1,102 @@
+"""The advice when to look again at a sensor and its references, from the database of the monitor."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from agent.monitor.database import Database
+from agent.monitor.fleet import Fleet, Place
+from agent.monitor.interval import DAY_NS, Advice, Trend, advise, daily, spread_of_rates, trend
+from calib.model import PARAMETERS
+
+POINTS = 400  # calibrations of a history that are looked at
+PEERS_MAX = 12  # sensors of the same kind that are looked at
+REFERENCE_SENSITIVITY = "reference sensitivity"  # kind of unknown, calib.estimate.quantities
+
+
+def advice_of(place: Place, database: Database, fleet: Fleet) -> list[dict[str, Any]]:
+    """Rows of (subject, interval_days, due_utc_ns, reason): the sensor's shortest interval, then its references'."""
+    history = database.history(*place, "calibration", POINTS)
+    if not history:
+        return []
+    peers = [trends(database.history(*peer, "calibration", POINTS)) for peer in fleet.peers(place, PEERS_MAX)]
+    own, newest = trends(history), history[-1]
+    found: list[tuple[str, Advice]] = []
+    for name, u in zip(PARAMETERS, newest["standard_uncertainty"], strict=True):
+        if u is None or u <= 0 or not newest["determined"][list(PARAMETERS).index(name)]:
+            continue
+        unit = newest["output_unit"] + (" per m/s²" if name.startswith("S") else "")
+        spread = spread_of_rates([peer[name] for peer in peers if name in peer])
+        found.append((name, advise(own.get(name), 2.0 * u, spread, unit)))
+    known = [(name, advice) for name, advice in found if advice.interval_days is not None]
+    rows = [_row(place[2], *min(known or found, key=_shortest), newest["t_utc_ns"])] if found else []
+    return rows + [_of_reference(*each) for each in _references(history).items()]
+
+
+def trends(history: Sequence[dict[str, Any]]) -> dict[str, Trend]:
+    """The trend of each parameter that is determined, by its name."""
+    chosen = [history[k] for k in daily([c["t_utc_ns"] for c in history])]
+    found = {}
+    for i, name in enumerate(PARAMETERS):
+        points = []
+        for calibration in chosen:
+            value, u = _values(calibration)[i], calibration["standard_uncertainty"][i]
+            if calibration["determined"][i] and value is not None and u:
+                points.append((calibration["t_utc_ns"], value, u))
+        if line := _line(points):
+            found[name] = line
+    return found
+
+
+def _line(points: Sequence[tuple[int, float, float]]) -> Trend | None:
+    if not points:
+        return None
+    t_utc_ns, values, u = zip(*points, strict=True)
+    days = np.array([(t - t_utc_ns[0]) / DAY_NS for t in t_utc_ns])
+    return trend(days, np.array(values, dtype=float), np.array(u, dtype=float))
+
+
+def _values(calibration: dict[str, Any]) -> list[float | None]:
+    return [value for row in calibration["sensitivity"] for value in row] + list(calibration["offset"])
+
+
+def _shortest(found: tuple[str, Advice]) -> float:
+    interval = found[1].interval_days
+    return float("inf") if interval is None else interval
+
+
+def _row(subject: str, name: str, advice: Advice, t_utc_ns: int) -> dict[str, Any]:
+    days = advice.interval_days
+    return {
+        "subject": subject,
+        "interval_days": days,
+        "due_utc_ns": None if days is None else t_utc_ns + round(days * DAY_NS),
+        "reason": f"{name}: {advice.reason}",
+    }
+
+
+def _references(history: Sequence[dict[str, Any]]) -> dict[str, list[tuple[int, float, float]]]:
+    """Of each reference its certificates in time: (when first used, first sensitivity, its standard uncertainty)."""
+    found: dict[str, dict[str, tuple[int, float, float]]] = {}
+    for calibration in history:
+        for shared in calibration.get("shared_errors", []):
+            u = [
+                u for kind, u in zip(shared["kinds"], shared["u_stated"], strict=True) if kind == REFERENCE_SENSITIVITY
+            ]
+            if u and shared["sensitivity"]:
+                value = shared["sensitivity"][0]
+                point = (calibration["t_utc_ns"], value, abs(value) * u[0])
+                found.setdefault(shared["reference"], {}).setdefault(shared["certificate_sha256"], point)
+    return {name: list(points.values()) for name, points in found.items()}
+
+
+def _of_reference(name: str, points: list[tuple[int, float, float]]) -> dict[str, Any]:
+    line = _line(points)
+    if line is None:
+        advice = Advice(None, f"{len(points)} certificates in the history of this sensor; needs 4")
+    else:
+        advice = advise(line, 2.0 * points[-1][2], None, "of its sensitivity")
+    return _row(f"reference {name}", "sensitivity", advice, points[-1][0])
