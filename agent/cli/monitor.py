@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import ipaddress
+import socket
 import sqlite3
 import ssl
 import sys
+import threading
 from collections.abc import Callable
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -128,14 +130,30 @@ def monitor(
         except sqlite3.Error as error:
             say(f"fieldcal monitor: {data_dir / 'monitor.sqlite'}: {error}", err=True)
             return 1
+        stopping = threading.Event()
+        forwarding, live = Forwarding(endpoints, commander, access, fleet), Live(endpoints, tls, stopping)
+        app = application(database, fleet, following, access, forwarding, live, stopping, names)
+        settings = uvicorn.Config(app, log_level="warning", timeout_graceful_shutdown=2, server_header=False,
+                                  ssl_certfile=https_certificate, ssl_keyfile=https_key,
+                                  proxy_headers=behind_proxy, forwarded_allow_ips="127.0.0.1,::1")  # fmt: skip
+        try:
+            listening = socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+        except OSError as error:
+            say(f"fieldcal monitor: {listen}: {error.strerror or error}", err=True)
+            return 1
         say(f"the fleet page is at http{'s' if https_certificate else ''}://{listen}")
         if users is None and not _is_loopback(host):
             say("anyone who reaches this address can read the page: it has no login (option --users)", err=True)
-        forwarding = Forwarding(endpoints, commander, access, fleet)
-        app = application(database, fleet, following, access, forwarding, Live(endpoints, tls), names)
-        uvicorn.run(app, host=host, port=port, log_level="warning", timeout_graceful_shutdown=1, server_header=False,
-                    ssl_certfile=https_certificate, ssl_keyfile=https_key, proxy_headers=behind_proxy,
-                    forwarded_allow_ips="127.0.0.1,::1")  # fmt: skip
+
+        class Server(uvicorn.Server):
+            """Ends the streams of open pages at Ctrl-C."""
+
+            def handle_exit(self, sig: int, frame: Any) -> None:
+                stopping.set()
+                super().handle_exit(sig, frame)
+
+        with suppress(KeyboardInterrupt):
+            Server(settings).run([listening])
     return 0
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import threading
 from collections.abc import AsyncIterator, Sequence
 
 import anyio
@@ -27,9 +28,10 @@ ALIVE_S = 10.0  # s without a block after which a comment keeps the connection
 
 
 class Live:
-    """Streams of blocks, each with a Zenoh session of its own that ends with the page."""
+    """Streams of blocks, each with a Zenoh session of its own that ends with the page, or when `stopping` is set."""
 
-    def __init__(self, endpoints: Sequence[str], tls: TlsFiles | None) -> None:
+    def __init__(self, endpoints: Sequence[str], tls: TlsFiles | None, stopping: threading.Event) -> None:
+        self._stopping = stopping
         self._config = session_config("client", connect=endpoints, tls=tls)
         self._streams = 0
 
@@ -49,7 +51,7 @@ class Live:
             with await anyio.to_thread.run_sync(zenoh.open, self._config) as session:
                 subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(2))
                 silent_s = 0.0
-                while True:
+                while not self._stopping.is_set():
                     sample = subscriber.try_recv()
                     if sample is not None and (told := _told(sample.payload.to_bytes())):
                         silent_s = 0.0

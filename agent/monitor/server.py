@@ -6,6 +6,7 @@ import asyncio
 import csv
 import io
 import json
+import threading
 from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -40,13 +41,15 @@ def application(
     access: Access,
     forwarding: Forwarding,
     live: Live,
+    stopping: threading.Event,
     names: Sequence[str] = (),
 ) -> ASGIApp:
     """The page, its data as JSON and CSV, and the stream of changes (server-sent events).
 
-    `names`: host names by which browsers reach this server, besides localhost and IP addresses.
+    `stopping` ends the streams, which a browser would keep open for ever. `names`: host names by which browsers reach
+    this server, besides localhost and IP addresses.
     """
-    data = _Data(database, fleet, following)
+    data = _Data(database, fleet, following, stopping)
     app = Starlette(
         routes=[
             Route("/api/fleet", access.reading(data.sensors)),
@@ -80,8 +83,8 @@ def _file(request: Request) -> Response:
 class _Data:
     """What the page asks for."""
 
-    def __init__(self, database: Database, fleet: Fleet, following: Following) -> None:
-        self._database, self._fleet, self._following = database, fleet, following
+    def __init__(self, database: Database, fleet: Fleet, following: Following, stopping: threading.Event) -> None:
+        self._database, self._fleet, self._following, self._stopping = database, fleet, following, stopping
         self._listeners: set[object] = set()
 
     def sensors(self, _: Request) -> Response:
@@ -124,7 +127,7 @@ class _Data:
         me, told = object(), -1
         self._listeners.add(me)
         try:
-            while True:
+            while not self._stopping.is_set():
                 if self._fleet.version != told:
                     told = self._fleet.version
                     yield f"data: {told}\n\n"

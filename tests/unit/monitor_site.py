@@ -60,9 +60,9 @@ class Served(AbstractContextManager["Served"]):
         )
         access = Access(users)
         forwarding = Forwarding([site.endpoint], None, access, self.fleet)
-        app = application(
-            self.database, self.fleet, self.following, access, forwarding, Live([site.endpoint], None), **more
-        )
+        stopping = threading.Event()
+        live = Live([site.endpoint], None, stopping)
+        app = application(self.database, self.fleet, self.following, access, forwarding, live, stopping, **more)
         listening = self._open.enter_context(closing(socket.create_server(("127.0.0.1", 0))))
         self.address = f"127.0.0.1:{listening.getsockname()[1]}"
         config = uvicorn.Config(app, log_level="error", server_header=False, timeout_graceful_shutdown=1)
@@ -71,6 +71,7 @@ class Served(AbstractContextManager["Served"]):
         thread.start()
 
         def stop() -> None:
+            stopping.set()
             server.should_exit = True
             thread.join(5)
 

@@ -7,7 +7,7 @@ const axisOf = () => ({ stroke: getComputedStyle(document.body).color, grid: { s
 const width = (box) => box.clientWidth || 320;
 
 export function boxOf(label) {
-  return make("div", [], { role: "img", "aria-label": label, class: "plot" });
+  return make("div", [], { role: "group", "aria-label": label, class: "plot" });
 }
 
 // Values over time with bands, one plot for each series {label, title, values, u, onsets}; u: standard uncertainties.

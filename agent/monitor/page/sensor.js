@@ -70,6 +70,12 @@ function spaceSection(newest, later) {
   return section("Rows of S in space", canvas);
 }
 
+function inForceSection(place, newest) {
+  if (!newest) return [];
+  const rows = NAMES.map((name, i) => [name, short(value(newest, i)), finite(newest.standard_uncertainty[i]) ? short(2 * newest.standard_uncertainty[i]) : "not known", `${newest.output_unit}${i < 9 ? " per m/s²" : ""}`, newest.determined[i] ? "yes" : "no"]);
+  return section("In force", table("In force", ["Parameter", "Value", "U (k = 2)", "Unit", "Determined by data"], rows), csv(place, "calibration"));
+}
+
 function adviceSection(place, advice) {
   const rows = advice.map((a) => [a.subject, a.interval_days === null ? "not yet" : `${short(a.interval_days)} days`, a.due_utc_ns ? at(a.due_utc_ns) : "", a.reason]);
   return section("When to look again", make("p", "Interval in which a change stays within the limit with 95 %, from the history (control chart, ILAC-G24)."), table("When to look again", ["Of", "Interval", "Due (UTC)", "Reasoning"], rows), make("p", make("a", "CSV", { href: `advice.csv?${place}` })));
@@ -81,10 +87,11 @@ function sections(place, told, advice, later) {
   const order = (verb, sequence) => ({ gateway, sensor, verb, arguments: { sequence } });
   const numbers = (w) => Object.entries(w.numbers).map(([name, v]) => `${name} ${short(v)}`).join(", ");
   return [
+    inForceSection(place, newest),
     section("Drift", table("Drift", ["UTC", "Parameter", "Verdict", "Since", "Reason"], newestFirst(drift).map((r) => [at(r.t_utc_ns), r.parameter, r.verdict, r.verdict === "stable" ? "" : at(r.onset_utc_ns), r.reason])), csv(place, "drift")),
     adviceSection(place, advice),
     section("Estimates that are not in force", table("Estimates", ["UTC", "Number", "Why not in force", "Accept"], newestFirst(estimate).map((r) => [at(r.t_utc_ns), r.sequence, r.reason, opener(`Accept ${r.sequence}`, order("accept", r.sequence))])), csv(place, "estimate")),
-    section("History of calibrations", table("Calibrations", ["UTC", "Number", "Windows", "Method", "Roll back"], newestFirst(calibration).map((r, i) => [at(r.t_utc_ns), r.sequence, r.windows, r.method, i === 0 ? "in force" : opener(`Roll back to ${r.sequence}`, order("rollback", r.sequence))])), csv(place, "calibration")),
+    section("History of calibrations", table("Calibrations", ["UTC", "Number", "Windows", "Method", "Roll back"], newestFirst(calibration).map((r, i) => [at(r.t_utc_ns), r.sequence, r.windows, r.method, i === 0 ? "in force" : opener(`Roll back to ${r.sequence}`, order("rollback", r.sequence))]))),
     responseSection(newest, later),
     spaceSection(newest, later),
     temperatureSection(calibration, later),
