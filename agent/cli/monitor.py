@@ -19,6 +19,7 @@ from agent.cli.tls_options import tls_files, tls_options
 from agent.commanding.arguments import VERBS
 from agent.config.key_file import KeyFileError, read_private_key
 from agent.config.known_keys import read_known_keys
+from agent.config.reading import ConfigError
 from agent.delivery.router import DEFAULT_ENDPOINT, open_router, router_running
 from agent.delivery.session import EndpointError
 from agent.terminal.text import say
@@ -46,6 +47,8 @@ _OPTIONS: list[Callable[[Callable[..., Any]], Callable[..., Any]]] = [
                  "the password, or reads it from the standard input."),
     click.option("--verb", "verbs", multiple=True, type=click.Choice(VERBS),
                  help="With --add-user: a command that the page forwards for this user; may be given several times."),
+    click.option("--config", "config_file", type=_FILE, metavar="F",
+                 help="Plan of the structure, and who gets notices (TOML)."),
     click.option("--https-certificate", type=_FILE, metavar="F",
                  help="Certificate of the web server (PEM), for HTTPS."),
     click.option("--https-key", type=_FILE, metavar="F", help="Private key of --https-certificate (PEM)."),
@@ -77,6 +80,7 @@ def monitor(
     users: Path | None,
     add_user: str | None,
     verbs: tuple[str, ...],
+    config_file: Path | None,
     https_certificate: Path | None,
     https_key: Path | None,
     behind_proxy: bool,
@@ -101,6 +105,8 @@ def monitor(
     from agent.monitor.forwarding import Forwarding
     from agent.monitor.live import Live
     from agent.monitor.login import Access
+    from agent.monitor.notices import Notifier, Watch
+    from agent.monitor.settings import MonitorSettings, load_settings
 
     if add_user is not None:
         return _add_user(users, add_user, verbs)
@@ -117,6 +123,7 @@ def monitor(
         try:
             if keys is not None:
                 read_known_keys(keys)
+            settings = load_settings(config_file) if config_file is not None else MonitorSettings()
             access = Access(users)
             if with_router and not router_running(DEFAULT_ENDPOINT):
                 stack.enter_context(open_router(None)[0])
@@ -124,7 +131,7 @@ def monitor(
             database = stack.enter_context(closing(Database(data_dir / "monitor.sqlite")))
             fleet = Fleet()
             following = stack.enter_context(closing(Following(endpoints, tls, database, fleet, keys)))
-        except (EndpointError, KeyFileError, UsersError) as error:
+        except (ConfigError, EndpointError, KeyFileError, UsersError) as error:
             say(f"fieldcal monitor: {error}", err=True)
             return 2
         except sqlite3.Error as error:
@@ -132,8 +139,15 @@ def monitor(
             return 1
         stopping = threading.Event()
         forwarding, live = Forwarding(endpoints, commander, access, fleet), Live(endpoints, tls, stopping)
-        app = application(database, fleet, following, access, forwarding, live, stopping, names)
-        settings = uvicorn.Config(app, log_level="warning", timeout_graceful_shutdown=2, server_header=False,
+        notifier = None
+        if settings.notices is not None:
+            shown = (ca, certificate, command_certificate, https_certificate)
+            watch = Watch(fleet, settings.notices, [Path(path) for path in shown if path is not None])
+            notifier = stack.enter_context(closing(Notifier(watch, settings.notices)))
+        app = application(
+            database, fleet, following, access, forwarding, live, stopping, names, settings.plan, notifier
+        )
+        served = uvicorn.Config(app, log_level="warning", timeout_graceful_shutdown=2, server_header=False,
                                   ssl_certfile=https_certificate, ssl_keyfile=https_key,
                                   proxy_headers=behind_proxy, forwarded_allow_ips="127.0.0.1,::1")  # fmt: skip
         try:
@@ -153,7 +167,7 @@ def monitor(
                 super().handle_exit(sig, frame)
 
         with suppress(KeyboardInterrupt):
-            Server(settings).run([listening])
+            Server(served).run([listening])
     return 0
 
 

@@ -49,6 +49,7 @@ class Fleet:
         self._gateways: set[tuple[str, str]] = set()
         self._changed: dict[Place, int] = {}  # `version` at the last change of each sensor
         self._events: deque[dict[str, Any]] = deque(maxlen=EVENTS_MAX)
+        self._alarms: deque[dict[str, Any]] = deque(maxlen=EVENTS_MAX)
         self._mutex = threading.Lock()
 
     def admits(self, address: Address) -> bool:
@@ -61,8 +62,13 @@ class Fleet:
             self.left_out += not admitted
             return admitted
 
-    def take(self, site: str, gateway: str, sensor: str, what: str, fields: dict[str, Any]) -> None:
-        """Take a result of a sensor that is admitted; it must be newer than those of the same kind before."""
+    def take(
+        self, site: str, gateway: str, sensor: str, what: str, fields: dict[str, Any], *, fresh: bool = True
+    ) -> None:
+        """Take a result of a sensor that is admitted; it must be newer than those of the same kind before.
+
+        `fresh`: it has just come, so people are told where it needs them.
+        """
         part = {
             "drift": f"drift {fields.get('parameter')}",
             "window": "good window" if fields.get("used") else "refused window",
@@ -75,13 +81,19 @@ class Fleet:
             self.version += 1
             self._changed[site, gateway, sensor] = self.version
         if told := _told_of(what, fields):
-            self.note(site, gateway, sensor, what, fields["t_utc_ns"], told)
+            self.note(
+                site, gateway, sensor, what, fields["t_utc_ns"], told, alarm=fresh and _needs_a_person(what, fields)
+            )
 
-    def note(self, site: str, gateway: str, sensor: str, what: str, t_utc_ns: int, told: str) -> None:
-        """Add an event to the list of the newest ones."""
+    def note(
+        self, site: str, gateway: str, sensor: str, what: str, t_utc_ns: int, told: str, *, alarm: bool = False
+    ) -> None:
+        """Add an event to the list of the newest ones; an `alarm` also to those that people are told."""
         event = {"t_utc_ns": t_utc_ns, "site": site, "gateway": gateway, "sensor": sensor, "what": what}
         with self._mutex:
             self._events.append(event | {"text": clipped(told)})
+            if alarm:
+                self._alarms.append(self._events[-1])
             self.version += 1
 
     def peers(self, place: Place, most: int) -> list[Place]:
@@ -97,6 +109,13 @@ class Fleet:
         """The newest events, the newest first."""
         with self._mutex:
             return list(reversed(self._events))
+
+    def alarms(self) -> list[dict[str, Any]]:
+        """The alarms since the last call, the oldest first."""
+        with self._mutex:
+            found = list(self._alarms)
+            self._alarms.clear()
+            return found
 
     def set_alive(self, site: str, gateway: str, alive: bool) -> None:
         """Whether the gateway is on the bus."""
@@ -153,6 +172,12 @@ class Fleet:
         if gateway not in self._gateways and len(self._gateways) < GATEWAYS_MAX and all(map(CHUNK.fullmatch, gateway)):
             self._gateways.add(gateway)
         return gateway in self._gateways
+
+
+def _needs_a_person(what: str, fields: dict[str, Any]) -> bool:
+    if what == "drift":
+        return bool(fields["verdict"] != "stable")
+    return what == "status" and fields["status"] in NEEDS_A_PERSON
 
 
 def _told_of(what: str, fields: dict[str, Any]) -> str:

@@ -46,7 +46,7 @@ class Following:
         self._stop = threading.Event()
         self._open = ExitStack()
         for place in database.newest():
-            fleet.take(*place)
+            fleet.take(*place, fresh=False)
         self._thread = threading.Thread(target=self._run, name="following", daemon=True)
         self._thread.start()
 

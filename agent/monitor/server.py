@@ -17,6 +17,7 @@ from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
+from agent.config.files import read_file
 from agent.monitor.advising import advice_of
 from agent.monitor.database import Database
 from agent.monitor.fleet import Fleet, Place
@@ -25,11 +26,14 @@ from agent.monitor.forwarding import Forwarding
 from agent.monitor.guard import Guard
 from agent.monitor.live import Live
 from agent.monitor.login import Access
+from agent.monitor.notices import Notifier
+from agent.monitor.settings import PICTURES, Plan
 
 PAGE = Path(__file__).parent / "page"
 TYPES = {".html": "text/html", ".svg": "image/svg+xml", ".js": "text/javascript", ".css": "text/css"}
 FILES = {path.name: TYPES[path.suffix] for path in PAGE.iterdir() if path.suffix in TYPES}
 HISTORY_MAX = 2000  # results of one kind that a page or a CSV file holds
+LARGEST_PICTURE = 32 << 20  # bytes
 LISTENERS_MAX = 50  # pages that are told of changes at the same time
 TELL_S = 0.5  # s between two looks for a change
 
@@ -43,18 +47,21 @@ def application(
     live: Live,
     stopping: threading.Event,
     names: Sequence[str] = (),
+    plan: Plan | None = None,
+    notifier: Notifier | None = None,
 ) -> ASGIApp:
     """The page, its data as JSON and CSV, and the stream of changes (server-sent events).
 
     `stopping` ends the streams, which a browser would keep open for ever. `names`: host names by which browsers reach
-    this server, besides localhost and IP addresses.
+    this server, besides localhost and IP addresses. `plan`: picture of the structure. `notifier`: its fault is shown.
     """
-    data = _Data(database, fleet, following, stopping)
+    data = _Data(database, fleet, following, stopping, plan, notifier)
     app = Starlette(
         routes=[
             Route("/api/fleet", access.reading(data.sensors)),
             Route("/api/history", access.reading(data.history)),
             Route("/api/changes", access.reading_async(data.changes)),
+            Route("/plan", access.reading(data.plan)),
             Route("/fleet.csv", access.reading(data.sensors_csv)),
             Route("/sensor.csv", access.reading(data.history_csv)),
             Route("/api/live", access.reading_async(live.stream)),
@@ -83,15 +90,30 @@ def _file(request: Request) -> Response:
 class _Data:
     """What the page asks for."""
 
-    def __init__(self, database: Database, fleet: Fleet, following: Following, stopping: threading.Event) -> None:
+    def __init__(
+        self, database: Database, fleet: Fleet, following: Following, stopping: threading.Event, plan: Plan | None,
+        notifier: Notifier | None,
+    ) -> None:  # fmt: skip
         self._database, self._fleet, self._following, self._stopping = database, fleet, following, stopping
+        self._plan, self._notifier = plan, notifier
         self._listeners: set[object] = set()
 
     def sensors(self, _: Request) -> Response:
         following, fleet = self._following, self._fleet
         bus = {"fault": following.fault, "unconfirmed": following.unconfirmed, "left_out": fleet.left_out,
                "verifies": following.keys is not None}  # fmt: skip
-        return JSONResponse({"sensors": fleet.rows(), "gateways": fleet.gateways(following.refused), "bus": bus})
+        bus["notices"] = self._notifier.fault if self._notifier is not None else ""
+        told = {"sensors": fleet.rows(), "gateways": fleet.gateways(following.refused), "bus": bus}
+        return JSONResponse(told | {"plan": None if self._plan is None else dict(self._plan.positions)})
+
+    def plan(self, _: Request) -> Response:
+        if self._plan is None:
+            return Response("no plan is configured", 404)
+        try:
+            picture = read_file(self._plan.picture, LARGEST_PICTURE)
+        except OSError as error:
+            return Response(f"the picture cannot be read: {error.strerror}", 404)
+        return Response(picture, 200, None, PICTURES[self._plan.picture.suffix.lower()])
 
     def sensors_csv(self, _: Request) -> Response:
         return _csv("fleet.csv", self._fleet.rows())

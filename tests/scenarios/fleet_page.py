@@ -14,16 +14,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import msgspec
+import numpy as np
 import zenoh
 
 from agent.commanding.network import serve_queries
-from agent.core.events import Estimate
+from agent.core.events import Acceleration, Estimate
 from agent.delivery.history import Record
 from agent.delivery.keys import gateway_key
 from agent.delivery.publication import Publisher
 from agent.delivery.store import Store
 from agent.fleet.simulated import SimulatedFleet
+from agent.recording.acceleration import encode_acceleration
 from tests.unit.browser import Watched, chromium
 from tests.unit.command_desk import GATEWAY, DeskSite
 from tests.unit.monitor_site import Served
@@ -32,6 +33,12 @@ from tests.unit.zenoh_site import Site, record, wait_for
 
 DAY_NS = 86_400_000_000_000
 SEED = 7
+# Sensitivities that fall with frequency, as the field `response` of a calibration.
+RESPONSE = [
+    {"low_hz": low, "high_hz": 3 * low, "sensitivity_re": np.diag([26000.0 - 5.0 * low**2] * 3).tolist(),
+     "sensitivity_im": np.zeros((3, 3)).tolist(), "standard_uncertainty": np.full((3, 3), 20.0).tolist()}
+    for low in (1.0, 3.0, 9.0)
+]  # fmt: skip
 IMAGES = Path(__file__).parents[2] / "docs" / "images"
 
 
@@ -78,11 +85,15 @@ class CommandedGateway:
         self._publisher.start()
 
     def publish_more(self) -> int:
-        """A second calibration, and an estimate, whose number this returns."""
+        """A second calibration with all that the page can show, and an estimate, whose number this returns."""
         first = self._store.last_sequence() + 1
         estimate = Estimate(run_id="r", sequence=first + 1, sensor="mems", t_utc_ns=time.time_ns(),
                             reason="Sxx changed by 4 U", calibration=calibration(first + 1))  # fmt: skip
-        self.publish([record(first, "calibration"), Record.of(estimate, recorded=True, recording="f.mcap", epoch="")])
+        known = {"response": RESPONSE, "reference_frequency_hz": 5.0, "reference_temperature_degc": 21.0,
+                 "temperature_low_degc": 15.0, "temperature_high_degc": 30.0, "references": ["B12 4711"]}  # fmt: skip
+        self.publish([record(first, "calibration", **known),
+                      Record.of(estimate, recorded=True, recording="f.mcap", epoch=""),
+                      record(first + 2, "clock")])  # fmt: skip
         return first + 1
 
     def publish(self, records: Sequence[Record]) -> None:
@@ -91,21 +102,20 @@ class CommandedGateway:
         for each in records:
             self._publisher.publish(each)
 
+    def stream(self) -> None:
+        """Publish half a second of the corrected stream."""
+        wave = np.sin(np.arange(100) / 5.0)[:, None] * [1.0, 0.5, 0.0]
+        block = Acceleration(
+            sensor="mems", t_utc_ns=time.time_ns(), first_index=0, rate_hz=200.0, acceleration=wave,
+            covariance=np.eye(3), noise=np.ones(3), determined=np.ones(12, dtype=bool), calibration_run_id="r",
+            calibration_sequence=103, dynamic_only=False, recorded=True,
+        )  # fmt: skip
+        self._publisher.stream("mems", encode_acceleration(1, block))
+
     def close(self) -> None:
         """Leave the bus."""
         self._publisher.close()
         self._store.close()
-
-
-def with_response(update: Any) -> Any:
-    """A calibration whose sensitivity falls with frequency."""
-    bands = []
-    for low, high in ((1.0, 3.0), (3.0, 10.0), (10.0, 30.0), (30.0, 60.0)):
-        fall = 1.0 - 2e-5 * (low * high)
-        rows = [[fall * value for value in row] for row in update.sensitivity]
-        bands.append({"low_hz": low, "high_hz": high, "sensitivity_re": rows, "sensitivity_im": [[0.0] * 3] * 3,
-                      "standard_uncertainty": [[20.0] * 3] * 3})  # fmt: skip
-    return msgspec.convert(msgspec.to_builtins(update) | {"response": bands}, type(update))
 
 
 def write_pictures() -> None:

@@ -19,12 +19,14 @@ from tests.unit.zenoh_site import Site, wait_for
 pytest.importorskip("starlette", reason="the extra monitor is not installed")
 pytest.importorskip("uvicorn", reason="the extra monitor is not installed")
 pytest.importorskip("argon2", reason="the extra monitor is not installed")
+from agent.monitor.settings import Plan
 from agent.monitor.users import set_user
-from tests.scenarios.fleet_page import CommandedGateway, page_site
+from tests.scenarios.fleet_page import IMAGES, CommandedGateway, page_site
 from tests.unit.monitor_site import COMMAND, Monitor, Served
 
 pytestmark = needs_chromium
 PASSWORD = "correct horse battery staple"
+PICTURE = IMAGES / "report.png"
 RISES_S = 2.0
 SILENT_S = 10.0
 
@@ -47,7 +49,9 @@ def first_sensor(page: Any) -> str:
 
 
 def test_a_drifting_sensor_rises_is_sorted_opened_and_zoomed(site: Site, tmp_path: Path, browser: Any) -> None:
-    with page_site(site, tmp_path) as shown:
+    places = {f"simulated/gw000{k}/s0": (0.1 + 0.1 * k, 0.5) for k in range(8)}
+    plan = Plan(picture=PICTURE, positions=places)
+    with page_site(site, tmp_path, plan=plan) as shown:
         drifting = f"simulated/{shown.fleet.names_of('drifting')[0]}/s0"
         shown.rounds(5)
         watched = Watched(browser, shown.served.address, viewport={"width": 1280, "height": 900})
@@ -61,6 +65,11 @@ def test_a_drifting_sensor_rises_is_sorted_opened_and_zoomed(site: Site, tmp_pat
         assert (
             "Sxx drifting: the sensor or the reference changes steadily" in page.locator("#rows tr").first.inner_text()
         )
+        assert page.get_by_text("HELD: <img src=x onerror=alert(3)>").count() == 1  # text, not an element
+        assert page.locator("#plan .point").count() == 8
+        assert page.locator("#plan .point.alarm").count() == 4
+        assert page.locator("#plan img").evaluate("image => image.naturalWidth") > 0
+        assert page.locator("img").count() == 1
         assert serious_faults(page) == []
 
         page.get_by_role("button", name="Sensor", exact=True).click()
@@ -134,6 +143,17 @@ def test_commands_with_and_without_the_right(site: Site, tmp_path: Path, browser
             page.locator("#key-file").set_input_files(key_file)
             page.get_by_text("the key is kept").wait_for()
 
+            page.goto(f"http://{served.address}/#site=workshop&gateway=gateway-1&sensor=mems")
+            page.get_by_role("heading", name="Response over frequency; S holds at 5 Hz").wait_for()
+            for shown in ("9 to 27", "Q holds at 21 °C", "References: B12 4711", "25995 ± 40, imaginary 0"):
+                assert shown in page.locator("#details").inner_text(), shown
+            page.get_by_role("button", name="Show the live waveform").click()
+            page.get_by_text("waiting for a block").wait_for()
+            while page.get_by_text("corrected acceleration by calibration 103, 200 Hz").count() == 0:
+                gateway.stream()
+                page.wait_for_timeout(100)
+            page.get_by_role("button", name="Stop").click()
+
             def sent(button: str) -> str:
                 page.get_by_role("button", name=button).first.click()
                 page.get_by_role("button", name="Sign and send").click()
@@ -143,7 +163,6 @@ def test_commands_with_and_without_the_right(site: Site, tmp_path: Path, browser
                 page.get_by_role("button", name="Close").click()
                 return text
 
-            page.goto(f"http://{served.address}/#site=workshop&gateway=gateway-1&sensor=mems")
             assert sent("Roll back to 101") == "taken by the gateway"
             assert sent(f"Accept {estimate}").startswith("refused: key anna has no right to send accept")
             assert [(event.verb, bool(event.refused)) for event in gateway.desk.events] == [

@@ -31,7 +31,7 @@ function rowOf(row, verifies) {
     make("td", row.status + (verifies && !row.verified ? " (not verified)" : "")),
     make("td", row.change_in_u === null ? "" : row.change_in_u.toFixed(1), { class: "number", "data-title": "change in U" }),
     make("td", ago(row.last_good_utc_ns), { class: "number", "data-title": "last good window" }),
-    make("td", row.gateway_state || "on the bus", { "data-title": "gateway" }),
+    make("td", row.gateway_state || "on the bus", { class: "short", "data-title": "gateway" }),
     make("td", row.why, { class: "why" }),
   ]);
 }

@@ -37,7 +37,7 @@ function summary() {
   return [
     `${told.sensors.length} sensors, ${need} need a person`, gateways ? `${gateways} of ${told.gateways.length} gateways need a person` : "",
     bus.verifies ? "signatures are verified" : "signatures are not verified (option --keys)", bus.unconfirmed ? `${bus.unconfirmed} unconfirmed results` : "",
-    bus.left_out ? `${bus.left_out} results beyond the limits are not shown` : "", bus.fault,
+    bus.left_out ? `${bus.left_out} results beyond the limits are not shown` : "", bus.fault, bus.notices,
   ].filter(Boolean).join("; ");
 }
 

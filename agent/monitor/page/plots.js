@@ -43,7 +43,7 @@ export class TimePlots {
     return new uPlot({
       title: one.title, width: width(box), height: 200, cursor: { sync: { key: "time" } }, legend: { live: true },
       axes: [axis, { ...axis, size: 70 }],
-      series: [{}, { label: one.label, stroke: colour, width: 2, points: { show: data[0].length < 60 } }, { label: "+U", stroke: `${colour}88` }, { label: "-U", stroke: `${colour}88` }],
+      series: [{}, { label: one.label, stroke: colour, width: 2, points: { show: data[0].length < 60 } }, ...["+U", "-U"].map((label) => ({ label, stroke: `${colour}88`, points: { show: false } }))],
       bands: [{ series: [2, 3], fill: `${colour}33` }],
       hooks: { draw: [drawOnsets], setScale: [(plot, key) => key === "x" && this.zoomed(plot)] },
     }, data, box);
