@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,28 +13,43 @@ from agent.monitor.fleet import Fleet, Place
 from agent.monitor.interval import DAY_NS, Advice, Trend, advise, daily, spread_of_rates, trend
 from calib.model import PARAMETERS
 
-POINTS = 400  # calibrations of a history that are looked at
+POINTS = 400  # calibrations that are looked at, evenly from the whole history
 PEERS_MAX = 12  # sensors of the same kind that are looked at
+PEERS_FOR_S = 3600.0  # s for which what was found of a peer is kept
 REFERENCE_SENSITIVITY = "reference sensitivity"  # kind of unknown, calib.estimate.quantities
 
 
-def advice_of(place: Place, database: Database, fleet: Fleet) -> list[dict[str, Any]]:
-    """Rows of (subject, interval_days, due_utc_ns, reason): the sensor's shortest interval, then its references'."""
-    history = database.history(*place, "calibration", POINTS)
-    if not history:
-        return []
-    peers = [trends(database.history(*peer, "calibration", POINTS)) for peer in fleet.peers(place, PEERS_MAX)]
-    own, newest = trends(history), history[-1]
-    found: list[tuple[str, Advice]] = []
-    for name, u in zip(PARAMETERS, newest["standard_uncertainty"], strict=True):
-        if u is None or u <= 0 or not newest["determined"][list(PARAMETERS).index(name)]:
-            continue
-        unit = newest["output_unit"] + (" per m/s²" if name.startswith("S") else "")
-        spread = spread_of_rates([peer[name] for peer in peers if name in peer])
-        found.append((name, advise(own.get(name), 2.0 * u, spread, unit)))
-    known = [(name, advice) for name, advice in found if advice.interval_days is not None]
-    rows = [_row(place[2], *min(known or found, key=_shortest), newest["t_utc_ns"])] if found else []
-    return rows + [_of_reference(*each) for each in _references(history).items()]
+class Advisor:
+    """Advice for the sensors of a database. May be used by several threads."""
+
+    def __init__(self, database: Database, fleet: Fleet) -> None:
+        self._database, self._fleet = database, fleet
+        self._of_peers: dict[Place, tuple[float, dict[str, Trend]]] = {}
+
+    def advice(self, place: Place) -> list[dict[str, Any]]:
+        """Rows of subject, interval_days, due_utc_ns and reason: the sensor with its shortest interval, references."""
+        history = self._database.spread(*place, "calibration", POINTS)
+        if not history:
+            return []
+        peers = [self._peer(peer) for peer in self._fleet.peers(place, PEERS_MAX)]
+        own, newest = trends(history), history[-1]
+        found: list[tuple[str, Advice]] = []
+        for i, name in enumerate(PARAMETERS):
+            u = newest["standard_uncertainty"][i]
+            if u is None or u <= 0 or not newest["determined"][i]:
+                continue
+            unit = newest["output_unit"] + (" per m/s²" if name.startswith("S") else "")
+            spread = spread_of_rates([peer[name] for peer in peers if name in peer])
+            found.append((name, advise(own.get(name), 2.0 * u, spread, unit)))
+        rows = [_row(place[2], *min(found, key=_shortest), newest["t_utc_ns"])] if found else []
+        return rows + [_of_reference(*each) for each in _references(history).items()]
+
+    def _peer(self, place: Place) -> dict[str, Trend]:
+        kept_s, found = self._of_peers.get(place, (-PEERS_FOR_S, {}))
+        if time.monotonic() - kept_s >= PEERS_FOR_S:
+            found = trends(self._database.spread(*place, "calibration", POINTS))
+            self._of_peers[place] = time.monotonic(), found
+        return found
 
 
 def trends(history: Sequence[dict[str, Any]]) -> dict[str, Trend]:

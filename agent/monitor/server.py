@@ -6,6 +6,7 @@ import asyncio
 import csv
 import io
 import json
+import re
 import threading
 from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
@@ -18,7 +19,7 @@ from starlette.routing import Route
 from starlette.types import ASGIApp
 
 from agent.config.files import read_file
-from agent.monitor.advising import advice_of
+from agent.monitor.advising import Advisor
 from agent.monitor.database import Database
 from agent.monitor.fleet import Fleet, Place
 from agent.monitor.following import Following
@@ -33,6 +34,11 @@ PAGE = Path(__file__).parent / "page"
 TYPES = {".html": "text/html", ".svg": "image/svg+xml", ".js": "text/javascript", ".css": "text/css"}
 FILES = {path.name: TYPES[path.suffix] for path in PAGE.iterdir() if path.suffix in TYPES}
 HISTORY_MAX = 2000  # results of one kind that a page or a CSV file holds
+PLOTTED = (
+    "t_utc_ns", "sensitivity", "offset", "standard_uncertainty", "output_unit", "reference_temperature_degc",
+    "temperature_low_degc", "temperature_high_degc",
+)  # fmt: skip
+_NUMBER = re.compile(r"[0-9]{1,9}")
 LARGEST_PICTURE = 32 << 20  # bytes
 LISTENERS_MAX = 50  # pages that are told of changes at the same time
 TELL_S = 0.5  # s between two looks for a change
@@ -60,6 +66,8 @@ def application(
         routes=[
             Route("/api/fleet", access.reading(data.sensors)),
             Route("/api/history", access.reading(data.history)),
+            Route("/api/spread", access.reading(data.spread)),
+            Route("/gateways.csv", access.reading(data.gateways_csv)),
             Route("/api/changes", access.reading_async(data.changes)),
             Route("/plan", access.reading(data.plan)),
             Route("/fleet.csv", access.reading(data.sensors_csv)),
@@ -96,6 +104,7 @@ class _Data:
     ) -> None:  # fmt: skip
         self._database, self._fleet, self._following, self._stopping = database, fleet, following, stopping
         self._plan, self._notifier = plan, notifier
+        self._advisor = Advisor(database, fleet)
         self._listeners: set[object] = set()
 
     def sensors(self, _: Request) -> Response:
@@ -125,19 +134,30 @@ class _Data:
         return _csv("events.csv", self._fleet.events())
 
     def advice(self, request: Request) -> Response:
-        return JSONResponse(advice_of(_place(request), self._database, self._fleet))
+        return JSONResponse(self._advisor.advice(_place(request)))
 
     def advice_csv(self, request: Request) -> Response:
-        return _csv("advice.csv", advice_of(_place(request), self._database, self._fleet))
+        return _csv("advice.csv", self._advisor.advice(_place(request)))
 
     def history(self, request: Request) -> Response:
         return JSONResponse(self._history(request))
+
+    def spread(self, request: Request) -> Response:
+        """Calibrations from the whole history, for plots."""
+        rows = self._database.spread(*_place(request), "calibration", HISTORY_MAX)
+        return JSONResponse([{name: row[name] for name in PLOTTED if name in row} for row in rows])
+
+    def gateways_csv(self, _: Request) -> Response:
+        return _csv("gateways.csv", self._fleet.gateways(self._following.refused))
 
     def history_csv(self, request: Request) -> Response:
         return _csv("sensor.csv", self._history(request))
 
     def _history(self, request: Request) -> list[dict[str, Any]]:
-        rows = self._database.history(*_place(request), request.query_params.get("what", ""), HISTORY_MAX)
+        asked = request.query_params
+        limit = asked.get("limit", "")
+        most = min(int(limit), HISTORY_MAX) if _NUMBER.fullmatch(limit) else HISTORY_MAX
+        rows = self._database.history(*_place(request), asked.get("what", ""), most)
         return [{name: value for name, value in row.items() if name != "covariance"} for row in rows]
 
     async def changes(self, _: Request) -> Response:

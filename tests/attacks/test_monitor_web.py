@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Iterator
 from pathlib import Path
 
+import msgspec
 import pytest
 import zenoh
+from msgspec import structs
 
+from agent.core.events import DriftReport, Estimate, Result, SharedError
 from agent.delivery.keys import Address
+from agent.delivery.received import Received
 from tests.attacks.signed_site import KEY, OTHER, Gateway, listed
+from tests.unit.browser import Watched, chromium, needs_chromium
+from tests.unit.results import calibration, clock, status, window
 from tests.unit.zenoh_site import Site, record, wait_for
 
 pytest.importorskip("starlette", reason="the extra monitor is not installed")
@@ -130,3 +137,63 @@ def test_without_a_list_results_are_shown_as_not_verified(site: Site, tmp_path: 
             assert not any(row["verified"] for row in served.ask("/api/fleet").json["sensors"])
     finally:
         gateway.stop()
+
+
+HOSTILE = "'\"><img src=x onerror=\"document.title='owned'\"><script>alert(1)</script>\u202e=cmd()"
+KEPT = {"sensor", "status", "verdict", "parameter", "role", "run_id"}  # texts that a consumer checks
+
+
+def made_hostile(value: object) -> object:
+    """Every text in a result replaced, keys of free names too."""
+    if isinstance(value, dict):
+        return {(name if name.isidentifier() else HOSTILE): v if name in KEPT else made_hostile(v)
+                for name, v in value.items()}  # fmt: skip
+    if isinstance(value, list):
+        return [made_hostile(each) for each in value]
+    return HOSTILE if isinstance(value, str) else value
+
+
+def results() -> list[tuple[str, Result]]:
+    """One of each kind, with all texts that a result can have."""
+    shared = SharedError(reference="r", serial_number="1", certificate_sha256="a", sensitivity=[1.0], unknowns=["u"],
+                         kinds=["k"], stated=[0.0], u_stated=[1e-3], value=[0.0], own_derivative=[[1.0]],
+                         derivative=[[0.0] * 12])  # fmt: skip
+    made = structs.replace(calibration(1), references=["r"], shared_errors=[shared], identity="A 1")
+    drift = DriftReport(run_id="r", sequence=4, sensor="mems", t_utc_ns=1, parameter="Sxx", verdict="stepped",
+                        change=1.0, u_change=1.0, rate=0.0, u_rate=0.0, onset_utc_ns=1, statistic=1.0, threshold=1.0,
+                        false_alarms_a_year=0.1, reason="r")  # fmt: skip
+    estimate = Estimate(run_id="r", sequence=5, sensor="mems", t_utc_ns=1, reason="r", calibration=made)
+    of_window = structs.replace(window(2, reason="r"), numbers={"a b": 1.0})
+    each = (made, of_window, status(3, "HELD"), drift, estimate, clock(6))
+    return [(result.what, result) for result in each]
+
+
+@needs_chromium
+def test_no_text_of_the_bus_becomes_part_of_the_page(served: Served) -> None:
+    for number, (what, result) in enumerate(results(), start=1):
+        fields = made_hostile(msgspec.json.decode(msgspec.json.encode(result)))
+        assert isinstance(fields, dict)
+        assert HOSTILE in fields.values()
+        address = Address("site", "gw", "mems", what)
+        served.database.add(Received("", address, number, fields, None))
+        served.fleet.take("site", "gw", "mems", what, fields)
+    told = {"state": HOSTILE, "reasons": [HOSTILE], "version": HOSTILE, "t_utc_ns": 1}
+    served.fleet.set_told("site", "gw", msgspec.json.encode(told))
+    served.fleet.set_alive("site", "gw", True)
+    sensor = "site=site&gateway=gw&sensor=mems"
+    with chromium() as browser:
+        watched = Watched(browser, served.address)
+        for view in ("", f"#{sensor}", "#view=events", "#view=<img src=x>", f"#site={HOSTILE}&gateway=g&sensor=s",
+                     f"#filter={HOSTILE}&sort={HOSTILE}&from={HOSTILE}&to=1"):  # fmt: skip
+            page = watched.open(view)
+            page.wait_for_function("() => document.getElementById('summary').textContent.startsWith('Sensors: 1')")
+            if view == f"#{sensor}":
+                page.get_by_role("heading", name="Devices and certificates").wait_for()
+                assert page.locator("td", has_text="document.title").count() >= 8
+            assert page.locator("img, main script, main iframe").count() == 0, view
+            assert page.title().startswith("fieldcal: ")
+            assert "\u202e" not in page.locator("main").inner_text()
+            page.goto("about:blank")
+        watched.close()
+    table = served.ask(f"/sensor.csv?{sensor}&what=status").text
+    assert not any(cell.startswith(("=", "+", "-", "@")) for row in csv.reader(table.splitlines()) for cell in row)

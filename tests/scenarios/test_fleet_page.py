@@ -104,7 +104,7 @@ def test_a_drifting_sensor_rises_is_sorted_opened_and_zoomed(site: Site, tmp_pat
         page.locator("#details table").first.wait_for()
         assert page.evaluate("() => location.hash") == zoomed
         assert page.locator("#span").input_value() == "zoom"
-        assert "Sxx: 6 calibrations in 50 days" in page.locator("#details").inner_text()
+        page.get_by_text("Sxx: 6 calibrations in 50 days").wait_for()
         with page.expect_download() as saved:
             page.get_by_role("button", name="PNG").last.click()
         assert saved.value.path().read_bytes().startswith(b"\x89PNG")
@@ -194,8 +194,8 @@ def test_a_killed_gateway_is_shown_and_a_restarted_monitor_has_the_whole_history
     site: Site, tmp_path: Path, browser: Any
 ) -> None:
     options = ["simulate", "--fleet", "1", "--sensors", "1", "--every", "0.3", "--connect", site.endpoint]
-    gateway = subprocess.Popen([sys.executable, "-c", COMMAND, *options], stdout=subprocess.DEVNULL)
     monitor = Monitor(site, tmp_path / "monitor")
+    gateway = subprocess.Popen([sys.executable, "-c", COMMAND, *options], stdout=subprocess.DEVNULL)
     asked = "api/history?site=simulated&gateway=gw0000&sensor=s0&what=calibration"
     try:
         watched = Watched(browser, monitor.address)
@@ -211,7 +211,7 @@ def test_a_killed_gateway_is_shown_and_a_restarted_monitor_has_the_whole_history
         monitor.stop()
         page.get_by_text("the monitor does not answer").wait_for()
         monitor = Monitor(site, tmp_path / "monitor", address=monitor.address)
-        page.get_by_text("1 sensors, 1 need a person").wait_for()  # the open page goes on by itself
+        page.get_by_text("Sensors: 1, of which need a person: 1").wait_for()  # the open page goes on by itself
         assert monitor.get(asked) == history
         watched.close()
     finally:

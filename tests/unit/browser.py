@@ -52,4 +52,4 @@ class Watched:
         self.context.close()
         own = f"http://{self.address}/"
         assert [url for url in self.asked if not url.startswith((own, f"blob:{own[:-1]}"))] == []
-        assert self.errors == []
+        assert not self.errors, self.errors

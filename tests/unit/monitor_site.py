@@ -6,6 +6,7 @@ import http.client
 import json
 import signal
 import socket
+import ssl
 import subprocess
 import sys
 import threading
@@ -26,6 +27,7 @@ from agent.monitor.login import Access
 from agent.monitor.server import application
 from tests.unit.zenoh_site import Site, wait_for
 
+STARTS_S = 30.0
 COMMAND = "import sys; from agent.cli.main import run_cli; sys.exit(run_cli(sys.argv[1:]))"
 
 
@@ -96,15 +98,21 @@ class Served(AbstractContextManager["Served"]):
 
 
 class Monitor:
-    """`fieldcal monitor` in a process of its own."""
+    """`fieldcal monitor` in a process of its own. `ca`: the authority of its certificate, where it serves HTTPS."""
 
-    def __init__(self, site: Site, directory: Path, *options: str, address: str = "") -> None:
+    def __init__(self, site: Site, directory: Path, *options: str, address: str = "", ca: Path | None = None) -> None:
         with closing(socket.socket()) as free:
             free.bind(("127.0.0.1", 0))
             self.address = address or f"127.0.0.1:{free.getsockname()[1]}"
+        self.tls = ssl.create_default_context(cafile=ca) if ca is not None else None
+        self.url = f"http{'s' if ca is not None else ''}://{self.address}"
         given = ["--connect", site.endpoint, "--listen", self.address, "--data-dir", str(directory), *options]
-        self._process = subprocess.Popen([sys.executable, "-c", COMMAND, "monitor", *given])
-        wait_for(self._answers)
+        self._process = subprocess.Popen([sys.executable, "-c", COMMAND, "monitor", *given], stderr=subprocess.PIPE)
+        try:
+            wait_for(self._answers, STARTS_S)
+        except AssertionError:
+            self._process.kill()
+            raise
 
     def _answers(self) -> bool:
         try:
@@ -114,7 +122,7 @@ class Monitor:
         return True
 
     def get(self, path: str) -> Any:
-        with urlopen(f"http://{self.address}/{path}", timeout=5) as answer:
+        with urlopen(f"{self.url}/{path}", timeout=5, context=self.tls) as answer:
             assert answer.headers["Content-Security-Policy"].startswith("default-src 'self'")
             text = answer.read().decode()
         return json.loads(text) if path.startswith("api") else text
@@ -124,5 +132,7 @@ class Monitor:
         return rows
 
     def stop(self) -> None:
+        """Ctrl-C. Fails where the program ends with a traceback."""
         self._process.send_signal(signal.SIGINT)
-        self._process.wait(10)
+        said = self._process.communicate(timeout=10)[1].decode()
+        assert "Traceback" not in said, said

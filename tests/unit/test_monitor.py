@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
+from datetime import UTC, datetime
 from pathlib import Path
+from urllib.error import HTTPError
+from urllib.request import Request, urlopen
 
 import pytest
 
 from agent.delivery.publication import Publisher
 from agent.delivery.store import Store
+from agent.keys.certificates import issue, make_authority
+from agent.keys.files import write_new
 from tests.unit.zenoh_site import Site, record, wait_for
 
 pytest.importorskip("starlette", reason="the extra monitor is not installed")
@@ -48,5 +54,33 @@ def test_a_sensor_is_shown_with_why_and_kept_over_a_restart(site: Site, gateway:
         asked = "site=site&gateway=gw&sensor=mems&what="
         assert len(monitor.get(f"api/history?{asked}calibration")) == 1
         assert "count" in monitor.get(f"sensor.csv?{asked}calibration")
+    finally:
+        monitor.stop()
+
+
+def test_over_https_a_user_logs_in_with_a_cookie_of_this_host(site: Site, tmp_path: Path) -> None:
+    pytest.importorskip("argon2", reason="the extra monitor is not installed")
+    from agent.monitor.users import set_user
+
+    authority = make_authority("authority", 10, datetime.now(UTC))
+    server = issue(authority, "fleet", 10, datetime.now(UTC), ["127.0.0.1"])
+    write_new(tmp_path, {"ca.pem": authority.certificate_pem, "fleet.pem": server.certificate_pem,
+                         "fleet.key": server.key_pem})  # fmt: skip
+    set_user(tmp_path / "users.txt", "anna", (), "correct horse battery staple")
+    options = ["--https-certificate", str(tmp_path / "fleet.pem"), "--https-key", str(tmp_path / "fleet.key"),
+               "--users", str(tmp_path / "users.txt")]  # fmt: skip
+    monitor = Monitor(site, tmp_path / "monitor", *options, ca=tmp_path / "ca.pem")
+    try:
+        body = json.dumps({"name": "anna", "password": "correct horse battery staple"}).encode()
+        login = Request(f"{monitor.url}/api/login", body, {"Origin": monitor.url})
+        with urlopen(login, timeout=10, context=monitor.tls) as answer:
+            cookie = answer.headers["Set-Cookie"].split(";")
+        assert cookie[0].startswith("__Host-fieldcal=")
+        assert {"secure", "httponly", "samesite=strict"} <= {part.strip().lower() for part in cookie[1:]}
+        asked = Request(f"{monitor.url}/api/fleet", headers={"Cookie": cookie[0]})
+        with urlopen(asked, timeout=10, context=monitor.tls) as answer:
+            assert json.loads(answer.read())["sensors"] == []
+        with pytest.raises(HTTPError, match="401"):
+            monitor.get("api/fleet")
     finally:
         monitor.stop()

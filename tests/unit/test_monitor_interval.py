@@ -11,7 +11,7 @@ import pytest
 
 from agent.delivery.keys import Address
 from agent.delivery.received import Received
-from agent.monitor.advising import advice_of
+from agent.monitor.advising import Advisor
 from agent.monitor.database import Database
 from agent.monitor.fleet import Fleet
 from agent.monitor.interval import DAY_NS, K, Trend, advise, daily, spread_of_rates, trend
@@ -95,6 +95,7 @@ def test_calibrations_of_one_day_count_once() -> None:
 
 def test_the_advice_of_a_sensor_names_the_parameter_that_changes_most(tmp_path: Path) -> None:
     database, fleet = Database(tmp_path / "monitor.sqlite"), Fleet()
+    advisor = Advisor(database, fleet)
     place = ("site", "gw", "mems")
     shared = {"reference": "R 1", "serial_number": "1", "sensitivity": [100.0], "kinds": ["reference sensitivity"],
               "u_stated": [1e-3]}  # fmt: skip
@@ -104,12 +105,15 @@ def test_the_advice_of_a_sensor_names_the_parameter_that_changes_most(tmp_path: 
         fields |= {"t_utc_ns": 30 * k * DAY_NS, "shared_errors": [shared | {"certificate_sha256": f"{k // 5}"}]}
         database.add(Received("", Address(*place, "calibration"), k + 1, fields, None))
         fleet.take(*place, "calibration", fields)
-    sensor, reference = advice_of(place, database, fleet)
+    sensor, reference = advisor.advice(place)
     assert sensor["subject"] == "mems"
     assert sensor["reason"].startswith("Sxx: 10 calibrations in 270 days, drift 24.4 ")
     assert 100 < sensor["interval_days"] < 180  # 12 at 2 in 30 days is 180 days, less what is not sure
     assert sensor["due_utc_ns"] == 270 * DAY_NS + round(sensor["interval_days"] * DAY_NS)
     assert (reference["subject"], reference["interval_days"]) == ("reference R 1", None)
     assert "2 certificates in the history" in reference["reason"]
-    assert advice_of(("site", "gw", "other"), database, fleet) == []
+    assert advisor.advice(("site", "gw", "other")) == []
+    numbers = [made["sequence"] for made in database.spread(*place, "calibration", 4)]
+    assert (len(numbers), numbers[-1], numbers == sorted(numbers)) == (4, 10, True)
+    assert [made["sequence"] for made in database.spread(*place, "calibration", 100)] == list(range(1, 11))
     database.close()

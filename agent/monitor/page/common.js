@@ -2,7 +2,8 @@
 export const $ = (id) => document.getElementById(id);
 // Control characters, and those that turn the direction of writing, are shown as such.
 const UNSEEN = /[\u0000-\u001f\u007f-\u009f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]/g;
-export const text = (value) => document.createTextNode(value === null || value === undefined ? "" : String(value).replace(UNSEEN, "\ufffd"));
+export const clean = (value) => (value === null || value === undefined ? "" : String(value).replace(UNSEEN, "\ufffd"));
+export const text = (value) => document.createTextNode(clean(value));
 
 export function make(tag, children = [], attributes = {}) {
   const element = document.createElement(tag);

@@ -76,5 +76,6 @@ export function startFleet(go) {
   for (const status of ["VALID", "HELD", "INVALID", "RECALIBRATING", "COLLECTING", "UNCALIBRATED"]) $("status").append(make("option", status, { value: status }));
   for (const name of FIELDS) $(name).addEventListener("input", () => go({ [name]: $(name).value }));
   $("filters").addEventListener("submit", (event) => event.preventDefault());
+  $("events-png").addEventListener("click", () => saveTable($("event-rows").querySelector("table"), "events.png"));
   $("fleet-png").addEventListener("click", () => saveTable($("sensors"), "fleet.png"));
 }

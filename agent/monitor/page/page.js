@@ -35,7 +35,7 @@ async function show() {
 function summary() {
   const need = told.sensors.filter((row) => row.why).length, gateways = told.gateways.filter((g) => g.why).length, bus = told.bus;
   return [
-    `${told.sensors.length} sensors, ${need} need a person`, gateways ? `${gateways} of ${told.gateways.length} gateways need a person` : "",
+    `Sensors: ${told.sensors.length}, of which need a person: ${need}`, gateways ? `gateways: ${told.gateways.length}, of which need a person: ${gateways}` : "",
     bus.verifies ? "signatures are verified" : "signatures are not verified (option --keys)", bus.unconfirmed ? `${bus.unconfirmed} unconfirmed results` : "",
     bus.left_out ? `${bus.left_out} results beyond the limits are not shown` : "", bus.fault, bus.notices,
   ].filter(Boolean).join("; ");

@@ -21,12 +21,13 @@ export class TimePlots {
   }
 
   update(times, series) {
-    if (this.plots.length !== series.length) {
+    const shown = times.length ? series : [];
+    if (this.plots.length !== shown.length) {
       this.plots = [];
-      this.container.replaceChildren(...series.map((one) => boxOf(`${one.title} over time with its k = 2 band`)));
+      this.container.replaceChildren(...shown.map((one) => boxOf(`${one.title} over time with its k = 2 band`)));
     }
     this.setting = true;
-    series.forEach((one, i) => {
+    shown.forEach((one, i) => {
       const shift = (k) => one.values.map((v, j) => (v === null || one.u[j] === null ? null : v + k * one.u[j]));
       const data = [times, shift(0), shift(2), shift(-2)];
       if (this.plots[i]) this.plots[i].setData(data, !this.range);

@@ -1,12 +1,13 @@
 // The view of one sensor: S and Q with U over time, response, drift, windows, devices, history, and its commands.
-import { $, at, get, make, placeOf, table, text, view } from "./common.js";
+import { $, at, clean, get, make, placeOf, table, text, view } from "./common.js";
 import { opener, poseForm } from "./commands.js";
 import { drawRows } from "./diagram.js";
 import { savePlots } from "./picture.js";
 import { boxOf, curves, TimePlots } from "./plots.js";
 
-const AXES = ["x", "y", "z"], SHOWN = 100; // rows of a table
+const AXES = ["x", "y", "z"];
 const NAMES = [...AXES.flatMap((i) => AXES.map((j) => `S${i}${j}`)), ...AXES.map((i) => `Q${i}`)];
+const NEWEST = 100; // results of each kind that are asked for, beside the calibrations of the whole history
 const KINDS = ["calibration", "window", "drift", "status", "estimate", "clock"];
 const value = (c, i) => (i < 9 ? c.sensitivity[Math.floor(i / 3)][i % 3] : c.offset[i - 9]);
 const finite = (v) => typeof v === "number" && Number.isFinite(v);
@@ -19,7 +20,7 @@ function onsetsOf(drifts) {
 }
 
 function seriesOf(calibrations, drifts) {
-  const unit = calibrations.at(-1)?.output_unit ?? "", onsets = onsetsOf(drifts);
+  const unit = clean(calibrations.at(-1)?.output_unit), onsets = onsetsOf(drifts);
   return NAMES.map((name, i) => ({
     label: name, title: `${name}, ${unit}${i < 9 ? " per m/s²" : ""}`, onsets: onsets[i],
     values: calibrations.map((c) => value(c, i)), u: calibrations.map((c) => c.standard_uncertainty[i]),
@@ -28,7 +29,7 @@ function seriesOf(calibrations, drifts) {
 
 const section = (title, ...content) => make("section", [make("h3", title), ...content.flat()]);
 const csv = (place, what) => make("p", make("a", "CSV", { href: `sensor.csv?${place}&what=${what}` }));
-const newestFirst = (rows) => rows.slice(-SHOWN).reverse();
+const newestFirst = (rows) => rows.slice().reverse();
 
 function responseSection(newest, later) {
   const bands = newest?.response ?? [];
@@ -42,10 +43,10 @@ function responseSection(newest, later) {
   return section(`Response over frequency; S holds at ${short(newest.reference_frequency_hz)} Hz`, box, table("Response over frequency", ["Hz", "Sxx", "Syy", "Szz"], rows));
 }
 
-function temperatureSection(calibrations, later) {
-  const known = calibrations.filter((c) => finite(c.reference_temperature_degc));
+function temperatureSection(last, whole, later) {
+  const known = whole.filter((c) => finite(c.reference_temperature_degc));
   if (!known.length) return section("Temperature", make("p", "The device measures no temperature."));
-  const box = boxOf("Temperature over time: of reference, and the range of the data"), last = known.at(-1);
+  const box = boxOf("Temperature over time: of reference, and the range of the data");
   const keys = [["of reference", "reference_temperature_degc"], ["lowest", "temperature_low_degc"], ["highest", "temperature_high_degc"]];
   later.push(() => curves(box, "Temperature, °C", known.map((c) => c.t_utc_ns / 1e9), keys.map(([label, key]) => ({ label, values: known.map((c) => c[key]) })), false, true));
   const told = `Q holds at ${short(last.reference_temperature_degc)} °C; data from ${short(last.temperature_low_degc)} to ${short(last.temperature_high_degc)} °C.`;
@@ -76,12 +77,19 @@ function inForceSection(place, newest) {
   return section("In force", table("In force", ["Parameter", "Value", "U (k = 2)", "Unit", "Determined by data"], rows), csv(place, "calibration"));
 }
 
-function adviceSection(place, advice) {
-  const rows = advice.map((a) => [a.subject, a.interval_days === null ? "not yet" : `${short(a.interval_days)} days`, a.due_utc_ns ? at(a.due_utc_ns) : "", a.reason]);
-  return section("When to look again", make("p", "Interval in which a change stays within the limit with 95 %, from the history (control chart, ILAC-G24)."), table("When to look again", ["Of", "Interval", "Due (UTC)", "Reasoning"], rows), make("p", make("a", "CSV", { href: `advice.csv?${place}` })));
+// The advice looks at the peers too, so it comes later than the rest.
+function adviceSection(place) {
+  const box = make("div", "is being computed");
+  get(`api/advice?${place}`).then((advice) => box.replaceChildren(adviceTable(advice)), () => box.replaceChildren(text("not known")));
+  return section("When to look again", make("p", "Interval in which a change stays within the limit with 95 %, from the history (control chart, ILAC-G24)."), box, make("p", make("a", "CSV", { href: `advice.csv?${place}` })));
 }
 
-function sections(place, told, advice, later) {
+function adviceTable(advice) {
+  const rows = advice.map((a) => [a.subject, a.interval_days === null ? "not yet" : `${short(a.interval_days)} days`, a.due_utc_ns ? at(a.due_utc_ns) : "", a.reason]);
+  return table("When to look again", ["Of", "Interval", "Due (UTC)", "Reasoning"], rows);
+}
+
+function sections(place, told, whole, later) {
   const gateway = `${place.get("site")}/${place.get("gateway")}`, sensor = place.get("sensor");
   const { calibration, window, drift, status, estimate, clock } = told, newest = calibration.at(-1);
   const order = (verb, sequence) => ({ gateway, sensor, verb, arguments: { sequence } });
@@ -89,12 +97,12 @@ function sections(place, told, advice, later) {
   return [
     inForceSection(place, newest),
     section("Drift", table("Drift", ["UTC", "Parameter", "Verdict", "Since", "Reason"], newestFirst(drift).map((r) => [at(r.t_utc_ns), r.parameter, r.verdict, r.verdict === "stable" ? "" : at(r.onset_utc_ns), r.reason])), csv(place, "drift")),
-    adviceSection(place, advice),
+    adviceSection(place),
     section("Estimates that are not in force", table("Estimates", ["UTC", "Number", "Why not in force", "Accept"], newestFirst(estimate).map((r) => [at(r.t_utc_ns), r.sequence, r.reason, opener(`Accept ${r.sequence}`, order("accept", r.sequence))])), csv(place, "estimate")),
     section("History of calibrations", table("Calibrations", ["UTC", "Number", "Windows", "Method", "Roll back"], newestFirst(calibration).map((r, i) => [at(r.t_utc_ns), r.sequence, r.windows, r.method, i === 0 ? "in force" : opener(`Roll back to ${r.sequence}`, order("rollback", r.sequence))]))),
     responseSection(newest, later),
     spaceSection(newest, later),
-    temperatureSection(calibration, later),
+    temperatureSection(newest, whole, later),
     section("Status", table("Status", ["UTC", "Status", "Reason"], newestFirst(status).map((r) => [at(r.t_utc_ns), r.status, r.reason])), csv(place, "status")),
     section("Windows", table("Windows", ["UTC", "Position", "Verdict", "Reason", "Numbers"], newestFirst(window).map((r) => [at(r.t_utc_ns), r.position, r.used ? "used" : "refused", r.reason, numbers(r)])), csv(place, "window")),
     devicesSection(newest, clock),
@@ -143,17 +151,17 @@ export async function showSensor(told, go) {
   const mine = current;
   if (mine.changed !== (row?.changed ?? 0)) {
     mine.changed = row?.changed ?? 0;
-    const [advice, ...results] = await Promise.all([get(`api/advice?${place}`), ...KINDS.map((what) => get(`api/history?${place}&what=${what}`))]);
+    const [whole, ...results] = await Promise.all([get(`api/spread?${place}`), ...KINDS.map((what) => get(`api/history?${place}&what=${what}&limit=${NEWEST}`))]);
     if (current !== mine) return;
     const found = Object.fromEntries(KINDS.map((what, i) => [what, results[i]])), later = [];
-    mine.last = (found.calibration.at(-1)?.t_utc_ns ?? 0) / 1e9;
-    mine.plots.update(found.calibration.map((c) => c.t_utc_ns / 1e9), seriesOf(found.calibration, found.drift));
-    $("details").replaceChildren(...sections(place, found, advice, later));
+    mine.last = (whole.at(-1)?.t_utc_ns ?? 0) / 1e9;
+    mine.plots.update(whole.map((c) => c.t_utc_ns / 1e9), seriesOf(whole, found.drift));
+    $("details").replaceChildren(...sections(place, found, whole, later));
     for (const draw of later) draw();
   }
-  const days = Number(now.get("days")), zoom = now.has("from") && now.has("to");
+  const days = Number(now.get("days")), from = Number(now.get("from")), to = Number(now.get("to")), zoom = from > 0 && to > from;
   $("span").value = zoom ? "zoom" : now.get("days") ?? "";
-  const range = zoom ? [Number(now.get("from")), Number(now.get("to"))] : days > 0 ? [mine.last - 86400 * days, mine.last] : null;
+  const range = zoom ? [from, to] : days > 0 ? [mine.last - 86400 * days, mine.last] : null;
   if (`${range}` !== `${mine.plots.range}`) mine.plots.setRange(range);
 }
 
