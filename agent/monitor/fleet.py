@@ -9,6 +9,7 @@ from typing import Any
 
 import msgspec
 
+from agent.core.events import RESULTS
 from agent.delivery.keys import CHUNK, Address
 from calib.model import PARAMETERS
 
@@ -20,6 +21,8 @@ GATEWAYS_MAX = 10_000
 TEXT_MAX = 500  # characters of a reason that are shown; the program's own have some 100
 EVENTS_MAX = 500  # changes of status, verdicts and commands that the page lists, the newest
 LARGEST_TOLD = 16 << 10  # bytes of what a gateway says of itself; with four devices it has 2 kB
+
+SHOWN = {"status", "calibration", "good window"}  # a sensor of which none is known, and no drift, has no row
 
 Place = tuple[str, str, str]  # site, gateway, sensor
 
@@ -48,6 +51,7 @@ class Fleet:
         self._told: dict[tuple[str, str], GatewayTold] = {}
         self._gateways: set[tuple[str, str]] = set()
         self._changed: dict[Place, int] = {}  # `version` at the last change of each sensor
+        self._made: dict[Place, tuple[str, dict[str, Any]]] = {}  # the row of each sensor, for a state of its gateway
         self._events: deque[dict[str, Any]] = deque(maxlen=EVENTS_MAX)
         self._alarms: deque[dict[str, Any]] = deque(maxlen=EVENTS_MAX)
         self._mutex = threading.Lock()
@@ -73,13 +77,14 @@ class Fleet:
             "drift": f"drift {fields.get('parameter')}",
             "window": "good window" if fields.get("used") else "refused window",
         }.get(what, what)
-        if what == "drift" and fields["parameter"] not in PARAMETERS:
+        if what not in RESULTS or (what == "drift" and fields["parameter"] not in PARAMETERS):
             return
         with self._mutex:
             self._knows((site, gateway))
             self._newest.setdefault((site, gateway, sensor), {})[part] = fields
             self.version += 1
             self._changed[site, gateway, sensor] = self.version
+            self._made.pop((site, gateway, sensor), None)
         if told := _told_of(what, fields):
             self.note(
                 site, gateway, sensor, what, fields["t_utc_ns"], told, alarm=fresh and _needs_a_person(what, fields)
@@ -143,10 +148,9 @@ class Fleet:
         """One row for each sensor; those that need a person first, then by the worst change."""
         with self._mutex:
             rows = [
-                _row(place, newest, self._state_of(place[:2])) | {"changed": self._changed[place]}
+                self._row_of(place)
                 for place, newest in self._newest.items()
-                if newest.keys() & {"status", "calibration", "good window"}
-                or any(part.startswith("drift ") for part in newest)
+                if any(part in SHOWN or part.startswith("drift ") for part in newest)
             ]
         return sorted(
             rows, key=lambda r: (not r["why"], -(r["change_in_u"] or 0), r["site"], r["gateway"], r["sensor"])
@@ -162,6 +166,14 @@ class Fleet:
                 for place in self._gateways | {_place(source) for source in refused}
             ]  # fmt: skip
         return sorted(rows, key=lambda r: (not r["why"], r["site"], r["gateway"]))
+
+    def _row_of(self, place: Place) -> dict[str, Any]:
+        state = self._state_of(place[:2])
+        made = self._made.get(place)
+        if made is None or made[0] != state:
+            row = _row(place, self._newest[place], state) | {"changed": self._changed[place]}
+            made = self._made[place] = state, row
+        return made[1]
 
     def _state_of(self, gateway: tuple[str, str]) -> str:
         if gateway not in self._alive:

@@ -12,9 +12,10 @@ from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from starlette.applications import Starlette
 from starlette.requests import Request
-from starlette.responses import JSONResponse, Response, StreamingResponse
+from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
@@ -113,7 +114,7 @@ class _Data:
                "verifies": following.keys is not None}  # fmt: skip
         bus["notices"] = self._notifier.fault if self._notifier is not None else ""
         told = {"sensors": fleet.rows(), "gateways": fleet.gateways(following.refused), "bus": bus}
-        return JSONResponse(told | {"plan": None if self._plan is None else dict(self._plan.positions)})
+        return _json(told | {"plan": None if self._plan is None else dict(self._plan.positions)})
 
     def plan(self, _: Request) -> Response:
         if self._plan is None:
@@ -128,24 +129,24 @@ class _Data:
         return _csv("fleet.csv", self._fleet.rows())
 
     def events(self, _: Request) -> Response:
-        return JSONResponse(self._fleet.events())
+        return _json(self._fleet.events())
 
     def events_csv(self, _: Request) -> Response:
         return _csv("events.csv", self._fleet.events())
 
     def advice(self, request: Request) -> Response:
-        return JSONResponse(self._advisor.advice(_place(request)))
+        return _json(self._advisor.advice(_place(request)))
 
     def advice_csv(self, request: Request) -> Response:
         return _csv("advice.csv", self._advisor.advice(_place(request)))
 
     def history(self, request: Request) -> Response:
-        return JSONResponse(self._history(request))
+        return _json(self._history(request))
 
     def spread(self, request: Request) -> Response:
         """Calibrations from the whole history, for plots."""
         rows = self._database.spread(*_place(request), "calibration", HISTORY_MAX)
-        return JSONResponse([{name: row[name] for name in PLOTTED if name in row} for row in rows])
+        return _json([{name: row[name] for name in PLOTTED if name in row} for row in rows])
 
     def gateways_csv(self, _: Request) -> Response:
         return _csv("gateways.csv", self._fleet.gateways(self._following.refused))
@@ -181,6 +182,10 @@ class _Data:
 def _place(request: Request) -> Place:
     site, gateway, sensor = (request.query_params.get(name, "") for name in ("site", "gateway", "sensor"))
     return site, gateway, sensor
+
+
+def _json(told: object) -> Response:
+    return Response(msgspec.json.encode(told), 200, None, "application/json")
 
 
 def _csv(name: str, rows: list[dict[str, Any]]) -> Response:

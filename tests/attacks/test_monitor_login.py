@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import socket
 import stat
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
@@ -18,6 +20,8 @@ from agent.cli.monitor import monitor
 from agent.commanding.network import serve_queries
 from agent.delivery.keys import gateway_key
 from agent.delivery.session import session_config
+from agent.keys.certificates import issue, make_authority
+from agent.keys.files import write_new
 from tests.unit.command_desk import GATEWAY, DeskSite, sealed
 from tests.unit.zenoh_site import Site
 
@@ -241,3 +245,25 @@ def test_add_user_reads_the_password_from_the_standard_input(tmp_path: Path) -> 
 def test_passwords_are_not_taken_over_plain_http_from_the_network(users: Path) -> None:
     done = CliRunner().invoke(monitor, ["--users", str(users), "--listen", "0.0.0.0:8460"])
     assert (done.exit_code, "needs HTTPS" in done.output) == (2, True)
+
+
+def test_what_cannot_be_served_is_told_in_one_line(site: Site, tmp_path: Path) -> None:
+    authority = make_authority("authority", 10, datetime.now(UTC))
+    others = [issue(authority, "fleet", 10, datetime.now(UTC), ["127.0.0.1"]) for _ in range(2)]
+    write_new(tmp_path, {"a.pem": others[0].certificate_pem, "a.key": others[0].key_pem, "b.key": others[1].key_pem})
+    (tmp_path / "empty.keys").write_text("gateway nonsense\n")
+    certificate = ["--https-certificate", str(tmp_path / "a.pem")]
+    with closing(socket.create_server(("127.0.0.1", 0))) as taken:
+        port = taken.getsockname()[1]
+        for options, status, words in (
+            (certificate, 2, "must be given together"),
+            ([*certificate, "--https-key", str(tmp_path / "b.key")], 2, "not a certificate in PEM of the key"),
+            (["--keys", str(tmp_path / "empty.keys")], 2, "line 1: not `gateway"),
+            (["--users", str(tmp_path / "none.txt")], 2, "cannot be read"),
+            (["--listen", f"127.0.0.1:{port}"], 1, "Address already in use"),
+        ):
+            where = ["--connect", site.endpoint, "--data-dir", str(tmp_path / "data")]
+            done = CliRunner().invoke(monitor, [*where, *options], standalone_mode=False)
+            said = done.output + str(done.exception or "")
+            assert (words in said, "Traceback" in said) == (True, False), said
+            assert (done.return_value or 2) == status

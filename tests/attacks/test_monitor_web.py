@@ -95,10 +95,12 @@ def test_invented_names_and_numbers_of_sensors_are_bounded(monkeypatch: pytest.M
     assert takes("site", "gw", "s1")
     for k in range(100):
         fleet.take("site", "gw", "s0", "drift", {"parameter": f"S{k}", "verdict": "stepped", "reason": "", "change": 1})
+        fleet.take("site", "gw", "s0", f"invented{k}", {"sequence": k})
         fleet.set_alive("site", f"invented{k}", True)
         fleet.set_told("site", "gw", b"[" * 100_000)
         fleet.set_told("site", "gw", b'{"state": "running", "reasons": [], "t_utc_ns": 1' + b" " * 100_000 + b"}")
     assert len(fleet.rows()) == 3
+    assert set(fleet._newest["site", "gw", "s0"]) == {"status"}
     assert [row["gateway"] for row in fleet.gateways({})] == ["gw", "gw2"]
     assert {row["state"] for row in fleet.gateways({})} == {""}
     assert all(len(row["why"]) < 2 * fleet_module.TEXT_MAX for row in fleet.rows())

@@ -119,6 +119,7 @@ export async function keysSection() {
     } catch (error) {
       told.replaceChildren(text(error.name === "ConstraintError" ? "this browser has a key of this name already" : error.message));
     }
+    file.value = "";
     await refresh();
   };
   const id = make("input", [], { id: "new-key", size: "12" });

@@ -92,11 +92,11 @@ function drawOnsets(plot) {
 export function curves(box, title, x, series, log, time = false) {
   const axis = axisOf(), drawn = [{}], data = [x], bands = [];
   series.forEach((one, i) => {
-    drawn.push({ label: one.label, stroke: COLOURS[i], width: one.u ? 2 : 1, points: { show: Boolean(one.u) } });
+    drawn.push({ label: one.label, stroke: COLOURS[i], width: one.u ? 2 : 1, points: { show: x.length < 60 } });
     data.push(one.values);
     if (!one.u) return;
     for (const k of [2, -2]) {
-      drawn.push({ label: `${one.label} ${k > 0 ? "+" : "-"}U`, stroke: `${COLOURS[i]}66` });
+      drawn.push({ label: `${one.label} ${k > 0 ? "+" : "-"}U`, stroke: `${COLOURS[i]}66`, points: { show: false } });
       data.push(one.values.map((v, j) => v + k * one.u[j]));
     }
     bands.push({ series: [drawn.length - 2, drawn.length - 1], fill: `${COLOURS[i]}22` });
