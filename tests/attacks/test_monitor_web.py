@@ -8,7 +8,6 @@ from pathlib import Path
 
 import msgspec
 import pytest
-import zenoh
 from msgspec import structs
 
 from agent.core.events import DriftReport, Estimate, Result, SharedError
@@ -127,16 +126,16 @@ def test_with_a_list_of_keys_only_signed_results_are_shown(site: Site, tmp_path:
         forger.stop()
 
 
-def test_without_a_list_results_are_shown_as_not_verified(site: Site, tmp_path: Path) -> None:
-    gateway = Gateway(site, tmp_path / "gw")
+def test_without_a_list_results_are_shown_as_not_verified_whatever_they_claim(site: Site, tmp_path: Path) -> None:
+    gateway = Gateway(site, tmp_path / "gw", None)
+    claims = record(gateway.store.last_sequence() + 1, "calibration", signed_by="0123456789abcdef")
     try:
-        with Served(site, tmp_path / "monitor") as served, site.client() as stranger:
-            gateway.send(1)
-            claims = record(9).payload.replace(b'"used"', b'"signed_by":"KNOWN","used"')
+        with Served(site, tmp_path / "monitor") as served:
+            gateway.store.commit([claims])
+            gateway.publisher.publish(claims)
             wait_for(lambda: [row["verified"] for row in served.ask("/api/fleet").json["sensors"]] == [False])
-            stranger.put("fieldcal/v1/site/gw/mems/window", claims, attachment=zenoh.ZBytes(b"1"))
-            wait_for(lambda: served.ask("/api/fleet").json["bus"]["unconfirmed"] == 1)
-            assert not any(row["verified"] for row in served.ask("/api/fleet").json["sensors"])
+            kept = served.ask("/api/history?site=site&gateway=gw&sensor=mems&what=calibration").json
+            assert [result["signed_by"] for result in kept] == [""]
     finally:
         gateway.stop()
 
