@@ -109,6 +109,12 @@ def test_a_drifting_sensor_rises_is_sorted_opened_and_zoomed(site: Site, tmp_pat
             page.get_by_role("button", name="PNG").last.click()
         assert saved.value.path().read_bytes().startswith(b"\x89PNG")
         assert serious_faults(page) == []
+        page.set_viewport_size({"width": 390, "height": 800})  # a phone: the reason fits
+        watched.open().locator("#rows .why").first.wait_for()
+        edges = page.locator("#rows td").evaluate_all(
+            "cells => cells.map((cell) => cell.getBoundingClientRect().right)"
+        )
+        assert 200 < max(edges) <= 390
         for view in ("events", "keys"):
             watched.open(f"#view={view}").locator(f"#{view}:visible").wait_for()
             assert serious_faults(page) == []
