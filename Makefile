@@ -22,9 +22,10 @@ run: $(VENV)/runtime  ## the agent on the virtual bench, with a router beside it
 
 # A shell ignores SIGINT in what it runs in the background, so the monitor is ended with SIGTERM.
 fleet: $(VENV)/development  ## router, fleet page and a simulated fleet of 40 sensors, of a year in six minutes; until Ctrl-C
-	@directory=$$(mktemp -d); $(BIN)/fieldcal monitor --router --data-dir $$directory & monitor=$$!; \
+	@directory=$$(mktemp -d); touch $$directory/known.keys; \
+	$(BIN)/fieldcal monitor --router --data-dir $$directory --keys $$directory/known.keys & monitor=$$!; \
 	trap 'kill $$monitor 2>/dev/null; wait $$monitor; rm -r $$directory' EXIT; trap : INT TERM; \
-	$(BIN)/fieldcal simulate --fleet 10 --sensors 4 --every 1 --age 365 --speed 86400
+	$(BIN)/fieldcal simulate --fleet 10 --sensors 4 --every 1 --age 365 --speed 86400 --keys $$directory/known.keys
 
 # Tests of running programs against the clock can fail where other work delays them. What failed runs once more, alone.
 once_more = { test $$? = 1 && $(BIN)/python -m pytest --last-failed --last-failed-no-failures none $(1); }

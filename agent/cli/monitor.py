@@ -3,31 +3,89 @@
 from __future__ import annotations
 
 import ipaddress
+import socket
 import sqlite3
-from contextlib import ExitStack, closing
+import ssl
+import sys
+import threading
+from collections.abc import Callable
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
+from typing import Any
 
 import click
 
 from agent.cli.tls_options import tls_files, tls_options
+from agent.commanding.arguments import VERBS
+from agent.config.key_file import KeyFileError, read_private_key
+from agent.config.known_keys import read_known_keys
+from agent.config.reading import ConfigError
 from agent.delivery.router import DEFAULT_ENDPOINT, open_router, router_running
 from agent.delivery.session import EndpointError
 from agent.terminal.text import say
 
+_FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
+_NEEDS = "fieldcal monitor: the page needs the extra monitor; install it with: fieldcal extras --install monitor"
+
+
+_OPTIONS: list[Callable[[Callable[..., Any]], Callable[..., Any]]] = [
+    click.option("--connect", "endpoints", multiple=True, default=[DEFAULT_ENDPOINT], show_default=True,
+                 metavar="ENDPOINT", help="Router; may be given several times."),
+    click.option("--listen", default="127.0.0.1:8460", show_default=True, metavar="HOST:PORT",
+                 help="Where the page is."),
+    click.option("--router", "with_router", is_flag=True,
+                 help=f"Start a router at {DEFAULT_ENDPOINT} unless one runs."),
+    click.option("--data-dir", type=click.Path(file_okay=False, path_type=Path), default=Path("monitor"),
+                 show_default=True, help="Where the database is kept."),
+    click.option("--keys", type=_FILE, metavar="F",
+                 help="List of known keys; results that no key of their gateway signed are refused and counted."),
+    click.option("--host", "names", multiple=True, metavar="NAME", help="Name by which browsers reach this server, "
+                 "besides localhost and IP addresses; may be given several times."),
+    click.option("--users", type=click.Path(dir_okay=False, path_type=Path), metavar="F",
+                 help="File of users: the page then needs a login."),
+    click.option("--add-user", metavar="NAME", help="Add a user to the file --users, or replace one, and end. Asks for "
+                 "the password, or reads it from the standard input."),
+    click.option("--verb", "verbs", multiple=True, type=click.Choice(VERBS),
+                 help="With --add-user: a command that the page forwards for this user; may be given several times."),
+    click.option("--config", "config_file", type=_FILE, metavar="F",
+                 help="Plan of the structure, and who gets notices (TOML)."),
+    click.option("--https-certificate", type=_FILE, metavar="F",
+                 help="Certificate of the web server (PEM), for HTTPS."),
+    click.option("--https-key", type=_FILE, metavar="F", help="Private key of --https-certificate (PEM)."),
+    click.option("--behind-proxy", is_flag=True, help="A web server on this machine does HTTPS and passes requests on: "
+                 "believe its X-Forwarded-For and X-Forwarded-Proto."),
+    click.option("--command-certificate", type=click.Path(exists=True, dir_okay=False), metavar="F",
+                 help="Certificate of a commander (PEM) for the router, see `fieldcal keys`; default: --certificate."),
+    click.option("--command-key", type=click.Path(exists=True, dir_okay=False), metavar="F",
+                 help="Private key of --command-certificate (PEM)."),
+    tls_options,
+]  # fmt: skip
+
+
+def _options(command: Callable[..., Any]) -> Callable[..., Any]:
+    for option in reversed(_OPTIONS):
+        command = option(command)
+    return command
+
 
 @click.command()
-@click.option("--connect", "endpoints", multiple=True, default=[DEFAULT_ENDPOINT], show_default=True,
-              metavar="ENDPOINT", help="Router; may be given several times.")  # fmt: skip
-@click.option("--listen", default="127.0.0.1:8460", show_default=True, metavar="HOST:PORT", help="Where the page is.")
-@click.option("--router", "with_router", is_flag=True, help=f"Start a router at {DEFAULT_ENDPOINT} unless one runs.")
-@click.option("--data-dir", type=click.Path(file_okay=False, path_type=Path), default=Path("monitor"),
-              show_default=True, help="Where the database is kept.")  # fmt: skip
-@tls_options
+@_options
 def monitor(
     endpoints: tuple[str, ...],
     listen: str,
     with_router: bool,
     data_dir: Path,
+    keys: Path | None,
+    names: tuple[str, ...],
+    users: Path | None,
+    add_user: str | None,
+    verbs: tuple[str, ...],
+    config_file: Path | None,
+    https_certificate: Path | None,
+    https_key: Path | None,
+    behind_proxy: bool,
+    command_certificate: str | None,
+    command_key: str | None,
     ca: str | None,
     certificate: str | None,
     certificate_key: str | None,
@@ -37,36 +95,112 @@ def monitor(
         import uvicorn
 
         from agent.monitor.server import application
+        from agent.monitor.users import UsersError
     except ImportError:
-        say("fieldcal monitor: the page needs starlette and uvicorn; install them with: "
-            "fieldcal extras --install monitor", err=True)  # fmt: skip
+        say(_NEEDS, err=True)
         return 1
     from agent.monitor.database import Database
     from agent.monitor.fleet import Fleet
     from agent.monitor.following import Following
+    from agent.monitor.forwarding import Forwarding
+    from agent.monitor.live import Live
+    from agent.monitor.login import Access
+    from agent.monitor.notices import Notifier, Watch
+    from agent.monitor.settings import MonitorSettings, load_settings
 
+    if add_user is not None:
+        return _add_user(users, add_user, verbs)
     host, port = _listen(listen)
+    _check_https(https_certificate, https_key)
+    if users is not None and not (https_certificate or behind_proxy or _is_loopback(host)):
+        raise click.UsageError(
+            "--users on an address that is not loopback needs HTTPS, because passwords could be read on the way; "
+            "give --https-certificate and --https-key, or --behind-proxy"
+        )
     tls = tls_files(endpoints, ca, certificate, certificate_key)
+    commander = tls_files(endpoints, ca, command_certificate or certificate, command_key or certificate_key)
     with ExitStack() as stack:
         try:
+            if keys is not None:
+                read_known_keys(keys)
+            settings = load_settings(config_file) if config_file is not None else MonitorSettings()
+            access = Access(users)
             if with_router and not router_running(DEFAULT_ENDPOINT):
                 stack.enter_context(open_router(None)[0])
             data_dir.mkdir(parents=True, exist_ok=True)
             database = stack.enter_context(closing(Database(data_dir / "monitor.sqlite")))
             fleet = Fleet()
-            following = stack.enter_context(closing(Following(endpoints, tls, database, fleet)))
-        except EndpointError as error:
+            following = stack.enter_context(closing(Following(endpoints, tls, database, fleet, keys)))
+        except (ConfigError, EndpointError, KeyFileError, UsersError) as error:
             say(f"fieldcal monitor: {error}", err=True)
             return 2
         except sqlite3.Error as error:
             say(f"fieldcal monitor: {data_dir / 'monitor.sqlite'}: {error}", err=True)
             return 1
-        say(f"the fleet page is at http://{listen}")
-        if not _is_loopback(host):
-            say("anyone who reaches this address can read the page: it has no login", err=True)
-        app = application(database, fleet, following)
-        uvicorn.run(app, host=host, port=port, log_level="warning", timeout_graceful_shutdown=1, server_header=False)
+        stopping = threading.Event()
+        forwarding, live = Forwarding(endpoints, commander, access, fleet), Live(endpoints, tls, stopping)
+        notifier = None
+        if settings.notices is not None:
+            shown = (ca, certificate, command_certificate, https_certificate)
+            watch = Watch(fleet, settings.notices, [Path(path) for path in shown if path is not None])
+            notifier = stack.enter_context(closing(Notifier(watch, settings.notices)))
+        app = application(
+            database, fleet, following, access, forwarding, live, stopping, names, settings.plan, notifier
+        )
+        served = uvicorn.Config(app, log_level="warning", timeout_graceful_shutdown=2, server_header=False,
+                                  ssl_certfile=https_certificate, ssl_keyfile=https_key,
+                                  proxy_headers=behind_proxy, forwarded_allow_ips="127.0.0.1,::1")  # fmt: skip
+        try:
+            listening = socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+        except OSError as error:
+            say(f"fieldcal monitor: {listen}: {error.strerror or error}", err=True)
+            return 1
+        say(f"the fleet page is at http{'s' if https_certificate else ''}://{listen}")
+        if users is None and not _is_loopback(host):
+            say("anyone who reaches this address can read the page: it has no login (option --users)", err=True)
+
+        class Server(uvicorn.Server):
+            """Ends the streams of open pages at Ctrl-C."""
+
+            def handle_exit(self, sig: int, frame: Any) -> None:
+                stopping.set()
+                super().handle_exit(sig, frame)
+
+        with suppress(KeyboardInterrupt):
+            Server(served).run([listening])
     return 0
+
+
+def _add_user(users: Path | None, name: str, verbs: tuple[str, ...]) -> int:
+    from agent.monitor.users import UsersError, set_user
+
+    if users is None:
+        raise click.UsageError("--add-user needs --users, the file to which the user is added")
+    if sys.stdin.isatty():
+        password = click.prompt(f"password of {name}", hide_input=True, confirmation_prompt=True)
+    else:
+        password = sys.stdin.readline().rstrip("\n")
+    try:
+        set_user(users, name, verbs, password)
+    except UsersError as error:
+        say(f"fieldcal monitor: {error}", err=True)
+        return 2
+    say(f"{users}: {name} may read{''.join(f', {verb}' for verb in verbs)}")
+    return 0
+
+
+def _check_https(certificate: Path | None, key: Path | None) -> None:
+    if (certificate is None) != (key is None):
+        raise click.UsageError("--https-certificate and --https-key must be given together")
+    if certificate is None or key is None:
+        return
+    try:
+        read_private_key(key)
+        ssl.create_default_context(ssl.Purpose.CLIENT_AUTH).load_cert_chain(certificate, key)
+    except KeyFileError as error:
+        raise click.UsageError(str(error)) from None
+    except (OSError, ssl.SSLError):
+        raise click.UsageError(f"{certificate}: not a certificate in PEM of the key {key}") from None
 
 
 def _listen(listen: str) -> tuple[str, int]:

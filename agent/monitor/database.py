@@ -66,6 +66,16 @@ class Database:
         )
         return [msgspec.json.decode(payload) for (payload,) in reversed(rows)]
 
+    def spread(self, site: str, gateway: str, sensor: str, what: str, most: int) -> list[dict[str, Any]]:
+        """At most `most` results of one kind of a sensor, evenly from its whole history, the newest among them."""
+        rows = self._rows(
+            "SELECT payload FROM result WHERE rowid IN (SELECT max(rowid) FROM (SELECT rowid, ntile(?) OVER"
+            " (ORDER BY rowid) AS tile FROM result WHERE site = ? AND gateway = ? AND sensor = ? AND what = ?)"
+            " GROUP BY tile) ORDER BY rowid",
+            *(most, site, gateway, sensor, what),
+        )
+        return [msgspec.json.decode(payload) for (payload,) in rows]
+
     def close(self) -> None:
         """Close the file."""
         with self._mutex:

@@ -7,9 +7,11 @@ import sqlite3
 import threading
 from collections.abc import Sequence
 from contextlib import ExitStack
+from pathlib import Path
 
 import zenoh
 
+from agent.config.key_file import KeyFileError
 from agent.config.tls import TlsFiles
 from agent.delivery.consumer import Consumer
 from agent.delivery.keys import PREFIX, parse_key
@@ -27,11 +29,16 @@ class Following:
     """Takes all results from the routers at `endpoints`, in threads, until `close`.
 
     `unconfirmed` counts results that were not kept, because the store of their gateway did not have them.
+    `keys`: the list of known keys; results that their gateway did not sign are then refused.
     Raises EndpointError for an invalid endpoint.
     """
 
-    def __init__(self, endpoints: Sequence[str], tls: TlsFiles | None, database: Database, fleet: Fleet) -> None:
+    def __init__(
+        self, endpoints: Sequence[str], tls: TlsFiles | None, database: Database, fleet: Fleet, keys: Path | None = None
+    ) -> None:
         self.unconfirmed = 0
+        self.keys = keys
+        self._consumer: Consumer | None = None
         self.fault = ""  # why nothing is received or kept; "" where all is well
         self._endpoints, self._tls = endpoints, tls
         self._config = session_config("client", connect=endpoints, tls=tls)
@@ -39,9 +46,14 @@ class Following:
         self._stop = threading.Event()
         self._open = ExitStack()
         for place in database.newest():
-            fleet.take(*place)
+            fleet.take(*place, fresh=False)
         self._thread = threading.Thread(target=self._run, name="following", daemon=True)
         self._thread.start()
+
+    @property
+    def refused(self) -> dict[str, int]:
+        """The number of results that were not verified, by the gateway in whose name they were published."""
+        return self._consumer.refused if self._consumer is not None else {}
 
     def close(self) -> None:
         """End the threads."""
@@ -53,30 +65,42 @@ class Following:
         while not self._stop.is_set():
             try:
                 self._follow()
-            except (ConnectionError, zenoh.ZError, sqlite3.Error) as error:
+            except (ConnectionError, KeyFileError, zenoh.ZError, sqlite3.Error) as error:
                 self.fault = str(error)
                 _log.warning("monitor: %s", error)
             self._stop.wait(RECONNECT_S)
 
     def _follow(self) -> None:
-        consumer = Consumer(self._endpoints, last_sequence=self._database.last_sequence(), tls=self._tls)
+        last = self._database.last_sequence()
+        consumer = self._consumer = Consumer(self._endpoints, last_sequence=last, tls=self._tls, keys=self.keys)
         with consumer, zenoh.open(self._config) as session:
             self._open.callback(consumer.close)
             tokens = session.liveliness().declare_subscriber(
                 f"{PREFIX}/*/*/alive", zenoh.handlers.FifoChannel(TOKENS), history=True
             )
             threading.Thread(target=self._watch, args=(tokens,), name="presence", daemon=True).start()
+            told = session.declare_subscriber(f"{PREFIX}/*/*/status", zenoh.handlers.RingChannel(TOKENS))
+            threading.Thread(target=self._hear, args=(told,), name="health", daemon=True).start()
             self.fault = ""
             for result in consumer:
                 if not result.confirmed:
                     self.unconfirmed += 1
                     continue
-                self._database.add(result)
                 a = result.address
+                if not self._fleet.admits(a):
+                    continue
+                result.fields["signed_by"] = result.signed_by
+                self._database.add(result)
                 self._fleet.take(a.site, a.gateway, a.sensor, a.what, result.fields)
             tokens.undeclare()
+            told.undeclare()
 
     def _watch(self, tokens: zenoh.Subscriber[zenoh.Handler[zenoh.Sample]]) -> None:
         for token in tokens:
             if (address := parse_key(str(token.key_expr))) is not None:
                 self._fleet.set_alive(address.site, address.gateway, token.kind == zenoh.SampleKind.PUT)
+
+    def _hear(self, told: zenoh.Subscriber[zenoh.Handler[zenoh.Sample]]) -> None:
+        for sample in told:
+            if (address := parse_key(str(sample.key_expr))) is not None:
+                self._fleet.set_told(address.site, address.gateway, sample.payload.to_bytes())

@@ -6,97 +6,171 @@ import asyncio
 import csv
 import io
 import json
-from collections.abc import AsyncIterator
+import re
+import threading
+from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from starlette.applications import Starlette
 from starlette.requests import Request
-from starlette.responses import JSONResponse, Response, StreamingResponse
+from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
+from starlette.types import ASGIApp
 
+from agent.config.files import read_file
+from agent.monitor.advising import Advisor
 from agent.monitor.database import Database
-from agent.monitor.fleet import Fleet
+from agent.monitor.fleet import Fleet, Place
 from agent.monitor.following import Following
+from agent.monitor.forwarding import Forwarding
+from agent.monitor.guard import Guard
+from agent.monitor.live import Live
+from agent.monitor.login import Access
+from agent.monitor.notices import Notifier
+from agent.monitor.settings import PICTURES, Plan
 
 PAGE = Path(__file__).parent / "page"
-FILES = {
-    "": ("index.html", "text/html"),
-    "page.js": ("page.js", "text/javascript"),
-    "page.css": ("page.css", "text/css"),
-    "uPlot.iife.min.js": ("uPlot.iife.min.js", "text/javascript"),
-    "uPlot.min.css": ("uPlot.min.css", "text/css"),
-}
+TYPES = {".html": "text/html", ".svg": "image/svg+xml", ".js": "text/javascript", ".css": "text/css"}
+FILES = {path.name: TYPES[path.suffix] for path in PAGE.iterdir() if path.suffix in TYPES}
 HISTORY_MAX = 2000  # results of one kind that a page or a CSV file holds
+PLOTTED = (
+    "t_utc_ns", "sensitivity", "offset", "standard_uncertainty", "output_unit", "reference_temperature_degc",
+    "temperature_low_degc", "temperature_high_degc",
+)  # fmt: skip
+_NUMBER = re.compile(r"[0-9]{1,9}")
+LARGEST_PICTURE = 32 << 20  # bytes
 LISTENERS_MAX = 50  # pages that are told of changes at the same time
 TELL_S = 0.5  # s between two looks for a change
-HEADERS = {
-    "Content-Security-Policy": "default-src 'self'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'",
-    "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",
-    "Cache-Control": "no-store",
-}
 
 
-def application(database: Database, fleet: Fleet, following: Following) -> Starlette:
-    """The page, its data as JSON and CSV, and the stream of changes (server-sent events)."""
-    data = _Data(database, fleet, following)
-    return Starlette(
+def application(
+    database: Database,
+    fleet: Fleet,
+    following: Following,
+    access: Access,
+    forwarding: Forwarding,
+    live: Live,
+    stopping: threading.Event,
+    names: Sequence[str] = (),
+    plan: Plan | None = None,
+    notifier: Notifier | None = None,
+) -> ASGIApp:
+    """The page, its data as JSON and CSV, and the stream of changes (server-sent events).
+
+    `stopping` ends the streams, which a browser would keep open for ever. `names`: host names by which browsers reach
+    this server, besides localhost and IP addresses. `plan`: picture of the structure. `notifier`: its fault is shown.
+    """
+    data = _Data(database, fleet, following, stopping, plan, notifier)
+    app = Starlette(
         routes=[
-            Route("/api/fleet", data.sensors),
-            Route("/api/history", data.history),
-            Route("/api/changes", data.changes),
-            Route("/fleet.csv", data.sensors_csv),
-            Route("/sensor.csv", data.history_csv),
+            Route("/api/fleet", access.reading(data.sensors)),
+            Route("/api/history", access.reading(data.history)),
+            Route("/api/spread", access.reading(data.spread)),
+            Route("/gateways.csv", access.reading(data.gateways_csv)),
+            Route("/api/changes", access.reading_async(data.changes)),
+            Route("/plan", access.reading(data.plan)),
+            Route("/fleet.csv", access.reading(data.sensors_csv)),
+            Route("/sensor.csv", access.reading(data.history_csv)),
+            Route("/api/live", access.reading_async(live.stream)),
+            Route("/api/advice", access.reading(data.advice)),
+            Route("/advice.csv", access.reading(data.advice_csv)),
+            Route("/api/events", access.reading(data.events)),
+            Route("/events.csv", access.reading(data.events_csv)),
+            Route("/api/me", access.me),
+            Route("/api/login", access.log_in, methods=["POST"]),
+            Route("/api/logout", access.log_out, methods=["POST"]),
+            Route("/api/command", forwarding.command, methods=["POST"]),
             Route("/", _file),
             Route("/{name}", _file),
         ]
     )
+    return Guard(app, names)
 
 
 def _file(request: Request) -> Response:
-    found = FILES.get(request.path_params.get("name", ""))
-    if found is None:
-        return Response("no such page", 404, HEADERS)
-    return Response((PAGE / found[0]).read_bytes(), 200, HEADERS, found[1])
+    name = request.path_params.get("name", "index.html")
+    if name not in FILES:
+        return Response("no such page", 404)
+    return Response((PAGE / name).read_bytes(), 200, None, FILES[name])
 
 
 class _Data:
     """What the page asks for."""
 
-    def __init__(self, database: Database, fleet: Fleet, following: Following) -> None:
-        self._database, self._fleet, self._following = database, fleet, following
+    def __init__(
+        self, database: Database, fleet: Fleet, following: Following, stopping: threading.Event, plan: Plan | None,
+        notifier: Notifier | None,
+    ) -> None:  # fmt: skip
+        self._database, self._fleet, self._following, self._stopping = database, fleet, following, stopping
+        self._plan, self._notifier = plan, notifier
+        self._advisor = Advisor(database, fleet)
         self._listeners: set[object] = set()
 
     def sensors(self, _: Request) -> Response:
-        bus = {"fault": self._following.fault, "unconfirmed": self._following.unconfirmed}
-        return JSONResponse({"sensors": self._fleet.rows(), "bus": bus}, 200, HEADERS)
+        following, fleet = self._following, self._fleet
+        bus = {"fault": following.fault, "unconfirmed": following.unconfirmed, "left_out": fleet.left_out,
+               "verifies": following.keys is not None}  # fmt: skip
+        bus["notices"] = self._notifier.fault if self._notifier is not None else ""
+        told = {"sensors": fleet.rows(), "gateways": fleet.gateways(following.refused), "bus": bus}
+        return _json(told | {"plan": None if self._plan is None else dict(self._plan.positions)})
+
+    def plan(self, _: Request) -> Response:
+        if self._plan is None:
+            return Response("no plan is configured", 404)
+        try:
+            picture = read_file(self._plan.picture, LARGEST_PICTURE)
+        except OSError as error:
+            return Response(f"the picture cannot be read: {error.strerror}", 404)
+        return Response(picture, 200, None, PICTURES[self._plan.picture.suffix.lower()])
 
     def sensors_csv(self, _: Request) -> Response:
         return _csv("fleet.csv", self._fleet.rows())
 
+    def events(self, _: Request) -> Response:
+        return _json(self._fleet.events())
+
+    def events_csv(self, _: Request) -> Response:
+        return _csv("events.csv", self._fleet.events())
+
+    def advice(self, request: Request) -> Response:
+        return _json(self._advisor.advice(_place(request)))
+
+    def advice_csv(self, request: Request) -> Response:
+        return _csv("advice.csv", self._advisor.advice(_place(request)))
+
     def history(self, request: Request) -> Response:
-        return JSONResponse(self._history(request), 200, HEADERS)
+        return _json(self._history(request))
+
+    def spread(self, request: Request) -> Response:
+        """Calibrations from the whole history, for plots."""
+        rows = self._database.spread(*_place(request), "calibration", HISTORY_MAX)
+        return _json([{name: row[name] for name in PLOTTED if name in row} for row in rows])
+
+    def gateways_csv(self, _: Request) -> Response:
+        return _csv("gateways.csv", self._fleet.gateways(self._following.refused))
 
     def history_csv(self, request: Request) -> Response:
         return _csv("sensor.csv", self._history(request))
 
     def _history(self, request: Request) -> list[dict[str, Any]]:
         asked = request.query_params
-        site, gateway, sensor = (asked.get(name, "") for name in ("site", "gateway", "sensor"))
-        rows = self._database.history(site, gateway, sensor, asked.get("what", ""), HISTORY_MAX)
+        limit = asked.get("limit", "")
+        most = min(int(limit), HISTORY_MAX) if _NUMBER.fullmatch(limit) else HISTORY_MAX
+        rows = self._database.history(*_place(request), asked.get("what", ""), most)
         return [{name: value for name, value in row.items() if name != "covariance"} for row in rows]
 
     async def changes(self, _: Request) -> Response:
         if len(self._listeners) >= LISTENERS_MAX:
-            return Response("too many pages are open", 503, HEADERS)
-        return StreamingResponse(self._tell(), 200, HEADERS, "text/event-stream")
+            return Response("too many pages are open", 503)
+        return StreamingResponse(self._tell(), 200, None, "text/event-stream")
 
     async def _tell(self) -> AsyncIterator[str]:
         me, told = object(), -1
         self._listeners.add(me)
         try:
-            while True:
+            while not self._stopping.is_set():
                 if self._fleet.version != told:
                     told = self._fleet.version
                     yield f"data: {told}\n\n"
@@ -105,15 +179,22 @@ class _Data:
             self._listeners.discard(me)
 
 
+def _place(request: Request) -> Place:
+    site, gateway, sensor = (request.query_params.get(name, "") for name in ("site", "gateway", "sensor"))
+    return site, gateway, sensor
+
+
+def _json(told: object) -> Response:
+    return Response(msgspec.json.encode(told), 200, None, "application/json")
+
+
 def _csv(name: str, rows: list[dict[str, Any]]) -> Response:
     text = io.StringIO()
     columns = list(dict.fromkeys(column for row in rows for column in row))
     writer = csv.writer(text)
     writer.writerow(columns)
     writer.writerows([_cell(row.get(column)) for column in columns] for row in rows)
-    return Response(
-        text.getvalue(), 200, HEADERS | {"Content-Disposition": f'attachment; filename="{name}"'}, "text/csv"
-    )
+    return Response(text.getvalue(), 200, {"Content-Disposition": f'attachment; filename="{name}"'}, "text/csv")
 
 
 def _cell(value: Any) -> Any:

@@ -1,116 +1,116 @@
-"use strict";
-// Every text of the bus passes `text`, which makes text nodes alone; no string is ever read as HTML.
-const $ = (id) => document.getElementById(id);
-const text = (value) => document.createTextNode(value === null || value === undefined ? "" : String(value));
-function make(tag, children = [], attributes = {}) {
-  const element = document.createElement(tag);
-  for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
-  for (const child of [children].flat()) element.append(child instanceof Node ? child : text(child));
-  return element;
-}
-const ago = (ns) => {
-  if (!ns) return "never";
-  const s = Math.max(0, Date.now() / 1000 - ns / 1e9);
-  return s < 120 ? `${Math.round(s)} s` : s < 7200 ? `${Math.round(s / 60)} min` : s < 172800 ? `${Math.round(s / 3600)} h` : `${Math.round(s / 86400)} d`;
-};
-const COLUMNS = [
-  ["sensor", "Sensor", (r) => `${r.site}/${r.gateway}/${r.sensor}`],
-  ["status", "Status", (r) => r.status],
-  ["change", "Change in U", (r) => r.change_in_u ?? -1],
-  ["age", "Last good window", (r) => -(r.last_good_utc_ns ?? 0)],
-  ["gateway", "Gateway", (r) => (r.alive ? 1 : 0)],
-  ["why", "Why a person is needed", (r) => r.why],
-];
-const NAMES = ["S_xx", "S_xy", "S_xz", "S_yx", "S_yy", "S_yz", "S_zx", "S_zy", "S_zz", "Q_x", "Q_y", "Q_z"];
-let sensors = [];
-const view = () => new URLSearchParams(location.hash.slice(1));
-function go(changes) {
+// Which view is shown, who is logged in, and what changed.
+import { $, get, make, NeedsLogin, text, view } from "./common.js";
+import { keysSection, setUser } from "./commands.js";
+import { showEvents, showFleet, startFleet } from "./fleet.js";
+import { leaveSensor, showSensor, startSensor } from "./sensor.js";
+
+const VIEWS = ["fleet", "sensor", "events", "keys"];
+let told = null, me = { needs_login: false, user: "", verbs: [], token: "" }, changes = null, loading = false, again = false, keysShown = false;
+
+function go(given) {
   const next = view();
-  for (const [name, value] of Object.entries(changes)) value ? next.set(name, value) : next.delete(name);
+  for (const [name, value] of Object.entries(given)) value ? next.set(name, value) : next.delete(name);
   history.replaceState(null, "", `#${next}`);
   show();
 }
-function place(row) {
-  return new URLSearchParams({ site: row.site, gateway: row.gateway, sensor: row.sensor });
+
+async function show() {
+  if (!told) return;
+  const now = view(), chosen = now.has("sensor") ? "sensor" : VIEWS.includes(now.get("view")) ? now.get("view") : "fleet";
+  for (const id of VIEWS) $(id).hidden = id !== chosen;
+  for (const id of ["fleet", "events", "keys"]) id === chosen ? $(`to-${id}`).setAttribute("aria-current", "page") : $(`to-${id}`).removeAttribute("aria-current");
+  document.title = `fieldcal: ${chosen === "sensor" ? now.get("sensor") : chosen}`;
+  if (chosen !== "sensor") leaveSensor();
+  try {
+    if (chosen === "sensor") await showSensor(told, go);
+    else if (chosen === "events") showEvents(await get("api/events"));
+    else if (chosen === "keys" && !keysShown) $("key-rows").replaceChildren(...await keysSection());
+    else if (chosen === "fleet") showFleet(told);
+    keysShown = chosen === "keys";
+  } catch (error) {
+    failed(error);
+  }
 }
-function showFleet() {
-  const now = view(), column = COLUMNS.find(([id]) => id === now.get("sort")), down = now.get("down") === "1";
-  const wanted = (now.get("filter") ?? "").toLowerCase();
-  if ($("filter").value !== (now.get("filter") ?? "")) $("filter").value = now.get("filter") ?? "";
-  let rows = sensors.filter((r) => `${r.site}/${r.gateway}/${r.sensor} ${r.status} ${r.why}`.toLowerCase().includes(wanted));
-  if (column) rows.sort((a, b) => (column[2](a) < column[2](b) ? -1 : column[2](a) > column[2](b) ? 1 : 0) * (down ? -1 : 1));
-  COLUMNS.forEach(([id], i) => $("heads").children[i].setAttribute("aria-sort", now.get("sort") !== id ? "none" : down ? "descending" : "ascending"));
-  $("rows").replaceChildren(...rows.map((r) => make("tr", [
-    make("td", make("a", `${r.site}/${r.gateway}/${r.sensor}`, { href: `#${place(r)}` })),
-    make("td", r.status),
-    make("td", r.change_in_u === null ? "" : r.change_in_u.toFixed(1), { class: "number" }),
-    make("td", ago(r.last_good_utc_ns), { class: "number" }),
-    make("td", r.alive ? "on the bus" : "silent"),
-    make("td", r.why, { class: "why" }),
-  ])));
+
+function summary() {
+  const need = told.sensors.filter((row) => row.why).length, gateways = told.gateways.filter((g) => g.why).length, bus = told.bus;
+  return [
+    `Sensors: ${told.sensors.length}, of which need a person: ${need}`, gateways ? `gateways: ${told.gateways.length}, of which need a person: ${gateways}` : "",
+    bus.verifies ? "signatures are verified" : "signatures are not verified (option --keys)", bus.unconfirmed ? `${bus.unconfirmed} unconfirmed results` : "",
+    bus.left_out ? `${bus.left_out} results beyond the limits are not shown` : "", bus.fault, bus.notices,
+  ].filter(Boolean).join("; ");
 }
-async function showSensor(now) {
-  const names = new URLSearchParams(["site", "gateway", "sensor"].map((n) => [n, now.get(n) ?? ""]));
-  const get = async (what) => (await fetch(`api/history?${names}&what=${what}`)).json();
-  const [calibrations, windows, drifts, states] = await Promise.all(["calibration", "window", "drift", "status"].map(get));
-  if (view().toString() !== now.toString()) return;
-  $("name").replaceChildren(text(`${now.get("site")}/${now.get("gateway")}/${now.get("sensor")}`));
-  $("plots").replaceChildren(...NAMES.map((name) => make("div", [], { role: "img", "aria-label": `${name} over time with its k = 2 band` })));
-  const value = (c, i) => (i < 9 ? c.sensitivity[Math.floor(i / 3)][i % 3] : c.offset[i - 9]);
-  const style = getComputedStyle(document.body).color;
-  NAMES.forEach((name, i) => {
-    const box = $("plots").children[i], shift = (k) => calibrations.map((c) => value(c, i) === null || c.standard_uncertainty[i] === null ? null : value(c, i) + k * c.standard_uncertainty[i]);
-    const axis = { stroke: style, grid: { stroke: "#8884" }, ticks: { stroke: "#8884" } };
-    new uPlot({
-      title: `${name}, ${calibrations.at(-1)?.output_unit ?? ""}${i < 9 ? " per m/s²" : ""}`, width: box.clientWidth || 320, height: 200,
-      axes: [axis, { ...axis, size: 70 }],
-      series: [{}, { label: name, stroke: "#1a73e8", width: 2, points: { show: true } }, { label: "+U", stroke: "#1a73e888" }, { label: "-U", stroke: "#1a73e888" }],
-      bands: [{ series: [2, 3], fill: "#1a73e833" }],
-    }, [calibrations.map((c) => c.t_utc_ns / 1e9), shift(0), shift(2), shift(-2)], box);
-  });
-  const table = (title, what, heads, rows) => [
-    make("h3", [title, " ", make("a", "CSV", { href: `sensor.csv?${names}&what=${what}` })]),
-    make("div", make("table", [make("thead", make("tr", heads.map((h) => make("th", h, { scope: "col" })))),
-      make("tbody", rows.slice(-100).reverse().map((r) => make("tr", r.map((c) => make("td", c)))))]), { class: "wide" }),
-  ];
-  const at = (r) => Math.abs(r.t_utc_ns) > 8e21 ? "no time" : new Date(r.t_utc_ns / 1e6).toISOString().slice(0, 19).replace("T", " ");
-  $("tables").replaceChildren(
-    ...table("Drift", "drift", ["UTC", "Parameter", "Verdict", "Reason"], drifts.map((r) => [at(r), r.parameter, r.verdict, r.reason])),
-    ...table("Status", "status", ["UTC", "Status", "Reason"], states.map((r) => [at(r), r.status, r.reason])),
-    ...table("Calibrations", "calibration", ["UTC", "Number", "Windows", "Temperature"], calibrations.map((r) => [at(r), r.sequence, r.windows, r.reference_temperature_degc ?? "not measured"])),
-    ...table("Windows", "window", ["UTC", "Position", "Verdict", "Reason"], windows.map((r) => [at(r), r.position, r.used ? "used" : "refused", r.reason])));
+
+const say = (words) => { if ($("summary").textContent !== words) $("summary").replaceChildren(text(words)); };
+
+function failed(error) {
+  if (error instanceof NeedsLogin) return logIn();
+  say("the monitor does not answer");
+  return undefined;
 }
-function show() {
-  const now = view(), one = now.has("sensor");
-  $("fleet").hidden = one;
-  $("sensor").hidden = !one;
-  document.title = one ? `fieldcal: ${now.get("sensor")}` : "fieldcal: fleet";
-  one ? showSensor(now) : showFleet();
-}
-let loading = false, again = false;
+
 async function load() {
   if (loading) { again = true; return; }
   loading = true;
   try {
-    const answer = await (await fetch("api/fleet")).json();
-    sensors = answer.sensors;
-    const need = sensors.filter((r) => r.why).length;
-    $("summary").replaceChildren(text(`${sensors.length} sensors, ${need} need a person; ${answer.bus.unconfirmed} unconfirmed results${answer.bus.fault ? `; ${answer.bus.fault}` : ""}`));
-    show();
-  } catch { $("summary").replaceChildren(text("the monitor does not answer")); }
+    told = await get("api/fleet");
+    say(summary());
+    await show();
+  } catch (error) {
+    failed(error);
+  }
   loading = false;
   if (again) { again = false; setTimeout(load, 500); }
 }
-document.addEventListener("DOMContentLoaded", () => {
-  $("heads").replaceChildren(...COLUMNS.map(([id, title]) => {
-    const button = make("button", title, { type: "button" });
-    button.addEventListener("click", () => go({ sort: id, down: view().get("sort") === id && view().get("down") !== "1" ? "1" : "" }));
-    return make("th", button, { scope: "col" });
-  }));
-  $("filter").addEventListener("input", () => go({ filter: $("filter").value }));
-  addEventListener("hashchange", show);
-  const changes = new EventSource("api/changes");
+
+function follow() {
+  changes?.close();
+  changes = new EventSource("api/changes");
   changes.onmessage = load;
-  changes.onerror = () => $("summary").replaceChildren(text("the monitor does not answer"));
-  load();
+  changes.onerror = () => { say("the monitor does not answer"); if (changes.readyState === EventSource.CLOSED) setTimeout(begin, 2000); };
+}
+
+function logIn() {
+  changes?.close();
+  told = null;
+  for (const id of VIEWS) $(id).hidden = true;
+  $("user").replaceChildren();
+  $("login").hidden = false;
+  say("log in to see the fleet");
+}
+
+async function logOut() {
+  await fetch("api/logout", { method: "POST" });
+  await begin();
+}
+
+async function begin() {
+  try {
+    me = await get("api/me");
+  } catch {
+    say("the monitor does not answer");
+    setTimeout(begin, 2000);
+    return;
+  }
+  setUser(me);
+  if (me.needs_login && !me.user) { logIn(); return; }
+  $("login").hidden = true;
+  $("user").replaceChildren(...(me.user ? [text(`${me.user} `), make("button", "Log out", { type: "button", click: logOut })] : []));
+  follow();
+  await load();
+}
+
+$("login").addEventListener("submit", async (event) => {
+  event.preventDefault();
+  const fields = $("login").elements, given = { name: fields.name.value, password: fields.password.value };
+  const answer = await fetch("api/login", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(given) });
+  fields.password.value = "";
+  $("login-told").replaceChildren(text(answer.ok ? "" : await answer.text()));
+  if (answer.ok) await begin();
 });
+addEventListener("hashchange", show);
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { leaveSensor(); show(); });
+startFleet(go);
+startSensor(go);
+setInterval(() => { if (told && !$("fleet").hidden) showFleet(told); }, 30000); // ages grow without a change
+begin();

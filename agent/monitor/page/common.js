@@ -1,0 +1,47 @@
+// What all views use. Every text of the bus passes `text`, which makes text nodes alone: no string is read as HTML.
+export const $ = (id) => document.getElementById(id);
+// Control characters, and those that turn the direction of writing, are shown as such.
+const UNSEEN = /[\u0000-\u001f\u007f-\u009f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]/g;
+export const clean = (value) => (value === null || value === undefined ? "" : String(value).replace(UNSEEN, "\ufffd"));
+export const text = (value) => document.createTextNode(clean(value));
+
+export function make(tag, children = [], attributes = {}) {
+  const element = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) {
+    if (typeof value === "function") element.addEventListener(name, value);
+    else if (value !== false && value !== null) element.setAttribute(name, value === true ? "" : value);
+  }
+  for (const child of [children].flat()) element.append(child instanceof Node ? child : text(child));
+  return element;
+}
+
+export function ago(ns) {
+  if (!ns) return "never";
+  const s = Math.max(0, Date.now() / 1000 - ns / 1e9);
+  if (s < 120) return `${Math.round(s)} s`;
+  if (s < 7200) return `${Math.round(s / 60)} min`;
+  return s < 172800 ? `${Math.round(s / 3600)} h` : `${Math.round(s / 86400)} d`;
+}
+
+// UTC of a result. A stranger may send times that no date can hold.
+export const at = (ns) => (Math.abs(ns) > 8e21 ? "no time" : new Date(ns / 1e6).toISOString().slice(0, 19).replace("T", " "));
+
+// The view is in the address behind #, so that a link keeps it.
+export const view = () => new URLSearchParams(location.hash.slice(1));
+export const placeOf = (row) => new URLSearchParams({ site: row.site, gateway: row.gateway, sensor: row.sensor });
+
+export class NeedsLogin extends Error {}
+
+export async function get(path) {
+  const answer = await fetch(path);
+  if (answer.status === 401) throw new NeedsLogin();
+  if (!answer.ok) throw new Error(await answer.text());
+  return answer.json();
+}
+
+// A table with a caption for screen readers; cells are texts or elements.
+export function table(caption, heads, rows) {
+  const body = rows.map((row) => make("tr", row.map((cell) => make("td", cell === null ? "" : cell))));
+  const head = make("thead", make("tr", heads.map((title) => make("th", title, { scope: "col" }))));
+  return make("div", make("table", [make("caption", caption, { class: "hidden" }), head, make("tbody", body)]), { class: "wide", tabindex: "0", role: "region", "aria-label": caption });
+}

@@ -1,0 +1,112 @@
+"""The configuration of the monitor (`fieldcal monitor --config F`): the plan of the structure, and who gets notices."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from email.headerregistry import Address
+from pathlib import Path
+from typing import Annotated, Literal
+from urllib.parse import urlsplit
+
+from pydantic import AfterValidator, Field
+
+from agent.config.files import read_private_file
+from agent.config.reading import ConfigError, load_model
+from agent.config.section import Section
+
+PICTURES = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".webp": "image/webp"}
+LARGEST_SECRET = 4096
+Fraction = Annotated[float, Field(ge=0, le=1)]
+
+
+def _picture(path: Path) -> Path:
+    if path.suffix.lower() not in PICTURES:
+        raise ValueError(f"a picture is a file {', '.join(PICTURES)}")
+    return path
+
+
+def _url(url: str) -> str:
+    parts = urlsplit(url)
+    if parts.scheme not in ("https", "http") or not parts.hostname or parts.username or not url.isprintable():
+        raise ValueError("a webhook is https://HOST/PATH or http://HOST/PATH, without a user")
+    return url
+
+
+def _mail_address(text: str) -> str:
+    try:
+        address = Address(addr_spec=text)
+    except ValueError:
+        address = None
+    if address is None or not address.domain or not text.isprintable():
+        raise ValueError("not a mail address, such as operator@example.org")
+    return text
+
+
+MailAddress = Annotated[str, AfterValidator(_mail_address)]
+
+
+class Plan(Section):
+    """A picture, and where sensors (`<site>/<gateway>/<sensor>`) are on it: fractions of its width and height."""
+
+    picture: Annotated[Path, AfterValidator(_picture)]
+    positions: Mapping[str, tuple[Fraction, Fraction]]
+
+
+class Email(Section):
+    """A mail server and who writes to whom. `password_file`: its first line is the password of `user`."""
+
+    host: Annotated[str, Field(min_length=1)]
+    port: Annotated[int, Field(ge=1, le=65535)] = 587
+    security: Literal["starttls", "tls", "none"] = "starttls"
+    user: str = ""
+    password_file: Path | None = None
+    sender: MailAddress
+    recipients: Annotated[tuple[MailAddress, ...], Field(min_length=1, max_length=100)]
+
+
+class Notices(Section):
+    """Who is told of drift verdicts, a status that needs a person, silent gateways and certificates that end."""
+
+    silent_s: Annotated[
+        float, Field(ge=1, le=1e7, description="a gateway is told after it was off the bus for so long")
+    ] = 600.0
+    certificate_days: Annotated[float, Field(ge=1, le=3650, description="a certificate is told so long before")] = 30.0
+    webhooks: Annotated[tuple[Annotated[str, AfterValidator(_url)], ...], Field(max_length=20)] = ()
+    email: Email | None = None
+
+
+class MonitorSettings(Section):
+    """The whole file."""
+
+    plan: Plan | None = None
+    notices: Notices | None = None
+
+
+def load_settings(path: Path) -> MonitorSettings:
+    """Read the file. Names of files in it are relative to it. Raises ConfigError with all faults."""
+    settings = load_model(path, MonitorSettings)
+    faults, plan, notices = [], settings.plan, settings.notices
+    if plan is not None:
+        plan = plan.model_copy(update={"picture": path.parent / plan.picture})
+        if not plan.picture.is_file():
+            faults.append(f"{path}: plan.picture: there is no file {plan.picture}")
+    if notices is not None and notices.email is not None and notices.email.password_file is not None:
+        email = notices.email.model_copy(update={"password_file": path.parent / notices.email.password_file})
+        notices = notices.model_copy(update={"email": email})
+        try:
+            password_of(email)
+        except OSError as error:
+            faults.append(f"{path}: notices.email.password_file: {error.filename or ''} {error.strerror or error}")
+    if faults:
+        raise ConfigError(faults)
+    return MonitorSettings(plan=plan, notices=notices)
+
+
+def password_of(email: Email) -> str:
+    """The password of the user of a mail server. Raises OSError, also where other users can read its file."""
+    if email.password_file is None:
+        return ""
+    data, exposed = read_private_file(email.password_file, LARGEST_SECRET)
+    if exposed:
+        raise OSError(f"{email.password_file}: {exposed}")
+    return data.decode(errors="replace").split("\n", 1)[0]

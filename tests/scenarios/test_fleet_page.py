@@ -1,0 +1,226 @@
+"""A person at the fleet page, in a real browser: what rises to the top, views that a link keeps, and commands."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from agent.keys.files import SigningKey
+from tests.unit.browser import Watched, chromium, needs_chromium
+from tests.unit.command_desk import ANNA
+from tests.unit.zenoh_site import Site, wait_for
+
+pytest.importorskip("starlette", reason="the extra monitor is not installed")
+pytest.importorskip("uvicorn", reason="the extra monitor is not installed")
+pytest.importorskip("argon2", reason="the extra monitor is not installed")
+from agent.monitor.settings import Plan
+from agent.monitor.users import set_user
+from tests.scenarios.fleet_page import IMAGES, CommandedGateway, page_site
+from tests.unit.monitor_site import COMMAND, Monitor, Served
+
+pytestmark = needs_chromium
+PASSWORD = "correct horse battery staple"
+PICTURE = IMAGES / "report.png"
+RISES_S = 2.0
+SILENT_S = 10.0
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as opened:
+        yield opened
+
+
+def serious_faults(page: Any) -> list[str]:
+    """What axe-core finds in the page that keeps people from using it, or makes it hard."""
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe is not installed").Axe()
+    found = axe.run(page).response["violations"]
+    return [f"{v['id']}: {v['nodes'][0]['html']:.200}" for v in found if v["impact"] in ("serious", "critical")]
+
+
+def first_sensor(page: Any) -> str:
+    return str(page.locator("#rows a").first.inner_text())
+
+
+def test_a_drifting_sensor_rises_is_sorted_opened_and_zoomed(site: Site, tmp_path: Path, browser: Any) -> None:
+    places = {f"simulated/gw000{k}/s0": (0.1 + 0.1 * k, 0.5) for k in range(8)}
+    plan = Plan(picture=PICTURE, positions=places)
+    with page_site(site, tmp_path, plan=plan) as shown:
+        drifting = f"simulated/{shown.fleet.names_of('drifting')[0]}/s0"
+        shown.rounds(5)
+        watched = Watched(browser, shown.served.address, viewport={"width": 1280, "height": 900})
+        page = watched.open()
+        page.locator("#rows tr").nth(15).wait_for()
+        assert first_sensor(page) != drifting
+        shown.rounds(1)  # its drift is told now
+        begun = time.monotonic()
+        page.wait_for_function("name => document.querySelector('#rows a')?.textContent === name", arg=drifting)
+        assert time.monotonic() - begun < RISES_S
+        assert (
+            "Sxx drifting: the sensor or the reference changes steadily" in page.locator("#rows tr").first.inner_text()
+        )
+        assert page.get_by_text("HELD: <img src=x onerror=alert(3)>").count() == 1  # text, not an element
+        assert page.locator("#plan .point").count() == 8
+        assert page.locator("#plan .point.alarm").count() == 4
+        assert page.locator("#plan img").evaluate("image => image.naturalWidth") > 0
+        assert page.locator("img").count() == 1
+        assert serious_faults(page) == []
+
+        page.get_by_role("button", name="Sensor", exact=True).click()
+        names = page.locator("#rows a").all_inner_texts()
+        assert names == sorted(names)
+        page.get_by_role("button", name="Sensor", exact=True).press("Enter")  # by the keyboard too
+        assert page.locator("#rows a").all_inner_texts() == names[::-1]
+        assert page.locator("#heads th").first.get_attribute("aria-sort") == "descending"
+        page.get_by_label("Status").select_option("HELD")
+        page.get_by_label("Change at least").fill("0.5")
+        assert page.locator("#rows a").all_inner_texts() == [drifting]
+        page.reload()  # the link keeps the view
+        page.locator("#rows a").first.wait_for()
+        assert page.locator("#rows a").all_inner_texts() == [drifting]
+        with page.expect_download() as saved:
+            page.get_by_role("button", name="PNG").first.click()
+        assert saved.value.path().read_bytes().startswith(b"\x89PNG")
+
+        page.locator("#rows a").first.click()
+        page.locator("#details table").first.wait_for()
+        assert page.locator("#plots .uplot").count() == 12
+        plot = page.locator("#plots .u-over").first
+        box = plot.bounding_box()
+        middle = box["y"] + box["height"] / 2
+        page.mouse.move(box["x"] + 0.3 * box["width"], middle)
+        page.mouse.down()
+        page.mouse.move(box["x"] + 0.6 * box["width"], middle, steps=3)
+        page.mouse.up()
+        page.wait_for_function("() => location.hash.includes('from=')")
+        zoomed = page.evaluate("() => location.hash")
+        page.reload()
+        page.locator("#details table").first.wait_for()
+        assert page.evaluate("() => location.hash") == zoomed
+        assert page.locator("#span").input_value() == "zoom"
+        page.get_by_text("Sxx: 6 calibrations in 50 days").wait_for()
+        with page.expect_download() as saved:
+            page.get_by_role("button", name="PNG").last.click()
+        assert saved.value.path().read_bytes().startswith(b"\x89PNG")
+        assert serious_faults(page) == []
+        page.set_viewport_size({"width": 390, "height": 800})  # a phone: the reason fits
+        watched.open().locator("#rows .why").first.wait_for()
+        edges = page.locator("#rows td").evaluate_all(
+            "cells => cells.map((cell) => cell.getBoundingClientRect().right)"
+        )
+        assert 200 < max(edges) <= 390
+        for view in ("events", "keys"):
+            watched.open(f"#view={view}").locator(f"#{view}:visible").wait_for()
+            assert serious_faults(page) == []
+        watched.close()  # no request to outside, no error
+
+
+def log_in(watched: Watched, name: str) -> Any:
+    page = watched.open("#site=workshop&gateway=gateway-1&sensor=mems")
+    page.get_by_label("Name", exact=True).fill(name)
+    page.get_by_label("Password").fill(PASSWORD)
+    page.get_by_role("button", name="Log in").click()
+    page.get_by_role("button", name="Hold").wait_for()
+    return page
+
+
+def test_commands_with_and_without_the_right(site: Site, tmp_path: Path, browser: Any) -> None:
+    users, key_file = tmp_path / "users.txt", tmp_path / "anna.command.key"
+    set_user(users, "anna", ("accept", "rollback"), PASSWORD)
+    set_user(users, "bob", (), PASSWORD)
+    key_file.write_bytes(SigningKey("anna", ANNA).pem)
+    gateway = CommandedGateway(site, tmp_path / "gateway")
+    try:
+        with Served(site, tmp_path / "monitor", users=users) as served:
+            wait_for(lambda: len(served.fleet.rows()) == 1)
+            estimate = gateway.publish_more()
+            anna = Watched(browser, served.address)
+            page = anna.open()
+            page.locator("#login:visible").wait_for()
+            assert serious_faults(page) == []
+            log_in(anna, "anna")
+            page.get_by_role("link", name="Keys").click()
+            page.locator("#key-file").set_input_files(key_file)
+            page.get_by_text("the key is kept").wait_for()
+
+            page.goto(f"http://{served.address}/#site=workshop&gateway=gateway-1&sensor=mems")
+            page.get_by_role("heading", name="Response over frequency; S holds at 5 Hz").wait_for()
+            for shown in ("9 to 27", "Q holds at 21 °C", "References: B12 4711", "25995 ± 40, imaginary 0"):
+                assert shown in page.locator("#details").inner_text(), shown
+            page.get_by_role("button", name="Show the live waveform").click()
+            page.get_by_text("waiting for a block").wait_for()
+            while page.get_by_text("corrected acceleration by calibration 103, 200 Hz").count() == 0:
+                gateway.stream()
+                page.wait_for_timeout(100)
+            page.get_by_role("button", name="Stop").click()
+
+            def sent(button: str) -> str:
+                page.get_by_role("button", name=button).first.click()
+                page.get_by_role("button", name="Sign and send").click()
+                told = page.locator("#told").filter(has_text=":").or_(page.locator("#told").filter(has_text="taken"))
+                told.wait_for()
+                text = str(told.inner_text())
+                page.get_by_role("button", name="Close").click()
+                return text
+
+            assert sent("Roll back to 101") == "taken by the gateway"
+            assert sent(f"Accept {estimate}").startswith("refused: key anna has no right to send accept")
+            assert [(event.verb, bool(event.refused)) for event in gateway.desk.events] == [
+                ("rollback", False), ("accept", True)]  # fmt: skip
+            page.get_by_role("button", name="Hold").click()  # the user has no right to it: the line alone
+            page.get_by_text("anna has no right to send hold from here").wait_for()
+            assert serious_faults(page) == []
+            line = "fieldcal command hold --sensor mems --gateway workshop/gateway-1 --key KEY --connect ENDPOINT"
+            assert page.locator("#order code").inner_text() == line
+            assert page.get_by_role("button", name="Sign and send").count() == 0
+            anna.close()
+
+            bob = Watched(browser, served.address)
+            page = log_in(bob, "bob")
+            page.get_by_role("button", name="Roll back to 101").click()
+            page.get_by_text("bob has no right to send rollback from here").wait_for()
+            assert page.get_by_role("button", name="Sign and send").count() == 0
+            page.get_by_role("button", name="Close").click()
+            page.get_by_role("button", name="Log out").click()
+            page.locator("#login:visible").wait_for()
+            assert page.locator("#sensor:visible").count() == 0
+            bob.close()
+            assert len(gateway.desk.events) == 2
+    finally:
+        gateway.close()
+
+
+def test_a_killed_gateway_is_shown_and_a_restarted_monitor_has_the_whole_history(
+    site: Site, tmp_path: Path, browser: Any
+) -> None:
+    options = ["simulate", "--fleet", "1", "--sensors", "1", "--every", "0.3", "--connect", site.endpoint]
+    monitor = Monitor(site, tmp_path / "monitor")
+    gateway = subprocess.Popen([sys.executable, "-c", COMMAND, *options], stdout=subprocess.DEVNULL)
+    asked = "api/history?site=simulated&gateway=gw0000&sensor=s0&what=calibration"
+    try:
+        watched = Watched(browser, monitor.address)
+        page = watched.open()
+        page.get_by_text("on the bus", exact=True).wait_for()
+        wait_for(lambda: len(monitor.get(asked)) > 3)
+        gateway.kill()
+        gateway.wait()
+        begun = time.monotonic()
+        page.locator("td:visible", has_text="the gateway is not on the bus").first.wait_for()
+        assert time.monotonic() - begun < SILENT_S
+        history = monitor.get(asked)
+        monitor.stop()
+        page.get_by_text("the monitor does not answer").wait_for()
+        monitor = Monitor(site, tmp_path / "monitor", address=monitor.address)
+        page.get_by_text("Sensors: 1, of which need a person: 1").wait_for()  # the open page goes on by itself
+        assert monitor.get(asked) == history
+        watched.close()
+    finally:
+        gateway.kill()
+        gateway.wait()
+        monitor.stop()

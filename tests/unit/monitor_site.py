@@ -1,0 +1,138 @@
+"""The web server of the monitor within the test, and as a process of its own."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import signal
+import socket
+import ssl
+import subprocess
+import sys
+import threading
+from collections.abc import Mapping
+from contextlib import AbstractContextManager, ExitStack, closing
+from pathlib import Path
+from typing import Any
+from urllib.request import urlopen
+
+import uvicorn
+
+from agent.monitor.database import Database
+from agent.monitor.fleet import Fleet
+from agent.monitor.following import Following
+from agent.monitor.forwarding import Forwarding
+from agent.monitor.live import Live
+from agent.monitor.login import Access
+from agent.monitor.server import application
+from tests.unit.zenoh_site import Site, wait_for
+
+STARTS_S = 30.0
+COMMAND = "import sys; from agent.cli.main import run_cli; sys.exit(run_cli(sys.argv[1:]))"
+
+
+class Answer:
+    """An answer of the server. Header names are in lower case."""
+
+    def __init__(self, answer: http.client.HTTPResponse) -> None:
+        self.status = answer.status
+        self.headers = {name.lower(): value for name, value in answer.getheaders()}
+        self.text = answer.read().decode(errors="replace")
+
+    @property
+    def json(self) -> Any:
+        return json.loads(self.text)
+
+
+class Served(AbstractContextManager["Served"]):
+    """The server in a thread, on a free port of loopback, with a fleet that the test fills.
+
+    `keys`: known keys; `users`: who may log in; `more`: of the application.
+    """
+
+    def __init__(
+        self, site: Site, directory: Path, keys: Path | None = None, users: Path | None = None, **more: Any
+    ) -> None:
+        self._open = ExitStack()
+        directory.mkdir(exist_ok=True)
+        self.database = self._open.enter_context(closing(Database(directory / "monitor.sqlite")))
+        self.fleet = Fleet()
+        self.following = self._open.enter_context(
+            closing(Following([site.endpoint], None, self.database, self.fleet, keys))
+        )
+        access = Access(users)
+        forwarding = Forwarding([site.endpoint], None, access, self.fleet)
+        stopping = threading.Event()
+        live = Live([site.endpoint], None, stopping)
+        app = application(self.database, self.fleet, self.following, access, forwarding, live, stopping, **more)
+        listening = self._open.enter_context(closing(socket.create_server(("127.0.0.1", 0))))
+        self.address = f"127.0.0.1:{listening.getsockname()[1]}"
+        config = uvicorn.Config(app, log_level="error", server_header=False, timeout_graceful_shutdown=1)
+        server = uvicorn.Server(config)
+        thread = threading.Thread(target=server.run, args=([listening],), daemon=True)
+        thread.start()
+
+        def stop() -> None:
+            stopping.set()
+            server.should_exit = True
+            thread.join(5)
+
+        self._open.callback(stop)
+        wait_for(lambda: server.started)
+
+    def ask(
+        self, path: str, method: str = "GET", body: bytes | str = b"", headers: Mapping[str, str] | None = None
+    ) -> Answer:
+        """One request, with the path exactly as it is given."""
+        with closing(http.client.HTTPConnection(self.address, timeout=10)) as connection:
+            given = {name.lower(): value for name, value in (headers or {}).items()}
+            connection.putrequest(method, path, skip_host="host" in given, skip_accept_encoding=True)
+            data = body.encode() if isinstance(body, str) else body
+            for name, value in ({"content-length": str(len(data))} | given).items():
+                connection.putheader(name, value)
+            connection.endheaders(data)
+            return Answer(connection.getresponse())
+
+    def __exit__(self, *_: object) -> None:
+        self._open.close()
+
+
+class Monitor:
+    """`fieldcal monitor` in a process of its own. `ca`: the authority of its certificate, where it serves HTTPS."""
+
+    def __init__(self, site: Site, directory: Path, *options: str, address: str = "", ca: Path | None = None) -> None:
+        with closing(socket.socket()) as free:
+            free.bind(("127.0.0.1", 0))
+            self.address = address or f"127.0.0.1:{free.getsockname()[1]}"
+        self.tls = ssl.create_default_context(cafile=ca) if ca is not None else None
+        self.url = f"http{'s' if ca is not None else ''}://{self.address}"
+        given = ["--connect", site.endpoint, "--listen", self.address, "--data-dir", str(directory), *options]
+        self._process = subprocess.Popen([sys.executable, "-c", COMMAND, "monitor", *given], stderr=subprocess.PIPE)
+        try:
+            wait_for(self._answers, STARTS_S)
+        except AssertionError:
+            self._process.kill()
+            raise
+
+    def _answers(self) -> bool:
+        try:
+            self.get("")
+        except OSError:
+            return False
+        return True
+
+    def get(self, path: str) -> Any:
+        with urlopen(f"{self.url}/{path}", timeout=5, context=self.tls) as answer:
+            assert answer.headers["Content-Security-Policy"].startswith("default-src 'self'")
+            text = answer.read().decode()
+        return json.loads(text) if path.startswith("api") else text
+
+    def sensors(self) -> list[dict[str, Any]]:
+        rows: list[dict[str, Any]] = self.get("api/fleet")["sensors"]
+        return rows
+
+    def stop(self) -> None:
+        """Ctrl-C. Fails where the program ends with a traceback."""
+        self._process.send_signal(signal.SIGINT)
+        said = self._process.communicate(timeout=10)[1].decode()
+        assert "Traceback" not in said, said

@@ -1,0 +1,215 @@
+"""Notices of the monitor: what is told and when, webhooks and mails through real sockets, and what they refuse."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta
+from email import message_from_bytes
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+
+import pytest
+
+from agent.config.reading import ConfigError
+from agent.keys.certificates import make_authority
+from agent.monitor import notices as notices_module
+from agent.monitor.fleet import Fleet
+from agent.monitor.messages import Notice, mail, message_of, post
+from agent.monitor.notices import Notifier, Watch
+from agent.monitor.settings import Email, Notices, load_settings
+from tests.unit.zenoh_site import wait_for
+
+NOW = datetime(2026, 1, 1, tzinfo=UTC)
+PLACE = ("site", "gw", "mems")
+BAD = Notice("status", "site/gw/mems", "HELD: x\r\nBcc: all@example.org\r\n\r\nbody")
+
+
+def held(reason: str = "the window contradicts") -> dict[str, object]:
+    return {"status": "HELD", "reason": reason, "t_utc_ns": 1}
+
+
+class Hook:
+    """A web server that takes POST requests. `answers`: the status of each, the last for all others."""
+
+    def __init__(self, *answers: int) -> None:
+        self.taken: list[bytes] = []
+        self.visited: list[str] = []
+        hook = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_POST(self) -> None:
+                hook.taken.append(self.rfile.read(int(self.headers["Content-Length"])))
+                self.send_response(answers[min(len(hook.taken), len(answers)) - 1])
+                self.send_header("Location", "/elsewhere")
+                self.end_headers()
+
+            def do_GET(self) -> None:
+                hook.visited.append(self.path)
+
+            def log_message(self, *_: object) -> None:
+                pass
+
+        self.server = HTTPServer(("127.0.0.1", 0), Handler)
+        threading.Thread(target=self.server.serve_forever, daemon=True).start()
+        self.url = f"http://127.0.0.1:{self.server.server_port}/hook"
+
+
+@contextmanager
+def hooked(*answers: int) -> Iterator[Hook]:
+    hook = Hook(*answers)
+    yield hook
+    hook.server.shutdown()
+    hook.server.server_close()
+
+
+def test_verdicts_and_states_are_told_once_and_old_ones_not() -> None:
+    fleet = Fleet()
+    fleet.take(*PLACE, "status", held(), fresh=False)  # of the database, when the monitor starts
+    watch = Watch(fleet, Notices(), [])
+    assert watch.update(0.0, NOW) == []
+    fleet.take(*PLACE, "status", held())
+    fleet.take(*PLACE, "status", {"status": "VALID", "reason": "", "t_utc_ns": 1})
+    drift = {"parameter": "Sxx", "verdict": "stepped", "reason": "a step", "change": 1.0, "t_utc_ns": 1}
+    fleet.take(*PLACE, "drift", drift)
+    fleet.take(*PLACE, "drift", drift | {"verdict": "stable"})
+    assert [notice.line for notice in watch.update(1.0, NOW)] == [
+        "site/gw/mems: HELD: the window contradicts", "site/gw/mems: Sxx stepped: a step"]  # fmt: skip
+    assert watch.update(2.0, NOW) == []
+
+
+def test_a_silent_gateway_is_told_once_and_again_when_it_is_back() -> None:
+    fleet = Fleet()
+    watch = Watch(fleet, Notices(silent_s=600), [])
+    fleet.take(*PLACE, "status", held(), fresh=False)
+    for k in range(50):
+        fleet.set_alive("site", f"invented{k}", True)
+        fleet.set_alive("site", f"invented{k}", False)
+    fleet.set_alive("site", "gw", True)
+    assert watch.update(0.0, NOW) == []
+    fleet.set_alive("site", "gw", False)
+    told = [watch.update(t, NOW) for t in (100.0, 699.0, 700.0, 5000.0)]
+    assert [[n.line for n in each] for each in told] == [
+        [], [], ["site/gw: the gateway has not been on the bus for 600 s"], []]  # fmt: skip
+    fleet.set_alive("site", "gw", True)
+    assert [n.text for n in watch.update(5001.0, NOW)] == ["the gateway is on the bus again"]
+
+
+def test_a_certificate_that_ends_is_told_each_week(tmp_path: Path) -> None:
+    path = tmp_path / "fleet.pem"
+    path.write_bytes(make_authority("fleet", 40, NOW).certificate_pem)
+    watch = Watch(Fleet(), Notices(certificate_days=30), [path, tmp_path / "none.pem"])
+    texts = [
+        [n.text for n in watch.update(86400.0 * day, NOW + timedelta(days=day))] for day in (0, 9, 11, 12, 17, 18, 41)
+    ]
+    ends = "the certificate ends on 2026-02-10 00:00 UTC"
+    assert texts == [[], [], [ends], [], [], [ends], [ends.replace("ends", "ended")]]
+
+
+def test_a_webhook_gets_json_and_no_redirection_is_followed() -> None:
+    with hooked(200, 307, 302, 500) as hook:
+        post(hook.url, [BAD] * 60)
+        told = json.loads(hook.taken[0])
+        assert len(told["notices"]) == 50
+        assert told["text"].splitlines()[-1] == "and 10 more"
+        assert told["notices"][0]["subject"] == "site/gw/mems"
+        for answer in (307, 302, 500):
+            with pytest.raises(OSError, match=f"answers {answer}"):
+                post(hook.url, [BAD])
+        assert hook.visited == []
+        assert len(hook.taken) == 4
+
+
+def test_what_could_not_be_sent_is_sent_with_the_next_message(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(notices_module, "LOOK_S", 0.01)
+    monkeypatch.setattr(notices_module, "APART_S", 0.05)
+    fleet = Fleet()
+    with hooked(500, 200) as hook:
+        settings = Notices(webhooks=(hook.url,))
+        notifier = Notifier(Watch(fleet, settings, []), settings)
+        fleet.take(*PLACE, "status", held("first"))
+        wait_for(lambda: len(hook.taken) == 2 and notifier.fault == "")
+        fleet.take(*PLACE, "status", held("second"))
+        wait_for(lambda: len(hook.taken) == 3)
+        notifier.close()
+    texts = [json.loads(taken)["text"] for taken in hook.taken]
+    assert texts == [*["site/gw/mems: HELD: first"] * 2, "site/gw/mems: HELD: second"]
+
+
+def serve_mail(listening: socket.socket, taken: list[bytes]) -> None:
+    """One session of a mail server that takes everything."""
+    connection, _ = listening.accept()
+    with connection, connection.makefile("rb") as lines:
+        connection.sendall(b"220 test\r\n")
+        for line in lines:
+            if line.upper().startswith(b"DATA"):
+                connection.sendall(b"354 go on\r\n")
+                while (part := lines.readline()) != b".\r\n":
+                    taken.append(part)
+            connection.sendall(b"221 bye\r\n" if line.upper().startswith(b"QUIT") else b"250 ok\r\n")
+
+
+def test_a_mail_has_the_texts_of_the_bus_in_its_body_alone() -> None:
+    taken: list[bytes] = []
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        server = threading.Thread(target=serve_mail, args=(listening, taken), daemon=True)
+        server.start()
+        email = Email(host="127.0.0.1", port=listening.getsockname()[1], security="none",
+                      sender="fieldcal@example.org", recipients=("a@example.org", "b@example.org"))  # fmt: skip
+        mail(email, [BAD, BAD])
+        server.join(5)
+    message = message_from_bytes(b"".join(taken))
+    assert {name.lower() for name in message.keys()} == {  # noqa: SIM118 - a message gives no names by iteration
+        "subject", "from", "to", "content-type", "content-transfer-encoding", "mime-version"}  # fmt: skip
+    assert message["Subject"] == "fieldcal: 2 notices, status of site/gw/mems"
+    assert message["To"] == "a@example.org, b@example.org"
+    body = message.get_payload(decode=True)
+    assert isinstance(body, bytes)
+    assert (
+        body.decode().splitlines()
+        == ["site/gw/mems: HELD: x\ufffd\ufffdBcc: all@example.org\ufffd\ufffd\ufffd\ufffdbody"] * 2
+    )
+    with pytest.raises(ValueError, match="linefeed"):
+        message_of(email, [Notice("status", "a\r\nBcc: all@example.org", "")])
+
+
+@pytest.mark.parametrize(
+    ("line", "what"),
+    [
+        ('webhooks = ["file:///etc/passwd"]', "webhook"),
+        ('webhooks = ["https://user:word@example.org/"]', "without a user"),
+        ('webhooks = ["https://example.org/a\\r\\nX: y"]', "webhook"),
+        ('email = {host = "h", sender = "a@b\\r\\nBcc: c@d", recipients = ["a@example.org"]}', "mail address"),
+        ('email = {host = "h", sender = "a@example.org", recipients = []}', "recipients"),
+        ('email = {host = "h", sender = "a@example.org", recipients = ["x"]}', "mail address"),
+        ("silent_s = 0", "silent_s"),
+    ],
+)
+def test_targets_are_checked(tmp_path: Path, line: str, what: str) -> None:
+    path = tmp_path / "monitor.toml"
+    path.write_text(f"[notices]\n{line}\n")
+    with pytest.raises(ConfigError, match=rf"monitor\.toml: line 2: notices.*{what}"):
+        load_settings(path)
+
+
+def test_files_are_found_beside_the_configuration_and_must_be_there(tmp_path: Path) -> None:
+    path, secret = tmp_path / "monitor.toml", tmp_path / "mail.password"
+    path.write_text(
+        '[plan]\npicture = "plan.png"\npositions = {"site/gw/mems" = [0.5, 1]}\n[notices.email]\nhost = "h"\n'
+        'password_file = "mail.password"\nsender = "a@example.org"\nrecipients = ["b@example.org"]\n'
+    )
+    secret.write_text("secret\n")
+    with pytest.raises(ConfigError) as refused:
+        load_settings(path)
+    assert ["there is no file" in fault or "chmod 600" in fault for fault in refused.value.faults] == [True, True]
+    secret.chmod(0o600)
+    (tmp_path / "plan.png").write_bytes(b"\x89PNG")
+    settings = load_settings(path)
+    assert settings.plan is not None
+    assert settings.plan.picture == tmp_path / "plan.png"
+    path.write_text('[plan]\npicture = "plan.svg"\npositions = {}\n')
+    with pytest.raises(ConfigError, match="a picture is a file"):
+        load_settings(path)
