@@ -18,7 +18,7 @@ from agent.terminal.text import say
 @click.option("--install", "names", multiple=True, metavar="PART", help="Install this part; repeat it for more.")
 @click.option(
     "--wheels", type=click.Path(path_type=Path, exists=True, file_okay=False), metavar="DIR",
-    help=f"Take the wheels in DIR, without network; default: {WHEELS}, if it exists.",
+    help="Take the wheels in DIR, without network; default: `wheels` in this Python environment, if it exists.",
 )  # fmt: skip
 @click.option("--index", is_flag=True, help="Take them from the package index, also where there are wheels.")
 @click.option("--json", "json_to", type=click.Choice(["-"]), help="One JSON object on standard output.")
