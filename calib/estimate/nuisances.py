@@ -14,6 +14,7 @@ not measure it: t in phase with the motion, q 90 deg ahead of it. A table that r
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -171,6 +172,7 @@ class Nuisances:
         self, poses: Sequence[Pose], channels: int, priors: Priors, applied: Applied, reference: str = ""
     ) -> None:
         """`reference` is the identity of the reference; see calib.estimate.terms."""
+        self._made_of = poses, channels, priors, reference
         self.terms = [t for t in terms(poses, channels, priors, applied.by_kind, reference) if t.uncertainty > 0.0]
         n = len(poses)
         self._stated = np.zeros((n, 3, channels))
@@ -190,7 +192,7 @@ class Nuisances:
         self._magnitude = np.maximum(np.linalg.norm(self.gravity, axis=1), np.finfo(float).tiny)
         self._turn_direction = self._stacked("turn_direction", (n, 3))
         self._turn_gravity = self._stacked("turn_gravity", (n, 3))
-        self._cross_direction = _cross(self._turn_direction)
+        self._cross_direction, self._cross_gravity = _cross(self._turn_direction), _cross(self._turn_gravity)
         self._transverse = self._stacked("transverse", (n, 3))
         self._quadrature = self._stacked("quadrature", (n, 3))
         self._reference = self._stacked("reference", (channels,))
@@ -203,11 +205,27 @@ class Nuisances:
         # Of ln |h| at the reference frequency by the terms, when the response is 1 at 0 Hz.
         at = np.array([2.0 * np.pi * priors.reference_frequency_hz])
         self._at_reference = by_term(at, priors.response_powers)[0].real
-        self._applied_response = np.array([t.applied for t in self.terms]) @ self.response
+        self._applied_response = self._applied() @ self.response
         self._corner_hz = (self.reference_corner - self.sensor_corner) / (2.0 * np.pi)
 
     def __len__(self) -> int:
         return len(self.terms)
+
+    def are_of(self, pose: Pose, channels: int, priors: Priors, reference: str) -> bool:
+        """Whether they were made of this pose alone and of these arguments."""
+        poses, of_channels, of_priors, of_reference = self._made_of
+        same = len(poses) == 1 and poses[0] is pose and of_priors is priors
+        return same and (of_channels, of_reference) == (channels, reference)
+
+    def with_applied(self, applied: Applied) -> Nuisances:
+        """The same nuisances with other values removed from the data: much sooner made than anew."""
+        other = copy(self)
+        other.terms = [t.with_applied(applied.by_kind) for t in self.terms]
+        other._applied_response = other._applied() @ other.response
+        return other
+
+    def _applied(self) -> Array:
+        return np.array([t.applied for t in self.terms])
 
     @property
     def uncertainty(self) -> Array:
@@ -246,7 +264,7 @@ class Nuisances:
         stretch = 1.0 + np.einsum("j,jo->o", z, self._gravity) / self._magnitude
         unstretched = np.einsum("pik,pk->pi", rotations(np.einsum("j,jpk->pk", z, self._turn_gravity)), self.gravity)
         gravity = unstretched * stretch[:, None]
-        d_gravity = (_cross(self._turn_gravity) @ gravity[..., None])[..., 0] + self._gravity[:, :, None] * (
+        d_gravity = (self._cross_gravity @ gravity[..., None])[..., 0] + self._gravity[:, :, None] * (
             unstretched / self._magnitude[:, None]
         )
         return Inputs(

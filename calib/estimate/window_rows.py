@@ -160,10 +160,15 @@ class WindowRows:
         reference_degc: float,
         held_mps2: Array | None,
         seen_degc: tuple[float, float],
+        like: Nuisances | None = None,
     ) -> None:
+        """`like`: the nuisances of another window, which are not built again if this window has the same."""
         self.summary, self.data = summary, summary.data
         applied = Applied.of(priors, summary.lag_s, Response(summary.response) if summary.response else FLAT)
-        self.nuisances = Nuisances([summary.moved], self.data.channels, priors, applied, summary.reference)
+        if like is not None and like.are_of(summary.moved, self.data.channels, priors, summary.reference):
+            self.nuisances = like.with_applied(applied)
+        else:
+            self.nuisances = Nuisances([summary.moved], self.data.channels, priors, applied, summary.reference)
         u_lag_s = max(priors.lag_window_s, summary.u_lag_s)
         self._scatter = SlopeScatter.of(self.data, u_lag_s, summary.attenuation)
         # The scatter between windows is in the covariance of the rows, not before it.
