@@ -190,9 +190,9 @@ class Nuisances:
         self.gravity = np.where(self.known[:, None], stated, 0.0)  # 0 in a pose whose gravity is not known
         self._real = own_channels(channels)
         self._magnitude = np.maximum(np.linalg.norm(self.gravity, axis=1), np.finfo(float).tiny)
-        self._turn_direction = self._stacked("turn_direction", (n, 3))
-        self._turn_gravity = self._stacked("turn_gravity", (n, 3))
-        self._cross_direction, self._cross_gravity = _cross(self._turn_direction), _cross(self._turn_gravity)
+        by_direction, by_gravity = (self._stacked(f"turn_{of}", (n, 3)) for of in ("direction", "gravity"))
+        self._turns = np.stack([by_direction, by_gravity], axis=1)
+        self._cross_direction, self._cross_gravity = _cross(by_direction), _cross(by_gravity)
         self._transverse = self._stacked("transverse", (n, 3))
         self._quadrature = self._stacked("quadrature", (n, 3))
         self._reference = self._stacked("reference", (channels,))
@@ -243,7 +243,7 @@ class Nuisances:
 
     def at(self, z: Array) -> Inputs:
         """The inputs when the nuisances have the values `z` (J,)."""
-        turn = rotations(np.einsum("j,jpk->pk", z, self._turn_direction))
+        turn, gravity_turn = rotations(np.einsum("j,jgpk->gpk", z, self._turns))
         scale = 1.0 + np.einsum("j,jm->m", z, self._reference)
         sideways = self._stated.copy()
         if sideways.shape[2]:
@@ -262,7 +262,7 @@ class Nuisances:
         # The product of turn and quadrature is neglected: at most 1 % of 0.2 deg.
         d_quadrature = np.einsum("pik,jpk->jpi", turn, self._quadrature)
         stretch = 1.0 + np.einsum("j,jo->o", z, self._gravity) / self._magnitude
-        unstretched = np.einsum("pik,pk->pi", rotations(np.einsum("j,jpk->pk", z, self._turn_gravity)), self.gravity)
+        unstretched = np.einsum("pik,pk->pi", gravity_turn, self.gravity)
         gravity = unstretched * stretch[:, None]
         d_gravity = (self._cross_gravity @ gravity[..., None])[..., 0] + self._gravity[:, :, None] * (
             unstretched / self._magnitude[:, None]
@@ -286,8 +286,8 @@ class Nuisances:
 
 
 def rotations(vectors: Array) -> Array:
-    """Rotation matrices (P, 3, 3) of rotation vectors (P, 3) in rad, by Rodrigues' formula."""
-    angle = np.linalg.norm(vectors, axis=1)[:, None, None]
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) in rad, by Rodrigues' formula."""
+    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
     cross = _cross(vectors)
     linear, square = np.sinc(angle / np.pi), 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
     return np.asarray(np.eye(3) + linear * cross + square * (cross @ cross))
