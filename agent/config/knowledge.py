@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable
 from datetime import UTC, date, datetime, timedelta
-from functools import reduce
+from functools import cached_property, reduce
 from typing import Annotated
 
 import msgspec
@@ -119,7 +119,7 @@ class Certificate(Section):
         """The date `calibrated`, midnight UTC; None where it is not stated."""
         return datetime.fromisoformat(self.calibrated).replace(tzinfo=UTC) if self.calibrated else None
 
-    @property
+    @cached_property
     def sha256(self) -> str:
         """SHA-256 of what is stated: the JSON of all fields that have not their default, by name, without blanks."""
         stated = self.model_dump(mode="json", exclude_defaults=True)

@@ -53,7 +53,7 @@ def calibration_update(
     `made_by` is the state that made the calibration, where that is known: what S and Q owe to the references is stated
     only if this state still has these S and Q. `certificate_of` a reference: None if it is not connected.
     """
-    known = np.array_equal(made_by.result().covariance, calibration.covariance)
+    known = np.array_equal(made_by.covariance, calibration.covariance)
     powers = [k for k in range(1, MOST_TEMPERATURE_ORDER + 1) if offset_temperature(k)[0] in recursion.names]
     by_power = [_both(recursion, offset_temperature(k)) for k in powers]
     S_temperature = _both(recursion, MAIN_TEMPERATURE) if MAIN_TEMPERATURE[0] in recursion.names else ([], [])

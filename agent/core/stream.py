@@ -12,7 +12,7 @@ import numpy as np
 from calib.model import Array
 from calib.signal.samples import Samples
 from calib.signal.timing import HORIZON_S, ClockFit, ClockModel
-from hw.block import BlockFlags, SampleBlock
+from hw.block import LARGEST, BlockFlags, SampleBlock
 
 # Largest rate of sample numbers, as a multiple of the nominal rate. A faster count is no count of samples but, for
 # example, of microseconds; filling the gaps between its numbers would use up the memory.
@@ -34,6 +34,7 @@ class Run:
         self.number = number
         self.blocks: deque[SampleBlock] = deque()
         self.model = clock
+        self.sound = True  # no block so far had a number that is too large to compute with
         self._fitted: ClockFit | None = None  # the clock model's result, until the next block
         self._in_time = True
 
@@ -41,6 +42,7 @@ class Run:
         """Take the next block, whose bursts arrived at these times (B,)."""
         self.model.update(block.first_index + block.burst_count.astype(np.int64) - 1, arrivals_s)
         self.blocks.append(block)
+        self.sound = self.sound and _is_sound(block)
         self._fitted = None
 
     @property
@@ -85,6 +87,7 @@ class Run:
         """The run whose `snapshot` this is."""
         run = cls(ClockModel.restore(state["clock"]), state["number"])
         run.blocks.extend(_block_of(s) for s in state["blocks"])
+        run.sound = all(_is_sound(block) for block in run.blocks)
         return run
 
 
@@ -121,6 +124,11 @@ class DeviceStream:
     def nominal_rate_hz(self) -> float | None:
         """As the newest block tells it; None before any."""
         return self._runs[-1].blocks[-1].nominal_rate_hz if self._holds else None
+
+    @property
+    def sound(self) -> bool:
+        """Whether no sample and no temperature is too large to compute with."""
+        return all(run.sound for run in self._runs)
 
     @property
     def _holds(self) -> bool:
@@ -247,6 +255,12 @@ class DeviceStream:
         stream.newest_arrival_s = state["newest_arrival_s"]
         stream.first_sample_s = state["first_sample_s"]
         return stream
+
+
+def _is_sound(block: SampleBlock) -> bool:
+    values, degc = block.indications, block.temperature_degc
+    counts = values.dtype == np.int32
+    return (counts or not (np.abs(values) > LARGEST).any()) and not (degc is not None and abs(degc) > LARGEST)
 
 
 def _block_state(block: SampleBlock) -> dict[str, Any]:

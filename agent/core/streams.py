@@ -236,7 +236,7 @@ class Streams:
     def _unsound(self, start_s: float, stop_s: float) -> str:
         """Which device shows a number that nothing can be computed from, and which; "" where none does."""
         for name, stream in self._in_use.items():
-            cut = stream.cut(start_s - self._margin_s, stop_s + self._margin_s)
+            cut = None if stream.sound else stream.cut(start_s - self._margin_s, stop_s + self._margin_s)
             if cut is None:
                 continue
             shown = {

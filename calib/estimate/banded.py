@@ -176,11 +176,12 @@ class _Factors:
         self.noise = np.maximum(np.sqrt(left / freedom[:, None] / bands.independent), TINY)
 
     def seen(self, response: Complex) -> Array:
-        """(3, 2 M B, M) whitened slopes of each axis, by channel, if V is `response` (B,) times u."""
+        """(..., 3, 2 M B, M) whitened slopes of each axis, by channel, if V is `response` (..., B) times u."""
         m = self.root.shape[2] // 2
-        rows = response.real[:, None, None] * self.root[..., :m]
-        rows += (response.imag / self.omega)[:, None, None] * self.root[..., m:]
-        return np.asarray((rows / self.noise.T[:, :, None, None]).reshape(3, -1, m))
+        rows = response.real[..., None, None] * self.root[..., :m]
+        rows += (response.imag / self.omega)[..., None, None] * self.root[..., m:]
+        rows = rows[..., None, :, :, :] / self.noise.T[:, :, None, None]
+        return np.asarray(rows.reshape(*response.shape[:-1], 3, -1, m))
 
     def observed(self) -> Array:
         """(3, 2 M B) whitened slopes of each axis."""
@@ -243,7 +244,7 @@ def _told(factors: _Factors, powers: int) -> _Told:
     gain[:, live] = _fitted(np.concatenate([moving, lagged @ gain], axis=2), observed)[:, :-1]
     free = np.concatenate([moving / _length(moving), lagged @ gain], axis=2)
     ways, _ = np.linalg.qr(free)
-    rows = np.concatenate([observed[..., None], *(factors.seen(term) @ gain for term in terms.T)], axis=2)
+    rows = np.concatenate([observed[..., None], *(factors.seen(terms.T) @ gain)], axis=2)
     rows = (rows - ways @ (ways.transpose(0, 2, 1) @ rows)).reshape(-1, 1 + powers)
     at_hz, noise = np.tile(factors.by_row(factors.middle_hz), 3), factors.by_row(factors.noise.T).ravel()
     return _Told(rows[:, 0], rows[:, 1:], observed.ravel(), at_hz, noise, 3 * free.shape[2])

@@ -14,6 +14,7 @@ not measure it: t in phase with the motion, q 90 deg ahead of it. A table that r
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -171,6 +172,7 @@ class Nuisances:
         self, poses: Sequence[Pose], channels: int, priors: Priors, applied: Applied, reference: str = ""
     ) -> None:
         """`reference` is the identity of the reference; see calib.estimate.terms."""
+        self._made_of = poses, channels, priors, reference
         self.terms = [t for t in terms(poses, channels, priors, applied.by_kind, reference) if t.uncertainty > 0.0]
         n = len(poses)
         self._stated = np.zeros((n, 3, channels))
@@ -188,9 +190,9 @@ class Nuisances:
         self.gravity = np.where(self.known[:, None], stated, 0.0)  # 0 in a pose whose gravity is not known
         self._real = own_channels(channels)
         self._magnitude = np.maximum(np.linalg.norm(self.gravity, axis=1), np.finfo(float).tiny)
-        self._turn_direction = self._stacked("turn_direction", (n, 3))
-        self._turn_gravity = self._stacked("turn_gravity", (n, 3))
-        self._cross_direction = _cross(self._turn_direction)
+        by_direction, by_gravity = (self._stacked(f"turn_{of}", (n, 3)) for of in ("direction", "gravity"))
+        self._turns = np.stack([by_direction, by_gravity], axis=1)
+        self._cross_direction, self._cross_gravity = _cross(by_direction), _cross(by_gravity)
         self._transverse = self._stacked("transverse", (n, 3))
         self._quadrature = self._stacked("quadrature", (n, 3))
         self._reference = self._stacked("reference", (channels,))
@@ -203,11 +205,27 @@ class Nuisances:
         # Of ln |h| at the reference frequency by the terms, when the response is 1 at 0 Hz.
         at = np.array([2.0 * np.pi * priors.reference_frequency_hz])
         self._at_reference = by_term(at, priors.response_powers)[0].real
-        self._applied_response = np.array([t.applied for t in self.terms]) @ self.response
+        self._applied_response = self._applied() @ self.response
         self._corner_hz = (self.reference_corner - self.sensor_corner) / (2.0 * np.pi)
 
     def __len__(self) -> int:
         return len(self.terms)
+
+    def are_of(self, pose: Pose, channels: int, priors: Priors, reference: str) -> bool:
+        """Whether they were made of this pose alone and of these arguments."""
+        poses, of_channels, of_priors, of_reference = self._made_of
+        same = len(poses) == 1 and poses[0] is pose and of_priors is priors
+        return same and (of_channels, of_reference) == (channels, reference)
+
+    def with_applied(self, applied: Applied) -> Nuisances:
+        """The same nuisances with other values removed from the data: much sooner made than anew."""
+        other = copy(self)
+        other.terms = [t.with_applied(applied.by_kind) for t in self.terms]
+        other._applied_response = other._applied() @ other.response
+        return other
+
+    def _applied(self) -> Array:
+        return np.array([t.applied for t in self.terms])
 
     @property
     def uncertainty(self) -> Array:
@@ -225,7 +243,7 @@ class Nuisances:
 
     def at(self, z: Array) -> Inputs:
         """The inputs when the nuisances have the values `z` (J,)."""
-        turn = rotations(np.einsum("j,jpk->pk", z, self._turn_direction))
+        turn, gravity_turn = rotations(np.einsum("j,jgpk->gpk", z, self._turns))
         scale = 1.0 + np.einsum("j,jm->m", z, self._reference)
         sideways = self._stated.copy()
         if sideways.shape[2]:
@@ -244,9 +262,9 @@ class Nuisances:
         # The product of turn and quadrature is neglected: at most 1 % of 0.2 deg.
         d_quadrature = np.einsum("pik,jpk->jpi", turn, self._quadrature)
         stretch = 1.0 + np.einsum("j,jo->o", z, self._gravity) / self._magnitude
-        unstretched = np.einsum("pik,pk->pi", rotations(np.einsum("j,jpk->pk", z, self._turn_gravity)), self.gravity)
+        unstretched = np.einsum("pik,pk->pi", gravity_turn, self.gravity)
         gravity = unstretched * stretch[:, None]
-        d_gravity = (_cross(self._turn_gravity) @ gravity[..., None])[..., 0] + self._gravity[:, :, None] * (
+        d_gravity = (self._cross_gravity @ gravity[..., None])[..., 0] + self._gravity[:, :, None] * (
             unstretched / self._magnitude[:, None]
         )
         return Inputs(
@@ -268,8 +286,8 @@ class Nuisances:
 
 
 def rotations(vectors: Array) -> Array:
-    """Rotation matrices (P, 3, 3) of rotation vectors (P, 3) in rad, by Rodrigues' formula."""
-    angle = np.linalg.norm(vectors, axis=1)[:, None, None]
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) in rad, by Rodrigues' formula."""
+    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
     cross = _cross(vectors)
     linear, square = np.sinc(angle / np.pi), 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
     return np.asarray(np.eye(3) + linear * cross + square * (cross @ cross))

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
+from functools import lru_cache
 from typing import Any, Self
 
 import numpy as np
@@ -167,17 +168,21 @@ class OverFrequency:
 
 def terms_of(state: JointState, reference: str) -> list[int]:
     """Where the terms of the response beside a reference are in a state, in the order of POWERS."""
-    return _named(state, reference, [f"response_{power}" for power in POWERS])
+    return _named(state, reference, tuple(f"response_{power}" for power in POWERS))
 
 
 def attenuation_of(state: JointState, reference: str) -> list[int]:
     """Where the attenuation at the one frequency beside a reference is in a state; empty where it is no unknown."""
-    return _named(state, reference, ["attenuation"])
+    return _named(state, reference, ("attenuation",))
 
 
-def _named(state: JointState, reference: str, names: Sequence[str]) -> list[int]:
-    keys = [Quantity(name, RESPONSE, owner=reference).key for name in names]
-    return [state.index(key) for key in keys if key in state]
+def _named(state: JointState, reference: str, names: tuple[str, ...]) -> list[int]:
+    return [state.index(key) for key in _keys(reference, names) if key in state]
+
+
+@lru_cache(maxsize=64)
+def _keys(reference: str, names: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(Quantity(name, RESPONSE, owner=reference).key for name in names)
 
 
 def changed(state: JointState, point: Array) -> bool:

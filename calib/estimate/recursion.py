@@ -107,16 +107,23 @@ class Recursion(WindowState):
     @property
     def determined(self) -> Flags:
         """(12,) see calib.estimate.determined."""
-        mean, covariance = self._parameters()
-        return determined(
-            mean, np.sqrt(np.diag(covariance)), self._stated.standard_uncertainty, np.ones(12, dtype=bool)
-        )
+        return self._determined(*self._parameters())
+
+    def _determined(self, mean: Array, covariance: Array) -> Flags:
+        u = np.sqrt(covariance.diagonal())
+        return determined(mean, u, self._stated.standard_uncertainty, np.ones(12, dtype=bool))
 
     def result(self) -> Calibration:
         """S and Q as they are; where a parameter is not determined, still what was known beforehand of it."""
         mean, covariance = self._parameters()
         freedom = self._noise.degrees_of_freedom or np.inf
-        return Calibration(mean[:9].reshape(3, 3), mean[9:], covariance, self.determined, freedom, METHOD)
+        told = self._determined(mean, covariance)
+        return Calibration(mean[:9].reshape(3, 3), mean[9:], covariance, told, freedom, METHOD)
+
+    @property
+    def covariance(self) -> Array:
+        """(12, 12) that of `result`."""
+        return self._parameters()[1]
 
     @property
     def coverage_factor(self) -> float:
@@ -140,11 +147,9 @@ class Recursion(WindowState):
         more = [state.index(quantity.name) for quantity, _ in temperature.terms(self.scale)]
         mean, factor = self._parameters_factor()
         mean, factor = np.append(mean, state.mean[more]), np.vstack([factor, self._over.factor(state)[more]])
-        low, high = self.temperature_range_degc
-        u_beyond = temperature.u_offset_mps2[1] * self.scale
-        return Law(
-            mean, factor @ factor.T, order, rows, self.reference_temperature_degc, low, high, u_beyond, self.determined
-        )
+        covariance, (low, high) = factor @ factor.T, self.temperature_range_degc
+        told, u_beyond = self._determined(mean[:12], covariance[:12, :12]), temperature.u_offset_mps2[1] * self.scale
+        return Law(mean, covariance, order, rows, self.reference_temperature_degc, low, high, u_beyond, told)
 
     def quantity(self, name: str) -> tuple[float, float]:
         """(value, u) of an unknown of the sensor, its mount or its present reference. Raises KeyError for another."""

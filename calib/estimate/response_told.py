@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,11 +57,11 @@ def response_told(
     `band_hz`.
     """
     count = max(1, round(per_octave * np.log2(band_hz[1] / band_hz[0])))
-    edges = np.geomspace(*band_hz, count + 1)
+    edges = _spaced(*band_hz, count + 1)
     middles_hz = np.append(0.0, np.sqrt(edges[:-1] * edges[1:]))
     at, u_at = _sensitivities(estimate, covariance, effects, middles_hz, reference_hz)
     ends = zip(edges[:-1].tolist(), edges[1:].tolist(), at[1:], u_at[1:], strict=True)
-    terms, grid = estimate[9:] @ effects, np.geomspace(*band_hz, GRID)
+    terms, grid = estimate[9:] @ effects, _spaced(*band_hz, GRID)
     away = np.abs(np.exp(_log_h(grid, reference_hz, len(terms)) @ terms)) - 1.0
     limit = coverage_factor * _least_u(estimate[:9], covariance) / 3.0
     return ResponseTold(
@@ -97,6 +98,14 @@ def told_at_one_frequency(
         u_at[0],
         (BandSensitivity(motion_hz, motion_hz, at[1], u_at[1]),),
     )
+
+
+@lru_cache(maxsize=8)
+def _spaced(low_hz: float, high_hz: float, count: int) -> Array:
+    """(count,) frequencies in steps of one ratio, cached and read-only: those of a channel are always the same."""
+    found = np.geomspace(low_hz, high_hz, count)
+    found.flags.writeable = False
+    return found
 
 
 def _least_u(S: Array, covariance: Array) -> float:

@@ -59,6 +59,16 @@ class Term:
                 moves[f.name] = more if own is None else own + more
         return replace(self, uncertainty=max(self.uncertainty, other.uncertainty), **moves)
 
+    def with_applied(self, applied: Mapping[Kind, Sequence[float]]) -> Term:
+        """The same nuisance; `applied` are the values, by kind, that the front end has already removed from the data:
+        one value, for the response one for each of its terms, or for the first of them."""
+        if (values := applied.get(self.kind)) is None:
+            return self
+        if self.response is None:
+            return replace(self, applied=float(values[0]))
+        k = int(np.flatnonzero(self.response)[0])
+        return replace(self, applied=float(values[k] / self.response[k]) if k < len(values) else 0.0)
+
     @property
     def name(self) -> str:
         """The name for people."""
@@ -94,14 +104,12 @@ def terms(
     the nuisances of that position. `reference` is the identity of the reference, which owns its own nuisances.
     """
     found: dict[str, Term] = {}
-    for term in _terms(poses, channels, priors, applied, reference):
+    for term in _terms(poses, channels, priors, reference):
         found[term.key] = term if term.key not in found else found[term.key].with_(term)
-    return list(found.values())
+    return [term.with_applied(applied) for term in found.values()]
 
 
-def _terms(
-    poses: Sequence[Pose], channels: int, priors: Stated, applied: Mapping[Kind, Sequence[float]], reference: str
-) -> Iterator[Term]:
+def _terms(poses: Sequence[Pose], channels: int, priors: Stated, reference: str) -> Iterator[Term]:
     yield from _clamp_terms(poses, priors)
     yield from _pose_terms(poses, priors, reference)
     yield from _lean_terms(poses, priors)
@@ -120,7 +128,7 @@ def _terms(
         own = np.resize(np.eye(real)[m], channels)
         yield _term(f"reference{of}", kinds.REFERENCE, priors, owner=reference, reference=own)
         yield _term(f"reference_drift{of}", kinds.REFERENCE_DRIFT, priors, owner=reference, reference=own)
-    yield _term("lag", kinds.LAG, priors, applied, reference, lag=np.ones(3))
+    yield _term("lag", kinds.LAG, priors, reference, lag=np.ones(3))
     for name, k in zip(_axes("lag"), np.eye(3), strict=True):
         yield _term(name, kinds.LAG_OF_AXIS, priors, owner=reference, lag=k)
     if priors.response > 0.0:
@@ -128,14 +136,12 @@ def _terms(
         names = [f"response_{power}" for power in ALL_POWERS[: len(units)]]
         if priors.response_terms == 1.0:
             names, units = ["attenuation"], attenuating(priors.response_hz)[:1]  # -ln |h| at the one frequency
-        removed = np.resize([*applied[kinds.RESPONSE], *[0.0] * len(names)], len(ALL_POWERS))
         for n, (name, unit) in enumerate(zip(names, units.tolist(), strict=True)):
-            taken = {kinds.RESPONSE: [float(removed[n]) / unit]}
             term = unit * np.eye(max(len(POWERS), len(units)))[n]
-            yield _term(name, kinds.RESPONSE, priors, taken, reference, response=term)
+            yield _term(name, kinds.RESPONSE, priors, reference, response=term)
     turn = np.full(1, 2.0 * np.pi)
-    yield _term("reference_corner", kinds.REFERENCE_CORNER, priors, applied, reference, reference_corner=turn)
-    yield _term("sensor_corner", kinds.SENSOR_CORNER, priors, applied, sensor_corner=turn)
+    yield _term("reference_corner", kinds.REFERENCE_CORNER, priors, reference, reference_corner=turn)
+    yield _term("sensor_corner", kinds.SENSOR_CORNER, priors, sensor_corner=turn)
 
 
 def _clamp_terms(poses: Sequence[Pose], priors: Stated) -> Iterator[Term]:
@@ -247,17 +253,11 @@ def _at(name: str, kind: Kind, pose: Pose) -> Quantity:
     return Quantity(f"{name}[{pose.position}]", kind, pose.position)
 
 
-def _term(
-    name: str,
-    kind: Kind,
-    priors: Stated,
-    applied: Mapping[Kind, Sequence[float]] | None = None,
-    owner: str = "",
-    **moves: Array,
-) -> Term:
+def _term(name: str, kind: Kind, priors: Stated, owner: str = "", **moves: Array) -> Term:
     """A nuisance that is common to all positions; `moves` are its effects, as fields of Term."""
-    taken, expected = float((applied or {}).get(kind, [0.0])[0]), priors.of(kind.mean)
-    return Term(Quantity(name, kind, owner=owner), priors.of(kind.prior), expected=expected, applied=taken, **moves)
+    return Term(
+        Quantity(name, kind, owner=owner), priors.of(kind.prior), expected=priors.of(kind.mean), applied=0.0, **moves
+    )
 
 
 def _turned(quantity: Quantity, uncertainty: float, axis: Array) -> Term:

@@ -11,6 +11,7 @@ import numpy as np
 from calib.estimate.banded import Banded, Deviations
 from calib.estimate.condense import Condensed, condense
 from calib.estimate.equations import Equations
+from calib.estimate.equations import Rows as Linear
 from calib.estimate.joint_state import JointState
 from calib.estimate.nuisances import Applied, Nuisances, Priors
 from calib.estimate.quantities import LAG, MAIN_TEMPERATURE, offset_temperature
@@ -160,10 +161,15 @@ class WindowRows:
         reference_degc: float,
         held_mps2: Array | None,
         seen_degc: tuple[float, float],
+        like: Nuisances | None = None,
     ) -> None:
+        """`like`: the nuisances of another window, which are not built again if this window has the same."""
         self.summary, self.data = summary, summary.data
         applied = Applied.of(priors, summary.lag_s, Response(summary.response) if summary.response else FLAT)
-        self.nuisances = Nuisances([summary.moved], self.data.channels, priors, applied, summary.reference)
+        if like is not None and like.are_of(summary.moved, self.data.channels, priors, summary.reference):
+            self.nuisances = like.with_applied(applied)
+        else:
+            self.nuisances = Nuisances([summary.moved], self.data.channels, priors, applied, summary.reference)
         u_lag_s = max(priors.lag_window_s, summary.u_lag_s)
         self._scatter = SlopeScatter.of(self.data, u_lag_s, summary.attenuation)
         # The scatter between windows is in the covariance of the rows, not before it.
@@ -175,6 +181,7 @@ class WindowRows:
         told = np.isfinite(above) or not np.isfinite(seen_degc).all()
         self._perhaps_k = () if told else tuple(degc - reference_degc for degc in seen_degc)
         self._live = np.repeat(np.diag(self.data.root[0]) > 0.0, 3)
+        self._kept: tuple[Array, Linear] | None = None
 
     def made_of(
         self, summary: Summary, priors: Priors, held_mps2: Array | None, seen_degc: tuple[float, float]
@@ -203,7 +210,7 @@ class WindowRows:
         added: the first window of all has no other."""
         noise = noise.pooled(self.noise).filtered(self.summary.independent)
         x, chain = self._own(state, at)
-        rows = self.equations.at(x)
+        rows = self._linear_at(x)
         slope, d_slope = rows.slope.reshape(-1), rows.d_slope.reshape(-1, len(x))
         mean, d_mean = rows.mean.reshape(-1), rows.d_mean.reshape(-1, len(x))
         slope, d_slope = slope[self._live], d_slope[self._live]
@@ -223,6 +230,12 @@ class WindowRows:
             return Rows(np.zeros(0), np.zeros((0, len(state))), 0)
         residual, jacobian = zip(*parts, strict=True)
         return Rows(np.concatenate(residual), np.vstack(jacobian) @ chain, slope.size)
+
+    def _linear_at(self, x: Array) -> Linear:
+        """The equations at x, kept: a window becomes part of the base at the point at which it was taken."""
+        if self._kept is None or not np.array_equal(self._kept[0], x):
+            self._kept = x, self.equations.at(x)
+        return self._kept[1]
 
     def with_its_lag(self, state: JointState, values: Array) -> Array:
         """The values (N,) of the state's quantities with the lag that was taken out of the window."""

@@ -142,7 +142,8 @@ class WindowState:
         made = self._made.get(id(summary))
         if made is not None and made.made_of(summary, priors, held, seen_degc):
             return made
-        return WindowRows(summary, priors, self.scale, reference_degc, held, seen_degc)
+        like = next((rows.nuisances for rows in self._made.values() if rows.summary.moved is summary.moved), None)
+        return WindowRows(summary, priors, self.scale, reference_degc, held, seen_degc, like)
 
     def _priors(self, summary: Summary) -> Priors:
         """What is stated now beside the reference of a window."""

@@ -58,15 +58,14 @@ def without_noise(bands: BandSums, noise: Array) -> BandSums:
     m, total = noise.shape[1], float(bands.points.sum())
     power = np.zeros((len(bands.points), 2 * m))
     kept = np.ones(len(power), dtype=bool)
+    own = bands.products.diagonal(axis1=1, axis2=2)
+    moved, moved_rate = own[:, :m].sum(axis=1), own[:, m : 2 * m].sum(axis=1)
     for k in np.flatnonzero(noise[0] > 0.0):
         end_hz = np.sqrt(3.0) * noise[1, k] / noise[0, k] / (2.0 * np.pi)
         low, high = np.minimum(bands.low_hz, end_hz), np.minimum(bands.high_hz, end_hz)
         power[:, k] = total * noise[0, k] ** 2 * (high - low) / end_hz
         power[:, m + k] = total * noise[1, k] ** 2 * (high**3 - low**3) / end_hz**3
-        for of in (k, m + k):
-            first = of - k
-            moved = bands.products[:, range(first, first + m), range(first, first + m)].sum(axis=1)
-            kept &= moved > OVER_NOISE * power[:, of]
+        kept &= (moved > OVER_NOISE * power[:, k]) & (moved_rate > OVER_NOISE * power[:, m + k])
         kept &= bands.high_hz <= end_hz
     products = bands.products.copy()
     products[:, range(2 * m), range(2 * m)] -= power

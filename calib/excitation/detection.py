@@ -78,6 +78,12 @@ def _regression(columns: Array, outputs: Array) -> Array:
     return np.asarray(solution.T)
 
 
+def may_be_clipped(V: Array) -> bool:
+    """Whether an axis of V (n, 3) has so many points at an extreme value that `clipped` must look at them."""
+    ends = np.stack([V.max(axis=0), V.min(axis=0)])
+    return bool(((ends[:, None] == V).sum(axis=1) >= CLIPPED_POINTS).any())
+
+
 def clipped(V: Array, residual: Array, finest: Array) -> int:
     """Number of points of V (n, 3) that are clipped: several points have the same extreme value, and either the motion
     goes beyond that value, or hardly any two points within the range have the same value.

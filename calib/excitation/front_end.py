@@ -333,10 +333,10 @@ def _told_hz(V: Array, instrument: Instrument, rate_hz: float, sensor_rate_hz: f
 
 def _clipped(columns: Array) -> int:
     """How many of the samples [V, u, du] (n, 3 + 2 m) are at an end of the sensor's range."""
-    if len(columns) <= columns.shape[1]:
+    V = columns[:, :3]
+    if len(columns) <= columns.shape[1] or not detection.may_be_clipped(V):
         return 0
-    V, finest = columns[:, :3], detection.least_step(columns[:, :3])
-    basis = np.column_stack([np.ones(len(columns)), columns[:, 3:]])
+    basis, finest = np.column_stack([np.ones(len(columns)), columns[:, 3:]]), detection.least_step(V)
     _, residual = detection.knocked(V, basis, finest)
     return detection.clipped(V, residual, finest)
 

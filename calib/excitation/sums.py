@@ -8,7 +8,7 @@ points (section 2.3).
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,8 +59,8 @@ def window_sums(u: ArrayLike, du: ArrayLike, V: ArrayLike, segment_edges: ArrayL
     bounds = [(int(a), int(b)) for a, b in itertools.pairwise(edges) if b > a]
     if not bounds:
         raise ValueError("a window needs at least one sample")
-    parts = [_segment(channels[a:b], rates[a:b], indications[a:b]) for a, b in bounds]
-    mean, scatter = np.array([p[0] for p in parts]), np.array([p[1] for p in parts])
+    parts = [_segments(channels[a:b], rates[a:b], indications[a:b], count) for a, b, count in _alike(bounds)]
+    mean, scatter = (np.concatenate(part) for part in zip(*parts, strict=True))
     if not (np.isfinite(mean).all() and np.isfinite(scatter).all()):
         raise ValueError("a window's samples must be finite: leave out samples that are missing (NaN)")
     return WindowSums(m, np.array([float(b - a) for a, b in bounds]), mean, scatter)
@@ -110,21 +110,32 @@ def factor(sums: WindowSums, *, derivative: bool = False) -> Factor:
     return Factor(r, rhs, residual, n)
 
 
-def _segment(u: Array, du: Array, V: Array) -> tuple[Array, Array]:
-    """Mean (q,) and centred scatter (q, q) of consecutive samples; each block fits the cache and is read twice."""
+def _alike(bounds: Sequence[tuple[int, int]]) -> Iterator[tuple[int, int, int]]:
+    """(first, stop, number) of neighbouring segments that have one length, BLOCK_SAMPLES together or a single one."""
+    for size, group in itertools.groupby(bounds, key=lambda segment: segment[1] - segment[0]):
+        segments, most = list(group), max(BLOCK_SAMPLES // size, 1)
+        for k in range(0, len(segments), most):
+            together = segments[k : k + most]
+            yield together[0][0], together[-1][1], len(together)
+
+
+def _segments(u: Array, du: Array, V: Array, count: int) -> tuple[Array, Array]:
+    """Means (count, q) and centred scatter (count, q, q) of segments of one length; each block fits the cache and is
+    read twice."""
+    if len(u) > BLOCK_SAMPLES:  # a single segment
+        starts = range(0, len(u), BLOCK_SAMPLES)
+        blocks = [_segments(u[k:][:BLOCK_SAMPLES], du[k:][:BLOCK_SAMPLES], V[k:][:BLOCK_SAMPLES], 1) for k in starts]
+        sizes = np.array([float(min(BLOCK_SAMPLES, len(u) - k)) for k in starts])
+        mean, scatter = _pool(sizes, *(np.concatenate(part) for part in zip(*blocks, strict=True)))
+        return mean[None], scatter[None]
     m = u.shape[1]
-    blocks = []
-    for start in range(0, len(u), BLOCK_SAMPLES):
-        part = slice(start, start + BLOCK_SAMPLES)
-        n = len(u[part])
-        z = np.empty((2 * m + 3, n))  # one channel per row: 1.6 times as fast as one sample per row
-        z[:m], z[m : 2 * m], z[2 * m :] = u[part].T, du[part].T, V[part].T
-        centre = z @ np.ones(n) / n
-        z -= centre[:, None]
-        blocks.append((float(n), centre, z @ z.T))
-    if len(blocks) == 1:
-        return blocks[0][1:]
-    return _pool(*(np.array(column) for column in zip(*blocks, strict=True)))
+    z = np.empty((2 * m + 3, len(u)))  # one channel per row: 1.6 times as fast as one sample per row
+    z[:m], z[m : 2 * m], z[2 * m :] = u.T, du.T, V.T
+    size = len(u) // count
+    segments, ones = [z[:, k : k + size] for k in range(0, len(u), size)], np.ones(size)
+    centre = np.array([segment @ ones for segment in segments]) / size
+    z -= np.repeat(centre.T, size, axis=1)
+    return centre, np.array([segment @ segment.T for segment in segments])
 
 
 def _pool(count: Array, mean: Array, scatter: Array) -> tuple[Array, Array]:

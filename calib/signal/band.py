@@ -103,7 +103,7 @@ def lowpass(x: Array, rate_hz: float, band_hz: float) -> Array:
     half = lowpass_lost(rate_hz, band_hz)
     n = np.arange(-half, half + 1)
     cut = 1.25 * band_hz / rate_hz
-    taps = 2.0 * cut * np.sinc(2.0 * cut * n) * np.kaiser(2 * half + 1, 0.1102 * (STOP_BAND_DB - 8.7))
+    taps = 2.0 * cut * np.sinc(2.0 * cut * n) * _kaiser(2 * half + 1)
     taps /= taps.sum()
     return convolved(x, taps)
 
@@ -118,10 +118,11 @@ def convolved(x: Array, taps: Array) -> Array:
         return np.full_like(x, np.nan)
     out: Array = np.full(x.T.shape, np.nan).T
     size = _fast_length(len(x) + 2 * half)
-    held = np.ascontiguousarray(np.nan_to_num(x).T)
-    filtered = np.fft.irfft(np.fft.rfft(held, size) * np.fft.rfft(taps, size), size)
+    absent = np.isnan(x)
+    missing = absent.any(axis=1)
+    held = np.where(absent, 0.0, x) if missing.any() else x
+    filtered = np.fft.irfft(np.fft.rfft(np.ascontiguousarray(held.T), size) * np.fft.rfft(taps, size), size)
     out[half:-half] = filtered[:, 2 * half : len(x)].T
-    missing = np.isnan(x).any(axis=1)
     if missing.any():
         near = np.convolve(missing, np.ones(2 * half + 1), "same") > 0.5
         out[near] = np.nan
@@ -145,6 +146,7 @@ def without_short_holes(raw: Array, V: Array, rates_hz: tuple[float, float]) -> 
     return raw, V, raw_filled, filled
 
 
+@lru_cache(maxsize=16)
 def _fast_length(least: int) -> int:
     """Smallest 2^a 3^b 5^c not below `least`: an FFT whose length has a large prime factor is several times slower."""
     odd = (3**b * 5**c for b in range(4) for c in range(4))
@@ -155,6 +157,14 @@ def lowpass_lost(rate_hz: float, band_hz: float) -> int:
     """Number of samples that the filter loses at each end: half its length, by Kaiser's formula for a transition
     width of band_hz / 2."""
     return int(np.ceil((STOP_BAND_DB - 8.0) / (2.285 * np.pi * band_hz / rate_hz) / 2.0))
+
+
+@lru_cache(maxsize=4)
+def _kaiser(size: int) -> Array:
+    """Kaiser's window (size,) for STOP_BAND_DB, cached and read-only as `hanning`."""
+    window = np.kaiser(size, 0.1102 * (STOP_BAND_DB - 8.7))
+    window.flags.writeable = False
+    return window
 
 
 @lru_cache(maxsize=4)
@@ -174,4 +184,4 @@ def _spectra(x: Array, size: int) -> tuple[Array, int]:
     parts = np.ascontiguousarray(x[: whole * size].reshape(whole, size, -1).swapaxes(1, 2))
     parts = parts[~np.isnan(parts).any(axis=(1, 2))]
     lines = np.fft.rfft((parts - parts.mean(axis=2, keepdims=True)) * hanning(size), axis=2)
-    return np.sum(np.abs(lines) ** 2, axis=0) / max(len(parts), 1), len(parts)
+    return np.sum(lines.real**2 + lines.imag**2, axis=0) / max(len(parts), 1), len(parts)

@@ -59,8 +59,8 @@ def resample(x: Array, clock: ClockFit, time_s: Array, first_index: int = 0, mar
     usable = (start >= margin) & (start + TAPS + margin <= len(x))
     for gap in clock.gaps:
         usable &= np.abs(base - gap) > HALF + margin + NODES
-    middle = clock.index_of(median(time_s))
-    rate = 1.0 / float(clock.time_of(middle + 0.5) - clock.time_of(middle - 0.5))
+    before_s, after_s = clock.time_of(clock.index_of(median(time_s)) + np.array([-0.5, 0.5])).tolist()
+    rate = 1.0 / (after_s - before_s)
     # A channel a row: what is done to a channel afterwards finds its samples side by side.
     u, du = np.zeros((x.shape[1], len(position))), np.zeros((x.shape[1], len(position)))
     inside = np.nonzero(usable)[0]
