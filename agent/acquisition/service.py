@@ -103,6 +103,8 @@ class Service:
         writer = RecordingThread(self._recorder, self._deliver, flush_s=config.recording.flush_s)
         plant = Plant(self._data_dir, events, writer, self._recorder, Outbox(self._store), self._publisher)
         self._supervisor = Supervisor(config, self._run_id, self._origin_ns, plant, Notifier(os.environ))
+        for channel in config.channels:
+            self._supervisor.remember(plant.outbox.drifts(channel.sensor))
         self.begun = True
         try:
             writer.put(0, self._run_start(continuation=False), [])

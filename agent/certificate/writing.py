@@ -13,6 +13,7 @@ from agent.certificate.html import page
 from agent.certificate.pdf import pdf
 from agent.certificate.schema import check_schema
 from agent.certificate.signing import Signer, as_json
+from agent.certificate.x509 import X509Signer
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -20,8 +21,14 @@ if TYPE_CHECKING:
 NAME = "certificate"
 
 
-def write(c: Certificate, directory: Path, key: Ed25519PrivateKey | None, xsd: Path | None = None) -> list[Path]:
-    """Write the certificate in all forms into `directory`, which is created if needed, and its signature with a key.
+def write(
+    c: Certificate,
+    directory: Path,
+    key: Ed25519PrivateKey | None,
+    xsd: Path | None = None,
+    x509: X509Signer | None = None,
+) -> list[Path]:
+    """Write the certificate in all forms into `directory`, which is created if needed, and its signatures.
 
     With `xsd`, the schema of the DCC, the XML must be valid. Raises OSError, CertificateError and SchemaError; with the
     latter two nothing is written.
@@ -38,6 +45,8 @@ def write(c: Certificate, directory: Path, key: Ed25519PrivateKey | None, xsd: P
     }
     if (signature := signer.sign(files)) is not None:
         files[f"{NAME}.sig"] = signature + b"\n"
+    if x509 is not None:
+        files |= x509.files(files)
     directory.mkdir(parents=True, exist_ok=True)
     for name, content in files.items():
         (directory / name).write_bytes(content)

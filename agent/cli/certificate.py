@@ -20,10 +20,19 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
 @click.option("-o", "--output", type=click.Path(path_type=Path, file_okay=False), required=True, metavar="DIR",
               help="Directory for certificate.pdf, .html, .xml and .json.")  # fmt: skip
 @click.option("--key", type=_FILE, help="Ed25519 private key (PEM) that signs the certificate.")
+@click.option("--x509-key", type=_FILE, help="RSA or EC private key (PEM) that signs the certificate's files as CMS.")
+@click.option("--x509-certificate", type=_FILE, help="Its X.509 certificate (PEM), then those of the authorities.")
 @click.option("--xsd", type=_FILE, help="dcc.xsd of PTB, with SI_Format.xsd beside it: the XML is checked against it.")
 @click.option("--sensor", metavar="NAME", help="The sensor, if the input has several.")
 def certificate(
-    inputs: tuple[Path, ...], stated: Path, output: Path, key: Path | None, xsd: Path | None, sensor: str | None
+    inputs: tuple[Path, ...],
+    stated: Path,
+    output: Path,
+    key: Path | None,
+    x509_key: Path | None,
+    x509_certificate: Path | None,
+    xsd: Path | None,
+    sensor: str | None,
 ) -> int:
     """Make a calibration certificate.
 
@@ -32,6 +41,8 @@ def certificate(
 
     Exit status 3 if the data were refused: then there is no certificate. 2 if the input cannot be used.
     """
+    if (x509_key is None) != (x509_certificate is None):
+        raise click.UsageError("--x509-key and --x509-certificate must be given together")
     try:
         import matplotlib  # noqa: F401 - imported to check for it before any other work
     except ImportError:
@@ -44,12 +55,14 @@ def certificate(
     from agent.certificate.schema import SchemaError
     from agent.certificate.statements import Statements
     from agent.certificate.writing import write
+    from agent.certificate.x509 import X509Signer
     from agent.report.material import MaterialError, gather
     from agent.report.writing import left_over
 
     try:
         told = load_model(stated, Statements)
         private = None if key is None else load_private_key(key)
+        x509 = X509Signer.load(x509_key, x509_certificate) if x509_key and x509_certificate else None
         material = gather(inputs, sensor)
         if len(material.results) > 1:
             raise MaterialError("a certificate is of one result; give one RESULT.json")
@@ -57,7 +70,7 @@ def certificate(
             for reason in material.results[0].reasons:
                 say(f"refused: {reason}", err=True)
             return 3
-        written = write(certificate_of(material, told, stated.parent, left_over(material)), output, private, xsd)
+        written = write(certificate_of(material, told, stated.parent, left_over(material)), output, private, xsd, x509)
     except (ConfigError, KeyFileError, MaterialError, SchemaError) as error:
         for line in str(error).splitlines():
             say(f"fieldcal certificate: {line}", err=True)

@@ -12,7 +12,16 @@ from typing import Literal
 import msgspec
 
 from agent.config import Config
-from agent.core.events import CalibrationUpdate, DeviceChange, Event, Gap, Result, StatusChange, WindowReport
+from agent.core.events import (
+    CalibrationUpdate,
+    DeviceChange,
+    DriftReport,
+    Event,
+    Gap,
+    Result,
+    StatusChange,
+    WindowReport,
+)
 from agent.supervision.devices import DeviceHealth, DeviceWatch
 from hw.block import SampleBlock
 
@@ -68,14 +77,33 @@ class Situation(msgspec.Struct, frozen=True, kw_only=True):
     process: ProcessHealth | None
 
 
+class InForce(msgspec.Struct, frozen=True, kw_only=True):
+    """The calibration in force. `made_utc_ns`: when it was made; a restart does not change it.
+
+    `sensitivity` 3 x 3 and `offset` 3 in `output_unit` (per m/s2). `expanded_uncertainty`: 12, S row by row, then Q.
+    """
+
+    made_utc_ns: int
+    sensitivity: list[list[float]]
+    offset: list[float]
+    expanded_uncertainty: list[float]
+    coverage_factor: float
+    output_unit: str
+
+
 class SensorHealth(msgspec.Struct, frozen=True, kw_only=True):
-    """Results of one sensor since the run began. `calibrations` were made in this run: one restored is none of them."""
+    """Results of one sensor since the run began. `calibrations` were made in this run: one restored is none of them.
+
+    `drifts`: the newest verdict of the drift test on each parameter that it has judged, also in earlier runs.
+    """
 
     status: str
     reason: str
     windows_used: int
     windows_refused: int
     calibrations: int
+    in_force: InForce | None = None
+    drifts: dict[str, str] = {}
 
 
 class GatewayStatus(Situation, frozen=True, kw_only=True):
@@ -130,6 +158,12 @@ class Health:
         for result in results:
             self._take(result)
 
+    def remember(self, reports: Sequence[DriftReport]) -> None:
+        """Take verdicts of the drift test of earlier runs, oldest first."""
+        for report in reports:
+            if report.sensor in self._sensors:
+                self._take(report)
+
     def state(self, now_ns: int, situation: Situation, faults: Sequence[str]) -> tuple[State, list[str]]:
         """The state at `now_ns` (CLOCK_MONOTONIC) and its reasons, which include `faults`. Takes microseconds."""
         reasons = [
@@ -159,8 +193,11 @@ class Health:
         if isinstance(result, WindowReport):
             used, refused = sensor.windows_used + result.used, sensor.windows_refused + (not result.used)
             sensor = msgspec.structs.replace(sensor, windows_used=used, windows_refused=refused)
-        elif isinstance(result, CalibrationUpdate) and not result.made_sequence:
-            sensor = msgspec.structs.replace(sensor, calibrations=sensor.calibrations + 1)
+        elif isinstance(result, CalibrationUpdate):
+            made = sensor.calibrations + (not result.made_sequence)
+            sensor = msgspec.structs.replace(sensor, calibrations=made, in_force=_in_force(result))
+        elif isinstance(result, DriftReport):
+            sensor = msgspec.structs.replace(sensor, drifts={**sensor.drifts, result.parameter: result.verdict})
         elif isinstance(result, StatusChange):
             sensor = msgspec.structs.replace(sensor, status=result.status, reason=result.reason)
         self._sensors[result.sensor] = sensor
@@ -178,3 +215,14 @@ class Health:
             f"queue more than half full, the agent is too slow: {', '.join(behind)}": behind,
         }
         return [words for words, holds in told.items() if holds]
+
+
+def _in_force(update: CalibrationUpdate) -> InForce:
+    return InForce(
+        made_utc_ns=update.date_utc_ns,
+        sensitivity=update.sensitivity,
+        offset=update.offset,
+        expanded_uncertainty=[update.coverage_factor * u for u in update.standard_uncertainty],
+        coverage_factor=update.coverage_factor,
+        output_unit=update.output_unit,
+    )

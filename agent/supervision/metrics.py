@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import math
 import socket
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, cast, get_args
 
 from agent.supervision.devices import ClockQuality, DeviceHealth
 from agent.supervision.front_page import HEADERS, front_page
-from agent.supervision.health import GatewayStatus, State
+from agent.supervision.health import GatewayStatus, InForce, State
 
 if TYPE_CHECKING:
     from prometheus_client.metrics_core import Metric
 
+AXES = ("x", "y", "z")
+VERDICTS = ("stable", "drifting", "stepped")
 CALIBRATION_STATES = ("UNCALIBRATED", "COLLECTING", "VALID", "HELD", "RECALIBRATING", "INVALID")
 
 Number = float | int | bool | None
@@ -101,6 +104,29 @@ class StatusCollector:
         yield _family("fieldcal_windows", "Windows of known excitation", True, ["sensor", "verdict"], windows)
         calibrations = [((name,), sensor.calibrations) for name, sensor in status.sensors.items()]
         yield _family("fieldcal_calibrations", "Calibrations that came into force", True, ["sensor"], calibrations)
+        judged = [
+            ((n, parameter), verdict) for n, s in status.sensors.items() for parameter, verdict in s.drifts.items()
+        ]
+        yield _states("fieldcal_drift_state", "Verdict of the drift test", ["sensor", "parameter"], judged, VERDICTS)
+        yield from self._in_force({n: s.in_force for n, s in status.sensors.items() if s.in_force is not None})
+
+    def _in_force(self, sensors: Mapping[str, InForce]) -> Iterator[Metric]:
+        """S, Q and U of the calibrations in force, and when they were made."""
+        made = [((name,), c.made_utc_ns * 1e-9) for name, c in sensors.items()]
+        text = "UTC at which the calibration in force was made; a restart does not change it"
+        yield _family("fieldcal_calibration_timestamp_seconds", text, False, ["sensor"], made)
+        factors = [((name,), c.coverage_factor) for name, c in sensors.items()]
+        yield _family("fieldcal_calibration_coverage_factor", "k of the U in force", False, ["sensor"], factors)
+        cells = [
+            ((name, output, direction), c.output_unit, c.sensitivity[i][k], c.expanded_uncertainty[3 * i + k])
+            for name, c in sensors.items() for i, output in enumerate(AXES) for k, direction in enumerate(AXES)
+        ]  # fmt: skip
+        yield from _with_u("sensitivity", "S, output unit per m/s2", ["sensor", "output", "direction"], cells)
+        rows = [
+            ((name, output), c.output_unit, c.offset[i], c.expanded_uncertainty[9 + i])
+            for name, c in sensors.items() for i, output in enumerate(AXES)
+        ]  # fmt: skip
+        yield from _with_u("offset", "Q, output unit", ["sensor", "output"], rows)
 
 
 def serve_metrics(host: str, port: int, newest: Callable[[], GatewayStatus | None]) -> str:
@@ -145,6 +171,17 @@ def _family(name: str, text: str, grows: bool, labels: list[str], values: Values
         if value is not None:
             family.add_metric(list(of), float(value))
     return family
+
+
+def _with_u(
+    name: str, text: str, labels: list[str], cells: Iterable[tuple[tuple[str, ...], str, float, float]]
+) -> Iterator[Metric]:
+    """A quantity and its expanded uncertainty, each cell with its unit; those that are not known are left out."""
+    known = [((*of, unit), value, u) for of, unit, value, u in cells if math.isfinite(value) and math.isfinite(u)]
+    name = f"fieldcal_calibration_{name}"
+    yield _family(name, text, False, [*labels, "unit"], [(of, value) for of, value, _ in known])
+    uncertainties = [(of, u) for of, _, u in known]
+    yield _family(f"{name}_expanded_uncertainty", f"U of {text}", False, [*labels, "unit"], uncertainties)
 
 
 def _states(

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
+from agent.core.events import DriftReport
 from agent.delivery.history import History, StoreError
 from agent.delivery.publication import Publisher
 from agent.delivery.store import Store
@@ -22,6 +23,7 @@ from agent.supervision.health import (
     Situation,
 )
 
+MOST_DRIFTS = 120  # ten changes of verdict of each of the twelve parameters
 _PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 
 
@@ -48,6 +50,15 @@ class Outbox:
         if now != self._asked:
             self._asked, self._count = now, self._read(*now)
         return self._count
+
+    def drifts(self, sensor: str) -> list[DriftReport]:
+        """The newest stored verdicts of the drift test on a sensor, oldest first; none if the store is not readable."""
+        try:
+            with History(self._store.path) as history:
+                found = [record.result for record in history.newest(sensor, "drift", limit=MOST_DRIFTS)]
+        except (StoreError, sqlite3.Error):
+            return []
+        return [report for report in reversed(found) if isinstance(report, DriftReport)]
 
     def _read(self, published: int, last: int) -> int | None:
         if published >= last:

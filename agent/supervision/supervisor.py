@@ -10,7 +10,7 @@ import msgspec
 
 from agent import __version__
 from agent.config import Config
-from agent.core.events import Event, Result, Tick, WindowReport
+from agent.core.events import DriftReport, Event, Result, Tick, WindowReport
 from agent.supervision.health import GatewayStatus, Health, State
 from agent.supervision.logs import log_event, tell
 from agent.supervision.metrics import serve_metrics
@@ -43,6 +43,10 @@ class Supervisor:
         tell("run", f"run {run_id} begins", run_id=run_id, version=__version__, gateway=config.gateway.name)
         if self._settings.metrics.enabled:
             self._serve_metrics()
+
+    def remember(self, reports: Sequence[DriftReport]) -> None:
+        """Take verdicts of the drift test of earlier runs, oldest first. Call it before the first event."""
+        self._health.remember(reports)
 
     def on_event(self, event: Event, results: Sequence[Result]) -> None:
         """Take an event that the pipeline has processed, with its results."""
