@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import ipaddress
+import os
 import socket
 import sqlite3
 import ssl
 import sys
-import threading
 from collections.abc import Callable
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -92,82 +92,45 @@ def monitor(
 ) -> int:
     """Show all sensors of all gateways on one web page, until Ctrl-C. Exit status: 1 port or disk, 2 bad input."""
     try:
-        import uvicorn
-
-        from agent.monitor.server import application
+        from agent.monitor.running import Bus, Web, serve
+        from agent.monitor.settings import MonitorSettings, load_settings
         from agent.monitor.users import UsersError
     except ImportError:
         say(_NEEDS, err=True)
         return 1
-    from agent.monitor.database import Database
-    from agent.monitor.fleet import Fleet
-    from agent.monitor.following import Following
-    from agent.monitor.forwarding import Forwarding
-    from agent.monitor.live import Live
-    from agent.monitor.login import Access
-    from agent.monitor.notices import Notifier, Watch
-    from agent.monitor.settings import MonitorSettings, load_settings
-
     if add_user is not None:
         return _add_user(users, add_user, verbs)
     host, port = _listen(listen)
-    _check_https(https_certificate, https_key)
-    if users is not None and not (https_certificate or behind_proxy or _is_loopback(host)):
-        raise click.UsageError(
-            "--users on an address that is not loopback needs HTTPS, because passwords could be read on the way; "
-            "give --https-certificate and --https-key, or --behind-proxy"
-        )
-    tls = tls_files(endpoints, ca, certificate, certificate_key)
-    commander = tls_files(endpoints, ca, command_certificate or certificate, command_key or certificate_key)
+    _check_https(host, users, https_certificate, https_key, behind_proxy)
+    bus = Bus(
+        endpoints=endpoints, tls=tls_files(endpoints, ca, certificate, certificate_key), keys=keys,
+        commander=tls_files(endpoints, ca, command_certificate or certificate, command_key or certificate_key),
+    )  # fmt: skip
+    web = Web(names=names, users=users, certificate=https_certificate, key=https_key, behind_proxy=behind_proxy)
     with ExitStack() as stack:
         try:
             if keys is not None:
                 read_known_keys(keys)
             settings = load_settings(config_file) if config_file is not None else MonitorSettings()
-            access = Access(users)
+            family = socket.AF_INET6 if ":" in host else socket.AF_INET
+            listening = stack.enter_context(socket.create_server((host, port), family=family))
             if with_router and not router_running(DEFAULT_ENDPOINT):
                 stack.enter_context(open_router(None)[0])
             data_dir.mkdir(parents=True, exist_ok=True)
-            database = stack.enter_context(closing(Database(data_dir / "monitor.sqlite")))
-            fleet = Fleet()
-            following = stack.enter_context(closing(Following(endpoints, tls, database, fleet, keys)))
+            say(f"the fleet page is at http{'s' if https_certificate else ''}://{listen}")
+            if users is None and not _is_loopback(host):
+                say("anyone who reaches this address can read the page: it has no login (option --users)", err=True)
+            ended = serve(listening, data_dir, bus, web, settings)
         except (ConfigError, EndpointError, KeyFileError, UsersError) as error:
             say(f"fieldcal monitor: {error}", err=True)
             return 2
-        except sqlite3.Error as error:
-            say(f"fieldcal monitor: {data_dir / 'monitor.sqlite'}: {error}", err=True)
+        except (sqlite3.Error, OSError) as error:
+            where = listen if isinstance(error, OSError) else data_dir / "monitor.sqlite"
+            say(f"fieldcal monitor: {where}: {error}", err=True)
             return 1
-        stopping = threading.Event()
-        forwarding, live = Forwarding(endpoints, commander, access, fleet), Live(endpoints, tls, stopping)
-        notifier = None
-        if settings.notices is not None:
-            shown = (ca, certificate, command_certificate, https_certificate)
-            watch = Watch(fleet, settings.notices, [Path(path) for path in shown if path is not None])
-            notifier = stack.enter_context(closing(Notifier(watch, settings.notices)))
-        app = application(
-            database, fleet, following, access, forwarding, live, stopping, names, settings.plan, notifier
-        )
-        served = uvicorn.Config(app, log_level="warning", timeout_graceful_shutdown=2, server_header=False,
-                                  ssl_certfile=https_certificate, ssl_keyfile=https_key,
-                                  proxy_headers=behind_proxy, forwarded_allow_ips="127.0.0.1,::1")  # fmt: skip
-        try:
-            listening = socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
-        except OSError as error:
-            say(f"fieldcal monitor: {listen}: {error.strerror or error}", err=True)
-            return 1
-        say(f"the fleet page is at http{'s' if https_certificate else ''}://{listen}")
-        if users is None and not _is_loopback(host):
-            say("anyone who reaches this address can read the page: it has no login (option --users)", err=True)
-
-        class Server(uvicorn.Server):
-            """Ends the streams of open pages at Ctrl-C."""
-
-            def handle_exit(self, sig: int, frame: Any) -> None:
-                stopping.set()
-                super().handle_exit(sig, frame)
-
-        with suppress(KeyboardInterrupt):
-            Server(served).run([listening])
+    if not ended:  # a router that does not answer blocks a thread; do not wait for it
+        sys.stdout.flush()
+        os._exit(0)
     return 0
 
 
@@ -189,7 +152,12 @@ def _add_user(users: Path | None, name: str, verbs: tuple[str, ...]) -> int:
     return 0
 
 
-def _check_https(certificate: Path | None, key: Path | None) -> None:
+def _check_https(host: str, users: Path | None, certificate: Path | None, key: Path | None, behind_proxy: bool) -> None:
+    if users is not None and not (certificate or behind_proxy or _is_loopback(host)):
+        raise click.UsageError(
+            "--users on an address that is not loopback needs HTTPS, because passwords could be read on the way; "
+            "give --https-certificate and --https-key, or --behind-proxy"
+        )
     if (certificate is None) != (key is None):
         raise click.UsageError("--https-certificate and --https-key must be given together")
     if certificate is None or key is None:

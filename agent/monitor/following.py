@@ -20,6 +20,7 @@ from agent.monitor.database import Database
 from agent.monitor.fleet import Fleet
 
 RECONNECT_S = 2.0  # s between two attempts to reach a router
+CLOSE_S = 2.0
 TOKENS = 10_000  # changes of presence that may wait
 
 _log = logging.getLogger(__name__)
@@ -55,11 +56,16 @@ class Following:
         """The number of results that were not verified, by the gateway in whose name they were published."""
         return self._consumer.refused if self._consumer is not None else {}
 
-    def close(self) -> None:
-        """End the threads."""
+    def close(self, timeout_s: float = CLOSE_S) -> bool:
+        """End the threads. May be called twice.
+
+        Returns False where a router that does not answer still blocks a thread after `timeout_s`. The process must then
+        end with `os._exit`: a thread that returns from Zenoh during the interpreter's shutdown aborts it.
+        """
         self._stop.set()
         self._open.close()
-        self._thread.join(RECONNECT_S)
+        self._thread.join(timeout_s)
+        return not self._thread.is_alive()
 
     def _run(self) -> None:
         while not self._stop.is_set():
@@ -75,25 +81,36 @@ class Following:
         consumer = self._consumer = Consumer(self._endpoints, last_sequence=last, tls=self._tls, keys=self.keys)
         with consumer, zenoh.open(self._config) as session:
             self._open.callback(consumer.close)
+            if self._stop.is_set():  # `close` may have been before the callback
+                return
             tokens = session.liveliness().declare_subscriber(
                 f"{PREFIX}/*/*/alive", zenoh.handlers.FifoChannel(TOKENS), history=True
             )
-            threading.Thread(target=self._watch, args=(tokens,), name="presence", daemon=True).start()
             told = session.declare_subscriber(f"{PREFIX}/*/*/status", zenoh.handlers.RingChannel(TOKENS))
-            threading.Thread(target=self._hear, args=(told,), name="health", daemon=True).start()
+            threads = [threading.Thread(target=self._watch, args=(tokens,), name="presence", daemon=True),
+                       threading.Thread(target=self._hear, args=(told,), name="health", daemon=True)]  # fmt: skip
+            for thread in threads:
+                thread.start()
             self.fault = ""
-            for result in consumer:
-                if not result.confirmed:
-                    self.unconfirmed += 1
-                    continue
-                a = result.address
-                if not self._fleet.admits(a):
-                    continue
-                result.fields["signed_by"] = result.signed_by
-                self._database.add(result)
-                self._fleet.take(a.site, a.gateway, a.sensor, a.what, result.fields)
-            tokens.undeclare()
-            told.undeclare()
+            try:
+                self._take(consumer)
+            finally:
+                tokens.undeclare()
+                told.undeclare()
+                for thread in threads:
+                    thread.join(CLOSE_S)
+
+    def _take(self, consumer: Consumer) -> None:
+        for result in consumer:
+            if not result.confirmed:
+                self.unconfirmed += 1
+                continue
+            a = result.address
+            if not self._fleet.admits(a):
+                continue
+            result.fields["signed_by"] = result.signed_by
+            self._database.add(result)
+            self._fleet.take(a.site, a.gateway, a.sensor, a.what, result.fields)
 
     def _watch(self, tokens: zenoh.Subscriber[zenoh.Handler[zenoh.Sample]]) -> None:
         for token in tokens:

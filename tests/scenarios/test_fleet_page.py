@@ -200,7 +200,7 @@ def test_a_killed_gateway_is_shown_and_a_restarted_monitor_has_the_whole_history
     site: Site, tmp_path: Path, browser: Any
 ) -> None:
     options = ["simulate", "--fleet", "1", "--sensors", "1", "--every", "0.3", "--connect", site.endpoint]
-    monitor = Monitor(site, tmp_path / "monitor")
+    monitor = Monitor(site.endpoint, tmp_path / "monitor")
     gateway = subprocess.Popen([sys.executable, "-c", COMMAND, *options], stdout=subprocess.DEVNULL)
     asked = "api/history?site=simulated&gateway=gw0000&sensor=s0&what=calibration"
     try:
@@ -216,7 +216,7 @@ def test_a_killed_gateway_is_shown_and_a_restarted_monitor_has_the_whole_history
         history = monitor.get(asked)
         monitor.stop()
         page.get_by_text("the monitor does not answer").wait_for()
-        monitor = Monitor(site, tmp_path / "monitor", address=monitor.address)
+        monitor = Monitor(site.endpoint, tmp_path / "monitor", address=monitor.address)
         page.get_by_text("Sensors: 1, of which need a person: 1").wait_for()  # the open page goes on by itself
         assert monitor.get(asked) == history
         watched.close()

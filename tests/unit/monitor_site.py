@@ -57,9 +57,8 @@ class Served(AbstractContextManager["Served"]):
         directory.mkdir(exist_ok=True)
         self.database = self._open.enter_context(closing(Database(directory / "monitor.sqlite")))
         self.fleet = Fleet()
-        self.following = self._open.enter_context(
-            closing(Following([site.endpoint], None, self.database, self.fleet, keys))
-        )
+        self.following = Following([site.endpoint], None, self.database, self.fleet, keys)
+        self._open.callback(self._end_following)
         access = Access(users)
         forwarding = Forwarding([site.endpoint], None, access, self.fleet)
         stopping = threading.Event()
@@ -79,6 +78,9 @@ class Served(AbstractContextManager["Served"]):
 
         self._open.callback(stop)
         wait_for(lambda: server.started)
+
+    def _end_following(self) -> None:
+        assert self.following.close(30.0), "a thread is still in Zenoh"
 
     def ask(
         self, path: str, method: str = "GET", body: bytes | str = b"", headers: Mapping[str, str] | None = None
@@ -100,13 +102,15 @@ class Served(AbstractContextManager["Served"]):
 class Monitor:
     """`fieldcal monitor` in a process of its own. `ca`: the authority of its certificate, where it serves HTTPS."""
 
-    def __init__(self, site: Site, directory: Path, *options: str, address: str = "", ca: Path | None = None) -> None:
+    def __init__(
+        self, endpoint: str, directory: Path, *options: str, address: str = "", ca: Path | None = None
+    ) -> None:
         with closing(socket.socket()) as free:
             free.bind(("127.0.0.1", 0))
             self.address = address or f"127.0.0.1:{free.getsockname()[1]}"
         self.tls = ssl.create_default_context(cafile=ca) if ca is not None else None
         self.url = f"http{'s' if ca is not None else ''}://{self.address}"
-        given = ["--connect", site.endpoint, "--listen", self.address, "--data-dir", str(directory), *options]
+        given = ["--connect", endpoint, "--listen", self.address, "--data-dir", str(directory), *options]
         self._process = subprocess.Popen([sys.executable, "-c", COMMAND, "monitor", *given], stderr=subprocess.PIPE)
         try:
             wait_for(self._answers, STARTS_S)
@@ -132,7 +136,7 @@ class Monitor:
         return rows
 
     def stop(self) -> None:
-        """Ctrl-C. Fails where the program ends with a traceback."""
+        """Ctrl-C. Fails where the program does not end well."""
         self._process.send_signal(signal.SIGINT)
         said = self._process.communicate(timeout=10)[1].decode()
-        assert "Traceback" not in said, said
+        assert (self._process.returncode, "Traceback" in said, "FATAL" in said) == (0, False, False), said

@@ -1,0 +1,94 @@
+"""All parts of the monitor together: database, bus, notices and web server, until Ctrl-C."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from collections.abc import Sequence
+from contextlib import ExitStack, closing, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import uvicorn
+
+from agent.config.tls import TlsFiles
+from agent.monitor.database import Database
+from agent.monitor.fleet import Fleet
+from agent.monitor.following import Following
+from agent.monitor.forwarding import Forwarding
+from agent.monitor.live import Live
+from agent.monitor.login import Access
+from agent.monitor.notices import Notifier, Watch
+from agent.monitor.server import application
+from agent.monitor.settings import MonitorSettings
+
+GRACE_S = 2  # s in which answers on their way may end at Ctrl-C
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bus:
+    """Routers, the files of a consumer (`tls`) and of a commander, and the list of known keys."""
+
+    endpoints: Sequence[str]
+    tls: TlsFiles | None
+    commander: TlsFiles | None
+    keys: Path | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Web:
+    """Names of the server, who may log in, and HTTPS: the certificate with its key, or a proxy on this machine."""
+
+    names: Sequence[str]
+    users: Path | None
+    certificate: Path | None
+    key: Path | None
+    behind_proxy: bool
+
+
+class _Server(uvicorn.Server):
+    """Ends the streams of open pages at Ctrl-C, which would otherwise be cut with an error."""
+
+    def __init__(self, config: uvicorn.Config, stopping: threading.Event) -> None:
+        super().__init__(config)
+        self._stopping = stopping
+
+    def handle_exit(self, sig: int, frame: Any) -> None:
+        self._stopping.set()
+        super().handle_exit(sig, frame)
+
+
+def serve(listening: socket.socket, data_dir: Path, bus: Bus, web: Web, settings: MonitorSettings) -> bool:
+    """Serve the page on a socket that listens, until Ctrl-C. Returns what `Following.close` returns.
+
+    Raises EndpointError, KeyFileError, UsersError, or sqlite3.Error where the database cannot be used.
+    """
+    fleet, stopping = Fleet(), threading.Event()
+    access, live = Access(web.users), Live(bus.endpoints, bus.tls, stopping)
+    forwarding = Forwarding(bus.endpoints, bus.commander, access, fleet)
+    with ExitStack() as stack:
+        database = stack.enter_context(closing(Database(data_dir / "monitor.sqlite")))
+        following = Following(bus.endpoints, bus.tls, database, fleet, bus.keys)
+        stack.callback(following.close)
+        notifier = None
+        if settings.notices is not None:
+            notifier = Notifier(Watch(fleet, settings.notices, _certificates(bus, web)), settings.notices)
+            stack.callback(notifier.close)
+        app = application(
+            database, fleet, following, access, forwarding, live, stopping, web.names, settings.plan, notifier
+        )
+        config = uvicorn.Config(
+            app, log_level="warning", timeout_graceful_shutdown=GRACE_S, server_header=False,
+            ssl_certfile=web.certificate, ssl_keyfile=web.key,
+            proxy_headers=web.behind_proxy, forwarded_allow_ips="127.0.0.1,::1",
+        )  # fmt: skip
+        with suppress(KeyboardInterrupt):
+            _Server(config, stopping).run([listening])
+        return following.close()
+
+
+def _certificates(bus: Bus, web: Web) -> list[Path]:
+    """The certificates of this monitor whose end is told."""
+    named = [name for files in (bus.tls, bus.commander) if files is not None for name in (files.ca, files.certificate)]
+    return [Path(name) for name in dict.fromkeys(named)] + ([web.certificate] if web.certificate is not None else [])
