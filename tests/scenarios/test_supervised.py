@@ -78,7 +78,10 @@ def systemd(tmp_path: Path) -> Iterator[Systemd]:
 
 @pytest.fixture
 def imu(tmp_path: Path) -> Iterator[PtyDevice]:
-    device = PtyDevice(SampleLines(lambda _, n: np.ones((n, 3)), lambda t_s: int(t_s * 100)), link=tmp_path / "imu")
+    # The time since the machine was started would make a line for every sample since then.
+    began_s = time.monotonic()
+    lines = SampleLines(lambda _, n: np.ones((n, 3)), lambda t_s: int((t_s - began_s) * 100))
+    device = PtyDevice(lines, link=tmp_path / "imu")
     device.start()
     yield device
     device.stop()
