@@ -19,7 +19,7 @@ from calib.estimate.clamping import Clamping
 
 CLAMP_FROM_S = 15.0  # of samples, in which a clamp can be judged
 LEAST_STAY_S = 30.0  # before that the spread of the noise itself is hardly known
-LOOK_S = 2.0  # from one look to the next, and twice the time that a look takes
+LOOK_S = 5.0  # from one look to the next, or twice the time that a look takes
 Ending = Literal["measured", "left out", "quit"]
 
 

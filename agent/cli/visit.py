@@ -97,7 +97,7 @@ def _channels(settings: Config, sensors: tuple[str, ...]) -> list[Channel]:
     """The channels to visit, in the order of --sensor. Raises ValueError where one cannot be visited."""
     by_name = {channel.sensor: channel for channel in settings.channels}
     if unknown := [name for name in sensors if name not in by_name]:
-        raise ValueError(f"--sensor {unknown[0]}: no channel has this sensor; there are {', '.join(by_name)}")
+        raise ValueError(f"--sensor {unknown[0]}: no channel has it; there are {', '.join(by_name)}")
     found = [by_name[name] for name in dict.fromkeys(sensors)] if sensors else list(settings.channels)
     for channel in found:
         where = f"the channel of {channel.sensor}"

@@ -58,10 +58,10 @@ class Clamping:
 
     `turned_deg` (3,): the rotation vector of T in the frame of the reference, with the standard uncertainties
     `u_turned_deg` (3,), and `turned` whether it contradicts what is stated. `rise`: by how much the output is smaller,
-    relative to the reference's motion, in the uppermost band with motion, about `high_hz`, than at low frequencies. `rattle`: rms of
-    what is not coherent and grows with the motion, relative to the motion. `coherence` is that of all bands together,
-    of the worst axis. `moved_mps2` (3,) is the rms of the reference's channels, `noise_mps2` that of what does not grow
-    with the motion.
+    relative to the reference's motion, in the uppermost band with motion, about `high_hz`, than at low frequencies.
+    `rattle`: rms of what is not coherent and grows with the motion, relative to the motion. `coherence` is that of all
+    bands together, of the worst axis. `moved_mps2` (3,) is the rms of the reference's channels, `noise_mps2` that of
+    what does not grow with the motion.
     """
 
     turned: bool

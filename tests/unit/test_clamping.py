@@ -9,12 +9,13 @@ import pytest
 
 from agent.bench.clamp_words import findings
 from agent.bench.growth import MONTH_DAYS, Growth
-from agent.bench.measuring import Record
 from agent.bench.visit_dialogue import forbidden
 from agent.bench.visiting import ahead
+from agent.calibrate.outcome import Outcome
 from benchmarks.visits import Visit
 from calib.estimate.clamping import Clamping, clamping
 from calib.estimate.next_stop import Wanted
+from calib.model import PARAMETERS, Calibration
 from hw.virtual.visits import Clamped
 
 SECONDS = 30.0
@@ -65,19 +66,26 @@ def test_little_motion_is_no_loose_clamp():
     assert found.noise_mps2 == pytest.approx(0.005, rel=0.7)
 
 
-def test_the_time_is_right_for_a_known_budget():
-    """U falls with the root of the time where noise is all, and never below what the reference forbids."""
-    visit = Visit.drawn(5, Clamped())
-    outcome = visit.measuring.outcome(visit.record(SECONDS), [visit.taken(SECONDS)])
-    measured_s = visit.taken(SECONDS).stop_s - visit.taken(SECONDS).start_s
-    told = ahead(outcome, measured_s, Wanted(0.0022, np.inf))
+def _outcome(type_a: float, reference: float) -> Outcome:
+    found = Calibration(np.eye(3), np.zeros(3), np.eye(12), np.ones(12, dtype=bool), np.inf, "")
+    budget = {
+        "type A": dict.fromkeys(PARAMETERS, type_a), "reference sensitivity": dict.fromkeys(PARAMETERS, reference)
+    }  # fmt: skip
+    return Outcome(found, (), [], 200.0, "", more={"budget": budget})
+
+
+def test_the_time_follows_from_the_budget():
+    """The variance of noise falls with the inverse of the time; the reference stays, and forbids what is below it."""
+    wanted = Wanted(2.0 * np.hypot(0.003, 0.004 / 2.0), np.inf)  # a half of the noise: four times the time
+    told = ahead(_outcome(0.004, 0.003), 30.0, wanted)
     assert told is not None
-    assert told.at_last[[0, 4, 8]].max() == pytest.approx(0.002, rel=0.01)  # the reference: u 0.1 %
-    assert np.isinf(ahead(outcome, measured_s, Wanted(0.0019, np.inf)).needed_s)  # type: ignore[union-attr]
-    assert ahead(outcome, measured_s, Wanted(0.0019, np.inf)).because == "reference sensitivity"  # type: ignore[union-attr]
-    near, far = (ahead(outcome, measured_s, Wanted(w, np.inf)).needed_s for w in (0.0022, 0.003))  # type: ignore[union-attr]
-    shares = [w**2 - float(told.at_last[[0, 4, 8]].max()) ** 2 for w in (0.0022, 0.003)]
-    assert near / far == pytest.approx(shares[1] / shares[0], rel=0.1)
+    assert told.now == pytest.approx(np.full(9, 0.01))
+    assert told.needed_s == pytest.approx(120.0)
+    never = ahead(_outcome(0.004, 0.003), 30.0, Wanted(0.0059, np.inf))
+    assert never is not None
+    assert np.isinf(never.needed_s)
+    assert never.at_last == pytest.approx(np.full(9, 0.006))
+    assert never.because == "reference sensitivity"
 
 
 def test_what_the_reference_forbids_is_said():
@@ -102,8 +110,3 @@ def test_u_grows_as_the_configuration_states():
     told = later.told(0.5, datetime(2026, 1, 1, tzinfo=UTC))
     assert [a["months"] for a in told["after"]] == [0, 1, 3, 6, 12]
     assert told["exceeded_on"] > "2026-02-01"
-
-
-def test_a_record_is_what_devices_send():
-    record: Record = Visit.drawn(1, Clamped()).record(5.0)
-    assert {len(samples.values) // 32 for samples in record.values()} == {31}
