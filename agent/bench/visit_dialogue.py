@@ -154,7 +154,7 @@ class VisitDialogue:
 
     def _tell(self, later: Ahead, clamp: Clamping | None, stayed_s: float) -> None:
         """Say once how long it takes, and then show how it goes on."""
-        moved = "" if clamp is None else f" at this motion ({1e3 * float(clamp.moved_mps2.max()):.2g} mm/s2 rms)"
+        moved = "" if clamp is None else f" at this motion ({1e3 * float(clamp.moved_mps2.max()):.3g} mm/s2 rms)"
         if self._promised_s is None and "time" not in self._warned:
             self._warned.add("time")
             if np.isinf(later.needed_s):
