@@ -1,1 +1,1 @@
-"""`fieldcal bench`: leads a person through positions to a wanted uncertainty, and ends with the result."""
+"""`fieldcal bench` and `fieldcal visit`: lead a person through positions, or with a reference from sensor to sensor."""

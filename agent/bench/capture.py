@@ -6,6 +6,7 @@ import json
 import queue
 import threading
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -115,6 +116,14 @@ class Capture(threading.Thread):
         with self._lock:
             blocks = self._blocks[device]
             return (blocks[-1].t_monotonic_ns - self._origin_ns) * 1e-9 if blocks else None
+
+    def silent(self, devices: Iterable[str], now_s: float, after_s: float) -> str | None:
+        """The first of the devices that has sent nothing for `after_s`; None if all do."""
+        for device in devices:
+            newest_s = self.newest_s(device)
+            if newest_s is None or now_s - newest_s > after_s:
+                return device
+        return None
 
     def record(self, since_s: float = 0.0) -> dict[str, DeviceSamples]:
         """The samples of all devices in the blocks that arrived after `since_s`."""

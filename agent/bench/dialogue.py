@@ -68,19 +68,19 @@ class Dialogue:
                 break
             self._take(stop)
         else:
-            self._say(f"reached after {_count(len(self.taken))}: U {_told(self._session.joint.expanded)}")
+            self._say(f"reached after {_count(len(self.taken))}: U {told_u(self._session.joint.expanded)}")
 
     def _begin(self) -> None:
         wanted, (_, outlook) = self._session.wanted, self._mind.next_stop()
-        self._say(f"wanted: U (k = 2) {_pair(wanted.main, wanted.transverse)}, apart from the reference's own error")
+        self._say(f"wanted: U (k = 2) {pair(wanted.main, wanted.transverse)}, apart from the reference's own error")
         if outlook.stops is not None:
             self._say(f"this takes about {_count(outlook.stops)}")
             return
-        self._say(f"this bench does not reach it: after 100 stops U would still be {_pair(*outlook.best)}")
+        self._say(f"this bench does not reach it: after 100 stops U would still be {pair(*outlook.best)}")
         if outlook.because:
             self._say(
                 f"the reason is {outlook.because}, which all stops share: U never becomes less than "
-                f"{_pair(*outlook.floor)}; state a smaller uncertainty of it if you know it better, or end with q"
+                f"{pair(*outlook.floor)}; state a smaller uncertainty of it if you know it better, or end with q"
             )
         elif len({s.pose.theta_rad for s in self._session.stops}) == 1 and self._session.stops[0].columns.get(
             "theta_deg"
@@ -93,7 +93,7 @@ class Dialogue:
         stop, left = self._session.stops[best.stop], outlook.stops
         self._say(f"stop {len(self.taken) + 1}: {stop.told}")
         more = "" if left is None or left < 2 else f"; {_count(left - 1)} more then to what is wanted"
-        self._say(f"  U will be {_told(best.expanded)}{more}")
+        self._say(f"  U will be {told_u(best.expanded)}{more}")
         while True:
             answer = self._ask(f"  Enter when it stands ({stop.name}); another position as typed; u: undo; q: end > ")
             for line in self._capture.said():
@@ -156,7 +156,7 @@ class Dialogue:
                 self._put(stop)
         self.taken.append(Taken(stop, start_s, stop_s))
         self._refused = self._mind.take(self._capture.record(), self.taken)
-        self._say(f"  stop {len(self.taken)}, {stop.name}: U is now {_told(self._session.joint.expanded)}")
+        self._say(f"  stop {len(self.taken)}, {stop.name}: U is now {told_u(self._session.joint.expanded)}")
         for line in self._session.doubts():
             self._say(f"  {line}")
         for reason in self._refused:
@@ -199,7 +199,7 @@ class Dialogue:
             stayed_s = now_s - start_s
             for line in self._capture.said():
                 self._say(f"  {line}")
-            if (dumb := self._silent(now_s)) is not None:
+            if (dumb := self._capture.silent(self._mind.measuring.devices, now_s, STALE_S)) is not None:
                 self._say(f"  no samples of {dumb} for {STALE_S:g} s: check its cable")
                 return None, now_s
             if stayed_s < FIT_FROM_S:
@@ -217,26 +217,19 @@ class Dialogue:
             if look.left_out > knocked:
                 self._say(f"  knocks: {look.left_out} of {look.points} samples are left out; do not touch the table")
                 knocked = 2 * look.left_out
-            self._progress(f"  {stayed_s:3.0f} s: U will be {_told(look.expanded)}")
+            self._progress(f"  {stayed_s:3.0f} s: U will be {told_u(look.expanded)}")
             enough = stayed_s >= self._stay.least_s and look.gain < GAIN
             if enough or not look.fit.fits or stayed_s > self._stay.most_s:
                 return look.fit, now_s
-
-    def _silent(self, now_s: float) -> str | None:
-        for device in self._mind.measuring.devices:
-            newest_s = self._capture.newest_s(device)
-            if newest_s is None or now_s - newest_s > STALE_S:
-                return device
-        return None
 
 
 def _count(stops: int) -> str:
     return f"{stops} stop{'' if stops == 1 else 's'}"
 
 
-def _pair(main: float, transverse: float) -> str:
+def pair(main: float, transverse: float) -> str:
     return f"{100.0 * main:.2g} % (main), {100.0 * transverse:.2g} % (transverse)"
 
 
-def _told(expanded: Array) -> str:
-    return _pair(float(expanded[MAIN].max()), float(expanded[~MAIN].max()))
+def told_u(expanded: Array) -> str:
+    return pair(float(expanded[MAIN].max()), float(expanded[~MAIN].max()))

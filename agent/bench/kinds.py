@@ -12,9 +12,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from agent.bench.stops import Stop, on_clamp, on_faces, turned_by_hand
+from agent.bench.stops import GRAVITY, Stop, on_clamp, on_faces, turned_by_hand
 from agent.config import Channel
 from calib.estimate.quantities import PRIORS, REFERENCE, YEAR_DAYS
+from calib.geometry import beside
 
 Kind = Literal["clamp", "triad", "gravity"]
 
@@ -37,6 +38,15 @@ def stops_of(channel: Channel, thetas_deg: Sequence[float], alphas_deg: Sequence
     if channel.rotation is None:
         return on_faces(channel.gravity_mps2)
     return turned_by_hand(np.reshape(channel.rotation, (3, 3)), channel.gravity_mps2)
+
+
+def mounted(channel: Channel) -> Stop:
+    """A mounted sensor beside a tri-axial reference, which feels gravity and so tells how both stand."""
+    assert channel.rotation is not None
+    up = np.array([0.0, 0.0, channel.gravity_mps2])  # read again, it only shows that gravity is felt
+    felt = np.zeros(3) if channel.coupling == "dc" else None
+    pose = beside(np.reshape(channel.rotation, (3, 3)), felt)
+    return Stop("", channel.sensor, pose, dict(zip(GRAVITY, up.tolist(), strict=True)), np.zeros(3))
 
 
 def stated(channel: Channel, directory: Path) -> list[str]:

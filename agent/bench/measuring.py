@@ -14,6 +14,7 @@ from agent.bench.capture import DeviceSamples
 from agent.bench.stops import Stop
 from agent.calibrate.adjusting import adjusted, over_frequency, with_response
 from agent.calibrate.files import Files, Options
+from agent.calibrate.outcome import Outcome
 from agent.calibrate.poses import PoseInterval
 from agent.calibrate.priors import instrument_of, priors_of
 from agent.calibrate.tables import ReferenceTable, SensorTable
@@ -63,6 +64,11 @@ class Measuring:
 
     def all(self, record: Record, taken: Sequence[Taken]) -> tuple[list[Window], Priors]:
         """The used windows of all stops, with their lag taken out, and the priors for them."""
+        windows = _used(self.without_lag(record, taken))
+        return windows, over_frequency(self.priors, windows, self.lag_s)
+
+    def without_lag(self, record: Record, taken: Sequence[Taken]) -> list[Window]:
+        """The windows of all stops, used or not, with their lag taken out."""
         applied = Applied.of(self.priors, 0.0)
 
         def lag_of(windows: Sequence[Window], lag_s: float) -> float:
@@ -71,11 +77,15 @@ class Measuring:
             )
 
         windows, self.lag_s = without_lag(self.lag_s, self._files(record, taken).windows, _used, lag_of)
-        return _used(windows), over_frequency(self.priors, windows, self.lag_s)
+        return windows
+
+    def outcome(self, record: Record, taken: Sequence[Taken]) -> Outcome:
+        """What `fieldcal calibrate` would say of these stops."""
+        return adjusted(self._files(record, taken), self.priors)
 
     def refused(self, record: Record, taken: Sequence[Taken]) -> tuple[str, ...]:
         """Why `fieldcal calibrate` would refuse these stops; empty if it would not."""
-        return adjusted(self._files(record, taken), self.priors).reasons
+        return self.outcome(record, taken).reasons
 
     def moved_mps2(self, record: Record) -> float:
         """The rms of the reference's motion; 0 where there is no reference."""

@@ -1,22 +1,18 @@
-"""The computing of a session, in a process of its own: in this one it would delay the reading of the devices."""
+"""The computing of a session, aside from the process that reads the devices."""
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-import signal
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 
+from agent.bench.aside import Aside
 from agent.bench.measuring import Measuring, Record, Taken
 from agent.bench.session import Fit, Outlook, Session, expected_of
 from calib.estimate.next_stop import Suggestion
 from calib.model import Array, Window
 
-NICE = 5
 VERY_LONG = 100.0  # times as long a stay, to see what more time would gain
 
 
@@ -37,38 +33,24 @@ class Look:
 
 
 class Thinking:
-    """A session and its measuring. Each method computes in the other process."""
+    """A session and its measuring. Each method computes aside, in the other process."""
 
-    def __init__(self, session: Session, measuring: Measuring) -> None:
-        self.session, self.measuring = session, measuring
-
-    def __enter__(self) -> Thinking:
-        spawn = multiprocessing.get_context("spawn")
-        self._pool = ProcessPoolExecutor(1, mp_context=spawn, initializer=_modest)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._pool.shutdown(cancel_futures=True)
+    def __init__(self, session: Session, measuring: Measuring, aside: Aside) -> None:
+        self.session, self.measuring, self._aside = session, measuring, aside
 
     def next_stop(self) -> tuple[Suggestion, Outlook]:
         """The stop that gains most, and how far it is to what is wanted."""
-        return self._pool.submit(_next_stop, self.session).result()
+        return self._aside.call(_next_stop, self.session)
 
     def look(self, record: Record, taken: Taken) -> Look:
         """Look at the stop that is being taken."""
-        return self._pool.submit(_look, self.session, self.measuring, record, taken).result()
+        return self._aside.call(_look, self.session, self.measuring, record, taken)
 
     def take(self, record: Record, taken: Sequence[Taken]) -> tuple[str, ...]:
         """Adjust all stops; none at all begins anew. Where all is as wanted: why the result would be refused."""
-        future = self._pool.submit(_take, self.session, self.measuring, record, taken)
-        self.session, self.measuring, refused = future.result()
+        found = self._aside.call(_take, self.session, self.measuring, record, taken)
+        self.session, self.measuring, refused = found
         return refused
-
-
-def _modest() -> None:
-    """Leave the processor to the reading of devices, and Ctrl-C to the process that has the session."""
-    os.nice(NICE)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _next_stop(session: Session) -> tuple[Suggestion, Outlook]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -14,13 +13,13 @@ import click
 import numpy as np
 
 from agent.cli.finite import Finite
+from agent.cli.led import ask, check_stated, made, opened, parsed, progress
 from agent.config import Channel, Config, ConfigError, load_config, parse_config
-from agent.terminal.text import for_drawing, say
+from agent.terminal.text import say
 
 if TYPE_CHECKING:
     from agent.bench.stops import Stop
 
-OPEN_S = 20.0  # for the devices to be opened and to send their first block
 FIRST_S = 2.0  # of samples that tell how much the shaker moves
 THETAS_DEG, ALPHA_STEP_DEG = "35,55", 15
 U_MAIN_PCT, U_TRANSVERSE_PCT = 0.05, 0.25
@@ -108,6 +107,7 @@ def _channel(settings: Config, sensor: str | None, path: Path) -> Channel:
 
 
 def _session(settings: Config, channel: Channel, output: Path, options: dict[str, Any], turn: Turn | None) -> int:
+    from agent.bench.aside import Aside
     from agent.bench.capture import Capture
     from agent.bench.dialogue import Dialogue, Stay
     from agent.bench.kinds import stated, stops_of, write_prior
@@ -123,21 +123,22 @@ def _session(settings: Config, channel: Channel, output: Path, options: dict[str
     if output.exists():
         raise FileExistsError
     if options["stated"] is not None:
-        _check_stated(options["stated"])
+        check_stated(options["stated"])
     with Capture(settings, devices) as capture:
-        info = _opened(capture, devices)
+        info = opened(capture, devices)
         output.mkdir(parents=True)
         scale = write_prior(channel, info.get("nominal_sensitivity"), output / "prior.json")
         arguments = [*stated(channel, output), f"--json={output / 'result.json'}"]
-        told = _parsed(arguments)
+        told = parsed(arguments)
         measuring = Measuring(channel, told)
         wanted = Wanted(options["u_main_pct"] / 100.0, options["u_transverse_pct"] / 100.0)
         time.sleep(FIRST_S)
         moved = measuring.moved_mps2(capture.record(capture.now_s - FIRST_S))
         expected = replace(START, rms_mps2=moved) if moved > LEAST_MOTION_MPS2 else START
         stay = Stay(options["stay_s"], max(options["most_s"], options["stay_s"]))
-        with Thinking(Session(stops, measuring.priors, wanted, scale, expected), measuring) as mind:
-            dialogue = Dialogue(mind, capture, stay, _ask, say, _progress, turn)
+        with Aside() as aside:
+            mind = Thinking(Session(stops, measuring.priors, wanted, scale, expected), measuring, aside)
+            dialogue = Dialogue(mind, capture, stay, ask, say, progress, turn)
             try:
                 dialogue.run()
             finally:  # also after Ctrl-C: what was measured is kept
@@ -150,72 +151,7 @@ def _session(settings: Config, channel: Channel, output: Path, options: dict[str
             output.rmdir()
             say("no stop was taken, so there is no result", err=True)
             return 3
-    return _result(told, output, options["stated"])
-
-
-def _opened(capture: Any, devices: list[str]) -> dict[str, Any]:
-    """What the sensor's driver read of it, when all devices send. Raises ValueError where one does not."""
-    end = time.monotonic() + OPEN_S
-    while time.monotonic() < end:
-        for line in capture.said():
-            say(line, err=True)
-        if all(capture.newest_s(device) is not None for device in devices):
-            return dict(capture.info(devices[0]) or {})
-        time.sleep(0.1)
-    silent = [device for device in devices if capture.newest_s(device) is None]
-    raise ValueError(f"no samples of {', '.join(silent)} within {OPEN_S:g} s; `fieldcal probe` shows what answers")
-
-
-def _parsed(arguments: list[str]) -> dict[str, Any]:
-    """The options of `fieldcal calibrate` by these arguments."""
-    from agent.cli.calibrate import calibrate
-
-    with calibrate.make_context("calibrate", list(arguments)) as context:
-        return dict(context.params)
-
-
-def _check_stated(path: Path) -> None:
-    """Raises ConfigError before the session rather than after it."""
-    from agent.certificate.statements import Statements
-    from agent.config.reading import load_model
-
-    load_model(path, Statements)
-
-
-def _result(options: dict[str, Any], output: Path, stated: Path | None) -> int:
-    """Make the result from the files as `fieldcal calibrate` does, and the certificate."""
-    from agent.cli.calibrate import calibrate
-    from agent.cli.certificate import certificate
-
-    assert calibrate.callback is not None
-    assert certificate.callback is not None
-    status = int(calibrate.callback(**options))
-    if status or stated is None:
-        return status
-    return int(
-        certificate.callback(
-            inputs=(output / "result.json",), stated=stated, output=output / "certificate", key=None, xsd=None,
-            sensor=None,
-        )
-    )  # fmt: skip
-
-
-def _ask(prompt: str) -> str | None:
-    """An answer from standard input, None at its end."""
-    sys.stdout.write(prompt)
-    sys.stdout.flush()
-    line = sys.stdin.readline()
-    if not sys.stdin.isatty():
-        sys.stdout.write("\n")
-    return line.strip() if line else None
-
-
-def _progress(line: str) -> None:
-    """Show how a stay goes on, on a terminal only."""
-    if sys.stdout.isatty():
-        stream = for_drawing(sys.stdout)
-        stream.write(f"\r{line:<100}\r")
-        stream.flush()
+    return made(told, output, options["stated"])
 
 
 @contextmanager

@@ -18,6 +18,7 @@ COMPLETION = "_FIELDCAL_COMPLETE"  # set by the completion files in deploy/compl
 COMMANDS = {
     "init": ("agent.cli.init", "Write a configuration for the devices of this machine."),
     "bench": ("agent.cli.bench", "Calibrate at a bench, led from position to position to a wanted uncertainty."),
+    "visit": ("agent.cli.visit", "Calibrate mounted sensors one after another beside a portable reference."),
     "run": ("agent.cli.run", "Run the agent: read devices, calibrate, record and publish."),
     "calibrate": ("agent.cli.calibrate", "Calibrate a sensor from recorded files."),
     "convert": ("agent.cli.convert", "Write a recorded file of another format as CSV."),

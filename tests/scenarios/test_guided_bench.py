@@ -3,13 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import selectors
-import subprocess
-import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,42 +11,8 @@ import pytest
 
 from hw.virtual.bench import Bench
 from hw.virtual.presets import by_hand
-from tests.scenarios.processes import ROOT, fieldcal
-
-SESSION_S = 240.0  # on a busy machine; it takes 30 s
-Answer = Callable[[str], str]
-
-
-def _led(output: Path, answer: Answer, *arguments: str) -> tuple[int, str]:
-    """Run a session; `answer` gets what was printed since the last prompt. Returns the exit status and all output."""
-    with subprocess.Popen(
-        [sys.executable, "-m", "agent", "bench", "-o", str(output), *arguments],
-        cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env=dict(os.environ),
-    ) as process:  # fmt: skip
-        try:
-            return _answered(process, answer)
-        finally:
-            process.kill()
-
-
-def _answered(process: subprocess.Popen[bytes], answer: Answer) -> tuple[int, str]:
-    assert process.stdin is not None
-    assert process.stdout is not None
-    told, seen, end_s = "", 0, time.monotonic() + SESSION_S
-    with selectors.DefaultSelector() as waiting:
-        waiting.register(process.stdout, selectors.EVENT_READ)
-        while time.monotonic() < end_s:
-            if not waiting.select(1.0):
-                continue
-            data = process.stdout.read1(65536)  # type: ignore[attr-defined]
-            if not data:
-                return process.wait(10), told
-            told += data.decode()
-            if told.endswith("> "):
-                process.stdin.write(f"{answer(told[seen:])}\n".encode())
-                process.stdin.flush()
-                seen = len(told)
-    raise AssertionError(f"the session did not end within {SESSION_S:g} s:\n{told}")
+from tests.scenarios.guided import led
+from tests.scenarios.processes import fieldcal
 
 
 def _errors_over_u(output: Path, kind: str, seed: int) -> np.ndarray:
@@ -69,9 +29,11 @@ def test_a_clamp_with_a_wrong_turn(tmp_path):
     def answer(_: str) -> str:
         return next(wrong, "")
 
-    status, told = _led(
-        tmp_path / "out", answer, "--u-main-pct", "0.5", "--u-transverse-pct", "1", "--stay-s", "4", "--seed", "3"
-    )
+    status, told = led(
+        ["bench", "-o", str(tmp_path / "out"), "--u-main-pct", "0.5", "--u-transverse-pct", "1", "--stay-s", "4",
+         "--seed", "3"],
+        answer,
+    )  # fmt: skip
     assert status == 0, told
     assert told.count("does not look like") == 1
     assert "stands as at 35 60" in told
@@ -88,7 +50,8 @@ def test_a_clamp_with_a_wrong_turn(tmp_path):
 def test_a_stop_is_taken_back_and_a_session_ended_early(tmp_path):
     """A position is named by the person, one is taken back, a wrong name is told; the files hold what was kept."""
     answers = iter(["", "u", "no position", "-x", "q"])
-    status, told = _led(tmp_path / "out", lambda _: next(answers, "q"), "--virtual", "gravity", "--stay-s", "2")
+    arguments = ["bench", "-o", str(tmp_path / "out"), "--virtual", "gravity", "--stay-s", "2"]
+    status, told = led(arguments, lambda _: next(answers, "q"))
     assert status == 0, told
     assert re.search(r"stop 1 \([+-][xyz]\) is not used", told)
     assert "'no position' is no position" in told

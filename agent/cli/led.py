@@ -1,0 +1,81 @@
+"""What the commands have in common that lead a person: `fieldcal bench` and `fieldcal visit`."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from agent.terminal.text import for_drawing, say
+
+if TYPE_CHECKING:
+    from agent.bench.capture import Capture
+
+OPEN_S = 20.0  # for the devices to be opened and to send their first block
+
+
+def opened(capture: Capture, devices: list[str]) -> dict[str, Any]:
+    """What the sensor's driver read of it, when all devices send. Raises ValueError where one does not."""
+    end = time.monotonic() + OPEN_S
+    while time.monotonic() < end:
+        for line in capture.said():
+            say(line, err=True)
+        if all(capture.newest_s(device) is not None for device in devices):
+            return dict(capture.info(devices[0]) or {})
+        time.sleep(0.1)
+    silent = [device for device in devices if capture.newest_s(device) is None]
+    raise ValueError(f"no samples of {', '.join(silent)} within {OPEN_S:g} s; `fieldcal probe` shows what answers")
+
+
+def parsed(arguments: list[str]) -> dict[str, Any]:
+    """The options of `fieldcal calibrate` by these arguments."""
+    from agent.cli.calibrate import calibrate
+
+    with calibrate.make_context("calibrate", list(arguments)) as context:
+        return dict(context.params)
+
+
+def check_stated(path: Path) -> None:
+    """Raises ConfigError before the session rather than after it."""
+    from agent.certificate.statements import Statements
+    from agent.config.reading import load_model
+
+    load_model(path, Statements)
+
+
+def made(options: dict[str, Any], output: Path, stated: Path | None) -> int:
+    """Make the result from the files as `fieldcal calibrate` does, and the certificate."""
+    from agent.cli.calibrate import calibrate
+    from agent.cli.certificate import certificate
+
+    assert calibrate.callback is not None
+    assert certificate.callback is not None
+    status = int(calibrate.callback(**options))
+    if status or stated is None:
+        return status
+    return int(
+        certificate.callback(
+            inputs=(output / "result.json",), stated=stated, output=output / "certificate", key=None, xsd=None,
+            sensor=None,
+        )
+    )  # fmt: skip
+
+
+def ask(prompt: str, *, err: bool = False) -> str | None:
+    """An answer from standard input, None at its end. The prompt is on standard output, or on standard error."""
+    stream = sys.stderr if err else sys.stdout
+    stream.write(prompt)
+    stream.flush()
+    line = sys.stdin.readline()
+    if not sys.stdin.isatty():
+        stream.write("\n")
+    return line.strip() if line else None
+
+
+def progress(line: str) -> None:
+    """Show how a stay goes on, on a terminal only."""
+    if sys.stdout.isatty():
+        stream = for_drawing(sys.stdout)
+        stream.write(f"\r{line:<100}\r")
+        stream.flush()
