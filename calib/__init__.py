@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from calib.signal.samples import Samples
     from calib.signal.stamps import clock_from_stamps
 
+__version__ = "0.2.0"
+
 __all__ = [
     "PARAMETERS",
     "Calibration",
