@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+KNOWN_BEFORE = "*"  # marks a parameter that a nominal value or a prior tells rather than the data
+
 
 def plus_minus(value: float | None, expanded: float | None) -> str:
     """`value ± U`, both rounded to the second digit of U; `–` if there is no value."""

@@ -13,7 +13,7 @@ import click
 
 from agent.calibrate.faults import as_table_error
 from agent.calibrate.poses import PosesFile
-from agent.calibrate.stated import options_of
+from agent.calibrate.stated import FILES, options_of
 from agent.calibrate.station import by_metadata, compared, pose_of_station
 from agent.calibrate.tables import ReferenceFile, SensorFile, read_reference, read_sensor
 from agent.reading.formats import NOT_DESCRIBED, Description
@@ -33,9 +33,10 @@ BAR_FROM_BYTES = 30_000_000  # smaller files are read too fast for a progress ba
 def calibrated(params: dict[str, Any]) -> Outcome:
     """The outcome for these parameters of the command. Raises TableError and click.UsageError."""
     _check_metadata(params)
-    options = options_of(params)
+    given = {name: bool(params[name]) for name in ("reference", "poses", "prior")}
     with as_table_error():
-        options.check(reference=bool(params["reference"]), poses=bool(params["poses"]))
+        options_of(params | dict.fromkeys(FILES)).check(**given)  # before any file is read
+    options = options_of(params)
     sensor, reference = _read(params)
     options, read = _stated(params["poses"], sensor, reference, options)
     with as_table_error(read.line):

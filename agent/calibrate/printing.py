@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -11,11 +10,10 @@ import numpy as np
 
 from calib.model import PARAMETERS, Array, Window
 from calib.recorded.outcome import Outcome
-from calib.rounding import plus_minus
+from calib.rounding import KNOWN_BEFORE, plus_minus
 
 AXES = "xyz"
 FILE_WIDTH = 120  # columns if the output is no terminal
-KNOWN_BEFORE = "*"  # marks a parameter that --nominal or --prior tells rather than the data
 
 
 def print_outcome(outcome: Outcome) -> None:
@@ -35,11 +33,7 @@ def _print_calibration(console: Any, outcome: Outcome) -> None:
     from rich import box
     from rich.table import Table
 
-    c = outcome.calibration
-    assert c is not None
-    expanded = outcome.coverage_factor * c.standard_uncertainty
-    values = np.append(c.sensitivity.ravel(), c.offset)
-    cells = [_cell(*each) for each in zip(values.tolist(), expanded.tolist(), c.determined.tolist(), strict=True)]
+    cells = outcome.cells()
     table = Table(box=box.SIMPLE_HEAD)
     for heading in ("", "Sx", "Sy", "Sz", "Q"):
         table.add_column(heading, justify="right", no_wrap=True)
@@ -48,7 +42,7 @@ def _print_calibration(console: Any, outcome: Outcome) -> None:
     console.print(table)
     kind = f", {outcome.uncertainty_kind}" if outcome.uncertainty_kind else ""
     console.print(f"  S in output unit per m/s², Q in output unit, U with k = {outcome.coverage_factor:.3g}{kind}")
-    if np.any(np.isfinite(values) & ~c.determined):
+    if np.any(np.isfinite(outcome.values) & ~outcome.determined):
         console.print_line(f"  {KNOWN_BEFORE} known before: the data do not halve its uncertainty")
     _print_sources(console, outcome)
     _print_frequencies(console, outcome)
@@ -84,13 +78,6 @@ def _print_sources(console: Any, outcome: Outcome) -> None:
 
 def _of(source: Mapping[str, float] | Array, k: int) -> float:
     return float(source[PARAMETERS[k]] if isinstance(source, Mapping) else source[k])
-
-
-def _cell(value: float, expanded: float, determined: bool) -> str:
-    if not math.isfinite(value):
-        return "not determined"
-    text = "0" if value == expanded == 0.0 else plus_minus(value, expanded)  # 0 because the frame was chosen so
-    return text if determined else f"{text} {KNOWN_BEFORE}"
 
 
 def _print_windows(console: Any, windows: Sequence[Window]) -> None:

@@ -18,6 +18,7 @@ from calib.recorded.errors import OptionError
 from calib.recorded.options import Options
 from calib.recorded.priors import prior_of
 
+FILES = ("prior", "reference_certificate")  # parameters that name a file with options
 NAMES = {"gravity": "gravity_mps2"}  # of parameters whose option has another name
 
 

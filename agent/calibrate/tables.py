@@ -16,12 +16,19 @@ from agent.reading.ground_motion import GroundMotion
 from agent.reading.source import Array, Progress, Source, TableError
 from agent.reading.stationxml import Component
 from agent.reading.units import Sensitivity, unit_of
-from calib.recorded.table import REFERENCES, SENSOR, ReferenceTable, SensorTable, check_count, check_time, make_whole
+from calib.recorded.table import (
+    REFERENCES,
+    SENSOR,
+    ReferenceTable,
+    SensorTable,
+    check_count,
+    check_time,
+    make_whole,
+    second_of,
+)
 
 TEMPERATURE = "temperature_degc"
 ELECTRICAL = ("indication", "count")
-# From these values on, a time without unit counts since 1970, in this part of a second: 1e9 s is the year 2001.
-SINCE_1970 = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -178,10 +185,10 @@ def _rows(source: Source, chosen: Sequence[Chosen], progress: Progress | None, s
     place, names = str(source.path), [c.column.name for c in chosen]
     with tempfile.TemporaryFile() as spool, as_table_error(source.place):
         for rows in source.pieces([c.column for c in chosen], progress):
-            if second is None:
-                second = next((part for least, part in SINCE_1970 if len(rows) and rows[0, 0] >= least), 1.0)
+            if second is None and len(rows):
+                second = second_of(float(rows[0, 0]))
             make_whole(rows, names, place, count)
-            if second != 1.0:
+            if second is not None and second != 1.0:
                 rows[:, 0] *= second
             if (scale != 1.0).any():
                 rows[:, 1:] *= scale

@@ -9,6 +9,7 @@ import click
 
 from agent.calibrate.calibrating import read_files
 from agent.calibrate.origin import SourceFile, source_file
+from agent.calibrate.stated import FILES
 from agent.reading.source import TableError
 from agent.report.result import CalibrationResult, WindowVerdict
 from agent.report.trace import Trace
@@ -28,7 +29,7 @@ def retrace(result: CalibrationResult, directory: Path) -> tuple[dict[str, Trace
         return {}, [f"{hindrance}, so indications and residuals are not shown" for hindrance in hindrances]
     try:
         named = {name: found.get(options.get(name)) for name in ("sensor", "reference", "poses")}
-        read = read_files(options | named | dict.fromkeys(("prior", "reference_certificate")))
+        read = read_files(options | named | dict.fromkeys(FILES))
     except (TableError, click.UsageError, KeyError, TypeError, ValueError) as error:
         return {}, [
             f"indications and residuals are not shown: the files cannot be read with the options in the result: {error}"

@@ -75,14 +75,14 @@ class Options:
             if value is not None and (remedy := _out_of_range(name, value)):
                 raise _wrong(name, value, remedy)
 
-    def check(self, *, reference: bool, poses: bool) -> None:
-        """Check options that need or exclude each other. `reference`, `poses`: whether they are given.
+    def check(self, *, reference: bool, poses: bool, prior: bool) -> None:
+        """Check options that need or exclude each other. `reference`, `poses`, `prior`: whether they are given.
 
         Raises OptionError.
         """
         if (self.nominal is None) != (self.u_nominal_pct is None):
             raise OptionError("`nominal` and `u_nominal_pct` must be given together")
-        if self.nominal is not None and self.prior is not None:
+        if self.nominal is not None and prior:
             raise OptionError("give `nominal` or `prior`, not both")
         if self.rotation is not None and not reference:
             raise OptionError("`rotation` needs a tri-axial `reference`")

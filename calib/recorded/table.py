@@ -26,6 +26,8 @@ LATEST_STAMP_S = 0.1
 ROWS_AT_ONCE = 1 << 20
 FEWEST_ROWS = 2
 LAST_S = 1e11  # in the year 5138; a later time is in another unit
+# From these values on, a time without unit counts since 1970, in this part of a second: 1e9 s is the year 2001.
+SINCE_1970 = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,6 +65,11 @@ class ReferenceTable:
     def place(self) -> str:
         """Where its columns are named, for messages."""
         return f"{self.name}, {self.header}" if self.header else self.name
+
+
+def second_of(first: float) -> float:
+    """What one unit of a time without unit is in s, by its first value."""
+    return next((part for least, part in SINCE_1970 if first >= least), 1.0)
 
 
 def make_whole(rows: Array, columns: Sequence[str], place: str, first: int = 0) -> None:
