@@ -1,3 +1,5 @@
 """The gateway agent: configuration, pipeline, recording, store, publication and the command line."""
 
-__version__ = "0.2.0"
+from calib import __version__
+
+__all__ = ["__version__"]

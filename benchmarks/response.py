@@ -20,9 +20,9 @@ from pathlib import Path
 
 import numpy as np
 
-from agent.calibrate.adjusting import adjusted
 from benchmarks.page import machine, write_part
 from calib.estimate.nuisances import Priors
+from calib.recorded.adjusting import adjusted
 from tests.pair import Filter, decimator, highpass, lowpass, moving_mean, pair, resonance, sinc3
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "response.md"

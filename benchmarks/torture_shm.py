@@ -20,7 +20,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from agent.calibrate.streams import FileStream
 from benchmarks.page import machine, write_part
 from benchmarks.torture_rows import FIXED, Q_TRUE, S_TRUE
 from calib.estimate.adjustment import adjust
@@ -29,6 +28,7 @@ from calib.excitation.pieces import pieces_of
 from calib.geometry import beside
 from calib.model import Window
 from calib.paper.method3 import fit
+from calib.recorded.streams import TableStream
 from calib.signal.instrument import Instrument
 from hw.virtual.bench import Bench, Recording
 from hw.virtual.motion import ambient
@@ -71,8 +71,8 @@ def one(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
 
 def windows(recording: Recording, settings: Settings) -> list[Window]:
     """All windows of a recording, made by the front end."""
-    sensor = FileStream("sensor", recording.sensor_stamp_s, recording.v)
-    reference = FileStream("reference", recording.reference_stamp_s, recording.reference)
+    sensor = TableStream("sensor", recording.sensor_stamp_s, recording.v)
+    reference = TableStream("reference", recording.reference_stamp_s, recording.reference)
     pose, found = beside(np.eye(3), np.zeros(3)), list[Window]()
     for span_s in pieces_of(0.0, SECONDS, settings.limits.longest_s, 1.0):
         parts = sensor.cut(*span_s), reference.cut(span_s[0] - 1.0, span_s[1] + 1.0)

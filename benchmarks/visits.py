@@ -28,6 +28,7 @@ from agent.bench.clamp_words import findings
 from agent.bench.kinds import mounted, stated, write_prior
 from agent.bench.measuring import Measuring, Record, Taken
 from agent.bench.visiting import looked
+from agent.calibrate.stated import options_of
 from agent.cli.led import parsed
 from agent.config import Channel, parse_config
 from benchmarks.page import machine, write_part
@@ -78,7 +79,7 @@ class Visit:
         with tempfile.TemporaryDirectory() as name:
             directory = Path(name)
             write_prior(channel, None, directory / "prior.json")
-            measuring = Measuring(channel, parsed(stated(channel, directory)))
+            measuring = Measuring(channel, options_of(parsed(stated(channel, directory))))
         return cls(Structure(parameters, seed, way), channel, measuring)
 
     def record(self, seconds: float) -> Record:

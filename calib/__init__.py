@@ -19,13 +19,18 @@ if TYPE_CHECKING:
     from calib.paper.method3 import fit as fit_method3
     from calib.paper.sine_fit import four_parameter as four_parameter_sine
     from calib.paper.sine_fit import three_parameter as three_parameter_sine
+    from calib.recorded.errors import InputError
+    from calib.recorded.notebook import calibrate
     from calib.signal.instrument import Instrument
     from calib.signal.samples import Samples
     from calib.signal.stamps import clock_from_stamps
 
+__version__ = "0.2.0"
+
 __all__ = [
     "PARAMETERS",
     "Calibration",
+    "InputError",
     "Instrument",
     "Pose",
     "Priors",
@@ -35,6 +40,7 @@ __all__ = [
     "along",
     "at_rest",
     "beside",
+    "calibrate",
     "clamp",
     "clock_from_stamps",
     "corrected",
@@ -56,6 +62,8 @@ _PLACES = {
     "calib.excitation.windows": ("rests_anywhere",),
     "calib.geometry": ("along", "at_rest", "beside", "clamp", "on_axis"),
     "calib.model": ("PARAMETERS", "Calibration", "Pose", "Window"),
+    "calib.recorded.errors": ("InputError",),
+    "calib.recorded.notebook": ("calibrate",),
     "calib.signal.instrument": ("Instrument",),
     "calib.signal.samples": ("Samples",),
     "calib.signal.stamps": ("clock_from_stamps",),

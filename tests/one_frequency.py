@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
-from agent.calibrate.adjusting import adjusted
-from agent.calibrate.files import Files, Options
-from agent.calibrate.outcome import Outcome
-from agent.calibrate.poses import PoseInterval
-from agent.calibrate.tables import ReferenceTable, SensorTable
 from calib.estimate.nuisances import Priors
 from calib.excitation.front_end import Settings
 from calib.geometry import clamp
 from calib.model import Array
+from calib.recorded.adjusting import adjusted
+from calib.recorded.outcome import Outcome
+from calib.recorded.poses import PoseInterval
+from calib.recorded.table import ReferenceTable, SensorTable
+from calib.recorded.tables import Making, Tables
 from calib.signal.instrument import Instrument
 from hw.virtual.bench import Bench
 from hw.virtual.motion import sine
@@ -42,12 +40,12 @@ def calibrated(parameters: BenchParameters, seed: int, priors: Priors) -> Outcom
         if p.theta_deg is not None and p.alpha_deg is not None
     ]
     return adjusted(
-        Files(
-            SensorTable(Path("sensor.csv"), recording.sensor_stamp_s, recording.v, None),
-            ReferenceTable(Path("r.csv"), recording.reference_stamp_s, recording.reference, "acceleration", "a"),
+        Tables(
+            SensorTable("sensor.csv", recording.sensor_stamp_s, recording.v, None),
+            ReferenceTable("r.csv", recording.reference_stamp_s, recording.reference, "acceleration", "a"),
             poses,
             Instrument(),
-            Options(Settings(bands=True)),
+            Making(Settings(bands=True)),
         ),
         priors,
     )

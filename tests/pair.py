@@ -7,18 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, freqs, freqz, remez
 
-from agent.calibrate.files import Files, Options
-from agent.calibrate.poses import PoseInterval
-from agent.calibrate.tables import ReferenceTable, SensorTable
 from calib.excitation.front_end import Settings
 from calib.geometry import beside
 from calib.model import Array
+from calib.recorded.poses import PoseInterval
+from calib.recorded.table import ReferenceTable, SensorTable
+from calib.recorded.tables import Making, Tables
 from calib.signal.instrument import Instrument
 
 Complex = NDArray[np.complex128]
@@ -72,7 +71,7 @@ def highpass(corner_hz: float, order: int = 1) -> Filter:
 class Pair:
     """The files of both, S at the reference frequency, and that frequency in Hz."""
 
-    files: Files
+    files: Tables
     sensitivity: Array
     reference_frequency_hz: float
 
@@ -108,11 +107,11 @@ def pair(
     u = u * (1.0 + reference_error) + reference_noise_mps2 * random.normal(size=u.shape)
     time_s = np.arange(len(u)) / rate_hz
     pose = beside(np.eye(3))
-    files = Files(
-        SensorTable(Path("sensor.csv"), time_s, V, None),
-        ReferenceTable(Path("reference.csv"), time_s, u, "acceleration", "ax_mps2"),
+    files = Tables(
+        SensorTable("sensor.csv", time_s, V),
+        ReferenceTable("reference.csv", time_s, u, "acceleration", "ax_mps2"),
         [PoseInterval(0.0, float(time_s[-1]), pose)],
         Instrument(),
-        Options(Settings(bands=True)),
+        Making(Settings(bands=True)),
     )
     return Pair(files, sensitivity, middle_hz)

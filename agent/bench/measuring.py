@@ -6,26 +6,25 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from agent.bench.capture import DeviceSamples
 from agent.bench.stops import Stop
-from agent.calibrate.adjusting import adjusted, over_frequency, with_response
-from agent.calibrate.files import Files, Options
-from agent.calibrate.outcome import Outcome
-from agent.calibrate.poses import PoseInterval
-from agent.calibrate.priors import instrument_of, priors_of
-from agent.calibrate.tables import ReferenceTable, SensorTable
 from agent.config import Channel
-from agent.reading.source import TableError
 from calib.estimate.adjustment import adjust
 from calib.estimate.lag_search import without_lag
 from calib.estimate.nuisances import Applied, Priors
 from calib.excitation.front_end import Settings
 from calib.excitation.window_verdict import Limits
 from calib.model import Array, Window
+from calib.recorded.adjusting import adjusted, over_frequency, with_response
+from calib.recorded.options import Options
+from calib.recorded.outcome import Outcome
+from calib.recorded.poses import PoseInterval
+from calib.recorded.priors import instrument_of, priors_of
+from calib.recorded.table import ReferenceTable, SensorTable
+from calib.recorded.tables import Making, Tables
 
 FEWEST = 10  # samples of a device that make a clock
 Record = Mapping[str, DeviceSamples]
@@ -44,7 +43,7 @@ class Taken:
 class Measuring:
     """The windows of a session's samples. `lag_s` is the sensor's lag behind the reference, as far as it is known."""
 
-    def __init__(self, channel: Channel, options: dict[str, Any]) -> None:
+    def __init__(self, channel: Channel, options: Options) -> None:
         """`options` are those of `fieldcal calibrate` by which the result will be made."""
         self._channel, self._options = channel, options
         self.priors: Priors = priors_of(options)
@@ -58,8 +57,8 @@ class Measuring:
     def newest(self, record: Record, taken: Taken) -> list[Window]:
         """The windows of the stop that is being taken, used or not; empty where there are too few samples yet."""
         try:
-            return self._files(record, [taken]).windows(self.lag_s)
-        except (ValueError, TableError):
+            return self._tables(record, [taken]).windows(self.lag_s)
+        except ValueError:
             return []
 
     def all(self, record: Record, taken: Sequence[Taken]) -> tuple[list[Window], Priors]:
@@ -76,12 +75,12 @@ class Measuring:
                 adjust(_used(windows), with_response(self.priors, windows), replace(applied, lag_s=lag_s)).lag_s or 0.0
             )
 
-        windows, self.lag_s = without_lag(self.lag_s, self._files(record, taken).windows, _used, lag_of)
+        windows, self.lag_s = without_lag(self.lag_s, self._tables(record, taken).windows, _used, lag_of)
         return windows
 
     def outcome(self, record: Record, taken: Sequence[Taken]) -> Outcome:
         """What `fieldcal calibrate` would say of these stops."""
-        return adjusted(self._files(record, taken), self.priors)
+        return adjusted(self._tables(record, taken), self.priors)
 
     def refused(self, record: Record, taken: Sequence[Taken]) -> tuple[str, ...]:
         """Why `fieldcal calibrate` would refuse these stops; empty if it would not."""
@@ -97,20 +96,20 @@ class Measuring:
         assert self._channel.reference is not None
         return np.asarray(record[self._channel.reference].values / self._channel.certificate.sensitivity)
 
-    def _files(self, record: Record, taken: Sequence[Taken]) -> Files:
-        """Raises ValueError or TableError where there are too few samples."""
+    def _tables(self, record: Record, taken: Sequence[Taken]) -> Tables:
+        """Raises ValueError where there are too few samples."""
         own, name = record[self._channel.sensor], self._channel.sensor
-        sensor = SensorTable(Path(name), own.time_s, own.values, None)
+        sensor = SensorTable(name, own.time_s, own.values)
         instrument, reference = instrument_of(self._options), None
         if self._channel.reference is not None:
             name, quantity = self._channel.reference, self._channel.certificate.quantity
-            reference = ReferenceTable(Path(name), record[name].time_s, self._reference_si(record), quantity, name)
+            reference = ReferenceTable(name, record[name].time_s, self._reference_si(record), quantity, name)
             instrument = replace(instrument, quantity=quantity)
         if min(len(samples.time_s) for samples in record.values()) < FEWEST:
             raise ValueError("too few samples")
         intervals = [PoseInterval(each.start_s, each.stop_s, each.stop.pose) for each in taken]
-        limits = Limits.of(self._options["u_offset_mps2"], math.radians(self._options["u_angle_deg"]))
-        return Files(sensor, reference, intervals, instrument, Options(Settings(limits, bands=True)))
+        limits = Limits.of(self._options.u_offset_mps2, math.radians(self._options.u_angle_deg))
+        return Tables(sensor, reference, intervals, instrument, Making(Settings(limits, bands=True)))
 
     def write(self, record: Record, taken: Sequence[Taken], directory: Path) -> None:
         """Write sensor.csv, reference.csv and poses.csv for `fieldcal calibrate`. Raises OSError."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -16,24 +15,10 @@ from agent.config.knowledge import Certificate
 from agent.config.reading import ConfigError, load_model
 from agent.config.section import Section
 from agent.reading.source import TableError
-from calib.model import Array
+from calib.recorded.certificate import ReferenceCertificate
 
 MAIN = [0, 4, 8]
 LARGEST = 64 << 20  # bytes
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ReferenceCertificate:
-    """What it states. `sensitivity` and its relative standard uncertainty `u_relative`: (1,), or (3,) by channel, as
-    indication per SI unit. `corner_hz`: of an AC-coupled reference, with its u; None where it is not stated. `sha256`
-    of the file."""
-
-    path: str
-    sha256: str
-    serial_number: str
-    sensitivity: Array
-    u_relative: Array
-    corner_hz: tuple[float, float] | None = None
 
 
 class _Toml(Section):

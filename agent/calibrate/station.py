@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any, Literal
@@ -12,16 +13,16 @@ from typing import Any, Literal
 import numpy as np
 
 from agent import __version__
-from agent.calibrate.outcome import Outcome
-from agent.calibrate.poses import Setting, beside_reference
 from agent.config.files import read_file
 from agent.reading.source import TableError
 from agent.reading.stationxml import LARGEST, Component, import_obspy
 from agent.reading.xml import check_xml
-from calib.geometry import along
-from calib.model import Array, Pose
+from calib.geometry import STANDARD_GRAVITY_MPS2
+from calib.model import Array
+from calib.recorded.options import Options
+from calib.recorded.outcome import Outcome
+from calib.recorded.poses import DIRECTION, GRAVITY
 
-NOT_FELT = (0.0, 0.0, 0.0)
 IN_DIRECTION = 1e-3  # of a unit vector: what an axis that nobody moved may contribute
 
 
@@ -47,13 +48,26 @@ def frame_of(components: Sequence[Component]) -> Array:
     return np.asarray(frame * np.array([[1.0], [1.0], [np.sign(np.linalg.det(frame))]]))
 
 
-def pose_of_station(sensor: Sequence[Component], reference: Sequence[Component], setting: Setting) -> Pose:
-    """The pose of a sensor beside a reference with three axes or one, from the metadata of both."""
+def by_metadata(options: Options, sensor: Sequence[Component], reference: Sequence[Component]) -> Options:
+    """The options with the couplings and the rotation as the metadata of both instruments say."""
+    rotation = options.rotation
+    if rotation is None and sensor and len(reference) == 3:
+        rotation = frame_of(sensor)
+    coupling = coupling_of(sensor) or options.coupling
+    beside = options.reference_coupling or coupling_of(reference)
+    return replace(options, coupling=coupling, reference_coupling=beside, rotation=rotation)
+
+
+def pose_of_station(
+    sensor: Sequence[Component], reference: Sequence[Component], options: Options
+) -> Mapping[str, float]:
+    """The fields of the pose of a sensor beside a reference with three axes or one, from the metadata of both."""
     frame = frame_of(sensor)
-    gravity = (frame @ (0.0, 0.0, setting.gravity_mps2)).tolist() if setting.coupling == "dc" else NOT_FELT
+    gravity = (frame @ (0.0, 0.0, options.gravity or STANDARD_GRAVITY_MPS2)).tolist()
+    felt = dict(zip(GRAVITY, gravity, strict=True))
     if len(reference) == 3:
-        return beside_reference(setting, gravity)
-    return along(frame @ reference[0].direction, gravity)
+        return felt
+    return dict(zip(DIRECTION, (frame @ reference[0].direction).tolist(), strict=True)) | felt
 
 
 def compared(outcome: Outcome, components: Sequence[Component]) -> list[dict[str, Any]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,68 +9,46 @@ from pathlib import Path
 
 import numpy as np
 
+from agent.calibrate.faults import as_table_error
 from agent.reading.choice import AXES, Choice, Chosen, quantity_of
 from agent.reading.formats import NOT_DESCRIBED, Description, open_source
 from agent.reading.ground_motion import GroundMotion
 from agent.reading.source import Array, Progress, Source, TableError
 from agent.reading.stationxml import Component
 from agent.reading.units import Sensitivity, unit_of
-from calib.signal.stamps import kind_of
+from calib.recorded.table import (
+    REFERENCES,
+    SENSOR,
+    ReferenceTable,
+    SensorTable,
+    check_count,
+    check_time,
+    make_whole,
+    second_of,
+)
 
-SENSOR = ("time_s", "vx", "vy", "vz")
 TEMPERATURE = "temperature_degc"
-# Columns of a reference, and the quantity that they hold.
-REFERENCES = {
-    ("ax", "ay", "az"): "acceleration",
-    ("a",): "acceleration",
-    ("v",): "velocity",
-    ("d",): "displacement",
-}
 ELECTRICAL = ("indication", "count")
-# A stamp may be earlier than the previous one by up to this time, because of jitter or a burst that was read late
-# (delays are some tens of ms).
-LATEST_STAMP_S = 0.1
-LAST_S = 1e11  # in the year 5138; a later time is in another unit
-ROWS_AT_ONCE = 1 << 20
-# From these values on, a time without unit counts since 1970, in this part of a second: 1e9 s is the year 2001.
-SINCE_1970 = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SensorTable:
-    """Stamps (n,) in s, indications (n, 3), temperature (n,) in degC or None. The arrays are on disk.
+class SensorFile(SensorTable):
+    """The samples of a sensor's file. `components`: what the metadata of a station say of the three outputs; empty
+    where there are none."""
 
-    A row of indications is NaN where one of them is missing. `said`: what was guessed, for the user. `components`: what
-    the metadata of a station say of the three outputs; empty where there are none.
-    """
-
-    path: Path
-    time_s: Array
-    v: Array
-    temperature_degc: Array | None
-    said: tuple[str, ...] = ()
     components: tuple[Component, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ReferenceTable:
-    """Stamps (n,) in s, channels (n, 1 or 3) of a quantity of calib.signal.instrument in SI units.
+class ReferenceFile(ReferenceTable):
+    """The samples of a reference's file. `components` as those of a sensor."""
 
-    `column` says where the file names the first channel. `said` and `components`: as those of a sensor.
-    """
-
-    path: Path
-    time_s: Array
-    x: Array
-    quantity: str
-    column: str
-    said: tuple[str, ...] = ()
     components: tuple[Component, ...] = ()
 
 
 def read_sensor(
     path: Path, progress: Progress | None = None, columns: str | None = None, described: Description = NOT_DESCRIBED
-) -> SensorTable:
+) -> SensorFile:
     """Read the samples of a sensor, in the unit of the file. Raises TableError.
 
     `columns` is the option --columns.
@@ -81,7 +58,8 @@ def read_sensor(
         chosen = choice.in_one_group(_sensor_columns)
         rows = _rows(source, chosen, progress, np.ones(len(chosen) - 1))
         said, components = _described(source, choice, chosen[1:4])
-    return SensorTable(path, rows[:, 0], rows[:, 1:4], rows[:, 4] if len(chosen) > 4 else None, said, components)
+    temperature_degc = rows[:, 4] if len(chosen) > 4 else None
+    return SensorFile(str(path), rows[:, 0], rows[:, 1:4], temperature_degc, said, components)
 
 
 def _described(
@@ -122,7 +100,7 @@ def read_reference(
     columns: str | None = None,
     sensitivity: Sensitivity | None = None,
     described: Description = NOT_DESCRIBED,
-) -> ReferenceTable:
+) -> ReferenceFile:
     """Read the samples of a reference in SI units. Raises TableError.
 
     `columns` is the option --reference-columns, `metadata` a StationXML.
@@ -133,8 +111,8 @@ def read_reference(
         scale = np.array([_si(choice, c, sensitivity) for c in chosen[1:]])
         rows = _rows(source, chosen, progress, scale)
         said, components = _described(source, choice, chosen[1:])
-    column = f"{source.header}: column {chosen[1].column}"
-    return ReferenceTable(path, rows[:, 0], rows[:, 1:], quantity, column, said, components)
+    column, header = str(chosen[1].column), source.header
+    return ReferenceFile(str(path), rows[:, 0], rows[:, 1:], quantity, column, header, said, components)
 
 
 def _reference_columns(choice: Choice, sensitivity: Sensitivity | None) -> tuple[list[Chosen], str]:
@@ -204,66 +182,21 @@ def _rows(source: Source, chosen: Sequence[Chosen], progress: Progress | None, s
         raise TableError(f"{source.path}, {source.header}: column {str(chosen[0].column)!r} is in {chosen[0].unit}, "
                          "which is no unit of time")  # fmt: skip
     second = None if time_unit is None else time_unit.si
-    with tempfile.TemporaryFile() as spool:
+    place, names = str(source.path), [c.column.name for c in chosen]
+    with tempfile.TemporaryFile() as spool, as_table_error(source.place):
         for rows in source.pieces([c.column for c in chosen], progress):
-            if second is None:
-                second = next((part for least, part in SINCE_1970 if len(rows) and rows[0, 0] >= least), 1.0)
-            if not np.isfinite(rows.sum()):
-                _check_whole(source, chosen, rows, count)
-                rows[np.isnan(rows[:, 1:4]).any(axis=1), 1:4] = np.nan
-            if second != 1.0:
+            if second is None and len(rows):
+                second = second_of(float(rows[0, 0]))
+            make_whole(rows, names, place, count)
+            if second is not None and second != 1.0:
                 rows[:, 0] *= second
             if (scale != 1.0).any():
                 rows[:, 1:] *= scale
             spool.write(np.ascontiguousarray(rows).data)
             count += len(rows)
             whole += int(np.isfinite(rows[:, 1]).sum())
-        if whole < 2:
-            raise TableError(f"{source.path}: the file has {whole} rows of data, at least 2 are needed")
+        check_count(whole, place)
         spool.flush()
         found = np.asarray(np.memmap(spool, dtype=np.float64, mode="r", shape=(count, len(chosen))))
-    _check_time(source, chosen[0], found[:, 0])
+        check_time(found[:, 0], names[0], place)
     return found
-
-
-def _check_whole(source: Source, chosen: Sequence[Chosen], rows: Array, before: int) -> None:
-    """Check that each row has a time, and that no value is infinite. Raises TableError."""
-    wrong = np.isinf(rows)
-    wrong[:, 0] |= np.isnan(rows[:, 0])
-    if wrong.any():
-        row, k = (int(i[0]) for i in np.nonzero(wrong))
-        name, value = chosen[k].column, rows[row, k]
-        where = f"{source.path}, {source.place(before + row)}, column {name}"
-        raise TableError(f"{where}: {value:g} is not a finite number; correct the value, or remove the row")
-
-
-def _check_time(source: Source, time: Chosen, time_s: Array) -> None:
-    """Check that time increases. Stamps may decrease by LATEST_STAMP_S, but not if they are on an exact grid.
-
-    Raises TableError.
-    """
-    ends = float(time_s[0]), float(time_s[-1])
-    if max(map(abs, ends)) > LAST_S:
-        raise TableError(
-            f"{source.path}, column {time.column}: the time runs from {ends[0]:.10g} s to {ends[1]:.10g} s, which is "
-            "no time since 1970 in s; state its unit, for example --columns time=NAME:ms"
-        )
-    try:
-        allowed = 0.0 if kind_of(np.asarray(time_s[:ROWS_AT_ONCE])) == "grid" else LATEST_STAMP_S
-    except ValueError:
-        allowed = 0.0
-    newest = -math.inf
-    for first in range(0, len(time_s), ROWS_AT_ONCE):
-        part = np.asarray(time_s[first : first + ROWS_AT_ONCE])
-        before = np.maximum.accumulate(np.append(newest, part))
-        newest = float(before[-1])
-        wrong = np.flatnonzero(before[:-1] - part > allowed)
-        if len(wrong):
-            at = int(wrong[0])
-            later = f"{part[at]:.10g} after {before[at]:.10g}"
-            where = f"{source.path}, {source.place(first + at)}, column {time.column}"
-            raise TableError(f"{where}: {later}; time must not decrease, sort or cut the file")
-    if not newest > float(time_s[0]):
-        raise TableError(
-            f"{source.path}, column {time.column}: the value is {newest:.10g} in every row; time must increase"
-        )

@@ -17,7 +17,6 @@ import numpy as np
 
 from agent import __version__
 from agent.calibrate.origin import source_file
-from agent.calibrate.reference_certificate import ReferenceCertificate
 from agent.config.files import read_file
 from agent.core.events import CalibrationUpdate, SharedError
 from agent.delivery.calibrations import calibrations
@@ -27,6 +26,7 @@ from agent.recording.signed_text import sign, written
 from agent.report.result import ResultError, parse, plain
 from calib.estimate.reference_share import ReferenceShare
 from calib.model import Array
+from calib.recorded.certificate import ReferenceCertificate
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey

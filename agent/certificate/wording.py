@@ -12,8 +12,8 @@ from agent.calibrate.origin import SourceFile
 from agent.certificate.content import COVERAGE_PROBABILITY, EQUATION, Certificate
 from agent.report.tables import number
 from agent.report.units import ACCELERATION, output_unit, position_name, sensitivity_unit
-from agent.terminal.quantity import plus_minus
 from calib.model import PARAMETERS
+from calib.rounding import plus_minus
 
 Rows = Sequence[tuple[str, str]]
 MOST_FILES = 6

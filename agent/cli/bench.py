@@ -114,6 +114,7 @@ def _session(settings: Config, channel: Channel, output: Path, options: dict[str
     from agent.bench.measuring import Measuring
     from agent.bench.session import START, Session
     from agent.bench.thinking import Thinking
+    from agent.calibrate.stated import options_of
     from calib.estimate.next_stop import Wanted
     from calib.excitation.front_end import most_margin_s
     from calib.excitation.windows import LEAST_MOTION_MPS2
@@ -130,7 +131,7 @@ def _session(settings: Config, channel: Channel, output: Path, options: dict[str
         scale = write_prior(channel, info.get("nominal_sensitivity"), output / "prior.json")
         arguments = [*stated(channel, output), f"--json={output / 'result.json'}"]
         told = parsed(arguments)
-        measuring = Measuring(channel, told)
+        measuring = Measuring(channel, options_of(told))
         wanted = Wanted(options["u_main_pct"] / 100.0, options["u_transverse_pct"] / 100.0)
         time.sleep(FIRST_S)
         moved = measuring.moved_mps2(capture.record(capture.now_s - FIRST_S))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,17 +11,29 @@ import click
 
 from agent.calibrate.calibrating import calibrated
 from agent.calibrate.origin import origin
-from agent.calibrate.outcome import as_json, print_outcome
+from agent.calibrate.printing import print_outcome
 from agent.calibrate.station import differences, write_proposed
-from agent.calibrate.tables import REFERENCES
 from agent.cli.finite import Finite
 from agent.reading.source import TableError
 from agent.terminal.text import say
-from calib.signal.instrument import QUANTITIES
+from calib.recorded.options import CHOICES, DEFAULTS, GRAVITY_MPS2
+from calib.recorded.outcome import as_json
+from calib.recorded.table import REFERENCES
 
 _REFERENCES = " or ".join(",".join(("time_s", *names)) for names in REFERENCES)
 _FILE = click.Path(path_type=Path, dir_okay=False)
 _U = Finite(0)
+
+
+def _choice(option: str, form: str = "{}") -> click.Choice[str]:
+    return click.Choice([form.format(value) for value in CHOICES[option]])
+
+
+def _u(name: str, told: str) -> Callable[[Any], Any]:
+    """An option with a number from 0 on, whose default is that of calib."""
+    return click.option(
+        f"--{name.replace('_', '-')}", type=_U, default=getattr(DEFAULTS, name), show_default=True, help=told
+    )
 
 
 @click.command()
@@ -40,57 +53,39 @@ _U = Finite(0)
     "--poses", type=_FILE, help="Columns start_s,stop_s and theta_deg,alpha_deg | dx,dy,dz | axis | gx,gy,gz."
 )
 @click.option(
-    "--method", type=click.Choice(["1", "2", "3"]), default="3", show_default=True, help="Method of the paper."
+    "--method", type=_choice("method"), default=str(DEFAULTS.method), show_default=True, help="Method of the paper."
 )
-@click.option("--reference-quantity", type=click.Choice(list(QUANTITIES)), help="Default: by the header.")
-@click.option("--reference-coupling", type=click.Choice(["dc", "ac"]), help="Default: ac for one axis, dc for three.")
+@click.option("--reference-quantity", type=_choice("reference_quantity"), help="Default: by the header.")
 @click.option(
-    "--coupling", type=click.Choice(["dc", "ac"]), default="dc", show_default=True, help="Coupling of the sensor."
+    "--reference-coupling", type=_choice("reference_coupling"), help="Default: ac for one axis, dc for three."
 )
 @click.option(
-    "--u-angle-deg", type=_U, default=0.2, show_default=True, help="u of alpha or direction, for each position."
+    "--coupling", type=_choice("coupling"), default=DEFAULTS.coupling, show_default=True, help="Coupling of the sensor."
 )
-@click.option("--u-theta-deg", type=_U, default=0.2, show_default=True, help="u of theta, common to all positions.")
-@click.option(
-    "--u-alpha-common-deg", type=_U, default=0.1, show_default=True, help="u of alpha, common to all positions."
-)
-@click.option("--u-theta-position-deg", type=_U, default=0.0, show_default=True, help="u of theta, for each position.")
-@click.option("--u-offset-mps2", type=_U, default=0.05, show_default=True, help="u of the offset between windows.")
-@click.option(
-    "--u-offset-position-mps2", type=_U, default=0.0, show_default=True, help="u of the offset, for each position."
-)
-@click.option("--u-reference-pct", type=_U, default=0.1, show_default=True, help="u of the reference's sensitivity.")
+@_u("u_angle_deg", "u of alpha or direction, for each position.")
+@_u("u_theta_deg", "u of theta, common to all positions.")
+@_u("u_alpha_common_deg", "u of alpha, common to all positions.")
+@_u("u_theta_position_deg", "u of theta, for each position.")
+@_u("u_offset_mps2", "u of the offset between windows.")
+@_u("u_offset_position_mps2", "u of the offset, for each position.")
+@_u("u_reference_pct", "u of the reference's sensitivity.")
 @click.option("--reference-certificate", type=_FILE, metavar="FILE",
               help="The reference's certificate (TOML with [certificate], or JSON or DCC of `fieldcal certificate`). "
               "Its u counts in the place of --u-reference-pct.")  # fmt: skip
-@click.option(
-    "--u-transverse-motion-pct",
-    type=_U,
-    default=1.0,
-    show_default=True,
-    help="u of motion transverse to a uniaxial reference.",
-)
-@click.option(
-    "--reference-corner-hz",
-    type=_U,
-    default=0.0,
-    show_default=True,
-    help="Corner frequency of an AC-coupled reference.",
-)
-@click.option("--u-reference-corner-hz", type=_U, default=0.0, show_default=True, help="Its standard uncertainty.")
-@click.option(
-    "--sensor-corner-hz", type=_U, default=0.0, show_default=True, help="Corner frequency of an AC-coupled sensor."
-)
-@click.option("--u-sensor-corner-hz", type=_U, default=0.0, show_default=True, help="Its standard uncertainty.")
-@click.option("--u-tilt-deg", type=_U, default=0.0, show_default=True, help="u of the mount's tilt.")
+@_u("u_transverse_motion_pct", "u of motion transverse to a uniaxial reference.")
+@_u("reference_corner_hz", "Corner frequency of an AC-coupled reference.")
+@_u("u_reference_corner_hz", "Its standard uncertainty.")
+@_u("sensor_corner_hz", "Corner frequency of an AC-coupled sensor.")
+@_u("u_sensor_corner_hz", "Its standard uncertainty.")
+@_u("u_tilt_deg", "u of the mount's tilt.")
 @click.option("--rotation", metavar="R11,...,R33", help="Rotation of a tri-axial reference: a = R a_ref.")
-@click.option("--u-rotation-deg", type=_U, default=0.2, show_default=True, help="u of the rotation, about each axis.")
-@click.option("--gravity", "gravity_mps2", type=Finite(9.7, 9.9), help="Local gravity in m/s2.")
+@_u("u_rotation_deg", "u of the rotation, about each axis.")
+@click.option("--gravity", "gravity_mps2", type=Finite(*GRAVITY_MPS2), help="Local gravity in m/s2.")
 @click.option("--u-gravity-mps2", type=_U, help="u of gravity. Default: 0.03, or 0 with --gravity.")
 @click.option(
     "--static-sign",
-    type=click.Choice(["+1", "-1"]),
-    default="+1",
+    type=_choice("static_sign", "{:+d}"),
+    default=f"{DEFAULTS.static_sign:+d}",
     show_default=True,
     help="Sign of gravity in a pose; +1 as in Eqs. (9)-(11).",
 )

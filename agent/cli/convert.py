@@ -8,10 +8,11 @@ import click
 import numpy as np
 
 from agent.calibrate.calibrating import reference_of, sensor_of
-from agent.calibrate.tables import REFERENCES, SENSOR, TEMPERATURE
+from agent.calibrate.tables import TEMPERATURE
 from agent.reading.formats import Description
 from agent.reading.source import ROWS_AT_ONCE, Array, TableError
 from agent.terminal.text import say
+from calib.recorded.table import REFERENCES, SENSOR
 
 _FILE = click.Path(path_type=Path, dir_okay=False)
 

@@ -143,6 +143,7 @@ def _visit(
     from agent.bench.measuring import Measuring
     from agent.bench.visit_dialogue import LEAST_STAY_S, Stay, VisitDialogue, forbidden
     from agent.bench.visiting import Visiting
+    from agent.calibrate.stated import options_of
     from calib.estimate.next_stop import COVERAGE_FACTOR, Wanted
     from calib.excitation.front_end import most_margin_s
 
@@ -153,7 +154,7 @@ def _visit(
     with Capture(settings, devices) as capture:
         write_prior(channel, opened(capture, devices).get("nominal_sensitivity"), output / "prior.json")
         arguments = [*stated(channel, output), f"--json={output / 'result.json'}"]
-        measuring = Measuring(channel, parsed(arguments))
+        measuring = Measuring(channel, options_of(parsed(arguments)))
         across = options["u_transverse_pct"]
         wanted = Wanted(options["u_pct"] / 100.0, np.inf if across is None else across / 100.0)
         if why := forbidden(COVERAGE_FACTOR * measuring.priors.reference, wanted.main):

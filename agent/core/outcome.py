@@ -23,7 +23,6 @@ from agent.core.events import (
 from calib.estimate.drift import DriftVerdict
 from calib.estimate.quantities import MAIN_TEMPERATURE, RATES, offset_temperature
 from calib.estimate.recursion import Recursion
-from calib.estimate.reference_share import ReferenceShare
 from calib.estimate.response_told import ResponseTold
 from calib.model import Array, Calibration, Window
 
@@ -76,22 +75,12 @@ def calibration_update(
     )  # fmt: skip
 
 
-def shared_error(share: ReferenceShare, serial_number: str, certificate_sha256: str) -> SharedError:
-    """What S and Q owe to a reference, as results state it."""
-    return SharedError(
-        reference=share.reference, serial_number=serial_number, certificate_sha256=certificate_sha256,
-        sensitivity=share.sensitivity.tolist(), unknowns=list(share.unknowns), kinds=list(share.kinds),
-        stated=share.stated.tolist(), u_stated=share.u_stated.tolist(), value=share.value.tolist(),
-        own_derivative=share.own_derivative.T.tolist(), derivative=share.derivative.T.tolist(),
-    )  # fmt: skip
-
-
 def _shared_errors(recursion: Recursion, certificate_of: Callable[[str], Certificate | None]) -> list[SharedError]:
     found = []
     for share in recursion.shares:
         certificate = certificate_of(share.reference)
         told = ("", "") if certificate is None else (certificate.serial_number, certificate.sha256)
-        found.append(shared_error(share, *told))
+        found.append(SharedError(**share.told(*told)))
     return found
 
 

@@ -9,18 +9,20 @@ from typing import Any
 
 import numpy as np
 
-from agent.calibrate.adjusting import adjusted, over_frequency
-from agent.calibrate.calibrating import files_of, reference_of, sensor_of
+from agent.calibrate.calibrating import reference_of, sensor_of, tables_of
 from agent.calibrate.earlier import read_earlier
-from agent.calibrate.files import Files
-from agent.calibrate.priors import NOMINAL_TRANSVERSE, instrument_of, priors_of
-from agent.calibrate.tables import ReferenceTable
+from agent.calibrate.stated import options_of
+from agent.calibrate.tables import ReferenceFile
 from agent.fleet.site_file import DeviceSection
 from agent.reading.source import TableError
 from calib.estimate.device import Device
 from calib.estimate.link import Link, link
 from calib.estimate.nuisances import Applied, Priors
 from calib.model import Array, Window, own_channels
+from calib.recorded.adjusting import adjusted, over_frequency
+from calib.recorded.options import Options
+from calib.recorded.priors import NOMINAL_TRANSVERSE, instrument_of, priors_of
+from calib.recorded.tables import Tables
 from calib.signal.response import FLAT, Response
 
 WORST_CONDITION = 1e3  # of S: a dead output makes it infinite
@@ -67,29 +69,32 @@ def stated(section: DeviceSection, directory: Path) -> tuple[Array, Array] | Non
     return None
 
 
-def read(options: dict[str, Any], known: tuple[Array, Array] | None) -> Files:
-    """The files of a meeting. `known` is of a reference whose file holds its own indications. Raises TableError."""
-    sensor = sensor_of(options["sensor"], options["columns"])
+def read(params: dict[str, Any], options: Options, known: tuple[Array, Array] | None) -> Tables:
+    """The files of a meeting, by the parameters of `fieldcal calibrate`. Raises TableError.
+
+    `known` is of a reference whose file holds its own indications.
+    """
+    sensor = sensor_of(params["sensor"], params["columns"])
     reference = None
-    if options["reference"] and known is None:
-        reference = reference_of(options["reference"], options["reference_columns"], options["sensitivity"])
-    elif options["reference"] and known is not None:
-        table, (mean, _) = sensor_of(options["reference"], options["reference_columns"]), known
+    if params["reference"] and known is None:
+        reference = reference_of(params["reference"], params["reference_columns"], params["sensitivity"])
+    elif params["reference"] and known is not None:
+        table, (mean, _) = sensor_of(params["reference"], params["reference_columns"]), known
         a = (np.asarray(table.v) - mean[9:]) @ np.linalg.inv(mean[:9].reshape(3, 3)).T
-        reference = ReferenceTable(table.path, table.time_s, a, "acceleration", "by its own S and Q", table.said)
-    return files_of(options, sensor, reference, instrument_of(options))
+        reference = ReferenceFile(table.name, table.time_s, a, "acceleration", "by its own S and Q", said=table.said)
+    return tables_of(params["poses"], sensor, reference, options, instrument_of(options))
 
 
-def meeting(sensor: str, reference: str, stretches: Sequence[Files], priors: Priors) -> Meeting:
+def meeting(sensor: str, reference: str, stretches: Sequence[Tables], priors: Priors) -> Meeting:
     """Calibrate the sensor beside the reference alone; what is not refused becomes a link.
 
-    `stretches`: files of one mounting, one or several. A stretch that is refused is left out.
+    `stretches`: tables of one mounting, one or several. A stretch that is refused is left out.
     """
     used: list[Window] = []
     reasons: list[str] = []
     seen, lag_s = 0, 0.0
-    for files in stretches:
-        outcome = adjusted(files, priors)
+    for tables in stretches:
+        outcome = adjusted(tables, priors)
         seen += len(outcome.windows)
         reasons += outcome.reasons
         if not outcome.reasons:
@@ -105,9 +110,10 @@ def meeting(sensor: str, reference: str, stretches: Sequence[Files], priors: Pri
     return Meeting(sensor, reference, found, tuple(reasons), *told)
 
 
-def met(sensor: str, reference: str, options: dict[str, Any], known: tuple[Array, Array] | None) -> Meeting:
+def met(sensor: str, reference: str, params: dict[str, Any], known: tuple[Array, Array] | None) -> Meeting:
     """A meeting by its files and options. Raises TableError."""
-    found = meeting(sensor, reference, [read(options, known)], priors_of(options))
+    options = options_of(params)
+    found = meeting(sensor, reference, [read(params, options, known)], priors_of(options))
     if known is None or found.found is None or found.found.rotation is not None:
         return found
     reason = (

@@ -15,9 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from agent.calibrate.files import Files, Options
-from agent.calibrate.poses import PoseInterval
-from agent.calibrate.tables import ReferenceTable, SensorTable
+from agent.calibrate.faults import as_table_error
 from agent.config import Channel
 from agent.config.recorded import recorded_config
 from agent.core.events import DeviceChange, RunStart
@@ -33,20 +31,23 @@ from calib.estimate.quantities import YEAR_DAYS
 from calib.excitation.front_end import Settings
 from calib.excitation.window_verdict import Limits
 from calib.model import Array
+from calib.recorded.poses import PoseInterval
+from calib.recorded.table import ReferenceTable, SensorTable
+from calib.recorded.tables import Making, Tables
 
 YEAR_S = YEAR_DAYS * 86400.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recorded:
-    """A channel of a recording: identities, files, priors with what is known of S and Q, and why it is not used."""
+    """A channel of a recording: identities, tables, priors with what is known of S and Q, and why it is not used."""
 
     sensor: str
     reference: str
     channels: int  # of the reference
     priors: Priors
     gravity_mps2: float
-    files: Files | None
+    tables: Tables | None
     reason: str = ""
 
 
@@ -71,17 +72,17 @@ def meetings_in(paths: Sequence[Path]) -> tuple[list[Device], list[Meeting]]:
             "are not of one site; adjust them apart"
         )
     meetings, devices = [], dict[str, Device]()
-    sensors = {one.sensor for one in found if one.files is not None}
+    sensors = {one.sensor for one in found if one.tables is not None}
     for (sensor, reference), own in together.items():
-        files = [one.files for one in own if one.files is not None]
-        first = next((one for one in own if one.files is not None), own[0])
+        tables = [one.tables for one in own if one.tables is not None]
+        first = next((one for one in own if one.tables is not None), own[0])
         reason = first.reason
         if reference in sensors:
             reason = f"{reference} is a sensor of another channel too; describe such a site in a TOML file"
         if reason:
             meetings.append(Meeting(sensor, reference, None, (reason,), 0, 0, 0, 0.0))
             continue
-        meetings.append(meeting(sensor, reference, files, first.priors))
+        meetings.append(meeting(sensor, reference, tables, first.priors))
         mean, covariance = first.priors.parameters, first.priors.covariance
         assert mean is not None
         assert covariance is not None
@@ -118,14 +119,16 @@ def _recorded(path: Path, start: RunStart, channel: Channel, infos: dict[str, st
     stated = Priors({**priors.values, "reference": u_reference, "reference_drift": 0.0}, mean, np.diag(u**2))
     sensor, reference = (_table(path, name) for name in (channel.sensor, channel.reference))
     settings = Settings(Limits.of(priors.offset_mps2, priors.angle_rad, channel.window_s), bands=True)
-    files = Files(
-        SensorTable(path, sensor[:, 0], sensor[:, 1:4], None),
-        ReferenceTable(path, reference[:, 0], reference[:, 1:], channel.instrument.quantity, channel.reference),
-        list(_intervals(channel, sensor[:, 0])),
-        channel.instrument,
-        Options(settings, guard_s=channel.guard_s),
-    )
-    return Recorded(names[0], names[1], reference.shape[1] - 1, stated, channel.gravity_mps2, files)
+    name, quantity = str(path), channel.instrument.quantity
+    with as_table_error():
+        tables = Tables(
+            SensorTable(name, sensor[:, 0], sensor[:, 1:4]),
+            ReferenceTable(name, reference[:, 0], reference[:, 1:], quantity, channel.reference),
+            list(_intervals(channel, sensor[:, 0])),
+            channel.instrument,
+            Making(settings, guard_s=channel.guard_s),
+        )
+    return Recorded(names[0], names[1], reference.shape[1] - 1, stated, channel.gravity_mps2, tables)
 
 
 def _unusable(start: RunStart, channel: Channel, infos: dict[str, str]) -> str:

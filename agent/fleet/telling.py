@@ -10,13 +10,13 @@ import msgspec
 import numpy as np
 
 from agent import __version__
-from agent.calibrate.outcome import plain
 from agent.fleet.adjusting import Adjusted
-from agent.terminal.quantity import plus_minus
 from agent.terminal.text import say
 from calib.estimate.contradiction import FALSE_ALARM, Verdict
 from calib.estimate.link import GRAVITY_NAME
 from calib.model import Array
+from calib.recorded.outcome import plain
+from calib.rounding import plus_minus
 
 METHOD = "site adjustment"
 

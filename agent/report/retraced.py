@@ -8,11 +8,12 @@ from typing import Any
 import click
 
 from agent.calibrate.calibrating import read_files
-from agent.calibrate.files import Files
 from agent.calibrate.origin import SourceFile, source_file
+from agent.calibrate.stated import FILES
 from agent.reading.source import TableError
 from agent.report.result import CalibrationResult, WindowVerdict
 from agent.report.trace import Trace
+from calib.recorded.tables import Tables
 
 MOST_TRACES = 24  # windows with numbers: the newest window of each of so many positions
 
@@ -27,7 +28,8 @@ def retrace(result: CalibrationResult, directory: Path) -> tuple[dict[str, Trace
     if hindrances:
         return {}, [f"{hindrance}, so indications and residuals are not shown" for hindrance in hindrances]
     try:
-        read = read_files(options | {name: found.get(options.get(name)) for name in ("sensor", "reference", "poses")})
+        named = {name: found.get(options.get(name)) for name in ("sensor", "reference", "poses")}
+        read = read_files(options | named | dict.fromkeys(FILES))
     except (TableError, click.UsageError, KeyError, TypeError, ValueError) as error:
         return {}, [
             f"indications and residuals are not shown: the files cannot be read with the options in the result: {error}"
@@ -50,7 +52,7 @@ def _found(files: tuple[SourceFile, ...], directory: Path) -> tuple[dict[Any, Pa
     return found, hindrances
 
 
-def _traces(read: Files, result: CalibrationResult) -> dict[str, Trace]:
+def _traces(read: Tables, result: CalibrationResult) -> dict[str, Trace]:
     """The newest used window of each position."""
     newest: dict[str, WindowVerdict] = {}
     for window in result.windows:

@@ -11,9 +11,9 @@ import numpy as np
 from agent.report.result import CalibrationResult
 from agent.report.trace import Residuals
 from agent.report.units import ACCELERATION, output_unit, position_name, said, sensitivity_unit
-from agent.terminal.quantity import plus_minus
 from agent.terminal.text import page_text
 from calib.model import PARAMETERS
+from calib.rounding import plus_minus
 
 AXES = "xyz"
 MOST_ROWS = 200  # of windows; report.json has all

@@ -1,18 +1,6 @@
-"""Writes values with their uncertainties, durations and sizes for people."""
+"""Writes durations and sizes for people."""
 
 from __future__ import annotations
-
-import math
-
-
-def plus_minus(value: float | None, expanded: float | None) -> str:
-    """`value ± U`, both rounded to the second digit of U; `–` if there is no value."""
-    if value is None or not math.isfinite(value):
-        return "–"
-    if expanded is None or not math.isfinite(expanded) or expanded <= 0:
-        return f"{value:.6g} ± ?"
-    decimals = max(0, 1 - math.floor(math.log10(expanded)))
-    return f"{value:.{decimals}f} ± {expanded:.{decimals}f}"
 
 
 def duration(seconds: float) -> str:

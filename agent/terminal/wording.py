@@ -8,8 +8,9 @@ import msgspec
 import numpy as np
 
 from agent.core.events import CalibrationUpdate, DriftReport, Estimate, Result, StatusChange, WindowReport
-from agent.terminal.quantity import plus_minus, size
+from agent.terminal.quantity import size
 from calib.model import Array
+from calib.rounding import plus_minus
 
 if TYPE_CHECKING:
     from agent.delivery.publication import PublicationState

@@ -10,16 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from agent.calibrate.adjusting import adjusted
-from agent.calibrate.files import Files, Options
-from agent.calibrate.outcome import Outcome
-from agent.calibrate.poses import PoseInterval
-from agent.calibrate.tables import ReferenceTable, SensorTable
 from agent.config import Channel, Config
 from agent.core.events import CalibrationUpdate, Event, StatusChange
 from agent.core.schedule import pose_of
@@ -32,6 +26,11 @@ from calib.excitation.front_end import Settings
 from calib.excitation.window_verdict import Limits
 from calib.geometry import beside
 from calib.model import PARAMETERS, Array
+from calib.recorded.adjusting import adjusted
+from calib.recorded.outcome import Outcome
+from calib.recorded.poses import PoseInterval
+from calib.recorded.table import ReferenceTable, SensorTable
+from calib.recorded.tables import Making, Tables
 from hw.block import SampleBlock
 
 SEED, RUNS = 1, 20  # of each kind
@@ -143,10 +142,10 @@ def _offline(channel: Channel, sensor: tuple[Array, Array, float], reference: tu
     u = channel.prior.standard_uncertainty(mean)
     priors = Priors(channel.priors(fixed_mount=channel.fixed_mount).values, mean, np.diag(u**2))
     settings = Settings(Limits.of(priors.offset_mps2, priors.angle_rad, channel.window_s), bands=True)
-    files = Files(
-        SensorTable(Path("sensor"), stamps, values, None),
-        ReferenceTable(Path("reference"), reference[0], reference[1], "acceleration", "a"),
-        poses, channel.instrument, Options(settings, guard_s=channel.guard_s),
+    files = Tables(
+        SensorTable("sensor", stamps, values, None),
+        ReferenceTable("reference", reference[0], reference[1], "acceleration", "a"),
+        poses, channel.instrument, Making(settings, guard_s=channel.guard_s),
     )  # fmt: skip
     return adjusted(files, priors)
 

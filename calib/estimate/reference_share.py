@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -44,6 +45,15 @@ class ReferenceShare:
     value: Array
     own_derivative: Array
     derivative: Array
+
+    def told(self, serial_number: str, certificate_sha256: str) -> dict[str, Any]:
+        """The share as results state it (docs/shared-errors.md): `derivative` has a row for each unknown."""
+        return {
+            "reference": self.reference, "serial_number": serial_number, "certificate_sha256": certificate_sha256,
+            "sensitivity": self.sensitivity.tolist(), "unknowns": list(self.unknowns), "kinds": list(self.kinds),
+            "stated": self.stated.tolist(), "u_stated": self.u_stated.tolist(), "value": self.value.tolist(),
+            "own_derivative": self.own_derivative.T.tolist(), "derivative": self.derivative.T.tolist(),
+        }  # fmt: skip
 
     def restated(
         self, sensitivity: Array, u_relative: Array, corner_hz: tuple[float, float] | None = None

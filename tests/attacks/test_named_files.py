@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from agent.calibrate.priors import _read_prior
-from agent.calibrate.tables import TableError, read_sensor
+from agent.calibrate.stated import read_prior
+from agent.calibrate.tables import read_sensor
 from agent.cli.main import run_cli
 from agent.commanding.counters import Counters
 from agent.config import ConfigError, load_config
@@ -22,6 +22,7 @@ from agent.delivery.memory import MemoryFileError, load
 from agent.delivery.router import open_router
 from agent.delivery.session import EndpointError
 from agent.keys.files import read_signing_key
+from agent.reading.source import TableError
 from agent.recording.signing import load_public_key
 from agent.report.material import MaterialError, gather
 from hw.sensor import ConfigurationError, load_driver
@@ -34,7 +35,7 @@ READERS: list[tuple[Callable[[Path], object], type[Exception]]] = [
     (load_public_key, KeyFileError),
     (read_signing_key, KeyFileError),
     (read_sensor, TableError),
-    (_read_prior, TableError),
+    (read_prior, TableError),
     (load, MemoryFileError),
     (lambda path: open_router(None, path), EndpointError),
     (lambda path: gather([path], None), MaterialError),

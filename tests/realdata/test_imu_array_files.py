@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import itertools
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from agent.calibrate.adjusting import adjusted
-from agent.calibrate.files import Files, Options
-from agent.calibrate.poses import PoseInterval
-from agent.calibrate.tables import ReferenceTable, SensorTable
 from calib.estimate.norm_fit import PARAMETER, NormFit, norm_fit
 from calib.estimate.nuisances import Priors
 from calib.excitation.front_end import Settings
 from calib.excitation.windows import rests_anywhere
 from calib.geometry import beside
 from calib.model import Array
+from calib.recorded.adjusting import adjusted
+from calib.recorded.poses import PoseInterval
+from calib.recorded.table import ReferenceTable, SensorTable
+from calib.recorded.tables import Making, Tables
 from calib.signal.instrument import Instrument
 from tests.realdata.datasets import dataset
 from tests.realdata.test_imu_array_live import GRAVITY_MPS2, OTHER_SIDE, RESTS_END_S
@@ -64,12 +63,12 @@ def test_one_imu_calibrates_another_at_rest(recording: int, imu: int) -> None:
     resting = time_s < RESTS_END_S
     reference = (counts[:, 0] - first.offset) @ np.linalg.inv(first.sensitivity).T
     pose = beside(np.eye(3) if imu % 2 else OTHER_SIDE, [0.0, 0.0, 0.0])
-    files = Files(
-        SensorTable(Path("sensor.csv"), time_s[resting], counts[resting, imu - 1], None),
-        ReferenceTable(Path("reference.csv"), time_s[resting], reference[resting], "acceleration", "ax"),
+    files = Tables(
+        SensorTable("sensor.csv", time_s[resting], counts[resting, imu - 1], None),
+        ReferenceTable("reference.csv", time_s[resting], reference[resting], "acceleration", "ax"),
         [PoseInterval(float(time_s[0]), RESTS_END_S, pose)],
         Instrument(),
-        Options(Settings(bands=True)),
+        Making(Settings(bands=True)),
     )
     outcome = adjusted(files, Priors(rotation_rad=float(np.deg2rad(2.0))))
     found = outcome.calibration

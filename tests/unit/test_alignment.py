@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from agent.calibrate.files import Files, Options
-from agent.calibrate.poses import PoseInterval
-from agent.calibrate.tables import ReferenceTable, SensorTable
 from calib.excitation.alignment import drift, segment_lags
 from calib.excitation.windows import Points, motion_windows
 from calib.geometry import beside, clamp
 from calib.model import Pose, Window
 from calib.paper.method3 import fit
+from calib.recorded.poses import PoseInterval
+from calib.recorded.table import ReferenceTable, SensorTable
+from calib.recorded.tables import Making, Tables
 from calib.signal.instrument import Instrument
 
 RATE_HZ = 500.0
@@ -104,28 +102,28 @@ def tables(ppm: float) -> tuple[SensorTable, ReferenceTable, list[PoseInterval]]
     parts = zip(np.split(t, 3), poses, strict=True)
     V = np.concatenate([(motion(part, 1) @ p.direction.T + p.gravity_mps2) @ S.T + 0.1 for part, p in parts])
     V += 0.01 * rng.normal(size=V.shape)
-    sensor = SensorTable(Path("sensor.csv"), t, V, None)
-    reference = ReferenceTable(Path("reference.csv"), t * (1 + ppm * 1e-6), motion(t, 1), "acceleration", "a")
+    sensor = SensorTable("sensor.csv", t, V)
+    reference = ReferenceTable("reference.csv", t * (1 + ppm * 1e-6), motion(t, 1), "acceleration", "a")
     return sensor, reference, [PoseInterval(60.0 * k, 60.0 * (k + 1), p) for k, p in enumerate(poses)]
 
 
 def test_free_running_clocks_cost_nothing_once_aligned() -> None:
     sensor, reference, poses = tables(40.0)  # 7 ms apart in the end
-    front = Files(sensor, reference, poses, Instrument())
+    front = Tables(sensor, reference, poses, Instrument())
     front.windows()
     assert front.drift is not None
     # The reference's stamps run ahead: the sensor's lag behind them less and less.
     assert front.drift.rate == pytest.approx(-40e-6, abs=5e-7)
     lag_s = front.drift.lag_s
     aligned = fit(front.windows(lag_s))
-    as_they_are = fit(Files(sensor, reference, poses, Instrument(), Options(align=False)).windows(lag_s))
+    as_they_are = fit(Tables(sensor, reference, poses, Instrument(), Making(align=False)).windows(lag_s))
     assert aligned.residual_sd.max() < 0.015 < 0.1 < as_they_are.residual_sd.max()
     assert np.abs(aligned.calibration.sensitivity - S).max() < 5e-4
     assert np.abs(as_they_are.calibration.sensitivity - S).max() > 1e-3
 
 
 def test_clocks_in_step_are_left_alone() -> None:
-    front = Files(*tables(0.0), Instrument())
+    front = Tables(*tables(0.0), Instrument())
     front.windows()
     assert front.drift is not None
     assert not front.drift.significant

@@ -221,7 +221,7 @@ def no_number(path: Path) -> None:
         (
             None,
             ["--reference-quantity", "velocity"],
-            "reference.csv, line 1: column a holds acceleration, but --reference-quantity says velocity",
+            "reference.csv, line 1, column a: the column holds acceleration, but --reference-quantity says velocity",
         ),
         (None, ["--rotation", "1,2,3"], "'1,2,3' must be nine numbers"),
         (None, ["--rotation", "1,0,0,0,1,0,0,0,1"], "--rotation is for a tri-axial --reference"),

@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agent.calibrate.priors import priors_of
+from agent.calibrate.stated import options_of
 from agent.cli.calibrate import calibrate
 from agent.config.knowledge import Certificate, Knowledge, Prior, Process, Uncertainty
 from calib.estimate.nuisances import Priors
 from calib.estimate.quantities import KINDS, PRIORS, WALKS, Quantity, Statement
 from calib.estimate.wander import Wander
+from calib.recorded.priors import priors_of
 
 STATED = Knowledge(
     prior=Prior(sensitivity=1.0, corner_hz=0.2, u_corner_hz=0.03, reference_frequency_hz=4.0),
@@ -83,7 +84,7 @@ def test_an_option_of_calibrate_moves_what_it_names_and_nothing_else(option: str
     files = ["--sensor", "s.csv", "--reference", "r.csv", "--poses", "p.csv"]
     options = calibrate.make_context("calibrate", files).params
     value, expected = OF_THE_OPTIONS[option]
-    before, after = priors_of(options), priors_of(options | {option: value})
+    before, after = (priors_of(options_of(told)) for told in (options, options | {option: value}))
     assert {n: v for n, v in after.values.items() if v != before.values[n]} == pytest.approx(expected)
 
 

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from agent.calibrate.adjusting import adjusted
-from agent.calibrate.outcome import Outcome
 from agent.cli.calibrate import calibrate
 from calib.estimate.adjustment import adjust
 from calib.estimate.nuisances import Priors
 from calib.excitation.bands import band_sums
+from calib.recorded.adjusting import adjusted
+from calib.recorded.outcome import Outcome
 from calib.signal.response import POWERS, Response, passed
 from tests.pair import Filter, Pair, decimator, flat, highpass, lowpass, moving_mean, pair, resonance, sinc3
 

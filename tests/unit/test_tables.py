@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agent.calibrate.poses import Setting, read_poses
+from agent.calibrate.faults import as_table_error
+from agent.calibrate.poses import PosesFile
 from agent.calibrate.tables import read_reference, read_sensor
 from agent.reading import delimited
 from agent.reading.source import TableError
+from calib.recorded.poses import PoseInterval, Setting, intervals_of
 
 HEADER = "time_s,vx,vy,vz\n"
 
@@ -139,6 +141,13 @@ def test_a_reference_must_be_one_thing(tmp_path: Path, header: str) -> None:
 UNIAXIAL = Setting(reference_channels=1)
 
 
+def read_poses(path: Path, setting: Setting) -> list[PoseInterval]:
+    read = PosesFile(path)
+    assert read.poses is not None
+    with as_table_error(read.line):
+        return intervals_of(read.poses, setting)
+
+
 @pytest.mark.parametrize(
     ("header", "row", "direction", "gravity"),
     [
@@ -183,11 +192,11 @@ def test_who_feels_gravity(tmp_path: Path) -> None:
         (
             "start_s,stop_s,axis\n5,9,x\n0,5.5,y\n",
             UNIAXIAL,
-            r"line 2, column start_s: this pose begins at 5 s, before 5\.5 s, .* in line 3",
+            r"line 2, column start_s: this pose begins at 5 s, before the end of the pose from 0 s to 5\.5 s",
         ),
         ("start_s,stop_s,axis\n0,1\n", UNIAXIAL, r"line 2: 2 fields, but the header has 3"),
         ("start_s,stop_s,axis\n0,inf,x\n", UNIAXIAL, r"line 2, column stop_s: 'inf' is not a finite number"),
-        ("start_s,stop_s,axis\n", UNIAXIAL, r"the file has no poses"),
+        ("start_s,stop_s,axis\n", UNIAXIAL, r"there are no poses"),
         ("start_s,axis\n0,x\n", UNIAXIAL, r"line 1: column stop_s is missing"),
         (
             "start_s,stop_s,theta_deg,alpha_rad\n0,1,35,0\n",

@@ -1,4 +1,4 @@
-"""`fieldcal calibrate` without --plain: the adjustment of all windows, and the norm fit if there are only rests."""
+"""Method 3 without `plain`: the adjustment of all windows, and the norm fit if there are only rests."""
 
 from __future__ import annotations
 
@@ -7,15 +7,8 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-import msgspec
 import numpy as np
 
-from agent.calibrate.files import Files
-from agent.calibrate.outcome import NuisanceValue, Outcome, nothing_used
-from agent.calibrate.priors import priors_of, row_contradictions, u_gravity_mps2
-from agent.calibrate.reference_certificate import ReferenceCertificate
-from agent.calibrate.tables import SensorTable
-from agent.core.outcome import shared_error
 from calib.estimate.adjustment import Adjustment, adjust
 from calib.estimate.condense import condense, mean_frequency_hz
 from calib.estimate.lag_search import correlated_lag_s, largest_omega, without_lag
@@ -26,6 +19,12 @@ from calib.excitation.bands import motion_band_hz
 from calib.excitation.windows import rests_anywhere
 from calib.geometry import STANDARD_GRAVITY_MPS2
 from calib.model import PARAMETERS, Window
+from calib.recorded.certificate import ReferenceCertificate
+from calib.recorded.options import Options
+from calib.recorded.outcome import NuisanceValue, Outcome, nothing_used
+from calib.recorded.priors import priors_of, row_contradictions, u_gravity_mps2
+from calib.recorded.table import SensorTable
+from calib.recorded.tables import Tables
 from calib.signal.response import UNSETTLED
 from calib.signal.stamps import clock_from_stamps
 
@@ -36,21 +35,20 @@ RESPONSE_TURNS = 6
 HOPELESS = 2  # turns after which a refusal no longer comes from the response that is not yet taken out
 
 
-def adjusted(files: Files, priors: Priors, certificate: ReferenceCertificate | None = None) -> Outcome:
-    """The outcome for these files and priors. `certificate` is that of the reference, if it is given."""
-    outcome, share = _adjusted(files, priors)
+def adjusted(tables: Tables, priors: Priors, certificate: ReferenceCertificate | None = None) -> Outcome:
+    """The outcome for these tables and priors. `certificate` is that of the reference, if it is given."""
+    outcome, share = _adjusted(tables, priors)
     if share is None:
         return outcome
     if certificate is not None:
         share = replace(share, sensitivity=certificate.sensitivity)
     told = ("", "") if certificate is None else (certificate.serial_number, certificate.sha256)
-    shared = msgspec.structs.asdict(shared_error(share, *told))
-    return replace(outcome, more={**outcome.more, "shared_errors": [shared]})
+    return replace(outcome, more={**outcome.more, "shared_errors": [share.told(*told)]})
 
 
-def _adjusted(files: Files, priors: Priors) -> tuple[Outcome, ReferenceShare | None]:
+def _adjusted(tables: Tables, priors: Priors) -> tuple[Outcome, ReferenceShare | None]:
     """Make windows with the lag and the response over frequency taken out, and adjust them."""
-    search = _Search(files, priors)
+    search = _Search(tables, priors)
     applied, judged = search.begun()
     windows = judged
     for turn in range(RESPONSE_TURNS):
@@ -61,25 +59,25 @@ def _adjusted(files: Files, priors: Priors) -> tuple[Outcome, ReferenceShare | N
         found = search.at(windows, applied)
         if not search.stated.response:
             found = _attenuated(found, windows, priors, applied)
-            return _outcome(found, windows, files.rate_hz), found.share
+            return _outcome(found, windows, tables.rate_hz), found.share
         if found.response is None or found.response.terms.is_near(applied.response):
-            return _outcome(found, windows, files.rate_hz), found.share
+            return _outcome(found, windows, tables.rate_hz), found.share
         if found.reasons and turn >= HOPELESS:
-            return _outcome(found, windows, files.rate_hz), found.share
+            return _outcome(found, windows, tables.rate_hz), found.share
         applied = replace(applied, response=found.response.terms.modest)
     if not _used(windows) and not _used(judged):
-        return nothing_used(judged, files.rate_hz, METHOD), None
-    return Outcome(None, (UNSETTLED,), windows, files.rate_hz, METHOD), None
+        return nothing_used(judged, tables.rate_hz, METHOD), None
+    return Outcome(None, (UNSETTLED,), windows, tables.rate_hz, METHOD), None
 
 
 class _Search:
-    """Adjustments of the windows of files from which a lag and a response are taken out.
+    """Adjustments of the windows of tables from which a lag and a response are taken out.
 
     `stated` are the priors, later with those of the response, whose scale is that of the motion.
     """
 
-    def __init__(self, files: Files, priors: Priors) -> None:
-        self._files, self._priors = files, priors.beside_unknown_corner if files.corner_unknown else priors
+    def __init__(self, tables: Tables, priors: Priors) -> None:
+        self._tables, self._priors = tables, priors.beside_unknown_corner if tables.corner_unknown else priors
         self.stated = self._priors
         self._latest: tuple[Sequence[Window], Applied, Adjustment] | None = None
 
@@ -91,7 +89,7 @@ class _Search:
         flat = Applied(0.0, self._priors.reference_corner_at_hz, self._priors.sensor_corner_at_hz)
         windows, applied = self.without_lag(flat)
         if not _used(windows):
-            likely = replace(flat, lag_s=_likely_lag_s(self._files, self._priors, windows))
+            likely = replace(flat, lag_s=_likely_lag_s(self._tables, self._priors, windows))
             windows, applied = self.without_lag(likely)
         if _used(windows):
             return applied, windows
@@ -113,7 +111,7 @@ class _Search:
         def lag_of(made: Sequence[Window], lag_s: float) -> float:
             return self.at(made, replace(taken, lag_s=lag_s)).lag_s or 0.0
 
-        make = partial(self._files.windows, response=taken.response, steady=steady)
+        make = partial(self._tables.windows, response=taken.response, steady=steady)
         windows, lag_s = without_lag(taken.lag_s, make, _used, lag_of)
         return windows, replace(taken, lag_s=lag_s)
 
@@ -131,14 +129,14 @@ def _hardly_used(windows: Sequence[Window]) -> tuple[str, ...]:
     )
 
 
-def _likely_lag_s(files: Files, priors: Priors, windows: Sequence[Window]) -> float:
+def _likely_lag_s(tables: Tables, priors: Priors, windows: Sequence[Window]) -> float:
     """Where the search for the lag begins if no window can be used: a sensor that is late seems not to follow its
     reference. Steep filters with their corner above the motion delay by up to LAG_PERIODS periods of it."""
     omega = largest_omega(windows)
     if not (priors.lag_s and omega):
         return 0.0
     furthest_s = max(LAG_SD * priors.lag_s, LAG_PERIODS * 2.0 * np.pi / omega)
-    return correlated_lag_s(files.stretches(), files.rate_hz, furthest_s) or 0.0
+    return correlated_lag_s(tables.stretches(), tables.rate_hz, furthest_s) or 0.0
 
 
 def with_response(priors: Priors, windows: Sequence[Window]) -> Priors:
@@ -169,15 +167,13 @@ def _used(windows: Sequence[Window]) -> list[Window]:
     return [w for w in windows if w.used]
 
 
-def norm_fitted(sensor: SensorTable, options: dict[str, Any]) -> Outcome:
-    """Fit to rests that are found in the sensor's file. Only the magnitude of gravity is known, so the frame is free
+def norm_fitted(sensor: SensorTable, options: Options) -> Outcome:
+    """Fit to rests that are found in the sensor's table. Only the magnitude of gravity is known, so the frame is free
     and S is upper triangular.
-
-    Raises TableError if --prior cannot be read.
     """
     priors = priors_of(options)
     clock = clock_from_stamps(sensor.time_s)
-    gravity = options["gravity_mps2"] or STANDARD_GRAVITY_MPS2
+    gravity = options.gravity or STANDARD_GRAVITY_MPS2
     there = np.flatnonzero(np.isfinite(sensor.v).all(axis=1))
     windows = rests_anywhere(clock.time_of(there), np.asarray(sensor.v)[there], gravity)
     try:

@@ -1,18 +1,17 @@
-"""Priors of the nuisances and of S and Q, from the options of `fieldcal calibrate`."""
+"""Priors of the nuisances and of S and Q, from the options."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
-from agent.calibrate.earlier import read_earlier
-from agent.reading.source import TableError
 from calib.estimate.nuisances import Priors
 from calib.estimate.quantities import PRIORS
 from calib.model import PARAMETERS, Array, Calibration
+from calib.recorded.errors import OptionError
+from calib.recorded.options import Options
 from calib.signal.instrument import Instrument
 
 # Without a stated local value, standard gravity is used. Its error is up to 0.3 %: gravity differs by 0.05 m/s2 between
@@ -24,59 +23,61 @@ CONTRADICTION = 3.0
 NOMINAL_TRANSVERSE = 0.03  # of the nominal sensitivity: data sheets of MEMS say 1 to 3 %
 
 
-def priors_of(options: dict[str, Any]) -> Priors:
-    """The options --u-..., --nominal and --prior as priors. Raises TableError if --prior cannot be read."""
+def priors_of(options: Options) -> Priors:
+    """The options u_..., nominal and prior as priors."""
     parameters, covariance = _known(options)
-    told = options | {"u_gravity_mps2": u_gravity_mps2(options)}
-    stated = {s.name: s.convert(told[s.option]) for s in PRIORS.values() if s.option}
+    told = replace(options, u_gravity_mps2=u_gravity_mps2(options))
+    stated = {s.name: s.convert(getattr(told, s.option)) for s in PRIORS.values() if s.option}
     return Priors(stated, parameters, covariance)
 
 
-def instrument_of(options: dict[str, Any]) -> Instrument:
-    """The reference and the corner frequencies by the options. The quantity comes from the file of the reference."""
+def instrument_of(options: Options) -> Instrument:
+    """The reference and the corner frequencies by the options. The quantity is that of the reference's table."""
     return Instrument(
-        corner_hz=options["reference_corner_hz"],
-        u_corner_hz=options["u_reference_corner_hz"],
-        sensor_corner_hz=options["sensor_corner_hz"],
-        u_sensor_corner_hz=options["u_sensor_corner_hz"],
+        corner_hz=options.reference_corner_hz,
+        u_corner_hz=options.u_reference_corner_hz,
+        sensor_corner_hz=options.sensor_corner_hz,
+        u_sensor_corner_hz=options.u_sensor_corner_hz,
     )
 
 
-def u_gravity_mps2(options: dict[str, Any]) -> float:
+def u_gravity_mps2(options: Options) -> float:
     """Standard uncertainty of gravity, m/s2."""
-    stated: float | None = options["u_gravity_mps2"]
-    if stated is not None:
-        return stated
-    return U_STANDARD_GRAVITY_MPS2 if options["gravity_mps2"] is None else 0.0
+    if options.u_gravity_mps2 is not None:
+        return options.u_gravity_mps2
+    return U_STANDARD_GRAVITY_MPS2 if options.gravity is None else 0.0
 
 
-def _known(options: dict[str, Any]) -> tuple[Array | None, Array | None]:
-    """Prior values (12,) and covariance (12, 12) of S and Q, from --nominal or --prior."""
-    if options["nominal"] is not None:
-        main, u = options["nominal"], options["u_nominal_pct"] / 100.0
+def _known(options: Options) -> tuple[Array | None, Array | None]:
+    """Prior values (12,) and covariance (12, 12) of S and Q, from `nominal` or `prior`."""
+    if options.nominal is not None and options.u_nominal_pct is not None:
+        main, u = options.nominal, options.u_nominal_pct / 100.0
         sd = main * np.where(np.eye(3).ravel() > 0, u, NOMINAL_TRANSVERSE)
         return np.append(main * np.eye(3).ravel(), np.zeros(3)), np.diag(np.append(sd**2, np.full(3, np.inf)))
-    if options["prior"]:
-        return _read_prior(options["prior"])
-    return None, None
+    return (None, None) if options.prior is None else options.prior
 
 
-def _read_prior(path: Path) -> tuple[Array, Array]:
-    """Values and covariance from an earlier result or certificate. What is null there is not known."""
-    values, covariance = read_earlier(path)
+def prior_of(values: Array, covariance: Array) -> tuple[Array, Array]:
+    """The prior by the S row by row and Q (12,) of an earlier result and their covariance (12, 12).
+
+    What is NaN there is not known: it has an infinite variance in the prior. Raises OptionError.
+    """
+    values, covariance = np.array(values, dtype=float), np.array(covariance, dtype=float)
     if values.shape != (12,) or covariance.shape != (12, 12):
-        raise TableError(f"{path}: sensitivity must be 3 x 3, offset 3, covariance 12 x 12")
+        raise OptionError("sensitivity must be 3 x 3, offset 3, covariance 12 x 12", column="prior")
     unknown = ~(np.isfinite(values) & np.isfinite(np.diag(covariance)))
     covariance[unknown, :], covariance[:, unknown] = 0.0, 0.0
     covariance[unknown, unknown] = np.inf
     known = covariance[np.ix_(~unknown, ~unknown)]
     if not np.all(np.isfinite(known)) or (known.size and np.linalg.eigvalsh(known).min() <= 0.0):
-        raise TableError(f"{path}, covariance: the matrix is not positive definite, so it is no covariance")
+        raise OptionError(
+            "the covariance matrix is not positive definite, so it is no covariance", "give another one", column="prior"
+        )
     return np.nan_to_num(values), covariance
 
 
 def contradictions(found: Calibration, priors: Priors) -> list[str]:
-    """Reasons for sensitivities that contradict --nominal or --prior, for methods that do not use a prior."""
+    """Reasons for sensitivities that contradict the prior, for methods that do not use one."""
     if priors.parameters is None or priors.covariance is None:
         return []
     u_known = np.sqrt(np.diag(priors.covariance))[:9]

@@ -1,48 +1,46 @@
-"""`fieldcal calibrate --method 1|2`: the paper's methods on amplitudes, from the windows of files."""
+"""`fieldcal calibrate --method 1|2`: the paper's methods on amplitudes, from the windows of tables."""
 
 from __future__ import annotations
 
 from typing import Any
 
-import click
 import numpy as np
 
-from agent.calibrate.files import Files
-from agent.calibrate.outcome import Outcome, nothing_used
-from agent.calibrate.priors import contradictions, priors_of
 from calib.estimate.verdict import dead_reasons
 from calib.model import PARAMETERS
 from calib.paper import method1, method2
 from calib.paper.amplitudes import AmplitudeCalibration, Run
 from calib.paper.statistics import rel_s_pct, transverse_excess
+from calib.recorded.errors import OptionError
+from calib.recorded.options import Options
+from calib.recorded.outcome import Outcome, nothing_used
+from calib.recorded.priors import contradictions, priors_of
+from calib.recorded.tables import Tables
 
-SOLVE = {"1": method1.solve, "2": method2.solve}
+SOLVE = {1: method1.solve, 2: method2.solve}
 
 
-def by_amplitudes(files: Files, options: dict[str, Any]) -> Outcome:
+def by_amplitudes(tables: Tables, options: Options) -> Outcome:
     """Method 1 or 2 on every used window with motion. Windows of one position are repetitions.
 
-    Raises click.UsageError for --plain, which is for Method 3 only, and for a tri-axial reference. Raises TableError if
-    --prior cannot be read.
+    Raises OptionError for a tri-axial reference.
     """
-    if options["plain"]:
-        raise click.UsageError("--plain is for Method 3 only; remove --plain or --method")
     priors = priors_of(options)
-    pairs = list(files.runs())
+    pairs = list(tables.runs())
     windows = [window for _, window in pairs]
     # the front end has already converted a velocity to an acceleration
-    method = options["method"]
+    method = options.method
     if any(p.u.shape[1] != 1 for p, _ in pairs):
-        raise click.UsageError(
-            f"--method {method} needs a uniaxial --reference, but this one is tri-axial; use --method 3"
+        raise OptionError(
+            f"`method` {method} needs a uniaxial `reference`, but this one is tri-axial", "use `method` 3"
         )
     runs = [Run(p.time_s, p.u[:, 0], p.V, w.pose) for p, w in pairs if w.used]
     if not runs:
-        return nothing_used(windows, files.rate_hz, method)
+        return nothing_used(windows, tables.rate_hz, str(method))
     try:
         found = SOLVE[method](runs, priors)
     except ValueError as error:
-        return Outcome(None, (str(error),), windows, files.rate_hz, method)
+        return Outcome(None, (str(error),), windows, tables.rate_hz, str(method))
     reasons = (
         *found.reasons,
         *dead_reasons(found.calibration.sensitivity),
@@ -53,7 +51,7 @@ def by_amplitudes(files: Files, options: dict[str, Any]) -> Outcome:
         calibration=None if reasons else found.calibration,
         reasons=reasons,
         windows=windows,
-        rate_hz=files.rate_hz,
+        rate_hz=tables.rate_hz,
         method=found.calibration.method,
         coverage_factor=found.coverage_factor,
         uncertainty_kind="GUM, types A and B",

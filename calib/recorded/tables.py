@@ -1,4 +1,4 @@
-"""Makes windows from files: fits clocks to the stamps, cuts the poses into pieces, and runs the front end on each."""
+"""Makes windows from tables: fits clocks to the stamps, cuts the poses into pieces, and runs the front end on each."""
 
 from __future__ import annotations
 
@@ -8,10 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from agent.calibrate.poses import PoseInterval
-from agent.calibrate.streams import FileStream
-from agent.calibrate.tables import ReferenceTable, SensorTable
-from agent.reading.source import TableError
 from calib.excitation.alignment import Drift, drift
 from calib.excitation.front_end import (
     DEFAULT_SETTINGS,
@@ -26,6 +22,10 @@ from calib.excitation.front_end import (
 from calib.excitation.pieces import pieces_of
 from calib.excitation.windows import Points, motion_windows, rest_sd
 from calib.model import Array, Window
+from calib.recorded.errors import InputError
+from calib.recorded.poses import PoseInterval
+from calib.recorded.streams import TableStream
+from calib.recorded.table import ReferenceTable, SensorTable
 from calib.signal.instrument import Instrument
 from calib.signal.response import FLAT, Response
 from calib.signal.samples import Samples
@@ -34,10 +34,10 @@ GUARD_S = 0.1  # not used at both ends of a pose, because of handling and of err
 
 
 @dataclass(frozen=True, slots=True)
-class Options:
-    """How windows are made from files.
+class Making:
+    """How windows are made from tables.
 
-    `align` False takes the clocks of both files as they are, as printed Method 3.
+    `align` False takes the clocks of both tables as they are, as printed Method 3.
     """
 
     settings: Settings = DEFAULT_SETTINGS
@@ -45,10 +45,10 @@ class Options:
     guard_s: float = GUARD_S
 
 
-class Files:
-    """Makes windows from the sensor's file, the reference's file and the poses, as often as needed with another lag.
+class Tables:
+    """Makes windows from the sensor's table, the reference's table and the poses, as often as needed with another lag.
 
-    `instrument` describes the reference. Raises TableError if the files do not overlap in time.
+    `instrument` describes the reference. Raises InputError if they do not overlap in time.
     """
 
     def __init__(
@@ -57,16 +57,15 @@ class Files:
         reference: ReferenceTable | None,
         poses: Sequence[PoseInterval],
         instrument: Instrument,
-        options: Options | None = None,
+        making: Making | None = None,
     ) -> None:
         _check_overlap(sensor, reference, poses)
-        self._options = options or Options()
-        self._sensor = FileStream(str(sensor.path), sensor.time_s, sensor.v)
-        self._reference = None if reference is None else FileStream(str(reference.path), reference.time_s, reference.x)
+        self._making = making or Making()
+        self._sensor = TableStream(sensor.name, sensor.time_s, sensor.v)
+        self._reference = None if reference is None else TableStream(reference.name, reference.time_s, reference.x)
         self._instrument = instrument
         self.drift: Drift | None = None  # of the sensor's clock against the reference's; None until windows were made
         self.poses = poses
-        self.components = sensor.components
 
     @property
     def corner_unknown(self) -> bool:
@@ -94,7 +93,7 @@ class Files:
         a response that is not yet taken out can look like it.
         """
         found = self._made(lag_s, response, progress, steady=steady)
-        if self._options.align and self._reference is not None and self.drift is None:
+        if self._making.align and self._reference is not None and self.drift is None:
             self.drift = drift(found)
             if self.drift is not None and self.drift.significant:
                 self._reference.stretch(self.drift.rate, self.drift.time_s)
@@ -104,7 +103,7 @@ class Files:
     def _made(
         self, lag_s: float, response: Response, progress: Callable[[float], Any] | None, *, steady: bool
     ) -> list[Window]:
-        floor, settings = self._rest_floor(), self._options.settings
+        floor, settings = self._rest_floor(), self._making.settings
         if not steady:
             settings = replace(settings, limits=settings.limits.unsteady)
         windows: list[Window] = []
@@ -120,8 +119,8 @@ class Files:
         return windows
 
     def _pieces(self, interval: PoseInterval) -> Iterator[tuple[float, float]]:
-        longest_s = self._options.settings.limits.longest_s
-        return pieces_of(interval.start_s, interval.stop_s, longest_s, self._options.guard_s)
+        longest_s = self._making.settings.limits.longest_s
+        return pieces_of(interval.start_s, interval.stop_s, longest_s, self._making.guard_s)
 
     def _windows(
         self,
@@ -162,7 +161,7 @@ class Files:
 
     def runs(self) -> Iterator[tuple[Points, Window]]:
         """Windows with motion and all their samples, not filtered, for methods that need more than sums."""
-        settings = self._options.settings
+        settings = self._making.settings
         for interval in self.poses:
             for piece in self._pieces(interval):
                 found = self._aligned(interval, *piece, 0.0, limit_band=False)
@@ -194,7 +193,7 @@ class Files:
         With a reference: those with a reference value, at its times.
         """
         if interval.pose.direction.shape[1]:
-            found = self._aligned(interval, start_s, stop_s, lag_s, limit_band=self._options.settings.limit_band)
+            found = self._aligned(interval, start_s, stop_s, lag_s, limit_band=self._making.settings.limit_band)
             return None if found is None else found.points
         sensor = self._sensor.cut(start_s, stop_s)
         if sensor is None:
@@ -209,7 +208,7 @@ class Files:
         sensor, reference = self._cut(interval, start_s, stop_s, lag_s)
         if sensor is None or reference is None:
             return None
-        settings = replace(self._options.settings, limit_band=limit_band)
+        settings = replace(self._making.settings, limit_band=limit_band)
         return aligned(sensor, reference, self._instrument, (start_s, stop_s), lag_s, settings)
 
     def _rest_floor(self) -> Array | None:
@@ -226,12 +225,12 @@ class Files:
 
 
 def _check_overlap(sensor: SensorTable, reference: ReferenceTable | None, poses: Sequence[PoseInterval]) -> None:
-    spans = [(f"{t.path}", float(t.time_s[0]), float(t.time_s[-1])) for t in (sensor, reference) if t is not None]
+    spans = [(t.name, float(t.time_s[0]), float(t.time_s[-1])) for t in (sensor, reference) if t is not None]
     if poses:
         spans.append(("the poses", min(p.start_s for p in poses), max(p.stop_s for p in poses)))
     if max(s for _, s, _ in spans) >= min(e for _, _, e in spans):
         told = ", ".join(f"{name} from {start:.10g} s to {stop:.10g} s" for name, start, stop in spans)
-        raise TableError(f"the files do not overlap in time, so their times must be on one scale: {told}")
+        raise InputError("they do not overlap in time", f"their times must be on one scale: {told}")
 
 
 def _interpolated(at_s: Array, time_s: Array, values: Array) -> Array:

@@ -1,4 +1,4 @@
-"""The samples of a file as a stream, from which intervals of time are cut. Missing samples are counted."""
+"""The samples of a table as a stream, from which intervals of time are cut. Missing samples are counted."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from calib.signal.stamps import clock_from_stamps, counted
 from calib.signal.timing import ClockFit
 
 
-class FileStream:
-    """Consecutive samples of a file, with times from the clock that is fitted to their stamps.
+class TableStream:
+    """Consecutive samples of a table, with times from the clock that is fitted to their stamps.
 
-    `name` is the file's, for messages. `time_s` (n,) stamps, `values` (n, C); both may lie on disk.
+    `name` is the table's, for messages. `time_s` (n,) stamps, `values` (n, C); both may lie on disk.
     """
 
     def __init__(self, name: str, time_s: Array, values: Array) -> None:

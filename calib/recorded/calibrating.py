@@ -1,0 +1,131 @@
+"""From tables and poses to S and Q: makes windows, and chooses the estimator by the options."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from calib.estimate.nuisances import Priors
+from calib.estimate.verdict import dead_reasons
+from calib.excitation.front_end import Settings
+from calib.excitation.window_verdict import Limits
+from calib.geometry import STANDARD_GRAVITY_MPS2
+from calib.paper.method3 import PLAIN, fit, refusal
+from calib.recorded.adjusting import adjusted, norm_fitted
+from calib.recorded.amplitude_methods import by_amplitudes
+from calib.recorded.errors import InputError, OptionError
+from calib.recorded.options import Options
+from calib.recorded.outcome import Outcome, nothing_used
+from calib.recorded.poses import PoseInterval, Poses, Setting, beside_reference, intervals_of
+from calib.recorded.priors import contradictions, instrument_of, priors_of
+from calib.recorded.table import ReferenceTable, SensorTable
+from calib.recorded.tables import Making, Tables
+from calib.recorded.wrong_unit import check_gravity
+from calib.signal.instrument import Instrument
+
+COVERAGE_FACTOR = 2.0  # of plain Method 3, as in the paper: there are thousands of points
+
+
+def calibrated(sensor: SensorTable, reference: ReferenceTable | None, poses: Poses | None, options: Options) -> Outcome:
+    """The outcome for these samples, poses and options, which passed `options.check`. Raises InputError."""
+    if reference is None and poses is None and not options.plain:
+        return norm_fitted(sensor, options)
+    if options.method != 3:
+        return by_amplitudes(tables_of(sensor, reference, poses, options), options)
+    if options.plain:
+        return _plain(tables_of(sensor, reference, poses, options), priors_of(options))
+    certificate = options.reference_certificate
+    if certificate is not None:
+        options = replace(options, u_reference_pct=100.0 * float(np.max(certificate.u_relative)))
+    tables = tables_of(sensor, reference, poses, options, instrument_of(options))
+    return adjusted(tables, priors_of(options), certificate)
+
+
+def tables_of(
+    sensor: SensorTable, reference: ReferenceTable | None, poses: Poses | None, options: Options,
+    instrument: Instrument | None = None,
+) -> Tables:  # fmt: skip
+    """The tables with their poses, as the options say. Raises InputError.
+
+    `instrument` is from `instrument_of`. With None, corner frequencies of AC-coupled instruments are not used.
+    """
+    instrument = instrument or Instrument()
+    if reference is not None:
+        instrument = replace(instrument, quantity=reference.quantity)
+        _check_quantity(reference, instrument, options.reference_quantity)
+    setting = _setting(options, reference)
+    instrument = replace(instrument, ac_coupled="ac" in (setting.coupling, setting.reference_coupling))
+    if reference is not None and setting.reference_coupling == "dc":
+        check_gravity(reference)
+    intervals = _intervals(poses, setting, reference)
+    limits = Limits() if options.plain else Limits.of(options.u_offset_mps2, math.radians(options.u_angle_deg))
+    more = not options.plain
+    settings = Settings(limits, leave_out=more, limit_band=more, bands=more)
+    return Tables(sensor, reference, intervals, instrument, Making(settings, align=more))
+
+
+def _check_quantity(reference: ReferenceTable, instrument: Instrument, stated: str | None) -> None:
+    if stated and reference.quantity != stated:
+        raise InputError(
+            f"the column holds {reference.quantity}, but `reference_quantity` says {stated}",
+            place=reference.place, column=reference.column,
+        )  # fmt: skip
+    if instrument.derivatives and instrument.has_corner:
+        raise InputError(
+            f"a {reference.quantity} reference takes no corner frequency", "leave out the corner options",
+            place=reference.name,
+        )  # fmt: skip
+
+
+def _setting(options: Options, reference: ReferenceTable | None) -> Setting:
+    """The settings that apply to every pose."""
+    channels = 0 if reference is None else reference.x.shape[1]
+    return Setting(
+        gravity_mps2=options.gravity or STANDARD_GRAVITY_MPS2,
+        static_sign=options.static_sign,
+        coupling=options.coupling,
+        reference_coupling=options.reference_coupling or ("dc" if channels == 3 else "ac"),
+        reference_channels=channels,
+        rotation=options.rotation,
+    )
+
+
+def _intervals(poses: Poses | None, setting: Setting, reference: ReferenceTable | None) -> list[PoseInterval]:
+    if setting.rotation is not None and setting.reference_channels != 3:
+        raise OptionError("`rotation` is for a tri-axial `reference`, but this one has one axis", "remove `rotation`")
+    if poses is not None:
+        return intervals_of(poses, setting)
+    if reference is None or setting.reference_channels != 3:
+        raise OptionError(
+            "`poses` is missing", "only a tri-axial `reference`, or rests without a reference, need no poses"
+        )
+    try:
+        pose = beside_reference(setting)
+    except ValueError as error:
+        raise OptionError(str(error)) from None
+    return [PoseInterval(float(reference.time_s[0]), float(reference.time_s[-1]), pose)]
+
+
+def _plain(tables: Tables, priors: Priors) -> Outcome:
+    windows = tables.windows()
+    if not any(w.used for w in windows):
+        return nothing_used(windows, tables.rate_hz, PLAIN)
+    found = fit(windows)
+    reasons = (
+        *refusal(found, windows),
+        *dead_reasons(found.calibration.sensitivity),
+        *contradictions(found.calibration, priors),
+    )
+    return Outcome(
+        None if reasons else found.calibration,
+        reasons,
+        windows,
+        tables.rate_hz,
+        PLAIN,
+        coverage_factor=COVERAGE_FACTOR,
+        uncertainty_kind="type A, white",
+        rank=found.rank,
+        residual_sd=found.residual_sd.tolist(),
+    )

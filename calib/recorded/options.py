@@ -1,0 +1,110 @@
+"""What a user states for a calibration: the options of `fieldcal calibrate` that name no file, with their defaults."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Literal
+
+import numpy as np
+
+from calib.model import Array
+from calib.recorded.certificate import ReferenceCertificate
+from calib.recorded.errors import OptionError
+from calib.signal.instrument import QUANTITIES
+
+Coupling = Literal["dc", "ac"]
+CHOICES: Mapping[str, tuple[Any, ...]] = {
+    "method": (1, 2, 3),
+    "coupling": ("dc", "ac"),
+    "reference_coupling": ("dc", "ac"),
+    "reference_quantity": tuple(QUANTITIES),
+    "static_sign": (1, -1),
+}
+GRAVITY_MPS2 = (9.7, 9.9)
+ABOVE_ZERO = ("nominal", "u_nominal_pct", "reference_frequency_hz")
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Options:
+    """The options. Raises OptionError if a value is out of its range; `check` tells which do not go together.
+
+    `rotation` (3, 3): a = R a_ref. `prior`: S row by row and Q (12,), and their covariance (12, 12), see
+    calib.recorded.priors.prior_of. The u of `reference_certificate` counts in the place of `u_reference_pct`.
+    """
+
+    method: int = 3
+    plain: bool = False
+    coupling: Coupling = "dc"
+    reference_quantity: str | None = None
+    reference_coupling: Coupling | None = None
+    rotation: Array | None = None
+    gravity: float | None = None  # m/s2
+    static_sign: int = 1
+    nominal: float | None = None
+    u_nominal_pct: float | None = None
+    prior: tuple[Array, Array] | None = None
+    reference_certificate: ReferenceCertificate | None = None
+    reference_frequency_hz: float | None = None
+    reference_corner_hz: float = 0.0
+    u_reference_corner_hz: float = 0.0
+    sensor_corner_hz: float = 0.0
+    u_sensor_corner_hz: float = 0.0
+    u_angle_deg: float = 0.2
+    u_theta_deg: float = 0.2
+    u_theta_position_deg: float = 0.0
+    u_alpha_common_deg: float = 0.1
+    u_offset_mps2: float = 0.05
+    u_offset_position_mps2: float = 0.0
+    u_reference_pct: float = 0.1
+    u_transverse_motion_pct: float = 1.0
+    u_tilt_deg: float = 0.0
+    u_rotation_deg: float = 0.2
+    u_gravity_mps2: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, choices in CHOICES.items():
+            value = getattr(self, name)
+            if value is not None and value not in choices:
+                raise _wrong(name, value, f"choose one of {', '.join(map(repr, choices))}")
+        if self.rotation is not None and np.shape(self.rotation) != (3, 3):
+            raise _wrong("rotation", self.rotation, "give a matrix of 3 x 3 numbers, a = R a_ref")
+        for name in (f.name for f in fields(self) if f.type in ("float", "float | None")):
+            value = getattr(self, name)
+            if value is not None and (remedy := _out_of_range(name, value)):
+                raise _wrong(name, value, remedy)
+
+    def check(self, *, reference: bool, poses: bool, prior: bool) -> None:
+        """Check options that need or exclude each other. `reference`, `poses`, `prior`: whether they are given.
+
+        Raises OptionError.
+        """
+        if (self.nominal is None) != (self.u_nominal_pct is None):
+            raise OptionError("`nominal` and `u_nominal_pct` must be given together")
+        if self.nominal is not None and prior:
+            raise OptionError("give `nominal` or `prior`, not both")
+        if self.rotation is not None and not reference:
+            raise OptionError("`rotation` needs a tri-axial `reference`")
+        if self.method != 3 and not (reference and poses):
+            raise OptionError(f"`method` {self.method} needs `reference` and `poses`")
+        if self.method != 3 and self.plain:
+            raise OptionError("`plain` is for Method 3 only; remove `plain` or `method`")
+
+
+def _out_of_range(name: str, value: Any) -> str:
+    """What to give instead; "" if the value is in range."""
+    number = isinstance(value, int | float | np.number) and not isinstance(value, bool) and math.isfinite(value)
+    if name == "gravity":
+        low, high = GRAVITY_MPS2
+        return "" if number and low <= value <= high else f"give a number from {low:g} to {high:g} m/s2"
+    if name in ABOVE_ZERO:
+        return "" if number and value > 0 else "give a number above 0"
+    return "" if number and value >= 0 else "give a number from 0 on"
+
+
+def _wrong(name: str, value: object, remedy: str) -> OptionError:
+    return OptionError(f"{value!r} cannot be used", remedy, column=name, value=value)
+
+
+DEFAULTS = Options()

@@ -1,0 +1,130 @@
+"""The samples of a sensor and of a reference, and the checks that each table of samples must pass."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.model import Array
+from calib.recorded.errors import InputError
+from calib.signal.stamps import kind_of
+
+# Columns of a sensor, and of a reference with the quantity that they hold.
+SENSOR = ("time_s", "vx", "vy", "vz")
+REFERENCES = {
+    ("ax", "ay", "az"): "acceleration",
+    ("a",): "acceleration",
+    ("v",): "velocity",
+    ("d",): "displacement",
+}
+# A stamp may be earlier than the previous one by up to this time, because of jitter or a burst that was read late
+# (delays are some tens of ms).
+LATEST_STAMP_S = 0.1
+ROWS_AT_ONCE = 1 << 20
+FEWEST_ROWS = 2
+LAST_S = 1e11  # in the year 5138; a later time is in another unit
+# From these values on, a time without unit counts since 1970, in this part of a second: 1e9 s is the year 2001.
+SINCE_1970 = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensorTable:
+    """Stamps (n,) in s, indications (n, 3), temperature (n,) in degC or None. The arrays may be on disk.
+
+    `name`: of the file, or "sensor". A row of indications is NaN where one of them is missing. `said`: what was
+    guessed, for the user.
+    """
+
+    name: str
+    time_s: Array
+    v: Array
+    temperature_degc: Array | None = None
+    said: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReferenceTable:
+    """Stamps (n,) in s, channels (n, 1 or 3) of a quantity of calib.signal.instrument in SI units.
+
+    `name`: of the file, or "reference". `column` is the first channel's; `header`: where the file names its columns,
+    for messages. `said`: what was guessed, for the user.
+    """
+
+    name: str
+    time_s: Array
+    x: Array
+    quantity: str
+    column: str
+    header: str = ""
+    said: tuple[str, ...] = ()
+
+    @property
+    def place(self) -> str:
+        """Where its columns are named, for messages."""
+        return f"{self.name}, {self.header}" if self.header else self.name
+
+
+def second_of(first: float) -> float:
+    """What one unit of a time without unit is in s, by its first value."""
+    return next((part for least, part in SINCE_1970 if first >= least), 1.0)
+
+
+def make_whole(rows: Array, columns: Sequence[str], place: str, first: int = 0) -> None:
+    """Write NaN into all channels of a row, columns 1 to 3 of `rows` (n, k), where one of them has no value.
+
+    `first` is the number of the first row. Raises InputError where a time is missing, or where a value is infinite.
+    """
+    if np.isfinite(rows.sum()):
+        return
+    wrong = np.isinf(rows)
+    wrong[:, 0] |= np.isnan(rows[:, 0])
+    if wrong.any():
+        row, k = (int(i[0]) for i in np.nonzero(wrong))
+        value = float(rows[row, k])
+        raise InputError(
+            f"{value:g} is not a finite number", "correct the value, or remove the row",
+            place=place, row=first + row, column=columns[k], value=value,
+        )  # fmt: skip
+    rows[np.isnan(rows[:, 1:4]).any(axis=1), 1:4] = np.nan
+
+
+def check_count(whole: int, place: str) -> None:
+    """Raises InputError if there are fewer rows with values than two."""
+    if whole < FEWEST_ROWS:
+        raise InputError(f"there are {whole} rows of data, at least {FEWEST_ROWS} are needed", place=place, value=whole)
+
+
+def check_time(time_s: Array, column: str, place: str) -> None:
+    """Check that time increases. Stamps may decrease by LATEST_STAMP_S, but not if they are on an exact grid.
+
+    Raises InputError.
+    """
+    ends = float(time_s[0]), float(time_s[-1])
+    if max(map(abs, ends)) > LAST_S:
+        raise InputError(
+            f"the time runs from {ends[0]:.10g} s to {ends[1]:.10g} s, which is no time since 1970 in s",
+            "state its unit, or convert it to s", place=place, column=column, value=ends[0],
+        )  # fmt: skip
+    try:
+        allowed = 0.0 if kind_of(np.asarray(time_s[:ROWS_AT_ONCE])) == "grid" else LATEST_STAMP_S
+    except ValueError:
+        allowed = 0.0
+    newest = -math.inf
+    for first in range(0, len(time_s), ROWS_AT_ONCE):
+        part = np.asarray(time_s[first : first + ROWS_AT_ONCE])
+        before = np.maximum.accumulate(np.append(newest, part))
+        newest = float(before[-1])
+        wrong = np.flatnonzero(before[:-1] - part > allowed)
+        if len(wrong):
+            at = int(wrong[0])
+            raise InputError(
+                f"{part[at]:.10g} after {before[at]:.10g}", "time must not decrease, sort or cut the samples",
+                place=place, row=first + at, column=column, value=float(part[at]),
+            )  # fmt: skip
+    if not newest > float(time_s[0]):
+        raise InputError(
+            f"the value is {newest:.10g} in every row", "time must increase", place=place, column=column, value=newest
+        )

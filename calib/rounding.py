@@ -1,0 +1,17 @@
+"""Writes values with their uncertainties for people."""
+
+from __future__ import annotations
+
+import math
+
+KNOWN_BEFORE = "*"  # marks a parameter that a nominal value or a prior tells rather than the data
+
+
+def plus_minus(value: float | None, expanded: float | None) -> str:
+    """`value ± U`, both rounded to the second digit of U; `–` if there is no value."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    if expanded is None or not math.isfinite(expanded) or expanded <= 0:
+        return f"{value:.6g} ± ?"
+    decimals = max(0, 1 - math.floor(math.log10(expanded)))
+    return f"{value:.{decimals}f} ± {expanded:.{decimals}f}"
