@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-FILES = 240
+FILES = 60
 
 
 def test_no_hostile_file_ends_a_command_with_a_fault() -> None:
@@ -17,5 +17,6 @@ def test_no_hostile_file_ends_a_command_with_a_fault() -> None:
     assert done.returncode == 0, done.stdout + done.stderr
     counts = [[int(cell) for cell in line.split(" | ")[1:8]] for line in done.stdout.splitlines() if " MB |" in line]
     assert sum(row[0] for row in counts) == FILES
-    assert all(row[3] + row[4] > row[1] / 3 for row in counts), "hostile files are refused"
-    assert sum(row[2] for row in counts) > 0, "some mutations do no harm"
+    refused, harmless = sum(row[3] + row[4] for row in counts), sum(row[2] for row in counts)
+    assert refused > FILES / 2
+    assert harmless > 0
