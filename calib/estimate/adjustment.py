@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -171,7 +172,7 @@ def _response(
     own = np.flatnonzero([t.kind is RESPONSE for t in nuisances.terms])
     applied = np.array([nuisances.terms[j].applied for j in own])
     chosen = np.concatenate([np.arange(9), 12 + own])
-    told = told_at_one_frequency if one_frequency else response_told
+    told = told_at_one_frequency if one_frequency else partial(response_told, from_hz=priors.response_from_hz)
     return told(
         np.append(solution.x[:9], solution.x[12 + own] + applied),
         covariance[np.ix_(chosen, chosen)],

@@ -69,16 +69,19 @@ class Priors(Stated):
         object.__setattr__(self, "parameters", parameters)
         object.__setattr__(self, "covariance", covariance)
 
-    def with_response(self, band_hz: tuple[float, float], to_hz: float | None = None) -> Priors:
+    def with_response(
+        self, band_hz: tuple[float, float], to_hz: float | None = None, from_hz: float | None = None
+    ) -> Priors:
         """These and the priors of the response over frequency up to `to_hz`, for a motion in `band_hz`.
 
-        S holds at the frequency that is stated, or in the middle of the band.
+        Where a corner is unknown, the motion begins at `from_hz`. S holds at the frequency that is stated, or in the
+        middle of the band.
         """
         stated_hz = self.reference_frequency_hz or float(np.sqrt(band_hz[0] * band_hz[1]))
         told = {
             "response": RESPONSE_U, "response_at": 0.0,
             "response_terms": float(len(ALL_POWERS if self.corner_unknown else POWERS)),
-            "response_from_hz": band_hz[0] if self.corner_unknown else 0.0,
+            "response_from_hz": (from_hz or band_hz[0]) if self.corner_unknown else 0.0,
             "response_hz": to_hz or band_hz[1], "reference_frequency_hz": stated_hz,
         }  # fmt: skip
         return Priors({**self.values, **told}, self.parameters, self.covariance)

@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.model import Array
-from calib.signal.response import POWERS, Complex, Response, by_term
+from calib.signal.response import NEAR, Complex, Response, by_term
 
 PER_OCTAVE = 3  # bands in which S is reported
 LARGE = 0.5  # of the largest element of S: the elements whose relative uncertainty counts
 GRID = 200  # frequencies at which the valid band is searched
+LEFT_U = 0.5  # standard uncertainties of ln h that may be left in the windows
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,6 +33,7 @@ class ResponseTold:
 
     S of the calibration is that at `reference_frequency_hz`. In `valid_band_hz` S alone is right within a third of U.
     `at_0hz` and `u_at_0hz` (3, 3) are the sensitivity at 0 Hz and its standard uncertainty. `bands` cover the motion.
+    `covariance` (K, K) is that of the K terms.
     """
 
     terms: Response
@@ -40,6 +42,17 @@ class ResponseTold:
     at_0hz: Array
     u_at_0hz: Array
     bands: tuple[BandSensitivity, ...]
+    covariance: Array
+
+    def is_taken_out(self, taken: Response) -> bool:
+        """Whether `taken` differs from it by less than NEAR or a part of its uncertainty: what is left is small enough
+        to be estimated by linear equations."""
+        low_hz, high_hz = max(self.terms.from_hz, taken.from_hz), max(self.terms.to_hz, taken.to_hz)
+        frequency_hz = np.linspace(low_hz, high_hz, 50)
+        effects = by_term(2.0 * np.pi * frequency_hz, len(self.covariance))
+        u = np.sqrt(np.maximum(np.sum((effects @ self.covariance) * effects.conj(), axis=1).real, 0.0))
+        left = np.abs(self.terms.at(frequency_hz) - taken.at(frequency_hz))
+        return bool(np.all(left < np.maximum(NEAR, LEFT_U * u)))
 
 
 def response_told(
@@ -50,11 +63,12 @@ def response_told(
     band_hz: tuple[float, float],
     coverage_factor: float,
     per_octave: float = PER_OCTAVE,
+    from_hz: float = 0.0,
 ) -> ResponseTold:
     """The response from S row by row and J unknowns of the response: `estimate` (9 + J,), `covariance` (9 + J, 9 + J).
 
     `effects` (J, 5) or (J, 9): what a unit of each of the J unknowns adds to the terms in s^k. The motion was in
-    `band_hz`.
+    `band_hz`; `from_hz` is that of the terms below it, where they are unknowns.
     """
     count = max(1, round(per_octave * np.log2(band_hz[1] / band_hz[0])))
     edges = _spaced(*band_hz, count + 1)
@@ -65,12 +79,13 @@ def response_told(
     away = np.abs(np.exp(_log_h(grid, reference_hz, len(terms)) @ terms)) - 1.0
     limit = coverage_factor * _least_u(estimate[:9], covariance) / 3.0
     return ResponseTold(
-        Response(tuple(terms.tolist()), band_hz[1], band_hz[0] if len(terms) > len(POWERS) else 0.0),
+        Response(tuple(terms.tolist()), band_hz[1], from_hz),
         reference_hz,
         _around(grid, np.abs(away) <= limit, reference_hz),
         at[0].real,
         u_at[0],
         tuple(BandSensitivity(*end) for end in ends),
+        effects.T @ covariance[9:, 9:] @ effects,
     )
 
 
@@ -97,6 +112,7 @@ def told_at_one_frequency(
         at[0].real,
         u_at[0],
         (BandSensitivity(motion_hz, motion_hz, at[1], u_at[1]),),
+        effects.T @ covariance[9:, 9:] @ effects,
     )
 
 

@@ -121,14 +121,30 @@ def motion_band_hz(windows: Sequence[Window]) -> tuple[float, float] | None:
     shares = np.array([power[third == k].sum() for k in np.unique(third)]) / power.sum()
     if np.count_nonzero(shares > LEAST_SHARE) < FEWEST_THIRDS:
         return None
-    # A wide band of a short window may end far from its motion, whose frequency the derivative tells.
-    mean_hz = np.sqrt(np.divide(square, power, out=np.zeros_like(power), where=power > 0.0)) / (2.0 * np.pi)
-    wide, mean_hz = 2.0 ** (1.0 / BANDS_AN_OCTAVE), np.clip(mean_hz, low, high)
-    above, below = np.minimum(high, mean_hz * wide), np.maximum(low, mean_hz / wide)
+    below, above = _narrowed(low, high, power, square)
     surely_low = max(_end(b.low_hz, b.low_hz, _powers(b)[0], BELOW) for b in bands)
     surely_high = min(_end(b.high_hz, -b.high_hz, _powers(b)[0], ABOVE) for b in bands)
     low_hz, high_hz = _end(below, below, power, BELOW), _end(above, -above, power, ABOVE)
     return min(low_hz, surely_low), max(high_hz, surely_high)
+
+
+def lowest_hz(windows: Sequence[Window]) -> float:
+    """The frequency at which the motion of windows with bands begins, also if it begins within a wide band."""
+    bands = [w.bands for w in windows if w.bands is not None and len(w.bands.points)]
+    low, high = (np.concatenate([getattr(b, name) for b in bands]) for name in ("low_hz", "high_hz"))
+    power, square = (np.concatenate(part) for part in zip(*map(_powers, bands), strict=True))
+    below, _ = _narrowed(low, high, power, square)
+    return _end(below, below, power, BELOW)
+
+
+def _narrowed(low_hz: Array, high_hz: Array, power: Array, square: Array) -> tuple[Array, Array]:
+    """The ends of bands, nearer to their motion in a wide band of a short window: the derivative tells its frequency.
+
+    `power` is that of the motion, `square` that of its derivative.
+    """
+    mean_hz = np.sqrt(np.divide(square, power, out=np.zeros_like(power), where=power > 0.0)) / (2.0 * np.pi)
+    wide, mean_hz = 2.0 ** (1.0 / BANDS_AN_OCTAVE), np.clip(mean_hz, low_hz, high_hz)
+    return np.maximum(low_hz, mean_hz / wide), np.minimum(high_hz, mean_hz * wide)
 
 
 def _end(edge: Array, order: Array, power: Array, outside: float) -> float:

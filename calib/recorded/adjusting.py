@@ -15,7 +15,7 @@ from calib.estimate.lag_search import correlated_lag_s, largest_omega, without_l
 from calib.estimate.norm_fit import norm_fit
 from calib.estimate.nuisances import Applied, Priors
 from calib.estimate.reference_share import ReferenceShare
-from calib.excitation.bands import motion_band_hz
+from calib.excitation.bands import lowest_hz, motion_band_hz
 from calib.excitation.windows import rests_anywhere
 from calib.geometry import STANDARD_GRAVITY_MPS2
 from calib.model import PARAMETERS, Window
@@ -60,7 +60,7 @@ def _adjusted(tables: Tables, priors: Priors) -> tuple[Outcome, ReferenceShare |
         if not search.stated.response:
             found = _attenuated(found, windows, priors, applied)
             return _outcome(found, windows, tables.rate_hz), found.share
-        if found.response is None or found.response.terms.is_near(applied.response):
+        if found.response is None or found.response.is_taken_out(applied.response):
             return _outcome(found, windows, tables.rate_hz), found.share
         if found.reasons and turn >= HOPELESS:
             return _outcome(found, windows, tables.rate_hz), found.share
@@ -142,7 +142,7 @@ def _likely_lag_s(tables: Tables, priors: Priors, windows: Sequence[Window]) -> 
 def with_response(priors: Priors, windows: Sequence[Window]) -> Priors:
     """The priors with those of the response, where the motion covers a band that is wide enough to tell it."""
     band_hz = motion_band_hz(_used(windows))
-    return priors if band_hz is None else priors.with_response(band_hz)
+    return priors if band_hz is None else priors.with_response(band_hz, from_hz=lowest_hz(_used(windows)))
 
 
 def over_frequency(priors: Priors, windows: Sequence[Window], lag_s: float) -> Priors:

@@ -54,15 +54,13 @@ class Response:
         """Whether both instruments respond alike."""
         return not any(self.terms)
 
-    def is_near(self, other: Response) -> bool:
-        """Whether they differ by less than NEAR in the motion: what is left is estimated exactly."""
-        frequency_hz = np.linspace(max(self.from_hz, other.from_hz), max(self.to_hz, other.to_hz), 50)
-        return bool(np.abs(self.at(frequency_hz) - other.at(frequency_hz)).max() < NEAR)
-
     @property
     def modest(self) -> Response:
         """The same with terms so small that the instruments differ by no more than LARGEST in the motion: the first
-        estimates, from a linear equation, may be much too large."""
+        estimates, from a linear equation, may be much too large. Terms below the motion that hardly matter are left
+        to the estimate, because a filter for them costs the ends of a recording."""
+        if self.from_hz and np.abs(self.below_at(np.array([self.from_hz])))[0] < NEAR:
+            return Response(self.terms[: len(POWERS)], self.to_hz).modest
         size = float(np.abs(self.at(np.linspace(self.from_hz, self.to_hz, 50))).max())
         return self if size <= LARGEST else replace(self, terms=tuple(c * LARGEST / size for c in self.terms))
 

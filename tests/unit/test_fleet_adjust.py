@@ -52,7 +52,7 @@ sensor = "s"
 sensor_file = "sensor.csv"
 reference = "r"
 reference_file = "reference.csv"
-options = { poses = "poses.csv" }
+options = { poses = "poses.csv", reference-coupling = "dc" }
 """
 
 
@@ -194,7 +194,8 @@ def test_a_certificate_of_all_axes_needs_a_reference_that_measures_gravity(
 
 def test_one_link_alone_is_what_calibrate_finds(tmp_path: Path) -> None:
     recording = Recording(5, Devices(), bench=True, stand_s=12.0)
-    _, alone = recording.through_files(tmp_path, "--nominal", "1", "--u-nominal-pct", "5")
+    stated = ("--nominal", "1", "--u-nominal-pct", "5", "--reference-coupling", "dc")
+    _, alone = recording.through_files(tmp_path, *stated)
     (tmp_path / "site.toml").write_text(ONE_LINK)
     assert run_cli(["fleet", "adjust", str(tmp_path / "site.toml"), "--json", str(tmp_path / "site.json")]) == 0
     found = json.loads((tmp_path / "site.json").read_text())["devices"]["s"]

@@ -11,11 +11,12 @@ import pytest
 from rich.console import Console
 
 from agent.delivery.publication import PublicationState
-from agent.terminal.quantity import duration, plus_minus, size
+from agent.terminal.quantity import duration, size
 from agent.terminal.screen import Picture, Screen
 from agent.terminal.state import DeviceState, RecordingState, ViewState
 from agent.terminal.view import Lines, open_view
 from agent.terminal.wording import truth_line
+from calib.rounding import plus_minus
 from tests.unit.results import calibration, status, window
 
 
