@@ -209,7 +209,9 @@ def _result(
 
 
 def _say_growth(told: dict[str, Any], tell: Say) -> None:
-    after = ", ".join(f"{a['u_main_pct']:.2g} % after {a['months']} months" for a in told["after"][1:])
+    after = ", ".join(
+        f"{a['u_main_pct']:.2g} % after {a['months']} month{'s' * (a['months'] > 1)}" for a in told["after"][1:]
+    )
     tell(f"  without another visit U (main) will be: {after}")
     when = told["exceeded_on"]
     tell(
