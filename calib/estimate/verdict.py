@@ -109,7 +109,7 @@ def _response_reasons(shares: Budget) -> list[str]:
 
 
 def _sign_reasons(solution: Solution, turned: Callable[[int, int], Solution]) -> list[str]:
-    # With reversed signs a poor fit may end anywhere, so only its chi2 is compared.
+    # With reversed signs a poor fit may end anywhere, so only chi2 and the misfit of such a fit are looked at.
     if solution.chi2 <= chi2_quantile(CONTRADICTED, solution.residual.size) and not _prior_reasons(solution):
         return []
     tried = {
@@ -117,7 +117,7 @@ def _sign_reasons(solution: Solution, turned: Callable[[int, int], Solution]) ->
         "the polarity of the reference": turned(1, -1),
         "the static sign and the polarity of the reference": turned(-1, -1),
     }
-    tried = {name: other for name, other in tried.items() if np.isfinite(other.chi2)}
+    tried = {name: other for name, other in tried.items() if np.isfinite(other.chi2) and misfit(other) <= MISFIT_LIMIT}
     if not tried:
         return []
     best = min(other.chi2 for other in tried.values())

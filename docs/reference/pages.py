@@ -88,7 +88,8 @@ def commands() -> Iterator[str]:
     from agent.cli.main import fieldcal
 
     yield from _head("Commands", "What `fieldcal COMMAND --help` prints.")
-    context = click.Context(fieldcal, info_name="fieldcal", terminal_width=WIDTH, max_content_width=WIDTH)
+    settings = fieldcal.context_settings | {"terminal_width": WIDTH, "max_content_width": WIDTH}
+    context = click.Context(fieldcal, info_name="fieldcal", **settings)
     yield from _helps(fieldcal, context)
 
 
