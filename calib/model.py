@@ -138,3 +138,8 @@ def own_channels(channels: int) -> int:
     """Number of a reference's own channels: 0, 1 or 3. `channels` is 2 or 6 if their integrals follow them as well
     (calib.signal.corner)."""
     return {0: 0, 1: 1, 2: 1, 3: 3, 6: 3}[channels]
+
+
+def scale_of(parameters: Array) -> float:
+    """A sensor's scale in output unit per m/s2: root mean square of the main sensitivities among `parameters` (12,)."""
+    return float(np.sqrt(np.mean(parameters[[0, 4, 8]] ** 2)))

@@ -198,7 +198,8 @@ def _solution(
             poses.append(pose)
         pose_of.append(index[key])
     nuisances = Nuisances(poses, data.channels, priors, applied)
-    return solve(Equations(data, nuisances, pose_of, priors.offset_mps2, scatter), priors)
+    scale = priors.output_per_mps2
+    return solve(Equations(data, nuisances, pose_of, priors.offset_mps2, scatter, scale), priors)
 
 
 def _prior_u(priors: Priors) -> Array:

@@ -21,6 +21,7 @@ from calib.signal.response import POWERS, Complex, by_term
 
 PROBABILITY = 0.99  # confidence of the test for scatter between bands
 TINY = float(np.finfo(float).tiny)
+MOST_TAPERED = 2.0  # times: power of a band in the whole window over that in the tapered one
 RELATED = 1e-9  # relative eigenvalue of the channels' scatter below which a direction was not excited
 
 
@@ -113,6 +114,7 @@ def banded(
     windows: Sequence[Window],
     channels: int,
     to_hz: float,
+    mean_omega2: Array,
     omega2: Array,
     *,
     one_frequency: bool = False,
@@ -120,10 +122,11 @@ def banded(
 ) -> Banded:
     """The bands up to `to_hz` of W windows with `channels` reference channels at most.
 
-    A window without such bands moves at the frequency of `omega2` (W,) in rad2/s2. `one_frequency`: the bands are
-    those of a few sines and of their harmonics, which tell no term of the response. `powers`: how many terms there are.
+    The power of du/dt over that of u, in rad2/s2: `mean_omega2` (W,) of all channels of a window together, at which a
+    window without such bands moves, and `omega2` (W, M) of each channel. `one_frequency`: the bands are those of a few
+    sines and of their harmonics, which tell no term of the response. `powers`: how many terms there are.
     """
-    projected = np.array([_at_one_frequency(np.sqrt(square), channels, powers) for square in omega2.tolist()])
+    projected = np.array([_at_one_frequency(np.sqrt(square), channels, powers) for square in mean_omega2.tolist()])
     found = []
     for w, window in enumerate(windows):
         if window.bands is None or window.bands.reference_channels != channels:
@@ -131,7 +134,7 @@ def banded(
         kept = np.flatnonzero(window.bands.high_hz <= HIGHEST * to_hz)
         if kept.size:
             factors = _Factors(window.bands, kept)
-            projected[w] = _projected(factors, powers)
+            projected[w] = _projected(factors, powers, omega2[w])
             found += [] if one_frequency else [_told(factors, powers)]
     if not found:
         return Banded(projected, np.zeros(0), np.zeros((0, powers)), Deviations())
@@ -203,15 +206,32 @@ def _at_one_frequency(omega: float, channels: int, powers: int) -> Array:
     return np.stack([np.vstack([h.real * np.eye(channels), h.imag * per_omega * np.eye(channels)]) for h in terms])
 
 
-def _projected(factors: _Factors, powers: int) -> Array:
-    """(K, 2M, M) see Banded."""
-    gram, m = factors.gram.sum(axis=0), factors.gram.shape[1] // 2
+def _projected(factors: _Factors, powers: int, omega2: Array) -> Array:
+    """(K, 2M, M) see Banded. `omega2` (M,) is that of each channel in the whole window."""
+    bands, m = _as_in_the_window(factors, omega2), factors.gram.shape[1] // 2
+    gram = bands.sum(axis=0)
     scale = _unit(np.diag(gram))
     inverse = np.linalg.pinv(gram / np.outer(scale, scale), RELATED, hermitian=True) / np.outer(scale, scale)
     terms = by_term(factors.omega, powers)
-    moved = np.einsum("bk,brm->krm", terms.real, factors.gram[..., :m])
-    moved += np.einsum("bk,brm->krm", terms.imag / factors.omega[:, None], factors.gram[..., m:])
+    moved = np.einsum("bk,brm->krm", terms.real, bands[..., :m])
+    moved += np.einsum("bk,brm->krm", terms.imag / factors.omega[:, None], bands[..., m:])
     return np.asarray(inverse @ moved)
+
+
+def _as_in_the_window(factors: _Factors, omega2: Array) -> Array:
+    """(B, 2M, 2M) of [u, du/dt] in the bands as they are in the whole window, not in the tapered one.
+
+    The power of each channel is multiplied by 1 + b (omega^2 - <omega^2>), with b such that the power of its du/dt over
+    that of u is `omega2` (M,), 0 where the channel is silent.
+    """
+    power, rate_power = np.split(np.diagonal(factors.gram, axis1=1, axis2=2), 2, axis=1)
+    square = np.divide(rate_power, power, out=np.zeros_like(power), where=power > 0.0)
+    share = power / np.maximum(power.sum(axis=0), TINY)
+    mean = np.sum(share * square, axis=0)
+    wider = (omega2 - mean) / np.maximum(np.sum(share * (square - mean) ** 2, axis=0), TINY)
+    times = np.where(omega2 > 0.0, 1.0 + wider * (square - mean), 1.0).clip(1.0 / MOST_TAPERED, MOST_TAPERED)
+    root = np.tile(np.sqrt(times), 2)
+    return np.asarray(root[:, :, None] * root[:, None] * factors.gram)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -28,7 +28,7 @@ from calib.estimate.quantities import (
     Quantity,
 )
 from calib.estimate.wander import TemperatureModel, Wander
-from calib.model import Array
+from calib.model import Array, scale_of
 
 OF_REFERENCES = [s.name for kind in KINDS.values() if kind.of_reference for s in kind.statements if s.name in PRIORS]
 OF_DATA = (SENSITIVITY, OFFSET, SENSITIVITY_RATE)  # stated elsewhere, or not at all
@@ -49,7 +49,7 @@ class Beforehand:
     @property
     def scale(self) -> float:
         """Output unit per m/s2: root mean square of the main sensitivities."""
-        return float(np.sqrt(np.mean(self.mean[[0, 4, 8]] ** 2)))
+        return scale_of(self.mean)
 
     def state(self) -> JointState:
         """The joint state before any window: S, Q, the rates of Q, the coefficients of temperature."""

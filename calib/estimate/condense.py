@@ -61,7 +61,7 @@ def condense(
     channels = max(w.sums.reference_channels for w in windows)
     segments = [_segments(w, channels) for w in windows]
     roots, whiteners = zip(*(_root(s.xx.sum(0)) for s in segments), strict=True)
-    omega2 = np.array([_omega2(s.xx.sum(0), channels) for s in segments])
+    omega2, of_each = (np.array(part) for part in zip(*(_omega2(s.xx.sum(0), channels) for s in segments), strict=True))
     return Condensed(
         channels=channels,
         root=np.array(roots),
@@ -71,7 +71,7 @@ def condense(
         mean_v=np.array([s.mean[-3:] for s in segments]),
         count=np.array([s.count.sum() for s in segments]),
         type_a=pooled(segments, roots, whiteners, alike=alike),
-        bands=banded(windows, channels, response_hz, omega2, one_frequency=one_frequency, powers=powers)
+        bands=banded(windows, channels, response_hz, omega2, of_each, one_frequency=one_frequency, powers=powers)
         if response_hz
         else None,
     )
@@ -159,9 +159,10 @@ def _root(power: Array) -> tuple[Array, Array]:
     return np.triu(rows[:, :size]), rows[:, size:]
 
 
-def _omega2(power: Array, channels: int) -> float:
+def _omega2(products: Array, channels: int) -> tuple[float, Array]:
+    """The power of du/dt over that of u: of all channels that are no integrals together, and of each one (M,)."""
+    power, rate_power = np.split(products.diagonal(), 2)
     real = own_channels(channels)
-    moved = float(np.trace(power[:real, :real]))
-    return (
-        float(np.trace(power[channels : channels + real, channels : channels + real])) / moved if moved > 0.0 else 0.0
-    )
+    moved = float(power[:real].sum())
+    each = np.divide(rate_power, power, out=np.zeros(channels), where=power > 0.0)
+    return float(rate_power[:real].sum()) / moved if moved > 0.0 else 0.0, each

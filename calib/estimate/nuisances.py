@@ -32,7 +32,7 @@ from calib.estimate.quantities import (
     Statement,
 )
 from calib.estimate.terms import terms
-from calib.model import Array, Pose, own_channels
+from calib.model import Array, Pose, own_channels, scale_of
 from calib.signal.response import ALL_POWERS, FLAT, POWERS, Response, by_term
 
 # Standard uncertainty of a term of the response, relative to that of a low-pass filter at the upper end of the motion.
@@ -85,6 +85,13 @@ class Priors(Stated):
             "response_hz": to_hz or band_hz[1], "reference_frequency_hz": stated_hz,
         }  # fmt: skip
         return Priors({**self.values, **told}, self.parameters, self.covariance)
+
+    @property
+    def output_per_mps2(self) -> float | None:
+        """The sensor's scale in output unit per m/s2 by the main sensitivities that were known beforehand; None where
+        one of them was not."""
+        scale = np.nan if self.parameters is None else scale_of(self.parameters)
+        return scale if np.isfinite(scale) else None
 
     @property
     def beside_unknown_corner(self) -> Priors:

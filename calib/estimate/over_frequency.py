@@ -71,11 +71,18 @@ class OverFrequency:
         """The frequency at which S holds; 0 if nothing moved yet."""
         return self.stated(priors).reference_frequency_hz or self.first_hz
 
-    def response(self, state: JointState, reference: str) -> Response:
-        """The response of the sensor over that of a reference, as estimated: what the front end is to take out."""
+    def response(self, state: JointState, reference: str, taken: tuple[float, ...] = ()) -> Response:
+        """The response of the sensor over that of a reference: what the front end is to take out.
+
+        `taken`: the terms that were taken out of the window before. They stay while they are right but for a part of
+        their uncertainty, so that a response nobody can tell from a flat one is not taken out: files do the same.
+        """
         own = terms_of(state, reference)
         if self.motion_hz is None or not own:
             return FLAT
+        before = Response(taken, self.to_hz) if taken else FLAT
+        if self.is_taken_out(before, state, reference):
+            return before
         found = Response(tuple((state.mean[own] * in_units(self.to_hz)).tolist()), self.to_hz).rounded
         return FLAT if found.is_flat else found
 

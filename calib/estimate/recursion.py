@@ -67,8 +67,9 @@ class Recursion(WindowState):
 
     @property
     def response(self) -> Response:
-        """The response of the sensor over that of the reference in use, as far as known."""
-        return self._over.response(self._joint.state, self.reference)
+        """The response of the sensor over that of the reference in use, to take out of the next window."""
+        before = (kept.response for kept in reversed(self._joint.recent) if kept.reference == self.reference)
+        return self._over.response(self._joint.state, self.reference, next(before, ()))
 
     @property
     def response_is_known(self) -> bool:

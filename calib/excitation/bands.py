@@ -98,13 +98,17 @@ def _edges(frequency_hz: Array, fewest: int) -> NDArray[np.int64]:
 
 
 def share_above(window: Window, to_hz: float) -> float:
-    """The share of a window's motion, in power, that is above a frequency; 0 where the window has no bands."""
+    """The share of a window's motion, in power, that is above a frequency; 0 where the window has no bands.
+
+    The power of a band is taken to be even over it: a band that hardly reaches above the frequency hardly counts.
+    """
     bands = window.bands
     if bands is None:
         return 0.0
     m = bands.reference_channels
     power = np.trace(bands.products[:, :m, :m], axis1=1, axis2=2)
-    return float(power[bands.high_hz > to_hz].sum() / max(power.sum(), np.finfo(float).tiny))
+    part = ((bands.high_hz - to_hz) / (bands.high_hz - bands.low_hz)).clip(0.0, 1.0)
+    return float(power @ part / max(power.sum(), np.finfo(float).tiny))
 
 
 def motion_band_hz(windows: Sequence[Window]) -> tuple[float, float] | None:
