@@ -12,7 +12,7 @@ from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import Self
 
 import zenoh
 from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
@@ -20,17 +20,16 @@ from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 from agent.config.known_keys import WatchedKeys
 from agent.config.tls import TlsFiles
 from agent.delivery import memory as memory_file
-from agent.delivery.answers import NOTHING, REMOVED
 from agent.delivery.holding import Held
 from agent.delivery.keys import PREFIX, narrow
 from agent.delivery.progress import Progress
+from agent.delivery.questions import Answer, Dialogue, Questions, Replies, answer_of, steps
 from agent.delivery.received import Received, receive
 from agent.delivery.seldom import Seldom
 from agent.delivery.session import session_config
 from agent.delivery.verifying import Refusals, UnverifiedError, Verifier
 
 INBOX = 1000  # samples that may wait; further ones are dropped and later fetched from the gateway's store
-ANSWER_S = 5.0  # s that one query waits for its answer
 CONNECT_S = 10.0
 CLOSE_S = 2.0  # that closing waits for the thread that takes samples; it ends at once unless the inbox is full
 SAVE_S = 1.0  # s between two writes of the memory file while results come without a pause; a pause writes it at once
@@ -55,6 +54,7 @@ class Consumer:
     Each result names the result published before it. Where this is not the last one known, results are missing: the
     consumer asks the gateway's store with `?after=` and holds later results until it answers. After a lost connection
     the newest results come again (history and recovery of Zenoh's advanced subscriber), so that a gap is seen at once.
+    Many gateways are asked at once, so that one that does not answer delays no other.
     A result that is not the very next one counts only when the gateway's store has it too. Otherwise it is given with
     `confirmed` false, and does not move the numbers, so that one message of a stranger cannot hide what follows. So is
     a result whose gateway does not answer for five minutes. What waits is bounded (agent.delivery.holding). When
@@ -90,20 +90,22 @@ class Consumer:
         self._progress = Progress(self._done | dict(last_sequence or {}))
         self._unconfirmed: dict[tuple[str, str, int], Received] = {}  # given already, although the store had them not
         self._key = key
-        self._inbox: queue.Queue[zenoh.Sample | None] = queue.Queue(maxsize=INBOX)  # None: the session is closed
+        # None: the session is closed.
+        self._inbox: queue.Queue[zenoh.Sample | Replies | None] = queue.Queue()
+        self._room = threading.Semaphore(INBOX)  # for samples; replies need none, since only so many are asked at once
+        self._dialogues: dict[str, Dialogue] = {}  # by source: the gateways that are being asked
         self._held = Held()
         self._doubts = Seldom()
-        self._mutex = threading.Lock()  # closing a session while another thread uses it raises an exception there
-        self._closed = False
         config = session_config("client", connect=endpoints, tls=tls)
         config.insert_json5("connect/timeout_ms", json.dumps(int(CONNECT_S * 1000)))
         self._open = ExitStack()
         try:
-            self._session = self._open.enter_context(zenoh.open(config))
+            session = self._open.enter_context(zenoh.open(config))
         except zenoh.ZError:
             raise ConnectionError(f"no Zenoh router answers at {', '.join(endpoints)}") from None
+        self._questions = Questions(session, self._inbox)
         subscriber = declare_advanced_subscriber(
-            self._session,
+            session,
             key,
             zenoh.handlers.RingChannel(INBOX),
             history=HistoryConfig(detect_late_publishers=True),
@@ -126,24 +128,29 @@ class Consumer:
             if self._inbox.empty():
                 self._remember()
             try:
-                sample = self._inbox.get(timeout=self._held.wait_s())
+                item = self._inbox.get(timeout=self._held.wait_s())
             except queue.Empty:
                 pass
             except KeyboardInterrupt:
                 return
             else:
-                if sample is None:
+                if item is None:
                     return
-                if (result := self._received(sample)[0]) is not None:
-                    yield from self._follow(result)
+                yield from self._take(item)
             for source in self._held.due():
-                yield from self._ask(source)
+                yield from self._begin(source)
+
+    def _take(self, item: zenoh.Sample | Replies) -> Iterator[Received]:
+        if isinstance(item, Replies):
+            yield from self._go_on(item.source, item.dialogue, answer_of(item.replies, self._received))
+            return
+        self._room.release()
+        if (result := self._received(item)[0]) is not None:
+            yield from self._follow(result)
 
     def close(self) -> None:
         """End the iteration and the session. May be called twice, from any thread."""
-        with self._mutex:
-            self._closed = True
-            self._open.close()
+        self._questions.close(self._open.close)
         self._taking.join(CLOSE_S)
         atexit.unregister(self.close)
 
@@ -155,6 +162,7 @@ class Consumer:
 
     def _take_samples(self, subscriber: Iterable[zenoh.Sample]) -> None:
         for sample in subscriber:
+            self._room.acquire()
             self._inbox.put(sample)
         self._inbox.put(None)  # the subscriber is undeclared
 
@@ -179,19 +187,43 @@ class Consumer:
         if self._progress.is_next(result):
             yield from self._deliver(result)
             return
-        self._held.add(result)
+        self._held.add(result, known=self._progress.number(result.address.source) is not None)
 
-    def _ask(self, source: str) -> Iterator[Received]:
+    def _begin(self, source: str) -> Iterator[Received]:
+        """Begin the dialogue with a gateway."""
+        self._dialogues[source] = self._dialogue(source)
+        yield from self._go_on(source, self._dialogues[source], None)
+
+    def _go_on(self, source: str, dialogue: Dialogue, answer: Answer | None) -> Iterator[Received]:
+        """Hand an answer to the dialogue with a gateway, and give its results up to its next question."""
+        if self._dialogues.get(source) is not dialogue:
+            return
+        asked = False
+        try:
+            for step in steps(dialogue, answer):
+                if isinstance(step, Received):
+                    yield step
+                else:
+                    asked = self._questions.ask(source, dialogue, step)
+        finally:
+            if not asked:  # it ended, or the user takes no more results
+                del self._dialogues[source]
+                self._held.ended(source)
+        if not asked:
+            for result in self._held.pop_later(source):
+                yield from self._follow(result)
+
+    def _dialogue(self, source: str) -> Dialogue:
         """Ask a gateway for what follows the last result known of it, then give what was held meanwhile."""
         selector = narrow(self._key, source)
         if self._progress.number(source) is None:
-            answer = self._get(selector)  # the values in force
+            answer = yield selector  # the values in force
             yield from self._deliver(*answer.results, first=True)
             if not answer.results or not self._held_is_new(source):
                 yield from self._settle(source, answered=answer.answered)
                 return
-        self._find_epoch(source, selector)
-        epochs = self._other_epochs(source, selector)
+        yield from self._find_epoch(source, selector)
+        epochs = yield from self._other_epochs(source, selector)
         answered = yield from self._pages(source, f"{selector}?after=", self._progress.number(source) or 0, epochs)
         for epoch in epochs:
             yield from self._pages(source, f"{selector}?epoch={epoch};after=", 0, {}, epoch)
@@ -202,21 +234,24 @@ class Consumer:
         if self._held.asked(source, answered=answered, known=self._progress.number(source) is not None):
             yield from self._deliver_unconfirmed(*self._held.pop(source))
 
-    def _other_epochs(self, source: str, selector: str) -> dict[str, None]:
+    def _other_epochs(self, source: str, selector: str) -> Generator[str, Answer, dict[str, None]]:
         """The epochs of held results that are not known yet and that the gateway's store has."""
         held = {r.epoch for r in self._held.of(source) if self._progress.is_other_epoch(r)}
-        return dict.fromkeys(r.epoch for r in self._get(selector).results if r.epoch in held) if held else {}
+        if not held:
+            return {}
+        in_force = yield selector
+        return dict.fromkeys(r.epoch for r in in_force.results if r.epoch in held)
 
     def _pages(
         self, source: str, question: str, after: int, others: dict[str, None], epoch: str | None = None
-    ) -> Generator[Received, None, bool]:
+    ) -> Generator[Received | str, Answer, bool]:
         """Ask until nothing more comes; returns whether the gateway answered.
 
         Results of other epochs are not given, but these epochs are added to `others`; with `epoch`, only its results
         are given.
         """
         while True:
-            results, answered, removed, reached = self._get(f"{question}{after}")
+            results, answered, removed, reached = yield f"{question}{after}"
             if reached <= after:
                 return answered
             after = reached
@@ -230,7 +265,7 @@ class Consumer:
                 results[0] = replace(results[0], removed_up_to=removed)
             yield from self._deliver(*results)
 
-    def _find_epoch(self, source: str, selector: str) -> None:
+    def _find_epoch(self, source: str, selector: str) -> Generator[str, Answer, None]:
         """Find the epoch of a number that was given without one: that of the result with this number in the store."""
         known, held = self._progress.number(source), self._held.of(source)
         if known is None or not self._progress.without_epoch(source):
@@ -238,7 +273,7 @@ class Consumer:
         other = next((r.epoch for r in held if self._progress.is_other_epoch(r)), None)
         if other is None:
             return
-        results, _, removed, _ = self._get(f"{selector}?after={known - 1}")
+        results, _, removed, _ = yield f"{selector}?after={known - 1}"
         if results and results[0].sequence == known:
             self._progress.adopt(source, results[0].epoch, known)
         elif removed >= known:
@@ -285,26 +320,6 @@ class Consumer:
             memory_file.save(self._memory, self._done)
             self._saved, self._saved_s = dict(self._done), time.monotonic()
 
-    def _get(self, selector: str) -> _Answer:
-        """Query a gateway."""
-        with self._mutex:
-            if self._closed:
-                return _Answer([], False, 0, 0)
-            # With consolidation Zenoh would pass on only the last result of each key.
-            replies = self._session.get(selector, consolidation=zenoh.ConsolidationMode.NONE, timeout=ANSWER_S)
-        answered, removed, reached = False, 0, 0
-        results = []
-        for reply in replies:
-            if reply.ok:
-                result, number = self._received(reply.ok)
-                results.append(result)
-                reached = max(reached, number)
-            gone = _removed(reply.err) if reply.err else 0
-            removed = max(removed, gone)
-            answered |= reply.err is None or gone > 0 or reply.err.payload.to_bytes() == NOTHING
-        in_order = sorted((r for r in results if r is not None), key=lambda r: r.sequence)
-        return _Answer(in_order, answered, removed, reached)
-
     def _received(self, sample: zenoh.Sample) -> tuple[Received | None, int]:
         """(the result, or None where it is none or is refused; its number, also where it is refused, otherwise 0)."""
         attachment = sample.attachment.to_bytes() if sample.attachment is not None else None
@@ -322,26 +337,5 @@ class Consumer:
         return result, result.sequence if result else 0
 
 
-class _Answer(NamedTuple):
-    """What a gateway answered. `results`: in order. `removed`: number up to which it has deleted results, or 0.
-
-    `reached`: the highest number in the answer, also of results that were refused; 0 where there is none.
-    """
-
-    results: list[Received]
-    answered: bool
-    removed: int
-    reached: int
-
-
 def _identity(result: Received) -> tuple[str, str, int]:
     return result.address.source, result.epoch, result.sequence
-
-
-def _removed(error: zenoh.ReplyError) -> int:
-    """The number in an answer REMOVED; 0 for any other answer."""
-    try:
-        number = error.payload.to_string().removeprefix(REMOVED)
-    except zenoh.ZError:
-        return 0
-    return int(number) if number.isascii() and number.isdigit() and len(number) < 19 else 0

@@ -2,7 +2,8 @@
 
 A stranger may publish results of gateways that do not exist, or with numbers far ahead, as fast as the network allows.
 So a gateway is asked at most once in RETRY_S, results wait for a bounded time, and both gateways and results that wait
-are bounded in number. What is dropped is counted.
+are bounded in number. What is dropped is counted. AT_ONCE gateways are asked at the same time. Those that did not
+answer the last time, or are not known yet, are half of them at most, so that they never keep the others waiting.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from agent.delivery.seldom import Seldom
 
 RESULTS_MAX = 1000  # of a gateway that are held; further ones push out the oldest, which are in the gateway's store
 GATEWAYS_MAX = 1000  # of which results are held
+AT_ONCE = 32  # gateways that are asked at the same time
 RETRY_S = 1.0  # s between two queries to a gateway
 RETRY_LONGEST_S = 30.0  # s between two queries to a gateway that never answered; from RETRY_S each takes twice as long
 GIVE_UP_S = 300.0  # s without an answer, after which results are given although earlier ones may be missing
@@ -23,7 +25,9 @@ GIVE_UP_S = 300.0  # s without an answer, after which results are given although
 
 @dataclass
 class _Waiting:
+    answers: bool  # it answered the last time, or results of it are known
     results: deque[Received] = field(default_factory=lambda: deque(maxlen=RESULTS_MAX))
+    later: deque[Received] = field(default_factory=lambda: deque(maxlen=RESULTS_MAX))  # came while it was being asked
     due_s: float = 0.0  # monotonic time from which the gateway may be asked (again)
     wait_s: float = RETRY_S
     silent_since_s: float | None = None  # time of the first query that was not answered
@@ -35,18 +39,22 @@ class Held:
     def __init__(self) -> None:
         self.dropped: Counter[str] = Counter()
         self._waiting: dict[str, _Waiting] = {}
+        self._asking: dict[str, bool] = {}  # the gateways that are being asked, and whether they answered the last time
         self._log = Seldom()
 
-    def add(self, result: Received) -> None:
-        """Hold a result; where there is no place for it, it is dropped and counted."""
+    def add(self, result: Received, *, known: bool = False) -> None:
+        """Hold a result; where there is no place for it, it is dropped and counted. `known`: its gateway is known."""
         source = result.address.source
         if source not in self._waiting and len(self._waiting) >= GATEWAYS_MAX:
             self._drop("", f"results of {GATEWAYS_MAX} gateways are held already")
             return
-        waiting = self._waiting.setdefault(source, _Waiting())
-        if len(waiting.results) == RESULTS_MAX:
-            self._drop(source, f"it does not answer, and {RESULTS_MAX} results are held already")
-        waiting.results.append(result)
+        waiting = self._waiting.setdefault(source, _Waiting(known))
+        self._hold(result, waiting.later if source in self._asking else waiting.results)
+
+    def _hold(self, result: Received, among: deque[Received]) -> None:
+        if len(among) == RESULTS_MAX:
+            self._drop(result.address.source, f"it does not answer, and {RESULTS_MAX} results are held already")
+        among.append(result)
 
     def _drop(self, source: str, reason: str) -> None:
         self.dropped[source] += 1
@@ -63,18 +71,41 @@ class Held:
             self._waiting[source].results.clear()
         return results
 
+    def pop_later(self, source: str) -> list[Received]:
+        """Take what came of a gateway while it was being asked, in the order of coming."""
+        if (waiting := self._waiting.get(source)) is None:
+            return []
+        came, waiting.later = list(waiting.later), deque(maxlen=RESULTS_MAX)
+        return came
+
     def wait_s(self) -> float | None:
-        """Time in s until a gateway may be asked; None where nothing is held."""
-        due = [waiting.due_s for waiting in self._waiting.values() if waiting.results]
+        """Time in s until a gateway may be asked; None where nothing is held, or others must be answered before."""
+        due = [self._waiting[source].due_s for source in self._next()]
         return max(0.0, min(due) - time.monotonic()) if due else None
 
     def due(self) -> list[str]:
-        """The gateways to ask now."""
+        """The gateways to ask now; each is being asked until `ended`."""
         now_s = time.monotonic()
-        passed = {source for source, waiting in self._waiting.items() if waiting.due_s <= now_s}
-        for source in [source for source in passed if not self._waiting[source].results]:
-            del self._waiting[source]
-        return [source for source in self._waiting if source in passed]
+        for source in [source for source, waiting in self._waiting.items() if waiting.due_s <= now_s]:
+            waiting = self._waiting[source]
+            if not (waiting.results or waiting.later or source in self._asking):
+                del self._waiting[source]
+        found = [source for source in self._next() if self._waiting[source].due_s <= now_s]
+        self._asking |= {source: self._waiting[source].answers for source in found}
+        return found
+
+    def _next(self) -> list[str]:
+        """The gateways with results that may be asked beside those that are, by the time from which they may."""
+        held = {s: w for s, w in self._waiting.items() if s not in self._asking and (w.results or w.later)}
+        first = sorted(held, key=lambda source: held[source].due_s)
+        doubted = [source for source in first if not held[source].answers]
+        places = max(0, AT_ONCE // 2 - sum(not answers for answers in self._asking.values()))
+        left_out = set(doubted[places:])
+        return [source for source in first if source not in left_out][: AT_ONCE - len(self._asking)]
+
+    def ended(self, source: str) -> None:
+        """A gateway is not being asked any more."""
+        self._asking.pop(source, None)
 
     def asked(self, source: str, *, answered: bool, known: bool) -> bool:
         """A gateway was asked. Returns whether its results are to be given now, since no earlier ones will come.
@@ -86,6 +117,7 @@ class Held:
         now_s = time.monotonic()
         waiting.wait_s = RETRY_S if known or answered else min(2 * waiting.wait_s, RETRY_LONGEST_S)
         waiting.due_s = now_s + waiting.wait_s
+        waiting.answers = answered
         if answered:
             waiting.silent_since_s = None
             return True

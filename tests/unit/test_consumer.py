@@ -17,6 +17,7 @@ from agent.delivery.answers import NOTHING
 from agent.delivery.consumer import Consumer, Received
 from agent.delivery.keys import PREFIX, narrow, parse_key
 from agent.delivery.publication import Publisher
+from agent.delivery.questions import ANSWER_S
 from agent.delivery.store import Store
 from tests.unit.zenoh_site import Site, record, wait_for
 
@@ -283,3 +284,21 @@ def test_a_consumer_ends_without_a_traceback(site: Site, what: str) -> None:
     command = [sys.executable, "-c", CONSUMING, site.endpoint, what]
     told = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
     assert (told.returncode, told.stdout, told.stderr) == (0, "ended\n", "")
+
+
+def test_gateways_that_do_not_answer_delay_no_other(site: Site, gateway: Gateway) -> None:
+    with site.client() as stranger, Consumer([site.endpoint]) as consumer:
+        silent = stranger.declare_queryable("fieldcal/v1/site/silent-$*/**", zenoh.handlers.FifoChannel(8))
+        follower = Follower(consumer, gateway.base)
+        for number in range(5):
+            stranger.put(f"fieldcal/v1/site/silent-{number}/mems/window", record(7).payload, attachment="0")
+        queries = [next_query(silent) for _ in range(5)]  # none of them is answered
+        began_s = time.monotonic()
+        gateway.publisher.start()
+        gateway.send(3)
+        assert follower.up_to(3)[-1] == 3
+        assert time.monotonic() - began_s < ANSWER_S / 2
+        for query in queries:
+            query.drop()
+        silent.undeclare()
+        follower.stop()
