@@ -165,11 +165,15 @@ def _arrow_parser() -> Any:
     def parse(text: bytes, dialect: Dialect, places: Sequence[int]) -> Array:
         if dialect.delimiter == " ":
             text = re.sub(rb"[ \t]+", b" ", re.sub(rb"(?m)^[ \t]+|[ \t]+$", b"", text))
+        # A copy that belongs to Arrow: one of its threads may let go of it while the interpreter ends, and with a buffer
+        # of Python's it would then end the process with SIGABRT.
+        own = pa.BufferOutputStream()
+        own.write(text)
         names = [str(k) for k in range(len(dialect.header))]
         kinds = {names[k]: pa.string() if dialect.dates[k] else pa.float64() for k in places}
         try:
             table = csv.read_csv(
-                pa.BufferReader(text),
+                pa.BufferReader(own.getvalue()),
                 csv.ReadOptions(column_names=names, block_size=BLOCK_BYTES),
                 csv.ParseOptions(delimiter=dialect.delimiter),
                 csv.ConvertOptions(

@@ -21,6 +21,7 @@ from calib.signal.response import POWERS, Complex, by_term
 
 PROBABILITY = 0.99  # confidence of the test for scatter between bands
 TINY = float(np.finfo(float).tiny)
+NARROW = 1e-3  # SD of omega^2 relative to its mean
 MOST_TAPERED = 2.0  # times: power of a band in the whole window over that in the tapered one
 RELATED = 1e-9  # relative eigenvalue of the channels' scatter below which a direction was not excited
 
@@ -228,8 +229,10 @@ def _as_in_the_window(factors: _Factors, omega2: Array) -> Array:
     square = np.divide(rate_power, power, out=np.zeros_like(power), where=power > 0.0)
     share = power / np.maximum(power.sum(axis=0), TINY)
     mean = np.sum(share * square, axis=0)
-    wider = (omega2 - mean) / np.maximum(np.sum(share * (square - mean) ** 2, axis=0), TINY)
-    times = np.where(omega2 > 0.0, 1.0 + wider * (square - mean), 1.0).clip(1.0 / MOST_TAPERED, MOST_TAPERED)
+    spread = np.sum(share * (square - mean) ** 2, axis=0)
+    told = (omega2 > 0.0) & (spread > (NARROW * mean) ** 2)  # in a narrow band nothing can be made wider
+    wider = np.divide(omega2 - mean, spread, out=np.zeros_like(mean), where=told)
+    times = (1.0 + wider * (square - mean)).clip(1.0 / MOST_TAPERED, MOST_TAPERED)
     root = np.tile(np.sqrt(times), 2)
     return np.asarray(root[:, :, None] * root[:, None] * factors.gram)
 

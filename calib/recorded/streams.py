@@ -24,9 +24,20 @@ class TableStream:
         self.clock, self._rows, self._numbers = counted(clock_from_stamps(time_s))
 
     @property
+    def _count(self) -> int:
+        """Number of samples, the missing ones included."""
+        return int(self._numbers[-1]) + len(self._values) - int(self._rows[-1])
+
+    @property
     def axes(self) -> int:
         """Number of columns of values."""
         return int(self._values.shape[1])
+
+    @property
+    def span_s(self) -> tuple[float, float]:
+        """Time of the first sample, and that of the one that would follow the last."""
+        first_s, end_s = self.clock.time_of([0, self._count]).tolist()
+        return first_s, end_s
 
     def stretch(self, rate: float, at_s: float) -> None:
         """Change the times of the samples to a scale that runs faster by `rate`, see ClockFit.stretched."""
@@ -34,9 +45,8 @@ class TableStream:
 
     def cut(self, start_s: float, stop_s: float) -> Samples | None:
         """The samples with start_s <= t < stop_s, a row of NaN for each missing one; None if there are no samples."""
-        runs = [*self._numbers.tolist(), int(self._numbers[-1]) + len(self._values) - int(self._rows[-1])]
         edges = np.ceil(self.clock.index_of(np.array([start_s, stop_s])))
-        first, stop = (int(edge) for edge in np.clip(edges, 0, runs[-1]))
+        first, stop = (int(edge) for edge in np.clip(edges, 0, self._count))
         if stop <= first:
             return None
         held = np.full((stop - first, self.axes), np.nan)

@@ -119,8 +119,11 @@ class Tables:
         return windows
 
     def _pieces(self, interval: PoseInterval) -> Iterator[tuple[float, float]]:
-        longest_s = self._making.settings.limits.longest_s
-        return pieces_of(interval.start_s, interval.stop_s, longest_s, self._making.guard_s)
+        longest_s, guard_s = self._making.settings.limits.longest_s, self._making.guard_s
+        first_s, end_s = self._sensor.span_s  # there are no windows outside, however long a pose is said to be
+        return pieces_of(
+            interval.start_s, min(interval.stop_s, end_s + guard_s), longest_s, guard_s, after_s=first_s - longest_s
+        )
 
     def _windows(
         self,

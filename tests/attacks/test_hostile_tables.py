@@ -16,6 +16,11 @@ from agent.calibrate.tables import read_sensor
 from agent.proto import fieldcal_pb2 as pb
 from agent.reading.recording import HOLES_MAX
 from agent.reading.source import TableError
+from calib.model import Pose
+from calib.recorded.poses import PoseInterval
+from calib.recorded.table import SensorTable
+from calib.recorded.tables import Tables
+from calib.signal.instrument import Instrument
 from calib.signal.stamps import clock_from_stamps
 from tests.replay.forgery import Unpacked
 from tests.replay.golden_files import FORMATS, RECORDING
@@ -141,3 +146,15 @@ def test_a_certificate_of_a_reference_without_a_serial_number_is_read(tmp_path: 
     path = tmp_path / "certificate.json"
     path.write_text('{"certificate": ' + stated.replace("RESULT", result) + "}")
     assert read_reference_certificate(path).serial_number == ""
+
+
+@pytest.mark.parametrize(("start_s", "stop_s"), [(0.0, 1e15), (-1e15, 4.0)])
+def test_a_pose_that_lasts_for_ever_takes_no_time(start_s: float, stop_s: float) -> None:
+    """There are no windows outside the recording, and none are looked for: there would be 10^13 of them."""
+    time_s = np.arange(400) / 100
+    still = 9.8 + np.random.default_rng(1).normal(0.0, 1e-3, (400, 3))
+    pose = Pose("still", np.empty((3, 0)), np.array([0.0, 0.0, 9.81]))
+    table = SensorTable("sensor", time_s, still, None)
+    (window,) = Tables(table, None, [PoseInterval(start_s, stop_s, pose)], Instrument()).windows()
+    assert window.used
+    assert 300 < window.points <= 400

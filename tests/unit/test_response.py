@@ -12,6 +12,7 @@ from click.testing import CliRunner
 
 from agent.cli.calibrate import calibrate
 from calib.estimate.adjustment import adjust
+from calib.estimate.banded import _Factors, _projected
 from calib.estimate.nuisances import Priors
 from calib.excitation.bands import band_sums
 from calib.recorded.adjusting import adjusted
@@ -244,3 +245,15 @@ def test_bands_add_up_to_the_tapered_window() -> None:
     # The line at half the rate counts twice in the bands.
     last = rows.T @ np.cos(np.pi * np.arange(500))
     np.testing.assert_allclose(sums.products.sum(axis=0), rows.T @ rows + np.outer(last, last) / 500, atol=1e-9)
+
+
+def test_a_window_whose_motion_is_in_one_band_has_finite_derivatives() -> None:
+    """The powers of several bands are made like those of the whole window; with one band there is nothing to change."""
+    t = np.arange(2000) / 100.0
+    u = np.random.default_rng(1).normal(size=(2000, 1))
+    bands = band_sums(u, np.gradient(u, t, axis=0), np.repeat(u, 3, axis=1), 100.0)
+    assert bands is not None
+    factors = _Factors(bands, np.array([8]))
+    with np.errstate(all="raise"):
+        found = _projected(factors, len(POWERS), 1.3 * factors.omega**2)
+    np.testing.assert_allclose(found[0, 0], -(factors.omega**2)[:, None], rtol=1e-9)
