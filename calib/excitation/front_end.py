@@ -23,6 +23,7 @@ from calib.signal.corner import integral, with_integral, without_corner
 from calib.signal.glitches import glitches
 from calib.signal.holes import Mask
 from calib.signal.instrument import Instrument
+from calib.signal.known_response import REACHES_S
 from calib.signal.resampling import (
     BAND,
     DIFFERENTIATED_BAND_HZ,
@@ -90,11 +91,16 @@ class Aligned:
 def margin_s(instrument: Instrument, rate_hz: float) -> float:
     """How many seconds of the reference beyond both ends of a stretch its windows need."""
     lost = differentiator_lost(rate_hz, instrument.derivatives) + HALF + 1
-    return min(max(LEAST_MARGIN_S, lost / rate_hz), most_margin_s(instrument))
+    return min(max(LEAST_MARGIN_S, lost / rate_hz), _most_s(instrument)) + instrument.known.reach_s(rate_hz)
 
 
 def most_margin_s(instrument: Instrument) -> float:
     """The largest `margin_s` at any rate."""
+    return _most_s(instrument) + (0.0 if instrument.known.is_flat else REACHES_S[-1])
+
+
+def _most_s(instrument: Instrument) -> float:
+    """The same without the filters that are known."""
     return MOST_MARGIN_S if instrument.derivatives else LEAST_MARGIN_S
 
 
@@ -162,7 +168,8 @@ def aligned(
     if instrument.has_corner:
         u = np.hstack([without_corner(u, rate_hz, instrument.corner_hz), integral(u, rate_hz)])
         V = without_corner(V, sensor_rate_hz, instrument.sensor_corner_hz)
-    at = resample(passed(u, rate_hz, response), reference.clock, time_s - lag_s, reference.first_index, lost)
+    u = passed(instrument.known.passed(u, rate_hz), rate_hz, response)
+    at = resample(u, reference.clock, time_s - lag_s, reference.first_index, lost)
     columns = np.vstack([V.T, at.u.T, at.du.T]).T  # the samples of a channel lie side by side, also in what is kept
     columns[~at.usable] = np.nan
     band_hz, noise = _band(raw, at.u[at.usable][:, :m], V, instrument, (rate_hz, sensor_rate_hz), settings.to_hz)
@@ -302,10 +309,11 @@ def _band(
     derivatives, m = instrument.derivatives, raw.shape[1]
     found_hz, density = band_above_noise(raw, rate_hz)
     density = np.maximum(density, instrument.noise / np.sqrt(0.5 * rate_hz))
+    known = instrument.known
     widest_hz = RESAMPLED_BAND * rate_hz
     if derivatives:
         widest_hz = min(DIFFERENTIATED_BAND_HZ, widest_hz)
-    unlimited = noise_in_band(density, widest_hz, derivatives)
+    unlimited = noise_in_band(known.noise(widest_hz, rate_hz) * density, widest_hz, derivatives)
     whole = u[np.isfinite(u).all(axis=1)]  # one missing sample of the reference makes some of them NaN
     power = np.var(whole, axis=0).max(initial=0.0) if len(whole) else 0.0
     noisy = np.max(unlimited[0] ** 2, initial=0.0) > NOISE_MATTERS * power
@@ -314,7 +322,8 @@ def _band(
     band_hz = min((end_hz for end_hz in ends_hz if end_hz is not None), default=None)
     if band_hz is None:
         return None, unlimited.reshape(2, m)
-    return band_hz, noise_in_band(density, min(FILTER_BAND * band_hz, widest_hz), derivatives)
+    noise_hz = min(FILTER_BAND * band_hz, widest_hz)
+    return band_hz, noise_in_band(known.noise(noise_hz, rate_hz) * density, noise_hz, derivatives)
 
 
 def _told_hz(V: Array, instrument: Instrument, rate_hz: float, sensor_rate_hz: float) -> float | None:
