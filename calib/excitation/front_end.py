@@ -23,7 +23,6 @@ from calib.signal.corner import integral, with_integral, without_corner
 from calib.signal.glitches import glitches
 from calib.signal.holes import Mask
 from calib.signal.instrument import Instrument
-from calib.signal.known_response import REACHES_S
 from calib.signal.resampling import (
     BAND,
     DIFFERENTIATED_BAND_HZ,
@@ -91,17 +90,12 @@ class Aligned:
 def margin_s(instrument: Instrument, rate_hz: float) -> float:
     """How many seconds of the reference beyond both ends of a stretch its windows need."""
     lost = differentiator_lost(rate_hz, instrument.derivatives) + HALF + 1
-    return min(max(LEAST_MARGIN_S, lost / rate_hz), _most_s(instrument)) + instrument.known.reach_s(rate_hz)
+    return min(max(LEAST_MARGIN_S, lost / rate_hz), most_margin_s(instrument)) + instrument.known.reach_s(rate_hz)
 
 
 def most_margin_s(instrument: Instrument) -> float:
     """The largest `margin_s` at any rate."""
-    return _most_s(instrument) + (0.0 if instrument.known.is_flat else REACHES_S[-1])
-
-
-def _most_s(instrument: Instrument) -> float:
-    """The same without the filters that are known."""
-    return MOST_MARGIN_S if instrument.derivatives else LEAST_MARGIN_S
+    return (MOST_MARGIN_S if instrument.derivatives else LEAST_MARGIN_S) + instrument.known.most_reach_s
 
 
 def windows_of(
@@ -244,9 +238,8 @@ def _motion(
     if instrument.has_corner:
         pose = with_integral(pose)
     u_lag_s = float(np.hypot(sensor.clock.u_offset_s, reference.clock.u_offset_s))
-    windows = _beside(pose, found, settings)
     taken = () if response.is_flat else response.terms
-    return [replace(_told(window, found), u_lag_s=u_lag_s, response=taken) for window in windows]
+    return [replace(_told(w, found), u_lag_s=u_lag_s, response=taken) for w in _beside(pose, found, settings)]
 
 
 def _beside(pose: Pose, found: Aligned, settings: Settings) -> list[Window]:
@@ -305,15 +298,13 @@ def _band(
 
     `rates_hz`: of the reference and of the sensor. `to_hz` as in Settings.
     """
-    rate_hz, sensor_rate_hz = rates_hz
-    derivatives, m = instrument.derivatives, raw.shape[1]
+    (rate_hz, sensor_rate_hz), derivatives, m = rates_hz, instrument.derivatives, raw.shape[1]
     found_hz, density = band_above_noise(raw, rate_hz)
     density = np.maximum(density, instrument.noise / np.sqrt(0.5 * rate_hz))
-    known = instrument.known
     widest_hz = RESAMPLED_BAND * rate_hz
     if derivatives:
         widest_hz = min(DIFFERENTIATED_BAND_HZ, widest_hz)
-    unlimited = noise_in_band(known.noise(widest_hz, rate_hz) * density, widest_hz, derivatives)
+    unlimited = noise_in_band(instrument.known.noise(widest_hz, rate_hz) * density, widest_hz, derivatives)
     whole = u[np.isfinite(u).all(axis=1)]  # one missing sample of the reference makes some of them NaN
     power = np.var(whole, axis=0).max(initial=0.0) if len(whole) else 0.0
     noisy = np.max(unlimited[0] ** 2, initial=0.0) > NOISE_MATTERS * power
@@ -323,7 +314,7 @@ def _band(
     if band_hz is None:
         return None, unlimited.reshape(2, m)
     noise_hz = min(FILTER_BAND * band_hz, widest_hz)
-    return band_hz, noise_in_band(known.noise(noise_hz, rate_hz) * density, noise_hz, derivatives)
+    return band_hz, noise_in_band(instrument.known.noise(noise_hz, rate_hz) * density, noise_hz, derivatives)
 
 
 def _told_hz(V: Array, instrument: Instrument, rate_hz: float, sensor_rate_hz: float) -> float | None:

@@ -81,6 +81,11 @@ class KnownResponse:
         """How far its filter reaches to each side, in s."""
         return 0.0 if self.is_flat else len(_taps(self, _rounded(rate_hz))) // 2 / rate_hz
 
+    @property
+    def most_reach_s(self) -> float:
+        """The largest `reach_s` at any rate."""
+        return 0.0 if self.is_flat else REACHES_S[-1]
+
     def passed(self, u: Array, rate_hz: float) -> Array:
         """The reference's samples u (n, m) as the sensor shows them, but for the lag.
 
