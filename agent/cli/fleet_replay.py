@@ -23,6 +23,8 @@ from agent.terminal.text import say
 @click.option("--set", "settings", multiple=True, metavar="KEY=VALUE",
               help="Recompute with another setting, such as channels.*.certificate.sensitivity*=0.996.")  # fmt: skip
 @click.option("--audit", "with_audit", is_flag=True, help="Check every byte too, as `fieldcal audit`.")
+@click.option("--export", "ending", type=click.Choice(["csv", "parquet", "wav", "mseed"]),
+              help="Write the samples of each sensor into -o DIR, as `fieldcal export`; replay nothing.")  # fmt: skip
 @click.option("-o", "directory", metavar="DIR", type=click.Path(file_okay=False, path_type=Path),
               help="Write the results here, and go on from what is here already.")  # fmt: skip
 @click.option("--json", "json_to", type=click.Choice(["-"]), help="Print one JSON object on standard output.")
@@ -32,6 +34,7 @@ def replay(
     scheduler: str | None,
     settings: tuple[str, ...],
     with_audit: bool,
+    ending: str | None,
     directory: Path | None,
     json_to: str | None,
 ) -> int:
@@ -49,6 +52,8 @@ def replay(
 
     if scheduler is not None and workers is not None:
         raise click.UsageError("give --workers or --scheduler: Dask has workers of its own")
+    if ending is not None and (directory is None or settings or with_audit):
+        raise click.UsageError("--export needs -o DIR, and goes neither with --set nor with --audit")
     try:
         for text in settings:
             Setting.of(text)
@@ -60,8 +65,9 @@ def replay(
         say(f"fieldcal fleet replay: {error}", err=True)
         return 2
     summaries: list[Summary] = []
+    where = None if directory is None else directory.absolute()
     with chosen:
-        results = results_of(places, settings, chosen, directory, audit=with_audit)
+        results = results_of(places, settings, chosen, where, audit=with_audit, export=ending or "")
         for summary in _in_order(places, _shown(results, len(places))):
             summaries.append(summary)
             if json_to is None:
@@ -112,6 +118,11 @@ def _line(summary: Any) -> str:
     if summary.reasons:
         more = f" (and {len(summary.reasons) - 1} more reasons)" if len(summary.reasons) > 1 else ""
         return f"{summary.place}: REFUSED: {summary.reasons[0]}{more}"
+    again = " (unchanged)" if summary.unchanged else ""
+    if summary.exported:
+        files = (f"{e.file}, {e.samples} samples" + (f" ({e.ends_early})" if e.ends_early else "")
+                 for e in summary.exported)  # fmt: skip
+        return f"{summary.place}: {'; '.join(files)}{again}"
     told = f"{summary.place}: {summary.events} events, {summary.results} results"
     for update in summary.calibrations:
         S = update["sensitivity"]
@@ -121,4 +132,4 @@ def _line(summary: Any) -> str:
             for i, axis in enumerate("xyz")
         )
         told += f"; {update['sensor']} {values} {update['output_unit']} per m/s2"
-    return told + (" (unchanged)" if summary.unchanged else "")
+    return told + again

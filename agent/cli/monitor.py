@@ -92,6 +92,7 @@ def monitor(
 ) -> int:
     """Show all sensors of all gateways on one web page, until Ctrl-C. Exit status: 1 port or disk, 2 bad input."""
     try:
+        from agent.monitor.engines import DatabaseError
         from agent.monitor.running import Bus, Web, serve
         from agent.monitor.settings import MonitorSettings, load_settings
         from agent.monitor.users import UsersError
@@ -124,6 +125,9 @@ def monitor(
         except (ConfigError, EndpointError, KeyFileError, UsersError) as error:
             say(f"fieldcal monitor: {error}", err=True)
             return 2
+        except DatabaseError as error:
+            say(f"fieldcal monitor: {error}", err=True)
+            return 1
         except (sqlite3.Error, OSError) as error:
             where = listen if isinstance(error, OSError) else data_dir / "monitor.sqlite"
             say(f"fieldcal monitor: {where}: {error}", err=True)

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
-import re
 from collections.abc import Iterable, Iterator, Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from agent.config.files import read_file
+from agent.fleet.exporting import Exported, stem
 from agent.fleet.task import UNCHANGED, Task
 from agent.fleet.workers import DaskWorkers, LocalWorkers
 
@@ -24,6 +23,7 @@ class Summary(msgspec.Struct, kw_only=True):
     """What is said of one recording. `reasons`: why it is refused, empty where it is not.
 
     `unchanged`: the result was there already. `calibrations`: the last one of each sensor, without its covariance.
+    `exported`: files of samples.
     """
 
     place: str
@@ -34,6 +34,7 @@ class Summary(msgspec.Struct, kw_only=True):
     results: int = 0
     windows: int = 0
     calibrations: list[dict[str, Any]] = []
+    exported: list[Exported] = []
 
 
 class _Read(msgspec.Struct):
@@ -46,14 +47,16 @@ class _Read(msgspec.Struct):
     replayed: dict[str, Any] | None
     calibrations: list[dict[str, Any]]
     windows: list[dict[str, Any]]
+    exported: list[Exported] = []
 
 
 def results_of(
     places: Iterable[str], settings: Sequence[str], workers: LocalWorkers | DaskWorkers, directory: Path | None,
-    *, audit: bool,
+    *, audit: bool, export: str = "",
 ) -> Iterator[Summary]:  # fmt: skip
     """Compute each recording that has no valid result in `directory`, and write its result there. In any order.
 
+    `export`: write samples with this ending into `directory` instead of replaying.
     Raises OSError where a result cannot be written.
     """
     known: dict[str, Summary] = {}  # of the tasks that are given out
@@ -61,10 +64,15 @@ def results_of(
     def tasks() -> Iterator[Task]:
         for place in places:
             before = _read(directory, place) if directory is not None else None
+            if before is not None and before.reasons and export:  # a library may be there now that was missing
+                before = None
             if before is not None:
                 known[place] = _summary(before)
             made = (before.sha256, before.made_by) if before is not None else ("", "")
-            yield Task(place=place, settings=tuple(settings), audit=audit, known=made)
+            yield Task(
+                place=place, settings=tuple(settings), audit=audit, known=made, export=export,
+                directory=str(directory) if export else "",
+            )  # fmt: skip
 
     for task, result in workers.run(tasks()):
         before = known.pop(task.place, None)
@@ -82,8 +90,7 @@ def results_of(
 
 def result_path(directory: Path, place: str) -> Path:
     """The file of the result of the recording at `place`: its name, and a digest of its whole path."""
-    name = re.sub(r"[^A-Za-z0-9_.-]", "_", PurePosixPath(place).name)[:80]
-    return directory / f"{name}.{hashlib.sha256(os.fsencode(place)).hexdigest()[:16]}.json"
+    return directory / f"{stem(place)}.json"
 
 
 def _read(directory: Path, place: str) -> _Read | None:
@@ -92,7 +99,15 @@ def _read(directory: Path, place: str) -> _Read | None:
         found = msgspec.json.decode(read_file(result_path(directory, place), LARGEST_RESULT), type=_Read)
     except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return None
-    return found if found.place == place else None
+    whole = all(_size(directory / one.file) == one.bytes for one in found.exported)
+    return found if found.place == place and whole else None
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError:
+        return -1
 
 
 def _write(path: Path, result: bytes) -> None:
@@ -115,5 +130,6 @@ def _summary(read: _Read) -> Summary:
         events=replayed.get("events", 0),
         results=replayed.get("results", 0),
         windows=len(read.windows),
+        exported=read.exported,
         calibrations=[{name: update.get(name) for name in SHOWN} for update in last.values()],
     )

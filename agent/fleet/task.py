@@ -11,6 +11,8 @@ import msgspec
 
 from agent import __version__
 from agent.core.events import CalibrationUpdate, WindowReport
+from agent.export.samples import ExportError
+from agent.fleet.exporting import Exported, exported
 from agent.fleet.settings import Setting, SettingError, changed_config
 from agent.fleet.sources import SourceError, local
 from agent.recording.auditing import AuditedFile, audit_file
@@ -31,6 +33,8 @@ class Task(msgspec.Struct, frozen=True, kw_only=True):
     place: str
     settings: tuple[str, ...] = ()
     audit: bool = False
+    export: str = ""  # ending of the files of samples that are to be written, such as csv; then nothing is replayed
+    directory: str = ""  # where they are written
     known: tuple[str, str] = ("", "")
 
 
@@ -50,6 +54,7 @@ class FileResult(msgspec.Struct, kw_only=True):
     replayed: ReplayedFile | None = None
     calibrations: list[CalibrationUpdate] = []
     windows: list[WindowReport] = []
+    exported: list[Exported] = []
 
 
 def run_task(task: Task) -> bytes:
@@ -71,6 +76,9 @@ def _result(task: Task) -> FileResult | None:
             result.sha256 = hashlib.file_digest(file, "sha256").hexdigest()
             if (result.sha256, result.made_by) == task.known:
                 return None
+            if task.export:
+                result.exported = exported(path, task.place, task.export, Path(task.directory))
+                return result
             settings = [Setting.of(text) for text in task.settings]
             if task.audit:
                 file.seek(0)
@@ -85,6 +93,9 @@ def _result(task: Task) -> FileResult | None:
                 result.reasons += _reasons(replayed.run(path))
     except (SourceError, SettingError) as error:
         result.reasons.append(str(error).removeprefix(f"{task.place}: "))
+        return result
+    except ExportError as error:
+        result.reasons.append(str(error).removeprefix(f"{path}: "))
         return result
     except OSError as error:
         result.reasons.append(f"cannot be read: {error.strerror or error}")
@@ -140,5 +151,5 @@ def _reasons(file: ReplayedFile) -> list[str]:
 
 
 def _made_by(task: Task, here: dict[str, str]) -> str:
-    held: list[Any] = [__version__, task.audit, list(task.settings), sorted(here.items())]
+    held: list[Any] = [__version__, task.audit, task.export, list(task.settings), sorted(here.items())]
     return hashlib.sha256(msgspec.json.encode(held)).hexdigest()

@@ -1,86 +1,220 @@
-"""The database of the monitor: every confirmed result of every gateway, in one SQLite file."""
+"""The database of the monitor: every confirmed result of every gateway, the older ones as hourly summaries."""
 
 from __future__ import annotations
 
-import sqlite3
 import threading
-from pathlib import Path
+import time
+from bisect import bisect_right
+from collections.abc import Callable
 from typing import Any
 
-import msgspec
-
 from agent.delivery.received import Received
+from agent.monitor.engines import LASTING, Engine, Run
+from agent.monitor.summaries import COUNTS, FULL_DAYS, SUMMARISED, merged, packed, split, summarise, unpacked
 
-_SCHEMA = """
-CREATE TABLE IF NOT EXISTS result (
-    site TEXT, gateway TEXT, epoch TEXT, sequence INTEGER, sensor TEXT, what TEXT,
-    part TEXT,  -- of a drift its parameter, of a window whether it was used; so the newest of each is found at once
-    payload BLOB,
-    UNIQUE (site, gateway, epoch, sequence));
-CREATE INDEX IF NOT EXISTS by_sensor ON result (site, gateway, sensor, what, part);
-"""
+DAY_NS, HOUR_NS = 86_400_000_000_000, 3_600_000_000_000
+
+_TABLES = [
+    "CREATE TABLE IF NOT EXISTS sensor (id INTEGER PRIMARY KEY, site TEXT, gateway TEXT, sensor TEXT,"
+    " UNIQUE (site, gateway, sensor))",
+    # day: of its time, LASTING for rows that are never dropped; part: of a drift its parameter, of a window whether it
+    # was used, so that the newest of each is found at once; detail: NULL if it is that of the calibration before
+    "CREATE TABLE IF NOT EXISTS result (number {number}, day INTEGER NOT NULL, hour INTEGER NOT NULL,"
+    " sensor INTEGER NOT NULL, epoch TEXT NOT NULL, sequence BIGINT NOT NULL, what TEXT NOT NULL, part TEXT NOT NULL,"
+    " payload {bytes} NOT NULL, detail {bytes}, UNIQUE (sensor, day, epoch, sequence)) {partitioned}",
+    "CREATE INDEX IF NOT EXISTS by_sensor ON result (sensor, what, number)",
+    "CREATE TABLE IF NOT EXISTS newest (sensor INTEGER, what TEXT, part TEXT, number BIGINT,"
+    " PRIMARY KEY (sensor, what, part))",
+    "CREATE TABLE IF NOT EXISTS followed (site TEXT, gateway TEXT, epoch TEXT, sequence BIGINT, number BIGINT,"
+    " PRIMARY KEY (site, gateway, epoch))",
+    # done: the last sensor of which this day is summarised
+    "CREATE TABLE IF NOT EXISTS day (day INTEGER PRIMARY KEY, done INTEGER NOT NULL)",
+    "CREATE TABLE IF NOT EXISTS summary (sensor INTEGER, hour INTEGER, calibrations INTEGER, estimates INTEGER,"
+    " windows_used INTEGER, windows_refused INTEGER, clocks INTEGER, PRIMARY KEY (sensor, hour))",
+]
+_OF = "(SELECT id FROM sensor WHERE site = :site AND gateway = :gateway AND sensor = :name)"
 
 
 class Database:
     """Results by sensor, in the order of their arrival. May be used by several threads.
 
-    Raises sqlite3.Error where the file at `path` cannot be used.
+    `now_ns`: the present, UTC; a result that says to be of a later day is filed under today. Raises sqlite3.Error or
+    DatabaseError where the engine cannot be used.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._connection = sqlite3.connect(path, check_same_thread=False, isolation_level=None)
+    def __init__(self, engine: Engine, *, full_days: int = FULL_DAYS, now_ns: Callable[[], int] = time.time_ns) -> None:
+        self._engine, self._full_days, self._now_ns = engine, full_days, now_ns
         self._mutex = threading.Lock()
-        self._connection.execute("PRAGMA journal_mode = WAL")
-        # A power cut may undo the last results; `last_sequence` then asks the gateways for them again.
-        self._connection.execute("PRAGMA synchronous = NORMAL")
-        self._connection.executescript(_SCHEMA)
+        self._sensors: dict[tuple[str, str, str], int] = {}
+        self._days: set[int] = set()
+        self._details: dict[tuple[int, str], tuple[int, bytes]] = {}  # the last one of each sensor, with its day
+        columns = {"number": engine.NUMBER, "bytes": engine.BYTES, "partitioned": engine.PARTITIONED}
+        with engine.transaction() as run:
+            engine.make_tables(run, [statement.format(**columns) for statement in _TABLES])
 
     def add(self, result: Received) -> None:
         """Keep a result. One that is there already stays as it is."""
         a, fields = result.address, result.fields
         part = {"drift": fields.get("parameter", ""), "window": "used" if fields.get("used") else "refused"}
-        row = (a.site, a.gateway, result.epoch, result.sequence, a.sensor, a.what, part.get(a.what, ""))
-        self._rows("INSERT OR IGNORE INTO result VALUES (?, ?, ?, ?, ?, ?, ?, ?)", *row, msgspec.json.encode(fields))
+        t_utc_ns = fields.get("t_utc_ns")
+        t_utc_ns = t_utc_ns if isinstance(t_utc_ns, int) else self._now_ns()
+        with self._mutex:  # numbers rise in the order in which they are committed
+            day = self._day(t_utc_ns) if a.what in SUMMARISED else LASTING
+            sensor = self._sensor(a.site, a.gateway, a.sensor)
+            short, detail = split(fields) if a.what in SUMMARISED else (fields, None)
+            before = self._details.get((sensor, a.what))
+            kept = None if before == (day, detail) else detail
+            with self._engine.transaction() as run:
+                row = run(
+                    "INSERT INTO result (day, hour, sensor, epoch, sequence, what, part, payload, detail) VALUES (:day,"
+                    " :hour, :sensor, :epoch, :sequence, :what, :part, :payload, :detail) ON CONFLICT DO NOTHING"
+                    " RETURNING number",
+                    day=day, hour=min(t_utc_ns, self._now_ns()) // HOUR_NS, sensor=sensor, epoch=result.epoch,
+                    sequence=result.sequence, what=a.what, part=part.get(a.what, ""), payload=packed(short),
+                    detail=kept,
+                )  # fmt: skip
+                if not row:
+                    return
+                run(
+                    "INSERT INTO newest VALUES (:sensor, :what, :part, :number) ON CONFLICT (sensor, what, part)"
+                    " DO UPDATE SET number = excluded.number",
+                    sensor=sensor, what=a.what, part=part.get(a.what, ""), number=row[0][0],
+                )  # fmt: skip
+                run(
+                    "INSERT INTO followed VALUES (:site, :gateway, :epoch, :sequence, :number) ON CONFLICT"
+                    " (site, gateway, epoch) DO UPDATE SET number = excluded.number, sequence ="
+                    " CASE WHEN excluded.sequence > followed.sequence THEN excluded.sequence"
+                    " ELSE followed.sequence END",
+                    site=a.site, gateway=a.gateway, epoch=result.epoch, sequence=result.sequence, number=row[0][0],
+                )  # fmt: skip
+            if detail is not None:
+                self._details[sensor, a.what] = day, detail
 
     def last_sequence(self) -> dict[str, int]:
         """The last result of each gateway and epoch, as Consumer takes it: of one gateway the newest epoch last."""
-        rows = self._rows(
-            "SELECT site, gateway, epoch, max(sequence) FROM result GROUP BY site, gateway, epoch ORDER BY max(rowid)"
-        )
+        with self._engine.transaction() as run:
+            rows = run("SELECT site, gateway, epoch, sequence FROM followed ORDER BY number")
         return {"/".join(filter(None, (site, gateway, epoch))): number for site, gateway, epoch, number in rows}
 
     def newest(self) -> list[tuple[str, str, str, str, dict[str, Any]]]:
-        """(site, gateway, sensor, what, fields) of the newest result of each kind and part, oldest first."""
-        rows = self._rows(
-            "SELECT site, gateway, sensor, what, payload FROM result WHERE rowid IN"
-            " (SELECT max(rowid) FROM result GROUP BY site, gateway, sensor, what, part) ORDER BY rowid"
-        )
-        return [(*row[:4], msgspec.json.decode(row[4])) for row in rows]
+        """(site, gateway, sensor, what, fields) of the newest result of each kind and part, oldest first.
+
+        Without what summaries leave out.
+        """
+        with self._engine.transaction() as run:
+            rows = run(
+                "SELECT s.site, s.gateway, s.sensor, r.what, r.payload FROM newest n JOIN sensor s ON s.id = n.sensor"
+                " JOIN result r ON r.sensor = n.sensor AND r.what = n.what AND r.number = n.number ORDER BY r.number"
+            )
+        return [(*row[:4], unpacked(row[4])) for row in rows]
 
     def history(self, site: str, gateway: str, sensor: str, what: str, limit: int) -> list[dict[str, Any]]:
-        """The newest `limit` results of one kind of a sensor, oldest first."""
-        rows = self._rows(
-            "SELECT payload FROM result WHERE site = ? AND gateway = ? AND sensor = ? AND what = ?"
-            " ORDER BY rowid DESC LIMIT ?",
-            *(site, gateway, sensor, what, limit),
-        )
-        return [msgspec.json.decode(payload) for (payload,) in reversed(rows)]
+        """The newest `limit` results of one kind of a sensor, oldest first; of the older ones the last of each hour."""
+        with self._engine.transaction() as run:
+            rows = run(
+                f"SELECT r.payload, r.detail, r.day, r.number, r.sensor FROM result r WHERE r.sensor = {_OF}"
+                " AND r.what = :what ORDER BY r.number DESC LIMIT :limit",
+                site=site, gateway=gateway, name=sensor, what=what, limit=limit,
+            )[::-1]  # fmt: skip
+            held = _detail_before(run, what, *rows[0][2:]) if rows and rows[0][1] is None else None
+        found, day = [], rows[0][2] if rows else LASTING
+        for payload, detail, at, *_ in rows:
+            held = detail if detail is not None or at != day or at == LASTING else held
+            day = at
+            found.append(merged(unpacked(payload), held))
+        return found
 
     def spread(self, site: str, gateway: str, sensor: str, what: str, most: int) -> list[dict[str, Any]]:
-        """At most `most` results of one kind of a sensor, evenly from its whole history, the newest among them."""
-        rows = self._rows(
-            "SELECT payload FROM result WHERE rowid IN (SELECT max(rowid) FROM (SELECT rowid, ntile(?) OVER"
-            " (ORDER BY rowid) AS tile FROM result WHERE site = ? AND gateway = ? AND sensor = ? AND what = ?)"
-            " GROUP BY tile) ORDER BY rowid",
-            *(most, site, gateway, sensor, what),
-        )
-        return [msgspec.json.decode(payload) for (payload,) in rows]
+        """At most `most` results of one kind of a sensor, evenly from all that are kept, the newest among them.
+
+        Without what summaries leave out.
+        """
+        with self._engine.transaction() as run:
+            rows = run(
+                "SELECT r.payload FROM result r WHERE r.number IN (SELECT max(number) FROM (SELECT number, ntile(:most)"
+                f" OVER (ORDER BY number) AS tile FROM result WHERE sensor = {_OF} AND what = :what) t GROUP BY tile)"
+                f" AND r.sensor = {_OF} AND r.what = :what ORDER BY r.number",
+                most=most, site=site, gateway=gateway, name=sensor, what=what,
+            )  # fmt: skip
+        return [unpacked(payload) for (payload,) in rows]
+
+    def summaries(self, site: str, gateway: str, sensor: str, limit: int) -> list[dict[str, Any]]:
+        """The newest `limit` hours that are summarised, oldest first: `t_utc_ns` of its end, last status, counts."""
+        with self._engine.transaction() as run:
+            rows = run(
+                f"SELECT hour, {', '.join(COUNTS)} FROM summary WHERE sensor = {_OF} ORDER BY hour DESC LIMIT :limit",
+                site=site, gateway=gateway, name=sensor, limit=limit,
+            )[::-1]  # fmt: skip
+            known = run(
+                f"SELECT hour, payload FROM result WHERE sensor = {_OF} AND what = 'status' ORDER BY number",
+                site=site, gateway=gateway, name=sensor,
+            )  # fmt: skip
+        hours = [hour for hour, _ in known]
+        found = []
+        for hour, *counts in rows:
+            k = bisect_right(hours, hour)
+            status = unpacked(known[k - 1][1])["status"] if k else ""
+            found.append({"t_utc_ns": (hour + 1) * HOUR_NS, "status": status} | dict(zip(COUNTS, counts, strict=True)))
+        return found
+
+    def summarise(self) -> bool:
+        """Summarise one day of one sensor, or drop a day of which all are summarised; False where there is none."""
+        with self._engine.transaction() as run:
+            first = self._now_ns() // DAY_NS - self._full_days
+            rows = run("SELECT day, done FROM day WHERE day < :first ORDER BY day LIMIT 1", first=first)
+            if not rows:
+                return False
+            day, done = rows[0]
+            ((sensor,),) = run("SELECT min(id) FROM sensor WHERE id > :done", done=done)
+            if sensor is None:
+                run("DELETE FROM day WHERE day = :day", day=day)
+                self._engine.drop_day(run, day)
+            # Another monitor on the same database may be at the same sensor; then it has changed `done`.
+            elif run(
+                "UPDATE day SET done = :sensor WHERE day = :day AND done = :done RETURNING day",
+                sensor=sensor, day=day, done=done,
+            ):  # fmt: skip
+                summarise(run, day, sensor)
+                self._engine.forget(run, day, sensor)
+        return True
 
     def close(self) -> None:
-        """Close the file."""
-        with self._mutex:
-            self._connection.close()
+        """Close the file, or the connections."""
+        self._engine.close()
 
-    def _rows(self, sql: str, *values: object) -> list[tuple[Any, ...]]:
-        with self._mutex:
-            return self._connection.execute(sql, values).fetchall()
+    def _day(self, t_utc_ns: int) -> int:
+        """The day under which a result is filed; one that comes late is not summarised before its day is full."""
+        today = self._now_ns() // DAY_NS
+        day = min(max(t_utc_ns // DAY_NS, today - self._full_days), today)
+        if day not in self._days:
+            with self._engine.transaction() as run:
+                run("INSERT INTO day VALUES (:day, 0) ON CONFLICT DO NOTHING", day=day)
+                self._engine.make_day(run, day)
+            self._days = {known for known in self._days if known >= today - self._full_days} | {day}
+        return day
+
+    def _sensor(self, site: str, gateway: str, sensor: str) -> int:
+        place = site, gateway, sensor
+        while place not in self._sensors:  # another monitor may have taken the same id
+            with self._engine.transaction() as run:
+                run(
+                    "INSERT INTO sensor SELECT coalesce(max(id), 0) + 1, :site, :gateway, :name FROM sensor"
+                    " WHERE true ON CONFLICT DO NOTHING",
+                    site=site, gateway=gateway, name=sensor,
+                )  # fmt: skip
+                ((found,),) = run(f"SELECT {_OF}", site=site, gateway=gateway, name=sensor)
+            if found is not None:
+                self._sensors[place] = found
+        return self._sensors[place]
+
+
+def _detail_before(run: Run, what: str, day: int, number: int, sensor: int) -> bytes | None:
+    """The detail of a calibration that says the same as the ones before it on this day."""
+    if day == LASTING:
+        return None
+    rows = run(
+        "SELECT detail FROM result WHERE sensor = :sensor AND what = :what AND day = :day AND number < :number"
+        " AND detail IS NOT NULL ORDER BY number DESC LIMIT 1",
+        sensor=sensor, what=what, day=day, number=number,
+    )  # fmt: skip
+    return rows[0][0] if rows else None

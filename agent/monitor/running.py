@@ -14,6 +14,7 @@ import uvicorn
 
 from agent.config.tls import TlsFiles
 from agent.monitor.database import Database
+from agent.monitor.engines import open_engine
 from agent.monitor.fleet import Fleet
 from agent.monitor.following import Following
 from agent.monitor.forwarding import Forwarding
@@ -22,6 +23,7 @@ from agent.monitor.login import Access
 from agent.monitor.notices import Notifier, Watch
 from agent.monitor.server import application
 from agent.monitor.settings import MonitorSettings
+from agent.monitor.summaries import Summariser
 
 GRACE_S = 2  # s in which answers on their way may end at Ctrl-C
 
@@ -62,13 +64,17 @@ class _Server(uvicorn.Server):
 def serve(listening: socket.socket, data_dir: Path, bus: Bus, web: Web, settings: MonitorSettings) -> bool:
     """Serve the page on a socket that listens, until Ctrl-C. Returns what `Following.close` returns.
 
-    Raises EndpointError, KeyFileError, UsersError, or sqlite3.Error where the database cannot be used.
+    Raises EndpointError, KeyFileError, UsersError, or sqlite3.Error or DatabaseError where the database cannot
+    be used.
     """
     fleet, stopping = Fleet(), threading.Event()
     access, live = Access(web.users), Live(bus.endpoints, bus.tls, stopping)
     forwarding = Forwarding(bus.endpoints, bus.commander, access, fleet)
     with ExitStack() as stack:
-        database = stack.enter_context(closing(Database(data_dir / "monitor.sqlite")))
+        kept = settings.database
+        engine = open_engine(data_dir, kept.url)
+        database = stack.enter_context(closing(Database(engine, full_days=kept.full_days)))
+        stack.callback(Summariser(database.summarise).close)
         following = Following(bus.endpoints, bus.tls, database, fleet, bus.keys)
         stack.callback(following.close)
         notifier = None

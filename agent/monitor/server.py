@@ -68,6 +68,8 @@ def application(
             Route("/api/fleet", access.reading(data.sensors)),
             Route("/api/history", access.reading(data.history)),
             Route("/api/spread", access.reading(data.spread)),
+            Route("/api/hours", access.reading(data.hours)),
+            Route("/hours.csv", access.reading(data.hours_csv)),
             Route("/gateways.csv", access.reading(data.gateways_csv)),
             Route("/api/changes", access.reading_async(data.changes)),
             Route("/plan", access.reading(data.plan)),
@@ -148,6 +150,12 @@ class _Data:
         rows = self._database.spread(*_place(request), "calibration", HISTORY_MAX)
         return _json([{name: row[name] for name in PLOTTED if name in row} for row in rows])
 
+    def hours(self, request: Request) -> Response:
+        return _json(self._database.summaries(*_place(request), _limit(request)))
+
+    def hours_csv(self, request: Request) -> Response:
+        return _csv("hours.csv", self._database.summaries(*_place(request), _limit(request)))
+
     def gateways_csv(self, _: Request) -> Response:
         return _csv("gateways.csv", self._fleet.gateways(self._following.refused))
 
@@ -155,10 +163,7 @@ class _Data:
         return _csv("sensor.csv", self._history(request))
 
     def _history(self, request: Request) -> list[dict[str, Any]]:
-        asked = request.query_params
-        limit = asked.get("limit", "")
-        most = min(int(limit), HISTORY_MAX) if _NUMBER.fullmatch(limit) else HISTORY_MAX
-        rows = self._database.history(*_place(request), asked.get("what", ""), most)
+        rows = self._database.history(*_place(request), request.query_params.get("what", ""), _limit(request))
         return [{name: value for name, value in row.items() if name != "covariance"} for row in rows]
 
     async def changes(self, _: Request) -> Response:
@@ -182,6 +187,11 @@ class _Data:
 def _place(request: Request) -> Place:
     site, gateway, sensor = (request.query_params.get(name, "") for name in ("site", "gateway", "sensor"))
     return site, gateway, sensor
+
+
+def _limit(request: Request) -> int:
+    limit = request.query_params.get("limit", "")
+    return min(int(limit), HISTORY_MAX) if _NUMBER.fullmatch(limit) else HISTORY_MAX
 
 
 def _json(told: object) -> Response:

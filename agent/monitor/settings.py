@@ -13,6 +13,7 @@ from pydantic import AfterValidator, Field
 from agent.config.files import read_private_file
 from agent.config.reading import ConfigError, load_model
 from agent.config.section import Section
+from agent.monitor.summaries import FULL_DAYS
 
 PICTURES = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".webp": "image/webp"}
 LARGEST_SECRET = 4096
@@ -75,9 +76,29 @@ class Notices(Section):
     email: Email | None = None
 
 
+def _database_url(url: str) -> str:
+    try:
+        parts = urlsplit(url)
+    except ValueError:
+        parts = urlsplit("")
+    if parts.scheme != "postgresql" or not parts.path.strip("/") or not url.isprintable():
+        raise ValueError("a database is postgresql://USER@HOST:PORT/NAME")
+    return url
+
+
+class DatabaseSettings(Section):
+    """Where results are kept, and for how long in full. Without `url`: in the file `monitor.sqlite` of the data."""
+
+    url: Annotated[str, AfterValidator(_database_url)] | None = None
+    full_days: Annotated[
+        int, Field(ge=1, le=3650, description="days of full results; older ones are summarised by the hour")
+    ] = FULL_DAYS
+
+
 class MonitorSettings(Section):
     """The whole file."""
 
+    database: DatabaseSettings = DatabaseSettings()
     plan: Plan | None = None
     notices: Notices | None = None
 
@@ -86,6 +107,9 @@ def load_settings(path: Path) -> MonitorSettings:
     """Read the file. Names of files in it are relative to it. Raises ConfigError with all faults."""
     settings = load_model(path, MonitorSettings)
     faults, plan, notices = [], settings.plan, settings.notices
+    url = urlsplit(settings.database.url or "")
+    if url.password is not None or "password" in url.query:
+        faults.append(f"{path}: database.url: a password does not belong here; give it by PGPASSFILE or PGPASSWORD")
     if plan is not None:
         plan = plan.model_copy(update={"picture": path.parent / plan.picture})
         if not plan.picture.is_file():
@@ -99,7 +123,7 @@ def load_settings(path: Path) -> MonitorSettings:
             faults.append(f"{path}: notices.email.password_file: {error.filename or ''} {error.strerror or error}")
     if faults:
         raise ConfigError(faults)
-    return MonitorSettings(plan=plan, notices=notices)
+    return MonitorSettings(database=settings.database, plan=plan, notices=notices)
 
 
 def password_of(email: Email) -> str:

@@ -19,6 +19,7 @@ from urllib.request import urlopen
 import uvicorn
 
 from agent.monitor.database import Database
+from agent.monitor.engines import Sqlite
 from agent.monitor.fleet import Fleet
 from agent.monitor.following import Following
 from agent.monitor.forwarding import Forwarding
@@ -55,7 +56,7 @@ class Served(AbstractContextManager["Served"]):
     ) -> None:
         self._open = ExitStack()
         directory.mkdir(exist_ok=True)
-        self.database = self._open.enter_context(closing(Database(directory / "monitor.sqlite")))
+        self.database = self._open.enter_context(closing(Database(Sqlite(directory / "monitor.sqlite"))))
         self.fleet = Fleet()
         self.following = Following([site.endpoint], None, self.database, self.fleet, keys)
         self._open.callback(self._end_following)

@@ -274,8 +274,12 @@ def bucket(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 
 
 @pytest.mark.usefixtures("bucket")
-def test_recordings_in_an_object_store(recordings: Path, tmp_path: Path) -> None:
+def test_recordings_in_an_object_store(recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import s3fs
+
+    fetched = tmp_path / "fetched"
+    fetched.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(fetched))
 
     store = s3fs.S3FileSystem()
     store.mkdir("fleet")
@@ -291,7 +295,7 @@ def test_recordings_in_an_object_store(recordings: Path, tmp_path: Path) -> None
     everything = b"".join(written(tmp_path / "out").values()) + repr(told).encode()
     assert b"s3cretWORD" not in everything
     assert b"AKIDTEST" not in everything
-    assert not list(Path(os.environ.get("TMPDIR", "/tmp")).glob("fieldcal-fleet-*"))
+    assert not list(fetched.iterdir())
 
 
 def test_a_fetched_recording_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,6 +13,7 @@ from agent.delivery.keys import Address
 from agent.delivery.received import Received
 from agent.monitor.advising import Advisor
 from agent.monitor.database import Database
+from agent.monitor.engines import Sqlite
 from agent.monitor.fleet import Fleet
 from agent.monitor.interval import DAY_NS, K, Trend, advise, daily, spread_of_rates, trend
 from tests.unit.results import calibration
@@ -94,7 +95,7 @@ def test_calibrations_of_one_day_count_once() -> None:
 
 
 def test_the_advice_of_a_sensor_names_the_parameter_that_changes_most(tmp_path: Path) -> None:
-    database, fleet = Database(tmp_path / "monitor.sqlite"), Fleet()
+    database, fleet = Database(Sqlite(tmp_path / "monitor.sqlite")), Fleet()
     advisor = Advisor(database, fleet)
     place = ("site", "gw", "mems")
     shared = {"reference": "R 1", "serial_number": "1", "sensitivity": [100.0], "kinds": ["reference sensitivity"],

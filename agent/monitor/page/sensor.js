@@ -89,7 +89,13 @@ function adviceTable(advice) {
   return table("When to look again", ["Of", "Interval", "Due (UTC)", "Reasoning"], rows);
 }
 
-function sections(place, told, whole, later) {
+// Results before those that are kept in full: counts of each hour.
+function hoursSection(place, hours) {
+  const rows = newestFirst(hours).map((r) => [at(r.t_utc_ns), r.status, r.calibrations, r.estimates, r.windows_used, r.windows_refused, r.clocks]);
+  return section("Summarised hours", table("Summarised hours", ["Until (UTC)", "Status", "Calibrations", "Estimates", "Windows used", "Windows refused", "Clock reports"], rows), make("p", make("a", "CSV", { href: `hours.csv?${place}` })));
+}
+
+function sections(place, told, whole, hours, later) {
   const gateway = `${place.get("site")}/${place.get("gateway")}`, sensor = place.get("sensor");
   const { calibration, window, drift, status, estimate, clock } = told, newest = calibration.at(-1);
   const order = (verb, sequence) => ({ gateway, sensor, verb, arguments: { sequence } });
@@ -105,6 +111,7 @@ function sections(place, told, whole, later) {
     temperatureSection(newest, whole, later),
     section("Status", table("Status", ["UTC", "Status", "Reason"], newestFirst(status).map((r) => [at(r.t_utc_ns), r.status, r.reason])), csv(place, "status")),
     section("Windows", table("Windows", ["UTC", "Position", "Verdict", "Reason", "Numbers"], newestFirst(window).map((r) => [at(r.t_utc_ns), r.position, r.used ? "used" : "refused", r.reason, numbers(r)])), csv(place, "window")),
+    hoursSection(place, hours),
     devicesSection(newest, clock),
   ].flat();
 }
@@ -151,12 +158,12 @@ export async function showSensor(told, go) {
   const mine = current;
   if (mine.changed !== (row?.changed ?? 0)) {
     mine.changed = row?.changed ?? 0;
-    const [whole, ...results] = await Promise.all([get(`api/spread?${place}`), ...KINDS.map((what) => get(`api/history?${place}&what=${what}&limit=${NEWEST}`))]);
+    const [whole, hours, ...results] = await Promise.all([get(`api/spread?${place}`), get(`api/hours?${place}&limit=${NEWEST}`), ...KINDS.map((what) => get(`api/history?${place}&what=${what}&limit=${NEWEST}`))]);
     if (current !== mine) return;
     const found = Object.fromEntries(KINDS.map((what, i) => [what, results[i]])), later = [];
     mine.last = (whole.at(-1)?.t_utc_ns ?? 0) / 1e9;
     mine.plots.update(whole.map((c) => c.t_utc_ns / 1e9), seriesOf(whole, found.drift));
-    $("details").replaceChildren(...sections(place, found, whole, later));
+    $("details").replaceChildren(...sections(place, found, whole, hours, later));
     for (const draw of later) draw();
   }
   const days = Number(now.get("days")), from = Number(now.get("from")), to = Number(now.get("to")), zoom = from > 0 && to > from;

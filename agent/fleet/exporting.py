@@ -1,0 +1,66 @@
+"""Samples of a recording as files of other programs, one for each of its sensors."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+from collections.abc import Callable
+from pathlib import Path, PurePosixPath
+
+import msgspec
+
+from agent.config import recorded_config
+from agent.export.samples import Content, ExportError, content_of, samples
+from agent.export.seismic import write_mseed
+from agent.export.tables import write_csv, write_parquet, write_wav
+from agent.recording.reading import first_event
+
+Write = Callable[..., int]
+WRITE: dict[str, Write] = {"csv": write_csv, "parquet": write_parquet, "wav": write_wav, "mseed": write_mseed}
+
+
+class Exported(msgspec.Struct, frozen=True, kw_only=True):
+    """One file. `ends_early`: why the recording does; "" where it is whole."""
+
+    device: str
+    file: str
+    samples: int
+    bytes: int
+    sha256: str
+    ends_early: str = ""
+
+
+def exported(path: Path, place: str, ending: str, directory: Path) -> list[Exported]:
+    """Write the samples of each sensor of the recording at `path`, whose place is `place`, into a directory.
+
+    A file is complete or not there at all; one that is there is replaced. Raises ExportError or OSError.
+    """
+    start = first_event(path)
+    if start is None:
+        raise ExportError("not a recording made by fieldcal")
+    sensors = dict.fromkeys(channel.sensor for channel in recorded_config(start.config_json).channels)
+    return [_exported(path, content_of([path], sensor), stem(place), ending, directory) for sensor in sensors]
+
+
+def stem(place: str) -> str:
+    """How the files of the recording at `place` begin: its name, and a digest of its whole path."""
+    return f"{_plain(PurePosixPath(place).name)}.{hashlib.sha256(os.fsencode(place)).hexdigest()[:16]}"
+
+
+def _exported(path: Path, content: Content, begin: str, ending: str, directory: Path) -> Exported:
+    file = directory / f"{begin}.{_plain(content.device)}.{ending}"
+    new = file.with_name(f"{file.name}.new")
+    new.unlink(missing_ok=True)
+    rows = WRITE[ending](new, content, samples([path], content))
+    with new.open("rb") as written:
+        os.fsync(written.fileno())
+        digest = hashlib.file_digest(written, "sha256").hexdigest()
+        size = written.tell()
+    new.replace(file)
+    early = "; ".join(content.faults).removeprefix(f"{path}: ")
+    return Exported(device=content.device, file=file.name, samples=rows, bytes=size, sha256=digest, ends_early=early)
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[^A-Za-z0-9_.-]", "_", name)[:80]
