@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 import signal
 import threading
 from pathlib import Path
@@ -27,6 +28,8 @@ from agent.terminal.text import say
 )
 def router(listen: str | None, config_file: Path | None) -> int:
     """Serve until SIGINT or SIGTERM. Exit status: 2 invalid endpoint or configuration, 1 the port is in use."""
+    _, files = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (files, files))  # two for each client
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())

@@ -55,9 +55,11 @@ class Progress:
         self._set(result.address.source, _name(result), result.sequence)
 
     def _set(self, source: str, name: str, number: int) -> None:
-        if self._current.get(source) != name:
-            self.numbers.pop(name, None)  # so that the newest epoch is the last one
-            self._current[source] = name
+        if self._current.get(source) == name:
+            self.numbers[name] = number
+            return
+        self.numbers.pop(name, None)  # so that the newest epoch is the last one
+        self._current[source] = name
         self.numbers[name] = number
         epochs = [other for other in self.numbers if other == source or other.startswith(f"{source}/")]
         for oldest in epochs[:-EPOCHS_MAX]:

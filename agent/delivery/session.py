@@ -14,6 +14,9 @@ from agent.config.tls import TlsFiles
 
 # Bytes. A block of corrected acceleration at 10 kHz takes a fifth of this; Zenoh's default limit is 1 GiB.
 LARGEST_MESSAGE = 1 << 20
+# Clients of a router. Zenoh refuses number 1,001 by default. A client takes 2 open files of the router.
+ROUTER_SESSIONS = 10_000
+ROUTER_ACCEPTS = 1000  # clients that may be connecting at the same time: all gateways of a site after an outage
 
 
 class EndpointError(Exception):
@@ -47,6 +50,9 @@ def session_config(
         "transport/link/tls": _tls(tls),
     }.items():
         config.insert_json5(key, json.dumps(value))
+    if mode == "router":
+        config.insert_json5("transport/unicast/max_sessions", json.dumps(ROUTER_SESSIONS))
+        config.insert_json5("transport/unicast/accept_pending", json.dumps(ROUTER_ACCEPTS))
     for key, endpoints in (("connect/endpoints", connect), ("listen/endpoints", listen)):
         try:
             config.insert_json5(key, json.dumps(list(endpoints)))

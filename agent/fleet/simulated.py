@@ -119,8 +119,15 @@ class SimulatedGateway:
         return Record.of(result, recorded=True, recording="simulated.mcap", epoch=self._store.epoch, signed=data)
 
     def _attack(self, records: Sequence[Record]) -> None:
-        """What a stranger on the bus may send: to keys of its own and of others, through a session of its own."""
-        with zenoh.open(session_config("client", connect=self._connect)) as session:
+        """What a stranger on the bus may send: to keys of its own and of others, through a session of its own.
+
+        While no router answers, it sends nothing.
+        """
+        try:
+            session = zenoh.open(session_config("client", connect=self._connect))
+        except zenoh.ZError:
+            return
+        with session:
             for key, payload, attachment in self._hostile(records):
                 session.put(key, payload, attachment=attachment)
 

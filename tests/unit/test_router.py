@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import resource
 import signal
 import socket
 import time
 from pathlib import Path
 
 import pytest
+import zenoh
 
+from agent.delivery import session
 from agent.delivery.router import open_router, router_running
-from agent.delivery.session import EndpointError
-from tests.unit.zenoh_site import Site, router_process
+from agent.delivery.session import EndpointError, session_config
+from tests.unit.zenoh_site import Site, router_process, wait_for
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
@@ -27,6 +32,34 @@ def test_it_says_its_real_endpoint_and_ends_within_a_second(ending: signal.Signa
     assert time.monotonic() - begin < 1.0
     assert (router.returncode, faults) == (0, "")
     assert not router_running(endpoint)
+
+
+def test_it_may_open_as_many_files_as_the_system_allows() -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (256, hard))
+    try:
+        router = router_process("--listen", "tcp/127.0.0.1:0")
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    assert router.stdout is not None
+    router.stdout.readline()
+    assert resource.prlimit(router.pid, resource.RLIMIT_NOFILE) == (hard, hard)
+    router.terminate()
+    router.communicate(timeout=5)
+
+
+def test_a_thousand_gateways_and_more_may_connect(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The numbers in the router without a file and in the example of one; with a small number, that it counts."""
+    example = ROOT / "deploy" / "zenoh" / "router.json5"
+    for config in (session_config("router"), zenoh.Config.from_json5(example.read_text())):
+        assert int(config.get_json("transport/unicast/max_sessions")) == 10_000
+        assert int(config.get_json("transport/unicast/accept_pending")) == 1000
+    monkeypatch.setattr(session, "ROUTER_SESSIONS", 2)
+    site = Site()
+    with site.client(), site.client():
+        assert not router_running(site.endpoint), "a third client is refused"
+    wait_for(lambda: router_running(site.endpoint))
+    site.kill()
 
 
 def test_a_taken_port_is_one_clear_line_and_status_1() -> None:
@@ -50,9 +83,9 @@ def test_a_router_that_is_there_is_found() -> None:
 def test_a_configuration_file_is_used_and_its_faults_are_one_line(tmp_path: Path) -> None:
     good = tmp_path / "router.json5"
     good.write_text('{listen: {endpoints: ["tcp/127.0.0.1:0"]}, scouting: {multicast: {enabled: false}}}')
-    session, (endpoint,) = open_router(None, good)
+    opened, (endpoint,) = open_router(None, good)
     assert router_running(endpoint)
-    session.close()
+    opened.close()
     for text in ("{listen: 5}", "{nonsense: true}", "{", "{listen: {endpoints: ['nowhere']}}"):
         good.write_text(text)
         with pytest.raises(EndpointError, match=r"router\.json5: .+") as caught:

@@ -34,6 +34,15 @@ def consumer_of(site: Site, fleet: SimulatedFleet, directory: Path) -> Iterator[
         yield consumer
 
 
+def test_a_fleet_goes_on_while_the_router_is_away(tmp_path: Path) -> None:
+    site = Site()
+    with SimulatedFleet(4, 1, 1, [site.endpoint], tmp_path) as fleet:
+        assert fleet.names_of("hostile")
+        assert fleet.step(T_NS) > 0
+        site.kill()
+        assert fleet.step(T_NS + DAY_NS) > 0
+
+
 def test_every_result_arrives_once_in_order_and_signed_and_forged_ones_are_refused(site: Site, tmp_path: Path) -> None:
     with (
         SimulatedFleet(6, 2, 1, [site.endpoint], tmp_path) as fleet,
