@@ -14,7 +14,7 @@ from agent.delivery.received import Received
 from agent.delivery.seldom import Seldom
 
 ANSWER_S = 5.0  # s that one question waits for its answer
-REPLIES_MAX, BYTES_MAX = 2000, 8 << 20  # of one answer; a gateway gives 500 results, about 1 MB
+REPLIES_MAX, BYTES_MAX = 2000, 16 << 20  # of one answer; a gateway gives 500 results, about 2 MB
 
 
 class Answer(NamedTuple):

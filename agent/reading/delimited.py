@@ -165,8 +165,8 @@ def _arrow_parser() -> Any:
     def parse(text: bytes, dialect: Dialect, places: Sequence[int]) -> Array:
         if dialect.delimiter == " ":
             text = re.sub(rb"[ \t]+", b" ", re.sub(rb"(?m)^[ \t]+|[ \t]+$", b"", text))
-        # A copy that belongs to Arrow: one of its threads may let go of it while the interpreter ends, and with a buffer
-        # of Python's it would then end the process with SIGABRT.
+        # A copy that belongs to Arrow: one of its threads may let go of it while the interpreter ends. With a buffer of
+        # Python's, the process would then end with SIGABRT.
         own = pa.BufferOutputStream()
         own.write(text)
         names = [str(k) for k in range(len(dialect.header))]
