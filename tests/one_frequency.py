@@ -44,7 +44,7 @@ def calibrated(parameters: BenchParameters, seed: int, priors: Priors) -> Outcom
             SensorTable("sensor.csv", recording.sensor_stamp_s, recording.v, None),
             ReferenceTable("r.csv", recording.reference_stamp_s, recording.reference, "acceleration", "a"),
             poses,
-            Instrument(),
+            Instrument(known=priors.known),
             Making(Settings(bands=True)),
         ),
         priors,

@@ -19,6 +19,7 @@ from calib.recorded.poses import PoseInterval
 from calib.recorded.table import ReferenceTable, SensorTable
 from calib.recorded.tables import Making, Tables
 from calib.signal.instrument import Instrument
+from calib.signal.known_response import UNKNOWN, KnownResponse
 
 Complex = NDArray[np.complex128]
 Filter = Callable[[Array], Complex]
@@ -87,8 +88,12 @@ def pair(
     noise_mps2: float = 0.01,
     reference_noise_mps2: float = 0.0,
     reference_error: float = 0.0,
+    known: KnownResponse = UNKNOWN,
 ) -> Pair:
-    """Random motion in `band_hz`, the same power at all its frequencies; `reference_error` is relative."""
+    """Random motion in `band_hz`, the same power at all its frequencies; `reference_error` is relative.
+
+    `known`: what is stated of the filters, whatever they are.
+    """
     random = np.random.default_rng(seed)
     n = int((seconds + 2.0 * BEYOND_S) * rate_hz)
     frequency_hz = np.fft.rfftfreq(n, 1.0 / rate_hz)
@@ -111,7 +116,7 @@ def pair(
         SensorTable("sensor.csv", time_s, V),
         ReferenceTable("reference.csv", time_s, u, "acceleration", "ax_mps2"),
         [PoseInterval(0.0, float(time_s[-1]), pose)],
-        Instrument(),
+        Instrument(known=known),
         Making(Settings(bands=True)),
     )
     return Pair(files, sensitivity, middle_hz)

@@ -43,6 +43,7 @@ def read_reference_certificate(path: Path) -> ReferenceCertificate:
         np.array([stated.sensitivity]),
         np.array([stated.u_sensitivity_pct / 100.0]),
         (stated.corner_hz, stated.u_corner_hz) if stated.u_corner_hz else None,
+        stated.known_filters,
     )
 
 

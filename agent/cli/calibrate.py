@@ -73,6 +73,11 @@ def _u(name: str, told: str) -> Callable[[Any], Any]:
               help="The reference's certificate (TOML with [certificate], or JSON or DCC of `fieldcal certificate`). "
               "Its u counts in the place of --u-reference-pct.")  # fmt: skip
 @_u("u_transverse_motion_pct", "u of motion transverse to a uniaxial reference.")
+@click.option("--sensor-filter", multiple=True, metavar="'KIND NAME=NUMBER ...'", default=DEFAULTS.sensor_filter,
+              help="A known filter of the sensor, as 'lowpass order=2 corner_hz=31'; 'flat': none that matters. "
+              "May be given several times.")  # fmt: skip
+@click.option("--reference-filter", multiple=True, metavar="'KIND NAME=NUMBER ...'", default=DEFAULTS.reference_filter,
+              help="The same of the reference. Default: as its certificate says.")  # fmt: skip
 @_u("reference_corner_hz", "Corner frequency of an AC-coupled reference.")
 @_u("u_reference_corner_hz", "Its standard uncertainty.")
 @_u("sensor_corner_hz", "Corner frequency of an AC-coupled sensor.")

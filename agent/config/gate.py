@@ -8,6 +8,10 @@ from pydantic import Field
 
 from agent.config.section import Section
 from calib.estimate.drift import DriftSettings
+from calib.model import PARAMETERS
+
+MAX_CHANGE_OFFSET_MPS2 = 0.5  # as much as a mount that leans by 3 deg
+FIXED_MOUNT_LEAST = 4  # parameters: three of Q, and one of S; without turning, all twelve may never be
 
 
 class GateSettings(Section):
@@ -45,6 +49,18 @@ class GateSettings(Section):
     least_determined: Annotated[
         int | None, Field(ge=1, le=12, description="determined parameters that the first calibration needs")
     ] = None
+
+    def filled(self, scale: float, *, fixed_mount: bool) -> GateSettings:
+        """The settings with what they leave open: a jump of the offset, and how much a first calibration needs.
+
+        `scale` is the sensor's output unit per m/s2.
+        """
+        filled: dict[str, float] = {}
+        if self.max_change_offset is None:
+            filled["max_change_offset"] = MAX_CHANGE_OFFSET_MPS2 * scale
+        if self.least_determined is None:
+            filled["least_determined"] = FIXED_MOUNT_LEAST if fixed_mount else len(PARAMETERS)
+        return self.model_copy(update=filled)
 
 
 class DriftOptions(Section):

@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
+from agent.config.filters import Filters, ResponseTable
 from agent.config.gate import DriftOptions, GateSettings
 from agent.config.section import Section, Vector
 from calib.estimate.nuisances import Priors
@@ -19,6 +20,8 @@ from calib.estimate.quantities import PRIORS, WALKS, YEAR_DAYS, Statement
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import Array
 from calib.signal.instrument import QUANTITIES, Instrument
+from calib.signal.known_filters import Filter, filter_of
+from calib.signal.known_response import KnownResponse
 
 Percent = Annotated[float, Field(gt=0, le=100)]
 Positive = Annotated[float, Field(gt=0)]
@@ -31,8 +34,9 @@ class Prior(Section):
 
     `sensitivity` is the main one in output unit per m/s2, or all nine, row by row (row = output axis); left out, it is
     the data sheet's, which the drivers of the chips know. `offset` is in m/s2, as are its uncertainties. `corner_hz`
-    and `u_corner_hz` are of an AC-coupled sensor (first order), 0 where it responds to constants. S holds at
-    `reference_frequency_hz`; 0 takes the middle of the band of the first window.
+    and `u_corner_hz` are of an AC-coupled sensor (first order), 0 where it responds to constants. `filters` are the
+    known ones of the sensor; left out, they are the driver's. S holds at `reference_frequency_hz`; 0 takes the middle
+    of the band of the first window.
     """
 
     sensitivity: Positive | Nine | None = None
@@ -42,6 +46,7 @@ class Prior(Section):
     u_offset_mps2: Positive = 20.0  # two g: nothing is known
     corner_hz: NotNegative = 0.0
     u_corner_hz: NotNegative = 0.0
+    filters: Filters = ()
     reference_frequency_hz: NotNegative = 0.0
 
     def mean(self, nominal: float | None) -> Array:
@@ -92,7 +97,8 @@ class Certificate(Section):
 
     `u_sensitivity_pct` holds on the date `calibrated`. Since then the reference may have drifted: by a random walk
     whose standard uncertainty after one year is `stability_pct`. `interval_years` is the time after which the reference
-    must be calibrated again; `fieldcal check` tells when it is over.
+    must be calibrated again; `fieldcal check` tells when it is over. `filters` and the table `response` are divided out
+    of the data; left out, the filters are the driver's.
     """
 
     quantity: Annotated[str, AfterValidator(_quantity)] = "acceleration"
@@ -103,6 +109,8 @@ class Certificate(Section):
     noise_mps2: Annotated[float, Field(ge=0, description="rms, in SI units of the quantity; 0: as the data show")] = 0.0
     corner_hz: Annotated[float, Field(ge=0, description="of an AC-coupled reference, first order; 0: none")] = 0.0
     u_corner_hz: NotNegative = 0.0
+    filters: Filters = ()
+    response: ResponseTable | None = None
     serial_number: str = ""
     calibrated: IsoDate = ""
     interval_years: Annotated[float | None, Field(gt=0, le=100)] = None
@@ -113,6 +121,12 @@ class Certificate(Section):
         if self.interval_years is not None and not self.calibrated:
             raise ValueError("interval_years: needs the date of the certificate; add calibrated, as in 2026-03-01")
         return self
+
+    @property
+    def known_filters(self) -> tuple[Filter, ...]:
+        """The filters that it states, and its table over frequency; empty where it states none."""
+        table = () if self.response is None else (self.response.filter(),)
+        return (*map(filter_of, self.filters), *table)
 
     @property
     def date(self) -> datetime | None:
@@ -214,12 +228,19 @@ class Knowledge(Section):
         """What the front end must know of the reference, and of the sensor beside it."""
         c, s = self.certificate, self.prior
         return Instrument(
-            c.quantity, c.sensitivity, c.noise_mps2, c.corner_hz, c.u_corner_hz, s.corner_hz, s.u_corner_hz
-        )
+            c.quantity, c.sensitivity, c.noise_mps2, c.corner_hz, c.u_corner_hz, s.corner_hz, s.u_corner_hz,
+            known=self.known,
+        )  # fmt: skip
+
+    @property
+    def known(self) -> KnownResponse:
+        """What is stated of the filters of both instruments."""
+        sensor, reference = tuple(map(filter_of, self.prior.filters)), self.certificate.known_filters
+        return KnownResponse(sensor or None, reference or None)
 
     def priors(self, *, fixed_mount: bool) -> Priors:
         """The nuisances' priors."""
-        return Priors(self._stated(PRIORS.values(), fixed_mount=fixed_mount))
+        return Priors(self._stated(PRIORS.values(), fixed_mount=fixed_mount)).beside_known(self.known)
 
     def wander(self) -> Wander:
         """How fast things may change."""

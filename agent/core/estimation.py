@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from agent.config import Channel
-from agent.config.gate import GateSettings
 from agent.core.explaining import explained, most_likely
 from agent.core.gate import PROPOSALS_KEPT, Decision, Evidence, Gate, fields_of
 from agent.core.jump import jumped, possible_jump, tilt_rad
@@ -21,12 +20,10 @@ from calib.estimate.drift import DriftTest, DriftVerdict
 from calib.estimate.innovation import Innovation
 from calib.estimate.recursion import Recursion
 from calib.estimate.window_rows import Summary
-from calib.model import PARAMETERS, Calibration, Window, WindowSums
+from calib.model import Calibration, Window, WindowSums
 from calib.signal.response import Response
 
 DAY_S = 86400.0
-MAX_CHANGE_OFFSET_MPS2 = 0.5  # as much as a mount that leans by 3 deg
-FIXED_MOUNT_LEAST = 4  # parameters: three of Q, and one of S; without turning, all twelve may never be
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,7 +66,7 @@ class Estimation:
         self.recursion = Recursion(mean, u, priors, walks, temperature, fixed=fixed, check=check)
         self.in_force, self.law = self.recursion.result(), self.recursion.law()
         self.residual_sd = self.recursion.residual_sd
-        self.gate = Gate(_limits(channel, self.recursion.scale), self.in_force)
+        self.gate = Gate(channel.gate.filled(self.recursion.scale, fixed_mount=fixed), self.in_force)
         self.drift = DriftTest(channel.drift.settings())
         self._held: list[Summary] = []
         self._witnesses = Witnesses([beside.reference for beside in self._beside])
@@ -210,9 +207,9 @@ class Estimation:
     def _tried_of(self, window: Window, day: float, lag_s: float, temperature_degc: float) -> Tried:
         """The window tried on the state; what `after` did is not done again."""
         tried = self._tried
-        if tried is None or tried.window_sums is not window.sums or tried.summary.lag_s != lag_s:
-            return self._try(window, day, lag_s, temperature_degc)
-        return tried
+        if tried is not None and tried.window_sums is window.sums and tried.summary.lag_s == lag_s:
+            return tried
+        return self._try(window, day, lag_s, temperature_degc)
 
     def _try(self, window: Window, day: float, lag_s: float, temperature_degc: float) -> Tried:
         summary = self._summary(window, day, lag_s, temperature_degc)
@@ -266,16 +263,22 @@ class Estimation:
             self._held, self._proposed = [], []
         return changed and follows and self._update_in_force()
 
-    def restate(self, gravity_mps2: tuple[float, float] | None, *, remounted: bool) -> bool:
+    def restate(self, gravity_mps2: tuple[float, float] | None, *, remounted: bool, size: float | None = None) -> bool:
         """After `load` of a state that was made with another configuration: see Recursion.restate.
 
-        `remounted`: the stated poses changed. Returns whether the calibration in force changed.
+        `remounted`: the stated poses changed. `size`: other filters are stated, and those of the sensor pass so many
+        times what they did. Returns whether the calibration in force changed.
         """
         follows = self._follows_state()
+        if size is not None:
+            S = self.recursion.result().sensitivity.ravel()
+            self.recursion.loosen(np.append((size - 1.0) * S, np.zeros(3)), line=True, another_filter=True)
+            self._held = []
         if remounted:
             self.recursion.remount(of_reference=False)
             self._held = []
-        return self.recursion.restate(gravity_mps2) and follows and self._update_in_force()
+        changed = self.recursion.restate(gravity_mps2) or size is not None
+        return changed and follows and self._update_in_force()
 
     def _follows_state(self) -> bool:
         """Whether the calibration in force is that of the state."""
@@ -337,14 +340,3 @@ class Estimation:
         self._witnesses.load(state["witnesses"])
         for watch, kept in zip(self._lag_watches, state["lag_watches"], strict=False):
             watch.load(kept)
-
-
-def _limits(channel: Channel, scale: float) -> GateSettings:
-    """The gate's settings with what they leave open: a jump of the offset, and how much a first calibration needs."""
-    given = channel.gate
-    filled: dict[str, float] = {}
-    if given.max_change_offset is None:
-        filled["max_change_offset"] = MAX_CHANGE_OFFSET_MPS2 * scale
-    if given.least_determined is None:
-        filled["least_determined"] = FIXED_MOUNT_LEAST if channel.fixed_mount else len(PARAMETERS)
-    return given.model_copy(update=filled)

@@ -17,6 +17,7 @@ from typing import Any
 import msgspec
 
 from agent.config import Channel
+from agent.config.knowledge import Certificate, Prior
 from agent.config.pose import Stop
 from agent.config.section import Section
 from agent.core.estimation import Estimation
@@ -90,12 +91,16 @@ def take_up(kept: bytes, channel: Channel, nominal: float | None) -> Kept:
         if "prior" in changed and (beyond := fresh.gate.anchor_at(stated, fresh.in_force)):
             reason = f"begun again from the prior: the calibration in force contradicts the changed prior: {beyond}"
             return Kept(Estimation(channel, nominal), None, day, t_utc_ns, reason)
-        moved = fresh.restate(_gravity(changed, state["basis"], channel), remounted=bool(MOUNT & changed))
+        size = _size(state["basis"], channel, fresh.recursion.reference_frequency_hz)
+        gravity = _gravity(changed, state["basis"], channel)
+        moved = fresh.restate(gravity, remounted=bool(MOUNT & changed), size=size)
     except MALFORMED as error:
         return _from_in_force(state, in_force, channel, nominal, day, t_utc_ns, _said(error))
     reason = "restored from the previous run"
     if changed:
         reason += f"; these settings have changed and were exchanged in the state: {', '.join(sorted(changed))}"
+    if size is not None:
+        reason += "; other filters are stated, so that response and lag are found anew"
     return Kept(fresh, in_force, day, t_utc_ns, reason, moved)
 
 
@@ -160,6 +165,17 @@ def _made_otherwise(changed: Iterable[str], before: Mapping[str, str], channel: 
         found.append("prior.reference_frequency_hz")
     quantity = msgspec.json.decode(before["certificate"]).get("quantity", channel.certificate.quantity)
     return found if quantity == channel.certificate.quantity else [*found, "certificate.quantity"]
+
+
+def _size(before: Mapping[str, str], channel: Channel, frequency_hz: float) -> float | None:
+    """What the sensor's stated filters pass at the frequency at which S holds, over what those before did; None if the
+    same filters are stated of both instruments."""
+    prior, certificate = (msgspec.json.decode(before[name]) for name in ("prior", "certificate"))
+    stated = Prior.model_validate(prior), Certificate.model_validate(certificate)
+    were = channel.model_copy(update=dict(zip(("prior", "certificate"), stated, strict=True))).known
+    if were == channel.known:
+        return None
+    return channel.known.sensor_size(frequency_hz) / were.sensor_size(frequency_hz)
 
 
 def _gravity(changed: Iterable[str], before: Mapping[str, str], channel: Channel) -> tuple[float, float] | None:

@@ -116,7 +116,9 @@ def _recorded(path: Path, start: RunStart, channel: Channel, infos: dict[str, st
     mean = channel.prior.mean(nominal_of(json.loads(infos[channel.sensor])))
     u = channel.prior.standard_uncertainty(mean)
     u_reference = float(np.hypot(priors.reference, _drifted(start, channel)))
-    stated = Priors({**priors.values, "reference": u_reference, "reference_drift": 0.0}, mean, np.diag(u**2))
+    stated = Priors(
+        {**priors.values, "reference": u_reference, "reference_drift": 0.0}, mean, np.diag(u**2), priors.known
+    )
     sensor, reference = (_table(path, name) for name in (channel.sensor, channel.reference))
     settings = Settings(Limits.of(priors.offset_mps2, priors.angle_rad, channel.window_s), bands=True)
     name, quantity = str(path), channel.instrument.quantity

@@ -23,7 +23,7 @@ from calib.estimate.gauss_newton import Solution, slope_residuals, solve
 from calib.estimate.nuisances import Applied, Nuisances, Priors
 from calib.estimate.quantities import LAG, RESPONSE, Kind
 from calib.estimate.reference_share import ReferenceShare, share_after
-from calib.estimate.response_told import ResponseTold, response_told, told_at_one_frequency
+from calib.estimate.response_told import Known, ResponseTold, response_told, told_at_one_frequency
 from calib.estimate.slope_scatter import SlopeScatter, estimated
 from calib.estimate.verdict import misfit, nuisance_pull, reasons, turned_windows
 from calib.excitation.bands import motion_band_hz
@@ -122,7 +122,7 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
             break
         scatter = larger
         solution = _solution([e.window for e in found], data, priors, applied, scatter)
-    shares = budget(solution, priors.offset_mps2)
+    shares = budget(solution, priors.offset_mps2, priors.known_u)
     mean, covariance = solution.x[:12], shares.covariance[:12, :12]
     told = determined(mean, np.sqrt(np.diag(covariance)), _prior_u(stated), solution.equations.seen)
     known = told | np.isfinite(_prior_u(stated))
@@ -180,6 +180,7 @@ def _response(
         priors.reference_frequency_hz,
         band_hz,
         k,
+        known=Known(priors.known, 1.0 - priors.reference_share),
     )
 
 
@@ -216,7 +217,7 @@ def _without_offset(priors: Priors) -> Priors:
     covariance = priors.covariance.copy()
     covariance[9:, :], covariance[:, 9:] = 0.0, 0.0
     covariance[range(9, 12), range(9, 12)] = np.inf
-    return Priors(priors.values, priors.parameters, covariance)
+    return Priors(priors.values, priors.parameters, covariance, priors.known)
 
 
 def _reported(solution: Solution, shares: Budget) -> tuple[Nuisance, ...]:

@@ -163,7 +163,7 @@ class Before:
         if of_reference:
             return Before.of(stated)
         values = dict(stated.priors.values) | {name: self.priors.values[name] for name in OF_REFERENCES}
-        return Before(stated.mean.copy(), stated.standard_uncertainty.copy(), Priors(values))
+        return Before(stated.mean.copy(), stated.standard_uncertainty.copy(), Priors(values, known=stated.priors.known))
 
     def of_references_differ(self, now: Beforehand) -> bool:
         """Whether other values are stated of the reference now."""
@@ -183,4 +183,4 @@ class Before:
         """The statements whose snapshot this is. What it does not have (in a state of version 2) counts as now."""
         values = {name: value for name, value in (state["priors"] or {}).items() if name in PRIORS}
         mean = now.mean if state["mean"] is None else np.array(state["mean"])
-        return cls(mean, np.array(state["u"]), Priors(dict(now.priors.values) | values))
+        return cls(mean, np.array(state["u"]), Priors(dict(now.priors.values) | values, known=now.priors.known))

@@ -37,8 +37,9 @@ class Budget:
     consistency: tuple[float, float]  # chi-squared of the windows against noise and stated scatter, and its expectation
 
 
-def budget(solution: Solution, stated_offset_scatter_mps2: float) -> Budget:
-    """The budget of a solution. `stated_offset_scatter_mps2` is the prior scatter of the offset between windows."""
+def budget(solution: Solution, stated_offset_scatter_mps2: float, known_u: float = 0.0) -> Budget:
+    """The budget of a solution. `stated_offset_scatter_mps2` is the prior scatter of the offset between windows,
+    `known_u` relative of S: whose filter differs from what is stated."""
     seen = between_windows(solution)
     noise = _type_a(solution)
     sources = {"type A": (noise, solution.equations.data.type_a.degrees_of_freedom)}
@@ -53,6 +54,8 @@ def budget(solution: Solution, stated_offset_scatter_mps2: float) -> Budget:
     bands = BetweenBands() if banded is None else banded.between
     if bands.relative_u > 0.0:
         sources["response between bands"] = (_alike(solution, bands.relative_u), np.inf)
+    if known_u > 0.0:
+        sources["known filters"] = (_alike(solution, known_u), np.inf)
     half = solution.half
     sources["prior of S and Q"] = (half[:12].T @ solution.prior_precision[:12, :12] @ half[:12], np.inf)
     terms = solution.equations.nuisances.terms

@@ -37,12 +37,14 @@ def never_turned(inputs: Array) -> bool:
 class Held:
     """The constant input acceleration (3,) at a fixed mount, as stated, and how nuisances move it, by key (3,).
 
-    `steady`: derivatives, by key, of the logarithm of the sensitivity at 0 Hz over S.
+    `steady`: derivatives, by key, of the logarithm of the sensitivity at 0 Hz over S. `known_size`: the logarithm of S
+    over the sensitivity at 0 Hz by the sensor's known filters.
     """
 
     mps2: Array
     by: Mapping[str, Array]
     steady: Mapping[str, float] = field(default_factory=dict)
+    known_size: float = 0.0
 
     def parameters(self, state: JointState, joint: Array | None = None) -> tuple[Array, Array]:
         """S and Q (12,) and a factor (12, k) of their covariance, of a state with the mean output in the place of Q.
@@ -54,7 +56,7 @@ class Held:
         moving, moves = [state.index(key) for key in self.by], np.array([*self.by.values()]).reshape(-1, 3)
         terms, by_term = [state.index(key) for key in self.steady], np.array([*self.steady.values()])
         felt = self.mps2 + state.mean[moving] @ moves
-        steady = float(np.exp(state.mean[terms] @ by_term))
+        steady = float(np.exp(state.mean[terms] @ by_term - self.known_size))
         S = steady * mean[:9].reshape(3, 3)
         mean[9:] -= S @ felt
         factor[9:] -= steady * (felt @ factor[:9].reshape(3, 3, -1)) + (S @ moves.T) @ joint[moving]

@@ -68,10 +68,10 @@ def link(
         raise ValueError("no window is used")
     rotation = _rotation(used)
     of_site = {"reference_drift": 0.0} | ({} if rotation is None else {"reference": 0.0, "rotation_rad": 0.0})
-    here = Priors({**priors.values, **of_site}, priors.parameters, priors.covariance)
+    here = Priors({**priors.values, **of_site}, priors.parameters, priors.covariance, priors.known)
     mean, u = _point(used, here, applied)
     variance = np.append(u[:9] ** 2, np.full(3, np.inf))
-    found = adjust(used, Priors(here.values, mean, np.diag(variance)), applied)
+    found = adjust(used, Priors(here.values, mean, np.diag(variance), priors.known), applied)
     rows, told, shared = _information(found, mean, u, reference)
     return Link(sensor, reference, rows, told, shared, rotation, priors.rotation_rad, found)
 

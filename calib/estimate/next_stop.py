@@ -174,7 +174,7 @@ class Plan:
         """
         self.poses = tuple(poses)
         channels = poses[0].direction.shape[1]
-        given = Priors({**priors.values, "reference": 0.0, "reference_drift": 0.0})
+        given = Priors({**priors.values, "reference": 0.0, "reference_drift": 0.0}, known=priors.known)
         nuisances = Nuisances(poses, channels, given, Applied())
         at = nuisances.at(np.zeros(len(nuisances)))
         mean = np.zeros((len(poses), channels)) if reference_mps2 is None else np.asarray(reference_mps2)

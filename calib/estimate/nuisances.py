@@ -33,6 +33,7 @@ from calib.estimate.quantities import (
 )
 from calib.estimate.terms import terms
 from calib.model import Array, Pose, own_channels, scale_of
+from calib.signal.known_response import UNKNOWN, KnownResponse
 from calib.signal.response import ALL_POWERS, FLAT, POWERS, Response, by_term
 
 # Standard uncertainty of a term of the response, relative to that of a low-pass filter at the upper end of the motion.
@@ -56,18 +57,44 @@ class Priors(Stated):
     table: ClassVar[Mapping[str, Statement]] = PRIORS
     parameters: Array | None = field(default=None, compare=False)
     covariance: Array | None = field(default=None, compare=False)
+    known: KnownResponse = field(default=UNKNOWN, compare=False)
 
     def __init__(
         self,
         values: Mapping[str, float] | None = None,
         parameters: Array | None = None,
         covariance: Array | None = None,
+        known: KnownResponse = UNKNOWN,
         **stated: float,
     ) -> None:
         """`stated` overrides `values`, and `values` override the defaults. Raises TypeError for an unknown name."""
         super().__init__(values, **stated)
         object.__setattr__(self, "parameters", parameters)
         object.__setattr__(self, "covariance", covariance)
+        object.__setattr__(self, "known", known)
+
+    def with_values(self, told: Mapping[str, float]) -> Priors:
+        """The same with these values in the place of others."""
+        return Priors({**self.values, **told}, self.parameters, self.covariance, self.known)
+
+    def beside_known(self, known: KnownResponse) -> Priors:
+        """These for instruments with filters that are known, and are divided out of the data: all but their delay,
+        which is part of the lag."""
+        late = {"lag_at_s": self.lag_at_s + known.group_delay_s} if known.is_stated else {}
+        return Priors({**self.values, **late}, self.parameters, self.covariance, known)
+
+    def _known_told(self, frequency_hz: float, to_hz: float = 0.0) -> dict[str, float]:
+        """What known filters make of S, if it holds at this frequency, from a motion up to `to_hz`.
+
+        `known_size`: ln |h| of the sensor's. `reference_share`: of what is left of ln |h|, the other part is the
+        sensor's; `known_u`: relative standard uncertainty of S by this division, and by what no terms explain.
+        """
+        if not self.known.is_stated:
+            return {}
+        share, u = self.known.of_reference(frequency_hz)
+        size = float(np.log(self.known.sensor_size(frequency_hz)))
+        u_beside = self.known.u_beside_terms(to_hz) if to_hz else 0.0
+        return {"known_size": size, "known_u": float(np.hypot(u, u_beside)), "reference_share": share}
 
     def with_response(
         self, band_hz: tuple[float, float], to_hz: float | None = None, from_hz: float | None = None
@@ -79,12 +106,12 @@ class Priors(Stated):
         """
         stated_hz = self.reference_frequency_hz or float(np.sqrt(band_hz[0] * band_hz[1]))
         told = {
-            "response": RESPONSE_U, "response_at": 0.0,
+            "response": min(RESPONSE_U, self.known.u_response(to_hz or band_hz[1])), "response_at": 0.0,
             "response_terms": float(len(ALL_POWERS if self.corner_unknown else POWERS)),
             "response_from_hz": (from_hz or band_hz[0]) if self.corner_unknown else 0.0,
             "response_hz": to_hz or band_hz[1], "reference_frequency_hz": stated_hz,
         }  # fmt: skip
-        return Priors({**self.values, **told}, self.parameters, self.covariance)
+        return self.with_values({**told, **self._known_told(stated_hz, to_hz or band_hz[1])})
 
     @property
     def output_per_mps2(self) -> float | None:
@@ -96,7 +123,7 @@ class Priors(Stated):
     @property
     def beside_unknown_corner(self) -> Priors:
         """These for instruments of which one is AC-coupled, and nobody stated its corner."""
-        return Priors({**self.values, "corner_unknown": 1.0}, self.parameters, self.covariance)
+        return self.with_values({"corner_unknown": 1.0})
 
     @property
     def response_powers(self) -> int:
@@ -114,12 +141,15 @@ class Priors(Stated):
         late_s = lag_s - self.lag_at_s
         most = min(0.5 * (2.0 * np.pi * motion_hz * late_s) ** 2, MOST_ATTENUATED)
         attenuated = 0.5 * most * float(np.sign(late_s))  # a reference that comes late is the one that attenuates
+        u = float(np.hypot(0.5 * most, ATTENUATED_U))
+        if (u_known := float(np.hypot(self.known.u_size(motion_hz), ATTENUATED_U))) < u:
+            u, attenuated = u_known, 0.0
+        at_hz = self.reference_frequency_hz or motion_hz
         told = {
-            "response": float(np.hypot(0.5 * most, ATTENUATED_U)), "response_at": attenuated,
-            "response_terms": 1.0, "response_hz": motion_hz,
-            "reference_frequency_hz": self.reference_frequency_hz or motion_hz,
+            "response": u, "response_at": attenuated, "response_terms": 1.0, "response_hz": motion_hz,
+            "reference_frequency_hz": at_hz,
         }  # fmt: skip
-        return Priors({**self.values, **told}, self.parameters, self.covariance)
+        return self.with_values({**told, **self._known_told(at_hz)})
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,8 +244,9 @@ class Nuisances:
         self.response = self._stacked("response", (priors.response_powers,))
         # Of ln |h| at the reference frequency by the terms, when the response is 1 at 0 Hz.
         at = np.array([2.0 * np.pi * priors.reference_frequency_hz])
-        self._at_reference = by_term(at, priors.response_powers)[0].real
+        self._at_reference = (1.0 - priors.reference_share) * by_term(at, priors.response_powers)[0].real
         self._applied_response = self._applied() @ self.response
+        self._known_size = priors.known_size
         self._corner_hz = (self.reference_corner - self.sensor_corner) / (2.0 * np.pi)
 
     def __len__(self) -> int:
@@ -248,7 +279,7 @@ class Nuisances:
 
     def steady(self, z: Array) -> tuple[float, Array]:
         """The sensitivity at 0 Hz over that at the reference frequency, and the derivatives (J,) of its logarithm."""
-        away = self._at_reference @ (self._applied_response + z @ self.response)
+        away = self._at_reference @ (self._applied_response + z @ self.response) + self._known_size
         return float(np.exp(-away)), -(self.response @ self._at_reference)
 
     def at(self, z: Array) -> Inputs:

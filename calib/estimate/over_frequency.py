@@ -14,7 +14,7 @@ from calib.estimate.condense import Condensed, mean_frequency_hz
 from calib.estimate.joint_state import JointState
 from calib.estimate.nuisances import Priors
 from calib.estimate.quantities import RESPONSE, Quantity
-from calib.estimate.response_told import ResponseTold, response_told, told_at_one_frequency
+from calib.estimate.response_told import Known, ResponseTold, response_told, told_at_one_frequency
 from calib.model import Array
 from calib.signal.response import FLAT, NEAR, POWERS, Complex, Response, attenuating, by_term, in_units
 
@@ -108,9 +108,11 @@ class OverFrequency:
         u, u_was = (np.linalg.norm(_ENDS @ one.factor[k], axis=1) for one, k in ((state, own), (earlier, was)))
         return bool(np.any(moved > np.maximum(MOVED, SURELY * np.hypot(u, u_was))))
 
-    def factor(self, state: JointState) -> Array:
-        """A factor of the covariance of a state (N, N) or (N, N + 1), with what the bands deviate from one response."""
+    def factor(self, state: JointState, known_u: float) -> Array:
+        """A factor of the covariance of a state (N, N) or (N, N + 1), with what the bands deviate from one response,
+        and `known_u`, relative, of S."""
         relative = self.deviations.between.relative_u
+        relative = float(np.hypot(relative, known_u)) if known_u else relative
         if not relative:
             return state.factor
         deviating = np.zeros((len(state), 1))
@@ -125,15 +127,18 @@ class OverFrequency:
         if not own:
             return None
         chosen, effects = [*range(9), *own], np.diag(in_units(self.to_hz))
-        factor, hz = self.factor(state)[chosen], self.stated(priors).reference_frequency_hz
+        factor, hz = self.factor(state, priors.known_u)[chosen], self.stated(priors).reference_frequency_hz
         return response_told(
-            state.mean[chosen], factor @ factor.T, effects, hz, self.motion_hz, coverage_factor, per_octave=1.0
-        )
+            state.mean[chosen], factor @ factor.T, effects, hz, self.motion_hz, coverage_factor, per_octave=1.0,
+            known=_known(self.stated(priors)),
+        )  # fmt: skip
 
     def steady(self, state: JointState, reference: str, priors: Priors) -> dict[str, float]:
         """Derivatives, by the key of each term, of the logarithm of the sensitivity at 0 Hz over that at the reference
         frequency."""
-        at_reference = by_term(np.array(2.0 * np.pi * self.stated(priors).reference_frequency_hz)).real
+        stated = self.stated(priors)
+        at_reference = by_term(np.array(2.0 * np.pi * stated.reference_frequency_hz)).real
+        at_reference = (1.0 - stated.reference_share) * at_reference
         own, unit = self._unknowns(state, reference)
         return {state.keys[k]: float(by) for k, by in zip(own, -(at_reference * unit)[: len(own)], strict=True)}
 
@@ -157,9 +162,11 @@ class OverFrequency:
         if not own:
             return None
         chosen, effects = [*range(9), *own], attenuating(self.first_hz)[None]
-        factor, hz = self.factor(state)[chosen], self.stated(priors).reference_frequency_hz
+        factor, hz = self.factor(state, priors.known_u)[chosen], self.stated(priors).reference_frequency_hz
         band_hz = (self.first_hz, self.first_hz)
-        return told_at_one_frequency(state.mean[chosen], factor @ factor.T, effects, hz, band_hz, coverage_factor)
+        return told_at_one_frequency(
+            state.mean[chosen], factor @ factor.T, effects, hz, band_hz, coverage_factor, _known(self.stated(priors))
+        )
 
     def snapshot(self) -> dict[str, Any]:
         """Plain values, for `load`."""
@@ -171,6 +178,10 @@ class OverFrequency:
         band = state["motion_hz"]
         motion_hz = None if band is None else (band[0], band[1])
         return cls(**{**state, "motion_hz": motion_hz, "deviations": Deviations(**state["deviations"])})
+
+
+def _known(priors: Priors) -> Known:
+    return Known(priors.known, 1.0 - priors.reference_share)
 
 
 def terms_of(state: JointState, reference: str) -> list[int]:

@@ -326,12 +326,10 @@ FREQUENCIES = (
     Statement("response_hz"),  # to which the terms of the response are scaled
     Statement("response_from_hz"),  # to which those below the motion are scaled
     Statement("corner_unknown"),  # 1 where an instrument is AC-coupled and nobody states its corner
+    *map(Statement, ("known_size", "known_u", "reference_share")),  # see calib.estimate.nuisances.Priors
     Statement("response_terms", 5.0),  # how many of them are unknowns: one frequency tells c_2 alone
     Statement(  # at which S holds
-        "reference_frequency_hz",
-        configuration=("prior.reference_frequency_hz",),
-        option="reference_frequency_hz",
-        convert=_or_0,
+        "reference_frequency_hz", 0.0, ("prior.reference_frequency_hz",), (), "reference_frequency_hz", _or_0
     ),
 )
 PRIORS = by_name(

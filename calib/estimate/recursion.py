@@ -147,7 +147,7 @@ class Recursion(WindowState):
         state = self._joint.state
         more = [state.index(quantity.name) for quantity, _ in temperature.terms(self.scale)]
         mean, factor = self._parameters_factor()
-        mean, factor = np.append(mean, state.mean[more]), np.vstack([factor, self._over.factor(state)[more]])
+        mean, factor = np.append(mean, state.mean[more]), np.vstack([factor, self._factor()[more]])
         covariance, (low, high) = factor @ factor.T, self.temperature_range_degc
         told, u_beyond = self._determined(mean[:12], covariance[:12, :12]), temperature.u_offset_mps2[1] * self.scale
         return Law(mean, covariance, order, rows, self.reference_temperature_degc, low, high, u_beyond, told)

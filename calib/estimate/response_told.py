@@ -9,12 +9,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.model import Array
+from calib.signal.known_response import UNKNOWN, KnownResponse
 from calib.signal.response import NEAR, Complex, Response, by_term
 
 PER_OCTAVE = 3  # bands in which S is reported
 LARGE = 0.5  # of the largest element of S: the elements whose relative uncertainty counts
 GRID = 200  # frequencies at which the valid band is searched
 LEFT_U = 0.5  # standard uncertainties of ln h that may be left in the windows
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """The filters that are known, and the sensor's `share` of the response that is left."""
+
+    response: KnownResponse = UNKNOWN
+    share: float = 1.0
+
+    def size(self, frequency_hz: Array, reference_hz: float) -> Complex | float:
+        """h of the sensor's known filters at frequencies, over its size at the reference frequency."""
+        own = self.response
+        return own.of_sensor(frequency_hz) / own.sensor_size(reference_hz) if own.sensor else 1.0
+
+
+NOTHING = Known()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,24 +81,26 @@ def response_told(
     coverage_factor: float,
     per_octave: float = PER_OCTAVE,
     from_hz: float = 0.0,
+    known: Known = NOTHING,
 ) -> ResponseTold:
     """The response from S row by row and J unknowns of the response: `estimate` (9 + J,), `covariance` (9 + J, 9 + J).
 
     `effects` (J, 5) or (J, 9): what a unit of each of the J unknowns adds to the terms in s^k. The motion was in
-    `band_hz`; `from_hz` is that of the terms below it, where they are unknowns.
+    `band_hz`; `from_hz` is that of the terms below it, where they are unknowns. The terms are those of what is left
+    beside the `known` filters; the sensitivities contain the sensor's.
     """
     count = max(1, round(per_octave * np.log2(band_hz[1] / band_hz[0])))
     edges = _spaced(*band_hz, count + 1)
     middles_hz = np.append(0.0, np.sqrt(edges[:-1] * edges[1:]))
-    at, u_at = _sensitivities(estimate, covariance, effects, middles_hz, reference_hz)
+    at, u_at = _sensitivities(estimate, covariance, effects, middles_hz, reference_hz, known)
     ends = zip(edges[:-1].tolist(), edges[1:].tolist(), at[1:], u_at[1:], strict=True)
     terms, grid = estimate[9:] @ effects, _spaced(*band_hz, GRID)
-    away = np.abs(np.exp(_log_h(grid, reference_hz, len(terms)) @ terms)) - 1.0
+    away = np.abs(known.size(grid, reference_hz) * np.exp(known.share * _log_h(grid, reference_hz, len(terms)) @ terms))
     limit = coverage_factor * _least_u(estimate[:9], covariance) / 3.0
     return ResponseTold(
         Response(tuple(terms.tolist()), band_hz[1], from_hz),
         reference_hz,
-        _around(grid, np.abs(away) <= limit, reference_hz),
+        _around(grid, np.abs(away - 1.0) <= limit, reference_hz),
         at[0].real,
         u_at[0],
         tuple(BandSensitivity(*end) for end in ends),
@@ -96,14 +115,16 @@ def told_at_one_frequency(
     reference_hz: float,
     band_hz: tuple[float, float],
     coverage_factor: float,
+    known: Known = NOTHING,
 ) -> ResponseTold:
     """The same where all motion has one frequency, both ends of `band_hz`, and J = 1: the term in s^2 alone.
 
     The valid band follows from the largest such term, in size, that the data and its prior allow.
     """
     motion_hz = band_hz[1]
-    at, u_at = _sensitivities(estimate, covariance, effects, np.array([0.0, motion_hz]), reference_hz)
+    at, u_at = _sensitivities(estimate, covariance, effects, np.array([0.0, motion_hz]), reference_hz, known)
     most = (abs(estimate[9]) + coverage_factor * np.sqrt(covariance[9, 9])) * abs(effects[0, 0])
+    most += abs(np.log(known.response.sensor_size(motion_hz))) / (2.0 * np.pi * motion_hz) ** 2
     away = coverage_factor * _least_u(estimate[:9], covariance) / 3.0 / most / (2.0 * np.pi) ** 2  # in Hz^2
     return ResponseTold(
         Response(tuple((estimate[9:] @ effects).tolist()), motion_hz),
@@ -131,12 +152,12 @@ def _least_u(S: Array, covariance: Array) -> float:
 
 
 def _sensitivities(
-    estimate: Array, covariance: Array, effects: Array, frequency_hz: Array, reference_hz: float
+    estimate: Array, covariance: Array, effects: Array, frequency_hz: Array, reference_hz: float, known: Known
 ) -> tuple[Complex, Array]:
     """Complex sensitivities (F, 3, 3) at F frequencies, the lag taken out, and their standard uncertainties."""
     S, z = estimate[:9], estimate[9:]
-    by_unknown = _log_h(frequency_hz, reference_hz, effects.shape[1]) @ effects.T  # (F, J)
-    h = np.exp(by_unknown @ z)[:, None]
+    by_unknown = known.share * _log_h(frequency_hz, reference_hz, effects.shape[1]) @ effects.T  # (F, J)
+    h = (known.size(frequency_hz, reference_hz) * np.exp(by_unknown @ z))[:, None]
     moves = np.concatenate([h[..., None] * np.eye(9), (S * h)[..., None] * by_unknown[:, None, :]], axis=2)
     variance = np.sum((moves @ covariance) * moves.conj(), axis=2).real
     return np.asarray((S * h).reshape(-1, 3, 3)), np.sqrt(np.maximum(variance, 0.0)).reshape(-1, 3, 3)

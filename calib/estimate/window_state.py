@@ -87,10 +87,14 @@ class WindowState:
 
     def _parameters_factor(self) -> tuple[Array, Array]:
         """S and Q (12,) and a factor of their covariance."""
-        state, factor = self._joint.state, self._over.factor(self._joint.state)
+        state, factor = self._joint.state, self._factor()
         if self._held is not None:
             return self._held.parameters(state, factor)
         return state.mean[:12].copy(), factor[:12].copy()
+
+    def _factor(self) -> Array:
+        """A factor of the covariance of the state, with what the response over frequency adds to it."""
+        return self._over.factor(self._joint.state, self._stated.priors.known_u)
 
     @property
     def shares(self) -> list[ReferenceShare]:
@@ -194,7 +198,7 @@ class WindowState:
             self._held = self._held.moved_by(held_at(summary, self._priors(summary))[0], new)
         if self._held is not None and (first or not self._held.steady):
             steady = self._over.steady(self._joint.state, summary.reference, self._priors(summary))
-            self._held = replace(self._held, steady=steady)
+            self._held = replace(self._held, steady=steady, known_size=self._priors(summary).known_size)
         if first and self._joint.recent:
             self._take_again()  # the windows before this one depend on the response as well
         return rows

@@ -90,12 +90,12 @@ class Aligned:
 def margin_s(instrument: Instrument, rate_hz: float) -> float:
     """How many seconds of the reference beyond both ends of a stretch its windows need."""
     lost = differentiator_lost(rate_hz, instrument.derivatives) + HALF + 1
-    return min(max(LEAST_MARGIN_S, lost / rate_hz), most_margin_s(instrument))
+    return min(max(LEAST_MARGIN_S, lost / rate_hz), most_margin_s(instrument)) + instrument.known.reach_s(rate_hz)
 
 
 def most_margin_s(instrument: Instrument) -> float:
     """The largest `margin_s` at any rate."""
-    return MOST_MARGIN_S if instrument.derivatives else LEAST_MARGIN_S
+    return (MOST_MARGIN_S if instrument.derivatives else LEAST_MARGIN_S) + instrument.known.most_reach_s
 
 
 def windows_of(
@@ -162,7 +162,8 @@ def aligned(
     if instrument.has_corner:
         u = np.hstack([without_corner(u, rate_hz, instrument.corner_hz), integral(u, rate_hz)])
         V = without_corner(V, sensor_rate_hz, instrument.sensor_corner_hz)
-    at = resample(passed(u, rate_hz, response), reference.clock, time_s - lag_s, reference.first_index, lost)
+    u = passed(instrument.known.passed(u, rate_hz), rate_hz, response)
+    at = resample(u, reference.clock, time_s - lag_s, reference.first_index, lost)
     columns = np.vstack([V.T, at.u.T, at.du.T]).T  # the samples of a channel lie side by side, also in what is kept
     columns[~at.usable] = np.nan
     band_hz, noise = _band(raw, at.u[at.usable][:, :m], V, instrument, (rate_hz, sensor_rate_hz), settings.to_hz)
@@ -237,9 +238,8 @@ def _motion(
     if instrument.has_corner:
         pose = with_integral(pose)
     u_lag_s = float(np.hypot(sensor.clock.u_offset_s, reference.clock.u_offset_s))
-    windows = _beside(pose, found, settings)
     taken = () if response.is_flat else response.terms
-    return [replace(_told(window, found), u_lag_s=u_lag_s, response=taken) for window in windows]
+    return [replace(_told(w, found), u_lag_s=u_lag_s, response=taken) for w in _beside(pose, found, settings)]
 
 
 def _beside(pose: Pose, found: Aligned, settings: Settings) -> list[Window]:
@@ -298,14 +298,13 @@ def _band(
 
     `rates_hz`: of the reference and of the sensor. `to_hz` as in Settings.
     """
-    rate_hz, sensor_rate_hz = rates_hz
-    derivatives, m = instrument.derivatives, raw.shape[1]
+    (rate_hz, sensor_rate_hz), derivatives, m = rates_hz, instrument.derivatives, raw.shape[1]
     found_hz, density = band_above_noise(raw, rate_hz)
     density = np.maximum(density, instrument.noise / np.sqrt(0.5 * rate_hz))
     widest_hz = RESAMPLED_BAND * rate_hz
     if derivatives:
         widest_hz = min(DIFFERENTIATED_BAND_HZ, widest_hz)
-    unlimited = noise_in_band(density, widest_hz, derivatives)
+    unlimited = noise_in_band(instrument.known.noise(widest_hz, rate_hz) * density, widest_hz, derivatives)
     whole = u[np.isfinite(u).all(axis=1)]  # one missing sample of the reference makes some of them NaN
     power = np.var(whole, axis=0).max(initial=0.0) if len(whole) else 0.0
     noisy = np.max(unlimited[0] ** 2, initial=0.0) > NOISE_MATTERS * power
@@ -314,7 +313,8 @@ def _band(
     band_hz = min((end_hz for end_hz in ends_hz if end_hz is not None), default=None)
     if band_hz is None:
         return None, unlimited.reshape(2, m)
-    return band_hz, noise_in_band(density, min(FILTER_BAND * band_hz, widest_hz), derivatives)
+    noise_hz = min(FILTER_BAND * band_hz, widest_hz)
+    return band_hz, noise_in_band(instrument.known.noise(noise_hz, rate_hz) * density, noise_hz, derivatives)
 
 
 def _told_hz(V: Array, instrument: Instrument, rate_hz: float, sensor_rate_hz: float) -> float | None:

@@ -86,7 +86,7 @@ class _Search:
 
         If none can be used the sensor may be far too late, or a response may look like a mean that changes.
         """
-        flat = Applied(0.0, self._priors.reference_corner_at_hz, self._priors.sensor_corner_at_hz)
+        flat = Applied(self._priors.lag_at_s, self._priors.reference_corner_at_hz, self._priors.sensor_corner_at_hz)
         windows, applied = self.without_lag(flat)
         if not _used(windows):
             likely = replace(flat, lag_s=_likely_lag_s(self._tables, self._priors, windows))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Literal
 
@@ -13,6 +13,7 @@ from calib.model import Array
 from calib.recorded.certificate import ReferenceCertificate
 from calib.recorded.errors import OptionError
 from calib.signal.instrument import QUANTITIES
+from calib.signal.known_filters import filter_of
 
 Coupling = Literal["dc", "ac"]
 CHOICES: Mapping[str, tuple[Any, ...]] = {
@@ -30,8 +31,10 @@ ABOVE_ZERO = ("nominal", "u_nominal_pct", "reference_frequency_hz")
 class Options:
     """The options. Raises OptionError if a value is out of its range; `check` tells which do not go together.
 
-    `rotation` (3, 3): a = R a_ref. `prior`: S row by row and Q (12,), and their covariance (12, 12), see
-    calib.recorded.priors.prior_of. The u of `reference_certificate` counts in the place of `u_reference_pct`.
+    `sensor_filter`, `reference_filter`: the known filters of an instrument, each in one line of text
+    (calib.signal.known_filters); empty where nobody states any. `rotation` (3, 3): a = R a_ref. `prior`: S row by row
+    and Q (12,), and their covariance (12, 12), see calib.recorded.priors.prior_of. The u of `reference_certificate`
+    counts in the place of `u_reference_pct`.
     """
 
     method: int = 3
@@ -47,6 +50,8 @@ class Options:
     prior: tuple[Array, Array] | None = None
     reference_certificate: ReferenceCertificate | None = None
     reference_frequency_hz: float | None = None
+    sensor_filter: tuple[str, ...] = ()
+    reference_filter: tuple[str, ...] = ()
     reference_corner_hz: float = 0.0
     u_reference_corner_hz: float = 0.0
     sensor_corner_hz: float = 0.0
@@ -68,6 +73,13 @@ class Options:
             value = getattr(self, name)
             if value is not None and value not in choices:
                 raise _wrong(name, value, f"choose one of {', '.join(map(repr, choices))}")
+        for name in ("sensor_filter", "reference_filter"):
+            object.__setattr__(self, name, _lines(getattr(self, name)))
+            for line in getattr(self, name):
+                try:
+                    filter_of(line)
+                except ValueError as error:
+                    raise OptionError(str(error), column=name, value=line) from None
         if self.rotation is not None and np.shape(self.rotation) != (3, 3):
             raise _wrong("rotation", self.rotation, "give a matrix of 3 x 3 numbers, a = R a_ref")
         for name in (f.name for f in fields(self) if f.type in ("float", "float | None")):
@@ -88,8 +100,14 @@ class Options:
             raise OptionError("`rotation` needs a tri-axial `reference`")
         if self.method != 3 and not (reference and poses):
             raise OptionError(f"`method` {self.method} needs `reference` and `poses`")
+        if (self.sensor_filter or self.reference_filter) and (self.method != 3 or self.plain or not reference):
+            raise OptionError("`sensor_filter` and `reference_filter` are for Method 3 with a `reference`, not `plain`")
         if self.method != 3 and self.plain:
             raise OptionError("`plain` is for Method 3 only; remove `plain` or `method`")
+
+
+def _lines(given: str | Sequence[str]) -> tuple[str, ...]:
+    return (given,) if isinstance(given, str) else tuple(map(str, given))
 
 
 def _out_of_range(name: str, value: Any) -> str:

@@ -13,6 +13,7 @@ from calib.model import PARAMETERS, Array, Calibration
 from calib.recorded.errors import OptionError
 from calib.recorded.options import Options
 from calib.signal.instrument import Instrument
+from calib.signal.known_response import KnownResponse, known_of
 
 # Without a stated local value, standard gravity is used. Its error is up to 0.3 %: gravity differs by 0.05 m/s2 between
 # the poles and the equator.
@@ -28,7 +29,16 @@ def priors_of(options: Options) -> Priors:
     parameters, covariance = _known(options)
     told = replace(options, u_gravity_mps2=u_gravity_mps2(options))
     stated = {s.name: s.convert(getattr(told, s.option)) for s in PRIORS.values() if s.option}
-    return Priors(stated, parameters, covariance)
+    return Priors(stated, parameters, covariance).beside_known(known_response(options))
+
+
+def known_response(options: Options) -> KnownResponse:
+    """What is stated of the filters of both instruments; by the reference's certificate, where the options do not."""
+    certificate = options.reference_certificate
+    of_both = known_of(options.sensor_filter, options.reference_filter)
+    if options.reference_filter or certificate is None or not certificate.filters:
+        return of_both
+    return replace(of_both, reference=certificate.filters)
 
 
 def instrument_of(options: Options) -> Instrument:
@@ -38,6 +48,7 @@ def instrument_of(options: Options) -> Instrument:
         u_corner_hz=options.u_reference_corner_hz,
         sensor_corner_hz=options.sensor_corner_hz,
         u_sensor_corner_hz=options.u_sensor_corner_hz,
+        known=known_response(options),
     )
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from calib.signal.known_response import UNKNOWN, KnownResponse
+
 # How many times each quantity must be differentiated to give an acceleration.
 QUANTITIES = {"acceleration": 0, "velocity": 1, "displacement": 2}
 
@@ -16,7 +18,8 @@ class Instrument:
     standard deviation of its own noise over its whole band, in that quantity's SI unit; 0 where nobody stated it: it is
     then found from the data. `corner_hz`, `u_corner_hz`: corner frequency of an AC-coupled reference (first order) and
     its standard uncertainty; both 0 where it responds to constants. `sensor_corner_hz`, `u_sensor_corner_hz`: the same
-    of the sensor beside it. `ac_coupled`: the reference or the sensor does not respond to constants.
+    of the sensor beside it. `ac_coupled`: the reference or the sensor does not respond to constants. `known`: what is
+    stated of the filters of both.
     """
 
     quantity: str = "acceleration"
@@ -27,6 +30,7 @@ class Instrument:
     sensor_corner_hz: float = 0.0
     u_sensor_corner_hz: float = 0.0
     ac_coupled: bool = False
+    known: KnownResponse = UNKNOWN
 
     @property
     def derivatives(self) -> int:
