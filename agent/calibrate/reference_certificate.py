@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from agent.calibrate.earlier import DCC, read_earlier
 from agent.calibrate.origin import source_file
-from agent.config.files import read_file
+from agent.config.earlier import MAIN, EarlierError, identity_in, read_earlier
 from agent.config.knowledge import Certificate
 from agent.config.reading import ConfigError, load_model
 from agent.config.section import Section
 from agent.reading.source import TableError
 from calib.recorded.certificate import ReferenceCertificate
-
-MAIN = [0, 4, 8]
-LARGEST = 64 << 20  # bytes
 
 
 class _Toml(Section):
@@ -32,7 +26,7 @@ def read_reference_certificate(path: Path) -> ReferenceCertificate:
         if path.suffix != ".toml":
             return _of_ours(path, sha256)
         stated = load_model(path, _Toml).certificate
-    except ConfigError as error:
+    except (ConfigError, EarlierError) as error:
         raise TableError(str(error)) from None
     except OSError as error:
         raise TableError(f"{path}: {error.strerror or error}") from None
@@ -53,16 +47,4 @@ def _of_ours(path: Path, sha256: str) -> ReferenceCertificate:
     sensitivity, variance = values[MAIN], np.diag(covariance)[MAIN]
     if not np.isfinite([sensitivity, variance]).all() or (sensitivity <= 0.0).any():
         raise TableError(f"{path}: a main sensitivity of the reference is not known or not above 0")
-    return ReferenceCertificate(str(path), sha256, _serial_number(path), sensitivity, np.sqrt(variance) / sensitivity)
-
-
-def _serial_number(path: Path) -> str:
-    """The serial number of the calibrated instrument; "" in the JSON of a result. After `read_earlier`."""
-    data = read_file(path, LARGEST)
-    if data.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<"):
-        where = f".//{{{DCC}}}item/{{{DCC}}}identifications/{{{DCC}}}identification/{{{DCC}}}value"
-        return ET.fromstring(data).findtext(where) or ""
-    told = json.loads(data)
-    for name in ("certificate", "stated", "instrument", "serial_number"):
-        told = told.get(name, "") if isinstance(told, dict) else ""
-    return told if isinstance(told, str) else ""
+    return ReferenceCertificate(str(path), sha256, identity_in(path)[0], sensitivity, np.sqrt(variance) / sensitivity)

@@ -10,8 +10,8 @@ from typing import Any
 import click
 import numpy as np
 
-from agent.calibrate.earlier import read_earlier
 from agent.calibrate.reference_certificate import read_reference_certificate
+from agent.config.earlier import EarlierError, read_earlier
 from agent.reading.source import TableError
 from calib.model import Array
 from calib.recorded.errors import OptionError
@@ -43,6 +43,8 @@ def read_prior(path: Path) -> tuple[Array, Array]:
         return prior_of(*read_earlier(path))
     except OptionError as error:
         raise TableError(f"{path}: {error.problem}") from None
+    except EarlierError as error:
+        raise TableError(str(error)) from None
 
 
 def _rotation(text: str) -> Array:

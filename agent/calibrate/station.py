@@ -14,9 +14,9 @@ import numpy as np
 
 from agent import __version__
 from agent.config.files import read_file
+from agent.config.xml import check_xml
 from agent.reading.source import TableError
 from agent.reading.stationxml import LARGEST, Component, import_obspy
-from agent.reading.xml import check_xml
 from calib.geometry import STANDARD_GRAVITY_MPS2
 from calib.model import Array
 from calib.recorded.options import Options

@@ -12,11 +12,11 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from agent import __version__
-from agent.calibrate.earlier import COVARIANCE, DCC, PARAMETER_LIST, SI
 from agent.calibrate.origin import SourceFile
 from agent.certificate.content import COVERAGE_PROBABILITY, EQUATION, Certificate, CertificateError
 from agent.certificate.signing import Signer
 from agent.certificate.statements import NOT_IN_XML, Contact
+from agent.config.earlier import COVARIANCE, DCC, PARAMETER_LIST, SI
 from agent.report.units import output_unit
 from agent.terminal.text import one_line
 from calib.model import PARAMETERS, Array

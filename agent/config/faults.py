@@ -9,6 +9,7 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
+from agent.config.certified import filled_in
 from agent.config.key_file import KeyFileError, load_private_key
 from agent.config.known_keys import read_known_keys
 from agent.config.lines import Path
@@ -30,7 +31,7 @@ _PATH = re.compile(r"([a-z_]\w*(?:\.\w+)*): ")  # with which a check of several 
 def faults_of(raw: Mapping[str, Any]) -> tuple[Config | None, list[Told]]:
     """The configuration, None where it is none, and all faults: what the sections say, names, drivers and files."""
     config: Config | None = None
-    faults: list[Told] = []
+    raw, faults = filled_in(raw)
     named = list(name_faults(raw))
     try:
         config = Config.model_validate(raw)
@@ -74,7 +75,9 @@ def _unknown_sensitivities(raw: Mapping[str, Any], options: Mapping[str, Options
     """Channels whose sensor tells no sensitivity and whose prior states none: nothing could be calibrated."""
     for i, channel in enumerate(_entries(raw, "channels")):
         prior, sensor = channel.get("prior"), str(channel.get("sensor"))
-        if not isinstance(prior, Mapping) or prior.get("sensitivity") is not None or sensor not in options:
+        if not isinstance(prior, Mapping) or sensor not in options:
+            continue
+        if prior.get("sensitivity") is not None or prior.get("file"):  # what is wrong with the file is a fault already
             continue
         if not options[sensor].tells_sensitivity:
             what = f"is missing: the device {sensor!r} tells none; state it in its unit per m/s2, from its data sheet"
@@ -89,7 +92,8 @@ def _uncertified_references(raw: Mapping[str, Any], options: Mapping[str, Option
         if isinstance(beside, Mapping):
             places.append((("check_reference",), beside.get("device"), beside.get("certificate")))
         for path, device, certificate in places:
-            stated = certificate.get("sensitivity") if isinstance(certificate, Mapping) else None
+            held = certificate if isinstance(certificate, Mapping) else {}
+            stated = held.get("sensitivity") or held.get("file")
             if stated is None and device in options and (asked := options[str(device)].asked_of_certificate):
                 yield ("channels", i, *path, "certificate", "sensitivity"), f"is missing for {device!r}: {asked}"
 

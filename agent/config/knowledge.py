@@ -27,6 +27,9 @@ Percent = Annotated[float, Field(gt=0, le=100)]
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Nine = tuple[float, float, float, float, float, float, float, float, float]
+NinePositive = tuple[Positive, Positive, Positive, Positive, Positive, Positive, Positive, Positive, Positive]
+PositiveVector = tuple[Positive, Positive, Positive]
+Sha256 = Annotated[str, Field(pattern="^([0-9a-f]{64})?$", description="of `file`; if stated, the file must have it")]
 
 
 class Prior(Section):
@@ -36,14 +39,21 @@ class Prior(Section):
     the data sheet's, which the drivers of the chips know. `offset` is in m/s2, as are its uncertainties. `corner_hz`
     and `u_corner_hz` are of an AC-coupled sensor (first order), 0 where it responds to constants. `filters` are the
     known ones of the sensor; left out, they are the driver's. S holds at `reference_frequency_hz`; 0 takes the middle
-    of the band of the first window.
+    of the band of the first window. `file` names an earlier result or a certificate of `fieldcal certificate` (JSON, or
+    DCC XML) instead: the program reads it once, at the start, and fills in `sensitivity`, `u_sensitivity`, and the
+    offset where the file knows it.
     """
 
+    file: Annotated[str, Field(description="result or certificate that states S and Q")] = ""
+    file_sha256: Sha256 = ""
     sensitivity: Positive | Nine | None = None
+    u_sensitivity: Annotated[
+        NinePositive | None, Field(description="of all nine, in place of u_main_pct and u_transverse_pct")
+    ] = None
     u_main_pct: Percent = 5.0
     u_transverse_pct: Percent = 3.0  # of the main one: data sheets of MEMS say 1 to 3 %
     offset_mps2: Vector = (0.0, 0.0, 0.0)
-    u_offset_mps2: Positive = 20.0  # two g: nothing is known
+    u_offset_mps2: Positive | PositiveVector = 20.0  # two g: nothing is known
     corner_hz: NotNegative = 0.0
     u_corner_hz: NotNegative = 0.0
     filters: Filters = ()
@@ -65,7 +75,8 @@ class Prior(Section):
         """(12,) of what `mean` gave, in its units."""
         scale = scale_of(mean[:9].reshape(3, 3))
         share = np.where(np.eye(3).ravel() > 0, self.u_main_pct, self.u_transverse_pct) / 100.0
-        return scale * np.append(share, np.full(3, self.u_offset_mps2))
+        u_S = scale * share if self.u_sensitivity is None else np.array(self.u_sensitivity)
+        return np.append(u_S, scale * np.broadcast_to(self.u_offset_mps2, 3))
 
 
 def scale_of(S: Array) -> float:
@@ -98,9 +109,13 @@ class Certificate(Section):
     `u_sensitivity_pct` holds on the date `calibrated`. Since then the reference may have drifted: by a random walk
     whose standard uncertainty after one year is `stability_pct`. `interval_years` is the time after which the reference
     must be calibrated again; `fieldcal check` tells when it is over. `filters` and the table `response` are divided out
-    of the data; left out, the filters are the driver's.
+    of the data; left out, the filters are the driver's. `file` names a certificate of `fieldcal certificate` (JSON, or
+    DCC XML) instead: the program reads it once, at the start, and fills in `sensitivity` (the mean of the three main
+    ones), its u, which covers their spread, the serial number and the date.
     """
 
+    file: Annotated[str, Field(description="certificate of the reference")] = ""
+    file_sha256: Sha256 = ""
     quantity: Annotated[str, AfterValidator(_quantity)] = "acceleration"
     sensitivity: Annotated[float, Field(gt=0, description="indication per SI unit of the quantity")] = 1.0
     u_sensitivity_pct: Annotated[float, Field(gt=0, le=50)] = 0.1

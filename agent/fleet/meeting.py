@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from agent.calibrate.calibrating import reference_of, sensor_of, tables_of
-from agent.calibrate.earlier import read_earlier
 from agent.calibrate.stated import options_of
 from agent.calibrate.tables import ReferenceFile
+from agent.config.earlier import EarlierError, read_earlier
 from agent.fleet.site_file import DeviceSection
 from agent.reading.source import TableError
 from calib.estimate.device import Device
@@ -53,7 +53,10 @@ def stated(section: DeviceSection, directory: Path) -> tuple[Array, Array] | Non
     """
     if section.certificate is not None:
         path = directory / section.certificate
-        mean, covariance = read_earlier(path)
+        try:
+            mean, covariance = read_earlier(path)
+        except EarlierError as error:
+            raise TableError(str(error)) from None
         if not (np.isfinite(mean).all() and np.isfinite(covariance).all()):
             raise TableError(f"{path}: not all parameters and covariances are known; they are needed of a reference")
         if np.linalg.cond(mean[:9].reshape(3, 3)) > WORST_CONDITION:

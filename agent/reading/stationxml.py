@@ -16,8 +16,8 @@ import msgspec
 import numpy as np
 
 from agent.config.files import read_file
+from agent.config.xml import XmlError, check_xml
 from agent.reading.source import Array, TableError
-from agent.reading.xml import XmlError, check_xml
 
 LARGEST = 64 << 20  # bytes of a StationXML
 DERIVATIVES = {"M/S**2": 0, "M/S": 1, "M": 2}  # how many times the quantity is differentiated to give an acceleration

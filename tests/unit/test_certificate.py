@@ -16,10 +16,10 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 
-from agent.calibrate.earlier import DCC, PARAMETER_LIST, SI, read_earlier
 from agent.certificate.schema import SchemaError, check_schema
 from agent.certificate.signing import PURPOSE, signed_json
 from agent.cli.main import run_cli
+from agent.config.earlier import DCC, PARAMETER_LIST, SI, read_earlier
 from agent.recording.signed_text import SignedText, values_of
 from tests.unit.certificates import content, run, stated, uneven
 from tests.unit.recorded_bench import record

@@ -9,8 +9,7 @@ from typing import Any
 
 import pytest
 
-from agent.calibrate.earlier import DCC, read_earlier
-from agent.reading.source import TableError
+from agent.config.earlier import DCC, EarlierError, read_earlier
 from tests.unit.certificates import BANDS, content, run, stated
 from tests.unit.test_report_numbers import fields
 
@@ -31,7 +30,7 @@ def test_what_is_no_certificate_is_refused(text: str, words: str, tmp_path: Path
     path = tmp_path / "prior"
     for encoding in ("utf-8", "utf-16") if text.startswith("<!") else ("utf-8",):
         path.write_text(text, encoding=encoding)
-        with pytest.raises(TableError, match=words if encoding == "utf-8" else "prior: "):
+        with pytest.raises(EarlierError, match=words if encoding == "utf-8" else "prior: "):
             read_earlier(path)
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agent.calibrate.earlier import read_earlier
 from agent.cli.main import run_cli
+from agent.config.earlier import read_earlier
 from tests.unit.drawn_recording import Devices, Recording
 from tests.unit.recorded_bench import record
 

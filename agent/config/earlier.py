@@ -13,29 +13,54 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from agent.config.files import read_file
-from agent.reading.source import TableError
-from agent.reading.xml import XmlError, check_xml
+from agent.config.xml import XmlError, check_xml
 from calib.model import PARAMETERS, Array
 
 LARGEST = 64 << 20  # bytes; a result lists all its windows, each with 0.3 kB
 DCC, SI = "https://ptb.de/dcc", "https://ptb.de/si"  # namespaces
 PARAMETER_LIST, COVARIANCE = "fieldcal_parameters", "fieldcal_covariance"  # refType of what is ours in a DCC
+MAIN = [0, 4, 8]  # places of the main sensitivities among the parameters
+
+
+class EarlierError(Exception):
+    """The file does not say S and Q. The message names the file, the reason and the remedy."""
 
 
 def read_earlier(path: Path) -> tuple[Array, Array]:
-    """S row by row and Q (12,), and their covariance (12, 12); NaN where nothing is known. Raises TableError."""
+    """S row by row and Q (12,), and their covariance (12, 12); NaN where nothing is known. Raises EarlierError."""
     try:
         data = read_file(path, LARGEST)
         return _from_xml(data) if data.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<") else _from_json(data)
     except OSError as error:
-        raise TableError(f"{path}: {error.strerror}") from None
+        raise EarlierError(f"{path}: {error.strerror}") from None
     except _OtherXmlError as error:
-        raise TableError(f"{path}: {error}") from None
+        raise EarlierError(f"{path}: {error}") from None
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise TableError(
+        raise EarlierError(
             f"{path}: the file is neither a result of `fieldcal calibrate --json -` "
             f"nor a certificate of `fieldcal certificate`: {error}"
         ) from None
+
+
+def identity_in(path: Path) -> tuple[str, str]:
+    """Serial number of the calibrated instrument and last day of its calibration; "" where the file states none.
+
+    Only for a file that `read_earlier` read. Raises OSError.
+    """
+    data = read_file(path, LARGEST)
+    if data.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<"):
+        root = ET.fromstring(check_xml(data))
+        item = "/".join(f"{{{DCC}}}{tag}" for tag in ("item", "identifications", "identification", "value"))
+        return root.findtext(f".//{item}") or "", root.findtext(f".//{{{DCC}}}endPerformanceDate") or ""
+    told = json.loads(data)
+    return _text(told, "instrument", "serial_number"), _text(told, "dates", "ended")
+
+
+def _text(told: Any, *names: str) -> str:
+    """A text among the statements of a certificate in JSON."""
+    for name in ("certificate", "stated", *names):
+        told = told.get(name, "") if isinstance(told, dict) else ""
+    return told if isinstance(told, str) else ""
 
 
 class _OtherXmlError(Exception):
@@ -61,7 +86,7 @@ def _from_xml(data: bytes) -> tuple[Array, Array]:
     if quantity is None:
         raise _OtherXmlError(
             f"the DCC has no quantity with refType {COVARIANCE}, so it is not from `fieldcal certificate`; "
-            "state its sensitivity with --nominal"
+            "state its sensitivity and uncertainty by hand (calibrate: --nominal; configuration: prior or certificate)"
         )
     labels = (quantity.findtext(f"{{{SI}}}labelXMLList") or "").split()
     columns = quantity.findall(f".//{{{SI}}}column")
