@@ -41,11 +41,13 @@ def test_it_may_open_as_many_files_as_the_system_allows() -> None:
         router = router_process("--listen", "tcp/127.0.0.1:0")
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
-    assert router.stdout is not None
-    router.stdout.readline()
-    assert resource.prlimit(router.pid, resource.RLIMIT_NOFILE) == (hard, hard)
-    router.terminate()
-    router.communicate(timeout=5)
+    try:
+        assert router.stdout is not None
+        router.stdout.readline()
+        assert resource.prlimit(router.pid, resource.RLIMIT_NOFILE) == (hard, hard)
+    finally:
+        router.kill()
+        router.communicate()
 
 
 def test_a_thousand_gateways_and_more_may_connect(monkeypatch: pytest.MonkeyPatch) -> None:
