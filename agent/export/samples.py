@@ -139,6 +139,11 @@ class _Clocked:
         if told is None:
             return
         clock = told[0]
+        if not 0.0 < clock.rate_hz < np.inf:
+            raise ExportError(
+                f"{self._content.device}: the times of its samples do not rise (rate {clock.rate_hz:.3g} Hz), so that "
+                "they cannot be exported; `fieldcal audit` says whether the recording is damaged"
+            )
         times_s = clock.time_of(block.first_index + np.arange(block.n))
         values = np.asarray(block.indications, dtype=np.float64)
         newest = self._content.calibrations[-1] if self._content.calibrations else None

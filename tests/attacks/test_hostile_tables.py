@@ -13,6 +13,7 @@ import pytest
 
 from agent.calibrate.reference_certificate import read_reference_certificate
 from agent.calibrate.tables import read_sensor
+from agent.cli.main import run_cli
 from agent.proto import fieldcal_pb2 as pb
 from agent.reading.recording import HOLES_MAX
 from agent.reading.source import TableError
@@ -158,3 +159,24 @@ def test_a_pose_that_lasts_for_ever_takes_no_time(start_s: float, stop_s: float)
     (window,) = Tables(table, None, [PoseInterval(start_s, stop_s, pose)], Instrument()).windows()
     assert window.used
     assert 300 < window.points <= 400
+
+
+@pytest.mark.parametrize("ending", ["csv", "wav", "mseed"])
+def test_samples_whose_times_do_not_rise_are_not_exported(
+    ending: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if ending == "mseed":
+        pytest.importorskip("obspy", reason="the extra seismic is not installed")
+
+    def backwards(topic: str, message: Any) -> None:
+        if topic.endswith("/raw"):
+            first_ns = began_ns.setdefault(message.device, message.burst_t_monotonic_ns[0])
+            message.burst_t_monotonic_ns[:] = [2 * first_ns - ns for ns in message.burst_t_monotonic_ns]
+
+    began_ns: dict[str, int] = {}
+    path = changed(tmp_path / "backwards.mcap", backwards)
+    assert run_cli(["export", str(path), "--to", str(tmp_path / f"out.{ending}")]) == 2
+    assert capsys.readouterr().err.startswith(
+        "fieldcal export: imu: the times of its samples do not rise (rate -100 Hz)"
+    )
+    assert not (tmp_path / f"out.{ending}").exists()
