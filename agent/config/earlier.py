@@ -35,7 +35,7 @@ def read_earlier(path: Path) -> tuple[Array, Array]:
         raise EarlierError(f"{path}: {error.strerror}") from None
     except _OtherXmlError as error:
         raise EarlierError(f"{path}: {error}") from None
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise EarlierError(
             f"{path}: the file is neither a result of `fieldcal calibrate --json -` "
             f"nor a certificate of `fieldcal certificate`: {error}"

@@ -61,7 +61,7 @@ class Forwarding:
             said = await anyio.to_thread.run_sync(send, self._endpoints, self._tls, key, data, limiter=self._at_once)
             answer = json.loads(said)
             told = {"taken": answer["taken"] is True, "reason": str(answer["reason"])}
-        except (ConnectionError, ValueError, KeyError, TypeError, RecursionError) as error:
+        except (ConnectionError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
             self._note(asked, f"{verb} by {user.name}, key {key_id}: {error}")
             raise HTTPException(502, f"no answer: {error}") from None
         outcome = "taken" if told["taken"] else f"refused: {told['reason']}"

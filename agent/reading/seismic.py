@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +33,7 @@ def open_miniseed(path: Path) -> MiniSeed:
     missing for a time has gaps there. Raises TableError.
     """
     obspy = import_obspy()
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), _quiet_callbacks():
         warnings.simplefilter("ignore")
         try:
             stream = obspy.read(str(path), format="MSEED")
@@ -57,6 +59,16 @@ def open_miniseed(path: Path) -> MiniSeed:
             column = Column(AXES.get(code, code or "a"), "counts", group)
             values[column], seed_ids[column] = _whole(trace.data, at, length), trace.id
     return MiniSeed(path, values, seed_ids)
+
+
+@contextmanager
+def _quiet_callbacks() -> Iterator[None]:
+    """Where a damaged header is no text, a callback of ObsPy fails, and Python would print that with its traceback."""
+    before, sys.unraisablehook = sys.unraisablehook, lambda _: None
+    try:
+        yield
+    finally:
+        sys.unraisablehook = before
 
 
 def _whole(data: Array, first: int, length: int) -> Array:

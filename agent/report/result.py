@@ -203,7 +203,7 @@ def _array(value: Any, shape: tuple[int, ...], where: str) -> Array:
         array = np.where(array == None, np.nan, array).astype(float)  # noqa: E711 - elementwise
         if array.shape not in (shape, ()):
             raise ValueError
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         size = " x ".join(str(n) for n in shape)
         raise ResultError(f"field {where}: must be {size} numbers or null, not {_short(value)}") from None
     return np.broadcast_to(array, shape).copy()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,10 @@ import pytest
 from agent.calibrate.reference_certificate import read_reference_certificate
 from agent.calibrate.tables import read_sensor
 from agent.cli.main import run_cli
+from agent.config.earlier import EarlierError, read_earlier
 from agent.proto import fieldcal_pb2 as pb
 from agent.reading.recording import HOLES_MAX
+from agent.reading.seismic import open_miniseed
 from agent.reading.source import TableError
 from calib.model import Pose
 from calib.recorded.poses import PoseInterval
@@ -180,3 +183,27 @@ def test_samples_whose_times_do_not_rise_are_not_exported(
         "fieldcal export: imu: the times of its samples do not rise (rate -100 Hz)"
     )
     assert not (tmp_path / f"out.{ending}").exists()
+
+
+def test_a_number_too_large_for_a_result_is_told(tmp_path: Path) -> None:
+    result = uneven()
+    result["covariance"][0][0] = 10**400
+    path = tmp_path / "result.json"
+    path.write_text(json.dumps(result))
+    with pytest.raises(EarlierError, match="int too large"):
+        read_earlier(path)
+
+
+def test_a_header_of_miniseed_that_is_no_text_shows_no_traceback(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    obspy = pytest.importorskip("obspy", reason="the extra seismic is not installed")
+    path = tmp_path / "a.mseed"
+    header = {"network": "XX", "station": "A", "channel": "HNZ", "sampling_rate": 100.0}
+    obspy.Stream([obspy.Trace(np.arange(400, dtype=np.int32), header)]).write(path, format="MSEED", encoding="STEIM2")
+    data = bytearray(path.read_bytes())
+    data[8], data[70:74] = 0xA0, b"\xff\xff\xff\xff"  # of the station's name; the codes of the samples
+    path.write_bytes(data)
+    with suppress(TableError):
+        open_miniseed(path)
+    assert "Traceback" not in capfd.readouterr().err
