@@ -200,7 +200,7 @@ def _left(site: SimulatedSite, x: Array, where: dict[tuple[str, ...], slice]) ->
                 a = a @ (turned(x[where["rotation", f"{m}"]]) @ meeting.rotation).T
             left = V - a @ S.T - Q
             # Noise and one offset for the window: the mean of the samples gets its own, smaller weight.
-            offset = site.stated.offset_mps2 * np.linalg.norm(site.S[meeting.sensor]) / np.sqrt(3.0)
+            offset = site.stated.offset_mps2  # of a sensor whose scale is 1 by what was known of it beforehand
             share = 1.0 / np.sqrt(1.0 + len(V) * (offset / site.noise_mps2) ** 2)
             yield ((left - (1.0 - share) * left.mean(axis=0)) / site.noise_mps2).ravel()
 

@@ -212,7 +212,7 @@ def _same_section(before: str, section: object) -> bool:
     fields = type(section).model_fields.items()
     defaults = {name: field.default for name, field in fields if not field.is_required()}
     were = {**defaults, **msgspec.json.decode(before)}
-    return bool(msgspec.to_builtins(were) == section.model_dump(mode="json"))
+    return bool(msgspec.json.decode(msgspec.json.encode(were)) == section.model_dump(mode="json"))
 
 
 def _same_mount(name: str, before: dict[str, str], now: dict[str, str]) -> bool:
