@@ -141,5 +141,6 @@ def own_channels(channels: int) -> int:
 
 
 def scale_of(parameters: Array) -> float:
-    """A sensor's scale in output unit per m/s2: root mean square of the main sensitivities among `parameters` (12,)."""
+    """A sensor's scale in output unit per m/s2: root mean square of the main sensitivities in `parameters`, which begin
+    with S row by row."""
     return float(np.sqrt(np.mean(parameters[[0, 4, 8]] ** 2)))

@@ -11,7 +11,7 @@ import numpy as np
 from agent.config import Channel
 from calib.estimate.next_stop import COVERAGE_FACTOR
 from calib.estimate.quantities import S_AND_Q, YEAR_DAYS
-from calib.model import Array
+from calib.model import Array, scale_of
 
 MONTHS = (0, 1, 3, 6, 12)
 MONTH_DAYS = YEAR_DAYS / 12.0
@@ -34,7 +34,7 @@ class Growth:
 
     def variance_after(self, days: float) -> Array:
         """(12,) of S and Q, in the squares of their units."""
-        c, scale = self.channel, float(np.sqrt(np.mean(np.diag(self.sensitivity) ** 2)))
+        c, scale = self.channel, scale_of(self.sensitivity.ravel())
         walk = c.wander().variance_a_day(S_AND_Q, scale, c.gravity_mps2)
         p, t = c.process, c.temperature
         grown = walk * days

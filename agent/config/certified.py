@@ -14,8 +14,8 @@ import numpy as np
 
 from agent.config.earlier import LARGEST, MAIN, EarlierError, identity_in, read_earlier
 from agent.config.files import read_file
-from agent.config.knowledge import scale_of
 from agent.config.names import Told
+from calib.model import scale_of
 
 SPREADS = ("sensitivity", "u_sensitivity", "u_main_pct", "u_transverse_pct", "offset_mps2", "u_offset_mps2")
 CERTIFIED = ("sensitivity", "u_sensitivity_pct", "serial_number", "calibrated")
@@ -80,7 +80,7 @@ def _prior(path: FilePath) -> dict[str, Any]:
         )
     found: dict[str, Any] = {"sensitivity": values[:9].tolist(), "u_sensitivity": u[:9].tolist()}
     if np.isfinite(values[9:]).all() and (u[9:] > 0.0).all():
-        scale = scale_of(values[:9].reshape(3, 3))
+        scale = scale_of(values)
         found |= {"offset_mps2": (values[9:] / scale).tolist(), "u_offset_mps2": (u[9:] / scale).tolist()}
     return found
 

@@ -18,7 +18,7 @@ from agent.config.section import Section, Vector
 from calib.estimate.nuisances import Priors
 from calib.estimate.quantities import PRIORS, WALKS, YEAR_DAYS, Statement
 from calib.estimate.wander import TemperatureModel, Wander
-from calib.model import Array
+from calib.model import Array, scale_of
 from calib.signal.instrument import QUANTITIES, Instrument
 from calib.signal.known_filters import Filter, filter_of
 from calib.signal.known_response import KnownResponse
@@ -69,19 +69,14 @@ class Prior(Section):
             S = np.reshape(self.sensitivity, (3, 3))
         else:
             S = self.sensitivity * np.eye(3)
-        return np.append(S.ravel(), scale_of(S) * np.array(self.offset_mps2))
+        return np.append(S.ravel(), scale_of(S.ravel()) * np.array(self.offset_mps2))
 
     def standard_uncertainty(self, mean: Array) -> Array:
         """(12,) of what `mean` gave, in its units."""
-        scale = scale_of(mean[:9].reshape(3, 3))
+        scale = scale_of(mean)
         share = np.where(np.eye(3).ravel() > 0, self.u_main_pct, self.u_transverse_pct) / 100.0
         u_S = scale * share if self.u_sensitivity is None else np.array(self.u_sensitivity)
         return np.append(u_S, scale * np.broadcast_to(self.u_offset_mps2, 3))
-
-
-def scale_of(S: Array) -> float:
-    """Output unit per m/s2: root mean square of the main sensitivities."""
-    return float(np.sqrt(np.mean(np.diag(S) ** 2)))
 
 
 def _quantity(name: str) -> str:
