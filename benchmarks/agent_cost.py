@@ -104,37 +104,49 @@ def first_block_s(config: Path, data_dir: Path) -> float:
     return (first.t_monotonic_ns - began_ns) * 1e-9
 
 
+@contextmanager
+def twins(directory: Path) -> Iterator[None]:
+    """The sensor and the reference, begun anew, so that the positions come when the configuration says."""
+    serving = [sys.executable, "-m", "agent", "simulate", "--preset", "plain", "--link", str(directory / "port")]
+    process = subprocess.Popen(serving, stdout=subprocess.DEVNULL)
+    try:
+        while not (directory / "port-sensor").exists():
+            time.sleep(0.05)
+        yield
+    finally:
+        process.terminate()
+        process.wait(10)
+
+
 def main() -> None:
     """Measure and write the table."""
     with tempfile.TemporaryDirectory() as name:
         directory = Path(name)
         config = directory / "config.toml"
         config.write_text(CONFIG.format(link=directory / "port"))
-        serving = [sys.executable, "-m", "agent", "simulate", "--preset", "plain", "--link", str(directory / "port")]
-        twins = subprocess.Popen(serving, stdout=subprocess.DEVNULL)
         router = subprocess.Popen(
             [sys.executable, "-m", "agent", "router", "--listen", "tcp/127.0.0.1:7449"], stdout=subprocess.DEVNULL
         )
         try:
-            while not (directory / "port-sensor").exists():
-                time.sleep(0.05)
-            starts = sorted(first_block_s(config, directory / f"start{i}") for i in range(5))
+            with twins(directory):
+                starts = sorted(first_block_s(config, directory / f"start{i}") for i in range(5))
             shares, peaks = {"agent": [], "screen": [], "bare": []}, []
             for turn in range(2):
                 data = str(directory / f"data{turn}")
                 running = ["-m", "agent", "run", str(config), "--data-dir"]
-                share, peak = measure([*running, data])
+                with twins(directory):
+                    share, peak = measure([*running, data])
                 shares["agent"].append(share)
                 peaks.append(peak)
-                with terminal() as drawing:
+                with twins(directory), terminal() as drawing:
                     share, _ = measure([*running, data + "-screen"], stdout=drawing)
                 shares["screen"].append(share)
-                share, _ = measure(["-m", "benchmarks.bare_loop", str(config), data + "-bare", "600"])
+                with twins(directory):
+                    share, _ = measure(["-m", "benchmarks.bare_loop", str(config), data + "-bare", "600"])
                 shares["bare"].append(share)
         finally:
-            for process in (twins, router):
-                process.terminate()
-                process.wait(10)
+            router.terminate()
+            router.wait(10)
     agent, screen, bare = (sum(shares[k]) / len(shares[k]) for k in ("agent", "screen", "bare"))
     cost = f"{agent / bare:.2f} ({agent:.1%} against {bare:.1%} of a core)"
     drawn = f"{screen / agent:.2f} ({screen:.1%} of a core)"
@@ -144,7 +156,7 @@ def main() -> None:
         f"""
 `python -m benchmarks agent_cost` on {machine()}; sensor 1 kHz x 3 and reference 1 kHz on two serial ports (served by
 another process). The agent records them, finds windows, and publishes to a router. {MEASURED_S:g} s are measured after
-a warm-up of {WARM_UP_S:g} s; all three processes are measured in turn, twice.
+a warm-up of {WARM_UP_S:g} s; all three processes are measured in turn, twice, each beside instruments that begin anew.
 
 | figure | measured | goal |
 | --- | --- | --- |

@@ -7,14 +7,16 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
-from xml.etree import ElementTree as ET
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from agent.config.files import read_file
 from agent.config.xml import XmlError, check_xml
 from calib.model import PARAMETERS, Array
+
+if TYPE_CHECKING:
+    from xml.etree.ElementTree import Element
 
 LARGEST = 64 << 20  # bytes; a result lists all its windows, each with 0.3 kB
 DCC, SI = "https://ptb.de/dcc", "https://ptb.de/si"  # namespaces
@@ -49,7 +51,7 @@ def identity_in(path: Path) -> tuple[str, str]:
     """
     data = read_file(path, LARGEST)
     if data.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<"):
-        root = ET.fromstring(check_xml(data))
+        root = _parsed(data)
         item = "/".join(f"{{{DCC}}}{tag}" for tag in ("item", "identifications", "identification", "value"))
         return root.findtext(f".//{item}") or "", root.findtext(f".//{{{DCC}}}endPerformanceDate") or ""
     told = json.loads(data)
@@ -75,11 +77,17 @@ def _from_json(data: bytes) -> tuple[Array, Array]:
     return values, np.array(told["covariance"], dtype=float)
 
 
-def _from_xml(data: bytes) -> tuple[Array, Array]:
+def _parsed(data: bytes) -> Element:
+    from xml.etree import ElementTree  # few configurations name a certificate in XML
+
     try:
-        root = ET.fromstring(check_xml(data))
-    except (XmlError, ET.ParseError) as error:
+        return ElementTree.fromstring(check_xml(data))
+    except (XmlError, ElementTree.ParseError) as error:
         raise _OtherXmlError(f"{error}" if isinstance(error, XmlError) else f"the XML is broken: {error}") from None
+
+
+def _from_xml(data: bytes) -> tuple[Array, Array]:
+    root = _parsed(data)
     if root.tag != f"{{{DCC}}}digitalCalibrationCertificate":
         raise _OtherXmlError("the XML is no digital calibration certificate (DCC)")
     quantity = root.find(f".//{{{DCC}}}quantity[@refType='{COVARIANCE}']/{{{SI}}}realListXMLList")

@@ -69,7 +69,7 @@ def new_file(path: Path) -> Iterator[BinaryIO]:
 
 def content_of(paths: Sequence[Path], device: str | None) -> Content:
     """Look through the recordings for the device; without a name, for the only sensor. Raises ExportError."""
-    names = list(dict.fromkeys(c.sensor for path in paths for c in recorded_config(_start(path).config_json).channels))
+    names = list(dict.fromkeys(sensor for path in paths for sensor in sensors_of(path)))
     if device is None and len(names) != 1:
         raise ExportError(f"{paths[0]}: has the sensors {', '.join(names)}; choose one with --device")
     found = Content(device or names[0])
@@ -188,6 +188,14 @@ def _steps(path: Path, faults: list[str]) -> Iterator[Step]:
         if reader.fault.kind == "corrupt":
             raise ExportError(f"{path}: damaged at {reader.fault}; `fieldcal audit {path}` says more")
         faults.append(f"{path}: ends early, at {reader.fault}; the samples before this place are exported")
+
+
+def sensors_of(path: Path) -> list[str]:
+    """The sensors of a recording's configuration. Raises ExportError."""
+    try:
+        return [channel.sensor for channel in recorded_config(_start(path).config_json).channels]
+    except ValueError as error:
+        raise ExportError(f"{path}: its configuration cannot be read: {error}") from None
 
 
 def _start(path: Path) -> RunStart:

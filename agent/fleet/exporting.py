@@ -10,11 +10,9 @@ from pathlib import Path, PurePosixPath
 
 import msgspec
 
-from agent.config import recorded_config
-from agent.export.samples import Content, ExportError, content_of, samples
+from agent.export.samples import Content, content_of, samples, sensors_of
 from agent.export.seismic import write_mseed
 from agent.export.tables import write_csv, write_parquet, write_wav
-from agent.recording.reading import first_event
 
 Write = Callable[..., int]
 WRITE: dict[str, Write] = {"csv": write_csv, "parquet": write_parquet, "wav": write_wav, "mseed": write_mseed}
@@ -36,10 +34,7 @@ def exported(path: Path, place: str, ending: str, directory: Path) -> list[Expor
 
     A file is complete or not there at all; one that is there is replaced. Raises ExportError or OSError.
     """
-    start = first_event(path)
-    if start is None:
-        raise ExportError("not a recording made by fieldcal")
-    sensors = dict.fromkeys(channel.sensor for channel in recorded_config(start.config_json).channels)
+    sensors = dict.fromkeys(sensors_of(path))
     return [_exported(path, content_of([path], sensor), stem(place), ending, directory) for sensor in sensors]
 
 

@@ -94,7 +94,7 @@ def meetings_in(paths: Sequence[Path]) -> tuple[list[Device], list[Meeting]]:
 def _channels(path: Path, start: RunStart) -> Iterator[Recorded]:
     try:
         config = recorded_config(start.config_json)
-    except (ValueError, KeyError, TypeError, OverflowError) as error:
+    except (ValueError, OverflowError) as error:
         raise TableError(f"{path}: its configuration cannot be read: {error}") from None
     infos = {
         step.event.device: step.event.info_json

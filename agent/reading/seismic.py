@@ -11,11 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from agent.reading.source import Array, Arrays, Column, Grid, Slices, TableError
+from agent.reading.source import Array, Arrays, Column, Grid, Slices, TableError, check_announced
 from agent.reading.stationxml import import_obspy
 
 # The last letter of a channel's code names its component: east, north and up are x, y and z.
 AXES = {"E": "x", "N": "y", "Z": "z"}
+MERGED_BYTES = 16  # of each sample, for the channel whose traces are merged
 
 
 class MiniSeed(Arrays):
@@ -37,7 +38,10 @@ def open_miniseed(path: Path) -> MiniSeed:
         warnings.simplefilter("ignore")
         try:
             stream = obspy.read(str(path), format="MSEED")
+            check_announced(path, _size_bytes(stream))
             stream.merge(method=0)
+        except TableError:
+            raise
         except Exception as error:  # ObsPy raises many kinds for broken files
             raise TableError(f"{path}: the file cannot be read: {error}; write it anew") from None
     values: dict[Column, Slices] = {}
@@ -59,6 +63,17 @@ def open_miniseed(path: Path) -> MiniSeed:
             column = Column(AXES.get(code, code or "a"), "counts", group)
             values[column], seed_ids[column] = _whole(trace.data, at, length), trace.id
     return MiniSeed(path, values, seed_ids)
+
+
+def _size_bytes(stream: Any) -> int:
+    """Memory of the samples with those that their gaps have: the components of a group are of one length."""
+    size = 0
+    for group in {trace.id[:-1] for trace in stream}:
+        stats = [trace.stats for trace in stream if trace.id[:-1] == group]
+        span_s = max(one.endtime for one in stats) - min(one.starttime for one in stats)
+        length = int(span_s * max(one.sampling_rate for one in stats)) + 1
+        size += length * (8 * len({one.channel for one in stats}) + MERGED_BYTES)
+    return size
 
 
 @contextmanager

@@ -45,14 +45,14 @@ class RecordingError(Exception):
 
 def sensors_of(path: Path) -> list[str]:
     """Names of the sensors whose channels a recording holds. Raises RecordingError."""
-    return [channel.sensor for channel in _config(_start(path)).channels]
+    return [channel.sensor for channel in _config(path).channels]
 
 
 def read_recordings(paths: list[Path], sensor: str) -> Recorded:
     """Read files in the given order, each by itself. Raises RecordingError if one is damaged or cannot be read."""
     out = Recorded(sensor)
     for path in paths:
-        channel = next((c for c in _config(_start(path)).channels if c.sensor == sensor), None)
+        channel = next((c for c in _config(path).channels if c.sensor == sensor), None)
         if channel is None:
             raise RecordingError(f"{path}: the recording has no channel with the sensor {sensor!r}")
         reader = RecordingReader(path)
@@ -102,8 +102,11 @@ def _start(path: Path) -> RunStart:
     return step.event
 
 
-def _config(start: RunStart) -> Config:
-    return recorded_config(start.config_json)
+def _config(path: Path) -> Config:
+    try:
+        return recorded_config(_start(path).config_json)
+    except ValueError as error:
+        raise RecordingError(f"{path}: its configuration cannot be read: {error}") from None
 
 
 class _Windows:

@@ -164,6 +164,30 @@ def test_a_pose_that_lasts_for_ever_takes_no_time(start_s: float, stop_s: float)
     assert 300 < window.points <= 400
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "5",
+        '{"gateway": {}}',
+        '{"channels": 5}',
+        '{"channels": [5]}',
+        '{"channels": [{"process": 5, "certificate": {}}]}',
+        '{"channels": [{"process": {"reference_pct": "a"}, "certificate": {"calibrated": 5}}]}',
+    ],
+)
+@pytest.mark.parametrize("command", ["report", "export", "fleet replay", "replay"])
+def test_a_recording_whose_configuration_is_none_is_refused_in_one_line(
+    command: str, text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = str(changed(tmp_path / "a.mcap", configuration(text)))
+    out = {"report": "-o out", "export": "--to out.csv", "fleet replay": "--export csv -o out"}.get(command, "")
+    assert run_cli([*command.split(), path, *out.replace("out", str(tmp_path / "out")).split()]) in (2, 3)
+    told = capsys.readouterr()
+    lines = [line for line in (told.out + told.err).splitlines() if "onfiguration" in line]
+    assert len(lines) == 1
+    assert re.search(r"its configuration (cannot be read|and snapshot): .*(no table|Field required)", lines[0])
+
+
 @pytest.mark.parametrize("ending", ["csv", "wav", "mseed"])
 def test_samples_whose_times_do_not_rise_are_not_exported(
     ending: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -192,6 +216,20 @@ def test_a_number_too_large_for_a_result_is_told(tmp_path: Path) -> None:
     path.write_text(json.dumps(result))
     with pytest.raises(EarlierError, match="int too large"):
         read_earlier(path)
+
+
+def test_a_damaged_time_in_miniseed_does_not_fill_the_memory_with_a_gap(tmp_path: Path) -> None:
+    """Three components, one record of one of them 31 h early: 11 million samples each, 24 kB in the file."""
+    obspy = pytest.importorskip("obspy", reason="the extra seismic is not installed")
+    traces = [
+        obspy.Trace(np.arange(3000, dtype=np.int32), {"sampling_rate": 100.0, "channel": f"HN{k}"}) for k in "ENZ"
+    ]
+    early = obspy.Trace(np.arange(600, dtype=np.int32), {"sampling_rate": 100.0, "channel": "HNE"})
+    early.stats.starttime -= 31 * 3600
+    path = tmp_path / "a.mseed"
+    obspy.Stream([*traces, early]).write(str(path), format="MSEED")
+    with pytest.raises(TableError, match=r"the file says that it holds .* bytes of values"):
+        open_miniseed(path)
 
 
 def test_a_header_of_miniseed_that_is_no_text_shows_no_traceback(
