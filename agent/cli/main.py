@@ -92,6 +92,7 @@ def run_cli(arguments: list[str] | None = None) -> int:
 
     No traceback reaches a user unless FIELDCAL_TRACEBACK is set.
     """
+    output = sys.stdout
     try:
         result = fieldcal.main(args=arguments, prog_name="fieldcal", standalone_mode=False)
     except click.exceptions.Exit as error:
@@ -102,10 +103,6 @@ def run_cli(arguments: list[str] | None = None) -> int:
     except (click.Abort, KeyboardInterrupt):
         click.echo("interrupted", err=True)
         return INTERRUPTED
-    except BrokenPipeError:
-        # The program that reads the output has ended.
-        _discard_output()
-        return 1
     except OSError as error:
         _discard_output()
         click.echo(f"fieldcal: {error}", err=True)
@@ -113,6 +110,8 @@ def run_cli(arguments: list[str] | None = None) -> int:
     except SystemExit as error:
         if COMPLETION in os.environ:  # click ends so after it has answered the shell
             return int(error.code or 0)
+        if sys.stdout is not output:  # click replaces it where the program that reads the output has ended
+            return 1
         # of a plug-in: no command of ours raises it
         click.echo(f"fieldcal: a plug-in or library asked the program to end: SystemExit: {error}", err=True)
         return 1

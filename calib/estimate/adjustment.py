@@ -7,9 +7,9 @@ and whether the result may be used (verdict).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 
@@ -52,8 +52,8 @@ class Adjustment:
 
     `calibration` has NaN for a parameter that the data do not determine and of which nothing was known before; what was
     known of S and Q makes it the posterior. `contributions` {source: (12,) standard
-    uncertainties} is the budget. `reasons`: why it is refused, empty if it is not. `rank` of the input vectors, 4 at
-    most. `offset_scatter_mps2`, `slope_scatter` (relative) and `lag_scatter_s`: between windows, as estimated.
+    uncertainties} is the budget. `judged` tells the reasons. `rank` of the input vectors, 4 at most.
+    `offset_scatter_mps2`, `slope_scatter` (relative) and `lag_scatter_s`: between windows, as estimated.
     `misfit`: what S a + Q leaves of the signal. `nuisance_pull`: how far the nuisances moved from what was stated, in
     standard deviations, worst direction. `mean` (N,) and `covariance` (N, N): joint state of [S, Q, nuisances], nothing
     blanked. `response`: over frequency; None where it is no unknown. `share`: what S and Q owe to the reference.
@@ -63,7 +63,7 @@ class Adjustment:
     nuisances: tuple[Nuisance, ...]
     contributions: Mapping[str, Array]
     coverage_factor: float
-    reasons: tuple[str, ...]
+    judged: Callable[[], tuple[str, ...]]
     rank: int
     chi2: float
     chi2_degrees_of_freedom: float
@@ -76,6 +76,12 @@ class Adjustment:
     covariance: Array
     response: ResponseTold | None
     share: ReferenceShare | None
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Why it is refused, empty if it is not. Found when first asked: signs that contradict are tried out, which
+        takes longer than the adjustment."""
+        return self.judged()
 
     @property
     def expanded_uncertainty(self) -> Array:
@@ -132,6 +138,10 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
         reduced = [excited(w).window for w in turned_windows(used, static, polarity)]
         return _solution(reduced, data, priors, applied, scatter)
 
+    @cache
+    def judged() -> tuple[str, ...]:
+        return tuple(reasons(used, solution, shares, told, turned))
+
     k = coverage_factor(float(np.min(shares.degrees_of_freedom[told], initial=np.inf)))
     return Adjustment(
         calibration=Calibration(
@@ -145,7 +155,7 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
         nuisances=_reported(solution, shares),
         contributions=shares.contributions,
         coverage_factor=k,
-        reasons=tuple(reasons(used, solution, shares, told, turned)),
+        judged=judged,
         rank=solution.equations.rank,
         chi2=shares.consistency[0],
         chi2_degrees_of_freedom=shares.consistency[1],

@@ -182,7 +182,9 @@ def _calibration(x: Array, covariance: Array, freedom: float) -> Calibration:
     values, full = np.zeros(12), np.zeros((12, 12))
     values[PARAMETER] = x
     full[np.ix_(PARAMETER, PARAMETER)] = covariance
-    determined = np.sqrt(np.diag(full)) <= DETERMINED_U * np.abs(values[[0, 4, 8]]).max()
+    # Where the positions leave a direction free, rounding can make a variance negative: nothing is known there.
+    variance = np.where(np.diag(full) < 0.0, np.inf, np.diag(full))
+    determined = np.sqrt(variance) <= DETERMINED_U * np.abs(values[[0, 4, 8]]).max()
     values = np.where(determined, values, np.nan)
     full = np.where(np.outer(determined, determined), full, np.nan)
     return Calibration(values[:9].reshape(3, 3), values[9:], full, determined, freedom, "norm fit (frame free)")

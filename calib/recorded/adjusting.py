@@ -62,7 +62,7 @@ def _adjusted(tables: Tables, priors: Priors) -> tuple[Outcome, ReferenceShare |
             return _outcome(found, windows, tables.rate_hz), found.share
         if found.response is None or found.response.is_taken_out(applied.response):
             return _outcome(found, windows, tables.rate_hz), found.share
-        if found.reasons and turn >= HOPELESS:
+        if turn >= HOPELESS and found.reasons:
             return _outcome(found, windows, tables.rate_hz), found.share
         applied = replace(applied, response=found.response.terms.modest)
     if not _used(windows) and not _used(judged):
