@@ -7,9 +7,9 @@ and whether the result may be used (verdict).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from calib.estimate.condense import Condensed, condense, effective
 from calib.estimate.determined import determined
 from calib.estimate.equations import Equations
 from calib.estimate.fixed_mount import mean_input, never_turned
-from calib.estimate.gauss_newton import Solution, slope_residuals, solve
+from calib.estimate.gauss_newton import Flags, Solution, slope_residuals, solve
 from calib.estimate.nuisances import Applied, Nuisances, Priors
 from calib.estimate.quantities import LAG, RESPONSE, Kind
 from calib.estimate.reference_share import ReferenceShare, share_after
@@ -46,13 +46,36 @@ class Nuisance:
     unit: str
 
 
+@dataclass(frozen=True, eq=False)
+class Grounds:
+    """What an adjustment was made from, as far as its reasons need it."""
+
+    windows: Sequence[Window]
+    solution: Solution
+    shares: Budget
+    determined: Flags
+    data: Condensed
+    priors: Priors
+    applied: Applied
+    scatter: SlopeScatter
+
+    @cached_property
+    def reasons(self) -> tuple[str, ...]:
+        """Why the adjustment is refused, empty if it is not."""
+        return tuple(reasons(self.windows, self.solution, self.shares, self.determined, self._turned))
+
+    def _turned(self, static: int, polarity: int) -> Solution:
+        reduced = [excited(w).window for w in turned_windows(self.windows, static, polarity)]
+        return _solution(reduced, self.data, self.priors, self.applied, self.scatter)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Adjustment:
     """What the windows say of S and Q, what that rests on, and whether it may be used.
 
     `calibration` has NaN for a parameter that the data do not determine and of which nothing was known before; what was
     known of S and Q makes it the posterior. `contributions` {source: (12,) standard
-    uncertainties} is the budget. `judged` tells the reasons. `rank` of the input vectors, 4 at most.
+    uncertainties} is the budget. `grounds`: what `reasons` is found from. `rank` of the input vectors, 4 at most.
     `offset_scatter_mps2`, `slope_scatter` (relative) and `lag_scatter_s`: between windows, as estimated.
     `misfit`: what S a + Q leaves of the signal. `nuisance_pull`: how far the nuisances moved from what was stated, in
     standard deviations, worst direction. `mean` (N,) and `covariance` (N, N): joint state of [S, Q, nuisances], nothing
@@ -63,7 +86,7 @@ class Adjustment:
     nuisances: tuple[Nuisance, ...]
     contributions: Mapping[str, Array]
     coverage_factor: float
-    judged: Callable[[], tuple[str, ...]]
+    grounds: Grounds
     rank: int
     chi2: float
     chi2_degrees_of_freedom: float
@@ -81,7 +104,7 @@ class Adjustment:
     def reasons(self) -> tuple[str, ...]:
         """Why it is refused, empty if it is not. Found when first asked: signs that contradict are tried out, which
         takes longer than the adjustment."""
-        return self.judged()
+        return self.grounds.reasons
 
     @property
     def expanded_uncertainty(self) -> Array:
@@ -133,15 +156,6 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
     told = determined(mean, np.sqrt(np.diag(covariance)), _prior_u(stated), solution.equations.seen)
     known = told | np.isfinite(_prior_u(stated))
     values = np.where(known, mean, np.nan)
-
-    def turned(static: int, polarity: int) -> Solution:
-        reduced = [excited(w).window for w in turned_windows(used, static, polarity)]
-        return _solution(reduced, data, priors, applied, scatter)
-
-    @cache
-    def judged() -> tuple[str, ...]:
-        return tuple(reasons(used, solution, shares, told, turned))
-
     k = coverage_factor(float(np.min(shares.degrees_of_freedom[told], initial=np.inf)))
     return Adjustment(
         calibration=Calibration(
@@ -155,7 +169,7 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
         nuisances=_reported(solution, shares),
         contributions=shares.contributions,
         coverage_factor=k,
-        judged=judged,
+        grounds=Grounds(used, solution, shares, told, data, priors, applied, scatter),
         rank=solution.equations.rank,
         chi2=shares.consistency[0],
         chi2_degrees_of_freedom=shares.consistency[1],
