@@ -64,7 +64,7 @@ def recover(connection: sqlite3.Connection, directory: Path, *, everything: bool
             continue
         for fault in found.faults:
             _log.warning("%s: some results are not restored to the store: %s", path, fault)
-        if not recovered.file_sequence:
+        if not recovered.file_sequence and first_event(path) is not None:  # without it the number is used again
             recovered.file_sequence = number
             recovered.published = _published(found.metadata.get(FILE_METADATA, {}))
         records = _records(path, found)

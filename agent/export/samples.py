@@ -67,6 +67,20 @@ def new_file(path: Path) -> Iterator[BinaryIO]:
             raise
 
 
+@contextmanager
+def _followed(path: Path) -> Iterator[None]:
+    """Raises ExportError where the samples cannot follow the recording from its snapshot."""
+    try:
+        yield
+    except ExportError:
+        raise
+    except Exception as error:  # a damaged or forged snapshot may raise any exception
+        raise ExportError(
+            f"{path}: its samples cannot be followed from its snapshot: {type(error).__name__}: {error!s:.200}; "
+            f"`fieldcal audit {path}` says more"
+        ) from None
+
+
 def content_of(paths: Sequence[Path], device: str | None) -> Content:
     """Look through the recordings for the device; without a name, for the only sensor. Raises ExportError."""
     names = list(dict.fromkeys(sensor for path in paths for sensor in sensors_of(path)))
@@ -74,8 +88,9 @@ def content_of(paths: Sequence[Path], device: str | None) -> Content:
         raise ExportError(f"{paths[0]}: has the sensors {', '.join(names)}; choose one with --device")
     found = Content(device or names[0])
     for path in paths:
-        for step in _steps(path, found.faults):
-            _look(step, found)
+        with _followed(path):
+            for step in _steps(path, found.faults):
+                _look(step, found)
     if not found.axes:
         raise ExportError(f"{paths[0]}: has no samples of {found.device!r}; its sensors are {', '.join(names)}")
     return found
@@ -85,11 +100,12 @@ def samples(paths: Sequence[Path], content: Content) -> Iterator[Samples]:
     """The samples of the device in order. A block whose samples get no time from the clock is left out."""
     for path in paths:
         start = _start(path)
-        clocked = _Clocked(start, content)
-        for step in _steps(path, []):
-            if isinstance(step.event, SampleBlock) and step.event.device == content.device and step.event.n:
-                yield from clocked.update(step.event)
-        yield from clocked.rest()
+        with _followed(path):
+            clocked = _Clocked(start, content)
+            for step in _steps(path, []):
+                if isinstance(step.event, SampleBlock) and step.event.device == content.device and step.event.n:
+                    yield from clocked.update(step.event)
+            yield from clocked.rest()
 
 
 def acceleration(values: Array, calibration: CalibrationUpdate, degc: float | None) -> Array | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -58,17 +59,30 @@ def read_recordings(paths: list[Path], sensor: str) -> Recorded:
         reader = RecordingReader(path)
         windows: _Windows | None = None
         for step in reader.steps():
-            if isinstance(step.event, RunStart):
-                out.starts.append(step.event)
-                windows = _Windows(channel, step.event)
-            assert windows is not None  # a recording with any step begins with RunStart
-            windows.update(step.event)
-            _take(out, step.event, step.results, windows)
+            with _followed(path):
+                if isinstance(step.event, RunStart):
+                    out.starts.append(step.event)
+                    windows = _Windows(channel, step.event)
+                assert windows is not None  # a recording with any step begins with RunStart
+                windows.update(step.event)
+                _take(out, step.event, step.results, windows)
         if reader.fault is not None:
             if reader.fault.kind == "corrupt":
                 raise RecordingError(f"{path}: the recording is damaged at {reader.fault}; see `fieldcal audit`")
             out.faults.append((path, reader.fault))
     return out
+
+
+@contextmanager
+def _followed(path: Path) -> Iterator[None]:
+    """Raises RecordingError where the streams cannot follow the recording from its snapshot."""
+    try:
+        yield
+    except Exception as error:  # a damaged or forged snapshot may raise any exception
+        raise RecordingError(
+            f"{path}: its samples cannot be followed from its snapshot: {type(error).__name__}: {error!s:.200}; "
+            "see `fieldcal audit`"
+        ) from None
 
 
 def _take(out: Recorded, event: Event, results: list[Output], windows: _Windows) -> None:

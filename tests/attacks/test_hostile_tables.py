@@ -16,6 +16,7 @@ from agent.calibrate.reference_certificate import read_reference_certificate
 from agent.calibrate.tables import read_sensor
 from agent.cli.main import run_cli
 from agent.config.earlier import EarlierError, read_earlier
+from agent.core.snapshot import pack, unpack
 from agent.proto import fieldcal_pb2 as pb
 from agent.reading.recording import HOLES_MAX
 from agent.reading.seismic import open_miniseed
@@ -186,6 +187,39 @@ def test_a_recording_whose_configuration_is_none_is_refused_in_one_line(
     lines = [line for line in (told.out + told.err).splitlines() if "onfiguration" in line]
     assert len(lines) == 1
     assert re.search(r"its configuration (cannot be read|and snapshot): .*(no table|Field required)", lines[0])
+
+
+def without_channels(snapshot: bytes) -> bytes:
+    return pack(unpack(snapshot) | {"channels": {}})
+
+
+def with_a_broken_clock(snapshot: bytes) -> bytes:
+    state = unpack(snapshot)
+    for channel in state["channels"].values():
+        channel |= {"streams": {"imu": {"runs": [{"number": 0, "clock": {}, "blocks": []}]}}}
+    return pack(state)
+
+
+@pytest.mark.parametrize("damage", [lambda held: held + b"\0", without_channels, with_a_broken_clock])
+@pytest.mark.parametrize("command", ["report", "export", "fleet replay", "replay"])
+def test_a_recording_whose_snapshot_is_damaged_is_refused_in_one_line(
+    command: str, damage: Callable[[bytes], bytes], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def with_damage(topic: str, message: Any) -> None:
+        if topic == "/events" and message.HasField("run_start"):
+            message.run_start.snapshot = damage(message.run_start.snapshot)
+
+    path = str(changed(tmp_path / "a.mcap", with_damage))
+    out = {"report": "-o out", "export": "--to out.csv", "fleet replay": "--export csv -o out"}.get(command, "")
+    status = run_cli([*command.split(), path, *out.replace("out", str(tmp_path / "out")).split()])
+    told = capsys.readouterr()
+    if out.endswith(("csv", "csv -o out")) and damage is without_channels:
+        assert status == 0, "an export of the file's own samples needs nothing from before the file"
+        return
+    assert status in (2, 3)
+    lines = [line for line in (told.out + told.err).splitlines() if "snapshot: " in line]
+    assert len(lines) == 1
+    assert re.search("snapshot: (KeyError|ValueError): ", lines[0])
 
 
 @pytest.mark.parametrize("ending", ["csv", "wav", "mseed"])

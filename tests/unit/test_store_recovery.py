@@ -10,7 +10,7 @@ import pytest
 from agent.core.events import Result
 from agent.delivery.history import FILE_NAME, History, Record
 from agent.delivery.store import UNKEPT_MAX, Store
-from agent.recording.files import recordings
+from agent.recording.files import RecordingFile, recordings
 from agent.recording.scan import scan
 from agent.recording.writer import Recorder
 from tests.replay.stand_in import CONFIG, StandIn, happenings, record_run, run_start
@@ -142,3 +142,13 @@ def test_marks_are_those_that_the_newest_file_names(tmp_path: Path) -> None:
     assert (again.published(), again.file_sequence()) == (published, 2)
     assert payloads(kept(again)) == payloads(before)
     again.close()
+
+
+def test_the_number_of_a_file_without_an_event_is_used_again(tmp_path: Path) -> None:
+    recorded(tmp_path)
+    RecordingFile(tmp_path, run_start(StandIn(CONFIG), 0, 4), ["/events"], {}).abandon()  # killed before its RunStart
+    store = Store(tmp_path, 0)
+    recorder = Recorder(tmp_path, ["acc", "ref"], ["bridge-1"], ledger=store)
+    recorder.close_torn()
+    assert recorder.next_file_sequence == 4
+    store.close()
