@@ -86,8 +86,8 @@ class LineStream:
             breaks = self._follow(values[:, 0])
             values = np.ascontiguousarray(values[:, 1:])
         else:
-            lost_at = np.unique(np.searchsorted(line, decoded.bad_at))
-            breaks = [Break(int(at), BlockFlags.RESTART) for at in lost_at]
+            lost_at = set(np.searchsorted(line, decoded.bad_at).tolist())
+            breaks = [Break(at, BlockFlags.RESTART) for at in sorted(lost_at)]
         return self._cutter.cut(Stretch(values, arrivals_ns, np.searchsorted(line, burst_lines), self._utc_ns), breaks)
 
     def take_drops(self) -> list[Drop]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import functools
 import time
 from collections.abc import Callable, Mapping
@@ -152,6 +151,8 @@ def load_driver(name: str) -> DriverFactory:
 
 
 def _unknown(name: str) -> str:
+    import difflib
+
     names = driver_names()
     near = difflib.get_close_matches(name, names, n=1)
     hint = f"did you mean {near[0]!r}? " if near else ""

@@ -6,8 +6,7 @@ import gc
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-import numpy.fft
-import numpy.ma  # noqa: F401 - else numpy loads both at their first use, in the first window
+import numpy.fft  # noqa: F401 - else numpy loads it at its first use, in the first window
 
 
 @contextmanager

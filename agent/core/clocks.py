@@ -12,7 +12,7 @@ from agent.core.events import ClockReport, Result
 from agent.core.outcome import Source
 from agent.core.stream import DeviceStream
 from calib.model import Array
-from calib.signal.median import median
+from calib.signal.order_statistics import median
 from calib.signal.timing import ClockFit
 
 EVERY_S = 60.0

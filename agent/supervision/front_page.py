@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from datetime import UTC, datetime
-from html import escape
 
 from agent.supervision.health import GatewayStatus
+from agent.terminal.text import page_text
 
 HEADERS = (
     ("Content-Type", "text/html; charset=utf-8"),
@@ -20,14 +20,14 @@ def front_page(status: GatewayStatus | None) -> bytes:
     title = "fieldcal" if status is None else f"fieldcal {status.site}/{status.gateway}"
     body = "<p>No status yet.</p>" if status is None else _status(status)
     return (
-        f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title></head>'
-        f'<body><h1>{escape(title)}</h1>{body}<p><a href="/metrics">Metrics for Prometheus</a></p></body></html>\n'
+        f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{page_text(title)}</title></head>'
+        f'<body><h1>{page_text(title)}</h1>{body}<p><a href="/metrics">Metrics for Prometheus</a></p></body></html>\n'
     ).encode()
 
 
 def _status(status: GatewayStatus) -> str:
     when = datetime.fromtimestamp(status.t_utc_ns * 1e-9, UTC).isoformat(" ", "seconds")
-    reasons = "".join(f"<li>{escape(reason)}</li>" for reason in status.reasons)
+    reasons = "".join(f"<li>{page_text(reason)}</li>" for reason in status.reasons)
     devices = _table(
         ("device", "state", "rate in Hz", "samples", "missing"),
         (
@@ -40,12 +40,12 @@ def _status(status: GatewayStatus) -> str:
         ((name, s.status, s.windows_used, s.windows_refused, s.reason) for name, s in status.sensors.items()),
     )
     return (
-        f"<p><b>{escape(status.state)}</b>, {when}, version {escape(status.version)}</p><ul>{reasons}</ul>"
+        f"<p><b>{page_text(status.state)}</b>, {when}, version {page_text(status.version)}</p><ul>{reasons}</ul>"
         f"{devices}{sensors}"
     )
 
 
 def _table(head: Iterable[object], rows: Iterable[Iterable[object]]) -> str:
-    lines = ["".join(f"<th>{escape(str(cell))}</th>" for cell in head)]
-    lines += ["".join(f"<td>{escape(str(cell))}</td>" for cell in row) for row in rows]
+    lines = ["".join(f"<th>{page_text(str(cell))}</th>" for cell in head)]
+    lines += ["".join(f"<td>{page_text(str(cell))}</td>" for cell in row) for row in rows]
     return "<table>" + "".join(f"<tr>{line}</tr>" for line in lines) + "</table>"

@@ -17,6 +17,7 @@ from calib.distributions import chi2_quantile
 from calib.excitation.bands import HIGHEST
 from calib.excitation.sums import NOISE_FLOOR
 from calib.model import Array, BandSums, Window
+from calib.signal.order_statistics import distinct
 from calib.signal.response import POWERS, Complex, by_term
 
 PROBABILITY = 0.99  # confidence of the test for scatter between bands
@@ -294,7 +295,7 @@ def _deviations(found: Sequence[_Told], left: Array, powers: int) -> Deviations:
     freedom = float(np.count_nonzero(size) - sum(part.free for part in found) - powers)
     moved = left * signal * variance
     third: NDArray[np.int64] = np.round(3.0 * np.log2(at_hz)).astype(np.int64)
-    own = {k: third == k for k in np.unique(third).tolist()}
+    own = {k: third == k for k in distinct(third).tolist()}
     worst = max(own, key=lambda k: abs(float(moved[own[k]].sum())))
     largest = abs(float(moved[own[worst]].sum())) / max(float(np.sum((size * variance)[own[worst]])), TINY)
     return Deviations(

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.model import Array, BandSums, Window
+from calib.signal.order_statistics import distinct
 
 BANDS_AN_OCTAVE = 6
 TAPER = 0.1  # of the window, at each end: longer than the impulse response of any filter of an instrument
@@ -41,7 +42,8 @@ def band_sums(u: Array, du: Array, V: Array, rate_hz: float) -> BandSums | None:
     taper, density = _taper(n)
     rows = np.vstack([u.T, du.T, V.T])
     rows -= (rows @ taper / taper.sum())[:, None]
-    lines = np.fft.rfft(rows * taper, axis=1)[:, 1:]
+    rows *= taper
+    lines = np.fft.rfft(rows, axis=1)[:, 1:]
     frequency_hz: Array = np.fft.rfftfreq(n, 1.0 / rate_hz)[1:].astype(np.float64)
     edges = _edges(frequency_hz, fewest)
     products = np.array([(lines[:, a:b] @ lines[:, a:b].conj().T).real for a, b in itertools.pairwise(edges.tolist())])
@@ -121,8 +123,8 @@ def motion_band_hz(windows: Sequence[Window]) -> tuple[float, float] | None:
     power, square = (np.concatenate(part) for part in zip(*map(_powers, bands), strict=True))
     if not power.sum() > 0.0:
         return None
-    third = np.round(3.0 * np.log2(np.sqrt(low * high))).astype(int)
-    shares = np.array([power[third == k].sum() for k in np.unique(third)]) / power.sum()
+    third = np.round(3.0 * np.log2(np.sqrt(low * high))).astype(np.int64)
+    shares = np.array([power[third == k].sum() for k in distinct(third)]) / power.sum()
     if np.count_nonzero(shares > LEAST_SHARE) < FEWEST_THIRDS:
         return None
     below, above = _narrowed(low, high, power, square)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from calib.model import Array
 from calib.signal.band import hanning
-from calib.signal.median import median
+from calib.signal.order_statistics import distinct, median, quantile
 
 Mask = NDArray[np.bool_]
 Stretch = tuple[int, int]  # [first, stop) of samples
@@ -40,7 +40,7 @@ def moving(u: Array, rate_hz: float) -> list[Stretch]:
     if frames < 2:
         return [(0, len(u))] if len(u) else []
     level = np.sqrt(np.mean(slow[: frames * size].reshape(frames, -1) ** 2, axis=1))
-    on = level > MOVING_LEVEL * np.quantile(level, 0.9)
+    on = level > MOVING_LEVEL * quantile(level, 0.9)
     return _stretches(_bridged(on, round(BRIDGE_S / FRAME_S)), size * width, len(u))
 
 
@@ -106,7 +106,7 @@ def clipped(V: Array, residual: Array, finest: Array) -> int:
 def _all_differ(v: Array, noise: float) -> bool:
     """Whether the resolution of v (n,) is so fine that points within its range hardly ever have the same value."""
     inside = v[(v > v.min()) & (v < v.max())]
-    return noise > ROUNDING * float(np.ptp(v)) and len(np.unique(inside)) >= DISTINCT * len(inside) > 0
+    return noise > ROUNDING * float(np.ptp(v)) and len(distinct(inside)) >= DISTINCT * len(inside) > 0
 
 
 def band_width(u: Array, rate_hz: float, noise: Array) -> int:

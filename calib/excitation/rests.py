@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from calib.model import Array
+from calib.signal.order_statistics import quantile
 
 BLOCK_S = 0.25  # long enough to distinguish noise from a rotation, short compared with a rest
 LEAST_REST_S = 1.0
@@ -32,9 +33,9 @@ def find_rests(V: Array, rate_hz: float) -> list[tuple[int, int]]:
     shaped = V[: blocks * size].reshape(blocks, size, 3)
     sd = np.sqrt(shaped.var(axis=1).sum(axis=1))
     step = np.linalg.norm(np.diff(shaped.mean(axis=1), axis=0), axis=1)
-    noise = np.quantile(sd, STILL_QUANTILE)
+    noise = quantile(sd, STILL_QUANTILE)
     calm = sd <= STILL_FACTOR / 2.0 * noise
-    near = step <= max(STILL_FACTOR * np.quantile(step, STILL_QUANTILE), WHITE_FACTOR * noise * np.sqrt(2.0 / size))
+    near = step <= max(STILL_FACTOR * quantile(step, STILL_QUANTILE), WHITE_FACTOR * noise * np.sqrt(2.0 / size))
     still = calm & np.concatenate([[True], near]) & np.concatenate([near, [True]])
     edges = np.flatnonzero(np.diff(np.concatenate([[0], still.astype(int), [0]])))
     guard = round(GUARD_S * rate_hz)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from calib.model import Array
-from calib.signal.median import median
+from calib.signal.order_statistics import median
 
 # The change of the mean is searched at the edges of such blocks. The scatter of the blocks shows how well it is known.
 BLOCK_S = 1.0

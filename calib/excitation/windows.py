@@ -22,7 +22,7 @@ from calib.excitation.steadiness import step
 from calib.excitation.sums import factor, pool, window_sums
 from calib.excitation.window_verdict import DEFAULT_LIMITS, Limits, Verdict, judge
 from calib.model import Array, Pose, Window, WindowSums
-from calib.signal.median import median
+from calib.signal.order_statistics import median
 
 # 1 % of gravity. A reference that moves by more beside a sensor does not rest.
 LEAST_MOTION_MPS2 = 0.1

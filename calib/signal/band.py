@@ -13,7 +13,7 @@ import numpy as np
 
 from calib.model import Array
 from calib.signal.holes import Mask, in_short_holes, short_holes_filled
-from calib.signal.median import median
+from calib.signal.order_statistics import median
 
 SEGMENT_S = 4.0  # length of a segment of a spectrum: lines 0.25 Hz apart, and many segments in a few minutes
 LEAST_SEGMENTS = 8  # fewer segments give spectra that are too uncertain to choose a band

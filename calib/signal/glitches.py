@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.model import Array
-from calib.signal.median import median
+from calib.signal.order_statistics import median
 
 # Curvature over the usual curvature nearby. Gaussian motion with noise reaches 7 in 3.6 million samples.
 LIMIT = 50.0

@@ -16,7 +16,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from calib.model import Array
-from calib.signal.median import median
+from calib.signal.order_statistics import distinct, median
 from calib.signal.timing import ClockFit
 
 TAPS, DEGREE = 16, 7
@@ -51,7 +51,8 @@ def resample(x: Array, clock: ClockFit, time_s: Array, first_index: int = 0, mar
     nodes = np.linspace(time_s[0], time_s[-1], len(time_s) // NODES + 2)
     if len(clock.knot_time_s) > 2:  # the rate may bend at a knot
         knots = clock.knot_time_s
-        nodes = np.union1d(nodes, knots[(knots > time_s[0]) & (knots < time_s[-1])])
+        between = knots[(knots > time_s[0]) & (knots < time_s[-1])]
+        nodes = distinct(np.concatenate([nodes, between]))
     position = np.interp(time_s, nodes, clock.index_of(nodes))
     base = np.floor(position).astype(np.int64)
     fraction = position - base

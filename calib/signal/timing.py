@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib.model import Array
-from calib.signal.median import median
+from calib.signal.order_statistics import median
 
 IntArray = NDArray[np.int64]
 # A typical driver sends 3000 bursts in a minute. If the temperature changes the rate by 250 ppm in 30 min, a parabola
@@ -182,7 +182,7 @@ class Parabola:
 
     def clock(self, first: int, last: int) -> ClockFit:
         """The parabola as a clock with knots at the samples `first` and `last`."""
-        knots = np.unique(np.array([first, last], dtype=float))
+        knots = np.array(sorted({float(first), float(last)}))
         period = float(self.period_at(last))
         at_last = np.array([1.0, last - self.index, (last - self.index) ** 2])
         slope = np.array([0.0, 1.0, 2.0 * (last - self.index)])

@@ -27,6 +27,21 @@ def test_the_core_and_the_library_load_no_input_or_output() -> None:
     assert [name for name in loaded if name.partition(".")[0] in FORBIDDEN] == []
 
 
+def test_a_run_loads_nothing_while_devices_are_read() -> None:
+    """What numpy loads at the first use of a function costs memory, and time in which no device is read."""
+    code = (
+        "import sys, agent.cli.run, agent.acquisition.service\n"
+        "from agent.cli.main import run_cli\n"
+        "from tests.replay.golden_files import FORMATS, RECORDING\n"
+        "before = set(sys.modules)\n"
+        "run_cli(['replay', str(FORMATS[-1] / RECORDING)])\n"
+        "print(*sorted(name for name in set(sys.modules) - before if name.startswith('numpy')))"
+    )
+    run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert "from its own snapshot" in run.stdout
+    assert run.stdout.splitlines()[-1] == ""
+
+
 def test_no_file_is_too_long() -> None:
     generated = ROOT / "agent" / "proto"
     files = [path for room in ("agent", "calib", "hw", "tests", "benchmarks", "examples", "docs")

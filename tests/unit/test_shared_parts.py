@@ -1,4 +1,4 @@
-"""What is computed once for many windows is the same as computed anew; medians are those of numpy."""
+"""What is computed once for many windows is the same as computed anew; order statistics are those of numpy."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 
 from calib.estimate.nuisances import Applied, Nuisances, Priors
 from calib.geometry import beside
-from calib.signal.median import FEW, median
+from calib.signal.order_statistics import FEW, distinct, median, quantile
 from calib.signal.response import Response
 
 
@@ -34,6 +34,10 @@ def test_nuisances_are_shared_by_windows_of_one_pose_alone() -> None:
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 16, 17, FEW, FEW + 1, FEW + 2, 1001])
-def test_medians_are_those_of_numpy(n: int) -> None:
+def test_order_statistics_are_those_of_numpy(n: int) -> None:
     values = np.random.default_rng(n).normal(size=(3, 2, n))
     np.testing.assert_array_equal(median(values), np.median(values, axis=-1))
+    assert quantile(values[0, 0], 0.25) == np.quantile(values[0, 0], 0.25)
+    assert quantile(values[0, 0], 0.9) == np.quantile(values[0, 0], 0.9)
+    rounded = np.round(10.0 * values[0, 0]).astype(np.int64)
+    np.testing.assert_array_equal(distinct(rounded), np.unique(rounded))
