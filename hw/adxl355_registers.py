@@ -37,6 +37,7 @@ RATES_HZ = tuple(4000.0 / 2.0**code for code in range(11))  # index: the code in
 COUNTS_MIN, COUNTS_MAX = -(2**19), 2**19 - 1
 _RANGE_RESET_BITS = 0x80  # I2C high-speed bits, set by a reset and kept
 _X_MARK, _EMPTY = 0x01, 0x02  # in the last byte of a FIFO entry
+_FULL = bytes(last for last in range(256) if not last & _EMPTY)  # last bytes of the entries that hold a value
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,5 +134,7 @@ def triples(data: bytes) -> FifoSamples:
 
 def without_empty(data: bytes) -> bytes:
     """Remove the entries that the device marks as read from an empty FIFO."""
+    if not data[2::3].translate(None, _FULL):  # numpy takes fifteen times as long for the few entries of a poll
+        return data
     entries = np.frombuffer(data, np.uint8).reshape(-1, 3)
     return bytes(entries[(entries[:, 2] & _EMPTY) == 0].tobytes())

@@ -37,6 +37,7 @@ class I2CDevice:
         self._address = address
         self._sleep = sleep
         self._bus: SMBus | None = None
+        self._starts: dict[int, i2c_msg] = {}  # messages that name a register; they do not change from read to read
 
     def open(self) -> None:
         """Open the bus. Raises ConfigurationError if the adapter only supports SMBus transfers."""
@@ -88,10 +89,11 @@ class I2CDevice:
         self._retry(lambda bus: bus.write_byte_data(self._address, register, value))
 
     def _transfer(self, bus: SMBus, reads: Sequence[Read]) -> bytes:
-        starts = {register: i2c_msg.write(self._address, [register]) for register, _ in reads}
         messages = []
         for register, count in reads:
-            messages += [starts[register], i2c_msg.read(self._address, count)]
+            if register not in self._starts:
+                self._starts[register] = i2c_msg.write(self._address, [register])
+            messages += [self._starts[register], i2c_msg.read(self._address, count)]
         bus.i2c_rdwr(*messages)
         return b"".join(map(bytes, messages[1::2]))
 
