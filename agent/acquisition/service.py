@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 
 from agent import __version__
+from agent.acquisition.arena import one_arena
 from agent.acquisition.reader import EventQueue, Reader
 from agent.acquisition.stalls import few_objects
 from agent.commanding.reception import Reception
@@ -68,6 +69,7 @@ class Service:
         Raises StoreError or OSError where the data directory cannot be used, OtherGatewayError where it is another
         gateway's, KeyFileError for an unusable signing key.
         """
+        one_arena()
         self._data_dir.mkdir(parents=True, exist_ok=True)
         config = self._config
         check_owner(self._data_dir, f"{config.gateway.site}/{config.gateway.name}")
