@@ -63,6 +63,7 @@ class Streams:
         self._finder = FoundPositions(channel) if channel.positions else None
         self._places = self._finder or ToldTimes(channel)
         self._runs: dict[str, int] = {}  # of each device, the number of the run of which the last part was
+        self._margin_at: tuple[list[float | None], float] = [], 0.0  # margin in s, and the rates of which it follows
 
     def begin(self, origin_ns: int) -> None:
         """A new run, nothing is there yet."""
@@ -227,7 +228,10 @@ class Streams:
 
     @property
     def _margin_s(self) -> float:
-        return max(margin_of(beside, self.by_device) for beside in self._beside)
+        rates_hz = [stream.nominal_rate_hz for stream in self.by_device.values()]
+        if rates_hz != self._margin_at[0]:
+            self._margin_at = rates_hz, max(margin_of(beside, self.by_device) for beside in self._beside)
+        return self._margin_at[1]
 
     def _due(self, piece: Piece, first_s: float, now_s: float) -> bool:
         end_s = first_s + piece.stop_s + self._margin_s

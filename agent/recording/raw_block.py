@@ -58,7 +58,7 @@ def decode_block(data: bytes) -> tuple[int, SampleBlock]:
     names, kind = (DECIMALS, "<f8") if m.decimal else (COUNTS, "<i4")
     columns = [np.frombuffer(getattr(m, name), kind) for name in names[: m.axes]]
     n = len(columns[0])
-    if len(arrival) != len(count) or not len(count) or (np.diff(count, prepend=0) < 0).any():
+    if len(arrival) != len(count) or not len(count) or count[0] < 0 or (count[1:] < count[:-1]).any():
         raise ValueError(f"{len(arrival)} times of bursts, but {len(count)} counts, which must not decrease")
     if count[-1] != n or any(len(c) != n for c in columns):
         raise ValueError(f"x has {n} samples; the number of samples in the bursts or on another axis is different")

@@ -117,8 +117,10 @@ class ClockModel:
         self._index = np.concatenate([self._index, np.asarray(sample_index_after_burst, dtype=np.int64)])
         self._arrival_s = np.concatenate([self._arrival_s, np.asarray(arrival_s, dtype=float)])
         # Where a sample is missing within a burst, the burst comes in parts, and only the last part came without delay.
-        last = np.append(np.diff(self._arrival_s) != 0.0, True)[: len(self._index)]
-        self._index, self._arrival_s = self._index[last], self._arrival_s[last]
+        later = self._arrival_s[1:] != self._arrival_s[:-1]
+        if not later.all():
+            last = np.append(later, True)
+            self._index, self._arrival_s = self._index[last], self._arrival_s[last]
         if len(self._index):
             oldest = np.searchsorted(self._arrival_s, self._arrival_s[-1] - self._horizon_s)
             first = max(int(oldest), len(self._index) - MAX_BURSTS)
