@@ -12,6 +12,7 @@ import sys
 import click
 
 from agent import __version__
+from agent.cli.loading import loading
 
 INTERRUPTED = 130  # exit status after Ctrl-C: 128 and the number of SIGINT
 COMPLETION = "_FIELDCAL_COMPLETE"  # set by the completion files in deploy/completion
@@ -66,7 +67,9 @@ class LazyGroup(click.Group):
             return None
         if sys.platform != "linux" and cmd_name not in EVERYWHERE:
             raise click.ClickException(f"{cmd_name} needs Linux; {', '.join(EVERYWHERE)} work here too")
-        command = getattr(importlib.import_module(COMMANDS[cmd_name][0]), cmd_name.replace("-", "_"))
+        with loading():
+            module = importlib.import_module(COMMANDS[cmd_name][0])
+        command = getattr(module, cmd_name.replace("-", "_"))
         assert isinstance(command, click.Command)
         return command
 

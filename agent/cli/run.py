@@ -14,6 +14,7 @@ from typing import Any
 
 import click
 
+from agent.cli.loading import loading
 from agent.cli.stopping import STOP_SIGNALS, StoppedAtStart, stopped_by_signals
 from agent.config import Config, ConfigError, load_config, parse_config
 from agent.delivery.history import StoreError
@@ -49,8 +50,9 @@ def run(
     with_router: bool,
 ) -> int:
     """Read devices, calibrate, record and publish until Ctrl-C. Without CONFIG the virtual bench is used."""
-    from agent.supervision.logs import log_as_json, under_journal
-    from agent.terminal.watch import Watch
+    with loading():
+        from agent.supervision.logs import log_as_json, under_journal
+        from agent.terminal.watch import Watch
 
     if duration is not None and not math.isfinite(duration):
         raise click.BadParameter(f"{duration} is not a number of seconds", param_hint="--duration")
@@ -79,9 +81,10 @@ def run(
 
 def serve(config: Config, data_dir: Path, watch: Any, duration_s: float | None) -> int:
     """Run the service until a signal or for `duration_s` seconds; returns the exit status."""
-    from agent.acquisition.service import Service
-    from agent.config.key_file import KeyFileError
-    from agent.recording.owner import OtherGatewayError
+    with loading():
+        from agent.acquisition.service import Service
+        from agent.config.key_file import KeyFileError
+        from agent.recording.owner import OtherGatewayError
 
     service = Service(config, data_dir, watch)
     try:

@@ -13,7 +13,6 @@ from agent.config import Config
 from agent.core.events import DriftReport, Event, Result, Tick, WindowReport
 from agent.supervision.health import GatewayStatus, Health, State
 from agent.supervision.logs import log_event, tell
-from agent.supervision.metrics import serve_metrics
 from agent.supervision.notify import Notifier
 from agent.supervision.plant import Plant
 from hw.block import SampleBlock
@@ -85,6 +84,8 @@ class Supervisor:
             tell("state", status.line, state == "degraded", state=state, reasons=reasons)
 
     def _serve_metrics(self) -> None:
+        from agent.supervision.metrics import serve_metrics
+
         metrics = self._settings.metrics
         try:
             address = serve_metrics(metrics.host, metrics.port, lambda: self._newest)

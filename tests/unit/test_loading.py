@@ -1,0 +1,31 @@
+"""Modules load without the garbage collector, which runs again afterwards, whatever happens."""
+
+from __future__ import annotations
+
+import gc
+
+import pytest
+
+from agent.cli.loading import loading
+from agent.cli.main import run_cli
+
+
+def test_the_collector_waits_only_while_modules_load() -> None:
+    assert gc.isenabled()
+    with pytest.raises(ImportError), loading():
+        assert not gc.isenabled()
+        raise ImportError
+    assert gc.isenabled()
+    gc.disable()
+    try:
+        with loading():
+            pass
+        assert not gc.isenabled()  # who has switched it off decides when it runs again
+    finally:
+        gc.enable()
+
+
+def test_a_command_runs_with_the_collector(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_cli(["sensors"]) == 0
+    assert "adxl355" in capsys.readouterr().out
+    assert gc.isenabled()
