@@ -73,8 +73,10 @@ def _from_json(data: bytes) -> tuple[Array, Array]:
     told: dict[str, Any] = json.loads(data)
     if "certificate" in told:
         told = told["certificate"]["result"]
-    values = np.append(np.array(told["sensitivity"], dtype=float).ravel(), np.array(told["offset"], dtype=float))
-    return values, np.array(told["covariance"], dtype=float)
+    S, Q, covariance = (np.array(told[name], dtype=float) for name in ("sensitivity", "offset", "covariance"))
+    if (S.shape, Q.shape, covariance.shape) != ((3, 3), (3,), (12, 12)):
+        raise ValueError("sensitivity must have 3 x 3 numbers, offset 3 and covariance 12 x 12")
+    return np.append(S.ravel(), Q), covariance
 
 
 def _parsed(data: bytes) -> Element:

@@ -252,6 +252,24 @@ def test_a_number_too_large_for_a_result_is_told(tmp_path: Path) -> None:
         read_earlier(path)
 
 
+@pytest.mark.parametrize(
+    "damaged",
+    [
+        {"sensitivity": [[1.0, 0.0, 0.0]]},
+        {"sensitivity": 1.0},
+        {"offset": [0.0]},
+        {"offset": [0.0] * 9, "sensitivity": [1.0, 1.0, 1.0]},
+        {"covariance": [[1e-6] * 12] * 11},
+        {"covariance": 1e-6},
+    ],
+)
+def test_a_result_without_all_its_numbers_is_told(tmp_path: Path, damaged: dict[str, object]) -> None:
+    path = tmp_path / "result.json"
+    path.write_text(json.dumps(uneven() | damaged))
+    with pytest.raises(TableError, match=r"result\.json.*3 x 3 numbers, offset 3 and covariance 12 x 12"):
+        read_reference_certificate(path)
+
+
 def test_a_damaged_time_in_miniseed_does_not_fill_the_memory_with_a_gap(tmp_path: Path) -> None:
     """Three components, one record of one of them 31 h early: 11 million samples each, 24 kB in the file."""
     obspy = pytest.importorskip("obspy", reason="the extra seismic is not installed")
