@@ -12,6 +12,7 @@ import click
 import msgspec
 
 from agent.cli.given import Given, add_witnessed, read_head, recordings_of
+from agent.cli.kernels import compute_as_in
 from agent.delivery.history import StoreError
 from agent.recording.auditing import AuditedFile, audit_file
 from agent.recording.chain import Link, chain_faults, missing_after
@@ -63,8 +64,6 @@ def audit(
     """
     from agent.config.key_file import KeyFileError
     from agent.core.pipeline import Pipeline
-    from agent.recording.fingerprint import compute_as
-    from agent.recording.reading import first_event
     from agent.recording.signed_text import SignedTextError
     from agent.recording.witness import WitnessError
 
@@ -84,9 +83,8 @@ def audit(
         # Where the store knows of recordings that are gone, the audit itself reports them.
         say(f"{files[0]}: this directory has no recordings (fieldcal-*.mcap)", err=True)
         return 2
-    start = first_event(given.paths[0]) if given.paths else None
-    if start is not None:
-        compute_as(start.fingerprint)
+    if given.paths:
+        compute_as_in(given.paths[0])
     return run_audit(given, Pipeline.restore, as_json=json_to is not None, strict=strict, keys=keys)
 
 

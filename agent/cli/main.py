@@ -97,7 +97,8 @@ def run_cli(arguments: list[str] | None = None) -> int:
     """
     output = sys.stdout
     try:
-        result = fieldcal.main(args=arguments, prog_name="fieldcal", standalone_mode=False)
+        own_process = arguments is None  # else the command line of the process is that of another program
+        result = fieldcal.main(args=arguments, prog_name="fieldcal", standalone_mode=False, obj=own_process)
     except click.exceptions.Exit as error:
         return error.exit_code
     except click.ClickException as error:

@@ -10,6 +10,7 @@ from typing import Any
 import click
 import msgspec
 
+from agent.cli.kernels import compute_as_in
 from agent.core.events import CalibrationUpdate
 from agent.recording.replaying import Replay, ReplayedFile, Restore
 from agent.terminal.text import say
@@ -26,12 +27,8 @@ def replay(files: tuple[Path, ...], json_to: str | None) -> int:
     Exit status: 0 the computed results equal the recorded ones bit for bit, 3 they do not, 2 a file cannot be read.
     """
     from agent.core.pipeline import Pipeline
-    from agent.recording.fingerprint import compute_as
-    from agent.recording.reading import first_event
 
-    start = first_event(files[0])
-    if start is not None:
-        compute_as(start.fingerprint)
+    compute_as_in(files[0])
     return run_replay(files, Pipeline.restore, as_json=json_to is not None)
 
 

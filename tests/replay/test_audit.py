@@ -177,6 +177,27 @@ def test_an_audit_computes_with_the_kernels_of_the_recording(tmp_path: Path) -> 
     assert (done.returncode, file["ok"], file["replay"]["tolerance"], file["notes"]) == (0, True, 0.0, [])
 
 
+IN_ANOTHER_PROGRAM = """
+import sys
+from agent.cli.main import run_cli
+print("begun", flush=True)
+run_cli([sys.argv[1], sys.argv[2]])
+print("gone on")
+"""
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="names kernels of x86")
+@pytest.mark.parametrize("command", ["replay", "audit"])
+def test_a_program_that_runs_a_command_is_not_begun_anew(command: str, tmp_path: Path) -> None:
+    """Its command line is not that of the command; a test run ended so without a word, with status 0."""
+    kernel = "Nehalem" if fingerprint()["blas_kernel"] != "Nehalem" else "Prescott"
+    there = os.environ | {"OPENBLAS_CORETYPE": kernel, "NPY_DISABLE_CPU_FEATURES": fingerprint()["cpu_features"]}
+    subprocess.run([sys.executable, "-c", RECORD, str(tmp_path)], cwd=REPOSITORY, env=there, check=True, timeout=60)
+    program = [sys.executable, "-c", IN_ANOTHER_PROGRAM, command, str(tmp_path / "fieldcal-000001.mcap")]
+    done = subprocess.run(program, cwd=REPOSITORY, capture_output=True, text=True, check=False, timeout=60)
+    assert (done.stdout.count("begun"), done.stdout.count("gone on")) == (1, 1)
+
+
 def test_kernels_that_this_cpu_lacks_are_never_asked_for() -> None:
     here = fingerprint()
     assert environment_for(here | {"blas_kernel": "Other"}) is not None
