@@ -14,12 +14,14 @@ from __future__ import annotations
 import argparse
 import gc
 import importlib
+import json
 import os
 import random
 import re
 import resource
 import shutil
 import signal
+import subprocess
 import sys
 import tempfile
 import time
@@ -75,19 +77,42 @@ class Ran:
         return ""
 
 
-def run(arguments: Sequence[str], program: bool = False) -> Ran:
-    """Run a command in a process of its own."""
+class Program:
+    """The real program, started anew for each case by a small process (see benchmarks/spawner.py)."""
+
+    def __init__(self, output: Path) -> None:
+        self._output = output
+        environment = {k: v for k, v in os.environ.items() if k != "FIELDCAL_KERNELS_CHOSEN"}
+        small = [sys.executable, "-S", str(Path(__file__).with_name("spawner.py"))]
+        self._spawner = subprocess.Popen(
+            small, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, text=True
+        )
+
+    def run(self, arguments: Sequence[str]) -> Ran:
+        """Run a command."""
+        assert self._spawner.stdin is not None
+        assert self._spawner.stdout is not None
+        command = [sys.executable, "-m", "agent", *arguments]
+        self._spawner.stdin.write(json.dumps([command, str(self._output), ADDRESS_SPACE, HANGS_S]) + "\n")
+        self._spawner.stdin.flush()
+        status, cpu_s, peak_bytes = json.loads(self._spawner.stdout.readline())
+        with open(self._output, "rb") as output:
+            return Ran(status, cpu_s, peak_bytes, output.read(SHOWN))
+
+
+def run(arguments: Sequence[str]) -> Ran:
+    """Run a command in a process that is forked from this one."""
     with tempfile.TemporaryFile() as output:
         pid = os.fork()
         if pid == 0:
-            _become(arguments, output.fileno(), program)
+            _become(arguments, output.fileno())
         _, status, used = os.wait4(pid, 0)
         output.seek(0)
         told = output.read(SHOWN)
     return Ran(os.waitstatus_to_exitcode(status), used.ru_utime + used.ru_stime, used.ru_maxrss << 10, told)
 
 
-def _become(arguments: Sequence[str], output: int, program: bool) -> None:
+def _become(arguments: Sequence[str], output: int) -> None:
     """Be the command, in a process that was just forked. Does not return."""
     status = 70
     try:
@@ -98,9 +123,6 @@ def _become(arguments: Sequence[str], output: int, program: bool) -> None:
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         signal.alarm(HANGS_S)
         sys.argv = sys.orig_argv = ["fieldcal", *arguments]
-        if program:
-            os.environ.pop("FIELDCAL_KERNELS_CHOSEN")
-            os.execv(sys.executable, [sys.executable, "-m", "agent", *arguments])
         os.environ["FIELDCAL_TRACEBACK"] = "1"
         from agent.cli.main import run_cli
 
@@ -140,7 +162,8 @@ class Cases:
             guard_standard_streams()  # before a library keeps them for its warnings
         (directory / "site").mkdir()
         self.kinds = kinds(directory / "site", quick=quick)
-        self._at, self._program, self._keep = directory, program, keep
+        self._at, self._keep = directory, keep
+        self._run = Program(directory / "output").run if program else run
         self.rows = {kind.title: Row() for kind in self.kinds}
         if not program:
             self._load()
@@ -206,7 +229,7 @@ class Cases:
     def _ran(self, kind: Kind, use: Use, data: bytes) -> Ran:
         file, out = self._placed(kind, data)
         try:
-            return run(use.filled(file, out), self._program)
+            return self._run(use.filled(file, out))
         finally:
             shutil.rmtree(out, ignore_errors=True)
 

@@ -20,3 +20,19 @@ def test_no_hostile_file_ends_a_command_with_a_fault() -> None:
     refused, harmless = sum(row[3] + row[4] for row in counts), sum(row[2] for row in counts)
     assert refused > FILES / 2
     assert harmless > 0
+
+
+MEMORY = """
+import sys
+from pathlib import Path
+from benchmarks.hostile_files import Program
+large = bytearray(b"x" * (300 << 20))  # Linux counts it for each process that is forked from this one
+ran = Program(Path(sys.argv[1])).run(["--version"])
+print(ran.status, b"fieldcal, version" in ran.output, ran.peak_bytes < len(large) / 2)
+"""
+
+
+def test_the_memory_of_the_program_is_not_that_of_the_process_that_starts_it(tmp_path: Path) -> None:
+    run = [sys.executable, "-c", MEMORY, str(tmp_path / "output")]
+    done = subprocess.run(run, cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert done.stdout == "0 True True\n", done.stderr
