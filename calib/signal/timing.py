@@ -23,6 +23,7 @@ IntArray = NDArray[np.int64]
 # A typical driver sends 3000 bursts in a minute. If the temperature changes the rate by 250 ppm in 30 min, a parabola
 # follows the clock within a minute to 1 us.
 HORIZON_S = 60.0
+MOST_NEW = 64  # blocks whose bursts wait until somebody asks for the clock
 MAX_BURSTS = 8192  # limits memory and time for a device that sends each sample as a burst
 # Bursts in a group. The earliest two of a small group are later on average; large groups are too few for a fit.
 GROUPS, SMALLEST_GROUP, LARGEST_GROUP = 16, 8, 64
@@ -111,11 +112,21 @@ class ClockModel:
         """Forget all bursts, because the sample numbers before and after this moment are not comparable."""
         self._index = np.empty(0, dtype=np.int64)
         self._arrival_s = np.empty(0)
+        self._new: list[tuple[IntArray, Array]] = []  # not joined to them yet
 
     def update(self, sample_index_after_burst: ArrayLike, arrival_s: ArrayLike) -> None:
         """Take B bursts: the number of the newest sample in each (B,), and its arrival time in s (B,); both rise."""
-        self._index = np.concatenate([self._index, np.asarray(sample_index_after_burst, dtype=np.int64)])
-        self._arrival_s = np.concatenate([self._arrival_s, np.asarray(arrival_s, dtype=float)])
+        self._new.append((np.asarray(sample_index_after_burst, np.int64), np.asarray(arrival_s, np.float64)))
+        if len(self._new) == MOST_NEW:
+            self._join()
+
+    def _join(self) -> None:
+        """Join the new bursts to those of the last minute, all at once: to do so with each block takes far longer."""
+        if not self._new:
+            return
+        self._index = np.concatenate([self._index, *(index for index, _ in self._new)])
+        self._arrival_s = np.concatenate([self._arrival_s, *(arrival_s for _, arrival_s in self._new)])
+        self._new = []
         # Where a sample is missing within a burst, the burst comes in parts, and only the last part came without delay.
         later = self._arrival_s[1:] != self._arrival_s[:-1]
         if not later.all():
@@ -128,12 +139,14 @@ class ClockModel:
 
     def result(self) -> ClockFit:
         """The clock, estimated from the bursts of the last minute. Raises ValueError before the first burst."""
+        self._join()
         if not len(self._index):
             raise ValueError("no burst yet: call update() with at least one burst before result()")
         return parabola(self._index, self._arrival_s, self._nominal_rate_hz).clock(self._index[0], self._index[-1])
 
     def nominal(self) -> ClockFit:
         """The clock at the nominal rate under which the newest burst came at once. There must be a burst."""
+        self._join()
         newest, period_s = self._index[-1], 1.0 / self._nominal_rate_hz
         unknown = np.diag([period_s, 0.01 * period_s, 0.0]) ** 2
         line = Parabola(int(newest), float(self._arrival_s[-1]), np.array([0.0, period_s, 0.0]), unknown)
@@ -142,10 +155,12 @@ class ClockModel:
     def lateness_s(self, clock: ClockFit) -> Array:
         """(B,) delay in s of each burst of the last minute: its arrival time less the time of its newest sample by
         `clock`."""
+        self._join()
         return np.asarray(self._arrival_s - clock.time_of(self._index))
 
     def snapshot(self) -> dict[str, float | IntArray | Array]:
         """The complete state, for `restore`; bit for bit."""
+        self._join()
         return {
             "nominal_rate_hz": self._nominal_rate_hz,
             "horizon_s": self._horizon_s,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.signal.timing import ClockFit, ClockModel
+from calib.signal.timing import MAX_BURSTS, ClockFit, ClockModel
 
 Bursts = tuple[np.ndarray, np.ndarray, np.ndarray]
 
@@ -158,3 +158,25 @@ def test_index_is_the_inverse_of_time() -> None:
 def test_a_rate_that_cannot_be_is_refused() -> None:
     with pytest.raises(ValueError, match="above 0 Hz, is 0"):
         ClockModel(0.0)
+
+
+@pytest.mark.parametrize("horizon_s", [10.0, 1e6])
+@pytest.mark.parametrize("asked_each", [1, 7, 1000])
+def test_it_does_not_matter_how_often_the_clock_is_asked(asked_each: int, horizon_s: float) -> None:
+    """Bursts are joined when somebody asks: with parts of bursts, past the horizon and past the most bursts."""
+    random = np.random.default_rng(3)
+    often, once = ClockModel(1000.0, horizon_s), ClockModel(1000.0, horizon_s)
+    index, time_s = 0, 0.0
+    for number in range(500):
+        parts = random.integers(1, 40, size=random.integers(1, 120))
+        counted = index + np.cumsum(parts)
+        arrival_s = time_s + 1e-3 * np.cumsum(parts * random.integers(0, 2, size=len(parts)))
+        index, time_s = int(counted[-1]), float(arrival_s[-1]) + 1e-3
+        for model in (often, once):
+            model.update(counted, arrival_s)
+        if number % asked_each == 0:
+            often.result()
+    kept, same = often.snapshot(), once.snapshot()
+    assert all(np.array_equal(kept[name], same[name]) for name in kept)
+    held = len(np.asarray(kept["index"]))
+    assert held == MAX_BURSTS if horizon_s > 1000.0 else 100 < held < MAX_BURSTS
