@@ -25,7 +25,7 @@ from calib.recorded.outcome import NuisanceValue, Outcome, nothing_used
 from calib.recorded.priors import priors_of, row_contradictions, u_gravity_mps2
 from calib.recorded.table import SensorTable
 from calib.recorded.tables import Tables
-from calib.signal.response import UNSETTLED
+from calib.signal.response import FLAT, UNSETTLED, Response
 from calib.signal.stamps import clock_from_stamps
 
 METHOD = "3 (adjustment)"
@@ -64,7 +64,7 @@ def _adjusted(tables: Tables, priors: Priors) -> tuple[Outcome, ReferenceShare |
             return _outcome(found, windows, tables.rate_hz), found.share
         if turn >= HOPELESS and found.reasons:
             return _outcome(found, windows, tables.rate_hz), found.share
-        applied = replace(applied, response=found.response.terms.modest)
+        applied = replace(applied, response=_next_response(found.response.terms, applied.response))
     if not _used(windows) and not _used(judged):
         return nothing_used(judged, tables.rate_hz, METHOD), None
     return Outcome(None, (UNSETTLED,), windows, tables.rate_hz, METHOD), None
@@ -95,7 +95,7 @@ class _Search:
             return applied, windows
         unsteady, taken = self.without_lag(applied, steady=False)
         response = self.at(unsteady, taken).response if _used(unsteady) else None
-        return (applied if response is None else replace(taken, response=response.terms.modest)), windows
+        return (applied if response is None else replace(taken, response=_next_response(response.terms))), windows
 
     def at(self, windows: Sequence[Window], taken: Applied) -> Adjustment:
         """The adjustment of windows from which this was taken out; the latest one is kept."""
@@ -114,6 +114,12 @@ class _Search:
         make = partial(self._tables.windows, response=taken.response, steady=steady)
         windows, lag_s = without_lag(taken.lag_s, make, _used, lag_of)
         return windows, replace(taken, lag_s=lag_s)
+
+
+def _next_response(found: Response, taken: Response = FLAT) -> Response:
+    """What to take out after a turn that found this response. Terms below the motion that were taken out stay: without
+    their filter the windows would be longer ones again, and the search could go to and fro between both."""
+    return (found if taken.from_hz else found.without_slight_below).modest
 
 
 def _hardly_used(windows: Sequence[Window]) -> tuple[str, ...]:
