@@ -13,7 +13,7 @@ from click.testing import CliRunner
 from agent.cli.calibrate import calibrate
 from calib import calibrate as calibrated_arrays
 from calib.estimate.adjustment import adjust
-from calib.estimate.banded import _Factors, _projected
+from calib.estimate.banded import Factors, _projected
 from calib.estimate.nuisances import Priors
 from calib.excitation.bands import band_sums
 from calib.recorded.adjusting import adjusted
@@ -257,7 +257,7 @@ def test_a_window_whose_motion_is_in_one_band_has_finite_derivatives() -> None:
     u = np.random.default_rng(1).normal(size=(2000, 1))
     bands = band_sums(u, np.gradient(u, t, axis=0), np.repeat(u, 3, axis=1), 100.0)
     assert bands is not None
-    factors = _Factors(bands, np.array([8]))
+    factors = Factors(bands, np.array([8]))
     with np.errstate(all="raise"):
         found = _projected(factors, len(POWERS), 1.3 * factors.omega**2)
     np.testing.assert_allclose(found[0, 0], -(factors.omega**2), rtol=1e-9)
@@ -284,3 +284,21 @@ def test_short_stops_beside_an_ac_coupled_reference_settle(seed: int) -> None:
     )  # fmt: skip
     assert found.status == "valid", found.reasons
     assert np.abs((found.sensitivity - seen.truth.sensitivity).ravel() / found.standard_uncertainty[:9]).max() < 3.0
+
+
+def test_what_is_refused_tells_its_response_band_by_band() -> None:
+    """A resonance within the motion: no S, but each band tells its own sensitivity, right within its uncertainty."""
+    shape = resonance(14.0, 5.0)
+    made = pair(1, shape, band_hz=(0.5, 20.0), rate_hz=200.0, seconds=300.0)
+    found = calibrated(made)
+    assert found.calibration is None
+    at_reference = abs(shape(np.array([made.reference_frequency_hz]))[0])
+    away = []
+    for band in found.more["response"]:
+        middle_hz = np.array([np.sqrt(band["low_hz"] * band["high_hz"])])
+        told = np.abs(np.array(band["sensitivity_re"]) + 1j * np.array(band["sensitivity_im"])).diagonal()
+        true = made.sensitivity.diagonal() * abs(shape(middle_hz)[0]) / at_reference
+        away += ((told - true) / np.array(band["standard_uncertainty"]).diagonal()).tolist()
+        assert np.abs(told / true - 1.0).max() < 0.08  # at the peak the response bends within a band
+    assert len(away) >= 75
+    assert np.nanmax(np.abs(away)) < 4.0
