@@ -2,8 +2,8 @@
 
     python -m benchmarks.disturbed [--runs 10] [--write]
 
-A sensor and a tri-axial reference move together for 300 s, with the same response. The reference's error is drawn from its
-stated uncertainty of 0.1 %. "u over that without" compares the mean u of the main sensitivities.
+A sensor and a tri-axial reference move together for 300 s, with the same response. The error of the reference is drawn
+from its stated uncertainty of 0.1 %. "u over that without" compares the mean u of the main sensitivities.
 """
 
 from __future__ import annotations
