@@ -46,8 +46,8 @@ KINDS: dict[str, Made] = {
     "1/f noise of the sensor, 1 % of the motion": lambda low, high: noise(
         lambda f: 0.01 * _density(low, high) * np.sqrt(np.sqrt(low * high) / f)
     ),
-    "noise of the sensor as strong as the motion, above half of its band": lambda low, high: noise(_upper_half(low, high)),
-    "the same in the reference": lambda low, high: noise(_upper_half(low, high), of_reference=True),
+    "noise of the sensor as strong as the motion, above half of its band": lambda *ends: noise(_upper_half(*ends)),
+    "the same in the reference": lambda *ends: noise(_upper_half(*ends), of_reference=True),
     "white noise of the reference, 10 % of the motion": lambda low, high: noise(
         lambda f: np.full(len(f), 0.1 * _density(low, high)), of_reference=True
     ),
