@@ -83,11 +83,9 @@ def drawn_again(random: np.random.Generator, site: SimulatedSite, links: Sequenc
 
 def seen_by(each: Link, factor: np.ndarray) -> Link:
     """The link whose seen S is that of this link times `factor` (3, 3)."""
-    seen = each.adjustment.mean[:9].reshape(3, 3)
-    changed = each.adjustment.mean.copy()
-    changed[:9] = (seen @ factor).ravel()
-    told = each.told + each.rows @ (changed - each.adjustment.mean)
-    return replace(each, told=told, adjustment=replace(each.adjustment, mean=changed))
+    changed = each.mean.copy()
+    changed[:9] = (each.mean[:9].reshape(3, 3) @ factor).ravel()
+    return replace(each, told=each.told + each.rows @ (changed - each.mean), mean=changed)
 
 
 def beside(links: Sequence[Link], gain: dict[str, np.ndarray]) -> list[Link]:

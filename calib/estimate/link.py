@@ -38,7 +38,8 @@ class Link:
     row by row, Q, and `shared`: names of gravity and numbers of the reference's parameters, as (device, parameter).
     `rotation` (3, 3), with a = R a_ref, is given if the reference measures gravity in three axes. S and Q are then
     those that the sensor seems to have beside this reference, because its rotation, known to `u_rotation_rad`, and each
-    of the reference's 12 parameters act on them (calib.estimate.site); `shared` is empty.
+    of the reference's 12 parameters act on them (calib.estimate.site); `shared` is empty. `mean` (12,): S and Q by this
+    link alone; `degrees_of_freedom` of their type A part.
     """
 
     sensor: str
@@ -48,7 +49,8 @@ class Link:
     shared: tuple[tuple[str, int], ...]
     rotation: Array | None
     u_rotation_rad: float
-    adjustment: Adjustment
+    mean: Array
+    degrees_of_freedom: float
 
 
 def link(
@@ -73,7 +75,10 @@ def link(
     variance = np.append(u[:9] ** 2, np.full(3, np.inf))
     found = adjust(used, Priors(here.values, mean, np.diag(variance), priors.known), applied)
     rows, told, shared = _information(found, mean, u, reference)
-    return Link(sensor, reference, rows, told, shared, rotation, priors.rotation_rad, found)
+    return Link(
+        sensor, reference, rows, told, shared, rotation, priors.rotation_rad,
+        found.mean[:12].copy(), found.calibration.degrees_of_freedom,
+    )  # fmt: skip
 
 
 def _rotation(used: Sequence[Window]) -> Array | None:
