@@ -18,6 +18,7 @@ import numpy as np
 
 from calib.estimate.adjustment import Adjustment, adjust
 from calib.estimate.nuisances import Applied, Priors
+from calib.estimate.offset_drift import drift_of
 from calib.estimate.quantities import GRAVITY, REFERENCE
 from calib.model import Array, Window
 
@@ -73,8 +74,13 @@ def link(
     here = Priors({**priors.values, **of_site}, priors.parameters, priors.covariance, priors.known)
     mean, u = _point(used, here, applied)
     variance = np.append(u[:9] ** 2, np.full(3, np.inf))
-    found = adjust(used, Priors(here.values, mean, np.diag(variance), priors.known), applied)
-    rows, told, shared = _information(found, mean, u, reference)
+    known = Priors(here.values, mean, np.diag(variance), priors.known)
+    found = adjust(used, known, applied)
+    covariance = found.covariance
+    if (drift := drift_of(found, used)) is not None:
+        found = adjust(drift.removed_from(used), known, applied)
+        covariance = found.covariance + drift.covariance
+    rows, told, shared = _information(found, covariance, mean, u, reference)
     return Link(
         sensor, reference, rows, told, shared, rotation, priors.rotation_rad,
         found.mean[:12].copy(), found.calibration.degrees_of_freedom,
@@ -102,7 +108,7 @@ def _point(used: Sequence[Window], priors: Priors, applied: Applied | None) -> t
 
 
 def _information(
-    found: Adjustment, mean: Array, u: Array, reference: str
+    found: Adjustment, covariance: Array, mean: Array, u: Array, reference: str
 ) -> tuple[Array, Array, tuple[tuple[str, int], ...]]:
     """Rows, what they are told to be, and the shared unknowns; see Link. `mean`, `u` (12,) are subtracted."""
     kept = [j for j, n in enumerate(found.nuisances) if n.kind in (REFERENCE, GRAVITY)]
@@ -111,7 +117,7 @@ def _information(
     index = [*range(12), *(12 + j for j in kept)]
     u = np.append(u, [found.nuisances[j].prior_uncertainty for j in kept])
     mean = np.append(mean, np.zeros(len(kept)))
-    left, ways = np.linalg.eigh(found.covariance[np.ix_(index, index)] / np.outer(u, u))
+    left, ways = np.linalg.eigh(covariance[np.ix_(index, index)] / np.outer(u, u))
     told = left < 1.0 - LEAST_TOLD
     left, ways = np.maximum(left[told], ROUNDING), ways[:, told]
     weight = np.sqrt(1.0 / left - 1.0)
