@@ -31,7 +31,7 @@ from calib.estimate.link import Link, link
 from calib.estimate.nuisances import Priors
 from calib.estimate.site import Site
 from calib.model import Pose, Window, WindowSums
-from tests.dense_site import SimulatedSite, Stated, turned
+from tests.dense_site import RATE_HZ, SAMPLES, SimulatedSite, Stated, turned
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "fleet.md"
 NOMINAL = np.append(np.eye(3).ravel(), np.zeros(3))
@@ -39,6 +39,7 @@ PRIOR = np.diag(np.append(np.full(9, 0.2), np.full(3, 5.0)) ** 2)
 SENSORS, REFERENCES, POSITIONS = 200, 5, 3
 BAD_U = 3.0
 LARGE_SENSORS, LARGE_REFERENCES, LARGE_WINDOWS, SEGMENTS = 2000, 50, 50, 10
+EVERY_S = 60.0  # between the begins of two windows of a large site
 TOGETHER = 10  # runs with the same windows
 DRAWS = 200_000  # of the bounds; 95 % of them is known to 0.1 %
 NAMED = 0.95
@@ -191,9 +192,10 @@ def windows_of(base: Sequence[WindowSums], S: np.ndarray, Q: np.ndarray, noise: 
     shift = np.append(np.zeros(6), Q)
     pose = Pose("beside", np.eye(3), np.zeros(3))
     found = []
-    for sums in base:
+    for k, sums in enumerate(base):
         moved = WindowSums(3, sums.count, sums.mean @ matrix.T + shift, matrix @ sums.scatter @ matrix.T)
-        found.append(Window(0.0, 2.0, pose, moved, True, "", int(sums.count.sum()), 0))
+        at_s = EVERY_S * k
+        found.append(Window(at_s, at_s + SAMPLES / RATE_HZ, pose, moved, True, "", int(sums.count.sum()), 0))
     return found
 
 

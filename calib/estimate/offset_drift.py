@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.estimate.adjustment import Adjustment
-from calib.estimate.norm_fit import WALKS
+from calib.estimate.norm_fit import WALKS, walk_steps
 from calib.model import Array, Window
 
 # Scatter alone shows more than this once in a hundred meetings: three outputs together, each of which shows no walk in
@@ -23,7 +23,7 @@ from calib.model import Array, Window
 LEAST_CHI2 = 8.7
 # Variances of the scatter, in that which the adjustment gives the means: from the stated one on, because noise that is
 # slow within a window makes the adjustment give too large ones.
-LEAST_SCATTER, MOST_SCATTER, SCATTERS = 1e-3, 1e2, 19
+LEAST_SCATTER, MOST_SCATTER, SCATTERS = 1e-3, 1e2, 13
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,8 +57,9 @@ def drift_of(found: Adjustment, windows: Sequence[Window]) -> Drift | None:
     left, rows = (equations.split(part)[1][known] for part in (solution.residual, solution.jacobian))
     weight, stated = equations.mean_weight[known], 1.0 - equations.white_share[known].mean(axis=0)
     unit = np.mean(weight**2, axis=0)  # 1 / output unit squared
+    moved = walk_steps((time_s - 0.5 * (time_s.max() + time_s.min())) / np.ptp(time_s))
     courses = [
-        _course(left[:, i], rows[:, i], weight[:, i, None] * _walk(time_s) * weight[:, i] / unit[i], float(stated[i]))
+        _course(left[:, i], rows[:, i], weight[:, i, None] / np.sqrt(unit[i]) * moved, float(stated[i]))
         for i in range(3)
     ]
     if sum(course.chi2 for course in courses) <= LEAST_CHI2:
@@ -84,40 +85,35 @@ class _Course:
     more: Array
 
 
-def _course(left: Array, rows: Array, walk: Array, stated: float) -> _Course:
+def _course(left: Array, rows: Array, moved: Array, stated: float) -> _Course:
     """The walk that the means of one output show.
 
-    `left` (W,) is what the adjustment leaves of the means, `rows` (W, N) are those of y, `walk` (W, W) is the
-    covariance of a walk whose variance over the whole time is 1; `stated` is the variance of the scatter as stated. All
-    in units of the scatter that the adjustment gives the means.
+    `left` (W,) is what the adjustment leaves of the means, `rows` (W, N) are those of y; `moved` (W, R) is what the R
+    independent steps of a walk whose variance over the whole time is 1 do to the means; `stated` is the variance of the
+    scatter as stated. All in units of the scatter that the adjustment gives the means.
     """
-    size, ways = np.linalg.eigh(walk)  # in the coordinates `ways` the walk is independent, and the scatter as well
-    left, rows = ways.T @ left, ways.T @ rows
+    ways, root, _ = np.linalg.svd(moved, full_matrices=False)  # along `ways` the walk is independent
+    left_along, rows_along = ways.T @ left, ways.T @ rows
     scatters = np.geomspace(max(stated, LEAST_SCATTER), MOST_SCATTER, SCATTERS)
     scatter, ratio = (each.ravel() for each in np.meshgrid(scatters, WALKS, indexing="ij"))
-    walked = (scatter * ratio)[:, None] * np.maximum(size, 0.0)
-    shown = 1.0 / (scatter[:, None] + walked)  # (G, W)
+    walked = ratio[:, None] * root**2 / (1.0 + ratio[:, None] * root**2)  # (G, R) share of the walk in the variance
+    less, weight = walked / scatter[:, None], 1.0 / scatter
 
-    others = np.eye(rows.shape[1]) - rows.T @ rows
-    inverse = np.linalg.inv(others + np.einsum("gw,wn,wm->gnm", shown, rows, rows, optimize=True))
-    pull = ((shown - 1.0) * left) @ rows
+    square = rows.T @ rows
+    lost = np.einsum("gr,rn,rm->gnm", less, rows_along, rows_along, optimize=True)
+    inverse = np.linalg.inv(np.eye(len(square)) + (weight - 1.0)[:, None, None] * square - lost)
+    pull = (weight - 1.0)[:, None] * (left @ rows) - (less * left_along) @ rows_along
     step = (inverse @ pull[..., None])[..., 0]
-    chi2 = shown @ left**2 - np.sum(pull * step, axis=1)
-    likelihood = 0.5 * (np.log(shown).sum(axis=1) + np.linalg.slogdet(inverse)[1] - chi2)
+    chi2 = weight * (left @ left) - less @ left_along**2 - np.sum(pull * step, axis=1)
+    determinant = len(left) * np.log(scatter) - np.log1p(-walked).sum(axis=1) - np.linalg.slogdet(inverse)[1]
+    likelihood = -0.5 * (chi2 + determinant)
     share = np.exp(likelihood - likelihood.max())
     share /= share.sum()
     apart = step - share @ step
     still = np.repeat(inverse[ratio == 0.0], len(WALKS), axis=0)  # with the same scatter, but without a walk
     return _Course(
-        walk=ways @ np.sum(share[:, None] * walked * shown * (left - step @ rows.T), axis=0),
+        walk=ways @ np.sum(share[:, None] * walked * (left_along - step @ rows_along.T), axis=0),
         chi2=2.0 * float(likelihood.max() - likelihood[ratio == 0.0].max()),
         variance=float(share @ (scatter * ratio)),
         more=np.tensordot(share, inverse - still, 1) + (share[:, None] * apart).T @ apart,
     )
-
-
-def _walk(time_s: Array) -> Array:
-    """(W, W) covariance of a random walk that is 0 in the middle of the time; its variance over all of it is 1."""
-    part = (time_s - 0.5 * (time_s.max() + time_s.min())) / np.ptp(time_s)
-    same = np.sign(part)[:, None] == np.sign(part)
-    return np.where(same, np.minimum(np.abs(part)[:, None], np.abs(part)), 0.0)
