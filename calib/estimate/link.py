@@ -89,8 +89,8 @@ def link(
 
 def _rotation(used: Sequence[Window]) -> Array | None:
     """R if all windows are beside a tri-axial reference that measures gravity itself, in one pose; else None."""
-    first = used[0].pose.direction
-    alike = all(np.array_equal(w.pose.direction, first) and not np.any(w.pose.gravity_mps2) for w in used)
+    first, poses = used[0].pose.direction, {id(w.pose): w.pose for w in used}.values()
+    alike = all(np.array_equal(pose.direction, first) and not np.any(pose.gravity_mps2) for pose in poses)
     return first if first.shape == (3, 3) and alike else None
 
 

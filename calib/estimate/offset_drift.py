@@ -24,6 +24,7 @@ LEAST_CHI2 = 8.7
 # Variances of the scatter, in that which the adjustment gives the means: from the stated one on, because noise that is
 # slow within a window makes the adjustment give too large ones.
 LEAST_SCATTER, MOST_SCATTER, SCATTERS = 1e-3, 1e2, 13
+ROUNDING = 1e-12  # of what is known in a direction of y, which is 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,6 +93,9 @@ def _course(left: Array, rows: Array, moved: Array, stated: float) -> _Course:
     independent steps of a walk whose variance over the whole time is 1 do to the means; `stated` is the variance of the
     scatter as stated. All in units of the scatter that the adjustment gives the means.
     """
+    size, seen = np.linalg.eigh(rows.T @ rows)
+    seen = seen[:, size > ROUNDING]  # the directions of y that the means of this output tell of
+    rows = rows @ seen
     ways, root, _ = np.linalg.svd(moved, full_matrices=False)  # along `ways` the walk is independent
     left_along, rows_along = ways.T @ left, ways.T @ rows
     scatters = np.geomspace(max(stated, LEAST_SCATTER), MOST_SCATTER, SCATTERS)
@@ -100,7 +104,7 @@ def _course(left: Array, rows: Array, moved: Array, stated: float) -> _Course:
     less, weight = walked / scatter[:, None], 1.0 / scatter
 
     square = rows.T @ rows
-    lost = np.einsum("gr,rn,rm->gnm", less, rows_along, rows_along, optimize=True)
+    lost = np.swapaxes(less[..., None] * rows_along, 1, 2) @ rows_along
     inverse = np.linalg.inv(np.eye(len(square)) + (weight - 1.0)[:, None, None] * square - lost)
     pull = (weight - 1.0)[:, None] * (left @ rows) - (less * left_along) @ rows_along
     step = (inverse @ pull[..., None])[..., 0]
@@ -115,5 +119,5 @@ def _course(left: Array, rows: Array, moved: Array, stated: float) -> _Course:
         walk=ways @ np.sum(share[:, None] * walked * (left_along - step @ rows_along.T), axis=0),
         chi2=2.0 * float(likelihood.max() - likelihood[ratio == 0.0].max()),
         variance=float(share @ (scatter * ratio)),
-        more=np.tensordot(share, inverse - still, 1) + (share[:, None] * apart).T @ apart,
+        more=seen @ (np.tensordot(share, inverse - still, 1) + (share[:, None] * apart).T @ apart) @ seen.T,
     )
