@@ -244,7 +244,10 @@ def main() -> None:
             told.append(one(seed, site, links))
             print(seed + 1, told[-1], flush=True)
         name = "site-runs"
-        text = f"{options.runs} runs, false-alarm rate stated as {FALSE_ALARM:.0%}.\n\n{summary(told)}"
+        text = (
+            f"{options.runs} runs, false-alarm probability stated as {FALSE_ALARM:.0%}. What the best test reaches is "
+            f"of {DRAWS:,} draws.\n\n{summary(told)}"
+        )
     text = f"{text}\n\nMeasured on {machine()}."
     if options.write:
         write_part(name, text, PAGE)
