@@ -149,6 +149,44 @@ class Filtered(Harm):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Rattling(Harm):
+    """A loose part beside the sensor hits when the motion is strong, and rings in the sensor alone.
+
+    It hits where the acceleration rises above `above` times the level of the motion, and rings with `amplitude` times
+    this level at `frequency_hz`.
+    """
+
+    frequency_hz: float = 30.0
+    amplitude: float = 0.5
+    above: float = 1.5
+
+    def moved(self, visit: Visit, felt: Array) -> Array:
+        if visit.role != "sensor":
+            return felt
+        step_s = float(np.mean(np.diff(visit.time_s)))
+        beyond = np.linalg.norm(felt, axis=1) > self.above * visit.level_mps2
+        begins = beyond & ~np.concatenate([[False], beyond[:-1]])
+        hits = begins * visit.random.normal(1.0, 0.3, len(felt)) * visit.random.choice([-1.0, 1.0], len(felt))
+        cycles = np.arange(int(6.0 / self.frequency_hz / step_s)) * step_s * self.frequency_hz
+        rings = np.convolve(hits, np.exp(-cycles / 1.5) * np.sin(2.0 * np.pi * cycles))[: len(felt)]
+        return felt + self.amplitude * visit.level_mps2 * rings[:, None] * np.array([1.0, 0.4, -0.6])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Slipping(Harm):
+    """The sensor is held by friction alone: where the acceleration is above `above` times the level of the motion it
+    slips, and feels no more than that."""
+
+    above: float = 1.5
+
+    def moved(self, visit: Visit, felt: Array) -> Array:
+        if visit.role != "sensor":
+            return felt
+        size = np.linalg.norm(felt, axis=1, keepdims=True)
+        return felt * np.minimum(1.0, self.above * visit.level_mps2 / np.maximum(size, np.finfo(float).tiny))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class KnockedOff(Harm):
     """The sensor has fallen off its mount and is turned.
 

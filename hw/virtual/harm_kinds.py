@@ -18,7 +18,9 @@ from hw.virtual.harm import (
     Harm,
     KnockedOff,
     Lossy,
+    Rattling,
     Role,
+    Slipping,
     Transformed,
     Unplugged,
 )
@@ -97,6 +99,11 @@ def _resonant(random: np.random.Generator) -> Harm:
     return Filtered(f"resonance, {role}", role, response)
 
 
+def _rattling(random: np.random.Generator) -> Harm:
+    frequency_hz, amplitude = float(random.uniform(5.0, 40.0)), float(random.uniform(0.1, 2.0))
+    return Rattling("rattles", frequency_hz, amplitude, float(random.uniform(0.8, 2.0)))
+
+
 KINDS: dict[str, Drawing] = {
     "reference unplugged": _unplugged,
     "dead channel of the sensor": lambda random: _dead(random, "sensor"),
@@ -110,4 +117,6 @@ KINDS: dict[str, Drawing] = {
     "clock step": _clock_step,
     "low-pass filter": _filtered,
     "mount resonates": _resonant,
+    "rattles": _rattling,
+    "slips on its mount": lambda random: Slipping("slips", float(random.uniform(0.5, 2.0))),
 }
