@@ -20,6 +20,8 @@ from agent.certificate.schema import SchemaError, check_schema
 from agent.certificate.signing import PURPOSE, signed_json
 from agent.cli.main import run_cli
 from agent.config.earlier import DCC, PARAMETER_LIST, SI, read_earlier
+from agent.core.events import CalibrationUpdate
+from agent.recording.reading import RecordingReader
 from agent.recording.signed_text import SignedText, values_of
 from tests.unit.certificates import content, run, stated, uneven
 from tests.unit.recorded_bench import record
@@ -194,6 +196,13 @@ def test_a_data_directory_and_a_recording(tmp_path: Path) -> None:
     np.testing.assert_allclose(conditions["motion_frequency_hz"], np.sqrt((8**3 - 1) / 21), rtol=0.05)
     assert 1.0 < conditions["levels_mps2"][0] <= conditions["levels_mps2"][1] < 5.0
     assert found[0]["made_from"][0]["sha256"] == hashlib.sha256(recordings[0].read_bytes()).hexdigest()
+    steps = (step for path in recordings for step in RecordingReader(path).steps())
+    update = [r for step in steps for r in step.results if isinstance(r, CalibrationUpdate)][-1]
+    for one in found:
+        assert one["conditions"]["reference_frequency_hz"] == update.reference_frequency_hz > 1.0
+        assert one["conditions"]["valid_band_hz"] == update.valid_band_hz
+        assert one["result"]["response"] == [msgspec.structs.asdict(band) for band in update.response]
+    assert len(update.response) == 3
 
 
 def test_the_graph_leads_from_the_certificate_to_the_files_and_the_reference(tmp_path: Path) -> None:
