@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 import weakref
 from dataclasses import dataclass
@@ -15,21 +16,29 @@ class Spool:
     """Rows of `width` numbers in a temporary file, 8 bytes for each number. The file goes with the last user."""
 
     def __init__(self, width: int) -> None:
-        self._file = tempfile.TemporaryFile()  # noqa: SIM115 - open as long as there is a user
+        self._file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115 - open as long as there is a user
         weakref.finalize(self, self._file.close)
         self.width, self.rows = width, 0
 
     def append(self, rows: Array) -> None:
-        """Add rows (n, width). Raises OSError."""
-        self._file.seek(0, 2)
-        self._file.write(np.ascontiguousarray(rows, np.float64).data)
+        """Add rows (n, width). Raises OSError, which names the directory and the remedy."""
+        left = np.ascontiguousarray(rows, np.float64).ravel().view(np.uint8)
+        try:
+            self._file.seek(0, os.SEEK_END)
+            while len(left):
+                left = left[self._file.write(left.data) :]
+        except OSError as error:
+            told = f"{error.strerror}; set TMPDIR to a directory with room for all samples, 8 bytes for each number"
+            raise OSError(error.errno, told, tempfile.gettempdir()) from None
         self.rows += len(rows)
 
     def read(self, first: int, stop: int) -> Array:
         """The rows `first` to `stop` (n, width), a copy."""
         found = np.empty((max(stop - first, 0), self.width))
+        left = found.ravel().view(np.uint8)
         self._file.seek(8 * self.width * first)
-        self._file.readinto(found.data.cast("B"))
+        while len(left):
+            left = left[self._file.readinto(left.data) :]
         return found
 
 
