@@ -56,10 +56,10 @@ def read_sensor(
     with open_source(path, described, "sensor") as source:
         choice = Choice(source, columns, "--columns")
         chosen = choice.in_one_group(_sensor_columns)
-        rows = _rows(source, chosen, progress, np.ones(len(chosen) - 1))
+        times, values = _rows(source, chosen, progress, np.ones(len(chosen) - 1))
         said, components = _described(source, choice, chosen[1:4])
-    temperature_degc = Spooled(rows, 4) if len(chosen) > 4 else None
-    return SensorFile(str(path), Spooled(rows, 0), Spooled(rows, slice(1, 4)), temperature_degc, said, components)
+    temperature_degc = Spooled(values, 3) if len(chosen) > 4 else None
+    return SensorFile(str(path), times, Spooled(values, slice(0, 3)), temperature_degc, said, components)
 
 
 def _described(
@@ -109,11 +109,11 @@ def read_reference(
         choice = Choice(source, columns, "--reference-columns")
         chosen, quantity = choice.in_one_group(lambda choice: _reference_columns(choice, sensitivity))
         scale = np.array([_si(choice, c, sensitivity) for c in chosen[1:]])
-        rows = _rows(source, chosen, progress, scale)
+        times, values = _rows(source, chosen, progress, scale)
         said, components = _described(source, choice, chosen[1:])
     column, header = str(chosen[1].column), source.header
-    channels = Spooled(rows, slice(1, None))
-    return ReferenceFile(str(path), Spooled(rows, 0), channels, quantity, column, header, said, components)
+    channels = Spooled(values, slice(None))
+    return ReferenceFile(str(path), times, channels, quantity, column, header, said, components)
 
 
 def _reference_columns(choice: Choice, sensitivity: Sensitivity | None) -> tuple[list[Chosen], str]:
@@ -171,8 +171,8 @@ def _si(choice: Choice, chosen: Chosen, sensitivity: Sensitivity | None) -> floa
     return (1.0 if unit is None else unit.si) * sensitivity.per / sensitivity.value
 
 
-def _rows(source: Source, chosen: Sequence[Chosen], progress: Progress | None, scale: Array) -> Spool:
-    """The chosen columns (n, k), n >= 2, on disk: times in s, the others times `scale`.
+def _rows(source: Source, chosen: Sequence[Chosen], progress: Progress | None, scale: Array) -> tuple[Spooled, Spool]:
+    """The first of the chosen columns (n,), n >= 2, which are times in s, and the others (n, k) times `scale`; on disk.
 
     Where one of the channels (columns 1 to 3) has no value, the others have none either.
     """
@@ -182,18 +182,15 @@ def _rows(source: Source, chosen: Sequence[Chosen], progress: Progress | None, s
                          "which is no unit of time")  # fmt: skip
     second = None if time_unit is None else time_unit.si
     place, names = str(source.path), [c.column.name for c in chosen]
-    spool = Spool(len(chosen))
+    times, values = Spool(1), Spool(len(chosen) - 1)
     with as_table_error(source.place):
         for rows in source.pieces([c.column for c in chosen], progress):
             if second is None and len(rows):
                 second = second_of(float(rows[0, 0]))
-            make_whole(rows, names, place, spool.rows)
-            if second is not None and second != 1.0:
-                rows[:, 0] *= second
-            if (scale != 1.0).any():
-                rows[:, 1:] *= scale
-            spool.append(rows)
+            make_whole(rows, names, place, values.rows)
+            times.append(rows[:, :1] * (1.0 if second is None else second))
+            values.append(rows[:, 1:] * scale)
             whole += int(np.isfinite(rows[:, 1]).sum())
         check_count(whole, place)
-        check_time(Spooled(spool, 0), names[0], place)
-    return spool
+        check_time(time_s := Spooled(times, 0), names[0], place)
+    return time_s, values
