@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -274,3 +275,21 @@ def test_the_dcc_is_checked_against_a_schema_that_the_user_has(
         return
     with pytest.raises(SchemaError, match=words):
         check_schema(xml, tmp_path / "dcc.xsd")
+
+
+@pytest.mark.skipif("FIELDCAL_DCC_XSD" not in os.environ, reason="FIELDCAL_DCC_XSD does not name dcc.xsd of PTB")
+@pytest.mark.parametrize("source", ["files", "recording"])
+def test_the_dcc_is_valid_by_the_schema_of_ptb(source: str, made: Path, tmp_path: Path) -> None:
+    """dcc.xsd 3.2.1 with SI_Format.xsd 2.1.0 beside it; PTB's files are not part of this repository."""
+    pytest.importorskip("xmlschema", reason="the extra dcc is not installed")
+    out, schema = made, Path(os.environ["FIELDCAL_DCC_XSD"])
+    if source == "recording":
+        record(tmp_path / "data", 41.0)
+        told, out = stated(tmp_path), tmp_path / "out"
+        told.write_text(told.read_text().replace('output_unit = "count"\n', ""))
+        words = ["certificate", tmp_path / "data", "--stated", told, "-o", out, "--xsd", schema]
+        assert run_cli([str(word) for word in words]) == 0
+    check_schema((out / "certificate.xml").read_bytes(), schema)
+    broken = (out / "certificate.xml").read_bytes().replace(b"dcc:uniqueIdentifier", b"dcc:identifier")
+    with pytest.raises(SchemaError, match="identifier"):
+        check_schema(broken, schema)
