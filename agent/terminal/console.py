@@ -27,7 +27,3 @@ class TextConsole(Console):
         """Render, with all text made visible."""
         for segment in super().render(renderable, options):
             yield segment if segment.control else Segment(visible(segment.text), segment.style)
-
-    def on_broken_pipe(self) -> None:
-        """The program that reads the output has ended: told as for any other output. rich would end the program."""
-        raise  # rich calls this where it has caught the BrokenPipeError
