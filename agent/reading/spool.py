@@ -54,4 +54,4 @@ class Spooled:
 
     def __getitem__(self, rows: slice, /) -> Array:
         first, stop, step = rows.indices(self.spool.rows)
-        return self.spool.read(first, stop)[::step, self.of]
+        return np.ascontiguousarray(self.spool.read(first, stop)[::step, self.of])  # no view, which would keep all rows

@@ -28,7 +28,7 @@ def check_gravity(reference: ReferenceTable) -> None:
     if reference.channels != 3:
         return
     x, step = reference.x, -(-len(reference.x) // ROWS)
-    some = [x[first : first + ROWS_AT_ONCE * step][::step] for first in range(0, len(x), ROWS_AT_ONCE * step)]
+    some = [x[first : first + ROWS_AT_ONCE * step : step] for first in range(0, len(x), ROWS_AT_ONCE * step)]
     length = float(np.nanmedian(np.linalg.norm(np.concatenate(some), axis=1)))
     if unit := _unit(length):
         raise UnitError(
