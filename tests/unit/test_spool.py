@@ -6,12 +6,15 @@ import errno
 import gc
 import os
 import resource
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from agent.reading.spool import Spool, Spooled
+from calib.recorded.table import ReferenceTable
+from calib.recorded.wrong_unit import check_gravity
 
 
 def open_files() -> int:
@@ -29,6 +32,19 @@ def test_slices_are_those_of_an_array() -> None:
     for part in (slice(None), slice(5, 40), slice(95, 200), slice(-3, None), slice(7, 7), slice(0, 100, 9)):
         np.testing.assert_array_equal(time[part], rows[part, 0])
         np.testing.assert_array_equal(channels[part], rows[part, 1:])
+
+
+def test_looking_at_some_rows_needs_no_memory_for_the_others() -> None:
+    """`check_gravity` looks at 100,000 rows, spread over the file: 2.4 MB, where all have 96 MB."""
+    spool = Spool(4)
+    for _ in range(40):
+        spool.append(np.tile([0.0, 0.0, 0.0, 9.81], (75_000, 1)))
+    reference = ReferenceTable("reference", Spooled(spool, 0), Spooled(spool, slice(1, 4)), "acceleration", "ax")
+    tracemalloc.start()
+    check_gravity(reference)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 15e6
 
 
 def test_the_file_goes_with_its_last_user() -> None:
