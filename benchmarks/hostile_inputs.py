@@ -22,7 +22,7 @@ from tests.unit.results import calibration, status, window
 ROOT = Path(__file__).resolve().parents[1]
 SIGNED = ROOT / "tests" / "replay" / "signatures" / "version-2-results"
 RECORDED_S = 8.0
-SLOW = {"MATLAB": 5}  # kinds that are read in a process of their own: only each so manieth file
+SLOW = {"MATLAB": 5, "Excel": 5}  # kinds that are read in a process of their own: only each so manieth file
 # They stand in the arguments for the hostile file, its directory, and a directory that does not exist.
 FILE, FOLDER, OUT = "FILE", "FOLDER", "OUT"
 RATE_HZ, REST_S, G_MPS2 = 100, 3, 9.80665
@@ -178,7 +178,7 @@ def _tables(site: Path, time_s: np.ndarray, v: np.ndarray) -> list[tuple[str, st
     for title, name, write in (
         ("Parquet", "a.parquet", _parquet), ("Feather", "a.feather", _feather), ("WAV", "a.wav", _wav),
         ("MATLAB", "a.mat", _matlab), ("HDF5", "a.h5", _hdf5), ("TDMS", "a.tdms", _tdms),
-        ("MiniSEED", "a.mseed", _miniseed), ("NPZ", "a.npz", _npz),
+        ("MiniSEED", "a.mseed", _miniseed), ("NPZ", "a.npz", _npz), ("Excel", "a.xlsx", _excel),
     ):  # fmt: skip
         try:
             write(site / name, time_s, v)
@@ -248,6 +248,17 @@ def _miniseed(path: Path, _: np.ndarray, v: np.ndarray) -> None:
 
 def _npz(path: Path, time_s: np.ndarray, v: np.ndarray) -> None:
     np.savez_compressed(path, **_columns(time_s, v))
+
+
+def _excel(path: Path, time_s: np.ndarray, v: np.ndarray) -> None:
+    import openpyxl
+
+    book = openpyxl.Workbook(write_only=True)
+    sheet = book.create_sheet()
+    sheet.append(["time_s", "vx", "vy", "vz"])
+    for row in np.column_stack([time_s, v]).tolist():
+        sheet.append(row)
+    book.save(path)
 
 
 def _empty_recording() -> bytes:

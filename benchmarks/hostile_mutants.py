@@ -7,6 +7,7 @@ import random
 import re
 import struct
 import tempfile
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -233,6 +234,7 @@ def _of_format(title: str) -> bytes:
     """A bomb of a binary format; empty where there is none, or its library is not here."""
     makers: dict[str, Callable[[Path], None]] = {
         "Parquet": _zeros_in_parquet, "MATLAB": _zeros_in_matlab, "HDF5": _zeros_in_hdf5, "WAV": _long_wav,
+        "Excel": _cells_in_excel,
         "NPZ": lambda path: np.savez_compressed(path, vx=np.zeros(50_000_000, np.uint8)),
     }  # fmt: skip
     if title not in makers:
@@ -268,6 +270,12 @@ def _zeros_in_hdf5(path: Path) -> None:
     with h5py.File(path, "w") as file:
         for name in ("time", "x", "y", "z"):
             file.create_dataset(name, shape=(60_000_000,), dtype="f8", chunks=(1_000_000,), compression="gzip")
+
+
+def _cells_in_excel(path: Path) -> None:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("[Content_Types].xml", "<Types/>")
+        archive.writestr("xl/worksheets/sheet1.xml", b"<row><c/></row>" * 10_000_000)
 
 
 def _long_wav(path: Path) -> None:

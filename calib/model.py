@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,14 @@ class Pose:
     u_theta_rad: float = 0.0
     along: Array | None = None
     along_rate_s: Array | None = None
+
+
+class Slices(Protocol):
+    """Rows that can be read from one number to another: an array, or rows on disk."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, rows: slice, /) -> Any: ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -24,6 +24,7 @@ from calib.recorded import calibrating
 from calib.recorded.options import Options
 from calib.recorded.outcome import Outcome
 from calib.recorded.poses import PoseRow, Poses
+from calib.recorded.table import ends_s
 from calib.recorded.tables import Tables
 from calib.signal.instrument import Instrument
 
@@ -71,7 +72,7 @@ def _stated(
     stated = by_metadata(options, sensor.components, reference.components if reference is not None else ())
     if poses is None and reference is not None and reference.components and sensor.components:
         values = pose_of_station(sensor.components, reference.components, stated)
-        row = PoseRow(float(reference.time_s[0]), float(reference.time_s[-1]), values)
+        row = PoseRow(*ends_s(reference.time_s), values)
         return stated, PosesFile.of_metadata(Poses("the metadata", [row]))
     return stated, PosesFile(poses)
 

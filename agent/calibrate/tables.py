@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ from agent.reading.choice import AXES, Choice, Chosen, quantity_of
 from agent.reading.formats import NOT_DESCRIBED, Description, open_source
 from agent.reading.ground_motion import GroundMotion
 from agent.reading.source import Array, Progress, Source, TableError
+from agent.reading.spool import Spool, Spooled
 from agent.reading.stationxml import Component
 from agent.reading.units import Sensitivity, unit_of
 from calib.recorded.table import (
@@ -56,10 +56,10 @@ def read_sensor(
     with open_source(path, described, "sensor") as source:
         choice = Choice(source, columns, "--columns")
         chosen = choice.in_one_group(_sensor_columns)
-        rows = _rows(source, chosen, progress, np.ones(len(chosen) - 1))
+        times, values = _rows(source, chosen, progress, np.ones(len(chosen) - 1))
         said, components = _described(source, choice, chosen[1:4])
-    temperature_degc = rows[:, 4] if len(chosen) > 4 else None
-    return SensorFile(str(path), rows[:, 0], rows[:, 1:4], temperature_degc, said, components)
+    temperature_degc = Spooled(values, 3) if len(chosen) > 4 else None
+    return SensorFile(str(path), times, Spooled(values, slice(0, 3)), temperature_degc, said, components)
 
 
 def _described(
@@ -109,10 +109,11 @@ def read_reference(
         choice = Choice(source, columns, "--reference-columns")
         chosen, quantity = choice.in_one_group(lambda choice: _reference_columns(choice, sensitivity))
         scale = np.array([_si(choice, c, sensitivity) for c in chosen[1:]])
-        rows = _rows(source, chosen, progress, scale)
+        times, values = _rows(source, chosen, progress, scale)
         said, components = _described(source, choice, chosen[1:])
     column, header = str(chosen[1].column), source.header
-    return ReferenceFile(str(path), rows[:, 0], rows[:, 1:], quantity, column, header, said, components)
+    channels = Spooled(values, slice(None))
+    return ReferenceFile(str(path), times, channels, quantity, column, header, said, components)
 
 
 def _reference_columns(choice: Choice, sensitivity: Sensitivity | None) -> tuple[list[Chosen], str]:
@@ -170,33 +171,26 @@ def _si(choice: Choice, chosen: Chosen, sensitivity: Sensitivity | None) -> floa
     return (1.0 if unit is None else unit.si) * sensitivity.per / sensitivity.value
 
 
-def _rows(source: Source, chosen: Sequence[Chosen], progress: Progress | None, scale: Array) -> Array:
-    """The chosen columns (n, k), n >= 2: times in s, the others times `scale`.
+def _rows(source: Source, chosen: Sequence[Chosen], progress: Progress | None, scale: Array) -> tuple[Spooled, Spool]:
+    """The first of the chosen columns (n,), n >= 2, which are times in s, and the others (n, k) times `scale`; on disk.
 
     Where one of the channels (columns 1 to 3) has no value, the others have none either.
-
-    A temporary file on disk holds them while they are used.
     """
-    count, whole, time_unit = 0, 0, unit_of(chosen[0].unit) if chosen[0].unit else None
+    whole, time_unit = 0, unit_of(chosen[0].unit) if chosen[0].unit else None
     if time_unit is not None and time_unit.quantity != "time":
         raise TableError(f"{source.path}, {source.header}: column {str(chosen[0].column)!r} is in {chosen[0].unit}, "
                          "which is no unit of time")  # fmt: skip
     second = None if time_unit is None else time_unit.si
     place, names = str(source.path), [c.column.name for c in chosen]
-    with tempfile.TemporaryFile() as spool, as_table_error(source.place):
+    times, values = Spool(1), Spool(len(chosen) - 1)
+    with as_table_error(source.place):
         for rows in source.pieces([c.column for c in chosen], progress):
             if second is None and len(rows):
                 second = second_of(float(rows[0, 0]))
-            make_whole(rows, names, place, count)
-            if second is not None and second != 1.0:
-                rows[:, 0] *= second
-            if (scale != 1.0).any():
-                rows[:, 1:] *= scale
-            spool.write(np.ascontiguousarray(rows).data)
-            count += len(rows)
+            make_whole(rows, names, place, values.rows)
+            times.append(rows[:, :1] * (1.0 if second is None else second))
+            values.append(rows[:, 1:] * scale)
             whole += int(np.isfinite(rows[:, 1]).sum())
         check_count(whole, place)
-        spool.flush()
-        found = np.asarray(np.memmap(spool, dtype=np.float64, mode="r", shape=(count, len(chosen))))
-        check_time(found[:, 0], names[0], place)
-    return found
+        check_time(time_s := Spooled(times, 0), names[0], place)
+    return time_s, values

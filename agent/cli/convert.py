@@ -10,8 +10,9 @@ import numpy as np
 from agent.calibrate.calibrating import reference_of, sensor_of
 from agent.calibrate.tables import TEMPERATURE
 from agent.reading.formats import Description
-from agent.reading.source import ROWS_AT_ONCE, Array, TableError
+from agent.reading.source import ROWS_AT_ONCE, TableError
 from agent.terminal.text import say
+from calib.model import Slices
 from calib.recorded.table import REFERENCES, SENSOR
 
 _FILE = click.Path(path_type=Path, dir_okay=False)
@@ -44,7 +45,7 @@ def convert(file: Path, output: Path, role: str, columns: str | None, sensitivit
                 names, values = [*names, TEMPERATURE], [*values, sensor.temperature_degc]
         else:
             reference = reference_of(file, columns, sensitivity, None, described)
-            names = ["time_s", *_names(reference.quantity, reference.x.shape[1])]
+            names = ["time_s", *_names(reference.quantity, reference.channels)]
             values = [reference.time_s, reference.x]
         rows = _write(output, names, values)
     except TableError as error:
@@ -66,7 +67,7 @@ def _names(quantity: str, channels: int) -> tuple[str, ...]:
     )
 
 
-def _write(path: Path, names: list[str], values: list[Array]) -> int:
+def _write(path: Path, names: list[str], values: list[Slices]) -> int:
     """Write the columns so that reading them gives the same numbers; a gap is written as nan."""
     try:
         file = path.open("x", encoding="ascii")

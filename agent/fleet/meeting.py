@@ -83,7 +83,7 @@ def read(params: dict[str, Any], options: Options, known: tuple[Array, Array] | 
         reference = reference_of(params["reference"], params["reference_columns"], params["sensitivity"])
     elif params["reference"] and known is not None:
         table, (mean, _) = sensor_of(params["reference"], params["reference_columns"]), known
-        a = (np.asarray(table.v) - mean[9:]) @ np.linalg.inv(mean[:9].reshape(3, 3)).T
+        a = (table.v[:] - mean[9:]) @ np.linalg.inv(mean[:9].reshape(3, 3)).T
         reference = ReferenceFile(table.name, table.time_s, a, "acceleration", "by its own S and Q", said=table.said)
     return tables_of(params["poses"], sensor, reference, options, instrument_of(options))
 

@@ -10,6 +10,8 @@ import numpy as np
 
 from agent.reading.source import ROWS_AT_ONCE, Array, Column, Progress, Source, TableError, check_announced
 
+BUFFER_BYTES = 1 << 20  # of a column chunk of Parquet
+
 
 class Arrow(Source):
     """Numbers and dates of a Parquet or Feather file; columns of other types are left out. Raises TableError."""
@@ -31,8 +33,9 @@ class Arrow(Source):
         done = 0
         try:
             for batch, share in self._batches([column.name for column in columns]):
-                if batch.num_rows:
-                    yield np.column_stack([_values(batch.column(column.name)) for column in columns])
+                for first in range(0, batch.num_rows, ROWS_AT_ONCE):
+                    part = batch.slice(first, ROWS_AT_ONCE)
+                    yield np.column_stack([_values(part.column(column.name)) for column in columns])
                 if progress is not None:
                     progress(round(share * self.path.stat().st_size) - done)
                     done = round(share * self.path.stat().st_size)
@@ -61,7 +64,8 @@ class Parquet(Arrow):
     def _schema(self) -> Any:
         from pyarrow import parquet
 
-        self._file = parquet.ParquetFile(self.path)
+        # Without the first option all column chunks that were read stay in memory; without the second, a whole one.
+        self._file = parquet.ParquetFile(self.path, pre_buffer=False, buffer_size=BUFFER_BYTES)
         about = self._file.metadata
         check_announced(self.path, 8 * about.num_rows * about.num_columns)
         check_announced(self.path, sum(about.row_group(k).total_byte_size for k in range(about.num_row_groups)))
@@ -80,7 +84,7 @@ class Feather(Arrow):
     def _schema(self) -> Any:
         import pyarrow as pa
 
-        self._file = pa.memory_map(str(self.path))
+        self._file = pa.OSFile(str(self.path))
         self._table = pa.ipc.open_file(self._file)
         return self._table.schema
 

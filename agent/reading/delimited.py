@@ -52,8 +52,10 @@ class Delimited(Source):
                 line += lines
                 if skip >= lines:
                     continue
-                if skip > 0:
-                    text = b"".join(text.splitlines(keepends=True)[skip:])
+                begin = 0
+                for _ in range(skip):
+                    begin = text.index(b"\n", begin) + 1
+                text = text[begin:]
                 if not text.isspace():
                     yield self._rows(max(line - lines, self.dialect.first_line), text, places)
 

@@ -111,6 +111,17 @@ def _found(path: Path, encoding: str, lines: Sequence[str]) -> Dialect:
     return Dialect(encoding, delimiter, False, header, number, ("",) * len(header), number + 1, (False,) * len(header))
 
 
+def dialect_of_cells(rows: Sequence[tuple[int, list[str]]]) -> Dialect | None:
+    """How a sheet of cells writes its table, None where it has none. `rows`: the first ones, each with its number."""
+    split = [(n, cells) for n, cells in rows if any(cells) and not cells[0].startswith(COMMENTS)]
+    for enough in (_all_values, _two_values):
+        if _first_row(split, enough) is not None:
+            first = _first_row(split, _two_values)
+            assert first is not None  # lines of which all fields are values have two of them
+            return _of_rows("", "", (), split, first)
+    return None
+
+
 def _first_row(split: Sequence[tuple[int, list[str]]], enough: Callable[[Sequence[str]], bool]) -> int | None:
     """The first of two lines that have enough values; the last line needs no second one."""
     return next((k for k in range(len(split)) if all(enough(row) for _, row in split[k : k + 2])), None)
@@ -157,10 +168,9 @@ def _header(before: Sequence[tuple[int, list[str]]], width: int) -> tuple[tuple[
 
 def _in_comment(lines: Sequence[str], stop: int, delimiter: str, width: int) -> list[tuple[int, list[str]]]:
     """The last line of comment before line `stop`, if it has a name for each column, as numpy writes it."""
-    for number in range(stop - 1, 0, -1):
-        line = lines[number - 1].lstrip()
-        if line.startswith(COMMENTS):
-            fields = _fields(line.lstrip("#%/ "), delimiter)
+    for number, line in reversed(list(enumerate(lines[: stop - 1], start=1))):
+        if line.lstrip().startswith(COMMENTS):
+            fields = _fields(line.lstrip().lstrip("#%/ "), delimiter)
             return [(number, fields)] if len(fields) == width else []
     return []
 

@@ -33,6 +33,8 @@ class Format:
 IDE_BEGINS = rb"(?s)\x1aE\xdf\xa3.{0,60}mide"  # EBML, and the type of the document
 # A number of six digits and a letter (version 2, and SEED), or MS (version 3).
 MINISEED_BEGINS = (rb"\d{6}[DRQMV][ \x00]", rb"MS\x03")
+# A zip archive of which the first part is one of a workbook.
+XLSX_BEGINS = rb"(?s)PK\x03\x04.{26}(\[Content_Types\]\.xml|_rels/|docProps/|xl/)"
 MINISEED = "agent.reading.seismic:open_miniseed"
 FORMATS = (
     Format("MCAP", (".mcap",), (rb"\x89MCAP0\r\n",), "agent.reading.recording:open_mcap"),
@@ -44,6 +46,7 @@ FORMATS = (
     Format("MATLAB 7.3", (".mat",), (rb"MATLAB 7\.3",), "agent.reading.hdf5:open_hdf5", "hdf5"),
     Format("MiniSEED", (".mseed", ".miniseed", ".msd"), MINISEED_BEGINS, MINISEED, "seismic"),
     Format("IDE", (".ide",), (IDE_BEGINS,), "agent.reading.ide:open_ide", "endaq"),
+    Format("Excel", (".xlsx", ".xlsm"), (XLSX_BEGINS,), "agent.reading.xlsx:open_xlsx", "files"),
     Format("TDMS", (".tdms",), (b"TDSm",), "agent.reading.tdms:open_tdms", "tdms"),
 )
 TEXT = Format("CSV", (".csv", ".tsv", ".txt", ".dat"), (), "agent.reading.delimited:Delimited")

@@ -12,8 +12,9 @@ import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 
 from agent.reading.seismic import MiniSeed
-from agent.reading.source import Array, Arrays, Column, Grid, Slices, TableError
+from agent.reading.source import Array, Arrays, Column, Grid, TableError
 from agent.reading.stationxml import CONSISTENT, Component, StationXml
+from calib.model import Slices
 
 Role = Literal["sensor", "reference"]
 AXES = ("x", "y", "z")

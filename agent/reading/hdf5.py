@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from agent.reading.source import Arrays, Column, Grid, Slices, TableError
+from agent.reading.source import Arrays, Column, Grid, TableError
+from calib.model import Slices
 
 MOST_COLUMNS = 16  # of one data set; more are not the axes of a sensor
 MOST_OBJECTS = 10_000

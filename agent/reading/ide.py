@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.reading.own_process import Name, arrays_of, write_arrays
-from agent.reading.source import Arrays, Column, Slices
+from agent.reading.source import Arrays, Column
+from calib.model import Slices
 
 LEAST_MEMORY, COPIES = 1 << 30, 60  # bytes that reading may take: samples of 2 bytes become 8, idelib keeps copies
 TIME = "time_s"

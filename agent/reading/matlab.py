@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from agent.reading.hdf5 import RATES, columns_of, with_times
 from agent.reading.own_process import Name, arrays_of, write_arrays
-from agent.reading.source import Arrays, Column, Slices, check_announced
+from agent.reading.source import Arrays, Column, check_announced
+from calib.model import Slices
 
 HEADER_BYTES = 128
 COMPRESSED = 15  # data type of an element

@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from agent.reading.source import Array, Arrays, Column, Grid, Slices, TableError, check_announced
+from agent.reading.source import Array, Arrays, Column, Grid, TableError, check_announced
 from agent.reading.stationxml import import_obspy
+from calib.model import Slices
 
 # The last letter of a channel's code names its component: east, north and up are x, y and z.
 AXES = {"E": "x", "N": "y", "Z": "z"}

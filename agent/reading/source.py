@@ -7,10 +7,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
+
+from calib.model import Slices
 
 Array = NDArray[np.float64]
 Progress = Callable[[int], Any]  # called with the number of bytes that were just read
@@ -65,14 +67,6 @@ class Source(ABC):
     def place(self, row: int) -> str:
         """Where row `row`, counted from 0, is found in the file."""
         return f"row {row + 1}"
-
-
-class Slices(Protocol):
-    """Values that can be read from one row to another: an array, or a data set on disk."""
-
-    def __len__(self) -> int: ...
-
-    def __getitem__(self, rows: slice, /) -> Any: ...
 
 
 @dataclass(frozen=True, slots=True)

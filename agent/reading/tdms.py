@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from agent.reading.source import Array, Arrays, Column, Grid, Slices, TableError
+from agent.reading.source import Array, Arrays, Column, Grid, TableError
+from calib.model import Slices
 
 
 class Dates:

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.reading.source import Arrays, Column, Grid, Slices, TableError
+from agent.reading.source import Arrays, Column, Grid, TableError
+from calib.model import Slices
 
 PCM, FLOAT, EXTENSIBLE = 1, 3, 0xFFFE
 MOST_CHANNELS = 256

@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
+from msgspec.structs import asdict
 from numpy.typing import NDArray
 
 from agent.calibrate.origin import SourceFile
@@ -143,7 +144,7 @@ def from_update(
         "rate_hz": None,
         "status": "valid",
         "reasons": [],
-        "windows": [msgspec.structs.asdict(window) for window in windows],
+        "windows": [asdict(window) for window in windows],
         "statistics": {},
         "version": versions.get("fieldcal", ""),
         "method": update.method,
@@ -153,7 +154,11 @@ def from_update(
         "sensor": update.sensor,
         "windows_in_solution": update.windows,
         "residual_sd": update.residual_sd,
-        "shared_errors": [msgspec.structs.asdict(error) for error in update.shared_errors],
+        "reference_frequency_hz": update.reference_frequency_hz,
+        "valid_band_hz": update.valid_band_hz or None,
+        "sensitivity_at_0hz": asdict(update.sensitivity_at_0hz) if update.sensitivity_at_0hz.sensitivity else None,
+        "response": [asdict(band) for band in update.response] or None,
+        "shared_errors": [asdict(error) for error in update.shared_errors],
         "run_id": update.made[0],
         "sequence": update.made[1],
     }
@@ -171,7 +176,7 @@ def undetermined(reasons: tuple[str, ...], windows: tuple[WindowVerdict, ...]) -
         "determined": nothing,
         "status": "refused",
         "reasons": list(reasons),
-        "windows": [msgspec.structs.asdict(window) for window in windows],
+        "windows": [asdict(window) for window in windows],
     }
 
 

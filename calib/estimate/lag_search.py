@@ -29,16 +29,18 @@ def without_lag(
     `lag_of(made, lag_s)` estimates the whole lag from them, in s. The search begins at `lag_s`. It ends when the
     remaining lag is small enough, after TURNS iterations, or when no window is used.
     """
-    for turn in range(TURNS):
+    turns = 0
+    while True:
         made = make(lag_s)
         windows = used(made)
-        if not windows or turn == TURNS - 1:
-            break
+        turns += 1
+        if not windows or turns == TURNS:
+            return made, lag_s
         better_s = lag_of(made, lag_s)
         if abs(largest_omega(windows) * (better_s - lag_s)) ** 3 / 6.0 <= PHASE_LEFT:
-            break
+            return made, lag_s
         lag_s = better_s
-    return made, lag_s
+        del made, windows  # of a day, they would need as much memory as those that follow
 
 
 def starts(low_s: float, high_s: float, windows: Sequence[Window]) -> list[float]:

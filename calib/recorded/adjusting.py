@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -36,6 +35,8 @@ LEAST_USED = 0.05  # of the points in motion
 RESPONSE_TURNS = 6
 HOPELESS = 2  # turns after which a refusal no longer comes from the response that is not yet taken out
 
+_Told = tuple[Outcome, ReferenceShare | None]
+
 
 def adjusted(tables: Tables, priors: Priors, certificate: ReferenceCertificate | None = None) -> Outcome:
     """The outcome for these tables and priors. `certificate` is that of the reference, if it is given."""
@@ -48,60 +49,72 @@ def adjusted(tables: Tables, priors: Priors, certificate: ReferenceCertificate |
     return replace(outcome, more={**outcome.more, "shared_errors": [share.told(*told)]})
 
 
-def _adjusted(tables: Tables, priors: Priors) -> tuple[Outcome, ReferenceShare | None]:
+def _adjusted(tables: Tables, priors: Priors) -> _Told:
     """Make windows with the lag and the response over frequency taken out, and adjust them."""
     search = _Search(tables, priors)
-    applied, judged = search.begun()
-    windows, first = judged, None
+    applied = search.begin()
+    refused = None if _used(search.windows) else search.windows
+    first: tuple[Adjustment, float] | None = None
     for turn in range(RESPONSE_TURNS):
-        if turn or not _used(judged):
-            windows, applied = search.without_lag(applied)
-        if not _used(windows):
+        if turn or refused is not None:
+            applied = search.make(applied)
+        if not _used(search.windows):
             break
-        found = search.at(windows, applied)
-        first = first or (found, applied.lag_s)
-        if not search.stated.response:
-            found = _attenuated(found, windows, priors, applied)
-            return _outcome(found, windows, tables.rate_hz), found.share
-        told = found.response
-        if told is None or told.is_taken_out(applied.response) or (turn >= HOPELESS and found.reasons):
-            outcome = _outcome(found, windows, tables.rate_hz)
-            if outcome.calibration is None:
-                outcome = replace(outcome, more={**outcome.more, **_response(search.by_band(found, applied.lag_s))})
-            return outcome, found.share
-        applied = replace(applied, response=_next_response(told.terms, applied.response))
-    if not _used(windows) and not _used(judged):
-        return nothing_used(judged, tables.rate_hz, METHOD), None
+        first = first or (search.at(search.windows, applied), applied.lag_s)
+        told = _turned(search, priors, applied, turn, tables.rate_hz)
+        if not isinstance(told, Applied):
+            return told
+        applied = told
+    if refused is not None and not _used(search.windows):
+        return nothing_used(refused, tables.rate_hz, METHOD), None
     more = {} if first is None else _response(search.by_band(*first))
-    return Outcome(None, (UNSETTLED,), windows, tables.rate_hz, METHOD, more=more), None
+    return Outcome(None, (UNSETTLED,), search.windows, tables.rate_hz, METHOD, more=more), None
+
+
+def _turned(search: _Search, priors: Priors, applied: Applied, turn: int, rate_hz: float) -> _Told | Applied:
+    """The outcome, or what must still be taken out of the windows."""
+    windows, found = search.windows, search.at(search.windows, applied)
+    if not search.stated.response:
+        found = _attenuated(found, windows, priors, applied)
+        return _outcome(found, windows, rate_hz), found.share
+    told = found.response
+    if not (told is None or told.is_taken_out(applied.response) or (turn >= HOPELESS and found.reasons)):
+        return replace(applied, response=_next_response(told.terms, applied.response))
+    outcome = _outcome(found, windows, rate_hz)
+    if outcome.calibration is None:
+        outcome = replace(outcome, more={**outcome.more, **_response(search.by_band(found, applied.lag_s))})
+    return outcome, found.share
 
 
 class _Search:
     """Adjustments of the windows of tables from which a lag and a response are taken out.
 
-    `stated` are the priors, later with those of the response, whose scale is that of the motion.
+    `windows`: those made last; of a day they need so much memory that they go before others are made. `stated` are the
+    priors, later with those of the response, whose scale is that of the motion.
     """
 
     def __init__(self, tables: Tables, priors: Priors) -> None:
         self._tables, self._priors = tables, priors.beside_unknown_corner if tables.corner_unknown else priors
         self.stated = self._priors
+        self.windows: list[Window] = []
         self._latest: tuple[Sequence[Window], Applied, Adjustment] | None = None
 
-    def begun(self) -> tuple[Applied, list[Window]]:
-        """What the search begins with, and the windows as judged there.
+    def begin(self) -> Applied:
+        """Make the first windows; returns what the search goes on with.
 
         If none can be used the sensor may be far too late, or a response may look like a mean that changes.
         """
         flat = Applied(self._priors.lag_at_s, self._priors.reference_corner_at_hz, self._priors.sensor_corner_at_hz)
-        windows, applied = self.without_lag(flat)
-        if not _used(windows):
-            likely = replace(flat, lag_s=_likely_lag_s(self._tables, self._priors, windows))
-            windows, applied = self.without_lag(likely)
-        if _used(windows):
-            return applied, windows
-        unsteady, taken = self.without_lag(applied, steady=False)
-        response = self.at(unsteady, taken).response if _used(unsteady) else None
-        return (applied if response is None else replace(taken, response=_next_response(response.terms))), windows
+        applied = self.make(flat)
+        if not _used(self.windows):
+            applied = self.make(replace(flat, lag_s=_likely_lag_s(self._tables, self._priors, self.windows)))
+        if _used(self.windows):
+            return applied
+        refused = self.windows
+        taken = self.make(applied, steady=False)
+        response = self.at(self.windows, taken).response if _used(self.windows) else None
+        self.windows = refused
+        return applied if response is None else replace(taken, response=_next_response(response.terms))
 
     def at(self, windows: Sequence[Window], taken: Applied) -> Adjustment:
         """The adjustment of windows from which this was taken out; the latest one is kept."""
@@ -116,15 +129,18 @@ class _Search:
         this lag was taken out."""
         return told_by_band(found, self._tables.of_any_response(lag_s))
 
-    def without_lag(self, taken: Applied, *, steady: bool = True) -> tuple[list[Window], Applied]:
-        """The windows from which this response is taken out and whatever lag they show, and both."""
+    def make(self, taken: Applied, *, steady: bool = True) -> Applied:
+        """Make windows from which this response is taken out and whatever lag they show; returns both."""
+
+        def anew(lag_s: float) -> list[Window]:
+            self.windows, self._latest = [], None
+            return self._tables.windows(lag_s, taken.response, steady=steady)
 
         def lag_of(made: Sequence[Window], lag_s: float) -> float:
             return self.at(made, replace(taken, lag_s=lag_s)).lag_s or 0.0
 
-        make = partial(self._tables.windows, response=taken.response, steady=steady)
-        windows, lag_s = without_lag(taken.lag_s, make, _used, lag_of)
-        return windows, replace(taken, lag_s=lag_s)
+        self.windows, lag_s = without_lag(taken.lag_s, anew, _used, lag_of)
+        return replace(taken, lag_s=lag_s)
 
 
 def _next_response(found: Response, taken: Response = FLAT) -> Response:
@@ -191,8 +207,9 @@ def norm_fitted(sensor: SensorTable, options: Options) -> Outcome:
     priors = priors_of(options)
     clock = clock_from_stamps(sensor.time_s)
     gravity = options.gravity or STANDARD_GRAVITY_MPS2
-    there = np.flatnonzero(np.isfinite(sensor.v).all(axis=1))
-    windows = rests_anywhere(clock.time_of(there), np.asarray(sensor.v)[there], gravity)
+    V = sensor.v[:]
+    there = np.flatnonzero(np.isfinite(V).all(axis=1))
+    windows = rests_anywhere(clock.time_of(there), V[there], gravity)
     try:
         found = norm_fit(windows, gravity, u_gravity_mps2(options))
     except ValueError as error:

@@ -20,7 +20,7 @@ from calib.recorded.options import Options
 from calib.recorded.outcome import Outcome, nothing_used
 from calib.recorded.poses import PoseInterval, Poses, Setting, beside_reference, intervals_of
 from calib.recorded.priors import contradictions, instrument_of, priors_of
-from calib.recorded.table import ReferenceTable, SensorTable
+from calib.recorded.table import ReferenceTable, SensorTable, ends_s
 from calib.recorded.tables import Making, Tables
 from calib.recorded.wrong_unit import check_gravity
 from calib.signal.instrument import Instrument
@@ -81,7 +81,7 @@ def _check_quantity(reference: ReferenceTable, instrument: Instrument, stated: s
 
 def _setting(options: Options, reference: ReferenceTable | None) -> Setting:
     """The settings that apply to every pose."""
-    channels = 0 if reference is None else reference.x.shape[1]
+    channels = 0 if reference is None else reference.channels
     return Setting(
         gravity_mps2=options.gravity or STANDARD_GRAVITY_MPS2,
         static_sign=options.static_sign,
@@ -105,7 +105,7 @@ def _intervals(poses: Poses | None, setting: Setting, reference: ReferenceTable 
         pose = beside_reference(setting)
     except ValueError as error:
         raise OptionError(str(error)) from None
-    return [PoseInterval(float(reference.time_s[0]), float(reference.time_s[-1]), pose)]
+    return [PoseInterval(*ends_s(reference.time_s), pose)]
 
 
 def _plain(tables: Tables, priors: Priors) -> Outcome:

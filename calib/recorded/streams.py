@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 
-from calib.model import Array
+from calib.model import Slices
 from calib.signal.samples import Samples
 from calib.signal.stamps import clock_from_stamps, counted
 from calib.signal.timing import ClockFit
@@ -18,8 +18,9 @@ class TableStream:
     `name` is the table's, for messages. `time_s` (n,) stamps, `values` (n, C); both may lie on disk.
     """
 
-    def __init__(self, name: str, time_s: Array, values: Array) -> None:
+    def __init__(self, name: str, time_s: Slices, values: Slices) -> None:
         self._name, self._values = name, values
+        self.axes = int(values[:1].shape[1])  # number of columns of values
         self.clock: ClockFit
         self.clock, self._rows, self._numbers = counted(clock_from_stamps(time_s))
 
@@ -27,11 +28,6 @@ class TableStream:
     def _count(self) -> int:
         """Number of samples, the missing ones included."""
         return int(self._numbers[-1]) + len(self._values) - int(self._rows[-1])
-
-    @property
-    def axes(self) -> int:
-        """Number of columns of values."""
-        return int(self._values.shape[1])
 
     @property
     def span_s(self) -> tuple[float, float]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.model import Array
+from calib.model import Array, Slices
 from calib.recorded.errors import InputError
 from calib.signal.stamps import kind_of
 
@@ -32,34 +32,39 @@ SINCE_1970 = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorTable:
-    """Stamps (n,) in s, indications (n, 3), temperature (n,) in degC or None. The arrays may be on disk.
+    """Stamps (n,) in s, indications (n, 3), temperature (n,) in degC or None, all as arrays or on disk.
 
     `name`: of the file, or "sensor". A row of indications is NaN where one of them is missing. `said`: what was
     guessed, for the user.
     """
 
     name: str
-    time_s: Array
-    v: Array
-    temperature_degc: Array | None = None
+    time_s: Slices
+    v: Slices
+    temperature_degc: Slices | None = None
     said: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReferenceTable:
-    """Stamps (n,) in s, channels (n, 1 or 3) of a quantity of calib.signal.instrument in SI units.
+    """Stamps (n,) in s, channels (n, 1 or 3) of a quantity of calib.signal.instrument in SI units, arrays or on disk.
 
     `name`: of the file, or "reference". `column` is the first channel's; `header`: where the file names its columns,
     for messages. `said`: what was guessed, for the user.
     """
 
     name: str
-    time_s: Array
-    x: Array
+    time_s: Slices
+    x: Slices
     quantity: str
     column: str
     header: str = ""
     said: tuple[str, ...] = ()
+
+    @property
+    def channels(self) -> int:
+        """Number of channels."""
+        return int(self.x[:1].shape[1])
 
     @property
     def place(self) -> str:
@@ -97,12 +102,17 @@ def check_count(whole: int, place: str) -> None:
         raise InputError(f"there are {whole} rows of data, at least {FEWEST_ROWS} are needed", place=place, value=whole)
 
 
-def check_time(time_s: Array, column: str, place: str) -> None:
+def ends_s(time_s: Slices) -> tuple[float, float]:
+    """The first and the last of stamps (n,), n >= 1, in s."""
+    return float(time_s[:1][0]), float(time_s[len(time_s) - 1 :][0])
+
+
+def check_time(time_s: Slices, column: str, place: str) -> None:
     """Check that time increases. Stamps may decrease by LATEST_STAMP_S, but not if they are on an exact grid.
 
     Raises InputError.
     """
-    ends = float(time_s[0]), float(time_s[-1])
+    ends = ends_s(time_s)
     if max(map(abs, ends)) > LAST_S:
         raise InputError(
             f"the time runs from {ends[0]:.10g} s to {ends[1]:.10g} s, which is no time since 1970 in s",
@@ -124,7 +134,7 @@ def check_time(time_s: Array, column: str, place: str) -> None:
                 f"{part[at]:.10g} after {before[at]:.10g}", "time must not decrease, sort or cut the samples",
                 place=place, row=first + at, column=column, value=float(part[at]),
             )  # fmt: skip
-    if not newest > float(time_s[0]):
+    if not newest > ends[0]:
         raise InputError(
             f"the value is {newest:.10g} in every row", "time must increase", place=place, column=column, value=newest
         )

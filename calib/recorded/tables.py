@@ -25,8 +25,9 @@ from calib.excitation.windows import Points, motion_windows, rest_sd
 from calib.model import Array, Window
 from calib.recorded.errors import InputError
 from calib.recorded.poses import PoseInterval
+from calib.recorded.segments import segments_joined, with_joined
 from calib.recorded.streams import TableStream
-from calib.recorded.table import ReferenceTable, SensorTable
+from calib.recorded.table import ReferenceTable, SensorTable, ends_s
 from calib.signal.instrument import Instrument
 from calib.signal.response import FLAT, Response
 from calib.signal.samples import Samples
@@ -67,6 +68,9 @@ class Tables:
         self._instrument = instrument
         self.drift: Drift | None = None  # of the sensor's clock against the reference's; None until windows were made
         self.poses = poses
+        first_s, end_s = self._sensor.span_s
+        length_s = sum(max(min(p.stop_s, end_s) - max(p.start_s, first_s), 0.0) for p in poses)
+        self._joined = segments_joined(length_s, self._making.settings.limits.segment_s)
 
     @property
     def corner_unknown(self) -> bool:
@@ -101,7 +105,8 @@ class Tables:
             self.drift = drift(found)
             if self.drift is not None and self.drift.significant:
                 self._reference.stretch(self.drift.rate, self.drift.time_s)
-                found = self._made(settings, lag_s, response, progress)
+                del found  # of a day, it would need as much memory once more
+                return self._made(settings, lag_s, response, progress)
         return found
 
     def of_any_response(self, lag_s: float) -> list[Window]:
@@ -151,7 +156,7 @@ class Tables:
         if sensor is None or (reference is None and interval.pose.direction.shape[1]):
             return []
         try:
-            return windows_of(
+            found = windows_of(
                 interval.pose,
                 sensor,
                 reference,
@@ -164,6 +169,7 @@ class Tables:
             )
         except Unusable as error:
             return [nothing_in(interval.pose, start_s, stop_s, str(error))]
+        return [replace(w, sums=with_joined(w.sums, self._joined)) for w in found]
 
     def _cut(
         self, interval: PoseInterval, start_s: float, stop_s: float, lag_s: float = 0.0, response: Response = FLAT
@@ -227,20 +233,19 @@ class Tables:
         return aligned(sensor, reference, self._instrument, (start_s, stop_s), lag_s, settings)
 
     def _rest_floor(self) -> Array | None:
-        """The usual noise of the sensor at rest: the median over all static poses."""
+        """The usual noise of the sensor at rest: the median over the pieces of all static poses."""
+        at_rest = [interval for interval in self.poses if not interval.pose.direction.shape[1]]
         found = []
-        for interval in self.poses:
-            if interval.pose.direction.shape[1] == 0:
-                samples = self._sensor.cut(interval.start_s, interval.stop_s)
-                V = np.empty((0, 3)) if samples is None else samples.values
-                sd = rest_sd(V[np.isfinite(V).all(axis=1)], self.rate_hz)
-                if sd is not None:
-                    found.append(sd)
+        for samples in (self._sensor.cut(*piece) for interval in at_rest for piece in self._pieces(interval)):
+            V = np.empty((0, 3)) if samples is None else samples.values
+            sd = rest_sd(V[np.isfinite(V).all(axis=1)], self.rate_hz)
+            if sd is not None:
+                found.append(sd)
         return np.asarray(np.median(found, axis=0)) if found else None
 
 
 def _check_overlap(sensor: SensorTable, reference: ReferenceTable | None, poses: Sequence[PoseInterval]) -> None:
-    spans = [(t.name, float(t.time_s[0]), float(t.time_s[-1])) for t in (sensor, reference) if t is not None]
+    spans = [(t.name, *ends_s(t.time_s)) for t in (sensor, reference) if t is not None]
     if poses:
         spans.append(("the poses", min(p.start_s for p in poses), max(p.stop_s for p in poses)))
     if max(s for _, s, _ in spans) >= min(e for _, _, e in spans):

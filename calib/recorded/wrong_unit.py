@@ -14,6 +14,7 @@ from calib.recorded.table import ReferenceTable
 GRAVITY_IN = {"g": 1.0, "mg": 1000.0, "cm/s2": 100 * STANDARD_GRAVITY_MPS2, "mm/s2": 1000 * STANDARD_GRAVITY_MPS2}
 NEAR = 0.05  # relative: offsets of a sensor in g are not larger
 ROWS = 100_000  # spread over the file
+ROWS_AT_ONCE = 1000  # of them
 
 
 def unit_hint(length: float) -> str:
@@ -24,9 +25,11 @@ def unit_hint(length: float) -> str:
 
 def check_gravity(reference: ReferenceTable) -> None:
     """Refuse a tri-axial reference that feels gravity as in another unit. Raises UnitError with the unit."""
-    if reference.x.shape[1] != 3:
+    if reference.channels != 3:
         return
-    length = float(np.nanmedian(np.linalg.norm(reference.x[:: -(-len(reference.x) // ROWS)], axis=1)))
+    x, step = reference.x, -(-len(reference.x) // ROWS)
+    some = [x[first : first + ROWS_AT_ONCE * step : step] for first in range(0, len(x), ROWS_AT_ONCE * step)]
+    length = float(np.nanmedian(np.linalg.norm(np.concatenate(some), axis=1)))
     if unit := _unit(length):
         raise UnitError(
             f"the median magnitude is {length:.4g} m/s2, but gravity has 9.8{unit_hint(length)}",

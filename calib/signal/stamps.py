@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.model import Array
+from calib.model import Array, Slices
 from calib.signal.timing import FEWEST_FOR_RATE, HORIZON_S, ClockFit, Edge, IntArray, parabola
 
 Kind = Literal["grid", "bursts", "spread", "jittery"]
@@ -41,7 +41,7 @@ class Arrivals:
     arrival_s: Array
 
 
-def clock_from_stamps(stamp_s: Array) -> ClockFit:
+def clock_from_stamps(stamp_s: Slices) -> ClockFit:
     """The clock of a device from the stamps (n,) of its consecutive samples, n >= 2.
 
     Parabolas over a minute each, joined; anew after each gap and every `BLOCK_ROWS` rows. Raises ValueError where time

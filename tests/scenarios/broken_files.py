@@ -74,6 +74,16 @@ def linked(path: Path, _: np.ndarray) -> None:
         file.create_dataset("z", (len(TIME_S),), "f8", external=[("/etc/passwd", 0, h5py.h5f.UNLIMITED)])
 
 
+def workbook(path: Path, _: np.ndarray) -> None:
+    import openpyxl
+
+    book = openpyxl.Workbook()
+    for line in (HEADER + ROWS).splitlines():
+        book.active.append([cell if "v" in line else float(cell) for cell in line.split(",")])
+    book.active["C11"] = "two"
+    book.save(path)
+
+
 BROKEN = {
     "a word among numbers": Broken("a.csv", changed(20, "0.1,1,two,3"), "line 20, column vy: 'two'", "write|correct"),
     "a field too few": Broken("a.csv", changed(20, "0.1,1,2"), "line 20", "add|correct|columns"),
@@ -96,6 +106,8 @@ BROKEN = {
     "a WAV file without samples": Broken("a.wav", cut("scipy wav int16", 0.002), "a.wav", "write it|at least"),
     "a MiniSEED file that is cut": Broken("a.mseed", cut("ObsPy int16", 0.002), "a.mseed", "write it", ("obspy",)),
     "a TDMS file that is cut": Broken("a.tdms", cut("npTDMS", 0.003), "a.tdms", "write it|columns", ("nptdms",)),
+    "an Excel file that is cut": Broken("a.xlsx", cut("openpyxl"), "a.xlsx", "as CSV", ("openpyxl",)),
+    "a word in Excel": Broken("a.xlsx", workbook, "row 11, column vy: 'two'", "correct it", ("openpyxl",)),
     "a bag that is cut": Broken("a.mcap", cut("rosbags Imu", 0.4), "byte \\d+", "ros2 bag convert", ("rosbags",)),
     "a bag without Imu": Broken("a.mcap", part("rosbags AccelStamped", rows=3), "/imu", "--mapping", ("rosbags",)),
 }  # fmt: skip

@@ -97,6 +97,27 @@ def arrow_groups(path: Path, role: str, v: np.ndarray) -> None:
     pq.write_table(pa.Table.from_pandas(frame(v, role)), path, row_group_size=500, use_dictionary=False, version="1.0")
 
 
+def pandas_excel(time: str = "time", engine: str = "openpyxl", **options: Any) -> Write:
+    return lambda path, role, v: frame(v, role, time).to_excel(path, engine=engine, **options)
+
+
+def openpyxl_book(path: Path, role: str, v: np.ndarray) -> None:
+    """What people have: a title, a chart's sheet of text, the table on the second sheet, units in their own row."""
+    import openpyxl
+
+    book = openpyxl.Workbook()
+    book.active.title = "about"
+    book.active.append(["bridge 7", "spring"])
+    sheet = book.create_sheet("samples")
+    sheet.append(["Logger", 17])
+    sheet.append([])
+    sheet.append(["t", "acc x", "acc y", "acc z", "remark"])
+    sheet.append(["ms", *["m/s²" if role == "reference" else "counts"] * 3])
+    for k, row in enumerate(np.column_stack([1e3 * TIME_S, v]).tolist()):
+        sheet.append([*row, *(["a knock"] if k == 7 else [])])
+    book.save(path)
+
+
 def savetxt(**options: Any) -> Write:
     return lambda path, _, v: np.savetxt(path, np.column_stack([TIME_S, v]), **options)
 
@@ -270,6 +291,9 @@ WRITERS: dict[str, Writer] = {
     "pandas feather plain": Writer("pandas", ".feather", feather(compression="uncompressed"), needs=("pyarrow",)),
     "pyarrow csv": Writer("pyarrow", ".csv", arrow_csv, needs=("pandas",)),
     "pyarrow parquet 1.0": Writer("pyarrow", ".parquet", arrow_groups, needs=("pandas",)),
+    "pandas Excel": Writer("pandas", ".xlsx", pandas_excel(index=False), needs=("openpyxl",)),
+    "pandas Excel with index": Writer("pandas", ".xlsx", pandas_excel(), needs=("openpyxl",)),
+    "openpyxl": Writer("openpyxl", ".xlsx", openpyxl_book),
     "numpy savetxt": Writer("numpy", ".txt", savetxt(header="time x y z")),
     "numpy savetxt csv": Writer("numpy", ".csv", savetxt(header="time,x,y,z", delimiter=",", comments="")),
     "csv of Excel": Writer("csv", ".csv", stdlib_csv("excel")),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,8 @@ from agent.certificate.schema import SchemaError, check_schema
 from agent.certificate.signing import PURPOSE, signed_json
 from agent.cli.main import run_cli
 from agent.config.earlier import DCC, PARAMETER_LIST, SI, read_earlier
+from agent.core.events import CalibrationUpdate
+from agent.recording.reading import RecordingReader
 from agent.recording.signed_text import SignedText, values_of
 from tests.unit.certificates import content, run, stated, uneven
 from tests.unit.recorded_bench import record
@@ -194,6 +197,13 @@ def test_a_data_directory_and_a_recording(tmp_path: Path) -> None:
     np.testing.assert_allclose(conditions["motion_frequency_hz"], np.sqrt((8**3 - 1) / 21), rtol=0.05)
     assert 1.0 < conditions["levels_mps2"][0] <= conditions["levels_mps2"][1] < 5.0
     assert found[0]["made_from"][0]["sha256"] == hashlib.sha256(recordings[0].read_bytes()).hexdigest()
+    steps = (step for path in recordings for step in RecordingReader(path).steps())
+    update = [r for step in steps for r in step.results if isinstance(r, CalibrationUpdate)][-1]
+    for one in found:
+        assert one["conditions"]["reference_frequency_hz"] == update.reference_frequency_hz > 1.0
+        assert one["conditions"]["valid_band_hz"] == update.valid_band_hz
+        assert one["result"]["response"] == [msgspec.structs.asdict(band) for band in update.response]
+    assert len(update.response) == 3
 
 
 def test_the_graph_leads_from_the_certificate_to_the_files_and_the_reference(tmp_path: Path) -> None:
@@ -265,3 +275,21 @@ def test_the_dcc_is_checked_against_a_schema_that_the_user_has(
         return
     with pytest.raises(SchemaError, match=words):
         check_schema(xml, tmp_path / "dcc.xsd")
+
+
+@pytest.mark.skipif("FIELDCAL_DCC_XSD" not in os.environ, reason="FIELDCAL_DCC_XSD does not name dcc.xsd of PTB")
+@pytest.mark.parametrize("source", ["files", "recording"])
+def test_the_dcc_is_valid_by_the_schema_of_ptb(source: str, made: Path, tmp_path: Path) -> None:
+    """dcc.xsd 3.2.1 with SI_Format.xsd 2.1.0 beside it; PTB's files are not part of this repository."""
+    pytest.importorskip("xmlschema", reason="the extra dcc is not installed")
+    out, schema = made, Path(os.environ["FIELDCAL_DCC_XSD"])
+    if source == "recording":
+        record(tmp_path / "data", 41.0)
+        told, out = stated(tmp_path), tmp_path / "out"
+        told.write_text(told.read_text().replace('output_unit = "count"\n', ""))
+        words = ["certificate", tmp_path / "data", "--stated", told, "-o", out, "--xsd", schema]
+        assert run_cli([str(word) for word in words]) == 0
+    check_schema((out / "certificate.xml").read_bytes(), schema)
+    broken = (out / "certificate.xml").read_bytes().replace(b"dcc:uniqueIdentifier", b"dcc:identifier")
+    with pytest.raises(SchemaError, match="identifier"):
+        check_schema(broken, schema)

@@ -62,11 +62,11 @@ def test_a_table_has_times_indications_and_accelerations(
     assert run(capsys, recorded, "--to", path) == (0, "")
     time = "time_s" if ending == "csv" else "time"
     found = read_sensor(path, columns=f"time={time},x=vx,y=vy,z=vz")
-    np.testing.assert_array_equal(found.v, truth[1])
+    np.testing.assert_array_equal(found.v[:], truth[1])
     # The clock model is within a tenth of a sample of the truth, and has no steps of bursts of 25 ms.
-    np.testing.assert_allclose(found.time_s, truth[0], atol=1e-4)
-    assert np.diff(found.time_s).min() > 0.0
-    a = read_sensor(path, columns=f"time={time},x=ax,y=ay,z=az").v
+    np.testing.assert_allclose(found.time_s[:], truth[0], atol=1e-4)
+    assert np.diff(found.time_s[:]).min() > 0.0
+    a = read_sensor(path, columns=f"time={time},x=ax,y=ay,z=az").v[:]
     newest = content_of([recorded], None).calibrations[-1]
     np.testing.assert_allclose(a @ np.transpose(newest.sensitivity) + newest.offset, truth[1], rtol=1e-9, atol=1e-6)
 
@@ -76,7 +76,7 @@ def test_wav_has_the_samples_as_numbers_of_64_bits(
 ) -> None:
     path = tmp_path / "out.wav"
     assert run(capsys, recorded, "--to", path) == (0, "")
-    np.testing.assert_array_equal(read_sensor(path, columns="time=time_s,x=ch1,y=ch2,z=ch3").v, truth[1])
+    np.testing.assert_array_equal(read_sensor(path, columns="time=time_s,x=ch1,y=ch2,z=ch3").v[:], truth[1])
     channels, rate_hz = struct.unpack_from("<HI", path.read_bytes(), 22)
     assert channels == 6
     assert rate_hz == round((len(truth[0]) - 1) / (truth[0][-1] - truth[0][0]))
@@ -89,10 +89,10 @@ def test_miniseed_has_each_block_at_its_own_time(
     path = tmp_path / "out.mseed"
     assert run(capsys, recorded, "--to", path) == (0, "")
     found = read_sensor(path, columns="group=XX.MEMS.00.FN,time=time_s,x=1,y=2,z=3")
-    np.testing.assert_array_equal(found.v, truth[1])
+    np.testing.assert_array_equal(found.v[:], truth[1])
     # One grid for the whole file, as MiniSEED has it: the clock of the bench is steady, the rate has 24 bits.
-    np.testing.assert_allclose(found.time_s, truth[0], atol=1e-3)
-    a = read_sensor(path, columns="group=XX.MEMS.10.FN,time=time_s,x=1,y=2,z=3").v
+    np.testing.assert_allclose(found.time_s[:], truth[0], atol=1e-3)
+    a = read_sensor(path, columns="group=XX.MEMS.10.FN,time=time_s,x=1,y=2,z=3").v[:]
     newest = content_of([recorded], None).calibrations[-1]
     np.testing.assert_allclose(a @ np.transpose(newest.sensitivity) + newest.offset, truth[1], rtol=1e-9, atol=1e-6)
 
