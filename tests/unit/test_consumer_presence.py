@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -84,7 +85,7 @@ def test_a_gateway_is_looked_at_when_it_appears_and_then_about_once_a_minute(
         for _ in range(1000):
             now_s[0] += 1.0
             looks += [now_s[0]] * len(watched.due(5))
-        apart = [b - a for a, b in zip(looks, looks[1:], strict=False)]
+        apart = [b - a for a, b in pairwise(looks)]
         assert 30.0 <= min(apart) <= max(apart) <= 91.0
         assert 9 <= len(looks) <= 33
         token.undeclare()
