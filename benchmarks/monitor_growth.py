@@ -44,7 +44,7 @@ def main() -> None:
                         address = Address("site", "gateway", sensor.name, result.what)
                         received = Received("", address, sequence, msgspec.json.decode(data), None)
                         begun = time.perf_counter()
-                        database.add(received)
+                        database.add([received])
                         adding_s += time.perf_counter() - begun
             while True:
                 begun = time.perf_counter()

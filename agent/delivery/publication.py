@@ -78,7 +78,7 @@ class Publisher:
     ) -> None:
         self._key = gateway_key(site, gateway)
         self._endpoints = tuple(connect)
-        self._config = session_config(mode, connect=connect, tls=tls)
+        self._config = session_config(mode, connect=connect, tls=tls, one_of_many=True)
         self._tls = tls
         self._poll_s = poll_s
         self._serve_more = serve

@@ -44,7 +44,7 @@ class Kept:
     def add(self, result: Result, t_utc_ns: int, epoch: str = "", **more: Any) -> dict[str, Any]:
         fields = msgspec.json.decode(msgspec.json.encode(result)) | {"t_utc_ns": t_utc_ns} | more
         address = Address(*PLACE[:2], result.sensor, result.what)
-        self.database.add(Received("", address, result.sequence, fields, None, epoch=epoch))
+        self.database.add([Received("", address, result.sequence, fields, None, epoch=epoch)])
         return fields
 
     def rows(self, what: str, limit: int = 1000) -> list[dict[str, Any]]:
