@@ -68,6 +68,57 @@ def highpass(corner_hz: float, order: int = 1) -> Filter:
     return lambda frequency_hz: np.asarray(freqs(b, a, 2.0 * np.pi * frequency_hz)[1])
 
 
+Disturbance = Callable[[np.random.Generator, Array, float], tuple[Array, Array]]
+NOTHING = np.zeros((1, 3))
+
+
+def undisturbed(*_: object) -> tuple[Array, Array]:
+    """Nothing is added."""
+    return NOTHING, NOTHING
+
+
+def hum(frequency_hz: float, amplitude_mps2: float) -> Disturbance:
+    """A tone in the sensor alone, as from the mains."""
+
+    def added(random: np.random.Generator, u: Array, rate_hz: float) -> tuple[Array, Array]:
+        tone = np.sin(2.0 * np.pi * (frequency_hz * np.arange(len(u)) / rate_hz + random.uniform()))
+        return amplitude_mps2 * tone[:, None] * np.array([1.0, 0.5, -0.7]), NOTHING
+
+    return added
+
+
+def rattle(frequency_hz: float, amplitude_mps2: float) -> Disturbance:
+    """A loose part that hits when the motion along x exceeds 1.5 m/s2, and rings in the sensor alone."""
+
+    def added(random: np.random.Generator, u: Array, rate_hz: float) -> tuple[Array, Array]:
+        beyond = np.abs(u[:, 0]) > 1.5
+        hits = (
+            random.normal(1.0, 0.3, len(u))
+            * random.choice([-1.0, 1.0], len(u))
+            * np.diff(beyond, prepend=False)
+            * beyond
+        )
+        cycles = np.arange(int(6.0 * rate_hz / frequency_hz)) * frequency_hz / rate_hz
+        rings = np.convolve(hits, np.exp(-cycles / 1.5) * np.sin(2.0 * np.pi * cycles))[: len(u)]
+        return amplitude_mps2 * rings[:, None] * np.array([1.0, 0.4, -0.6]), NOTHING
+
+    return added
+
+
+def noise(density: Callable[[Array], Array], *, of_reference: bool = False) -> Disturbance:
+    """Noise whose amplitude density at frequencies in Hz is `density`, in m/s2 per root Hz."""
+
+    def added(random: np.random.Generator, u: Array, rate_hz: float) -> tuple[Array, Array]:
+        frequency_hz = np.fft.rfftfreq(len(u), 1.0 / rate_hz)
+        frequency_hz[0] = frequency_hz[1]
+        size = density(frequency_hz) * np.sqrt(0.25 * len(u) * rate_hz)
+        lines = random.normal(size=(3, len(size))) + 1j * random.normal(size=(3, len(size)))
+        made = np.fft.irfft(lines * size, len(u)).T
+        return (NOTHING, made) if of_reference else (made, NOTHING)
+
+    return added
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Pair:
     """The files of both, S at the reference frequency, and that frequency in Hz."""
@@ -89,10 +140,13 @@ def pair(
     reference_noise_mps2: float = 0.0,
     reference_error: float = 0.0,
     known: KnownResponse = UNKNOWN,
+    disturbed: Disturbance = undisturbed,
+    reference_late_s: float = 0.0,
 ) -> Pair:
     """Random motion in `band_hz`, the same power at all its frequencies; `reference_error` is relative.
 
-    `known`: what is stated of the filters, whatever they are.
+    `known`: what is stated of the filters, whatever they are. `disturbed`: what is added to both signals. The samples
+    of the reference are taken `reference_late_s` after those of the sensor.
     """
     random = np.random.default_rng(seed)
     n = int((seconds + 2.0 * BEYOND_S) * rate_hz)
@@ -105,16 +159,18 @@ def pair(
     at_middle = float(abs(response(np.array([middle_hz]))[0]))
     sensitivity = np.eye(3) + 0.02 * random.normal(size=(3, 3))
     inside = slice(int(BEYOND_S * rate_hz), int((BEYOND_S + seconds) * rate_hz))
-    u = np.fft.irfft(lines, n).T[inside]
+    u = np.fft.irfft(lines * np.exp(2j * np.pi * frequency_hz * reference_late_s), n).T[inside]
     felt = np.fft.irfft(lines * response(frequency_hz) / at_middle, n)
     V = (sensitivity @ felt).T[inside] + OFFSET
     V += noise_mps2 * random.normal(size=V.shape)
     u = u * (1.0 + reference_error) + reference_noise_mps2 * random.normal(size=u.shape)
+    to_sensor, to_reference = disturbed(random, u, rate_hz)
+    V, u = V + to_sensor, u + to_reference
     time_s = np.arange(len(u)) / rate_hz
     pose = beside(np.eye(3))
     files = Tables(
         SensorTable("sensor.csv", time_s, V),
-        ReferenceTable("reference.csv", time_s, u, "acceleration", "ax_mps2"),
+        ReferenceTable("reference.csv", time_s + reference_late_s, u, "acceleration", "ax_mps2"),
         [PoseInterval(0.0, float(time_s[-1]), pose)],
         Instrument(known=known),
         Making(Settings(bands=True)),

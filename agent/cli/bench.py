@@ -116,8 +116,8 @@ def _session(settings: Config, channel: Channel, output: Path, options: dict[str
     from agent.bench.thinking import Thinking
     from agent.calibrate.stated import options_of
     from calib.estimate.next_stop import Wanted
+    from calib.excitation.band_to_keep import LEAST_MOTION_MPS2
     from calib.excitation.front_end import most_margin_s
-    from calib.excitation.windows import LEAST_MOTION_MPS2
 
     stops = stops_of(channel, options["thetas"], options["alphas"])
     devices = [channel.sensor, *([channel.reference] if channel.reference else [])]

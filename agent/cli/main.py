@@ -114,7 +114,8 @@ def run_cli(arguments: list[str] | None = None) -> int:
     except SystemExit as error:
         if COMPLETION in os.environ:  # click ends so after it has answered the shell
             return int(error.code or 0)
-        if sys.stdout is not output:  # click replaces it where the program that reads the output has ended
+        # The program that reads the output has ended: click then replaces the stream, and rich raises on its own.
+        if sys.stdout is not output or isinstance(error.__context__, BrokenPipeError):
             return 1
         # of a plug-in: no command of ours raises it
         click.echo(f"fieldcal: a plug-in or library asked the program to end: SystemExit: {error}", err=True)

@@ -32,7 +32,7 @@ class Adjusted:
     def coverage_factor(self, name: str) -> float:
         """For about 95 % coverage, by the fewest degrees of freedom among the links of a device."""
         own = [m.found for m in self.meetings if m.found is not None and name in (m.sensor, m.reference)]
-        return coverage_factor(min((f.adjustment.calibration.degrees_of_freedom for f in own), default=np.inf))
+        return coverage_factor(min((f.degrees_of_freedom for f in own), default=np.inf))
 
     def determined(self, name: str) -> Array:
         """(12,) flags of the parameters of a sensor that the data determine (calib.estimate.determined)."""

@@ -137,5 +137,5 @@ def device(name: str, section: DeviceSection, directory: Path, meetings: list[Me
         channels = max((m.channels for m in meetings if m.reference == name), default=3)
         return Device.reference(name, section.u_sensitivity_pct / 100.0, channels)
     first = next((m.found for m in meetings if m.found is not None and m.sensor == name), None)
-    mean = np.append(np.eye(3).ravel(), np.zeros(3)) if first is None else first.adjustment.mean[:12]
+    mean = np.append(np.eye(3).ravel(), np.zeros(3)) if first is None else first.mean
     return Device.known(name, mean, np.diag(np.full(12, np.inf)))

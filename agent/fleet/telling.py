@@ -117,6 +117,7 @@ def _test(verdict: Verdict) -> dict[str, Any]:
     return {
         "device": verdict.device,
         "as": "reference" if verdict.is_reference else "sensor",
+        "axis": verdict.axis or None,
         "chi2": verdict.statistic,
         "degrees_of_freedom": verdict.degrees_of_freedom,
         "probability": verdict.probability,

@@ -204,7 +204,7 @@ def _response(
         priors.reference_frequency_hz,
         band_hz,
         k,
-        known=Known(priors.known, 1.0 - priors.reference_share),
+        known=Known.of(priors),
     )
 
 

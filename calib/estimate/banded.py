@@ -135,7 +135,7 @@ def banded(
             continue
         kept = np.flatnonzero(window.bands.high_hz <= HIGHEST * to_hz)
         if kept.size:
-            factors = _Factors(window.bands, kept)
+            factors = Factors(window.bands, kept)
             projected[w] = _projected(factors, powers, omega2[w])
             found += [] if one_frequency else [_told(factors, powers)]
     if not found:
@@ -151,7 +151,7 @@ def banded(
     return Banded(projected, triangle[:size, size], triangle[:size, :size] * scale, deviations)
 
 
-class _Factors:
+class Factors:
     """The regressions of V on u and du/dt in B bands of a window.
 
     `gram` (B, 2M, 2M) is that of [u, du/dt], `root` (B, 2M, 2M) its factor, `slopes` (B, 2M, 3) = root b, `noise`
@@ -208,7 +208,7 @@ def _at_one_frequency(omega: float, channels: int, powers: int) -> Array:
     return np.stack([np.vstack([h.real * np.eye(channels), h.imag * per_omega * np.eye(channels)]) for h in terms])
 
 
-def _projected(factors: _Factors, powers: int, omega2: Array) -> Array:
+def _projected(factors: Factors, powers: int, omega2: Array) -> Array:
     """(K, 2M, M) see Banded. `omega2` (M,) is that of each channel in the whole window."""
     bands, m = _as_in_the_window(factors, omega2), factors.gram.shape[1] // 2
     gram = bands.sum(axis=0)
@@ -220,7 +220,7 @@ def _projected(factors: _Factors, powers: int, omega2: Array) -> Array:
     return np.asarray(inverse @ moved)
 
 
-def _as_in_the_window(factors: _Factors, omega2: Array) -> Array:
+def _as_in_the_window(factors: Factors, omega2: Array) -> Array:
     """(B, 2M, 2M) of [u, du/dt] in the bands as they are in the whole window, not in the tapered one.
 
     The power of each channel is multiplied by 1 + b (omega^2 - <omega^2>), with b such that the power of its du/dt over
@@ -255,7 +255,7 @@ class _Told:
     free: int
 
 
-def _told(factors: _Factors, powers: int) -> _Told:
+def _told(factors: Factors, powers: int) -> _Told:
     terms = by_term(factors.omega, powers)
     own = factors.seen(np.ones(len(terms), dtype=complex))
     lagged = factors.seen(-1j * factors.omega)

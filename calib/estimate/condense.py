@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.estimate.banded import Banded, banded
-from calib.estimate.type_a import FEWEST_FREEDOM, LEAST_INFLATION, Segments, TypeA, pooled
+from calib.estimate.type_a import FEWEST_FREEDOM, LEAST_INFLATION, Index, Segments, TypeA, in_order, pooled
 from calib.excitation.excited import OF_STRONGEST
 from calib.model import Array, Window, own_channels
 from calib.signal.response import POWERS
@@ -59,18 +59,19 @@ def condense(
     over frequency; 0 where that is no unknown. `one_frequency`, `powers`: see calib.estimate.banded.
     """
     channels = max(w.sums.reference_channels for w in windows)
-    segments = [_segments(w, channels) for w in windows]
-    roots, whiteners = zip(*(_root(s.xx.sum(0)) for s in segments), strict=True)
-    omega2, of_each = (np.array(part) for part in zip(*(_omega2(s.xx.sum(0), channels) for s in segments), strict=True))
+    parts = _segments(windows, channels)
+    powers_of = [part.xx.sum(1) for part in parts]
+    roots, whiteners = zip(*map(_roots, powers_of), strict=True)
+    omega2, of_each = (in_order(parts, own) for own in zip(*(_omega2(p, channels) for p in powers_of), strict=True))
     return Condensed(
         channels=channels,
-        root=np.array(roots),
-        slopes=np.array([t @ s.xv.sum(0) for t, s in zip(whiteners, segments, strict=True)]),
+        root=in_order(parts, roots),
+        slopes=in_order(parts, [t @ part.xv.sum(1) for t, part in zip(whiteners, parts, strict=True)]),
         omega2=omega2,
-        mean_x=np.array([s.mean[:-3] for s in segments]),
-        mean_v=np.array([s.mean[-3:] for s in segments]),
-        count=np.array([s.count.sum() for s in segments]),
-        type_a=pooled(segments, roots, whiteners, alike=alike),
+        mean_x=in_order(parts, [part.mean[:, :-3] for part in parts]),
+        mean_v=in_order(parts, [part.mean[:, -3:] for part in parts]),
+        count=in_order(parts, [part.count.sum(1) for part in parts]),
+        type_a=pooled(parts, roots, whiteners, alike=alike),
         bands=banded(windows, channels, response_hz, omega2, of_each, one_frequency=one_frequency, powers=powers)
         if response_hz
         else None,
@@ -109,60 +110,72 @@ def effective(data: Condensed, independent: Array) -> Condensed:
     )
 
 
-def _segments(window: Window, channels: int) -> Segments:
-    """Sums of one window by segment, centred on the window's mean; channels that it does not have are zeros."""
-    own = window.sums.reference_channels
+def _segments(windows: Sequence[Window], channels: int) -> list[Segments]:
+    """Sums of the windows by segment, centred on each window's mean; windows of one shape together."""
+    shapes: dict[tuple[int, int], list[int]] = {}
+    for w, window in enumerate(windows):
+        shapes.setdefault((window.sums.reference_channels, len(window.sums.count)), []).append(w)
+    return [_alike(np.array(at), [windows[w] for w in at], channels) for at in shapes.values()]
+
+
+def _alike(at: Index, windows: Sequence[Window], channels: int) -> Segments:
+    """Sums of windows with equal numbers of segments and channels; channels that they do not have are zeros."""
+    own = windows[0].sums.reference_channels
     keep = [*range(own), *range(channels, channels + own), *range(2 * channels, 2 * channels + 3)]
     size = 2 * channels + 3
-    count = np.asarray(window.sums.count, dtype=np.float64)
-    mean = np.zeros((len(count), size))
-    mean[:, keep] = window.sums.mean
-    scatter = np.zeros((len(count), size, size))
-    scatter[np.ix_(range(len(count)), keep, keep)] = window.sums.scatter
-    centre = count @ mean / count.sum()
-    mean -= centre
-    scatter += count[:, None, None] * mean[:, :, None] * mean[:, None, :]
+    count = np.array([w.sums.count for w in windows], dtype=np.float64)
+    mean = np.zeros((*count.shape, size))
+    mean[..., keep] = [w.sums.mean for w in windows]
+    scatter = np.zeros((*count.shape, size, size))
+    scatter[..., np.array(keep)[:, None], keep] = [w.sums.scatter for w in windows]
+    centre = (count[:, None] @ mean)[:, 0] / count.sum(1)[:, None]
+    mean -= centre[:, None]
+    scatter += count[..., None, None] * mean[..., :, None] * mean[..., None, :]
     x = slice(0, 2 * channels)
-    noise = np.zeros(2 * channels)
-    if window.reference_noise is not None:
-        for powers, at in zip(window.reference_noise**2, (0, channels), strict=True):
-            noise[at : at + len(powers)] = powers
+    noise = np.zeros((len(windows), 2 * channels))
+    for own_noise, window in zip(noise, windows, strict=True):
+        if window.reference_noise is not None:
+            for powers, first in zip(window.reference_noise**2, (0, channels), strict=True):
+                own_noise[first : first + len(powers)] = powers
     return Segments(
+        at,
         count,
-        scatter[:, x, x],
-        scatter[:, x, -3:],
-        scatter[:, -3:, -3:],
-        count[:, None] * mean,
+        scatter[..., x, x],
+        scatter[..., x, -3:],
+        scatter[..., -3:, -3:],
+        count[..., None] * mean,
         centre,
         noise,
-        window.independent,
+        np.array([w.independent for w in windows]),
     )
 
 
-def _root(power: Array) -> tuple[Array, Array]:
-    """R (2M, 2M), upper triangular with R'R = power, and T with T power = R.
+def _roots(power: Array) -> tuple[Array, Array]:
+    """R (W, 2M, 2M), upper triangular with R'R = power, and T with T power = R.
 
     A channel without power of its own has rows of zeros.
     """
-    size = len(power)
-    half = size // 2
-    strongest = np.repeat([power.diagonal()[:half].max(initial=0.0), power.diagonal()[half:].max(initial=0.0)], half)
-    limit = np.maximum(PIVOT_FLOOR * power.diagonal(), EXCITED * strongest)
-    moved = power.diagonal() > limit  # noise in a silent channel must not correlate its column of S with the others
-    power = np.where(np.outer(moved, moved), power, 0.0)
-    work = np.hstack([power, np.eye(size)])
+    size = power.shape[-1]
+    own, half = np.diagonal(power, axis1=1, axis2=2), size // 2
+    strongest = np.repeat(own.reshape(len(own), 2, half).max(axis=2, initial=0.0), half, axis=1)
+    limit = np.maximum(PIVOT_FLOOR * own, EXCITED * strongest)
+    moved = own > limit  # noise in a silent channel must not correlate its column of S with the others
+    power = np.where(moved[:, :, None] & moved[:, None], power, 0.0)
+    work = np.concatenate([power, np.broadcast_to(np.eye(size), power.shape)], axis=2)
     rows = np.zeros_like(work)
     for j in range(size):
-        if work[j, j] > max(limit[j], 0.0):
-            rows[j] = work[j] / np.sqrt(work[j, j])
-            work = work - rows[j, :size, None] * rows[j]
-    return np.triu(rows[:, :size]), rows[:, size:]
+        pivot = work[:, j, j]
+        live = pivot > np.maximum(limit[:, j], 0.0)
+        root = np.sqrt(np.where(live, pivot, 1.0))[:, None]
+        rows[:, j] = np.where(live[:, None], work[:, j] / root, 0.0)
+        work = work - rows[:, j, :size, None] * rows[:, j, None]
+    return np.triu(rows[..., :size]), rows[..., size:]
 
 
-def _omega2(products: Array, channels: int) -> tuple[float, Array]:
-    """The power of du/dt over that of u: of all channels that are no integrals together, and of each one (M,)."""
-    power, rate_power = np.split(products.diagonal(), 2)
+def _omega2(products: Array, channels: int) -> tuple[Array, Array]:
+    """The power of du/dt over that of u: of all channels but integrals together (W,), and of each (W, M)."""
+    power, rate_power = np.split(np.diagonal(products, axis1=1, axis2=2), 2, axis=1)
     real = own_channels(channels)
-    moved = float(power[:real].sum())
-    each = np.divide(rate_power, power, out=np.zeros(channels), where=power > 0.0)
-    return float(rate_power[:real].sum()) / moved if moved > 0.0 else 0.0, each
+    each = np.divide(rate_power, power, out=np.zeros(power.shape), where=power > 0.0)
+    moved, rate = power[:, :real].sum(axis=1), rate_power[:, :real].sum(axis=1)
+    return np.divide(rate, moved, out=np.zeros(len(moved)), where=moved > 0.0), each

@@ -18,6 +18,7 @@ import numpy as np
 
 from calib.estimate.adjustment import Adjustment, adjust
 from calib.estimate.nuisances import Applied, Priors
+from calib.estimate.offset_drift import drift_of
 from calib.estimate.quantities import GRAVITY, REFERENCE
 from calib.model import Array, Window
 
@@ -38,7 +39,8 @@ class Link:
     row by row, Q, and `shared`: names of gravity and numbers of the reference's parameters, as (device, parameter).
     `rotation` (3, 3), with a = R a_ref, is given if the reference measures gravity in three axes. S and Q are then
     those that the sensor seems to have beside this reference, because its rotation, known to `u_rotation_rad`, and each
-    of the reference's 12 parameters act on them (calib.estimate.site); `shared` is empty.
+    of the reference's 12 parameters act on them (calib.estimate.site); `shared` is empty. `mean` (12,): S and Q by this
+    link alone; `degrees_of_freedom` of their type A part.
     """
 
     sensor: str
@@ -48,7 +50,8 @@ class Link:
     shared: tuple[tuple[str, int], ...]
     rotation: Array | None
     u_rotation_rad: float
-    adjustment: Adjustment
+    mean: Array
+    degrees_of_freedom: float
 
 
 def link(
@@ -71,15 +74,23 @@ def link(
     here = Priors({**priors.values, **of_site}, priors.parameters, priors.covariance, priors.known)
     mean, u = _point(used, here, applied)
     variance = np.append(u[:9] ** 2, np.full(3, np.inf))
-    found = adjust(used, Priors(here.values, mean, np.diag(variance), priors.known), applied)
-    rows, told, shared = _information(found, mean, u, reference)
-    return Link(sensor, reference, rows, told, shared, rotation, priors.rotation_rad, found)
+    known = Priors(here.values, mean, np.diag(variance), priors.known)
+    found = adjust(used, known, applied)
+    covariance = found.covariance
+    if (drift := drift_of(found, used)) is not None:
+        found = adjust(drift.removed_from(used), known, applied)
+        covariance = found.covariance + drift.covariance
+    rows, told, shared = _information(found, covariance, mean, u, reference)
+    return Link(
+        sensor, reference, rows, told, shared, rotation, priors.rotation_rad,
+        found.mean[:12].copy(), found.calibration.degrees_of_freedom,
+    )  # fmt: skip
 
 
 def _rotation(used: Sequence[Window]) -> Array | None:
     """R if all windows are beside a tri-axial reference that measures gravity itself, in one pose; else None."""
-    first = used[0].pose.direction
-    alike = all(np.array_equal(w.pose.direction, first) and not np.any(w.pose.gravity_mps2) for w in used)
+    first, poses = used[0].pose.direction, {id(w.pose): w.pose for w in used}.values()
+    alike = all(np.array_equal(pose.direction, first) and not np.any(pose.gravity_mps2) for pose in poses)
     return first if first.shape == (3, 3) and alike else None
 
 
@@ -97,7 +108,7 @@ def _point(used: Sequence[Window], priors: Priors, applied: Applied | None) -> t
 
 
 def _information(
-    found: Adjustment, mean: Array, u: Array, reference: str
+    found: Adjustment, covariance: Array, mean: Array, u: Array, reference: str
 ) -> tuple[Array, Array, tuple[tuple[str, int], ...]]:
     """Rows, what they are told to be, and the shared unknowns; see Link. `mean`, `u` (12,) are subtracted."""
     kept = [j for j, n in enumerate(found.nuisances) if n.kind in (REFERENCE, GRAVITY)]
@@ -106,7 +117,7 @@ def _information(
     index = [*range(12), *(12 + j for j in kept)]
     u = np.append(u, [found.nuisances[j].prior_uncertainty for j in kept])
     mean = np.append(mean, np.zeros(len(kept)))
-    left, ways = np.linalg.eigh(found.covariance[np.ix_(index, index)] / np.outer(u, u))
+    left, ways = np.linalg.eigh(covariance[np.ix_(index, index)] / np.outer(u, u))
     told = left < 1.0 - LEAST_TOLD
     left, ways = np.maximum(left[told], ROUNDING), ways[:, told]
     weight = np.sqrt(1.0 / left - 1.0)

@@ -101,7 +101,7 @@ def _averaged(means: Array, weight: Array, time_s: Array, gravity_mps2: float) -
     squared: averages over WALKS by restricted likelihood, each ratio as likely beforehand."""
     x = _solve(means, weight, gravity_mps2)
     span = max(float(np.ptp(time_s)), np.finfo(float).tiny)
-    walk = _steps((time_s - 0.5 * (time_s.max() + time_s.min())) / span)
+    walk = walk_steps((time_s - 0.5 * (time_s.max() + time_s.min())) / span)
     for _ in range(TURNS):
         residual, jacobian = _lengths(x, means, gravity_mps2)
         by_offset = jacobian[:, 6:]
@@ -143,7 +143,7 @@ def _freedom(rests: int) -> int:
     return max(rests - UNKNOWNS - 1, 1)
 
 
-def _steps(part: Array) -> Array:
+def walk_steps(part: Array) -> Array:
     """(W, STEPS) how far a walk in STEPS independent steps, 0 in the middle, has gone at these parts of the time."""
     edges = np.linspace(-0.5, 0.5, STEPS + 1)
     gone = np.clip(part[:, None], edges[:-1], edges[1:]) - np.clip(0.0, edges[:-1], edges[1:])

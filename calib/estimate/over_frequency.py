@@ -130,7 +130,7 @@ class OverFrequency:
         factor, hz = self.factor(state, priors.known_u)[chosen], self.stated(priors).reference_frequency_hz
         return response_told(
             state.mean[chosen], factor @ factor.T, effects, hz, self.motion_hz, coverage_factor, per_octave=1.0,
-            known=_known(self.stated(priors)),
+            known=Known.of(self.stated(priors)),
         )  # fmt: skip
 
     def steady(self, state: JointState, reference: str, priors: Priors) -> dict[str, float]:
@@ -165,7 +165,7 @@ class OverFrequency:
         factor, hz = self.factor(state, priors.known_u)[chosen], self.stated(priors).reference_frequency_hz
         band_hz = (self.first_hz, self.first_hz)
         return told_at_one_frequency(
-            state.mean[chosen], factor @ factor.T, effects, hz, band_hz, coverage_factor, _known(self.stated(priors))
+            state.mean[chosen], factor @ factor.T, effects, hz, band_hz, coverage_factor, Known.of(self.stated(priors))
         )
 
     def snapshot(self) -> dict[str, Any]:
@@ -178,10 +178,6 @@ class OverFrequency:
         band = state["motion_hz"]
         motion_hz = None if band is None else (band[0], band[1])
         return cls(**{**state, "motion_hz": motion_hz, "deviations": Deviations(**state["deviations"])})
-
-
-def _known(priors: Priors) -> Known:
-    return Known(priors.known, 1.0 - priors.reference_share)
 
 
 def terms_of(state: JointState, reference: str) -> list[int]:

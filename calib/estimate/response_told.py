@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,9 @@ from numpy.typing import NDArray
 from calib.model import Array
 from calib.signal.known_response import UNKNOWN, KnownResponse
 from calib.signal.response import NEAR, Complex, Response, by_term
+
+if TYPE_CHECKING:
+    from calib.estimate.nuisances import Priors
 
 PER_OCTAVE = 3  # bands in which S is reported
 LARGE = 0.5  # of the largest element of S: the elements whose relative uncertainty counts
@@ -24,6 +28,11 @@ class Known:
 
     response: KnownResponse = UNKNOWN
     share: float = 1.0
+
+    @classmethod
+    def of(cls, priors: Priors) -> Known:
+        """What the priors state."""
+        return cls(priors.known, 1.0 - priors.reference_share)
 
     def size(self, frequency_hz: Array, reference_hz: float) -> Complex | float:
         """h of the sensor's known filters at frequencies, over its size at the reference frequency."""

@@ -10,11 +10,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.excitation.sums import NOISE_FLOOR
 from calib.model import Array
 
 Flags = np.ndarray[tuple[int], np.dtype[np.bool_]]
+Index = NDArray[np.intp]
 
 # Correlation of neighbours above which segments are joined in pairs: they are shorter than 3 correlation times.
 RHO_COARSEN = 0.35
@@ -24,11 +26,15 @@ LEAST_INFLATION = 0.25  # variance ratios below it are the luck of few segments
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Segments:
-    """Sums of K segments about one centre: counts (K,), x x' (K, 2M, 2M), x V' (K, 2M, 3), V V' (K, 3, 3), sums of
-    [x, V] (K, 2M + 3); `mean` (2M + 3,) is that centre. `noise` (2M,): power a sample of the reference's own noise,
-    which is no longer in xx but still in the residuals. `independent`: share of points that a filter left independent.
+    """Sums of W windows of K segments each, about one centre for each window.
+
+    `at` (W,): which windows they are. Counts (W, K), x x' (W, K, 2M, 2M), x V' (W, K, 2M, 3), V V' (W, K, 3, 3), sums
+    of [x, V] (W, K, 2M + 3); `mean` (W, 2M + 3) is that centre. `noise` (W, 2M): power a sample of the reference's own
+    noise, which is no longer in xx but still in the residuals. `independent` (W,): share of points that a filter left
+    independent.
     """
 
+    at: Index
     count: Array
     xx: Array
     xv: Array
@@ -36,7 +42,7 @@ class Segments:
     total: Array
     mean: Array
     noise: Array
-    independent: float = 1.0
+    independent: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,63 +64,79 @@ class TypeA:
         return float(np.diag(self.slopes)[live].mean())
 
 
+def in_order(parts: Sequence[Segments], values: Sequence[Array]) -> Array:
+    """Values (W, ...) of the windows of each part, in the order of all windows."""
+    if len(parts) == 1:  # they are in order already
+        return values[0]
+    return np.concatenate(values)[np.argsort(np.concatenate([part.at for part in parts]))]
+
+
 def pooled(
-    windows: Sequence[Segments], roots: Sequence[Array], whiteners: Sequence[Array], *, alike: bool = False
+    parts: Sequence[Segments], roots: Sequence[Array], whiteners: Sequence[Array], *, alike: bool = False
 ) -> TypeA:
-    """Scatter of the whitened scores over all windows; slopes are whitened by T = `whiteners`.
+    """Scatter of the whitened scores over all windows; slopes are whitened by T = `whiteners` (W, 2M, 2M) of each part.
 
     `alike`: all windows are taken to be as noisy as their mean, so that all points weigh the same (Method 3).
     """
-    slopes = [t.T @ (t @ w.xv.sum(0)) for t, w in zip(whiteners, windows, strict=True)]
-    noise = np.array([_noise(*each) for each in zip(windows, slopes, roots, strict=True)])
+    slopes = [np.swapaxes(t, 1, 2) @ (t @ part.xv.sum(1)) for t, part in zip(whiteners, parts, strict=True)]
+    noise = in_order(parts, [_noise(*each) for each in zip(parts, slopes, roots, strict=True)])
     # Scores are summed in one unit. Each in units of its own window's noise would seem too small: it made that noise.
-    count = np.array([w.count.sum() for w in windows])
+    count = in_order(parts, [part.count.sum(1) for part in parts])
     sd = np.sqrt(count @ noise**2 / count.sum())
     if alike:
         noise = np.tile(sd, (len(noise), 1))
-    size = roots[0].shape[0]
+    size = roots[0].shape[-1]
     slope_scores, mean_scores = [], []
-    for window, beta, t in zip(windows, slopes, whiteners, strict=True):
-        score = np.einsum("rc,kci->kri", t, window.xv - window.xx @ beta) / (sd / np.sqrt(window.independent))
-        slope_scores.append(score.reshape(len(score), 3 * size))
-        score = (window.total[:, -3:] - window.total[:, :-3] @ beta) / (sd / np.sqrt(window.independent))
-        mean_scores.append(score / np.sqrt(window.count.sum()))
-    live = np.repeat([any(r[j, j] > 0.0 for r in roots) for j in range(size)], 3)
+    for part, beta, t in zip(parts, slopes, whiteners, strict=True):
+        unit = (sd / np.sqrt(part.independent)[:, None])[:, None]
+        score = np.einsum("wrc,wkci->wkri", t, part.xv - part.xx @ beta[:, None]) / unit[:, :, None]
+        slope_scores.append(score.reshape(*part.count.shape, 3 * size))
+        score = (part.total[..., -3:] - part.total[..., :-3] @ beta) / unit
+        mean_scores.append(score / np.sqrt(part.count.sum(1))[:, None, None])
+    live = np.repeat(np.any([np.any(np.diagonal(r, axis1=1, axis2=2) > 0.0, axis=0) for r in roots], axis=0), 3)
     slope_cov, slope_dof = _scatter(slope_scores, live)
     mean_cov, mean_dof = _scatter(mean_scores, np.ones(3, dtype=bool))
     return TypeA(noise, slope_cov, mean_cov, min(slope_dof, mean_dof))
 
 
-def _noise(window: Segments, slopes: Array, root: Array) -> Array:
-    """(3,) SD of the residuals of a window with these slopes."""
-    count, xv, vv = float(window.count.sum()), window.xv.sum(0), np.diag(window.vv.sum(0))
-    xx = window.xx.sum(0) + count * np.diag(window.noise)
-    left = vv - 2.0 * np.einsum("ci,ci->i", slopes, xv) + np.einsum("ci,cd,di->i", slopes, xx, slopes)
-    signal = vv + count * window.mean[-3:] ** 2
-    freedom = count - 1.0 - np.count_nonzero(np.diag(root))
-    floor = NOISE_FLOOR * np.sqrt(signal.max() / count) or 1.0
-    return np.asarray(np.sqrt(np.maximum(left, 0.0) / max(freedom, 1.0)).clip(min=floor))
+def _noise(part: Segments, slopes: Array, root: Array) -> Array:
+    """(W, 3) SD of the residuals of the windows with these slopes."""
+    count, xv, vv = part.count.sum(1), part.xv.sum(1), np.diagonal(part.vv.sum(1), axis1=1, axis2=2)
+    xx = part.xx.sum(1) + count[:, None, None] * part.noise[:, None] * np.eye(part.noise.shape[1])
+    left = vv - 2.0 * np.einsum("wci,wci->wi", slopes, xv) + np.einsum("wci,wcd,wdi->wi", slopes, xx, slopes)
+    signal = vv + count[:, None] * part.mean[:, -3:] ** 2
+    freedom = count - 1.0 - np.count_nonzero(np.diagonal(root, axis1=1, axis2=2), axis=1)
+    floor = NOISE_FLOOR * np.sqrt(signal.max(axis=1) / count)
+    spread = np.sqrt(np.maximum(left, 0.0) / np.maximum(freedom, 1.0)[:, None])
+    return np.asarray(np.maximum(spread, np.where(floor > 0.0, floor, 1.0)[:, None]))
 
 
 def _scatter(scores: list[Array], live: Flags) -> tuple[Array, float]:
-    """Covariance (D, D) of a window's summed scores and its degrees of freedom; `live` (D,) are those with data."""
-    lengths = np.array([len(s) for s in scores])
-    freedom = float(np.sum(lengths - 1))
+    """Covariance (D, D) of a window's summed scores and its degrees of freedom; `live` (D,) are those with data.
+
+    `scores` (W, K, D) of windows with K segments each.
+    """
+    windows, segments = np.array([s.shape[:2] for s in scores], dtype=float).T
+    freedom = float(windows @ (segments - 1.0))
     if freedom < 1 or not live.any():
         return np.eye(len(live)), np.inf
-    covariance = np.sum([len(s) * s.T @ s for s in scores], axis=0) / freedom
-    gamma0, gamma1 = _neighbours([s[:, live] for s in scores])
+    covariance = np.sum([s.shape[1] * _flat(s).T @ _flat(s) for s in scores], axis=0) / freedom
+    gamma0, gamma1 = _neighbours([s[..., live] for s in scores])
     if gamma0 <= 0.0:
         return covariance, freedom
     rho = gamma1 / gamma0
-    if rho > RHO_COARSEN and lengths.max() >= 4:
+    if rho > RHO_COARSEN and segments.max() >= 4:
         return _scatter([_paired(s) for s in scores], live)
     if rho <= 1.0 / np.sqrt(freedom * live.sum()):  # within its own SD of none at all
         return covariance, freedom
-    typical = float(lengths.mean())
+    typical = float(windows @ segments / windows.sum())
     naive = gamma0 - 2.0 * gamma1 / typical  # what the covariance above expects, neighbours being correlated
     inflation = max(1.0, (gamma0 + 2.0 * (1.0 - 1.0 / typical) * gamma1) / naive)
     return covariance * inflation, freedom / (1.0 + 0.5 * inflation)  # rho itself is known from as little
+
+
+def _flat(scores: Array) -> Array:
+    return scores.reshape(-1, scores.shape[-1])
 
 
 def _neighbours(scores: list[Array]) -> tuple[float, float]:
@@ -122,18 +144,18 @@ def _neighbours(scores: list[Array]) -> tuple[float, float]:
 
     With K scores g and r = g - mean(g): E sum r_k^2 and E sum r_k r_{k+1} are linear in both; solved over all windows.
     """
-    scores = [s for s in scores if len(s) > 2]
-    k = np.array([float(len(s)) for s in scores])
+    scores = [s for s in scores if s.shape[1] > 2]
+    windows, k = np.array([s.shape[:2] for s in scores], dtype=float).reshape(-1, 2).T
     none, mean_square = np.zeros_like(k), np.array([k, 2.0 * (k - 1.0)]) / k**2  # of mean(g), by gamma0, gamma1
     matrix = np.array(
         [
-            (np.array([k, none]) - k * mean_square).sum(axis=1),
-            (np.array([none, k - 1.0]) - (k + 1.0) * mean_square + 2.0 / k).sum(axis=1),
+            (windows * (np.array([k, none]) - k * mean_square)).sum(axis=1),
+            (windows * (np.array([none, k - 1.0]) - (k + 1.0) * mean_square + 2.0 / k)).sum(axis=1),
         ]
     )
-    own = sum(len(s) * float(np.vdot(s, s)) for s in scores)
-    next_to = sum(len(s) * float(np.vdot(s[1:], s[:-1])) for s in scores)
-    observed = np.array([own, next_to]) / max(scores[0].shape[1] if scores else 1, 1)
+    own = sum(s.shape[1] * float(np.vdot(s, s)) for s in scores)
+    next_to = sum(s.shape[1] * float(np.vdot(s[:, 1:], s[:, :-1])) for s in scores)
+    observed = np.array([own, next_to]) / max(scores[0].shape[2] if scores else 1, 1)
     if abs(np.linalg.det(matrix)) < 1e-9:
         return 0.0, 0.0
     gamma0, gamma1 = np.linalg.solve(matrix, observed)
@@ -141,11 +163,11 @@ def _neighbours(scores: list[Array]) -> tuple[float, float]:
 
 
 def _paired(scores: Array) -> Array:
-    """Neighbours summed; an odd last one goes with the pair before it, a single one stays."""
-    if len(scores) < 2:
+    """Neighbours (W, K, D) summed; an odd last one goes with the pair before it, a single one stays."""
+    if scores.shape[1] < 2:
         return scores
-    even = scores[: len(scores) // 2 * 2]
-    pairs = np.asarray(even.reshape(-1, 2, even.shape[1]).sum(1))
-    if len(even) < len(scores):
-        pairs[-1] += scores[-1]
+    even = scores[:, : scores.shape[1] // 2 * 2]
+    pairs = np.asarray(even.reshape(len(even), -1, 2, even.shape[2]).sum(2))
+    if even.shape[1] < scores.shape[1]:
+        pairs[:, -1] += scores[:, -1]
     return pairs

@@ -18,6 +18,7 @@ from calib.model import Array, BandSums, Window
 from calib.signal.order_statistics import distinct
 
 BANDS_AN_OCTAVE = 6
+HANN = 0.5
 TAPER = 0.1  # of the window, at each end: longer than the impulse response of any filter of an instrument
 MORE_LINES = 6  # in a band, beside those that the regression on u and du/dt uses; a band with fewer joins the next one
 FEWEST_BANDS = 4
@@ -29,9 +30,11 @@ HIGHEST = 1.001  # times the upper end of the motion: a band that ends there is 
 BELOW, ABOVE = 1e-2, 1e-3  # shares of the motion's power outside its band: a response differs more above than below
 
 
-def band_sums(u: Array, du: Array, V: Array, rate_hz: float) -> BandSums | None:
+def band_sums(u: Array, du: Array, V: Array, rate_hz: float, share: float = TAPER) -> BandSums | None:
     """Band sums of evenly sampled u (n, m) in m/s2, du (n, m) in m/s3 and V (n, 3) in output unit.
 
+    `share` of the window is tapered at each end. With HANN motion that is much stronger at other frequencies does not
+    leak into a band; the sums then have the weight of half of the points.
     None where the window is too short for a few bands, and without a reference or with its integrals
     (calib.signal.corner).
     """
@@ -39,7 +42,7 @@ def band_sums(u: Array, du: Array, V: Array, rate_hz: float) -> BandSums | None:
     fewest = 2 * m + MORE_LINES
     if m not in (1, 3) or n < 2 * FEWEST_BANDS * fewest:
         return None
-    taper, density = _taper(n)
+    taper, density = _taper(n, share)
     rows = np.vstack([u.T, du.T, V.T])
     rows -= (rows @ taper / taper.sum())[:, None]
     rows *= taper
@@ -76,9 +79,9 @@ def without_noise(bands: BandSums, noise: Array) -> BandSums:
 
 
 @lru_cache(maxsize=4)
-def _taper(n: int) -> tuple[Array, float]:
+def _taper(n: int, share: float) -> tuple[Array, float]:
     """A cosine taper (n,) with mean square 1, and the share of the points that it leaves independent."""
-    ramp = max(int(TAPER * n), 1)
+    ramp = max(int(share * n), 1)
     taper = np.ones(n)
     taper[:ramp] = 0.5 - 0.5 * np.cos(np.pi * (np.arange(ramp) + 0.5) / ramp)
     taper[n - ramp :] = taper[:ramp][::-1]

@@ -20,12 +20,19 @@ BRIDGE_S = 1.0  # a shorter pause does not end a stretch of motion
 MOVING_LEVEL = 0.4
 KNOCK_SD = 5.0  # robust SDs: white noise exceeds them at one point in 1.7 million
 KNOCK_PASSES = 8
+FEW_KNOCKS = 0.01  # of the points: below, nobody asks whether the residual grows with the motion
+LEVELS, FEWEST_A_LEVEL = 10, 50  # groups of points with as much motion, and points in each
+NEARBY = 51  # points over which the level of the motion is averaged
+GROWS = 2.0  # times: knocks that have nothing to do with the motion leave the medians of the groups alike
 # Least eigenvalue of the matrix of the columns' cosines: above it the normal equations are accurate to 1e-10, and ten
 # times as fast as a factorisation.
 INDEPENDENT = 1e-6
 SLOW_BAND_HZ = 50.0  # first band tried for the motion; it is widened until it holds most of the motion's power
 MOST_POWER = 0.7  # part of the motion's power
 SPECTRUM_SAMPLES, SPECTRA, FEWEST_FOR_SPECTRUM = 4096, 4, 16
+HANN_LINES = 2.0 / 3.0  # of the lines of a Hann window are independent
+LINES_TOGETHER = 16  # lines of a spectrum in which sensor and reference are related by one complex matrix
+RELATED = 1e-9  # relative eigenvalue of the sensor's channels below which they show nothing more
 CLIPPED_POINTS = 3  # fewer points with the same extreme value may occur by chance
 DISTINCT = 0.99  # if this part of the points within the range differ, three points at an extreme are no chance
 ROUNDING = 1e-9  # of the range: smaller residuals are rounding errors, not noise
@@ -48,20 +55,49 @@ def knocked(V: Array, basis: Array, finest: Array) -> tuple[Mask, Array]:
     """Flags (n,) of knocks: points whose residual from the regression of V (n, 3) on `basis` (n, p) is above five
     robust SDs; and the residuals (n, 3) of all points from the regression of the other points.
 
-    `finest` (3,) is the resolution of V (`least_step`).
+    `finest` (3,) is the resolution of V (`least_step`). Where many points are beyond the limit, and the residual grows
+    with the motion in `basis`, the robust SD is that of points with as much motion: such a residual is the model's (a
+    lever arm, a loose mount), not a knock.
     """
     columns, outputs = np.ascontiguousarray(basis.T), np.ascontiguousarray(V.T)
-    struck: Mask = np.zeros(len(V), dtype=bool)
+    struck, residual = _beyond(columns, outputs, finest, np.ones(len(V)))
+    if len(V) >= LEVELS * FEWEST_A_LEVEL and struck.mean() > FEW_KNOCKS:
+        growth = _growth(columns[1:], residual)
+        if growth.max() > GROWS * growth.min():
+            struck, residual = _beyond(columns, outputs, finest, growth / growth.min())
+    return struck, residual.T
+
+
+def _beyond(columns: Array, outputs: Array, finest: Array, growth: Array) -> tuple[Mask, Array]:
+    """Flags (n,) of points beyond five robust SDs, times `growth` (n,), and the residuals (3, n)."""
+    struck: Mask = np.zeros(outputs.shape[1], dtype=bool)
+    steady = bool(growth.max() <= 1.0)
     for _ in range(KNOCK_PASSES):
         kept = np.flatnonzero(~struck) if struck.any() else slice(None)
         residual = outputs - _regression(columns[:, kept], outputs[:, kept]) @ columns
-        away = np.abs(residual)
+        away = np.abs(residual) if steady else np.abs(residual) / growth
         limit = KNOCK_SD * np.maximum(1.4826 * median(away[:, kept]), 0.5 * finest)
         now = np.asarray((away > limit[:, None]).any(axis=0))
         if np.array_equal(now, struck):
             break
         struck = now
-    return struck, residual.T
+    return struck, residual
+
+
+def _growth(motion: Array, residual: Array) -> Array:
+    """How the size of the residual (3, n) grows with the level of the `motion` (p, n) nearby: its median in LEVELS
+    groups of points with as much motion, of the axis where it grows most; it never falls."""
+    centred = motion - motion.mean(axis=1, keepdims=True)
+    unit = np.sqrt(np.mean(centred**2, axis=1, keepdims=True))
+    level = np.sum(np.divide(centred, unit, out=np.zeros_like(centred), where=unit > 0.0) ** 2, axis=0)
+    level = np.convolve(level, np.ones(NEARBY), "same")
+    groups = np.array_split(np.argsort(level, kind="stable"), LEVELS)
+    sizes = np.array([median(np.abs(residual[:, group])) for group in groups])
+    rising = np.maximum.accumulate(sizes / np.maximum(sizes.min(axis=0), np.finfo(float).tiny), axis=0)
+    growth = np.empty(len(level))
+    for group, size in zip(groups, rising[:, int(np.argmax(rising[-1]))], strict=True):
+        growth[group] = size
+    return growth
 
 
 def _regression(columns: Array, outputs: Array) -> Array:
@@ -139,16 +175,47 @@ def white_noise(x: Array) -> Array:
 
     Motion does not change the median if it occupies less than half of the spectrum. Zero if x is too short.
     """
-    size = min(SPECTRUM_SAMPLES, 1 << max(len(x).bit_length() - 1, 0))
-    if size < FEWEST_FOR_SPECTRUM:
+    parts, window = spectral_parts(x)
+    if parts is None:
         return np.zeros(x.shape[1])
-    starts = sorted({k * (len(x) - size) // (SPECTRA - 1) for k in range(SPECTRA)})
-    rows, window = np.ascontiguousarray(x.T), hanning(size)
-    parts = np.stack([rows[:, k : k + size] for k in starts], axis=1)
     lines = np.fft.rfft((parts - parts.mean(axis=2, keepdims=True)) * window)[..., 1:-1]
-    power = median((lines.real**2 + lines.imag**2).reshape(len(rows), -1)) / np.sum(window**2)
+    power = median((lines.real**2 + lines.imag**2).reshape(len(lines), -1)) / np.sum(window**2)
     # The power of a line of white noise is exponentially distributed: its mean is its median divided by ln 2.
     return np.asarray(np.sqrt(power / np.log(2.0)))
+
+
+def incoherent(u: Array, V: Array) -> Array:
+    """SD (m,) of what of the reference u (n, m) the sensor's V (n, 3) does not show at any lag; inf if both are too
+    short. No noise of the reference is larger.
+
+    A motion that fills the spectrum looks like white noise (`white_noise`), but the sensor shows it as well.
+    """
+    parts, window = spectral_parts(np.hstack([u, V]))
+    if parts is None or parts.shape[2] < 4 * LINES_TOGETHER:
+        return np.full(u.shape[1], np.inf)
+    m, lines = u.shape[1], np.fft.rfft((parts - parts.mean(axis=2, keepdims=True)) * window)[..., 1:-1]
+    groups = lines.shape[2] // LINES_TOGETHER
+    together = lines[..., : groups * LINES_TOGETHER].reshape(len(lines), -1, groups, LINES_TOGETHER)
+    rows = together.transpose(2, 0, 1, 3).reshape(groups, len(lines), -1)  # of each group, all its lines of a channel
+    cross = rows @ rows.conj().transpose(0, 2, 1)
+    own, seen, both = cross[:, :m, :m], cross[:, m:, m:], cross[:, :m, m:]
+    left = own - both @ np.linalg.pinv(seen, RELATED, hermitian=True) @ both.conj().transpose(0, 2, 1)
+    # Neighbouring lines of a Hann window, and segments that overlap, tell less than as many independent ones.
+    independent = HANN_LINES * LINES_TOGETHER * min(parts.shape[1], len(u) / parts.shape[2])
+    power = independent / (independent - V.shape[1]) * np.diagonal(left, axis1=1, axis2=2).real.sum(axis=0)
+    # The variance of a channel is the sum of its lines on both sides of the spectrum.
+    size, segments = 2 * (lines.shape[2] + 1), parts.shape[1]
+    return np.asarray(np.sqrt(np.maximum(2.0 * power, 0.0) / (segments * size * np.sum(window**2))))
+
+
+def spectral_parts(x: Array) -> tuple[Array | None, Array]:
+    """Segments (m, SPECTRA, size) of x (n, m), spread over it, and their window (size,); None if x is too short."""
+    size = min(SPECTRUM_SAMPLES, 1 << max(len(x).bit_length() - 1, 0))
+    if size < FEWEST_FOR_SPECTRUM:
+        return None, np.zeros(0)
+    starts = sorted({k * (len(x) - size) // (SPECTRA - 1) for k in range(SPECTRA)})
+    rows = np.ascontiguousarray(x.T)
+    return np.stack([rows[:, k : k + size] for k in starts], axis=1), hanning(size)
 
 
 def least_step(V: Array) -> Array:

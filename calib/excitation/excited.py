@@ -49,6 +49,8 @@ def excited(window: Window) -> Excitation:
     noise = np.zeros((2, m)) if window.reference_noise is None else window.reference_noise**2
     own = _own_power(power, noise[0])
     live = own > 0.0
+    if live.all() and window.reference_noise is None and window.bands is None:  # nothing to remove or to subtract
+        return Excitation(window, np.linalg.qr(window.pose.direction[:, :m])[0], 0.0)
     share = float(np.max(noise[0][live] / own[live], initial=0.0))
     along, ahead = _shared(window, live, noise)
     # The shared motion of a silent channel turns the excited direction if it is more than noise and more than 1 %.

@@ -14,21 +14,21 @@ from functools import partial
 import numpy as np
 
 from calib.excitation import detection
+from calib.excitation.band_to_keep import FILTER_BAND, LEAST_MOTION_MPS2, band_to_keep
+from calib.excitation.bands import TAPER
+from calib.excitation.disturbance import NoiseFilter, against_noise, not_more_than_incoherent
 from calib.excitation.turning import feels_gravity, standing_parts
 from calib.excitation.window_verdict import DEFAULT_LIMITS, Limits
-from calib.excitation.windows import LEAST_MOTION_MPS2, Points, at_rest, motion_windows, rest_window, still_window
-from calib.model import Array, Pose, Window, WindowSums
-from calib.signal.band import STOP_BAND, band_above_noise, lowpass, noise_in_band, without_short_holes
+from calib.excitation.windows import Points, at_rest, motion_windows, rest_window, still_window
+from calib.model import Array, Pose, Window, WindowSums, own_channels
+from calib.signal.band import lowpass, without_short_holes
 from calib.signal.corner import integral, with_integral, without_corner
 from calib.signal.glitches import glitches
 from calib.signal.holes import Mask
 from calib.signal.instrument import Instrument
 from calib.signal.resampling import (
-    BAND,
-    DIFFERENTIATED_BAND_HZ,
     HALF,
     differentiate,
-    differentiated_band_hz,
     differentiator_lost,
     resample,
 )
@@ -41,10 +41,8 @@ LEAST_MARGIN_S = 1.0
 MOST_MARGIN_S = 5.0  # a second derivative at 10 Hz takes 4.2 s
 # Of many holes pieces of a second are left: too short for the reference's noise, and for type A by segments.
 MOST_MISSING_PCT = 5.0
-NOISE_MATTERS = 1e-5  # of the motion's power: a filter against less of it would cost its ends for nothing
-FILTER_BAND = 1.197  # times its band: the noise-equivalent bandwidth of calib.signal.band.lowpass
-RESAMPLED_BAND = 0.35  # of the reference's rate, to which interpolation itself passes noise
-AS_FAST = 0.9  # of the sensor's rate; two devices of one nominal rate differ by less
+# A sensor that follows the motion better, with fewer knocks, needs no other weights of the frequencies.
+COHERENT, KNOCKED_PCT = 0.999, 1.0
 
 
 class Unusable(ValueError):  # noqa: N818 - said of samples
@@ -55,8 +53,9 @@ class Unusable(ValueError):  # noqa: N818 - said of samples
 class Settings:
     """How windows are made. Method 3 as printed needs `leave_out` False (every point is kept) and `limit_band` False.
 
-    `limits`: what a window must keep to be used. `bands`: windows with motion hold sums in bands as well. `to_hz`: both
-    signals are limited so that no motion above this frequency is left; None leaves it.
+    `limits`: what a window must keep to be used. `bands`: windows with motion hold sums in bands as well, for which the
+    share `taper` of them is tapered at each end. `to_hz`: both signals are limited so that no motion above it is left;
+    None leaves it.
     """
 
     limits: Limits = DEFAULT_LIMITS
@@ -64,6 +63,7 @@ class Settings:
     limit_band: bool = True
     bands: bool = False
     to_hz: float | None = None
+    taper: float = TAPER
 
 
 DEFAULT_SETTINGS = Settings()
@@ -141,10 +141,12 @@ def aligned(
     lag_s: float = 0.0,
     settings: Settings = DEFAULT_SETTINGS,
     response: Response = FLAT,
+    against: NoiseFilter | None = None,
 ) -> Aligned | None:
     """Samples within `span_s` that have a reference, in m/s2; None where there are fewer than two.
 
-    Where nothing is left out, the reference's glitches stay (see calib.signal.glitches).
+    Where nothing is left out, the reference's glitches stay (see calib.signal.glitches). `against`: a filter that both
+    signals pass besides.
     """
     rate_hz = reference.clock.rate_hz
     raw = reference.values / instrument.sensitivity
@@ -166,14 +168,18 @@ def aligned(
     at = resample(u, reference.clock, time_s - lag_s, reference.first_index, lost)
     columns = np.vstack([V.T, at.u.T, at.du.T]).T  # the samples of a channel lie side by side, also in what is kept
     columns[~at.usable] = np.nan
-    band_hz, noise = _band(raw, at.u[at.usable][:, :m], V, instrument, (rate_hz, sensor_rate_hz), settings.to_hz)
-    clipped, independent, k = 0, 1.0, u.shape[1]
+    band_hz, noise = band_to_keep(raw, at.u[at.usable][:, :m], V, instrument, (rate_hz, sensor_rate_hz), settings.to_hz)
+    clipped, independent, k, unfiltered = 0, 1.0, u.shape[1], columns
     if band_hz is not None and settings.limit_band:
         independent = min(1.0, 2.0 * FILTER_BAND * band_hz / sensor_rate_hz)
-        clipped = _clipped(columns[np.isfinite(columns).all(axis=1) & inside & ~filled])
         columns = lowpass(columns, sensor_rate_hz, band_hz)
     else:
         columns[filled] = np.nan  # without a filter, a filled sample would only repeat what the others tell
+    if against is not None:
+        columns = against.passed(np.where(inside[:, None], columns, np.nan))  # beyond, the sensor may be turned
+        noise, independent = against.noise(noise), independent * against.independent
+    if columns is not unfiltered:
+        clipped = _clipped(unfiltered[np.isfinite(unfiltered).all(axis=1) & inside & ~filled])
     usable = np.isfinite(columns).all(axis=1) & inside
     if usable.sum() < 2:
         return None
@@ -185,6 +191,7 @@ def aligned(
         "reference_glitches": (odd & raw_inside).sum(),
     }
     points = Points(time_s[usable], *np.split(columns.T[:, usable].T, [3, 3 + k], axis=1))
+    noise = not_more_than_incoherent(noise, points.u[:, :m], points.V)
     told = {name: float(count) for name, count in counts.items() if count}
     return Aligned(points, noise, clipped, independent, band_hz if settings.limit_band else None, told)
 
@@ -233,19 +240,27 @@ def _motion(
     settings: Settings,
     response: Response,
 ) -> list[Window]:
-    if (found := aligned(sensor, reference, instrument, span_s, lag_s, settings, response)) is None:
+    align = partial(aligned, sensor, reference, instrument, span_s, lag_s, settings, response)
+    if (found := align()) is None:
         return []
     if instrument.has_corner:
         pose = with_integral(pose)
+    made = _beside(pose, found, settings)
+    knocked = any(window.numbers.get("left_out_pct", 0.0) > KNOCKED_PCT for window in made)
+    if settings.limit_band and (knocked or any(w.numbers.get("coherence", 1.0) < COHERENT for w in made)):
+        against = against_noise(found.points, own_channels(pose.direction.shape[1]), knocked=knocked)
+        if against is not None and (better := align(against=against)) is not None:
+            found, made = better, _beside(pose, better, settings)
     u_lag_s = float(np.hypot(sensor.clock.u_offset_s, reference.clock.u_offset_s))
     taken = () if response.is_flat else response.terms
-    return [replace(_told(w, found), u_lag_s=u_lag_s, response=taken) for w in _beside(pose, found, settings)]
+    return [replace(_told(w, found), u_lag_s=u_lag_s, response=taken) for w in made]
 
 
 def _beside(pose: Pose, found: Aligned, settings: Settings) -> list[Window]:
     """Windows in motion and, where the reference feels gravity, at rest; each in one position against gravity."""
     points, limits, leave_out = found.points, settings.limits, settings.leave_out
-    in_motion = partial(motion_windows, pose, limits=limits, leave_out=leave_out, bands=settings.bands)
+    taper = settings.taper if settings.bands else 0.0
+    in_motion = partial(motion_windows, pose, limits=limits, leave_out=leave_out, taper=taper)
     if points.u.shape[1] != 3 or not feels_gravity(points.u):
         return in_motion(points)
     rate_hz = (len(points.time_s) - 1) / (points.time_s[-1] - points.time_s[0])
@@ -289,46 +304,6 @@ def _told(window: Window, found: Aligned) -> Window:
     count = {"clipped_points": float(found.clipped_points), "clipped_points_threshold": 0.0}
     reason = window.reason or f"clipped: {found.clipped_points} points at the end of the sensor's range"
     return replace(window, used=False, reason=reason, numbers={**window.numbers, **count})
-
-
-def _band(
-    raw: Array, u: Array, V: Array, instrument: Instrument, rates_hz: tuple[float, float], to_hz: float | None
-) -> tuple[float | None, Array]:
-    """Where to limit both signals, None where that gains nothing, and the reference's noise (2, m) in what is left.
-
-    `rates_hz`: of the reference and of the sensor. `to_hz` as in Settings.
-    """
-    (rate_hz, sensor_rate_hz), derivatives, m = rates_hz, instrument.derivatives, raw.shape[1]
-    found_hz, density = band_above_noise(raw, rate_hz)
-    density = np.maximum(density, instrument.noise / np.sqrt(0.5 * rate_hz))
-    widest_hz = RESAMPLED_BAND * rate_hz
-    if derivatives:
-        widest_hz = min(DIFFERENTIATED_BAND_HZ, widest_hz)
-    unlimited = noise_in_band(instrument.known.noise(widest_hz, rate_hz) * density, widest_hz, derivatives)
-    whole = u[np.isfinite(u).all(axis=1)]  # one missing sample of the reference makes some of them NaN
-    power = np.var(whole, axis=0).max(initial=0.0) if len(whole) else 0.0
-    noisy = np.max(unlimited[0] ** 2, initial=0.0) > NOISE_MATTERS * power
-    ends_hz = [found_hz if noisy else None, _told_hz(V, instrument, rate_hz, sensor_rate_hz)]
-    ends_hz.append(None if to_hz is None else to_hz / STOP_BAND)
-    band_hz = min((end_hz for end_hz in ends_hz if end_hz is not None), default=None)
-    if band_hz is None:
-        return None, unlimited.reshape(2, m)
-    noise_hz = min(FILTER_BAND * band_hz, widest_hz)
-    return band_hz, noise_in_band(instrument.known.noise(noise_hz, rate_hz) * density, noise_hz, derivatives)
-
-
-def _told_hz(V: Array, instrument: Instrument, rate_hz: float, sensor_rate_hz: float) -> float | None:
-    """Where to limit both signals so that the sensor shows no motion that the reference cannot tell.
-
-    None where the sensor shows no such motion. A reference as fast as the sensor, and not differentiated, tells all.
-    """
-    if not instrument.derivatives and rate_hz > AS_FAST * sensor_rate_hz:
-        return None
-    right_hz = differentiated_band_hz(rate_hz) if instrument.derivatives else BAND * rate_hz
-    felt_hz, _ = band_above_noise(V, sensor_rate_hz)
-    if felt_hz is not None and felt_hz <= right_hz:
-        return None
-    return right_hz / STOP_BAND
 
 
 def _clipped(columns: Array) -> int:

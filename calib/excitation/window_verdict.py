@@ -47,6 +47,11 @@ class Limits:
         """The same without limits of how the mean may change."""
         return replace(self, most_drift_mps2=np.inf, most_step_mps2=np.inf)
 
+    @property
+    def of_any_response(self) -> Limits:
+        """The same without limits that a window may miss because the sensor responds in another way."""
+        return replace(self.unsteady, least_coherence=0.0, most_left_out_pct=100.0)
+
 
 DEFAULT_LIMITS = Limits()
 

@@ -16,16 +16,16 @@ from numpy.typing import NDArray
 
 from calib import geometry
 from calib.excitation import detection
+from calib.excitation.band_to_keep import LEAST_MOTION_MPS2
 from calib.excitation.bands import band_sums
+from calib.excitation.motion_numbers import motion_numbers
 from calib.excitation.rests import find_rests
 from calib.excitation.steadiness import step
-from calib.excitation.sums import factor, pool, window_sums
+from calib.excitation.sums import pool, window_sums
 from calib.excitation.window_verdict import DEFAULT_LIMITS, Limits, Verdict, judge
 from calib.model import Array, Pose, Window, WindowSums
 from calib.signal.order_statistics import median
 
-# 1 % of gravity. A reference that moves by more beside a sensor does not rest.
-LEAST_MOTION_MPS2 = 0.1
 SHORTEST_QUIET_S = 1.0  # a shorter pause makes no window of kind "quiet"
 
 
@@ -49,17 +49,17 @@ class Points(NamedTuple):
 
 
 def motion_windows(
-    pose: Pose, points: Points, limits: Limits = DEFAULT_LIMITS, *, leave_out: bool = True, bands: bool = False
+    pose: Pose, points: Points, limits: Limits = DEFAULT_LIMITS, *, leave_out: bool = True, taper: float = 0.0
 ) -> list[Window]:
     """The windows in samples of one pose: kind "motion" where the reference moves, kind "quiet" where it hardly moves.
 
-    If `leave_out` is false, the sums hold all points, knocks included (Method 3 as printed). With `bands`, windows hold
-    sums in bands of frequency as well.
+    If `leave_out` is false, the sums hold all points, knocks included (Method 3 as printed). With a `taper` (the share
+    of a window at each end), windows hold sums in bands of frequency as well.
     """
     return [
         window
         for kind, first, stop in motion_parts(points.u, _rate(points.time_s))
-        for window in judged(kind, pose, points.part(first, stop), limits, leave_out=leave_out, bands=bands)
+        for window in judged(kind, pose, points.part(first, stop), limits, leave_out=leave_out, taper=taper)
     ]
 
 
@@ -80,7 +80,7 @@ def motion_parts(u: Array, rate_hz: float) -> list[tuple[Kind, int, int]]:
 
 def judged(
     kind: Kind, pose: Pose, points: Points, limits: Limits = DEFAULT_LIMITS, *, leave_out: bool = True,
-    bands: bool = False,
+    taper: float = 0.0,
 ) -> list[Window]:  # fmt: skip
     """The windows of one part (see `motion_parts`), with their verdicts.
 
@@ -91,7 +91,7 @@ def judged(
         longest = round(limits.longest_s * _rate(points.time_s[first:stop]))
         for a, b in _pieces(first, stop, longest):
             part = points.part(a, b)
-            windows.append(_motion(kind, pose, part, _rate(part.time_s), limits, leave_out, bands))
+            windows.append(_motion(kind, pose, part, _rate(part.time_s), limits, leave_out, taper))
     return windows
 
 
@@ -195,7 +195,7 @@ def _motion(
     rate_hz: float,
     limits: Limits,
     leave_out: bool,
-    bands: bool,
+    taper: float,
     stepped: tuple[float, float] | None = None,
 ) -> Window:
     """One window. It is judged without the knocks, also where they stay in its sums.
@@ -215,7 +215,7 @@ def _motion(
     sound = _sound(struck, rate_hz, limits)
     if leave_out and not sound.all():
         left = Points(*(column[sound] for column in points))
-        rest = _motion(kind, pose, left, rate_hz, limits, leave_out, bands, stepped)
+        rest = _motion(kind, pose, left, rate_hz, limits, leave_out, taper, stepped)
         return _without_segments(rest, int((~sound).sum()))
     clean = sums = _sums(V, u, du, rate_hz, limits)
     if struck.any():
@@ -223,17 +223,17 @@ def _motion(
         clean = _sums(V[kept], u[kept], du[kept], rate_hz, limits)
         if leave_out:
             sums = clean
-    numbers = _motion_numbers(clean, basis[~struck], V[~struck], rate_hz, stepped)
+    numbers = motion_numbers(clean, basis[~struck], V[~struck], rate_hz, stepped, limits)
     numbers["stuck_axes"] = float(np.sum(np.ptp(V, axis=0) == 0.0))
     numbers["clipped_points"] = float(detection.clipped(V, residual, finest))
     verdict = judge(sums, struck, numbers, limits)
     if kind == "quiet" and verdict.used:
         verdict = Verdict(False, "the reference is calm here", verdict.numbers)
     window = _window(kind, pose, t, sums, verdict, int(struck.sum()) if leave_out else 0)
-    if not (bands and verdict.used):
+    if not (taper and verdict.used):
         return window
     # Without a knock's points the others would not be evenly spaced: the window's own regression takes their places.
-    return replace(window, bands=band_sums(u, du, np.where(struck[:, None], V - residual, V), rate_hz))
+    return replace(window, bands=band_sums(u, du, np.where(struck[:, None], V - residual, V), rate_hz, taper))
 
 
 def _sound(struck: NDArray[np.bool_], rate_hz: float, limits: Limits) -> NDArray[np.bool_]:
@@ -254,45 +254,8 @@ def _without_segments(window: Window, points: int) -> Window:
     return replace(window, left_out=window.left_out + points, numbers=numbers)
 
 
-def _motion_numbers(
-    sums: WindowSums, basis: Array, V: Array, rate_hz: float, stepped: tuple[float, float]
-) -> dict[str, float]:
-    """Statistics for the verdict: level, noise and coherence in the band of the motion, drift and step of the mean.
-
-    `basis` (n, 1 + 2 m) is [1, u, du]; `stepped` is a step and its standard uncertainty in output unit.
-    """
-    m = sums.reference_channels
-    u = basis[:, 1 : 1 + m]
-    noise = detection.white_noise(u)
-    width = detection.band_width(u, rate_hz, noise)
-    slow, slow_v = detection.averaged(basis, width), detection.averaged(V, width)
-    solution, *_ = np.linalg.lstsq(slow, slow_v, rcond=None)
-    total = float(np.sum((slow_v - slow_v.mean(axis=0)) ** 2))
-    rest = float(np.sum((slow_v - slow @ solution) ** 2))
-    scale = float(np.linalg.norm(solution[1 : 1 + m], 2))
-    return {
-        "reference_rms_mps2": float(np.sqrt(np.sum(np.var(slow[:, 1 : 1 + m], axis=0)))),
-        # A constant channel has only rounding errors as level and as noise: it must count as silent.
-        "reference_noise_mps2": float(np.sqrt(np.sum(noise**2) / width) + 1e-12 * np.abs(u).max()),
-        "coherence": 1.0 - rest / total if total > 0 else 0.0,
-        "drift_mps2": _drift(sums) / scale if scale > 0 else np.inf,
-        "step_mps2": stepped[0] / scale if scale > 0 else np.inf,
-        "u_step_mps2": stepped[1] / scale if scale > 0 else np.inf,
-    }
-
-
 def _never(numbers: Mapping[str, float]) -> Verdict:
     return Verdict(False, "the sensor is never at rest here", numbers)
-
-
-def _drift(sums: WindowSums) -> float:
-    """Largest difference between a segment's mean and its value by the window's own regression, in output unit."""
-    m = sums.reference_channels
-    part = factor(sums, derivative=True)
-    solution, *_ = np.linalg.lstsq(part.r, part.rhs, rcond=1e-12)
-    whole = sums.count >= 0.5 * sums.count.max()
-    basis = np.hstack([np.ones((len(sums.count), 1)), sums.mean[:, : 2 * m]])
-    return float(np.abs((sums.mean[:, 2 * m :] - basis @ solution)[whole]).max())
 
 
 def _sums(V: Array, u: Array, du: Array, rate_hz: float, limits: Limits) -> WindowSums:

@@ -15,6 +15,8 @@ from calib.estimate.lag_search import correlated_lag_s, largest_omega, without_l
 from calib.estimate.norm_fit import norm_fit
 from calib.estimate.nuisances import Applied, Priors
 from calib.estimate.reference_share import ReferenceShare
+from calib.estimate.response_by_band import told_by_band
+from calib.estimate.response_told import ResponseTold
 from calib.excitation.bands import lowest_hz, motion_band_hz
 from calib.excitation.windows import rests_anywhere
 from calib.geometry import STANDARD_GRAVITY_MPS2
@@ -25,7 +27,7 @@ from calib.recorded.outcome import NuisanceValue, Outcome, nothing_used
 from calib.recorded.priors import priors_of, row_contradictions, u_gravity_mps2
 from calib.recorded.table import SensorTable
 from calib.recorded.tables import Tables
-from calib.signal.response import UNSETTLED
+from calib.signal.response import FLAT, UNSETTLED, Response
 from calib.signal.stamps import clock_from_stamps
 
 METHOD = "3 (adjustment)"
@@ -50,24 +52,28 @@ def _adjusted(tables: Tables, priors: Priors) -> tuple[Outcome, ReferenceShare |
     """Make windows with the lag and the response over frequency taken out, and adjust them."""
     search = _Search(tables, priors)
     applied, judged = search.begun()
-    windows = judged
+    windows, first = judged, None
     for turn in range(RESPONSE_TURNS):
         if turn or not _used(judged):
             windows, applied = search.without_lag(applied)
         if not _used(windows):
             break
         found = search.at(windows, applied)
+        first = first or (found, applied.lag_s)
         if not search.stated.response:
             found = _attenuated(found, windows, priors, applied)
             return _outcome(found, windows, tables.rate_hz), found.share
-        if found.response is None or found.response.is_taken_out(applied.response):
-            return _outcome(found, windows, tables.rate_hz), found.share
-        if turn >= HOPELESS and found.reasons:
-            return _outcome(found, windows, tables.rate_hz), found.share
-        applied = replace(applied, response=found.response.terms.modest)
+        told = found.response
+        if told is None or told.is_taken_out(applied.response) or (turn >= HOPELESS and found.reasons):
+            outcome = _outcome(found, windows, tables.rate_hz)
+            if outcome.calibration is None:
+                outcome = replace(outcome, more={**outcome.more, **_response(search.by_band(found, applied.lag_s))})
+            return outcome, found.share
+        applied = replace(applied, response=_next_response(told.terms, applied.response))
     if not _used(windows) and not _used(judged):
         return nothing_used(judged, tables.rate_hz, METHOD), None
-    return Outcome(None, (UNSETTLED,), windows, tables.rate_hz, METHOD), None
+    more = {} if first is None else _response(search.by_band(*first))
+    return Outcome(None, (UNSETTLED,), windows, tables.rate_hz, METHOD, more=more), None
 
 
 class _Search:
@@ -95,7 +101,7 @@ class _Search:
             return applied, windows
         unsteady, taken = self.without_lag(applied, steady=False)
         response = self.at(unsteady, taken).response if _used(unsteady) else None
-        return (applied if response is None else replace(taken, response=response.terms.modest)), windows
+        return (applied if response is None else replace(taken, response=_next_response(response.terms))), windows
 
     def at(self, windows: Sequence[Window], taken: Applied) -> Adjustment:
         """The adjustment of windows from which this was taken out; the latest one is kept."""
@@ -104,6 +110,11 @@ class _Search:
         if self._latest is None or self._latest[0] is not windows or self._latest[1] != taken:
             self._latest = windows, taken, adjust(_used(windows), self.stated, taken)
         return self._latest[2]
+
+    def by_band(self, found: Adjustment, lag_s: float) -> ResponseTold | None:
+        """The response as each band tells it by itself, where no smooth one is right; `found` is of windows from which
+        this lag was taken out."""
+        return told_by_band(found, self._tables.of_any_response(lag_s))
 
     def without_lag(self, taken: Applied, *, steady: bool = True) -> tuple[list[Window], Applied]:
         """The windows from which this response is taken out and whatever lag they show, and both."""
@@ -114,6 +125,12 @@ class _Search:
         make = partial(self._tables.windows, response=taken.response, steady=steady)
         windows, lag_s = without_lag(taken.lag_s, make, _used, lag_of)
         return windows, replace(taken, lag_s=lag_s)
+
+
+def _next_response(found: Response, taken: Response = FLAT) -> Response:
+    """What to take out after a turn that found this response. Terms below the motion that were taken out stay: without
+    their filter the windows would be longer ones again, and the search could go to and fro between both."""
+    return (found if taken.from_hz else found.without_slight_below).modest
 
 
 def _hardly_used(windows: Sequence[Window]) -> tuple[str, ...]:
@@ -214,15 +231,14 @@ def _outcome(found: Adjustment, windows: Sequence[Window], rate_hz: float) -> Ou
             "lag_scatter_s": found.lag_scatter_s,
             "misfit": found.misfit,
             "nuisance_pull": found.nuisance_pull,
-            **_response(found),
+            **_response(found.response),
             "invariant": None if reasons else found.invariant,
         },
     )  # fmt: skip
 
 
-def _response(found: Adjustment) -> dict[str, Any]:
+def _response(told: ResponseTold | None) -> dict[str, Any]:
     """The members of the JSON object that tell the response over frequency."""
-    told = found.response
     if told is None:
         nothing = dict.fromkeys(("valid_band_hz", "sensitivity_at_0hz", "response"))
         return {"reference_frequency_hz": 0.0, **nothing}  # only rests

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from calib.excitation.alignment import Drift, drift
+from calib.excitation.bands import HANN
 from calib.excitation.front_end import (
     DEFAULT_SETTINGS,
     Aligned,
@@ -92,20 +93,31 @@ class Tables:
         the seconds of recording that were just done. With `steady` False windows whose mean changes are used as well:
         a response that is not yet taken out can look like it.
         """
-        found = self._made(lag_s, response, progress, steady=steady)
+        settings = self._making.settings
+        if not steady:
+            settings = replace(settings, limits=settings.limits.unsteady)
+        found = self._made(settings, lag_s, response, progress)
         if self._making.align and self._reference is not None and self.drift is None:
             self.drift = drift(found)
             if self.drift is not None and self.drift.significant:
                 self._reference.stretch(self.drift.rate, self.drift.time_s)
-                found = self._made(lag_s, response, progress, steady=steady)
+                found = self._made(settings, lag_s, response, progress)
         return found
 
+    def of_any_response(self, lag_s: float) -> list[Window]:
+        """Windows that tell the response of each band by itself: no limit refuses what another response may explain,
+        and no motion leaks from band to band."""
+        settings = self._making.settings
+        return self._made(replace(settings, limits=settings.limits.of_any_response, taper=HANN), lag_s)
+
     def _made(
-        self, lag_s: float, response: Response, progress: Callable[[float], Any] | None, *, steady: bool
+        self,
+        settings: Settings,
+        lag_s: float,
+        response: Response = FLAT,
+        progress: Callable[[float], Any] | None = None,
     ) -> list[Window]:
-        floor, settings = self._rest_floor(), self._making.settings
-        if not steady:
-            settings = replace(settings, limits=settings.limits.unsteady)
+        floor = self._rest_floor()
         windows: list[Window] = []
         for interval in self.poses:
             found = [

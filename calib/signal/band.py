@@ -59,6 +59,16 @@ def band_above_noise(x: Array, rate_hz: float) -> tuple[float | None, Array]:
     return band_hz, np.sqrt(floor / (0.5 * rate_hz * np.sum(window**2)))
 
 
+def power_share_above(x: Array, rate_hz: float, from_hz: float) -> float:
+    """The share of the power of x (n, m) above a frequency; 0 if x is too short to tell."""
+    size = min(int(SEGMENT_S * rate_hz), len(x) // LEAST_SEGMENTS)
+    if size < FEWEST_LINES:
+        return 0.0
+    powers, segments = _spectra(_bridged(x), size)
+    total = float(powers.sum())
+    return float(powers[:, int(np.ceil(from_hz * size / rate_hz)) :].sum()) / total if segments and total > 0.0 else 0.0
+
+
 def _floor(powers: Array, segments: int) -> Array:
     """(m,) mean power of the noise in spectral lines (m, k); fewer than half of the lines may hold motion as well.
 

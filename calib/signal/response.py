@@ -57,12 +57,16 @@ class Response:
     @property
     def modest(self) -> Response:
         """The same with terms so small that the instruments differ by no more than LARGEST in the motion: the first
-        estimates, from a linear equation, may be much too large. Terms below the motion that hardly matter are left
-        to the estimate, because a filter for them costs the ends of a recording."""
-        if self.from_hz and np.abs(self.below_at(np.array([self.from_hz])))[0] < NEAR:
-            return Response(self.terms[: len(POWERS)], self.to_hz).modest
+        estimates, from a linear equation, may be much too large."""
         size = float(np.abs(self.at(np.linspace(self.from_hz, self.to_hz, 50))).max())
         return self if size <= LARGEST else replace(self, terms=tuple(c * LARGEST / size for c in self.terms))
+
+    @property
+    def without_slight_below(self) -> Response:
+        """The same without its terms below the motion if these hardly matter: they are left to the estimate, because
+        a filter for them costs the ends of a recording."""
+        slight = self.from_hz and np.abs(self.below_at(np.array([self.from_hz])))[0] < NEAR
+        return Response(self.terms[: len(POWERS)], self.to_hz) if slight else self
 
     @property
     def rounded(self) -> Response:

@@ -48,12 +48,27 @@ def calibrated(sensor: np.ndarray, reference: np.ndarray, rate_hz: float) -> Out
     )  # fmt: skip
 
 
-def test_all_that_was_recorded_is_refused() -> None:
-    """Up to 100 Hz the ratio grows to 2.6 and falls again: no smooth response explains it, and no S is told."""
-    found = calibrated(*recorded())
+def test_all_that_was_recorded_is_refused_and_its_response_told() -> None:
+    """Up to 100 Hz the ratio grows to 2.6 and falls again: no smooth response explains it, and no S is told. Each band
+    tells the response by itself."""
+    sensor, reference, rate_hz = recorded()
+    found = calibrated(sensor, reference, rate_hz)
     assert found.status == "refused"
     assert any("no smooth response over frequency explains the bands" in reason for reason in found.reasons)
     assert found.calibration is None or np.isnan(found.calibration.sensitivity).all()
+    frequency_hz, h = ratio(sensor, reference, rate_hz)
+    away, u = [], []
+    for band in found.more["response"]:
+        middle_hz = np.sqrt(band["low_hz"] * band["high_hz"])
+        size = abs(complex(band["sensitivity_re"][0][0], band["sensitivity_im"][0][0])) / SCALE
+        if 0.5 < middle_hz < 18.0 and np.isfinite(size):
+            other = h[1:][np.abs(np.log(frequency_hz[1:] / middle_hz)) < 0.03].mean()
+            away.append(size / other - 1.0)
+            u.append(band["standard_uncertainty"][0][0] / SCALE / size)
+    assert len(away) >= 25
+    assert np.median(u) < 0.005
+    assert np.abs(away).max() < 0.025
+    assert np.count_nonzero(np.abs(away) < 2.0 * np.array(u)) >= 0.7 * len(away)  # Welch's spectra scatter as well
 
 
 def test_the_response_in_a_band_is_that_of_the_spectra() -> None:

@@ -63,3 +63,14 @@ def test_a_window_of_one_segment_beside_coloured_ones_stays_as_it_is():
     single = np.random.default_rng(54).normal(size=(PER_SEGMENT, 3)) * 0.02
     told = condense([*windows, window_of(REST, nothing, nothing, np.array([0.1, -0.2, 9.81]) + single, 1)]).type_a
     np.testing.assert_allclose(np.diag(told.means), np.diag(condense(windows).type_a.means), rtol=0.1)
+
+
+def test_windows_with_different_numbers_of_segments_stay_in_their_order():
+    random, nothing = np.random.default_rng(55), np.empty((120, 0))
+    segments = (6, 3, 6, 1)
+    windows = [window_of(REST, nothing, nothing, random.normal(size=(120, 3)), k) for k in segments]
+    together = condense(windows)
+    for k, window in enumerate(windows):
+        alone = condense([window])
+        np.testing.assert_array_equal(together.mean_v[k], alone.mean_v[0])
+        np.testing.assert_array_equal(together.type_a.noise[k], alone.type_a.noise[0])

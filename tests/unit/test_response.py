@@ -11,13 +11,17 @@ import pytest
 from click.testing import CliRunner
 
 from agent.cli.calibrate import calibrate
+from calib import calibrate as calibrated_arrays
 from calib.estimate.adjustment import adjust
-from calib.estimate.banded import _Factors, _projected
+from calib.estimate.banded import Factors, _projected
 from calib.estimate.nuisances import Priors
 from calib.excitation.bands import band_sums
 from calib.recorded.adjusting import adjusted
 from calib.recorded.outcome import Outcome
 from calib.signal.response import POWERS, Response, passed
+from hw.virtual.bench import Bench
+from hw.virtual.presets import COUNTS_PER_MPS2, plain
+from hw.virtual.schedule import Schedule, clamped
 from tests.pair import Filter, Pair, decimator, flat, highpass, lowpass, moving_mean, pair, resonance, sinc3
 
 EXACT = {"reference": 1e-9, "rotation_rad": 1e-9, "lag_axis_s": 1e-9}
@@ -253,7 +257,48 @@ def test_a_window_whose_motion_is_in_one_band_has_finite_derivatives() -> None:
     u = np.random.default_rng(1).normal(size=(2000, 1))
     bands = band_sums(u, np.gradient(u, t, axis=0), np.repeat(u, 3, axis=1), 100.0)
     assert bands is not None
-    factors = _Factors(bands, np.array([8]))
+    factors = Factors(bands, np.array([8]))
     with np.errstate(all="raise"):
         found = _projected(factors, len(POWERS), 1.3 * factors.omega**2)
     np.testing.assert_allclose(found[0, 0], -(factors.omega**2), rtol=1e-9)
+
+
+@pytest.mark.parametrize("seed", [3, 4, 8])
+def test_short_stops_beside_an_ac_coupled_reference_settle(seed: int) -> None:
+    """Three stops of 4 s, the last one at the end of the recording, with both instruments alike. A filter below the
+    motion costs the end of the last stop, which changes what the bands show: the search went to and fro between the
+    longer and the shorter window, and ended without a result."""
+    bench, hold_s = plain(seed), 4.1
+    stands = tuple(clamped(theta, alpha, hold_s) for theta, alpha in ((55.0, 45.0), (35.0, 180.0), (35.0, 270.0)))
+    of_250_hz = [replace(device.clock, nominal_rate_hz=250.0) for device in (bench.sensor, bench.reference)]
+    sensor, reference = replace(bench.sensor, clock=of_250_hz[0]), replace(bench.reference, clock=of_250_hz[1])
+    bench = replace(bench, schedule=Schedule(stands, 2.4, 1.0), sensor=sensor, reference=reference)
+    seen = Bench(bench, seed).recording(1.0 + 3 * (hold_s + 2.4) + 0.5)
+    poses = [
+        {"start_s": p.start_s, "stop_s": p.stop_s, "theta_deg": p.theta_deg, "alpha_deg": p.alpha_deg}
+        for p in seen.poses
+    ]
+    found = calibrated_arrays(
+        (seen.sensor_stamp_s, seen.v), (seen.reference_stamp_s, seen.reference), poses,
+        gravity=bench.gravity_mps2, nominal=COUNTS_PER_MPS2, u_nominal_pct=5.0,
+    )  # fmt: skip
+    assert found.status == "valid", found.reasons
+    assert np.abs((found.sensitivity - seen.truth.sensitivity).ravel() / found.standard_uncertainty[:9]).max() < 3.0
+
+
+def test_what_is_refused_tells_its_response_band_by_band() -> None:
+    """A resonance within the motion: no S, but each band tells its own sensitivity, right within its uncertainty."""
+    shape = resonance(14.0, 5.0)
+    made = pair(1, shape, band_hz=(0.5, 20.0), rate_hz=200.0, seconds=300.0)
+    found = calibrated(made)
+    assert found.calibration is None
+    at_reference = abs(shape(np.array([made.reference_frequency_hz]))[0])
+    away = []
+    for band in found.more["response"]:
+        middle_hz = np.array([np.sqrt(band["low_hz"] * band["high_hz"])])
+        told = np.abs(np.array(band["sensitivity_re"]) + 1j * np.array(band["sensitivity_im"])).diagonal()
+        true = made.sensitivity.diagonal() * abs(shape(middle_hz)[0]) / at_reference
+        away += ((told - true) / np.array(band["standard_uncertainty"]).diagonal()).tolist()
+        assert np.abs(told / true - 1.0).max() < 0.08  # at the peak the response bends within a band
+    assert len(away) >= 75
+    assert np.nanmax(np.abs(away)) < 4.0

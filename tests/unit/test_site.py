@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.estimate.contradiction import suspects, verdicts
+from calib.estimate.contradiction import alternatives, suspects, verdicts
 from calib.estimate.device import Device
 from calib.estimate.link import Link, link
 from calib.estimate.nuisances import Priors
@@ -105,6 +105,36 @@ def test_a_bad_reference_is_named_and_its_bias_told() -> None:
     assert bad.statistic > 3.0 * max(v.statistic for v in found if v.is_reference and v is not bad)
 
 
+def test_a_reference_with_one_bad_axis_is_named_with_the_axis() -> None:
+    site = SimulatedSite(16, sensors=6, references=4)
+    site.gain["r1"][1] = 6.0 * site.stated.reference
+    for k in range(6):
+        site.meet(f"s{k}", f"r{k % 4}", windows=4)
+        site.meet(f"s{k}", f"r{(k + 1) % 4}", windows=4)
+    (bad,) = suspects(verdicts(adjusted(site)))
+    assert (bad.device, bad.axis, bad.degrees_of_freedom) == ("r1", "y", 1.0)
+    assert not bad.bias[[0, 8]].any()
+    assert bad.bias[4] == pytest.approx(site.gain["r1"][1], abs=2.0 * site.stated.reference)
+
+
+def test_an_error_in_one_axis_of_a_certificate_is_supposed_in_its_row_of_s_and_its_offset() -> None:
+    """A certificate whose 12 parameters are correlated, at the scale of a sensor in counts."""
+    root = np.random.default_rng(17).normal(size=(12, 12)) * np.append(np.full(9, 0.2), np.full(3, 5.0))[:, None]
+    site = SimulatedSite(17, sensors=2, references=2)
+    for k in range(2):
+        site.meet(f"s{k}", "r0")
+        site.meet(f"s{k}", "r1")
+    mean = np.append(200.0 * np.eye(3).ravel(), np.zeros(3))
+    devices = [Device.known(name, NOMINAL, known(site)) for name in site.S]
+    devices += [Device.reference("r0", 1e-3, 3), Device.known("r1", mean, root @ root.T)]
+    links = [linked(site, m) for m in site.meetings]
+    found = {v.axis: v.bias for v in alternatives(Site(devices, links)) if v.device == "r1"}
+    assert set(found) == {"", "x", "y", "z"}
+    for i, axis in enumerate("xyz"):
+        own = [3 * i, 3 * i + 1, 3 * i + 2, 9 + i]
+        assert np.abs(np.delete(found[axis], own)).max() < 1e-9 * np.abs(found[axis][own]).max()
+
+
 def test_a_sensor_that_changed_between_two_references_is_named() -> None:
     site = SimulatedSite(12, sensors=6, references=3)
     for k in range(6):
@@ -132,18 +162,22 @@ def test_a_sensor_that_is_wrong_as_a_reference_is_named() -> None:
 
 
 def test_a_sound_site_names_nobody_and_statistics_are_chi_squared() -> None:
-    """Of 4 references of a sound site, over 8 sites: the statistics' mean is within 4 SD of the degrees of freedom."""
+    """Of 4 references of a sound site, over 8 sites: the mean statistic is within 4 SD of the degrees of freedom."""
     statistics: list[float] = []
+    of_axes: list[float] = []
     for seed in range(8):
         site = SimulatedSite(100 + seed, sensors=2, references=4)
         for k in range(4):
             site.meet(f"s{k % 2}", f"r{k}", windows=3)
             site.meet(f"s{k % 2}", f"r{(k + 2) % 4}", windows=3)
-        found = [v for v in verdicts(adjusted(site)) if v.is_reference]
-        assert {v.degrees_of_freedom for v in found} == {3.0}
-        statistics += [v.statistic for v in found]
+        assert not suspects(verdicts(adjusted(site)))
+        found = [v for v in alternatives(adjusted(site)) if v.is_reference]
+        assert {(v.axis, v.degrees_of_freedom) for v in found} == {("", 3.0), ("x", 1.0), ("y", 1.0), ("z", 1.0)}
+        statistics += [v.statistic for v in found if not v.axis]
+        of_axes += [v.statistic for v in found if v.axis]
     # Two pairs of references: within a pair both statistics are the same number, so 16 independent ones.
     assert np.mean(statistics) == pytest.approx(3.0, abs=4.0 * np.sqrt(6.0 / 16.0))
+    assert np.mean(of_axes) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / 48.0))
 
 
 def test_two_references_that_accuse_each_other_are_both_told() -> None:

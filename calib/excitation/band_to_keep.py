@@ -1,0 +1,67 @@
+"""The band to which sensor and reference are limited alike, and the noise of the reference in it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calib.excitation.turning import feels_gravity
+from calib.model import Array
+from calib.signal.band import STOP_BAND, band_above_noise, noise_in_band, power_share_above
+from calib.signal.instrument import Instrument
+from calib.signal.resampling import BAND, DIFFERENTIATED_BAND_HZ, differentiated_band_hz
+
+NOISE_MATTERS = 1e-5  # of the motion's power: a filter against less of it would cost its ends for nothing
+FILTER_BAND = 1.197  # times its band: the noise-equivalent bandwidth of calib.signal.band.lowpass
+RESAMPLED_BAND = 0.35  # of the reference's rate, to which interpolation itself passes noise
+# 1 % of gravity. A reference that moves by more beside a sensor does not rest.
+LEAST_MOTION_MPS2 = 0.1
+TOO_FAST = 0.01  # of the power of the reference: what interpolation loses of so little does not show
+AS_FAST = 0.9  # of the sensor's rate; two devices of one nominal rate differ by less
+
+
+def band_to_keep(
+    raw: Array, u: Array, V: Array, instrument: Instrument, rates_hz: tuple[float, float], to_hz: float | None
+) -> tuple[float | None, Array]:
+    """Where to limit both signals, None where that gains nothing, and the reference's noise (2, m) in what is left.
+
+    `rates_hz`: of the reference and of the sensor. `to_hz` as in Settings.
+    """
+    rate_hz, derivatives, m = rates_hz[0], instrument.derivatives, raw.shape[1]
+    found_hz, density = band_above_noise(raw, rate_hz)
+    density = np.maximum(density, instrument.noise / np.sqrt(0.5 * rate_hz))
+    widest_hz = RESAMPLED_BAND * rate_hz
+    if derivatives:
+        widest_hz = min(DIFFERENTIATED_BAND_HZ, widest_hz)
+    unlimited = noise_in_band(instrument.known.noise(widest_hz, rate_hz) * density, widest_hz, derivatives)
+    whole = u[np.isfinite(u).all(axis=1)]  # one missing sample of the reference makes some of them NaN
+    power = np.var(whole, axis=0).max(initial=0.0) if len(whole) else 0.0
+    noisy = np.max(unlimited[0] ** 2, initial=0.0) > NOISE_MATTERS * power
+    ends_hz = [found_hz if noisy else None, _told_hz(raw, V, instrument, rates_hz, found_hz)]
+    ends_hz.append(None if to_hz is None else to_hz / STOP_BAND)
+    band_hz = min((end_hz for end_hz in ends_hz if end_hz is not None), default=None)
+    if band_hz is None:
+        return None, unlimited.reshape(2, m)
+    noise_hz = min(FILTER_BAND * band_hz, widest_hz)
+    return band_hz, noise_in_band(instrument.known.noise(noise_hz, rate_hz) * density, noise_hz, derivatives)
+
+
+def _told_hz(
+    raw: Array, V: Array, instrument: Instrument, rates_hz: tuple[float, float], found_hz: float | None
+) -> float | None:
+    """Where to limit both signals so that the sensor shows no motion that the reference cannot tell.
+
+    None where the sensor shows no such motion. `found_hz`: the upper end of the reference's motion, None where nobody
+    knows it. A reference as fast as the sensor, and not differentiated, tells all up to BAND of its rate.
+    """
+    rate_hz, sensor_rate_hz = rates_hz
+    if not instrument.derivatives and rate_hz > AS_FAST * sensor_rate_hz:
+        if found_hz is not None or (raw.shape[1] == 3 and feels_gravity(raw[np.isfinite(raw).all(axis=1)])):
+            return None  # with a reference that feels gravity, rests count: a filter costs their ends
+        share, power = power_share_above(raw, rate_hz, BAND * rate_hz), float(np.nanvar(raw, axis=0).sum())
+        wide = share > TOO_FAST and share * power > LEAST_MOTION_MPS2**2
+        return BAND * rate_hz / STOP_BAND if wide else None
+    right_hz = differentiated_band_hz(rate_hz) if instrument.derivatives else BAND * rate_hz
+    felt_hz, _ = band_above_noise(V, sensor_rate_hz)
+    if felt_hz is not None and felt_hz <= right_hz:
+        return None
+    return right_hz / STOP_BAND

@@ -1,0 +1,174 @@
+"""Noise of the sensor that is far stronger at some frequencies than at others: hum, rattle, a band that is incoherent.
+
+Least squares over all points weighs all frequencies alike, so that one bad band costs all others. V = S a + Q holds for
+filtered signals as well, whatever the filter is, if both pass the same one. So sensor and reference pass a filter
+without phase shift that attenuates each band by as much as its noise is stronger: the bad bands are lost and no others.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.excitation.detection import RELATED, incoherent
+from calib.excitation.turning import feels_gravity, standing_parts
+from calib.excitation.windows import Points
+from calib.model import Array
+from calib.signal.band import convolved, hanning
+from calib.signal.order_statistics import distinct
+from calib.signal.response import Complex
+
+SEGMENTS = 8  # Hann segments, half overlapped, in which the noise is looked for
+CELL = 2  # lines of each segment
+BANDS_AN_OCTAVE = 6
+FEWEST_LINES = 4  # in a band, of each segment
+LEAST_GAIN = 4.0  # variance of the slopes without the filter over that with it: standard uncertainties halve
+LOUD = 10.0  # times the noise in the motion: a band without motion that is so loud looks like knocks
+INCOHERENT = 0.02  # of the motion in a band: less noise may be a response that changes within a few lines
+MOVES = 1e-3  # of the strongest band's motion: a band that holds less of it tells nothing
+CYCLES = 3.0  # of the lowest motion, which the filter reaches to each side
+MOST_LOST = 0.1  # of the samples at each end
+LEAST_WEIGHT = 1e-3
+MATTERS = 1e-2  # of the power of the reference: less of its noise moves S by less than that
+CLEARLY = 2.0  # times: white noise of both instruments never looks so
+TINY = 1e-300
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NoiseFilter:
+    """Taps (2 k + 1,) of the filter, and its amplitude (F,) at frequencies (F,) from 0 to half the sampling rate."""
+
+    taps: Array
+    frequency_hz: Array
+    amplitude: Array
+
+    def passed(self, columns: Array) -> Array:
+        """Samples (n, k) after the filter. A mean stays what it is; rows near an end or a missing sample are NaN."""
+        mean = np.nanmean(columns, axis=0)
+        return np.asarray(convolved(columns - mean, self.taps) + mean)
+
+    @property
+    def independent(self) -> float:
+        """The share of the points that stay independent."""
+        power = self.amplitude**2
+        return float(np.sum(power) ** 2 / (len(power) * np.sum(power**2)))
+
+    def noise(self, rms: Array) -> Array:
+        """(2, m) rms in u and du/dt after the filter, of noise that is white up to some frequency; `rms` (2, m) before.
+
+        The ratio of both tells this frequency.
+        """
+        out = rms.copy()
+        for k in np.flatnonzero(rms[0] > 0.0):
+            end_hz = np.sqrt(3.0) * rms[1, k] / rms[0, k] / (2.0 * np.pi)
+            inside = np.maximum(1, np.searchsorted(self.frequency_hz, end_hz))
+            power, square = self.amplitude[:inside] ** 2, self.frequency_hz[:inside] ** 2
+            out[:, k] *= np.sqrt([power.mean(), power @ square / max(square.sum(), TINY)])
+        return out
+
+
+def against_noise(points: Points, channels: int, *, knocked: bool) -> NoiseFilter | None:
+    """The filter for these points, of whose reference the first `channels` count; None where all bands are about as
+    noisy, or where there are too few points to tell. `knocked`: many points look like knocks, perhaps because of noise
+    beside the motion."""
+    u, rate_hz = points.u[:, :channels], float((len(points.u) - 1) / (points.time_s[-1] - points.time_s[0]))
+    size = 2 * (len(u) // (SEGMENTS + 1))
+    edges = _edges(size // 2)
+    if len(edges) < 3 or _is_turned(u, rate_hz):
+        return None
+    motion, noise = _powers(np.hstack([points.V, u]), size, edges)
+    lines = np.diff(edges).astype(np.float64)
+    moved = motion > MOVES * motion.max()
+    if not (motion > noise).any() or not (noise > 0.0).all():
+        return None
+    told = np.where(moved, motion * lines, 0.0)
+    usual = float(told.sum() / np.sum(told / noise))  # the noise that counts when each band weighs by its own
+    noise = np.where(noise < INCOHERENT * motion, np.minimum(noise, usual), noise)
+    gain = float(np.sum(told * noise) / told.sum()) / usual
+    loud = ~moved & (noise > LOUD * usual)
+    rattles = knocked and bool(np.sum((noise * lines)[loud]) > np.sum((noise * lines)[moved]))
+    if gain < LEAST_GAIN and not rattles:
+        return None
+    # Noise of the reference beside hardly any motion tells nothing and makes S smaller.
+    weights = np.clip(np.sqrt(np.minimum(usual / noise, 1.0) * motion / (motion + noise)), LEAST_WEIGHT, 1.0)
+    weights[: int(np.flatnonzero(moved)[0])] = 1.0  # slow changes of the mean are judged, not hidden
+    lowest_hz = float(edges[np.flatnonzero(moved)[0]]) * rate_hz / size
+    return _filter(weights, edges, size, rate_hz, lowest_hz, len(u))
+
+
+def not_more_than_incoherent(noise: Array, u: Array, V: Array) -> Array:
+    """The reference's noise (2, m) in u and du/dt, no larger than what of u the sensor does not show.
+
+    Noise that is thought to be white may be coloured, or a motion that fills the spectrum. Where both contradict each
+    other clearly, half of what is incoherent counts as the noise of the reference.
+    """
+    power = noise[0] ** 2
+    if not len(u) or np.all(power <= MATTERS * np.var(u, axis=0)):
+        return noise
+    most = incoherent(u, V) ** 2
+    size = np.sqrt(np.divide(0.5 * most, power, out=np.ones_like(power), where=power > CLEARLY * most))
+    return np.asarray(noise * size)
+
+
+def _is_turned(u: Array, rate_hz: float) -> bool:
+    """Whether a reference u (n, m) that feels gravity is turned: a filter would spread each turn."""
+    if u.shape[1] != 3 or not feels_gravity(u):
+        return False
+    return standing_parts(u, rate_hz) != [(0, len(u))]
+
+
+def _edges(lines: int) -> NDArray[np.int64]:
+    """Numbers of the spectral lines at which bands begin and end, from line 1 to `lines`."""
+    if lines < 4 * FEWEST_LINES:
+        return np.zeros(0, dtype=np.int64)
+    wanted = np.exp2(np.arange(0.0, np.log2(lines), 1.0 / BANDS_AN_OCTAVE))
+    starts = [1]
+    for k in wanted.round().astype(int).tolist():
+        if k - starts[-1] >= FEWEST_LINES and lines - k >= FEWEST_LINES:
+            starts.append(k)
+    return np.array([*starts, lines], dtype=np.int64)
+
+
+def _powers(rows: Array, size: int, edges: NDArray[np.int64]) -> tuple[Array, Array]:
+    """The power of V, the first three columns of `rows` (n, 3 + m), a line in each band: what the motion explains at
+    any lag, and the noise.
+
+    Both are found in cells of CELL lines, in which no response changes much: two instruments that respond differently
+    are not noisy. The noise is that of V, or that of the reference as V would show it, whichever is stronger.
+    """
+    window, starts = hanning(size), range(0, len(rows) - size + 1, size // 2)
+    parts = np.stack([rows[k : k + size].T for k in starts], axis=1)
+    lines = np.fft.rfft((parts - parts.mean(axis=2, keepdims=True)) * window, axis=2).transpose(2, 0, 1)[: edges[-1]]
+    cells = distinct(np.concatenate([np.arange(edges[0], edges[-1], CELL), edges[:-1]]))
+    cross = np.add.reduceat(lines @ lines.conj().transpose(0, 2, 1), cells, axis=0)
+    count = np.diff(np.append(cells, edges[-1])) * len(starts)
+    felt, told = _parted(cross[:, :3, :3], cross[:, 3:, 3:], cross[:, :3, 3:], count)
+    shown, alone = _parted(cross[:, 3:, 3:], cross[:, :3, :3], cross[:, 3:, :3], count)
+    scale = felt.sum() / max(float(shown.sum()), TINY)  # of V over the reference, squared
+    first = np.searchsorted(cells, edges[:-1])
+    motion, noise = (np.add.reduceat(part, first) for part in (felt, np.maximum(told, scale * alone)))
+    of_each = np.diff(edges) * len(starts)
+    return motion / of_each, noise / of_each
+
+
+def _parted(power: Complex, other: Complex, both: Complex, count: NDArray[np.int64]) -> tuple[Array, Array]:
+    """(B,) the power of some channels that other ones explain, and the rest, from their cross-spectra in B cells that
+    are sums over `count` (B,) lines."""
+    total = np.trace(power, axis1=1, axis2=2).real
+    inverse = np.linalg.pinv(other, RELATED, hermitian=True)
+    explained = np.sum((both @ inverse) * both.conj(), axis=(1, 2)).real
+    rest = np.maximum(total - explained, 0.0) * count / (count - other.shape[1])
+    return np.maximum(total - rest, 0.0), rest
+
+
+def _filter(
+    weights: Array, edges: NDArray[np.int64], size: int, rate_hz: float, lowest_hz: float, samples: int
+) -> NoiseFilter:
+    """A filter with these weights in the bands, of linear phase around its middle tap."""
+    frequency_hz = np.arange(size // 2 + 1) * rate_hz / size
+    amplitude = np.concatenate([np.full(int(edges[0]), weights[0]), np.repeat(weights, np.diff(edges)), weights[-1:]])
+    half = int(min(CYCLES * rate_hz / lowest_hz, MOST_LOST * samples, size // 2 - 1))
+    taps = np.roll(np.fft.irfft(amplitude, size), half)[: 2 * half + 1] * hanning(2 * half + 3)[1:-1]
+    return NoiseFilter(taps, frequency_hz, np.abs(np.fft.rfft(np.roll(np.pad(taps, (0, size - len(taps))), -half))))
