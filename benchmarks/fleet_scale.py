@@ -59,8 +59,10 @@ class Arrivals(threading.Thread):
         self._engine, self._nothing, self._stop_counting = engine, nothing, stop
 
     def run(self) -> None:
-        """Count until it is to stop."""
-        while not self._stop_counting.wait(1.0):
+        """Count until it is to stop, and then once more."""
+        stopped = False
+        while not stopped:
+            stopped = self._stop_counting.wait(1.0)
             reached = followed(self._engine)
             self.counts.append(
                 Counted(time.monotonic(), sum(reached.get(name, n) - n for name, n in self._nothing.items()))
@@ -227,7 +229,7 @@ def told(scene: Scene, run: Run) -> Iterator[str]:
     )
     yield (
         f"results sent {sent}, lost {run.lost}, twice {run.twice}; the monitor had all {run.caught_up_s:.1f} s after "
-        "the last round"
+        "the last round and the last cut"
     )
     for at_s, name, away_s in scene.kills():
         back_s = run.began_s + at_s + away_s
