@@ -1,118 +1,95 @@
 """A fleet of simulated gateways through a router and a monitor that are killed: what is lost, and what it costs.
 
-`python -m benchmarks.fleet_scale --gateways N --minutes M`. The router is killed after a fifth of the time (back after
-5 s), the monitor after two fifths (back after 5 s); from half the time on the router is away for `--cut` seconds.
-A second process asks the page for the whole fleet all the time. At the end the stores of the gateways are compared with
-the database, result by result. Exit status 1 where results are missing there.
+`python -m benchmarks.fleet_scale [--postgres]`. Simulated gateways make a round of results every `--every` seconds,
+each gateway at its own moment (`--together`: all at the same one). The router is killed after a fifth of `--minutes`
+(back after 5 s), the monitor after two fifths (back after 5 s); from half the time on the router is away for `--cut`
+seconds. Another process asks the page all the time. At the end the numbers of the results in the stores of the
+gateways are compared with the database, one by one. Exit status 1 where one is missing or is there twice.
 """
 
 from __future__ import annotations
 
 import argparse
-import http.client
 import os
 import resource
 import signal
-import sqlite3
-import subprocess
+import socket
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing
 from pathlib import Path
+from typing import NamedTuple
+from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 
 from agent.config.known_keys import add_key
 from agent.delivery.router import router_running
-from agent.fleet.simulated import SITE, SimulatedFleet
+from agent.fleet.simulated import SITE
+from agent.fleet.simulated_processes import FleetProcesses
+from agent.monitor.engines import Engine, open_engine
+from benchmarks.fleet_programs import Asked, Probe, Program, Usage, tree
+from benchmarks.monitor_growth import used_bytes
 from benchmarks.page import machine
+from tests.unit.postgres import postgres
 
-ROOT = Path(__file__).resolve().parents[1]
 AWAY_S = 5.0
-CAUGHT_UP_S = 180.0
-PROBE_S = 0.5  # s between two requests to the page; a page asks when something has changed, at most once a second
-YEAR_MIN = 525_960
-COMMAND = "import sys; from agent.cli.main import run_cli; sys.exit(run_cli(sys.argv[1:]))"
+CAUGHT_UP_S = 300.0
+FIRST_WITHIN_S = 20.0  # s over which the first round is spread, in which all publishers and sensors are new
+BEHIND_S = 2.0  # s of results that may be on their way when the monitor counts as having caught up
 
 
-class Program:
-    """`fieldcal` with these arguments, as a process that can be killed and started again."""
+class Counted(NamedTuple):
+    """At `at_s` (monotonic time) so many results of the fleet were in the database."""
 
-    def __init__(self, log: Path, *arguments: str) -> None:
-        self._arguments, self._log = arguments, log
-        self.cpu_s = 0.0  # of the lives that ended
-        self.rss_mb = 0.0  # the largest of all lives
-        self._process = self._start()
-
-    def _start(self) -> subprocess.Popen[bytes]:
-        with self._log.open("ab") as log:
-            command = [sys.executable, "-c", COMMAND, *self._arguments]
-            return subprocess.Popen(command, cwd=ROOT, stdout=log, stderr=log)
-
-    def measured(self) -> float:
-        """CPU time in s of all lives so far."""
-        fields = Path(f"/proc/{self._process.pid}/stat").read_text().rsplit(")", 1)[1].split()
-        status = Path(f"/proc/{self._process.pid}/status").read_text()
-        peak_kb = next((line.split()[1] for line in status.splitlines() if line.startswith("VmHWM")), "0")
-        self.rss_mb = max(self.rss_mb, int(peak_kb) / 1000)
-        return self.cpu_s + (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-    def away(self, for_s: float, stop: threading.Event) -> None:
-        """Kill -9 it, and start it again after `for_s`."""
-        self.cpu_s = self.measured()
-        self._process.kill()
-        self._process.wait()
-        stop.wait(for_s)
-        self._process = self._start()
-
-    def end(self) -> None:
-        """End it."""
-        self._process.send_signal(signal.SIGTERM)
-        try:
-            self._process.wait(10)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+    at_s: float
+    results: int
 
 
-class Probe(threading.Thread):
-    """Asks the page, while it runs. `times`: (monotonic time, s until the whole answer was there)."""
+class Arrivals(threading.Thread):
+    """Counts the results in the database each second, from `nothing` (last number of each gateway) on."""
 
-    def __init__(self, port: int, stop: threading.Event) -> None:
+    def __init__(self, engine: Engine, nothing: dict[str, int], stop: threading.Event) -> None:
         super().__init__(daemon=True)
-        self.times: list[tuple[float, float]] = []
-        self.bytes = 0
-        self._port, self._stop_probing = port, stop
+        self.counts: list[Counted] = []
+        self._engine, self._nothing, self._stop_counting = engine, nothing, stop
 
     def run(self) -> None:
-        """Ask until it is to stop; while the monitor is away there are no times."""
-        while not self._stop_probing.wait(PROBE_S):
-            began_s = time.monotonic()
-            try:
-                connection = http.client.HTTPConnection("127.0.0.1", self._port, timeout=30)
-                connection.request("GET", "/api/fleet")
-                self.bytes = len(connection.getresponse().read())
-                connection.close()
-            except (OSError, http.client.HTTPException):
-                continue
-            self.times.append((began_s, time.monotonic() - began_s))
+        """Count until it is to stop, and then once more."""
+        stopped = False
+        while not stopped:
+            stopped = self._stop_counting.wait(1.0)
+            reached = followed(self._engine)
+            self.counts.append(
+                Counted(time.monotonic(), sum(reached.get(name, n) - n for name, n in self._nothing.items()))
+            )
 
 
-def missing(fleet: SimulatedFleet, database: Path, after: dict[str, int]) -> int:
-    """The number of results in the stores after these numbers that the database does not have."""
-    with sqlite3.connect(f"file:{database}?mode=ro", uri=True) as connection:
-        rows = connection.execute("SELECT gateway, sequence FROM result WHERE site = ?", (SITE,)).fetchall()
-    kept: dict[str, set[int]] = {}
-    for gateway, sequence in rows:
-        kept.setdefault(gateway, set()).add(sequence)
-    return sum(
-        len(set(range(after[g.name] + 1, g.last_sequence + 1)) - kept.get(g.name, set()))
-        for g in fleet.gateways
-        if g.behaviour != "silent"  # what it had not sent when it left the bus for ever cannot be had
-    )
+def followed(engine: Engine) -> dict[str, int]:
+    """The last result of each gateway in the database."""
+    with engine.transaction() as run:
+        return dict(run("SELECT gateway, sequence FROM followed WHERE site = :site", site=SITE))
+
+
+def has(engine: Engine, numbers: dict[str, int]) -> bool:
+    """Whether the database has reached these numbers."""
+    return followed(engine).items() >= numbers.items()
+
+
+def compared(engine: Engine, after: dict[str, int], last: dict[str, int]) -> tuple[int, int]:
+    """(results of the stores after these numbers that the database does not have, results that it has twice)."""
+    with engine.transaction() as run:
+        rows = run(
+            "SELECT s.gateway, r.sequence FROM result r JOIN sensor s ON s.id = r.sensor WHERE s.site = :site",
+            site=SITE,
+        )
+    kept = Counter(rows)
+    lost = sum((name, number) not in kept for name in last for number in range(after[name] + 1, last[name] + 1))
+    return lost, sum(count - 1 for count in kept.values())
 
 
 def wait(condition: Callable[[], bool], limit_s: float) -> float:
@@ -123,126 +100,189 @@ def wait(condition: Callable[[], bool], limit_s: float) -> float:
     return time.monotonic() - began_s
 
 
-def at_times(minutes: float, cut_s: float) -> Iterator[tuple[float, str, float]]:
-    """(s after the start, who is killed, for how many s)."""
-    yield minutes * 12, "router", AWAY_S
-    yield minutes * 24, "monitor", AWAY_S
-    yield minutes * 30, "router", cut_s
+class Scene:
+    """Router, database, fleet and monitor, all running."""
 
+    def __init__(self, args: argparse.Namespace, opened: ExitStack) -> None:
+        self.args = args
+        place = Path(opened.enter_context(tempfile.TemporaryDirectory(prefix="fieldcal-scale-")))
+        self.log, endpoint = place / "log", f"tcp/127.0.0.1:{args.port}"
+        self.url = opened.enter_context(postgres(fsync=True)) if args.postgres else None
+        self.router = Program(self.log, "router", "--listen", endpoint)
+        opened.callback(self.router.end)
+        wait(lambda: router_running(endpoint), 20.0)
+        began_s = time.monotonic()
+        self.fleet = opened.enter_context(
+            FleetProcesses(args.gateways, args.sensors, 7, [endpoint], place / "gateways")
+        )
+        self.opened_s = time.monotonic() - began_s
+        for gateway in self.fleet.gateways:
+            add_key(place / "known.keys", gateway.source, gateway.public_key)
+        settings = place / "monitor.toml"
+        settings.write_text(f'[database]\nurl = "{self.url}"\n' if self.url else "")
+        self.monitor = Program(
+            self.log, "monitor", "--connect", endpoint, "--listen", f"127.0.0.1:{args.port + 1}",
+            "--data-dir", str(place / "monitor"), "--keys", str(place / "known.keys"), "--config", str(settings),
+        )  # fmt: skip
+        opened.callback(self.monitor.end)
+        wait(lambda: _answers(args.port + 1), 30.0)
+        self.engine = opened.enter_context(closing(open_engine(place / "monitor", self.url)))
 
-def measure(
-    fleet: SimulatedFleet, router: Program, monitor: Program, database: Path, port: int, args: argparse.Namespace
-) -> int:
-    """Run the fleet and print the figures; returns the number of lost results."""
-    stop = threading.Event()
-    first = fleet.step(time.time_ns())
-    nothing = {gateway.name: gateway.last_sequence - 1 for gateway in fleet.gateways}
-    wait(lambda: missing(fleet, database, nothing) == 0, CAUGHT_UP_S)
-    after = {gateway.name: gateway.last_sequence for gateway in fleet.gateways}
-    probe = Probe(port, stop)
-    probe.start()
-    programs = {"router": router, "monitor": monitor}
-    before = {name: program.measured() for name, program in programs.items()}
-    own = resource.getrusage(resource.RUSAGE_SELF)
-    began_s = time.monotonic()
+    def usage(self, stop: threading.Event) -> Usage:
+        """Of each part, from now until `stop`."""
+        fleet = self.fleet.pids()
+        groups: dict[str, Callable[[], Sequence[int]]] = {"router": self.router.pids, "monitor": self.monitor.pids}
+        if self.url is not None:
+            (place,) = parse_qs(urlsplit(self.url).query)["host"]
+            server = int((Path(place) / "data" / "postmaster.pid").read_text().split("\n")[0])
+            groups["PostgreSQL"] = lambda: tree(server)
+        return Usage(groups | {"simulated gateways": lambda: fleet}, stop)
 
-    def disturb() -> None:
-        for at_s, name, for_s in at_times(args.minutes, args.cut):
+    def disturb(self, began_s: float, stop: threading.Event) -> None:
+        """Kill router and monitor at their times, and start them again."""
+        programs = {"router": self.router, "monitor": self.monitor}
+        for at_s, name, for_s in self.kills():
             stop.wait(max(0.0, began_s + at_s - time.monotonic()))
             if not stop.is_set():
                 programs[name].away(for_s, stop)
 
-    disturbing = threading.Thread(target=disturb)
-    disturbing.start()
-    sent, rounds = 0, 0
+    def kills(self) -> list[tuple[float, str, float]]:
+        """(s after the beginning, who is killed, for how many s)."""
+        minutes = self.args.minutes
+        return [(minutes * 12, "router", AWAY_S), (minutes * 24, "monitor", AWAY_S),
+                (minutes * 30, "router", self.args.cut)]  # fmt: skip
+
+
+def _answers(port: int) -> bool:
     try:
-        while time.monotonic() - began_s < args.minutes * 60:
-            sent += fleet.step(time.time_ns())
-            rounds += 1
-            time.sleep(max(0.0, began_s + rounds * args.every - time.monotonic()))
-    except BaseException:
+        socket.create_connection(("127.0.0.1", port), 1.0).close()
+    except OSError:
+        return False
+    return True
+
+
+class Run:
+    """What happened in one run. Times are monotonic, in s."""
+
+    def __init__(self, scene: Scene) -> None:
+        args, fleet, engine = scene.args, scene.fleet, scene.engine
+        stop = threading.Event()
+        began_s = time.monotonic()
+        self.first = fleet.step(time.time_ns(), FIRST_WITHIN_S)
+        self.after = fleet.last_sequence()
+        wait(lambda: has(engine, self.after), CAUGHT_UP_S)
+        self.first_s = time.monotonic() - began_s
+        usage, arrivals = scene.usage(stop), Arrivals(engine, self.after, stop)
+        place = f"site={SITE}&gateway=gw0000&sensor=s1"
+        probe = Probe(args.port + 1, ["/api/fleet", f"/api/spread?{place}", f"/api/history?{place}&what=window"])
+        self.began_s = time.monotonic()
+        disturbing = threading.Thread(target=scene.disturb, args=(self.began_s, stop))
+        for thread in (usage, arrivals, disturbing):
+            thread.start()
+        self.made = [Counted(self.began_s, 0)]
+        try:
+            while (begin_s := time.monotonic()) - self.began_s < args.minutes * 60:
+                sent = fleet.step(time.time_ns(), 0.0 if args.together else args.every)
+                made = self.made[-1].results
+                self.made += [Counted(begin_s, made), Counted(time.monotonic(), made + sent)]
+                time.sleep(max(0.0, begin_s + args.every - time.monotonic()))
+        except BaseException:
+            stop.set()
+            raise
+        finally:
+            disturbing.join()
+        self.last = fleet.last_sequence()
+        self.caught_up_s = wait(lambda: has(engine, self.last), CAUGHT_UP_S)
+        self.spent_s = time.monotonic() - self.began_s
         stop.set()
-        raise
-    finally:
-        disturbing.join()
-    caught_up_s = wait(lambda: missing(fleet, database, after) == 0, CAUGHT_UP_S)
-    spent_s = time.monotonic() - began_s
-    stop.set()
-    probe.join()
-    lost = missing(fleet, database, after)
-    cpu = {name: 100 * (program.measured() - before[name]) / spent_s for name, program in programs.items()}
-    now = resource.getrusage(resource.RUSAGE_SELF)
-    own_cpu = 100 * (now.ru_utime + now.ru_stime - own.ru_utime - own.ru_stime) / spent_s
-    times_ms = 1000 * np.array([s for _, s in probe.times])
-    with sqlite3.connect(database) as connection:
-        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-        count = connection.execute("SELECT count(*) FROM result").fetchone()[0]
-    a_result = database.stat().st_size / count
-    a_round = first / (len(fleet.gateways) * args.sensors)
-    a_minute = sent / rounds / (len(fleet.gateways) * args.sensors)
+        usage.join()
+        arrivals.join()
+        self.asked, self.used, self.counts = probe.end(), usage.used, arrivals.counts
+        self.lost, self.twice = compared(engine, self.after, self.last)
+
+    def caught_up(self, back_s: float) -> float:
+        """Seconds from `back_s` until the database had all results but those of the last BEHIND_S."""
+        times, made = zip(*self.made, strict=True)
+        for at_s, results in self.counts:
+            if at_s > back_s and results >= np.interp(at_s - BEHIND_S, times, made):
+                return at_s - back_s
+        return float("inf")
+
+    def most(self, over_s: int = 5) -> float:
+        """The largest number of results a second that came into the database, over so many seconds."""
+        pairs = zip(self.counts, self.counts[over_s:], strict=False)
+        return max((b.results - a.results) / (b.at_s - a.at_s) for a, b in pairs)
+
+
+def told(scene: Scene, run: Run) -> Iterator[str]:
+    """The figures, one a line."""
+    args, sent = scene.args, run.made[-1].results
+    rounds = len(run.made) // 2
+    yield (
+        f"{machine()}: {args.gateways} gateways x {args.sensors} sensors, {run.spent_s:.0f} s, a round each "
+        f"{args.every:g} s, {'all gateways at once' if args.together else 'each gateway at its own moment'}, "
+        f"{'PostgreSQL' if args.postgres else 'SQLite'}; load average at the end {os.getloadavg()[1]:.1f}"
+    )
+    yield (
+        f"opened in {scene.opened_s:.0f} s, {scene.fleet.unconnected} without router at first; the monitor had the "
+        f"first {run.first} results after {run.first_s:.0f} s"
+    )
+    yield (
+        f"results sent {sent}, lost {run.lost}, twice {run.twice}; the monitor had all {run.caught_up_s:.1f} s after "
+        "the last round and the last cut"
+    )
+    for at_s, name, away_s in scene.kills():
+        back_s = run.began_s + at_s + away_s
+        yield f"{name} away for {away_s:g} s: nothing missing {run.caught_up(back_s):.0f} s after its start"
+    yield f"at most {run.most():.0f} results a second into the database"
+    for path in dict.fromkeys(asked.path for asked in run.asked):
+        yield _page(path, [asked for asked in run.asked if asked.path == path])
+    names = ["router", "monitor", *(["PostgreSQL"] if args.postgres else []), "simulated gateways"]
+    for name in names:
+        used = run.used(name)
+        yield (
+            f"{name}: CPU {used.mean_pct:.0f} % of one core, {used.peak_pct:.0f} % in the busiest 10 s; "
+            f"memory at most {used.memory_mb:.0f} MB"
+        )
+    with scene.engine.transaction() as query:
+        ((count,),) = query("SELECT count(*) FROM result")
+    a_round = sent / rounds / (args.gateways * args.sensors)
+    size = used_bytes(scene.engine, scene.url) / count
+    yield f"database: {size:.0f} B a result, {a_round:.2f} results a sensor and round"
+
+
+def _page(path: str, asked: Sequence[Asked]) -> str:
+    times_ms = 1000 * np.array([each.took_s for each in asked])
     p50, p95, p99 = np.percentile(times_ms, (50, 95, 99))
-    print(
-        f"{machine()}: {len(fleet.gateways)} gateways x {args.sensors} sensors, {spent_s:.0f} s, "
-        f"a round each {args.every:g} s"
+    return (
+        f"{path.split('?')[0]} ({max(each.size for each in asked) / 1000:.0f} kB): p50 {p50:.0f} ms, p95 {p95:.0f} ms, "
+        f"p99 {p99:.0f} ms, max {times_ms.max():.0f} ms of {len(times_ms)} requests, "
+        f"{100 * np.mean(times_ms <= 100):.1f} % within 100 ms"
     )
-    print(f"results sent {sent}, lost {lost}; the monitor had all {caught_up_s:.1f} s after the last round")
-    print(
-        f"page (/api/fleet, {probe.bytes / 1000:.0f} kB): p50 {p50:.0f} ms, p95 {p95:.0f} ms, p99 {p99:.0f} ms, "
-        f"max {times_ms.max():.0f} ms of {len(times_ms)} requests, {100 * np.mean(times_ms <= 100):.1f} % within 100 ms"
-    )
-    for name, program in programs.items():
-        print(f"{name}: CPU {cpu[name]:.1f} % of one core, memory at most {program.rss_mb:.0f} MB")
-    print(f"fleet itself: CPU {own_cpu:.1f} %, memory {now.ru_maxrss / 1000:.0f} MB")
-    print(
-        f"database: {a_result:.0f} B a result, {a_minute:.2f} results a sensor and round ({a_round:.2f} in the first): "
-        f"{a_result * a_minute * YEAR_MIN / 1e9:.2f} GB a sensor and year at one round a minute"
-    )
-    return lost
 
 
 def main() -> int:
-    """Exit status: 1 results were lost."""
+    """Exit status: 1 results were lost or are there twice."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--gateways", type=int, default=1000)
     parser.add_argument("--sensors", type=int, default=4)
     parser.add_argument("--minutes", type=float, default=20.0)
     parser.add_argument("--every", type=float, default=60.0, help="s between two rounds of results")
+    parser.add_argument("--together", action="store_true", help="all gateways make their results at the same moment")
     parser.add_argument("--cut", type=float, default=300.0, help="s for which the router is away")
+    parser.add_argument("--postgres", action="store_true", help="on a PostgreSQL 15 that is started for it")
     parser.add_argument("--port", type=int, default=7471, help="of the router; the page has the next one")
     args = parser.parse_args()
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that the programs and the directory do not stay
-    endpoint = f"tcp/127.0.0.1:{args.port}"
-    with ExitStack() as stack:
-        place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="fieldcal-scale-")))
-        router = Program(place / "log", "router", "--listen", endpoint)
-        stack.callback(router.end)
-        wait(lambda: router_running(endpoint), 20.0)
-        fleet = stack.enter_context(SimulatedFleet(args.gateways, args.sensors, 7, [endpoint], place / "gateways"))
-        print(
-            f"{fleet.unconnected} of {args.gateways} gateways found no router at first; "
-            f"{len(os.listdir('/proc/self/fd')) / args.gateways:.1f} open files each",
-            flush=True,
-        )
-        for gateway in fleet.gateways:
-            add_key(place / "known.keys", gateway.source, gateway.public_key)
-        monitor = Program(
-            place / "log", "monitor", "--connect", endpoint, "--listen", f"127.0.0.1:{args.port + 1}",
-            "--data-dir", str(place / "monitor"), "--keys", str(place / "known.keys"),
-        )  # fmt: skip
-        stack.callback(monitor.end)
-        database = place / "monitor" / "monitor.sqlite"
-        wait(database.exists, 20.0)
-        wait(lambda: "result" in _tables(database), 20.0)
-        lost = measure(fleet, router, monitor, database, args.port + 1, args)
-        print((place / "log").read_text()[-2000:], file=sys.stderr)
-    return 1 if lost else 0
-
-
-def _tables(database: Path) -> set[str]:
-    with sqlite3.connect(f"file:{database}?mode=ro", uri=True) as connection:
-        return {row[0] for row in connection.execute("SELECT name FROM sqlite_master")}
+    with ExitStack() as opened:
+        scene = Scene(args, opened)
+        run = Run(scene)
+        for line in told(scene, run):
+            print(line, flush=True)
+        print(scene.log.read_text()[-2000:], file=sys.stderr)
+    return 1 if run.lost or run.twice else 0
 
 
 if __name__ == "__main__":

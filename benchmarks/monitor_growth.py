@@ -44,14 +44,14 @@ def main() -> None:
                         address = Address("site", "gateway", sensor.name, result.what)
                         received = Received("", address, sequence, msgspec.json.decode(data), None)
                         begun = time.perf_counter()
-                        database.add(received)
+                        database.add([received])
                         adding_s += time.perf_counter() - begun
             while True:
                 begun = time.perf_counter()
                 if not database.summarise():
                     break
                 steps.append(time.perf_counter() - begun)
-            sizes.append(_used(engine, url))
+            sizes.append(used_bytes(engine, url))
         full, growth = sizes[FULL_DAYS], (sizes[-1] - sizes[FULL_DAYS]) / MORE_DAYS * 365.25
         print(f"{results} results of {published / results:.0f} bytes as JSON on average; {FULL_DAYS} days in full")
         print(
@@ -61,7 +61,7 @@ def main() -> None:
         database.close()
 
 
-def _used(engine: Engine, url: str | None) -> int:
+def used_bytes(engine: Engine, url: str | None) -> int:
     """Bytes in use: free pages of SQLite are used again."""
     with engine.transaction() as run:
         if url is None:

@@ -15,7 +15,7 @@ import click
 
 from agent.terminal.text import say
 
-FILES_PER_GATEWAY = 40  # open files: the store, its readers, and Zenoh
+FILES_PER_GATEWAY = 10  # open files: the store with its readers, and Zenoh; docs/fleet.md has what was measured
 ROUTER_S = 30.0  # s to wait for a router
 STEP_S = 0.5
 DAY_S = 86400.0
@@ -50,21 +50,24 @@ def serve_fleet(
 
     Until Ctrl-C, or for `duration_s`. Returns the exit status: 1 without router or with too few files, 2 bad endpoint.
     """
+    from concurrent.futures.process import BrokenProcessPool
+
     from agent.config.key_file import KeyFileError
     from agent.config.known_keys import add_key
     from agent.delivery.router import DEFAULT_ENDPOINT
     from agent.delivery.session import EndpointError
-    from agent.fleet.simulated import ODD, SimulatedFleet
+    from agent.fleet.simulated import ODD
+    from agent.fleet.simulated_processes import GATEWAYS_EACH, FleetProcesses
 
     endpoint, stop = connect or DEFAULT_ENDPOINT, threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     try:
-        if fault := _files_fault(fleet) or _router_fault(endpoint, stop):
+        if fault := _files_fault(min(fleet, GATEWAYS_EACH)) or _router_fault(endpoint, stop):
             say(f"fieldcal simulate: {fault}", err=True)
             return 1
         with TemporaryDirectory(prefix="fieldcal-fleet-") as directory:
-            with SimulatedFleet(fleet, sensors, seed, [endpoint], Path(directory)) as simulated:
+            with FleetProcesses(fleet, sensors, seed, [endpoint], Path(directory)) as simulated:
                 if simulated.unconnected:
                     say(f"fieldcal simulate: {simulated.unconnected} gateways found no router yet", err=True)
                 if keys is not None:
@@ -77,6 +80,11 @@ def serve_fleet(
                     say(f"{behaviour}: {', '.join(names[:NAMES_SHOWN]) or 'none'}{more}")
                 results = _run(simulated.step, stop, every_s, speed, age_days, duration_s)
             say(f"{results} results sent")
+    except BrokenProcessPool:
+        say(
+            "fieldcal simulate: a process of the fleet ended: there is too little memory for so many gateways", err=True
+        )
+        return 1
     except (EndpointError, KeyFileError) as error:
         say(f"fieldcal simulate: {error}", err=True)
         return 2
@@ -100,11 +108,11 @@ def _run(
     return results
 
 
-def _files_fault(fleet: int) -> str:
-    """Allow as many open files as the fleet needs; why that cannot be, "" if it can."""
-    needed, (soft, hard) = 256 + FILES_PER_GATEWAY * fleet, resource.getrlimit(resource.RLIMIT_NOFILE)
+def _files_fault(gateways: int) -> str:
+    """Allow as many open files as a process with so many gateways needs; why that cannot be, "" if it can."""
+    needed, (soft, hard) = 256 + FILES_PER_GATEWAY * gateways, resource.getrlimit(resource.RLIMIT_NOFILE)
     if hard != resource.RLIM_INFINITY and needed > hard:
-        return f"{fleet} gateways need {needed} open files, and this system allows {hard}; set `ulimit -Hn {needed}`"
+        return f"{gateways} gateways need {needed} open files, and this system allows {hard}; set `ulimit -Hn {needed}`"
     if soft != resource.RLIM_INFINITY:
         resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, needed), hard))
     return ""

@@ -11,13 +11,15 @@ from __future__ import annotations
 import time
 from collections import Counter, deque
 from dataclasses import dataclass, field
+from heapq import heappop, heappush
 
 from agent.delivery.received import Received
 from agent.delivery.seldom import Seldom
 
-RESULTS_MAX = 1000  # of a gateway that are held; further ones push out the oldest, which are in the gateway's store
-GATEWAYS_MAX = 1000  # of which results are held
 AT_ONCE = 32  # gateways that are asked at the same time
+RESULTS_MAX = 500  # of a gateway that are held; further ones push out the oldest, which are in the gateway's store
+GATEWAYS_MAX = 2000  # of which results are held
+LOOKS_MAX = 2 * AT_ONCE  # gateways that wait to be asked although nothing of them is held
 RETRY_S = 1.0  # s between two queries to a gateway
 RETRY_LONGEST_S = 30.0  # s between two queries to a gateway that never answered; from RETRY_S each takes twice as long
 GIVE_UP_S = 300.0  # s without an answer, after which results are given although earlier ones may be missing
@@ -26,9 +28,10 @@ GIVE_UP_S = 300.0  # s without an answer, after which results are given although
 @dataclass
 class _Waiting:
     answers: bool  # it answered the last time, or results of it are known
+    due_s: float  # monotonic time from which the gateway may be asked (again)
     results: deque[Received] = field(default_factory=lambda: deque(maxlen=RESULTS_MAX))
     later: deque[Received] = field(default_factory=lambda: deque(maxlen=RESULTS_MAX))  # came while it was being asked
-    due_s: float = 0.0  # monotonic time from which the gateway may be asked (again)
+    look: bool = False  # it is to be asked also where nothing is held
     wait_s: float = RETRY_S
     silent_since_s: float | None = None  # time of the first query that was not answered
 
@@ -40,6 +43,9 @@ class Held:
         self.dropped: Counter[str] = Counter()
         self._waiting: dict[str, _Waiting] = {}
         self._asking: dict[str, bool] = {}  # the gateways that are being asked, and whether they answered the last time
+        # All others that wait, by the time from which they may be asked, apart by whether they answered the last time.
+        self._next: dict[bool, list[tuple[float, str]]] = {True: [], False: []}
+        self._looks = 0  # that wait
         self._log = Seldom()
 
     def add(self, result: Received, *, known: bool = False) -> None:
@@ -48,8 +54,24 @@ class Held:
         if source not in self._waiting and len(self._waiting) >= GATEWAYS_MAX:
             self._drop("", f"results of {GATEWAYS_MAX} gateways are held already")
             return
-        waiting = self._waiting.setdefault(source, _Waiting(known))
+        waiting = self._of(source, known)
         self._hold(result, waiting.later if source in self._asking else waiting.results)
+
+    def look(self, source: str, *, known: bool) -> None:
+        """Ask a gateway although nothing of it is held. Only while there is `room`."""
+        waiting = self._of(source, known)
+        self._looks += not waiting.look
+        waiting.look = True
+
+    def room(self) -> int:
+        """The number of gateways for which `look` may be called now."""
+        return LOOKS_MAX - self._looks
+
+    def _of(self, source: str, known: bool) -> _Waiting:
+        if source not in self._waiting:
+            self._waiting[source] = _Waiting(known, time.monotonic())
+            self._queue(source)
+        return self._waiting[source]
 
     def _hold(self, result: Received, among: deque[Received]) -> None:
         if len(among) == RESULTS_MAX:
@@ -79,33 +101,40 @@ class Held:
         return came
 
     def wait_s(self) -> float | None:
-        """Time in s until a gateway may be asked; None where nothing is held, or others must be answered before."""
-        due = [self._waiting[source].due_s for source in self._next()]
-        return max(0.0, min(due) - time.monotonic()) if due else None
+        """Time in s until `due` has something to do; None where nothing waits, or others must be answered before."""
+        due_s = [queue[0][0] for queue in self._open_queues()]
+        return max(0.0, min(due_s) - time.monotonic()) if due_s else None
 
     def due(self) -> list[str]:
         """The gateways to ask now; each is being asked until `ended`."""
-        now_s = time.monotonic()
-        for source in [source for source, waiting in self._waiting.items() if waiting.due_s <= now_s]:
+        now_s, found = time.monotonic(), []
+        while queues := [queue for queue in self._open_queues() if queue[0][0] <= now_s]:
+            source = heappop(min(queues))[1]
             waiting = self._waiting[source]
-            if not (waiting.results or waiting.later or source in self._asking):
+            if waiting.results or waiting.later or waiting.look:
+                self._asking[source] = waiting.answers
+                self._looks -= waiting.look
+                waiting.look = False
+                found.append(source)
+            else:
                 del self._waiting[source]
-        found = [source for source in self._next() if self._waiting[source].due_s <= now_s]
-        self._asking |= {source: self._waiting[source].answers for source in found}
         return found
 
-    def _next(self) -> list[str]:
-        """The gateways with results that may be asked beside those that are, by the time from which they may."""
-        held = {s: w for s, w in self._waiting.items() if s not in self._asking and (w.results or w.later)}
-        first = sorted(held, key=lambda source: held[source].due_s)
-        doubted = [source for source in first if not held[source].answers]
-        places = max(0, AT_ONCE // 2 - sum(not answers for answers in self._asking.values()))
-        left_out = set(doubted[places:])
-        return [source for source in first if source not in left_out][: AT_ONCE - len(self._asking)]
+    def _open_queues(self) -> list[list[tuple[float, str]]]:
+        """The queues of which the first gateway may be asked beside those that are."""
+        if len(self._asking) >= AT_ONCE:
+            return []
+        doubted = sum(not answers for answers in self._asking.values())
+        return [queue for answers, queue in self._next.items() if queue and (answers or doubted < AT_ONCE // 2)]
+
+    def _queue(self, source: str) -> None:
+        waiting = self._waiting[source]
+        heappush(self._next[waiting.answers], (waiting.due_s, source))
 
     def ended(self, source: str) -> None:
         """A gateway is not being asked any more."""
-        self._asking.pop(source, None)
+        if self._asking.pop(source, None) is not None:
+            self._queue(source)
 
     def asked(self, source: str, *, answered: bool, known: bool) -> bool:
         """A gateway was asked. Returns whether its results are to be given now, since no earlier ones will come.
@@ -121,8 +150,8 @@ class Held:
         if answered:
             waiting.silent_since_s = None
             return True
-        if waiting.silent_since_s is None:
+        if waiting.silent_since_s is None and waiting.results:
             waiting.silent_since_s = now_s
             told = "%s does not answer: its results are held, for %g s at most, because earlier ones may be missing"
             self._log.warning(told, source, GIVE_UP_S)
-        return now_s - waiting.silent_since_s > GIVE_UP_S
+        return waiting.silent_since_s is not None and now_s - waiting.silent_since_s > GIVE_UP_S

@@ -55,3 +55,10 @@ def narrow(key: str, source: str) -> str:
     while named < 2 and rest and rest[0] != "**":
         rest, named = rest[1:], named + 1
     return "/".join([PREFIX, source, *rest])
+
+
+def presence_key(key: str) -> str:
+    """The keys of the liveliness tokens of the gateways that the key expression `key` may match."""
+    gateway = key.removeprefix(PREFIX + "/").split("/")[:2]
+    named = gateway[: gateway.index("**")] if "**" in gateway else gateway
+    return "/".join([PREFIX, *named, *["*"] * (2 - len(named)), "alive"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,6 +13,7 @@ import msgspec
 from agent.config.files import read_file
 
 SIZE_MAX = 16 << 20  # bytes read at most; one gateway takes about 50
+SAVE_S = 1.0  # s between two writes of the file while results come without a pause; a pause writes it at once
 
 
 class MemoryFileError(Exception):
@@ -21,6 +23,30 @@ class MemoryFileError(Exception):
 class _Content(msgspec.Struct, forbid_unknown_fields=True):
     last_sequence: dict[str, int]
     crc32: int  # of last_sequence; without it, a changed digit would skip results unnoticed
+
+
+class Memory:
+    """`numbers`: of the last result that was processed, by gateway; kept in a file where there is a `path`.
+
+    Raises MemoryFileError where the file cannot be read; the methods raise OSError where it cannot be written.
+    """
+
+    def __init__(self, path: Path | None) -> None:
+        self._path = path
+        self.numbers = self._saved = load(path) if path is not None else {}
+        self._saved_s = time.monotonic()
+
+    def processed(self, numbers: dict[str, int]) -> None:
+        """The results up to these numbers are processed. Saves them, unless it did within SAVE_S."""
+        self.numbers = numbers
+        if time.monotonic() - self._saved_s > SAVE_S:
+            self.save()
+
+    def save(self) -> None:
+        """Save the numbers where they have changed."""
+        if self._path is not None and self.numbers != self._saved:
+            save(self._path, self.numbers)
+            self._saved, self._saved_s = self.numbers, time.monotonic()
 
 
 def load(path: Path) -> dict[str, int]:

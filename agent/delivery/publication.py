@@ -58,6 +58,7 @@ class Publisher:
 
     `site`, `gateway`: names. `connect`: endpoints of routers. The session is a peer that does not listen; it connects
     when a router appears. With the `mode` "client" it opens faster, but only while a router is there.
+    `poll_s`: time in s after which a router that came back is noticed.
     `tls`: certificates, for endpoints tls/... `serve(session, open_things)` is called with each
     new session.
     Raises ValueError for an invalid name, EndpointError for an invalid endpoint. The methods raise nothing.
@@ -72,12 +73,14 @@ class Publisher:
         *,
         tls: TlsFiles | None = None,
         mode: Literal["peer", "client"] = "peer",
+        poll_s: float = POLL_S,
         serve: Callable[[zenoh.Session, ExitStack], None] | None = None,
     ) -> None:
         self._key = gateway_key(site, gateway)
         self._endpoints = tuple(connect)
-        self._config = session_config(mode, connect=connect, tls=tls)
+        self._config = session_config(mode, connect=connect, tls=tls, one_of_many=True)
         self._tls = tls
+        self._poll_s = poll_s
         self._serve_more = serve
         self._store = store
         self._recent: deque[Record] = deque(maxlen=RECENT_MAX)
@@ -182,7 +185,7 @@ class Publisher:
                     self._send_told(session)
                     self._send_waiting(session, history)
                     self._send_blocks(session)
-                self._wake.wait(0 if stopping else POLL_S)
+                self._wake.wait(0 if stopping else self._poll_s)
                 self._wake.clear()
 
     def _find_router(self, session: zenoh.Session) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import queue
 import threading
 from collections.abc import Callable, Generator, Iterator, Sequence
 from typing import NamedTuple
@@ -54,13 +53,13 @@ class Replies(NamedTuple):
 
 
 class Questions:
-    """Asks over a session and puts the replies into `inbox` when all are there, or after ANSWER_S.
+    """Asks over a session and hands the replies to `put` when all are there, or after ANSWER_S.
 
     Zenoh calls back in threads of its own; nothing but collecting is done there.
     """
 
-    def __init__(self, session: zenoh.Session, inbox: queue.Queue[zenoh.Sample | Replies | None]) -> None:
-        self._session, self._inbox = session, inbox
+    def __init__(self, session: zenoh.Session, put: Callable[[Replies], None]) -> None:
+        self._session, self._put = session, put
         self._mutex = threading.Lock()  # closing a session while another thread uses it raises an exception there
         self._closed = False
         self._log = Seldom()
@@ -83,7 +82,7 @@ class Questions:
                 self._log.warning(
                     "%s: an answer with too many results is not used; are there two such gateways?", source
                 )
-            self._inbox.put(Replies(source, dialogue, None if too_many else replies))
+            self._put(Replies(source, dialogue, None if too_many else replies))
 
         handler = zenoh.handlers.Callback(take, end, indirect=False)
         with self._mutex:

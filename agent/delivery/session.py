@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import random
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
@@ -17,6 +18,10 @@ LARGEST_MESSAGE = 1 << 20
 # Clients of a router. Zenoh refuses number 1,001 by default. A client takes 2 open files of the router.
 ROUTER_SESSIONS = 10_000
 ROUTER_ACCEPTS = 1000  # clients that may be connecting at the same time: all gateways of a site after an outage
+
+# s between two attempts to reach a router again: drawn for the first, twice as long after each, at most the last one.
+# 1,000 gateways that all came at once would keep a router busy for so long that connections time out.
+RETRY_FIRST_S, RETRY_LONGEST_S = (0.5, 1.5), 10.0
 
 
 class EndpointError(Exception):
@@ -33,9 +38,11 @@ def session_config(
     connect: Sequence[str] = (),
     listen: Sequence[str] = (),
     tls: TlsFiles | None = None,
+    one_of_many: bool = False,
 ) -> zenoh.Config:
     """A Zenoh configuration that uses only the given endpoints; with `tls`, both sides of a link show certificates.
 
+    `one_of_many`: sessions that lose their router at the same moment come back one after the other.
     Raises EndpointError where a given endpoint is not valid, or another user may read the private key.
     """
     config = zenoh.Config()
@@ -50,6 +57,10 @@ def session_config(
         "transport/link/tls": _tls(tls),
     }.items():
         config.insert_json5(key, json.dumps(value))
+    if one_of_many:
+        retry = {"period_init_ms": round(1000 * random.uniform(*RETRY_FIRST_S)), "period_increase_factor": 2.0,
+                 "period_max_ms": round(1000 * RETRY_LONGEST_S)}  # fmt: skip
+        config.insert_json5("connect/retry", json.dumps(retry))
     if mode == "router":
         config.insert_json5("transport/unicast/max_sessions", json.dumps(ROUTER_SESSIONS))
         config.insert_json5("transport/unicast/accept_pending", json.dumps(ROUTER_ACCEPTS))

@@ -27,6 +27,7 @@ SITE = "simulated"
 ODD: tuple[Behaviour, ...] = ("drifting", "silent", "wrong", "hostile")
 ONE_ODD_IN = 5  # gateways; at least one of each kind where there are enough
 AT_ONCE = 32  # gateways that open, or commit, at the same time
+POLL_S = 1.0  # s between two looks for a router; each look of each gateway costs time of the same process
 CONNECT_S = 10.0  # s to wait for one gateway's connection
 
 
@@ -56,7 +57,7 @@ class SimulatedGateway:
         self._store = Store(data_dir / name)
         self._signing = ResultSigner(self._store.epoch, self._signer)
         self._signing.gateway = self.source
-        self._publisher = Publisher(SITE, name, connect, self._store, mode="client")
+        self._publisher = Publisher(SITE, name, connect, self._store, mode="client", poll_s=POLL_S)
         # Of a gateway that is not sound only the first sensor is odd, so that the page has both.
         self._sensors = [SimulatedSensor(f"s{k}", behaviour if k == 0 else "sound", [*seed, k]) for k in range(sensors)]
         self._round = 0
@@ -90,9 +91,12 @@ class SimulatedGateway:
         return self._publisher.state().connected
 
     def step(self, t_utc_ns: int) -> int:
-        """Make, store and publish the results of the next round; returns how many. A silent gateway leaves the bus."""
+        """Make, store and publish the results of the next round; returns how many.
+
+        A silent gateway leaves the bus when all that it has made is published.
+        """
         silent = self.behaviour == "silent" and self._round > WRONG_FROM
-        if silent:
+        if silent and self.published == self.last_sequence:
             self._publisher.close()
             return 0
         results: list[Result] = []
@@ -145,24 +149,39 @@ class SimulatedGateway:
 class SimulatedFleet(AbstractContextManager["SimulatedFleet"]):
     """`count` gateways with `sensors` sensors each. `unconnected`: those that found no router.
 
-    Raises EndpointError, StoreError.
+    `numbers`: which of the gateways are here; default: all. Raises EndpointError, StoreError.
     """
 
-    def __init__(self, count: int, sensors: int, seed: int, connect: Sequence[str], data_dir: Path) -> None:
+    def __init__(
+        self, count: int, sensors: int, seed: int, connect: Sequence[str], data_dir: Path,
+        numbers: Sequence[int] | None = None,
+    ) -> None:  # fmt: skip
+        numbers = range(count) if numbers is None else numbers
+        kinds = behaviours(count, seed)
         with ExitStack() as opened:
-            self._pool = opened.enter_context(ThreadPoolExecutor(min(AT_ONCE, count), "simulated"))
+            self._pool = opened.enter_context(ThreadPoolExecutor(min(AT_ONCE, len(numbers)), "simulated"))
             self.gateways: list[SimulatedGateway] = []
             opened.callback(lambda: list(self._pool.map(SimulatedGateway.close, self.gateways)))
-            for k, behaviour in enumerate(behaviours(count, seed)):
-                gateway = SimulatedGateway(f"gw{k:04}", behaviour, sensors, [seed, 1, k], connect, data_dir)
+            for k in numbers:
+                gateway = SimulatedGateway(f"gw{k:04}", kinds[k], sensors, [seed, 1, k], connect, data_dir)
                 self.gateways.append(gateway)
             connected = list(self._pool.map(SimulatedGateway.open, self.gateways))
             self.unconnected = connected.count(False)
             self._opened = opened.pop_all()
 
-    def step(self, t_utc_ns: int) -> int:
-        """The next round of all gateways, whose results have this time; returns how many results there were."""
-        return sum(self._pool.map(lambda gateway: gateway.step(t_utc_ns), self.gateways))
+    def step(self, t_utc_ns: int, within_s: float = 0.0) -> int:
+        """The next round of all gateways, evenly spread over `within_s` from now on; returns how many results.
+
+        `t_utc_ns`: the time of the first gateway's results. Those of the others are as much later as they are made.
+        """
+        begun_s, apart_s = monotonic(), within_s / len(self.gateways)
+
+        def later(k: int) -> int:
+            sleep(max(0.0, begun_s + k * apart_s - monotonic()))
+            return t_utc_ns + round(k * apart_s * 1e9)
+
+        # `map` takes the times, and so waits for them, as it hands the gateways to the pool.
+        return sum(self._pool.map(SimulatedGateway.step, self.gateways, map(later, range(len(self.gateways)))))
 
     def names_of(self, behaviour: Behaviour) -> list[str]:
         """The gateways that behave so."""

@@ -76,7 +76,7 @@ class LocalWorkers(AbstractContextManager["LocalWorkers"]):
 
     @staticmethod
     def _new_pool(count: int) -> ProcessPoolExecutor:
-        return ProcessPoolExecutor(count, mp_context=_TASKS, initializer=_begin)
+        return ProcessPoolExecutor(count, mp_context=_TASKS, initializer=begin)
 
 
 class DaskWorkers(AbstractContextManager["DaskWorkers"]):
@@ -129,8 +129,8 @@ def outcome(result: Callable[[], bytes]) -> bytes | str:
         return f"a fault of the program: {type(error).__name__}: {str(error)[:1000]}"
 
 
-def _begin() -> None:
-    """In a new worker: the parent handles Ctrl-C, and the worker does not outlive the parent."""
+def begin() -> None:
+    """In a new process: the parent handles Ctrl-C, and the process does not outlive the parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     if parent is not None:

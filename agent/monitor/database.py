@@ -5,8 +5,8 @@ from __future__ import annotations
 import threading
 import time
 from bisect import bisect_right
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 from agent.delivery.received import Received
 from agent.monitor.engines import LASTING, Engine, Run
@@ -35,6 +35,20 @@ _TABLES = [
 _OF = "(SELECT id FROM sensor WHERE site = :site AND gateway = :gateway AND sensor = :name)"
 
 
+class _Row(NamedTuple):
+    """A result as it is kept. `gateway`: site, gateway, epoch; `detail`: what is kept where it has changed."""
+
+    gateway: tuple[str, str, str]
+    sequence: int
+    day: int
+    hour: int
+    sensor: int
+    what: str
+    part: str
+    payload: bytes
+    detail: bytes | None
+
+
 class Database:
     """Results by sensor, in the order of their arrival. May be used by several threads.
 
@@ -52,43 +66,65 @@ class Database:
         with engine.transaction() as run:
             engine.make_tables(run, [statement.format(**columns) for statement in _TABLES])
 
-    def add(self, result: Received) -> None:
-        """Keep a result. One that is there already stays as it is."""
-        a, fields = result.address, result.fields
+    def add(self, results: Sequence[Received]) -> None:
+        """Keep results, all of them or none, in one transaction. One that is there already stays as it is."""
+        with self._mutex:  # numbers rise in the order in which they are committed
+            rows = [self._row(result) for result in results]
+            with self._engine.transaction() as run:
+                self._engine.writes(run)
+                details = self._insert(run, rows)
+            self._details |= details
+
+    def _row(self, result: Received) -> _Row:
+        a, fields, now_ns = result.address, result.fields, self._now_ns()
         part = {"drift": fields.get("parameter", ""), "window": "used" if fields.get("used") else "refused"}
         t_utc_ns = fields.get("t_utc_ns")
-        t_utc_ns = t_utc_ns if isinstance(t_utc_ns, int) else self._now_ns()
-        with self._mutex:  # numbers rise in the order in which they are committed
-            day = self._day(t_utc_ns) if a.what in SUMMARISED else LASTING
-            sensor = self._sensor(a.site, a.gateway, a.sensor)
-            short, detail = split(fields) if a.what in SUMMARISED else (fields, None)
-            before = self._details.get((sensor, a.what))
-            kept = None if before == (day, detail) else detail
-            with self._engine.transaction() as run:
-                row = run(
-                    "INSERT INTO result (day, hour, sensor, epoch, sequence, what, part, payload, detail) VALUES (:day,"
-                    " :hour, :sensor, :epoch, :sequence, :what, :part, :payload, :detail) ON CONFLICT DO NOTHING"
-                    " RETURNING number",
-                    day=day, hour=min(t_utc_ns, self._now_ns()) // HOUR_NS, sensor=sensor, epoch=result.epoch,
-                    sequence=result.sequence, what=a.what, part=part.get(a.what, ""), payload=packed(short),
-                    detail=kept,
-                )  # fmt: skip
-                if not row:
-                    return
-                run(
-                    "INSERT INTO newest VALUES (:sensor, :what, :part, :number) ON CONFLICT (sensor, what, part)"
-                    " DO UPDATE SET number = excluded.number",
-                    sensor=sensor, what=a.what, part=part.get(a.what, ""), number=row[0][0],
-                )  # fmt: skip
-                run(
-                    "INSERT INTO followed VALUES (:site, :gateway, :epoch, :sequence, :number) ON CONFLICT"
-                    " (site, gateway, epoch) DO UPDATE SET number = excluded.number, sequence ="
-                    " CASE WHEN excluded.sequence > followed.sequence THEN excluded.sequence"
-                    " ELSE followed.sequence END",
-                    site=a.site, gateway=a.gateway, epoch=result.epoch, sequence=result.sequence, number=row[0][0],
-                )  # fmt: skip
-            if detail is not None:
-                self._details[sensor, a.what] = day, detail
+        t_utc_ns = t_utc_ns if isinstance(t_utc_ns, int) else now_ns
+        short, detail = split(fields) if a.what in SUMMARISED else (fields, None)
+        return _Row(
+            gateway=(a.site, a.gateway, result.epoch), sequence=result.sequence,
+            day=self._day(t_utc_ns) if a.what in SUMMARISED else LASTING, hour=min(t_utc_ns, now_ns) // HOUR_NS,
+            sensor=self._sensor(a.site, a.gateway, a.sensor), what=a.what, part=part.get(a.what, ""),
+            payload=packed(short), detail=detail,
+        )  # fmt: skip
+
+    def _insert(self, run: Run, rows: Sequence[_Row]) -> dict[tuple[int, str], tuple[int, bytes]]:
+        """Write the rows, and what is the newest after them; returns the last detail of each sensor, with its day."""
+        details: dict[tuple[int, str], tuple[int, bytes]] = {}
+        newest: dict[tuple[int, str, str], int] = {}
+        followed: dict[tuple[str, str, str], tuple[int, int]] = {}
+        for row in rows:
+            place = row.sensor, row.what
+            same = row.detail is not None and details.get(place, self._details.get(place)) == (row.day, row.detail)
+            added = run(
+                "INSERT INTO result (day, hour, sensor, epoch, sequence, what, part, payload, detail) VALUES (:day,"
+                " :hour, :sensor, :epoch, :sequence, :what, :part, :payload, :detail) ON CONFLICT DO NOTHING"
+                " RETURNING number",
+                day=row.day, hour=row.hour, sensor=row.sensor, epoch=row.gateway[2], sequence=row.sequence,
+                what=row.what, part=row.part, payload=row.payload, detail=None if same else row.detail,
+            )  # fmt: skip
+            if not added:
+                continue
+            ((number,),) = added
+            if row.detail is not None:
+                details[place] = row.day, row.detail
+            newest[row.sensor, row.what, row.part] = number
+            followed[row.gateway] = max(row.sequence, followed.get(row.gateway, (0, 0))[0]), number
+        for (sensor, what, part), number in newest.items():
+            run(
+                "INSERT INTO newest VALUES (:sensor, :what, :part, :number) ON CONFLICT (sensor, what, part)"
+                " DO UPDATE SET number = excluded.number",
+                sensor=sensor, what=what, part=part, number=number,
+            )  # fmt: skip
+        for (site, gateway, epoch), (sequence, number) in followed.items():
+            run(
+                "INSERT INTO followed VALUES (:site, :gateway, :epoch, :sequence, :number) ON CONFLICT"
+                " (site, gateway, epoch) DO UPDATE SET number = excluded.number, sequence ="
+                " CASE WHEN excluded.sequence > followed.sequence THEN excluded.sequence"
+                " ELSE followed.sequence END",
+                site=site, gateway=gateway, epoch=epoch, sequence=sequence, number=number,
+            )  # fmt: skip
+        return details
 
     def last_sequence(self) -> dict[str, int]:
         """The last result of each gateway and epoch, as Consumer takes it: of one gateway the newest epoch last."""

@@ -15,7 +15,7 @@ from typing import Any, Protocol
 
 Rows = list[tuple[Any, ...]]
 LASTING = 0  # in place of a day: rows that are never dropped
-_SETTING_UP = 7_160_001  # key of the lock under which PostgreSQL makes tables and partitions
+_LOCK = 7_160_001  # key of the lock under which PostgreSQL makes tables and partitions, and adds results
 
 
 class DatabaseError(ConnectionError):
@@ -44,6 +44,9 @@ class Engine(Protocol):
 
     def make_day(self, run: Run, day: int) -> None:
         """Before the first result of a day."""
+
+    def writes(self, run: Run) -> None:
+        """Before a transaction adds results: several monitors on one database add theirs one after the other."""
 
     def forget(self, run: Run, day: int, sensor: int) -> None:
         """The results of a sensor on this day are summarised."""
@@ -85,6 +88,9 @@ class Sqlite:
 
     def make_day(self, run: Run, day: int) -> None:
         pass
+
+    def writes(self, run: Run) -> None:
+        pass  # one monitor has the file
 
     def forget(self, run: Run, day: int, sensor: int) -> None:
         run("DELETE FROM result WHERE sensor = :sensor AND day = :day", sensor=sensor, day=day)
@@ -149,6 +155,9 @@ class Postgres:
         self._lock(run)
         self._partition(run, day)
 
+    def writes(self, run: Run) -> None:
+        self._lock(run)  # transactions that change the same rows in another order would wait for each other
+
     def forget(self, run: Run, day: int, sensor: int) -> None:
         pass  # with the partition
 
@@ -160,7 +169,7 @@ class Postgres:
 
     @staticmethod
     def _lock(run: Run) -> None:
-        run("SELECT pg_advisory_xact_lock(:key)", key=_SETTING_UP)
+        run("SELECT pg_advisory_xact_lock(:key)", key=_LOCK)
 
     @staticmethod
     def _partition(run: Run, day: int) -> None:

@@ -21,6 +21,8 @@ from agent.monitor.fleet import Fleet
 
 RECONNECT_S = 2.0  # s between two attempts to reach a router
 CLOSE_S = 2.0
+# Results in one transaction at most: what PostgreSQL takes for one is shared, and SQLite delays no question for long.
+BATCH = 100
 TOKENS = 10_000  # changes of presence that may wait
 
 _log = logging.getLogger(__name__)
@@ -101,16 +103,17 @@ class Following:
                     thread.join(CLOSE_S)
 
     def _take(self, consumer: Consumer) -> None:
-        for result in consumer:
-            if not result.confirmed:
-                self.unconfirmed += 1
-                continue
-            a = result.address
-            if not self._fleet.admits(a):
-                continue
-            result.fields["signed_by"] = result.signed_by
-            self._database.add(result)
-            self._fleet.take(a.site, a.gateway, a.sensor, a.what, result.fields)
+        for batch in consumer.batches(BATCH):
+            confirmed = [result for result in batch if result.confirmed]
+            self.unconfirmed += len(batch) - len(confirmed)
+            shown = [result for result in confirmed if self._fleet.admits(result.address)]
+            for result in shown:
+                result.fields["signed_by"] = result.signed_by
+            if shown:
+                self._database.add(shown)
+            for result in shown:
+                a = result.address
+                self._fleet.take(a.site, a.gateway, a.sensor, a.what, result.fields)
 
     def _watch(self, tokens: zenoh.Subscriber[zenoh.Handler[zenoh.Sample]]) -> None:
         for token in tokens:

@@ -176,7 +176,7 @@ def test_no_text_of_the_bus_becomes_part_of_the_page(served: Served) -> None:
         assert isinstance(fields, dict)
         assert HOSTILE in fields.values()
         address = Address("site", "gw", "mems", what)
-        served.database.add(Received("", address, number, fields, None))
+        served.database.add([Received("", address, number, fields, None)])
         served.fleet.take("site", "gw", "mems", what, fields)
     told = {"state": HOSTILE, "reasons": [HOSTILE], "version": HOSTILE, "t_utc_ns": 1}
     served.fleet.set_told("site", "gw", msgspec.json.encode(told))

@@ -136,6 +136,11 @@ class Monitor:
         rows: list[dict[str, Any]] = self.get("api/fleet")["sensors"]
         return rows
 
+    def kill(self) -> None:
+        """Kill -9."""
+        self._process.kill()
+        self._process.communicate()
+
     def stop(self) -> None:
         """Ctrl-C. Fails where the program does not end well."""
         self._process.send_signal(signal.SIGINT)

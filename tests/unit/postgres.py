@@ -18,8 +18,11 @@ USER = "fieldcal"
 
 
 @contextmanager
-def postgres() -> Iterator[str]:
-    """Its address. Skips where the server or the extra `fleet` is not installed."""
+def postgres(*, fsync: bool = False) -> Iterator[str]:
+    """Its address. Without `fsync` a power cut may damage it.
+
+    Skips where the server or the extra `fleet` is not installed.
+    """
     pytest.importorskip("sqlalchemy", reason="the extra fleet is not installed")
     pytest.importorskip("psycopg", reason="the extra fleet is not installed")
     if not (BINARIES / "initdb").exists():
@@ -38,7 +41,7 @@ def postgres() -> Iterator[str]:
             assert done.returncode == 0, done.stderr.decode()
 
         run("initdb", "-D", str(data), "-U", USER, "-A", "trust", "--no-sync", "--locale=C", "-E", "UTF8")
-        options = f"-k {place} -c listen_addresses='' -c fsync=off"
+        options = f"-k {place} -c listen_addresses='' -c fsync={'on' if fsync else 'off'}"
         run("pg_ctl", "-D", str(data), "-l", str(place / "log"), "-o", options, "-w", "start")
         try:
             yield f"postgresql://{USER}@/postgres?host={place}"

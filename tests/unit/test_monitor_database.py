@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
 from pathlib import Path
 from threading import Thread
 from typing import Any
@@ -42,10 +42,9 @@ class Kept:
         self.database = Database(engine, full_days=full_days, now_ns=lambda: self.now_ns)
 
     def add(self, result: Result, t_utc_ns: int, epoch: str = "", **more: Any) -> dict[str, Any]:
-        fields = msgspec.json.decode(msgspec.json.encode(result)) | {"t_utc_ns": t_utc_ns} | more
-        address = Address(*PLACE[:2], result.sensor, result.what)
-        self.database.add(Received("", address, result.sequence, fields, None, epoch=epoch))
-        return fields
+        received = received_from(result, t_utc_ns, epoch, **more)
+        self.database.add([received])
+        return received.fields
 
     def rows(self, what: str, limit: int = 1000) -> list[dict[str, Any]]:
         return self.database.history(*PLACE, what, limit)
@@ -55,6 +54,12 @@ class Kept:
         while self.database.summarise():
             steps += 1
         return steps
+
+
+def received_from(result: Result, t_utc_ns: int, epoch: str = "", **more: Any) -> Received:
+    fields = msgspec.json.decode(msgspec.json.encode(result)) | {"t_utc_ns": t_utc_ns} | more
+    address = Address(*PLACE[:2], result.sensor, result.what)
+    return Received("", address, result.sequence, fields, None, epoch=epoch)
 
 
 @pytest.fixture(params=["SQLite", "PostgreSQL"])
@@ -87,6 +92,48 @@ def test_results_come_back_whole_in_order_and_each_once(kept: Kept) -> None:
     kept.add(status(1), START, epoch="ab")
     kept.add(status(0), START, epoch="ab")
     assert list(kept.database.last_sequence().items()) == [("site/gw", 5), ("site/gw/ab", 1)]
+
+
+def test_results_of_one_batch_are_kept_as_one_by_one(kept: Kept) -> None:
+    batch = [received_from(calibration(k), START + k) for k in (1, 2, 2, 3)]
+    batch += [received_from(window(4), START, epoch="ab"), received_from(calibration(5, qz_known=False), START + 5)]
+    kept.database.add(batch)
+    assert kept.rows("calibration") == [batch[k].fields for k in (0, 1, 3, 5)]
+    with kept.engine.transaction() as run:
+        assert run("SELECT count(detail) FROM result") == [(2,)]
+    assert [fields["sequence"] for *_, fields in kept.database.newest()] == [4, 5]
+    assert kept.database.last_sequence() == {"site/gw/ab": 4, "site/gw": 5}
+
+
+@pytest.mark.parametrize("broken", ["INSERT INTO result", "INSERT INTO newest", "INSERT INTO followed"])
+def test_a_batch_that_fails_leaves_nothing_and_can_be_added_again(
+    kept: Kept, broken: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    batch = [received_from(calibration(k), START + k) for k in (1, 2, 3)]
+    transaction = kept.engine.transaction
+
+    @contextmanager
+    def failing() -> Iterator[Any]:
+        with transaction() as run:
+            seen: list[str] = []
+
+            def query(sql: str, /, **values: object) -> Any:
+                seen.append(sql)
+                rows = run(sql, **values)
+                if sum(sql.startswith(broken) for sql in seen) == (2 if "result" in broken else 1):
+                    raise sqlite3.OperationalError("disk I/O error")
+                return rows
+
+            yield query
+
+    monkeypatch.setattr(kept.engine, "transaction", failing)
+    with pytest.raises(sqlite3.OperationalError):
+        kept.database.add(batch)
+    monkeypatch.setattr(kept.engine, "transaction", transaction)
+    assert (kept.rows("calibration"), kept.database.last_sequence(), kept.database.newest()) == ([], {}, [])
+    kept.database.add(batch)
+    assert kept.rows("calibration") == [received.fields for received in batch]  # with their covariance
+    assert kept.database.last_sequence() == {"site/gw": 3}
 
 
 def test_a_covariance_is_kept_when_it_changed_and_read_with_every_result(kept: Kept) -> None:

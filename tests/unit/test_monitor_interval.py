@@ -104,7 +104,7 @@ def test_the_advice_of_a_sensor_names_the_parameter_that_changes_most(tmp_path: 
         made = calibration(k + 1, sxx=26154.0 + 2.0 * k)  # 2 in 30 days, against U = 12
         fields = msgspec.json.decode(msgspec.json.encode(made))
         fields |= {"t_utc_ns": 30 * k * DAY_NS, "shared_errors": [shared | {"certificate_sha256": f"{k // 5}"}]}
-        database.add(Received("", Address(*place, "calibration"), k + 1, fields, None))
+        database.add([Received("", Address(*place, "calibration"), k + 1, fields, None)])
         fleet.take(*place, "calibration", fields)
     sensor, reference = advisor.advice(place)
     assert sensor["subject"] == "mems"

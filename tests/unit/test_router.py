@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import resource
 import signal
 import socket
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 import zenoh
@@ -126,3 +128,17 @@ def test_what_is_no_endpoint_or_configuration_is_status_2(arguments: tuple[str, 
     router = router_process(*arguments)
     said, faults = router.communicate(timeout=5)
     assert (router.returncode, said, faults.count("\n")) == (2, "", 1)
+
+
+def test_sessions_of_many_gateways_do_not_try_again_at_the_same_moment() -> None:
+    """Each draws its first wait, and waits 10 s at most; a session of which there is one only keeps Zenoh's own."""
+
+    def retry(**more: Any) -> Any:
+        return json.loads(session_config("client", connect=["tcp/127.0.0.1:1"], **more).get_json("connect/retry"))
+
+    first_ms = [retry(one_of_many=True)["period_init_ms"] for _ in range(100)]
+    assert min(first_ms) >= 500
+    assert max(first_ms) <= 1500
+    assert len(set(first_ms)) > 50
+    assert retry(one_of_many=True)["period_max_ms"] == 10_000
+    assert retry() == json.loads(zenoh.Config().get_json("connect/retry"))

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
+import time
 from collections import Counter
 from collections.abc import Iterator
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -17,7 +20,9 @@ from agent.cli.simulate import simulate
 from agent.config.known_keys import add_key
 from agent.core.events import DriftReport, StatusChange, WindowReport
 from agent.delivery.consumer import Consumer, Received
+from agent.fleet import simulated_processes
 from agent.fleet.simulated import ODD, SimulatedFleet, behaviours
+from agent.fleet.simulated_processes import FleetProcesses
 from agent.fleet.simulated_sensor import SimulatedSensor
 from tests.unit.zenoh_site import Site, taken_until, wait_for
 
@@ -125,3 +130,47 @@ def test_options_that_do_not_belong_together() -> None:
 def test_an_invalid_endpoint_is_bad_input() -> None:
     done = CliRunner().invoke(simulate, ["--fleet", "2", "--connect", "nonsense"], standalone_mode=False)
     assert (done.return_value, "not an endpoint" in done.stderr) == (2, True)
+
+
+def test_a_fleet_in_several_processes_is_the_same_fleet(
+    site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(simulated_processes, "GATEWAYS_EACH", 4)
+    with (
+        SimulatedFleet(9, 1, 7, [site.endpoint], tmp_path / "one") as one,
+        FleetProcesses(9, 1, 7, [site.endpoint], tmp_path / "many") as many,
+    ):
+        assert len(set(many.pids())) == 3
+        assert sorted((g.name, g.behaviour, g.public_key) for g in many.gateways) == [
+            (g.name, g.behaviour, g.public_key) for g in one.gateways
+        ]
+        before = many.last_sequence()
+        begun_s = time.monotonic()
+        results = many.step(T_NS, 1.5)
+        assert time.monotonic() - begun_s > 1.0
+        after = many.last_sequence()
+        assert results == one.step(T_NS) == sum(after.values()) - sum(before.values())
+        assert all(after[name] > before[name] for name in after)
+
+
+def test_gateways_make_their_results_one_after_the_other(site: Site, tmp_path: Path) -> None:
+    with (
+        SimulatedFleet(5, 1, 1, [site.endpoint], tmp_path) as fleet,
+        consumer_of(site, fleet, tmp_path) as consumer,
+    ):
+        fleet.step(T_NS, 0.5)
+        times: dict[str, int] = {}
+
+        def all_there(result: Received) -> bool:
+            times[result.address.gateway] = result.fields["t_utc_ns"] - T_NS
+            return len(times) == 5
+
+        taken_until(consumer, all_there, 15.0)
+        assert sorted(times.values()) == [k * 100_000_000 for k in range(5)]
+
+
+def test_a_process_that_ends_is_told(site: Site, tmp_path: Path) -> None:
+    with FleetProcesses(2, 1, 1, [site.endpoint], tmp_path) as fleet:
+        os.kill(fleet.pids()[0], signal.SIGKILL)
+        with pytest.raises(BrokenProcessPool):
+            fleet.step(T_NS)

@@ -1,0 +1,111 @@
+"""A simulated fleet in several processes, because a process of Python slows down with the number of its threads."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import AbstractContextManager, ExitStack, suppress
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+from agent.delivery.session import session_config
+from agent.fleet.simulated import SimulatedFleet
+from agent.fleet.simulated_sensor import Behaviour
+from agent.fleet.workers import begin
+
+# Gateways in one process, with two threads each that wake up 15 times a second. docs/fleet.md has what more would cost.
+GATEWAYS_EACH = 100
+NICE = 10  # gateways are other machines: simulated ones leave the processor to a router and a monitor on this one
+
+_part: SimulatedFleet  # in a process of the fleet: its gateways
+Value = TypeVar("Value")
+
+
+class Named(NamedTuple):
+    """A gateway of the fleet. `source`: `<site>/<gateway>`; `public_key`: of its signatures, 32 bytes."""
+
+    name: str
+    source: str
+    behaviour: Behaviour
+    public_key: bytes
+
+
+class FleetProcesses(AbstractContextManager["FleetProcesses"]):
+    """`count` gateways with `sensors` sensors each, in processes of at most GATEWAYS_EACH, which open one by one.
+
+    `unconnected`: the number of gateways that found no router. The processes end with this process.
+    Raises EndpointError, StoreError; the methods raise BrokenProcessPool where a process has ended.
+    """
+
+    def __init__(self, count: int, sensors: int, seed: int, connect: Sequence[str], data_dir: Path) -> None:
+        session_config("client", connect=connect)  # raises EndpointError here rather than in another process
+        parts = -(-count // GATEWAYS_EACH)
+        self.gateways: list[Named] = []
+        self.unconnected = 0
+        self._parts: list[ProcessPoolExecutor] = []
+        spawn = multiprocessing.get_context("spawn")  # Zenoh does not work in a forked process
+        with ExitStack() as opened:
+            for part in range(parts):
+                process = opened.enter_context(ProcessPoolExecutor(1, mp_context=spawn, initializer=_begin))
+                numbers = range(part, count, parts)
+                gateways, unconnected = process.submit(
+                    _open, count, sensors, seed, connect, data_dir, numbers).result()  # fmt: skip
+                opened.callback(_leave, process)
+                self._parts.append(process)
+                self.gateways += gateways
+                self.unconnected += unconnected
+            self._opened = opened.pop_all()
+
+    def step(self, t_utc_ns: int, within_s: float = 0.0) -> int:
+        """As SimulatedFleet.step, in each process."""
+        return sum(self._each(_step, t_utc_ns, within_s))
+
+    def last_sequence(self) -> dict[str, int]:
+        """The number of the last result of each gateway, by its name."""
+        return {name: last for part in self._each(_last_sequence) for name, last in part.items()}
+
+    def pids(self) -> list[int]:
+        """Of its processes."""
+        return self._each(os.getpid)
+
+    def names_of(self, behaviour: Behaviour) -> list[str]:
+        """The gateways that behave so."""
+        return sorted(gateway.name for gateway in self.gateways if gateway.behaviour == behaviour)
+
+    def __exit__(self, *_: object) -> None:
+        self._opened.close()
+
+    def _each(self, what: Callable[..., Value], *arguments: Any) -> list[Value]:
+        """What the function gives in each process, where they run at the same time."""
+        return [future.result() for future in [part.submit(what, *arguments) for part in self._parts]]
+
+
+def _leave(process: ProcessPoolExecutor) -> None:
+    with suppress(BrokenProcessPool):  # it has ended
+        process.submit(_close).result()
+
+
+def _begin() -> None:
+    begin()
+    os.nice(NICE)
+
+
+def _open(*made: Any) -> tuple[list[Named], int]:
+    global _part
+    _part = SimulatedFleet(*made)
+    return [Named(g.name, g.source, g.behaviour, g.public_key) for g in _part.gateways], _part.unconnected
+
+
+def _step(t_utc_ns: int, within_s: float) -> int:
+    return _part.step(t_utc_ns, within_s)
+
+
+def _last_sequence() -> dict[str, int]:
+    return {gateway.name: gateway.last_sequence for gateway in _part.gateways}
+
+
+def _close() -> None:
+    _part.__exit__()
