@@ -169,7 +169,7 @@ class Rattling(Harm):
         hits = begins * visit.random.normal(1.0, 0.3, len(felt)) * visit.random.choice([-1.0, 1.0], len(felt))
         cycles = np.arange(int(6.0 / self.frequency_hz / step_s)) * step_s * self.frequency_hz
         rings = np.convolve(hits, np.exp(-cycles / 1.5) * np.sin(2.0 * np.pi * cycles))[: len(felt)]
-        return felt + self.amplitude * visit.level_mps2 * rings[:, None] * np.array([1.0, 0.4, -0.6])
+        return np.asarray(felt + self.amplitude * visit.level_mps2 * rings[:, None] * np.array([1.0, 0.4, -0.6]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -182,8 +182,8 @@ class Slipping(Harm):
     def moved(self, visit: Visit, felt: Array) -> Array:
         if visit.role != "sensor":
             return felt
-        size = np.linalg.norm(felt, axis=1, keepdims=True)
-        return felt * np.minimum(1.0, self.above * visit.level_mps2 / np.maximum(size, np.finfo(float).tiny))
+        size = np.maximum(np.linalg.norm(felt, axis=1, keepdims=True), np.finfo(float).tiny)
+        return np.asarray(felt * np.minimum(1.0, self.above * visit.level_mps2 / size))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -263,6 +263,20 @@ def test_a_window_whose_motion_is_in_one_band_has_finite_derivatives() -> None:
     np.testing.assert_allclose(found[0, 0], -(factors.omega**2), rtol=1e-9)
 
 
+def test_a_channel_with_nothing_but_rounding_says_nothing() -> None:
+    """The power of a silent channel, and that of its derivative, are what rounding leaves: their ratio is no square of
+    a frequency, and was so large that its square overflowed."""
+    u = np.random.default_rng(2).normal(size=(2000, 3))
+    bands = band_sums(u, np.gradient(u, 0.01, axis=0), np.repeat(u[:, :1], 3, axis=1), 100.0)
+    assert bands is not None
+    silent = np.array([1.0, 1.0, 1e-100, 1.0, 1.0, 1e-15, 1.0, 1.0, 1.0])
+    bands = replace(bands, products=bands.products * np.outer(silent, silent))
+    factors = Factors(bands, np.arange(4, 12))
+    with np.errstate(all="raise"):
+        found = _projected(factors, len(POWERS), np.array([1.3, 1.3, 0.0]) * factors.omega[3] ** 2)
+    assert np.all(np.isfinite(found))
+
+
 @pytest.mark.parametrize("seed", [3, 4, 8])
 def test_short_stops_beside_an_ac_coupled_reference_settle(seed: int) -> None:
     """Three stops of 4 s, the last one at the end of the recording, with both instruments alike. A filter below the
