@@ -115,7 +115,7 @@ def truth_line(calibration: CalibrationUpdate, truth: Truth) -> str:
 def publication_line(publication: PublicationState) -> str:
     """What is published, and to which routers."""
     where = ", ".join(publication.endpoints) or "nowhere"
-    link = "connected" if publication.connected else "no connection to a router, results are stored until then"
+    link = "connected" if publication.connected else "no router answers; results wait in the store"
     return f"{publication.key}/** to {where} ({publication.fault or link})"
 
 

@@ -156,8 +156,7 @@ def test_lines_tell_each_thing_once() -> None:
         "one",
         "two",
         "device reference: serial-csv /dev/pts/4, open",
-        "publishing: fieldcal/v1/virtual/bench/** to tcp/127.0.0.1:7447 (no connection "
-        "to a router, results are stored until then)",
+        "publishing: fieldcal/v1/virtual/bench/** to tcp/127.0.0.1:7447 (no router answers; results wait in the store)",
         "mems: window 350.0 to 356.0 s at 30 deg: refused: clipped",
     ]
 
