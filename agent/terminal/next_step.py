@@ -158,7 +158,7 @@ def _stated(channel: Channel, seen: Seen) -> str | None:
     stops = channel.stops
     left = [stop for stop in stops if stop.position not in seen.used] or stops
     used = len(stops) - len(left) if left is not stops else len(stops)
-    return f"{_taken(left[0])} and stay {STAY_S} s ({used} of {len(stops)} positions are used)"
+    return f"{_taken(left[0])} and stay {STAY_S} s (positions used: {used} of {len(stops)})"
 
 
 def _timed(channel: Channel, seen: Seen) -> str | None:

@@ -15,6 +15,7 @@ from agent.recording.writer import Recorder
 from agent.terminal.next_step import Guide
 from agent.terminal.state import DeviceState, RecordingState, Truth, ViewState
 from agent.terminal.view import open_view
+from agent.terminal.wording import gap_line
 from hw.block import BlockFlags, SampleBlock
 
 _log = logging.getLogger(__name__)
@@ -70,7 +71,7 @@ class Watch(logging.Handler):
             self._take_change(event)
         elif isinstance(event, Gap):
             self.state.devices[event.device].gaps += 1
-            self._said.put(f"{event.device}: {event.dropped} {event.unit} dropped, {event.reason}")
+            self._said.put(gap_line(event))
         self.state.take(results)
         self._advise(event, results)
         self._take_said()

@@ -46,7 +46,7 @@ def test_from_plugged_devices_to_a_report(tmp_path: Path) -> None:
     steps = [line for line in output.read_text().splitlines() if line.startswith("sensor: next: ")]
     assert (
         steps[0]
-        == "sensor: next: turn the sensor to theta 35 deg, alpha 0 deg and stay 20 s (0 of 4 positions are used)"
+        == "sensor: next: turn the sensor to theta 35 deg, alpha 0 deg and stay 20 s (positions used: 0 of 4)"
     )
     assert steps[-1].startswith("sensor: next: nothing has to be done")
     assert all(one != other for one, other in pairwise(steps)), "only when it changes"

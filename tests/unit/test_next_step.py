@@ -21,7 +21,7 @@ TIMED = [{**stop, "start_s": 15.0 * k, "stop_s": 15.0 * k + 12.0} for k, stop in
 FACES = [{"gravity_mps2": [sign * 9.81 * (i == k) for k in range(3)]} for i in range(3) for sign in (1, -1)]
 PUBLIC = "dzWPEyU0pMzL6HqvwwMvtIvoksq07njf+E/rdjfIIgM="
 CLOCK = {"t_monotonic_ns": 0, "t_utc_ns": 0}
-FIRST = "turn the sensor to theta 35 deg, alpha 0 deg and stay 20 s (0 of 3 positions are used)"
+FIRST = "turn the sensor to theta 35 deg, alpha 0 deg and stay 20 s (positions used: 0 of 3)"
 
 
 def configured(commands: bool = False, *, reference: bool = True, **channel: Any) -> Config:
@@ -62,7 +62,7 @@ def test_each_position_that_is_left_is_named_in_turn() -> None:
     guide = Guide(configured(positions=CLAMP), turns_itself=False)
     assert said(guide, status(1, "UNCALIBRATED")) == FIRST
     told = said(guide, used("theta 35 deg, alpha 0 deg"), status(2, "COLLECTING"))
-    assert told == "turn the sensor to theta 35 deg, alpha 120 deg and stay 20 s (1 of 3 positions are used)"
+    assert told == "turn the sensor to theta 35 deg, alpha 120 deg and stay 20 s (positions used: 1 of 3)"
     assert said(guide, used("theta 35 deg, alpha 0 deg")) == told, "the same position once more"
     assert "alpha 240" in said(guide, used("theta 35 deg, alpha 120 deg"))
     told = said(guide, used("theta 35 deg, alpha 240 deg"), calibration(3), status(4))
@@ -98,7 +98,7 @@ def test_rests_are_told_by_the_axis_that_points_up() -> None:
     config = configured(reference=False, positions=FACES)
     guide = Guide(config, turns_itself=False)
     told = said(guide, status(1, "UNCALIBRATED"))
-    assert told == "put the sensor down with its +x axis up and stay 20 s (0 of 6 positions are used)"
+    assert told == "put the sensor down with its +x axis up and stay 20 s (positions used: 0 of 6)"
     assert "its -x axis up" in said(guide, used(config.channels[0].stops[0].position))
 
 
