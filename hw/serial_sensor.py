@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import errno
+import os
 import termios
 import time
 from abc import ABC, abstractmethod
@@ -26,6 +28,14 @@ BLOCK_BYTES = 262144  # upper limit of the bytes of a block; 0.5 s at 4 Mbaud is
 LONGEST_GAP_S = 10.0  # a longer jump of the sequence number means that the counter restarted or the number was damaged
 # Pyserial raises any of these when the port is unplugged; termios.error is not an OSError
 LOST = (serial.SerialException, OSError, termios.error)
+
+
+def reason_of(error: Exception) -> str:
+    """Why a port was lost: what the system says, which pyserial repeats in words of its own."""
+    number = getattr(error, "errno", None)
+    if number == errno.EWOULDBLOCK:
+        return "another program has locked it"
+    return os.strerror(number) if number else str(error)
 
 
 class SerialOptions(Options):
@@ -95,7 +105,7 @@ class SerialSensor(ABC):
         try:
             port = serial.Serial(options.port, options.baud_rate, timeout=BLOCK_S, exclusive=True)
         except LOST as error:
-            raise DeviceLost(f"port {options.port}: {error}") from error
+            raise DeviceLost(f"port {options.port}: {reason_of(error)}") from error
         except ValueError as error:
             raise ConfigurationError(f"port {options.port}, baud_rate {options.baud_rate}: {error}") from error
         self._port = port
@@ -103,7 +113,7 @@ class SerialSensor(ABC):
             info = self._set_up(port)
         except LOST as error:
             self.close()
-            raise DeviceLost(f"port {options.port}: {error}") from error
+            raise DeviceLost(f"port {options.port}: {reason_of(error)}") from error
         except BaseException:
             self.close()
             raise
@@ -144,7 +154,7 @@ class SerialSensor(ABC):
                 data = port.read(min(max(1, port.in_waiting), READ_BYTES))
             except LOST as error:
                 # Raised after all earlier samples have been returned
-                self._loss = DeviceLost(f"port {self._options.port}: {error}")
+                self._loss = DeviceLost(f"port {self._options.port}: {reason_of(error)}")
                 break
             now_ns, utc_ns = self._clock()
             if not data:

@@ -12,6 +12,7 @@ from calib.distributions import chi2_quantile
 from calib.estimate.adjustment import Adjustment, adjust
 from calib.estimate.next_stop import Expected, Joint, Plan, Suggestion, Told, Wanted
 from calib.estimate.nuisances import Priors
+from calib.estimate.quantities import S_AND_Q
 from calib.estimate.stop_order import stops_ahead
 from calib.excitation.sums import factor
 from calib.model import Window
@@ -25,6 +26,7 @@ DECISIVE_CHI2 = 25.0
 DOUBTED = 2.5  # standard uncertainties by which a stated value may be off before it is doubted
 SCATTERED = 1.3  # times the stated scatter of the offset from which a person is told
 FEWEST_WITNESSES = 3  # stops from which on one of them can be found to be wrong, and not the newest
+MOST_SESSIONS = 0.95
 MOST_AHEAD = 100  # stops that are planned ahead
 # Before the first window: 5 m/s2 of motion and 2 mg of noise, in so many points that the noise does not matter, since
 # a stay lasts until it does not.
@@ -50,11 +52,14 @@ class Fit:
 class Outlook:
     """How many stops are still needed, None if MOST_AHEAD do not reach what is wanted.
 
+    `mostly`, before the first stop: how many are enough in MOST_SESSIONS, since few rests may show more scatter of the
+    offsets than there is.
     `best` is the uncertainty (main, transverse) after the stops that were planned. `floor` (main, transverse) is left
     after any number of stops, and `because` names the quantity behind it; "" if what is wanted can be reached.
     """
 
     stops: int | None
+    mostly: int | None
     best: tuple[float, float]
     floor: tuple[float, float]
     because: str
@@ -121,7 +126,23 @@ class Session:
         if not self.wanted.reached(left):
             over = {name: float(np.max(each / self.wanted.by_parameter)) for name, each in without.items()}
             because = min(over, key=lambda name: over[name]) if over else ""
-        return Outlook(stops, (last.main, last.transverse), (floor.main, floor.transverse), because)
+        mostly = self._mostly(stops) if stops is not None and not self.windows else stops
+        return Outlook(stops, mostly, (last.main, last.transverse), (floor.main, floor.transverse), because)
+
+    def _mostly(self, stops: int) -> int:
+        """So many stops that MOST_SESSIONS need no more.
+
+        The adjustment takes the larger of the stated scatter of the offsets and of the one that it sees, which has
+        three degrees of freedom for each rest, less the twelve of S and Q. Motion tells more, so that it needs no more.
+        """
+        for count in range(stops, MOST_AHEAD if self.expected.rms_mps2 == 0.0 else stops):
+            if (freedom := 3 * count - len(S_AND_Q)) <= 0:
+                continue  # the scatter is not seen yet, and the next rest may show a large one
+            seen = np.sqrt(chi2_quantile(MOST_SESSIONS, freedom) / freedom)
+            wanted = Wanted(self.wanted.main / seen, self.wanted.transverse / seen)
+            if len(stops_ahead(self.plan, self.joint, self.expected, wanted, MOST_AHEAD)) <= count:
+                return count
+        return stops
 
     def fit(self, stop: int, window: Window) -> Fit:
         """Whether a window fits this stop, by all that is known before it."""

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import click
 
 from agent.config.key_file import KeyFileError, load_private_key
-from agent.config.reading import ConfigError, load_model
+from agent.config.reading import ConfigError
 from agent.terminal.text import say
 
 _FILE = click.Path(path_type=Path, dir_okay=False)
@@ -15,8 +17,10 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
 
 @click.command()
 @click.argument("inputs", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="INPUT...")
-@click.option("--stated", type=_FILE, required=True, metavar="certificate.toml",
+@click.option("--stated", type=_FILE, metavar="certificate.toml",
               help="What only people know: organisation, customer, serial numbers, dates.")  # fmt: skip
+@click.option("--state", "entries", multiple=True, metavar="ENTRY=VALUE",
+              help="One of these statements, as customer.city=Pescara; repeat it for more.")  # fmt: skip
 @click.option("-o", "--output", type=click.Path(path_type=Path, file_okay=False), required=True, metavar="DIR",
               help="Directory for certificate.pdf, .html, .xml and .json.")  # fmt: skip
 @click.option("--key", type=_FILE, help="Ed25519 private key (PEM) that signs the certificate.")
@@ -24,43 +28,47 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
 @click.option("--x509-certificate", type=_FILE, help="Its X.509 certificate (PEM), then those of the authorities.")
 @click.option("--xsd", type=_FILE, help="dcc.xsd of PTB, with SI_Format.xsd beside it: the XML is checked against it.")
 @click.option("--sensor", metavar="NAME", help="The sensor, if the input has several.")
-def certificate(
-    inputs: tuple[Path, ...],
-    stated: Path,
-    output: Path,
-    key: Path | None,
-    x509_key: Path | None,
-    x509_certificate: Path | None,
-    xsd: Path | None,
-    sensor: str | None,
-) -> int:
+def certificate(inputs: tuple[Path, ...], output: Path, **options: Any) -> int:
     """Make a calibration certificate.
 
     INPUT is RESULT.json of `fieldcal calibrate --json RESULT.json`, a recording (several of one sensor are read one
     after the other), or the data directory of an agent: its calibration in force.
 
+    Statements that are in neither --stated nor --state are asked on a terminal. What is not only in a file is kept in
+    DIR/certificate.toml: give it as --stated the next time.
+
     Exit status 3 if the data were refused: then there is no certificate. 2 if the input cannot be used.
     """
+    return make(inputs, output, **options)
+
+
+def make(
+    inputs: Sequence[Path],
+    output: Path,
+    *,
+    stated: Path | None,
+    entries: Sequence[str] = (),
+    key: Path | None = None,
+    x509_key: Path | None = None,
+    x509_certificate: Path | None = None,
+    xsd: Path | None = None,
+    sensor: str | None = None,
+) -> int:
+    """Make a certificate of `inputs` in the directory `output`, and say so; the exit status of the command."""
     if (x509_key is None) != (x509_certificate is None):
         raise click.UsageError("--x509-key and --x509-certificate must be given together")
-    try:
-        import matplotlib  # noqa: F401 - imported to check for it before any other work
-    except ImportError:
-        say(
-            "fieldcal certificate: the PDF needs matplotlib; install it with: fieldcal extras --install report",
-            err=True,
-        )
+    if not drawable():
         return 1
     from agent.certificate.content import CertificateError, certificate_of
     from agent.certificate.schema import SchemaError
-    from agent.certificate.statements import Statements
+    from agent.certificate.stating import gather_statements
     from agent.certificate.writing import write
     from agent.certificate.x509 import X509Signer
     from agent.report.material import MaterialError, gather
     from agent.report.writing import left_over
+    from agent.setup.asking import Asking
 
     try:
-        told = load_model(stated, Statements)
         private = None if key is None else load_private_key(key)
         x509 = X509Signer.load(x509_key, x509_certificate) if x509_key and x509_certificate else None
         material = gather(inputs, sensor)
@@ -70,13 +78,16 @@ def certificate(
             for reason in material.results[0].reasons:
                 say(f"refused: {reason}", err=True)
             return 3
-        written = write(certificate_of(material, told, stated.parent, left_over(material)), output, private, xsd, x509)
+        told, text = gather_statements(stated, entries, Asking())
+        beside = Path() if stated is None else stated.parent
+        written = write(certificate_of(material, told, beside, left_over(material)), output, private, xsd, x509)
+        written += _kept(text, output / "certificate.toml", stated)
     except (ConfigError, KeyFileError, MaterialError, SchemaError) as error:
         for line in str(error).splitlines():
             say(f"fieldcal certificate: {line}", err=True)
         return 2
     except CertificateError as error:
-        say(f"fieldcal certificate: {stated}: {error}", err=True)
+        say(f"fieldcal certificate: {stated or '--state'}: {error}", err=True)
         return 2
     except OSError as error:
         say(f"fieldcal certificate: {error.filename or output}: {error.strerror}", err=True)
@@ -86,3 +97,22 @@ def certificate(
     for path in written:
         say(str(path))
     return 0
+
+
+def drawable() -> bool:
+    """Whether matplotlib is installed, which draws the PDF; if not, say what installs it."""
+    try:
+        import matplotlib  # noqa: F401 - imported to check for it before any other work
+    except ImportError:
+        told = "the PDF needs matplotlib; install it with: fieldcal extras --install report"
+        say(f"fieldcal certificate: {told}", err=True)
+        return False
+    return True
+
+
+def _kept(text: str, path: Path, stated: Path | None) -> list[Path]:
+    """Write the statements into the directory of the certificate, but not over the file that states the others."""
+    if not text or (stated is not None and stated.resolve() == path.resolve()):
+        return []
+    path.write_text(text, encoding="utf-8")
+    return [path]

@@ -11,6 +11,7 @@ import click
 
 from agent.config import Config, ConfigError, load_config
 from agent.config.tls import expiry_warning
+from agent.terminal.quantity import counted
 from agent.terminal.text import say
 
 
@@ -44,10 +45,9 @@ def check(config: Path, json_to: str | None) -> int:
         return 0
     for warning in warnings:
         say(warning, err=True)
-    told = f"{counts['poses']} poses" + (
-        f", {stops} positions that the agent finds" if (stops := counts["positions"]) else ""
-    )
-    say(f"{config}: good; {counts['devices']} devices, {counts['channels']} channels, {told}")
+    told = [counted(count, name) for name, count in counts.items() if count or name in ("devices", "channels")]
+    found = ", which the agent finds by gravity" if counts["positions"] else ""
+    say(f"{config}: good; {', '.join(told)}{found}")
     return 0
 
 

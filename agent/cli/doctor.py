@@ -17,6 +17,7 @@ from agent.delivery.history import FILE_NAME, History, StoreError
 from agent.setup import device_checks, machine_checks
 from agent.setup.finding import Finding
 from agent.setup.running import agent_runs
+from agent.terminal.quantity import counted
 from agent.terminal.text import say
 from hw.sensor import Options
 
@@ -48,7 +49,7 @@ def doctor(config: Path | None, data_dir: Path, measure_s: float | None, json_to
             say(f"{WORDS[finding.verdict]}  {finding.check}: {finding.says}")
             if finding.remedy:
                 say(f"        remedy: {finding.remedy}")
-        say(f"{count['fault']} faults, {count['advice']} pieces of advice")
+        say(f"{counted(count['fault'], 'faults')}, {counted(count['advice'], 'pieces')} of advice")
     return 3 if count["fault"] else 0
 
 

@@ -47,19 +47,13 @@ def check_stated(path: Path) -> None:
 def made(options: dict[str, Any], output: Path, stated: Path | None) -> int:
     """Make the result from the files as `fieldcal calibrate` does, and the certificate."""
     from agent.cli.calibrate import calibrate
-    from agent.cli.certificate import certificate
+    from agent.cli.certificate import make
 
     assert calibrate.callback is not None
-    assert certificate.callback is not None
     status = int(calibrate.callback(**options))
     if status or stated is None:
         return status
-    return int(
-        certificate.callback(
-            inputs=(output / "result.json",), stated=stated, output=output / "certificate", key=None, xsd=None,
-            sensor=None,
-        )
-    )  # fmt: skip
+    return make((output / "result.json",), output / "certificate", stated=stated)
 
 
 def ask(prompt: str, *, err: bool = False) -> str | None:

@@ -180,8 +180,10 @@ def _print(buses: list[Bus], ports: list[dict[str, str]]) -> None:
             for line in _self_test_lines(answer.self_test):
                 say(f"        {line}")
     for port in ports:
-        details = ", ".join(text for text in (port["description"], port["serial_number"]) if text)
-        say(f"{port['port']}: {details or 'no details'}")
+        known = [text for text in (port["description"], port["serial_number"]) if text not in ("", "n/a")]
+        say(f"{port['port']}: serial port, {', '.join(known) or 'of which the system knows nothing more'}")
+    if ports:
+        say("a port is not opened here; `fieldcal init --sensor-port PORT` listens to it")
 
 
 def _self_test_lines(result: dict[str, Any] | None) -> Iterator[str]:

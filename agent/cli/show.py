@@ -15,7 +15,7 @@ from agent import __version__
 from agent.core.events import RESULTS, CalibrationUpdate, StatusChange, WindowReport
 from agent.delivery.calibrations import calibrations
 from agent.delivery.history import FILE_NAME, History, Record, StoreError
-from agent.terminal.quantity import size
+from agent.terminal.quantity import counted, size
 from agent.terminal.text import one_line, say
 
 if TYPE_CHECKING:
@@ -127,7 +127,7 @@ def _print(overview: Overview) -> None:
     names = [name for name, _ in overview.recordings]
     span = f": {' to '.join(dict.fromkeys((names[0], names[-1])))}" if names else ""
     total = size(sum(octets for _, octets in overview.recordings))
-    console.print_line(f"{len(names)} recordings in {overview.data_dir}, {total}{span}")
+    console.print_line(f"{counted(len(names), 'recordings')} in {overview.data_dir}, {total}{span}")
 
 
 def _print_sensor(console: TextConsole, sensor: str, held: SensorHistory) -> None:
@@ -159,7 +159,7 @@ def _print_sensor(console: TextConsole, sensor: str, held: SensorHistory) -> Non
     for what, records in held.routine.items():
         console.print(f"  newest {what} results" if records else f"  no {what} result yet", style="dim")
         for record in records:
-            words = result_lines(record.result, None)[0]
+            words = result_lines(record.result, None)[0].removeprefix(f"{sensor}: ")
             console.print_line(f"    {_time(record.t_utc_ns)}  {words}")
     console.print()
 
@@ -179,7 +179,7 @@ def _print_calibration(console: TextConsole, calibration: CalibrationUpdate) -> 
     console.print(table)
     for line in (
         f"S in {unit} per m/s², Q in {unit}, {uncertainty_words(calibration)}",
-        f"{calibration.method}, {calibration.windows} windows, {_since(calibration)}",
+        f"method {calibration.method}, {counted(calibration.windows, 'windows')}, {_since(calibration)}",
         f"of {calibration.identity}",
     ):
         console.print_line(f"  {line}")

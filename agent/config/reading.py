@@ -38,20 +38,25 @@ class ConfigError(Exception):
 
 def load_config(path: FilePath) -> Config:
     """Read and check a TOML file, and the files it names. Raises ConfigError with all faults."""
-    raw, text = _read_toml(path)
+    raw, text = read_toml(path)
     return parse_config(raw, str(path), text)
 
 
 def load_model(path: FilePath, kind: type[Model]) -> Model:
     """Read and check a TOML file that holds one model. Raises ConfigError with all faults."""
-    raw, text = _read_toml(path)
+    raw, text = read_toml(path)
+    return check_model(raw, kind, str(path), text)
+
+
+def check_model(raw: dict[str, Any], kind: type[Model], origin: str, text: str = "") -> Model:
+    """Check the values of one model, as `parse_config` does those of a configuration. Raises ConfigError."""
     try:
         return kind.model_validate(raw)
     except ValidationError as error:
-        raise _refused(list(told(error, raw)), str(path), text) from None
+        raise _refused(list(told(error, raw)), origin, text) from None
 
 
-def _read_toml(path: FilePath) -> tuple[dict[str, Any], str]:
+def read_toml(path: FilePath) -> tuple[dict[str, Any], str]:
     """The values of a TOML file, and its text. Raises ConfigError."""
     try:
         text = read_file(path, LARGEST_FILE).decode("utf-8")

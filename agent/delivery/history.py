@@ -125,7 +125,7 @@ class History:
     def __init__(self, path: Path) -> None:
         self._path = path
         if not path.is_file():
-            raise StoreError(f"{path}: there is no such file")
+            raise StoreError(f"{path}: there is no such file; `fieldcal run` makes it in its data directory")
         self._connection = connect_read_only(path)
         try:
             version = version_of(self._connection)

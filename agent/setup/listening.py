@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import selectors
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 
@@ -13,7 +13,7 @@ import numpy as np
 import serial
 
 from hw.lines import decode
-from hw.serial_sensor import LOST, READ_BYTES
+from hw.serial_sensor import LOST, READ_BYTES, reason_of
 
 FIRST_LINE_S = 5.0  # opening the port restarts some boards, which need two seconds
 LISTEN_S = 3.0  # a burst of 20 ms at each end changes the rate by 1 % at most
@@ -62,7 +62,7 @@ def hear(ports: Mapping[str, int]) -> dict[str, Heard | str]:
             try:
                 port = serial.Serial(path, baud_rate, timeout=0, exclusive=True)
             except (*LOST, ValueError) as error:
-                found[path] = f"cannot be opened: {error}"
+                found[path] = f"cannot be opened: {reason_of(error)}"
                 continue
             stack.callback(port.close)
             lines[path] = _Line(port)
@@ -95,21 +95,27 @@ def _collect(lines: Mapping[str, _Line]) -> None:
 def _understood(line: _Line, baud_rate: int) -> Heard | str:
     if not line.arrivals:
         return f"nothing was sent within {FIRST_LINE_S:g} s"
-    (first_s, begin), (last_s, _) = line.arrivals[0], line.arrivals[-1]
-    text = bytes(line.data)
+    begin, text = line.arrivals[0][1], bytes(line.data)
     begin = text.find(b"\n", begin - 1) + 1  # the first arrival tells when counting begins
     text = text[begin : text.rfind(b"\n") + 1]
     columns = max(range(1, 5), key=lambda count: len(decode(text, count).line))
     values = decode(text, columns).values
-    if len(values) < FEWEST_LINES or last_s <= first_s:
+    if len(values) < FEWEST_LINES or len(line.arrivals) < 2:
         return f"no lines of numbers at {baud_rate} baud ([seq,]x,y,z or [seq,]a)"
     sequence = columns in (2, 4)
     axes = values[:, 1:] if sequence else values
-    counted_hz = len(values) / (last_s - first_s)
+    counted_hz = _octets_per_s(line.arrivals) * len(values) / len(text)
     return Heard(
         axes.shape[1], sequence, counted_hz, _nominal(counted_hz), tuple(axes.mean(axis=0).tolist()),
         bool(np.all(axes == np.round(axes))),
     )  # fmt: skip
+
+
+def _octets_per_s(arrivals: Sequence[tuple[float, int]]) -> float:
+    """Median over pairs of arrivals that are half of the time apart: a stall of this machine delays few of them."""
+    times_s, octets = np.array(arrivals).T
+    half = len(arrivals) // 2
+    return float(np.median((octets[half:] - octets[:-half]) / (times_s[half:] - times_s[:-half])))
 
 
 def _nominal(counted_hz: float) -> float:

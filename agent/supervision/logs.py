@@ -22,7 +22,7 @@ from typing import Any
 import msgspec
 
 from agent.core.events import Command, DeviceChange, Event, Gap, Pruned, Result
-from agent.terminal.wording import result_lines
+from agent.terminal.wording import gap_line, result_lines
 
 _JOURNAL = logging.getLogger("fieldcal")
 WAITING_MAX = 1000  # lines; a journal that hangs costs lines, which are counted, and never a sample
@@ -160,8 +160,7 @@ def log_event(event: Event, results: Sequence[Result]) -> None:
         message = f"{event.device}: {event.state}, {event.message}"
         tell("device", message, event.state == "lost", device=event.device, state=event.state, attempt=event.attempt)
     elif isinstance(event, Gap):
-        message = f"{event.device}: {event.dropped} {event.unit} dropped, {event.reason}"
-        tell("gap", message, True, device=event.device, dropped=event.dropped, unit=event.unit)
+        tell("gap", gap_line(event), True, device=event.device, dropped=event.dropped, unit=event.unit)
     elif isinstance(event, Command):
         refused = f"refused: {event.refused}" if event.refused else "taken"
         tell("command", f"{event.sensor}: command {event.verb} {refused}", bool(event.refused), **_fields(event))

@@ -1,4 +1,4 @@
-"""Writes durations and sizes for people."""
+"""Writes durations, sizes and counts for people."""
 
 from __future__ import annotations
 
@@ -9,6 +9,11 @@ def duration(seconds: float) -> str:
     if whole >= 86400:
         return f"{whole // 86400} d {whole % 86400 // 3600:02d} h"
     return f"{whole // 3600:02d}:{whole % 3600 // 60:02d}:{whole % 60:02d}"
+
+
+def counted(count: int, plural: str) -> str:
+    """A number of things: 1 line, 2 lines."""
+    return f"{count} {plural.removesuffix('s') if count == 1 else plural}"
 
 
 def size(octets: int) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 import time
 from collections.abc import Iterator
 from contextlib import suppress
@@ -68,7 +69,7 @@ class Picture:
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Text]:
         height = (options.height or options.size.height) - 1  # one line is for the cursor
-        top, bottom = self._top(), self._bottom()
+        top, bottom = self._top(options.max_width), self._bottom()
         room = max(0, height - len(top) - len(bottom))
         messages = list(self._state.messages)[-max(1, room // 3) :] if self._state.messages else []
         lines = [*top, *self._windows(room - len(messages)), *bottom, *(Text(f"› {m}", "magenta") for m in messages)]
@@ -77,7 +78,7 @@ class Picture:
             line.overflow = "ellipsis"
             yield line
 
-    def _top(self) -> list[Text]:
+    def _top(self, width: int) -> list[Text]:
         state = self._state
         lines = [
             Text.assemble(
@@ -87,7 +88,7 @@ class Picture:
             )
         ]
         for sensor in sorted(state.statuses.keys() | state.calibrations.keys()):
-            lines += [Text(), *self._sensor(sensor)]
+            lines += [Text(), *self._sensor(sensor, width)]
         lines += [Text(), _heading("device", "kind", "state", "rate", "blocks", "gaps", widths=_DEVICE)]
         for name, device in state.devices.items():
             style = "" if device.state == "open" else "red" if device.state == "lost" else "dim"
@@ -95,11 +96,14 @@ class Picture:
             lines.append(Text(_row(cells, _DEVICE), style))
         return lines
 
-    def _sensor(self, sensor: str) -> list[Text]:
+    def _sensor(self, sensor: str, width: int) -> list[Text]:
         status, calibration = self._state.statuses.get(sensor), self._state.calibrations.get(sensor)
         name = status.status if status else ""
         reason = f"  {one_line(status.reason)}" if status else ""
         lines = [Text.assemble((sensor, "bold"), "  ", (name, STATUS_STYLES.get(name, "cyan")), (reason, "dim"))]
+        if sensor in self._state.next_steps:
+            told = textwrap.wrap(f"next: {one_line(self._state.next_steps[sensor])}", width - 2)
+            lines += [Text(f"  {part}", "bold") for part in told]
         if calibration is None:
             return lines
         return lines + self._calibration(calibration)

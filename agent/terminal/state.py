@@ -57,6 +57,7 @@ class ViewState:
     windows_refused: int = 0
     calibrations: dict[str, CalibrationUpdate] = field(default_factory=dict)
     statuses: dict[str, StatusChange] = field(default_factory=dict)
+    next_steps: dict[str, str] = field(default_factory=dict)  # by sensor: what a person can do next
     truths: dict[str, Truth] = field(default_factory=dict)
     publication: PublicationState | None = None
     recording: RecordingState | None = None

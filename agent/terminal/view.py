@@ -73,6 +73,8 @@ class Lines:
                 self._shown = result.sequence
                 for line in result_lines(result, state.truths.get(result.sensor)):
                     self._write(line)
+        for sensor, step in state.next_steps.items():
+            self._tell(f"{sensor}: next", step)
 
     def close(self) -> None:
         """Write the lines that are not yet written."""

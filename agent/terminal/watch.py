@@ -9,11 +9,13 @@ import time
 from collections import deque
 
 from agent.config import Config
-from agent.core.events import DeviceChange, Event, Gap, Result
+from agent.core.events import DeviceChange, Event, Gap, Result, Tick
 from agent.delivery.publication import PublicationState
 from agent.recording.writer import Recorder
+from agent.terminal.next_step import Guide
 from agent.terminal.state import DeviceState, RecordingState, Truth, ViewState
 from agent.terminal.view import open_view
+from agent.terminal.wording import gap_line
 from hw.block import BlockFlags, SampleBlock
 
 _log = logging.getLogger(__name__)
@@ -38,6 +40,7 @@ class Watch(logging.Handler):
         self._arrivals: dict[str, deque[tuple[int, int]]] = {
             d.name: deque(maxlen=RATE_OVER_BLOCKS) for d in config.devices
         }
+        self._guide = Guide(config, turns_itself=truth is not None)
         self._said: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._began_s = time.monotonic()
 
@@ -68,8 +71,9 @@ class Watch(logging.Handler):
             self._take_change(event)
         elif isinstance(event, Gap):
             self.state.devices[event.device].gaps += 1
-            self._said.put(f"{event.device}: {event.dropped} {event.unit} dropped, {event.reason}")
+            self._said.put(gap_line(event))
         self.state.take(results)
+        self._advise(event, results)
         self._take_said()
         self._view.refresh(now=bool(results))
 
@@ -83,6 +87,14 @@ class Watch(logging.Handler):
         elif self.state.recording is not None:
             self.state.recording.recording = False
         self._view.refresh()
+
+    def _advise(self, event: Event, results: list[Result]) -> None:
+        if not results and isinstance(event, (SampleBlock, Tick)):
+            return  # what comes next follows from devices, commands and results
+        for sensor, step in self._guide.update(event, results).items():
+            if self.state.next_steps.get(sensor) != step:
+                self.state.next_steps[sensor] = step
+                _log.info("%s: next: %s", sensor, step)
 
     def _take_said(self) -> None:
         while not self._said.empty():

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
 
-from agent.core.events import CalibrationUpdate, DriftReport, Estimate, Result, StatusChange, WindowReport
-from agent.terminal.quantity import size
+from agent.core.events import (
+    CalibrationUpdate,
+    ClockReport,
+    DriftReport,
+    Estimate,
+    Gap,
+    Result,
+    StatusChange,
+    WindowReport,
+)
+from agent.terminal.quantity import counted, size
 from calib.model import Array
 from calib.rounding import plus_minus
 
@@ -32,6 +42,8 @@ def result_lines(result: Result, truth: Truth | None) -> list[str]:
         case Estimate():
             lines = [f"{result.sensor}: estimate {result.sequence}, not in force: {result.reason}"]
             return lines + [f"  {row}" for row in calibration_rows(result.calibration)]
+        case ClockReport():
+            return [f"{result.sensor}: {clock_words(result)}"]
         case CalibrationUpdate():
             lines = [f"{result.sensor}: calibration from {result.windows} windows, {uncertainty_words(result)}"]
             lines += [f"  {row}" for row in calibration_rows(result)]
@@ -51,6 +63,23 @@ def _fields(result: Result) -> list[str]:
         elif not (name.startswith("u_") and name[2:] in values):
             words.append(f"{name} {value:.6g}" if isinstance(value, float) else f"{name} {value}")
     return words
+
+
+def clock_words(clock: ClockReport) -> str:
+    """The clock of a device: its rate beside the nominal one, how its bursts arrive, and the lag where it is known."""
+    rate = plus_minus(clock.rate_hz, COVERAGE_FACTOR * clock.u_rate_hz)
+    words = (
+        f"clock of {clock.device}: {rate} Hz, nominal {clock.nominal_rate_hz:g} Hz; bursts come "
+        f"{1e3 * clock.offset_s:.2g} ms late and scatter by {1e3 * clock.jitter_s:.2g} ms"
+    )
+    if not math.isfinite(clock.lag_s):
+        return words
+    return f"{words}; lag {plus_minus(1e3 * clock.lag_s, 1e3 * COVERAGE_FACTOR * clock.u_lag_s)} ms"
+
+
+def gap_line(gap: Gap) -> str:
+    """What was lost between a device and the pipeline, and why."""
+    return f"{gap.device}: {counted(gap.dropped, gap.unit)} dropped: {gap.reason}"
 
 
 def verdict(window: WindowReport) -> str:
@@ -115,7 +144,7 @@ def truth_line(calibration: CalibrationUpdate, truth: Truth) -> str:
 def publication_line(publication: PublicationState) -> str:
     """What is published, and to which routers."""
     where = ", ".join(publication.endpoints) or "nowhere"
-    link = "connected" if publication.connected else "no connection to a router, results are stored until then"
+    link = "connected" if publication.connected else "no router answers; results wait in the store"
     return f"{publication.key}/** to {where} ({publication.fault or link})"
 
 

@@ -197,16 +197,27 @@ class Plan:
 
     def after(self, joint: Joint, stop: int, expected: Expected) -> Joint:
         """What is known after this stop."""
-        new = [j for j, name in enumerate(self._names) if self._own[j, stop] and name not in joint.quantities]
+        joint = self._with(joint, self._own[:, stop])
+        rows, noise = self._rows(joint, expected, [stop])
+        gain = _gain(joint.covariance, rows, noise)
+        return replace(joint, covariance=joint.covariance - (gain @ rows @ joint.covariance)[0])
+
+    def shared(self, joint: Joint) -> Joint:
+        """The same with every quantity that all positions share, also before the first stop.
+
+        What several stops tell together depends on it: an error that they share does not average out.
+        """
+        return self._with(joint, self._common)
+
+    def _with(self, joint: Joint, needed: Flags) -> Joint:
+        """The same with the `needed` ones of all nuisances (J,), as they are known beforehand."""
+        new = [j for j in np.flatnonzero(needed) if self._names[j] not in joint.quantities]
         n, more = len(joint.quantities), len(new)
         covariance = np.zeros((n + more, n + more))
         covariance[:n, :n] = joint.covariance
         covariance[range(n, n + more), range(n, n + more)] = self._u[new] ** 2
-        mean = np.append(joint.mean, np.zeros(more))
-        with_new = Joint(joint.quantities + tuple(self._names[j] for j in new), mean, covariance, joint.scale)
-        rows, noise = self._rows(with_new, expected, [stop])
-        gain = _gain(covariance, rows, noise)
-        return replace(with_new, covariance=covariance - (gain @ rows @ covariance)[0])
+        names = joint.quantities + tuple(self._names[j] for j in new)
+        return Joint(names, np.append(joint.mean, np.zeros(more)), covariance, joint.scale)
 
     def suggestions(self, joint: Joint, expected: Expected, wanted: Wanted) -> list[Suggestion]:
         """All stops, the one that brings S nearest to what is wanted first."""
@@ -243,9 +254,8 @@ class Plan:
 
         And what they would be if a quantity that all positions share were exact, by its name.
         """
-        shared = [name for name, common in zip(self._names, self._common, strict=True) if common]
-        start = self.after(joint, 0, expected)
-        kept = np.array([k < 12 or name in shared for k, name in enumerate(start.quantities)])
+        start = self.shared(joint)
+        kept = np.isin(start.quantities, [q.key for q in S_AND_Q] + list(np.array(self._names)[self._common]))
         start = Joint(
             tuple(name for name, keep in zip(start.quantities, kept, strict=True) if keep),
             start.mean[kept], start.covariance[np.ix_(kept, kept)], start.scale,

@@ -42,7 +42,7 @@ def calibration(
         covariance=[[u[i] ** 2 if i == j else 0.0 for j in range(12)] for i in range(12)],
         coverage_factor=2.0,
         determined=[True] * 11 + [qz_known],
-        method="Method 3 as printed",
+        method="3 (recursive adjustment)",
         uncertainty_kind="type A, white",
         windows=8,
         residual_sd=[10.0] * 3,

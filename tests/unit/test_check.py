@@ -71,7 +71,7 @@ def test_a_sound_configuration_is_good(tmp_path: Path, capsys: pytest.CaptureFix
     path = tmp_path / "gateway.toml"
     path.write_text(GOOD)
     assert run_cli(["check", str(path)]) == 0
-    assert capsys.readouterr().out == f"{path}: good; 2 devices, 1 channels, 0 poses\n"
+    assert capsys.readouterr().out == f"{path}: good; 2 devices, 1 channel\n"
 
 
 @pytest.mark.parametrize("calibrated", ["2001-05-01", '"2001-05-01"'])

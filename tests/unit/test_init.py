@@ -19,7 +19,7 @@ import pytest
 from agent.cli.main import run_cli
 from agent.config import load_config
 from agent.setup.buses import bus_clock_khz
-from agent.setup.listening import Heard, hear
+from agent.setup.listening import Heard, _Line, _understood, hear
 from agent.setup.toml import Setting, Table, written
 from hw.virtual.adxl355_twin import Adxl355Twin
 from hw.virtual.kernel import I2CBus, installed
@@ -189,6 +189,20 @@ def test_lines_that_are_heard(
     assert isinstance(heard, Heard), heard
     assert (heard.axes, heard.sequence, heard.whole) == (axes, sequence, whole)
     assert heard.nominal_hz == 100
+
+
+def test_a_stall_of_the_machine_does_not_change_the_rate() -> None:
+    """100 Hz for 3 s. The lines of 0.3 s in the middle and of 0.3 s at the end come late, at once."""
+    listened = _Line(None, bytearray())  # type: ignore[arg-type]
+    for k in range(300):
+        listened.data += b"%d,0.5\n" % (1000 + k)
+        if not (120 <= k < 150 or 270 <= k < 299):
+            listened.arrivals.append((0.01 * k, len(listened.data)))
+    listened.arrivals[-1] = (2.99 + 0.3, len(listened.data))
+    heard = _understood(listened, 115200)
+    assert isinstance(heard, Heard), heard
+    assert heard.nominal_hz == 100
+    assert heard.counted_hz == pytest.approx(100.0, rel=0.01)
 
 
 @pytest.mark.parametrize(("line", "unit"), [(b"0.02,-0.01,1.003", "g"), (b"0.2,-0.1,9.81", "m/s2")])

@@ -31,3 +31,10 @@ def test_a_command_runs_with_the_collector(capsys: pytest.CaptureFixture[str]) -
     assert run_cli(["sensors"]) == 0
     assert "adxl355" in capsys.readouterr().out
     assert gc.isenabled()
+
+
+def test_a_misspelled_command_is_answered_with_the_one_that_is_meant(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_cli(["calibrat"]) == 2
+    assert "there is no command 'calibrat': did you mean 'calibrate'?" in capsys.readouterr().err
+    assert run_cli(["xyzzy"]) == 2
+    assert "No such command 'xyzzy'" in capsys.readouterr().err

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from agent.bench.session import Session
 from agent.bench.stops import on_clamp, on_faces, turned_by_hand
 from benchmarks.guided import AMPLITUDE_MPS2, NOISE_MPS2, OFFSET_MPS2, RATE_HZ, STAY_S, User, priors
 from calib.estimate.next_stop import MAIN, Expected, Joint, Plan, Wanted
+from calib.estimate.stop_order import ALL_SETS, Together
 from calib.geometry import STANDARD_GRAVITY_MPS2
 
 ANGLE = float(np.deg2rad(0.2))
@@ -77,6 +80,34 @@ def test_rests_beside_a_triad(offset_mps2, most):
     assert told.stops <= most
     # N rests spread evenly: u(S_ij) = u(offset) / g sqrt(3 / N); no set of N is better for the worst of the three
     assert told.best[0] >= 2.0 * offset_mps2 / STANDARD_GRAVITY_MPS2 * np.sqrt(3.0 / told.stops)
+
+
+def test_four_rests_are_a_tetrahedron_and_what_is_said_of_more_rests_follows_from_few_degrees_of_freedom():
+    """N rests spread evenly: u = s / g sqrt(3 / N). From five rests on, the scatter that is seen may be larger."""
+    told = _session(TRIAD, priors(0.0025), Wanted(5e-4, 1.0)).outlook()
+    s_mps2 = np.hypot(0.0025, NOISE_MPS2 / np.sqrt(STAY_S * RATE_HZ))
+    even = [2.0 * s_mps2 / STANDARD_GRAVITY_MPS2 * np.sqrt(3.0 / n) for n in range(1, 20)]
+    assert told.stops == 4
+    assert told.best[0] == pytest.approx(even[3], rel=1e-3)
+    seen = [np.sqrt(chi2.ppf(0.95, 3 * n - 12) / (3 * n - 12)) for n in range(5, 20)]
+    assert told.mostly == 5 + next(k for k, factor in enumerate(seen) if factor * even[4 + k] <= 5e-4) == 7
+
+
+def test_the_set_of_stops_is_the_best_of_all():
+    """Of all sets of three stops on the clamp, and of the sets of four to which exchanges lead: tried one by one."""
+    session = _session(TWO[::4], STATED, Wanted(5e-4, 1.0))
+    together = Together(session.plan, session.joint, session.expected, session.wanted)
+    for count, all_sets in ((3, ALL_SETS), (4, 0)):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("calib.estimate.stop_order.ALL_SETS", all_sets)
+            _, found = together.best(range(count))
+        costs = []
+        for some in itertools.combinations(range(len(TWO[::4])), count):
+            joint = session.joint
+            for stop in some:
+                joint = session.plan.after(joint, stop, session.expected)
+            costs.append(float(session.wanted.cost(joint.expanded)))
+        assert float(session.wanted.cost(found)) == pytest.approx(min(costs), rel=1e-3)
 
 
 def test_six_faces_are_repeated_where_offsets_scatter():

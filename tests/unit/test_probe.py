@@ -80,3 +80,17 @@ def test_buses_that_cannot_be_asked(bus: I2CBus, capsys: pytest.CaptureFixture[s
     bus.functions = FUNCTIONS & ~1
     assert run_cli(["probe", "--bus", "4"]) == 1
     assert "plain I2C" in capsys.readouterr().out
+
+
+def test_ports_are_told_with_what_the_system_knows(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    board = {"port": "/dev/serial/by-id/usb-1", "description": "CP2102", "serial_number": "0001"}
+    bare = {"port": "/dev/ttyS0", "description": "n/a", "serial_number": ""}
+    monkeypatch.setattr("agent.cli.probe.serial_ports", lambda: [board, bare])
+    assert run_cli(["probe"]) == 0
+    assert capsys.readouterr().out.splitlines()[-3:] == [
+        "/dev/serial/by-id/usb-1: serial port, CP2102, 0001",
+        "/dev/ttyS0: serial port, of which the system knows nothing more",
+        "a port is not opened here; `fieldcal init --sensor-port PORT` listens to it",
+    ]

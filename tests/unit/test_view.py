@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from agent.core.events import Gap
 from agent.delivery.publication import PublicationState
-from agent.terminal.quantity import duration, size
+from agent.terminal.quantity import counted, duration, size
 from agent.terminal.screen import Picture, Screen
 from agent.terminal.state import DeviceState, RecordingState, ViewState
 from agent.terminal.view import Lines, open_view
-from agent.terminal.wording import truth_line
+from agent.terminal.wording import gap_line, truth_line
 from calib.rounding import plus_minus
 from tests.unit.results import calibration, status, window
 
@@ -156,10 +157,14 @@ def test_lines_tell_each_thing_once() -> None:
         "one",
         "two",
         "device reference: serial-csv /dev/pts/4, open",
-        "publishing: fieldcal/v1/virtual/bench/** to tcp/127.0.0.1:7447 (no connection "
-        "to a router, results are stored until then)",
+        "publishing: fieldcal/v1/virtual/bench/** to tcp/127.0.0.1:7447 (no router answers; results wait in the store)",
         "mems: window 350.0 to 356.0 s at 30 deg: refused: clipped",
     ]
+
+
+def test_a_gap_is_told_with_its_reason() -> None:
+    gap = Gap(device="mems", dropped=1, unit="lines", reason="no numbers", t_monotonic_ns=0)
+    assert gap_line(gap) == "mems: 1 line dropped: no numbers"
 
 
 def test_lines_to_a_reader_that_went_away_are_no_fault() -> None:
@@ -210,4 +215,5 @@ def test_a_value_is_written_to_the_second_digit_of_its_uncertainty(
 
 def test_sizes_and_durations_are_written_for_people() -> None:
     assert [size(n) for n in (0, 999, 1000, 1_234_567, 10**13)] == ["0 B", "999 B", "1 kB", "1.23 MB", "10 TB"]
+    assert [counted(n, "lines") for n in (0, 1, 2)] == ["0 lines", "1 line", "2 lines"]
     assert [duration(s) for s in (0.4, 3661.9, 200_000)] == ["00:00:00", "01:01:01", "2 d 07 h"]
