@@ -22,7 +22,6 @@ from calib.signal.response import POWERS, Complex, by_term
 
 PROBABILITY = 0.99  # confidence of the test for scatter between bands
 TINY = float(np.finfo(float).tiny)
-ROUNDING = float(np.finfo(float).eps)
 NARROW = 1e-3  # SD of omega^2 relative to its mean
 MOST_TAPERED = 2.0  # times: power of a band in the whole window over that in the tapered one
 RELATED = 1e-9  # relative eigenvalue of the channels' scatter below which a direction was not excited
@@ -225,11 +224,13 @@ def _as_in_the_window(factors: Factors, omega2: Array) -> Array:
     """(B, 2M, 2M) of [u, du/dt] in the bands as they are in the whole window, not in the tapered one.
 
     The power of each channel is multiplied by 1 + b (omega^2 - <omega^2>), with b such that the power of its du/dt over
-    that of u is `omega2` (M,), 0 where the channel is silent. A power that rounding can make says nothing.
+    that of u is `omega2` (M,), 0 where the channel is silent. A channel that has no more power than its
+    noise, which was subtracted, is silent as well.
     """
     power, rate_power = np.split(np.diagonal(factors.gram, axis1=1, axis2=2), 2, axis=1)
-    square = np.divide(rate_power, power, out=np.zeros_like(power), where=power > ROUNDING**2 * power.max())
-    share = power / np.maximum(power.sum(axis=0), TINY)
+    square = np.divide(rate_power, power, out=np.zeros_like(power), where=power > 0.0)
+    total = power.sum(axis=0)
+    share = np.divide(power, total, out=np.zeros_like(power), where=total > 0.0)
     mean = np.sum(share * square, axis=0)
     spread = np.sum(share * (square - mean) ** 2, axis=0)
     told = (omega2 > 0.0) & (spread > (NARROW * mean) ** 2)  # in a narrow band nothing can be made wider

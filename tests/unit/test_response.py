@@ -263,17 +263,18 @@ def test_a_window_whose_motion_is_in_one_band_has_finite_derivatives() -> None:
     np.testing.assert_allclose(found[0, 0], -(factors.omega**2), rtol=1e-9)
 
 
-def test_a_channel_with_nothing_but_rounding_says_nothing() -> None:
-    """The power of a silent channel, and that of its derivative, are what rounding leaves: their ratio is no square of
-    a frequency, and was so large that its square overflowed."""
+def test_a_channel_with_less_power_than_its_noise_is_silent() -> None:
+    """Where the noise that was subtracted is more than what the channel shows, its powers are below 0 in most bands:
+    they are no shares of its power, and their squares overflowed."""
     u = np.random.default_rng(2).normal(size=(2000, 3))
     bands = band_sums(u, np.gradient(u, 0.01, axis=0), np.repeat(u[:, :1], 3, axis=1), 100.0)
     assert bands is not None
-    silent = np.array([1.0, 1.0, 1e-100, 1.0, 1.0, 1e-15, 1.0, 1.0, 1.0])
-    bands = replace(bands, products=bands.products * np.outer(silent, silent))
-    factors = Factors(bands, np.arange(4, 12))
+    products = bands.products.copy()
+    products[:, 2] = products[:, :, 2] = 0.0
+    products[::2, 2, 2], products[1::2, 2, 2] = -2e-5, 1e-5
+    factors = Factors(replace(bands, products=products), np.arange(4, 12))
     with np.errstate(all="raise"):
-        found = _projected(factors, len(POWERS), np.array([1.3, 1.3, 0.0]) * factors.omega[3] ** 2)
+        found = _projected(factors, len(POWERS), 1.3 * factors.omega[3] ** 2 * np.ones(3))
     assert np.all(np.isfinite(found))
 
 
