@@ -35,6 +35,7 @@ REMEDIES = (
     ("drift_mps2", 1, "keep hands and cables off the sensor while it stands in a position, and let it warm up"),
     ("step_mps2", 1, "keep hands and cables off the sensor while it stands in a position, and let it warm up"),
     ("sd_over_floor", 1, "put the sensor where nothing moves it"),
+    ("nonlinearity_pct", 1, "fasten the sensor better: it slips or rattles where the motion is strong"),
     ("left_out_pct", 1, "keep knocks away from the sensor"),
 )
 

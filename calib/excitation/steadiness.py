@@ -1,7 +1,8 @@
-"""Whether the sensor's mean output stays the same within a window, apart from what the motion explains.
+"""Whether mean output and sensitivity of the sensor stay the same within a window, apart from what the motion explains.
 
 Each stated uncertainty of an angle or an offset belongs to a whole window or position. If the sensor slips in the
-middle of a window, its mean changes, and no angle is right for the whole window.
+middle of a window, its mean changes, and no angle is right for the whole window. If it slips wherever the motion is
+strong, its output is not proportional to the motion, and no S is right for the whole window.
 """
 
 from __future__ import annotations
@@ -9,11 +10,13 @@ from __future__ import annotations
 import numpy as np
 
 from calib.model import Array
-from calib.signal.order_statistics import median
+from calib.signal.order_statistics import median, quantile
 
 # The change of the mean is searched at the edges of such blocks. The scatter of the blocks shows how well it is known.
 BLOCK_S = 1.0
 FEWEST_BLOCKS = 4  # fewer blocks have two differences at most, too few to know their scatter
+FEWEST_STRONG = 8  # of fewer blocks a robust scatter is too uncertain
+STRONG = 0.9  # share of the points with less motion than those that are called strong
 # The median of chi-squared with three degrees of freedom over its mean.
 MEDIAN_OF_THREE = 0.789
 
@@ -44,3 +47,29 @@ def step(residual: Array, rate_hz: float) -> tuple[float, float]:
     at = int(np.argmax(change**2 / per_block))
     variance = 0.5 * float(median(np.sum(np.diff(level, axis=0) ** 2, axis=1))) / MEDIAN_OF_THREE
     return float(change[at]), float(np.sqrt(variance * per_block[at]))
+
+
+def nonlinearity(V: Array, residual: Array, rate_hz: float) -> dict[str, float]:
+    """By how many per cent the sensitivity to the strongest tenth of the motion differs from that of the whole window
+    (`nonlinearity_pct`), and the standard uncertainty of this, from the scatter of blocks (`u_nonlinearity_pct`).
+
+    `V` (n, 3) in output unit, `residual` (n, 3) from its regression on the motion, knocks included: a sensor that slips
+    where the motion is strong looks as if it were knocked there. Blocks with a slip are few, and do not count in the
+    scatter, which is robust. Both are 0 if the strong points are in fewer than FEWEST_STRONG blocks. `motion_kurtosis`
+    is 3 for Gaussian motion along one line and 1.5 for a sine.
+    """
+    moved = V - residual
+    moved -= moved.mean(axis=0)
+    power = np.einsum("ni,ni->n", moved, moved)
+    kurtosis = float(np.mean(power**2)) / max(float(np.mean(power)) ** 2, np.finfo(float).tiny)
+    strong = np.flatnonzero(power >= quantile(power, STRONG))
+    block = strong // max(round(BLOCK_S * rate_hz), 1)
+    in_block = np.bincount(block, power[strong])
+    along = np.bincount(block, np.einsum("ni,ni->n", residual[strong], moved[strong]))[in_block > 0.0]
+    in_block = in_block[in_block > 0.0]
+    gain = u = 0.0
+    if len(in_block) >= FEWEST_STRONG:
+        gain = float(along.sum() / in_block.sum())
+        scatter = np.abs(along - gain * in_block) / np.sqrt(in_block)
+        u = 1.4826 * float(median(scatter)) / float(np.sqrt(in_block.sum()))
+    return {"nonlinearity_pct": 100.0 * abs(gain), "u_nonlinearity_pct": 100.0 * u, "motion_kurtosis": kurtosis}

@@ -12,6 +12,7 @@ from calib.geometry import STANDARD_GRAVITY_MPS2
 from calib.model import WindowSums
 
 LEAST_STEP_MPS2 = 0.02  # 2 mg: a smaller change of the mean is possible whatever is stated
+NONLINEAR_SD = 4.0  # a difference by so many standard uncertainties, of few blocks, may be noise
 STEP_SD = 5.0  # a step of the mean by so many of its standard uncertainties may be noise, wherever it is searched
 
 
@@ -31,6 +32,8 @@ class Limits:
     most_left_out_of_segment_pct: float = 25.0
     most_drift_mps2: float = 0.2  # of the mean within a window: offsets drift by 0.05
     most_drift_pct: float = 10.0  # the same relative to the motion's rms; the larger limit counts
+    # Of the strongest tenth of the motion, beyond its noise; S is then off by a few tenths. Instruments stay below 1 %.
+    most_nonlinearity_pct: float = 2.0
     most_step_mps2: float = 0.12  # of the mean within a window, beyond its noise: `of` a stated 0.05 m/s2 and 0.2 deg
 
     @classmethod
@@ -50,7 +53,7 @@ class Limits:
     @property
     def of_any_response(self) -> Limits:
         """The same without limits that a window may miss because the sensor responds in another way."""
-        return replace(self.unsteady, least_coherence=0.0, most_left_out_pct=100.0)
+        return replace(self.unsteady, least_coherence=0.0, most_left_out_pct=100.0, most_nonlinearity_pct=np.inf)
 
 
 DEFAULT_LIMITS = Limits()
@@ -69,8 +72,8 @@ def judge(sums: WindowSums, struck: NDArray[np.bool_], numbers: Mapping[str, flo
     """The verdict on a window with these sums.
 
     `struck` (n,) flags the points that were found to be knocks. `numbers` are the statistics: for motion
-    reference_rms_mps2, reference_noise_mps2, coherence, drift_mps2, stuck_axes and clipped_points; for a rest
-    sd_over_floor, if there are other rests to compare with; for both step_mps2 and u_step_mps2. The verdict's numbers
+    reference_rms_mps2, reference_noise_mps2, coherence, drift_mps2, stuck_axes, clipped_points and those of
+    `steadiness.nonlinearity`; for a rest sd_over_floor, if there are other rests to compare with; for both step_mps2 and u_step_mps2. The verdict's numbers
     hold the limit of each statistic beside it, as `<name>_threshold`.
     """
     points = float(sums.count.sum())
@@ -89,6 +92,12 @@ def _thresholds(n: Mapping[str, float], limits: Limits) -> dict[str, float]:
         limit["stuck_axes"] = 0.0
         limit["coherence"] = limits.least_coherence
         limit["drift_mps2"] = max(limits.most_drift_mps2, limits.most_drift_pct / 100.0 * n["reference_rms_mps2"])
+    if "nonlinearity_pct" in n:
+        # Of a reference with noise, the strongest values are those to which the noise adds, and the sensor shows less
+        # there: by 60 % of noise over motion for a sine, 150 % for a square wave, nothing for Gaussian motion.
+        noise_pct = 100.0 * n["reference_noise_mps2"] / max(n["reference_rms_mps2"], np.finfo(float).tiny)
+        beyond = float(np.hypot(limits.most_nonlinearity_pct, NONLINEAR_SD * n["u_nonlinearity_pct"]))
+        limit["nonlinearity_pct"] = beyond + noise_pct * max(0.0, (3.0 - n["motion_kurtosis"]) / 1.5) ** 2
     if "step_mps2" in n:
         limit["step_mps2"] = float(np.hypot(limits.most_step_mps2, STEP_SD * n["u_step_mps2"]))
     if "sd_over_floor" in n:
@@ -125,6 +134,11 @@ def _reason(n: Mapping[str, float]) -> str:
         return (
             f"the sensor's mean changes by {n['step_mps2']:.3g} m/s2 from one part of the window to the other, "
             f"{limit['step_mps2']:.3g} m/s2 at most by the stated uncertainties of angle and offset"
+        )
+    if "nonlinearity_pct" in n and n["nonlinearity_pct"] > limit["nonlinearity_pct"]:
+        return (
+            f"the output is not proportional to the motion: where the motion is strongest, the sensitivity differs by "
+            f"{n['nonlinearity_pct']:.1f} %, {limit['nonlinearity_pct']:.1f} % at most (a mount that slips or rattles?)"
         )
     if "sd_over_floor" in n and n["sd_over_floor"] > limit["sd_over_floor"]:
         return (

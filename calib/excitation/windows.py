@@ -20,7 +20,7 @@ from calib.excitation.band_to_keep import LEAST_MOTION_MPS2
 from calib.excitation.bands import band_sums
 from calib.excitation.motion_numbers import motion_numbers
 from calib.excitation.rests import find_rests
-from calib.excitation.steadiness import step
+from calib.excitation.steadiness import nonlinearity, step
 from calib.excitation.sums import pool, window_sums
 from calib.excitation.window_verdict import DEFAULT_LIMITS, Limits, Verdict, judge
 from calib.model import Array, Pose, Window, WindowSums
@@ -224,6 +224,7 @@ def _motion(
         if leave_out:
             sums = clean
     numbers = motion_numbers(clean, basis[~struck], V[~struck], rate_hz, stepped, limits)
+    numbers |= nonlinearity(V, residual, rate_hz)
     numbers["stuck_axes"] = float(np.sum(np.ptp(V, axis=0) == 0.0))
     numbers["clipped_points"] = float(detection.clipped(V, residual, finest))
     verdict = judge(sums, struck, numbers, limits)

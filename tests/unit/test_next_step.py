@@ -144,6 +144,7 @@ def test_a_lost_device_is_named_until_it_is_back() -> None:
         ("drift_mps2", 0.4, 0.1, "hands and cables off"),
         ("step_mps2", 0.4, 0.1, "hands and cables off"),
         ("sd_over_floor", 9.0, 3.0, "where nothing moves it"),
+        ("nonlinearity_pct", 9.0, 2.0, "fasten the sensor better"),
         ("left_out_pct", 9.0, 5.0, "knocks"),
         ("position_chi2", 900.0, 20.0, "mend what the reason of the newest windows names"),
     ],
