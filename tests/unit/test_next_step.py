@@ -205,3 +205,9 @@ def test_the_line_is_shown_when_it_changes_and_stays_on_the_screen() -> None:
     assert lines == [f"mems: next: {step}" for step in (FIRST, "nothing has to be done", FIRST)]
     shown = [line.strip() for line in picture(state, 60, 24)]
     assert " ".join(shown[3:5]) == f"next: {FIRST}", "on a narrow terminal it has two lines, and no word is lost"
+
+
+def test_without_a_reference_and_positions_the_configuration_is_named() -> None:
+    """The agent ended with an internal fault when it looked for the next of no positions."""
+    guide = Guide(configured(reference=False), turns_itself=False)
+    assert said(guide, status(1, "UNCALIBRATED")).startswith("state a reference or positions in the configuration")

@@ -91,7 +91,7 @@ def test_commands_with_files_of_one_rate(line: str, site: Path, capsys: pytest.C
         site = site / "run"
         site.mkdir()
         shutil.copy(GOLDEN, site / "run.mcap")
-        begin_s = read_sensor(GOLDEN).time_s[0]
+        begin_s = float(read_sensor(GOLDEN).time_s[:1][0])
         poses = f"start_s,stop_s,theta_deg,alpha_deg\n{begin_s + 3},{begin_s + 15},35,0\n"
         (site / "poses.csv").write_text(poses)
     words = [str(site / word) if re.fullmatch(r"\w+\.\w+", word) else word for word in shlex.split(line)[1:]]
