@@ -73,9 +73,8 @@ def judge(sums: WindowSums, struck: NDArray[np.bool_], numbers: Mapping[str, flo
 
     `struck` (n,) flags the points that were found to be knocks. `numbers` are the statistics: for motion
     reference_rms_mps2, reference_noise_mps2, coherence, drift_mps2, stuck_axes, clipped_points and those of
-    `steadiness.nonlinearity`; for a rest sd_over_floor, if there are other rests to compare with; for both step_mps2 and
-    u_step_mps2. The verdict's numbers
-    hold the limit of each statistic beside it, as `<name>_threshold`.
+    `steadiness.nonlinearity`; for a rest sd_over_floor, if there are other rests to compare with; for both step_mps2
+    and u_step_mps2. The verdict's numbers hold the limit of each statistic beside it, as `<name>_threshold`.
     """
     points = float(sums.count.sum())
     left_out = 100.0 * float(struck.mean()) if len(struck) else 0.0
