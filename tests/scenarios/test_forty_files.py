@@ -66,7 +66,7 @@ def test_the_same_s_and_q(
     found = calibrated(files, capsys, *options)
     for value in ("sensitivity", "offset"):
         wanted = expected[writer.since_1970][value]
-        np.testing.assert_allclose(writer.full_scale * np.array(found[value]), wanted, rtol=1e-9, atol=1e-6)
+        np.testing.assert_allclose(writer.full_scale * np.array(found[value]), wanted, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.filterwarnings("default")
