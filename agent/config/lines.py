@@ -9,12 +9,13 @@ from collections.abc import Collection
 Path = tuple[str | int, ...]
 """Path of a setting, such as ("channels", 0, "prior"): names of tables, and numbers of entries in lists."""
 
-# Tokens of a text that is known to be TOML. No repetition can backtrack, so the time is linear for every text.
+# Tokens of a text that is known to be TOML. A string ends at the first quotes before which stands an even number of
+# backslashes. Nothing is tried twice, so the time is linear for every text. No group with choices is repeated by *+:
+# Python before 3.11.5, as in Debian 12, ends such a repetition at a wrong place.
 _TOKEN = re.compile(
     r'''(?P<space>[ \t\r]++|\#[^\n]*+)
       | (?P<newline>\n)
-      | (?P<string>"""(?:[^"\\]|\\.|"(?!""))*+"{3,5} | \'\'\'(?:[^']|'(?!\'\'))*+'{3,5}
-                 | "(?:[^"\\\n]|\\.)*+" | '[^'\n]*+')
+      | (?P<string>""".*?(?<!\\)(?:\\\\)*+"{3,5} | \'\'\'.*?'{3,5} | ".*?(?<!\\)(?:\\\\)*+" | '[^'\n]*+')
       | (?P<bare>[^\s"'#\[\]{},=.]++)
       | (?P<mark>[\[\]{},=.])''',
     re.VERBOSE | re.DOTALL,

@@ -22,7 +22,7 @@ DEEPEST_KEY = 16
 SHOWN_FAULTS = 100
 _PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+"""
 _LINE = re.compile(r"\(at line (\d+), column \d+\)")  # as in the messages of tomllib
-_LONG_KEY = re.compile(rf"(?<![\w.-]){_PART}(?:\.[ \t]*+{_PART}){{{DEEPEST_KEY},}}+")
+_LONG_KEY = re.compile(rf"(?<![\w.-]){_PART}(?:\.[ \t]*+{_PART}){{{DEEPEST_KEY}}}")
 
 
 Model = TypeVar("Model", bound=BaseModel)
