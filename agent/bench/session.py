@@ -26,7 +26,7 @@ DECISIVE_CHI2 = 25.0
 DOUBTED = 2.5  # standard uncertainties by which a stated value may be off before it is doubted
 SCATTERED = 1.3  # times the stated scatter of the offset from which a person is told
 FEWEST_WITNESSES = 3  # stops from which on one of them can be found to be wrong, and not the newest
-MOST_SESSIONS = 0.95
+MOST_SESSIONS = 0.95  # share of sessions in which the larger number of stops is enough
 MOST_AHEAD = 100  # stops that are planned ahead
 # Before the first window: 5 m/s2 of motion and 2 mg of noise, in so many points that the noise does not matter, since
 # a stay lasts until it does not.

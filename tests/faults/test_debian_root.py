@@ -174,7 +174,7 @@ def start_under_the_limits(debian: DebianRoot) -> set[str]:
 
 def test_both_commands_of_the_readme(debian: DebianRoot) -> None:
     """In a checkout without a virtual environment. pip finds the wheels of both lock files beside it, and no index."""
-    checkout = debian.path / "root/fieldcal"
+    checkout = debian.path / "srv/fieldcal"
     subprocess.run(["git", "clone", "--quiet", ROOT, checkout], check=True)
     download = [
         sys.executable,
@@ -189,6 +189,6 @@ def test_both_commands_of_the_readme(debian: DebianRoot) -> None:
     for lock in ("requirements.lock", "requirements-dev.lock"):
         subprocess.run([*download, "-r", ROOT / lock], check=True)
     pip = {"PIP_CONFIG_FILE": "/dev/null", "PIP_NO_INDEX": "1", "PIP_FIND_LINKS": "/wheels"}
-    debian.run("cd /root/fieldcal; make .venv/runtime", pip)
-    assert "VALID" in debian.run(f"cd /root/fieldcal; timeout --signal=INT {RUN_S} make run || [ $? = 124 ]", pip)
-    debian.run("cd /root/fieldcal; make test", pip)
+    debian.run("cd /srv/fieldcal; make .venv/runtime", pip)
+    assert "VALID" in debian.run(f"cd /srv/fieldcal; timeout --signal=INT {RUN_S} make run || [ $? = 124 ]", pip)
+    debian.run("cd /srv/fieldcal; make test", pip)

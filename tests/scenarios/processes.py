@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import pty
 import signal
 import sqlite3
 import subprocess
@@ -22,6 +23,24 @@ def fieldcal(*arguments: str | Path, timeout_s: float = 60.0) -> subprocess.Comp
     """Run a `fieldcal` command to its end."""
     command = [sys.executable, "-m", "agent", *map(str, arguments)]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=timeout_s, check=False)
+
+
+def answered(*arguments: str | Path, typed: str) -> None:
+    """Run a `fieldcal` command on a terminal, where somebody has `typed` all answers, to its end with status 0."""
+    ours, theirs = pty.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "agent", *map(str, arguments)],
+        stdin=theirs, stdout=theirs, stderr=theirs, cwd=ROOT, start_new_session=True,
+    )  # fmt: skip
+    os.close(theirs)
+    os.write(ours, typed.encode())
+    said = b""
+    try:
+        while data := os.read(ours, 4096):
+            said += data
+    except OSError:  # the other side is closed
+        pass
+    assert process.wait(START_S) == 0, said.decode()
 
 
 @contextmanager

@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import pty
-import subprocess
-import sys
 import tomllib
 from pathlib import Path
 
@@ -14,7 +10,7 @@ import pytest
 
 from agent.cli.led import made, parsed
 from agent.cli.main import run_cli
-from tests.scenarios.processes import ROOT
+from tests.scenarios.processes import answered
 from tests.unit.certificates import STATED, run, uneven
 
 pytest.importorskip("matplotlib", reason="the certificate needs the extra `report`")
@@ -104,21 +100,8 @@ def test_a_wrong_entry_is_one_line(
 
 
 def test_questions_are_asked_on_a_terminal(tmp_path: Path, result: Path) -> None:
-    ours, theirs = pty.openpty()
     stated = [f"--state={name}={value}" for name, value in entries().items() if not name.startswith("customer")]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "agent", "certificate", result, *stated, "-o", tmp_path / "out"],
-        stdin=theirs, stdout=theirs, stderr=theirs, cwd=ROOT, start_new_session=True,
-    )  # fmt: skip
-    os.close(theirs)
-    os.write(ours, b"Tower Operator\nPescara\nIT\n")
-    said = b""
-    try:
-        while data := os.read(ours, 4096):
-            said += data
-    except OSError:  # the other side is closed
-        pass
-    assert process.wait(20) == 0, said.decode()
+    answered("certificate", result, *stated, "-o", tmp_path / "out", typed="Tower Operator\nPescara\nIT\n")
     assert tomllib.loads((tmp_path / "out" / "certificate.toml").read_text())["customer"]["name"] == "Tower Operator"
 
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import pty
-import subprocess
-import sys
 import threading
 import time
 import tomllib
@@ -23,7 +21,7 @@ from agent.setup.listening import Heard, _Line, _understood, hear
 from agent.setup.toml import Setting, Table, written
 from hw.virtual.adxl355_twin import Adxl355Twin
 from hw.virtual.kernel import I2CBus, installed
-from tests.scenarios.processes import ROOT
+from tests.scenarios.processes import answered
 
 CLAMP = ("--theta-deg", "35", "--alpha-deg", "0,120,240")
 LINES = ("rate_hz=200", "axes=1", "sequence=true")
@@ -155,21 +153,8 @@ def test_an_existing_file_is_never_overwritten(capsys: pytest.CaptureFixture[str
 
 def test_questions_are_asked_on_a_terminal_only(tmp_path: Path) -> None:
     path = tmp_path / "gateway.toml"
-    ours, theirs = pty.openpty()
     options = ["--sensor", "adxl355", "--reference-port", "/dev/nowhere", *stated("reference", *LINES)]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "agent", "init", path, *options],
-        stdin=theirs, stdout=theirs, stderr=theirs, cwd=ROOT, start_new_session=True,
-    )  # fmt: skip
-    os.close(theirs)
-    os.write(ours, b"35\n0,90,180\nbridge\n\n")
-    said = b""
-    try:
-        while data := os.read(ours, 4096):
-            said += data
-    except OSError:  # the other side is closed
-        pass
-    assert process.wait(20) == 0, said.decode()
+    answered("init", path, *options, typed="35\n0,90,180\nbridge\n\n")
     config = load_config(path)
     assert [stop.alpha_deg for stop in config.channels[0].positions] == [0, 90, 180]  # type: ignore[union-attr]
     assert (config.gateway.site, config.gateway.name) == ("bridge", "gateway")
