@@ -93,9 +93,15 @@ class JointState:
         self.walked = self.walked[keep]
         self._rename()
 
-    def hand_over(self, owner: str, new_owner: str) -> None:
-        """Give the quantities of an owner another name of the same owner."""
-        self.quantities = [replace(q, owner=new_owner) if q.owner == owner else q for q in self.quantities]
+    def hand_over(self, owner: str, new_owner: str, *, of_place: bool = False) -> None:
+        """Give the quantities of an owner another owner; with `of_place` only those of its place (see `Kind.of_place`).
+
+        What the new owner has already, stays.
+        """
+        for k, quantity in enumerate(self.quantities):
+            handed = replace(quantity, owner=new_owner)
+            if quantity.owner == owner and (quantity.kind.of_place or not of_place) and handed.key not in self:
+                self.quantities[k] = handed
         self._rename()
 
     def transform(self, matrix: Array) -> None:

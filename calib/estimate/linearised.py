@@ -104,14 +104,15 @@ class Linearised:
                     state.shift(k, factor, amount)
         self.point = self.state.mean.copy()
 
-    def hand_over(self, owner: str, new_owner: str) -> dict[str, str]:
+    def hand_over(self, owner: str, new_owner: str, *, of_place: bool = False) -> dict[str, str]:
         """Give the quantities and the recent windows of a reference another name of the same reference.
 
+        With `of_place`: what belongs to the place of a reference goes to the next one there; no window may be recent.
         Returns the new key of each quantity by its old one.
         """
         before = list(self.state.keys)
         for state in (self.state, self.base):
-            state.hand_over(owner, new_owner)
+            state.hand_over(owner, new_owner, of_place=of_place)
         self.recent = [replace(w, reference=new_owner) if w.reference == owner else w for w in self.recent]
         return dict(zip(before, self.state.keys, strict=True))
 

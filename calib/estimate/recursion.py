@@ -9,7 +9,7 @@ Q, through swaps, restarts and changes of the configuration.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -249,20 +249,18 @@ class Recursion(WindowState):
     def remount(self, *, of_reference: bool) -> None:
         """The sensor was mounted again, or the reference in use was: what a mount decides may be another from now on.
 
-        The old value stays in the new one, which is a little too uncertain if all was mounted anew, and right if it was
-        not.
+        The new value is the old one and a difference: as large as that of two independent values, since it may be.
         """
         self._absorb(len(self._joint.recent))
         if self._held is not None and not of_reference:
             self._held.unmount(self._joint)
             self._held = None
-        state = self._joint.state
+        state, u = self._joint.state, np.zeros(len(self._joint.state))
         owners = [self.reference] if of_reference else ["", *self._mounted]
-        u = np.zeros(len(state))
         for k, quantity in enumerate(state.quantities):
             there = quantity.owner in owners and (quantity.kind.of_reference or not of_reference)
             if there and not quantity.first and "remount" in quantity.kind.loosened_by:
-                u[k] = state.stated_u[k]
+                u[k] = np.sqrt(2.0) * state.stated_u[k]
         self._spread(u)
 
     def suspect_reference(self, windows: Sequence[Summary], u: Callable[[Alike], float]) -> None:
@@ -288,26 +286,29 @@ class Recursion(WindowState):
         stated of this reference before. Returns whether that changed S or Q.
         """
         owner = self._owner(reference, calibrated)
-        back = owner not in self._mounted and owner in self._references
+        another = self._mounted[self._place] not in ("", owner)
         before, stated = self._references.get(owner) or sensitivity, self._beside[self._place]
-        if before != sensitivity or self._before[self._place].of_references_differ(stated):
+        if another or before != sensitivity or self._before[self._place].of_references_differ(stated):
             self._absorb(len(self._joint.recent))  # these windows were made with other statements
+        if another:
+            self._rename(self._joint.hand_over(self._mounted[self._place], owner, of_place=True))
         if before != sensitivity:
             self._joint.shift(REFERENCE, owner, before / sensitivity, before / sensitivity - 1.0)
             self._references[owner] = sensitivity
         self._mounted[self._place], self._sensitivity[self._place] = owner, sensitivity
         changed = self._restate(owner)
-        if back:
+        if another:
             self.remount(of_reference=True)
         return changed
+
+    def _rename(self, keys: Mapping[str, str]) -> None:
+        self._held = None if self._held is None else self._held.renamed(keys)
 
     def _owner(self, reference: str, calibrated: str) -> str:
         """The reference with the date of its certificate, as an owner of unknowns."""
         dated = f"{reference}{DATED}{calibrated}"
         if calibrated and dated not in self._references and reference in self._references:
-            keys = self._joint.hand_over(reference, dated)  # the date of the same certificate was stated later
-            if self._held is not None:
-                self._held = self._held.renamed(keys)
+            self._rename(self._joint.hand_over(reference, dated))  # the date of the same certificate was stated later
             self._references = {(dated if of == reference else of): s for of, s in self._references.items()}
             self._mounted = [dated if of == reference else of for of in self._mounted]
         if calibrated:
@@ -328,13 +329,12 @@ class Recursion(WindowState):
         return self._restate("")
 
     def _restate(self, reference: str) -> bool:
-        place = self._place
-        changed = self._beside[place].restate(self._joint, self._before[place], self._held, reference)
+        changed = self._beside[self._place].restate(self._joint, self._before[self._place], self._held, reference)
         if changed:
             self._take_again()
             self._settle()
         for k, stated in enumerate(self._beside):
-            self._before[k] = self._before[k].now(stated, of_reference=bool(reference) and k == place)
+            self._before[k] = self._before[k].now(stated, of_reference=bool(reference) and k == self._place)
         return changed
 
     def put(self, calibration: Calibration) -> None:

@@ -28,6 +28,7 @@ S_AND_Q_KEYS = [quantity.key for quantity in S_AND_Q]
 MEAN = np.append(np.eye(3).ravel(), np.zeros(3))
 U = np.append(np.where(np.eye(3).ravel() > 0, 0.05, 0.03), np.full(3, 1.0))
 PRIORS = {"reference": 3e-3, "rotation_rad": 3e-3, "gravity_mps2": 0.03, "gravity_direction_rad": 2e-3, "lag_s": 0.005}
+PLACE = " of the place"
 WANDER = {"sensitivity": 5e-5, "offset_mps2": 1e-3, "tilt_rad": 1e-3}
 
 
@@ -57,8 +58,9 @@ class Life:
         state = JointState(S_AND_Q, MEAN, U)
         for term in rows.terms:
             state.append(term.quantity, term.expected, term.uncertainty)
-            self.stated[term.key] = term.uncertainty
-        self.rows.append((state.quantities, rows.at(state, state.mean, Noise()).jacobian, self.hour * HOUR))
+            self.stated[_of_place(term.quantity).key] = term.uncertainty
+        jacobian = rows.at(state, state.mean, Noise()).jacobian
+        self.rows.append(([_of_place(quantity) for quantity in state.quantities], jacobian, self.hour * HOUR))
         self.hour += 1
 
     def restart(self, **changed: float) -> None:
@@ -77,18 +79,19 @@ class Life:
         names["gravity_"] = "gravity_direction_rad"
         for key in self.stated:
             name = names.get(key.split(" of ")[0].split("[")[0].rstrip("xyz"))
-            if name and (key.endswith(f" of {self.reference}") or " of " not in key):
+            if name and (key.endswith((f" of {self.reference}", PLACE)) or " of " not in key):
                 self.stated[key] = self.priors[name]
 
     def swap(self, reference: str) -> None:
-        """Another reference is connected; its rotation and lag may be others when it comes back."""
-        back = reference != self.reference and f"lag of {reference}" in self.stated
+        """Another reference is connected. The rotation may be another, and the lag when a reference comes back."""
+        if reference == self.reference:
+            return
         self.reference = reference
         self.recursion.meet(reference)
         self._restate()
-        for key, u in self.stated.items() if back else ():
-            if key.endswith(f" of {reference}") and key.startswith(("rotation", "lag ")):
-                self.loosened.append((len(self.rows), key, u**2))
+        for key, u in self.stated.items():
+            if key.endswith(PLACE) or key == f"lag of {reference}":
+                self.loosened.append((len(self.rows), key, 2.0 * u**2))
 
     def _values(self) -> dict[str, float]:
         return dict(Priors.none().values) | {"offset_mps2": 0.01} | self.priors
@@ -126,6 +129,11 @@ class Life:
             chosen[list(parts[k]), k] = np.sqrt(prior[list(parts[k])])
         half = np.linalg.solve(root.T, chosen)
         return np.asarray(half.T @ half)
+
+
+def _of_place(quantity: Quantity) -> Quantity:
+    """The rotation belongs to the place, whichever reference stands there."""
+    return replace(quantity, owner="the place") if quantity.name.startswith("rotation") else quantity
 
 
 def fresh(values: dict[str, float]) -> Recursion:
@@ -227,3 +235,13 @@ def test_two_references_in_turn_are_two_and_not_eight() -> None:
     u = life.recursion.result().standard_uncertainty[0]
     assert 0.999 * 3e-3 / np.sqrt(2.0) < u < 1.01 * 3e-3 / np.sqrt(2.0)
     assert life.recursion.references == ["A", "B"]
+
+
+def test_references_in_one_place_may_share_the_error_of_their_rotation() -> None:
+    life = begun(7)
+    for k in range(8):
+        life.swap("AB"[k % 2])
+        for _ in range(4):
+            life.window()
+    u = life.recursion.result().standard_uncertainty
+    assert np.all(u[[1, 2, 3, 5, 6, 7]] > 0.99 * (U[1] ** -2 + 3e-3**-2) ** -0.5)
