@@ -28,36 +28,8 @@ EQUATION = "V(t) = S a(t − lag) + Q"
 FORMAT = 1  # of certificate.json
 
 
-Row = tuple[float | None, float | None, float | None]
-Matrix = tuple[Row, Row, Row]
-
-
 class CertificateError(Exception):
     """No certificate can be made with these statements. The message names the field and the remedy."""
-
-
-class Band(msgspec.Struct, frozen=True):
-    """The complex sensitivity in one third octave; None where it is not known."""
-
-    low_hz: float
-    high_hz: float
-    sensitivity_re: Matrix | None
-    sensitivity_im: Matrix | None
-    standard_uncertainty: Matrix | None
-
-
-class Frequencies(msgspec.Struct, frozen=True):
-    """Where S holds, as the result tells it; None where it does not."""
-
-    reference_frequency_hz: float | None = None
-    valid_band_hz: tuple[float, float] | None = None
-    response: tuple[Band, ...] | None = None
-
-    @property
-    def bands(self) -> tuple[Band, ...]:
-        """Those that are known."""
-        known = self.response or ()
-        return tuple(b for b in known if b.sensitivity_re and b.sensitivity_im and b.standard_uncertainty)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +55,6 @@ class Certificate:
     reference_file: SourceFile | None
     files: tuple[SourceFile, ...]
     temperature_degc: tuple[float, float] | None
-    told: Frequencies
     frequency_hz: tuple[float, ...]
     levels_mps2: tuple[float, float] | None
     positions: tuple[str, ...]
@@ -117,10 +88,6 @@ def certificate_of(material: Material, stated: Statements, beside: Path, seen: I
     result = replace(result, unit=_unit(result.unit, stated.instrument.output_unit))
     residuals, levels = tuple(seen), _levels(material)
     source = material.files[0].path if material.files else "the input"
-    try:
-        told = msgspec.convert(result.fields, Frequencies)
-    except msgspec.ValidationError as error:
-        raise MaterialError(f"{source}: {error}; make the result again with `fieldcal calibrate`") from None
     known = np.isfinite(result.values) & np.isfinite(result.expanded_uncertainty)
     if not any(np.isfinite(result.covariance[k][known]).all() for k in np.flatnonzero(known)):
         raise MaterialError(
@@ -129,7 +96,7 @@ def certificate_of(material: Material, stated: Statements, beside: Path, seen: I
     found = Certificate(
         stated=stated, number=stated.number, sensor=material.sensor, result=result,
         reference_file=_reference_file(stated.reference.certificate_file, beside), files=tuple(material.files),
-        temperature_degc=_temperature(stated, material.history), told=told, frequency_hz=_frequencies(residuals),
+        temperature_degc=_temperature(stated, material.history), frequency_hz=_frequencies(residuals),
         levels_mps2=(min(levels), max(levels)) if levels else None,
         positions=tuple(dict.fromkeys(w.position for w in result.windows if w.used and w.position)),
         relative_pct=_relative(result), verdicts=_verdicts(result, stated.decision),
@@ -163,8 +130,8 @@ def as_object(certificate: Certificate) -> dict[str, Any]:
         "conditions": plain(
             {
                 "temperature_degc": c.temperature_degc,
-                "reference_frequency_hz": c.told.reference_frequency_hz,
-                "valid_band_hz": c.told.valid_band_hz,
+                "reference_frequency_hz": c.result.frequencies.reference_frequency_hz,
+                "valid_band_hz": c.result.frequencies.valid_band_hz,
                 "motion_frequency_hz": c.frequency_hz,
                 "levels_mps2": c.levels_mps2,
                 "positions": c.positions,

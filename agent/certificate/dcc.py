@@ -118,8 +118,8 @@ def _measured(results: ET.Element, c: Certificate) -> None:
 def _conditions(measured: ET.Element, c: Certificate) -> None:
     kinds: list[tuple[str, str, Iterable[float] | None]] = [
         ("temperature", r"\degreecelsius", c.temperature_degc),
-        ("band in which S holds", r"\hertz", c.told.valid_band_hz),
-        ("frequency at which S holds", r"\hertz", _one(c.told.reference_frequency_hz)),
+        ("band in which S holds", r"\hertz", c.result.frequencies.valid_band_hz),
+        ("frequency at which S holds", r"\hertz", _one(c.result.frequencies.reference_frequency_hz)),
         ("mean frequency of the motion", r"\hertz", c.frequency_hz or None),
         ("level of the motion, rms", UNITS["m/s²"], c.levels_mps2),
     ]
@@ -185,7 +185,7 @@ def _covariance(data: ET.Element, c: Certificate, known: np.ndarray[tuple[int, .
 
 def _response(listed: ET.Element, c: Certificate) -> None:
     """The complex sensitivity in third octaves: for each element of S a list of real and of imaginary parts, and u."""
-    bands = c.told.bands
+    bands = c.result.frequencies.bands
     if not bands:
         return
     data = _result(listed, "Response over frequency", "fieldcal_response")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,20 +10,19 @@ from matplotlib.figure import Figure, FigureBase
 
 from agent.certificate.content import MAIN, Certificate
 from agent.report import style
+from agent.report.frequencies import draw_response, has_response
 from agent.report.trace import by_phase
 from agent.report.units import labelled, output_unit, sensitivity_unit
 from agent.terminal.text import figure_text
-from calib.model import Array
 
 AXES = "xyz"
-_ABOVE: Any = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.0}
 Draw = Callable[[FigureBase, Certificate], None]
 
 
 def figures_of(c: Certificate) -> list[tuple[str, float, Draw]]:
     """Caption, height in inches at the full width of a phone's screen, and the function that draws it."""
     drawn: list[tuple[str, float, Draw]] = [("Main sensitivities with their expanded uncertainties", 2.6, _main)]
-    if _has_response(c):
+    if has_response(c.result):
         drawn.append(("Main sensitivities over frequency, with their expanded uncertainties", 2.6, _response))
     if len(c.history) > 1:
         drawn.append(("Earlier calibrations: main sensitivities relative to the newest", 2.6, _history))
@@ -63,40 +61,7 @@ def _main(on: FigureBase, c: Certificate) -> None:
 
 
 def _response(on: FigureBase, c: Certificate) -> None:
-    axes = on.subplots()
-    middle, relative, U = _bands(c)
-    for k in range(3):
-        shift = 1.0 + 0.02 * (k - 1)  # so that the bars of three axes can be told apart
-        axes.errorbar(middle * shift, 100 * relative[:, k], 100 * U[:, k], **_series(k))
-    axes.axhline(0, color=style.INK, linewidth=0.6)
-    at = c.told.reference_frequency_hz
-    if at:
-        axes.axvline(at, color=style.INK, linewidth=0.8, linestyle=":")
-    axes.set_xscale("log")
-    axes.set(xlabel="frequency in Hz", ylabel="% of S")
-    axes.xaxis.set_major_formatter("{x:g}")
-    axes.xaxis.set_minor_formatter("{x:g}")
-    axes.tick_params(axis="x", which="minor", labelsize=7)
-    axes.legend(ncols=3, **_ABOVE)
-
-
-def _has_response(c: Certificate) -> bool:
-    return bool(np.isfinite(_bands(c)[1]).any())
-
-
-def _bands(c: Certificate) -> tuple[Array, Array, Array]:
-    """Middles (B,) of the bands in Hz; deviation of |S_ii| from S_ii, and U, (B, 3), as shares; NaN: not known."""
-    bands = c.told.bands
-    if not bands:
-        return np.empty(0), np.empty((0, 3)), np.empty((0, 3))
-    values = [
-        np.array([np.diag(np.array(matrix, dtype=float)) for matrix in matrices])
-        for matrices in zip(*((b.sensitivity_re, b.sensitivity_im, b.standard_uncertainty) for b in bands), strict=True)
-    ]
-    S, k = c.result.values[MAIN], c.result.coverage_factor[MAIN]
-    edges = np.array([[band.low_hz, band.high_hz] for band in bands])
-    size = np.hypot(values[0], values[1])
-    return np.sqrt(edges.prod(axis=1)), size / np.abs(S) - 1.0, k * values[2] / np.abs(S)
+    draw_response(on, c.result)
 
 
 def _history(on: FigureBase, c: Certificate) -> None:
@@ -105,9 +70,9 @@ def _history(on: FigureBase, c: Certificate) -> None:
     S = np.array([np.diag(update.sensitivity) for update in c.history])
     U = np.array([update.coverage_factor * np.array(update.standard_uncertainty)[MAIN] for update in c.history])
     for k in range(3):
-        axes.errorbar(days - days[-1], 100 * (S[:, k] / S[-1, k] - 1), 100 * U[:, k] / abs(S[-1, k]), **_series(k))
+        axes.errorbar(days - days[-1], 100 * (S[:, k] / S[-1, k] - 1), 100 * U[:, k] / abs(S[-1, k]), **style.series(k))
     axes.set(xlabel="days before the newest", ylabel="%")
-    axes.legend(ncols=3, **_ABOVE)
+    axes.legend(ncols=3, **style.ABOVE)
 
 
 def _residuals(on: FigureBase, c: Certificate) -> None:
@@ -116,12 +81,7 @@ def _residuals(on: FigureBase, c: Certificate) -> None:
     assert seen.phase_rad is not None
     middle, mean, error = by_phase(seen.phase_rad, seen.residual)
     for k in range(3):
-        axes.errorbar(np.degrees(middle), mean[:, k], 2 * error[:, k], **_series(k))
+        axes.errorbar(np.degrees(middle), mean[:, k], 2 * error[:, k], **style.series(k))
     axes.axhline(0, color=style.INK, linewidth=0.6)
     axes.set(xlabel="phase of the reference in degrees", ylabel=figure_text(output_unit(c.result.unit)), xlim=(0, 360))
-    axes.legend(ncols=3, **_ABOVE)
-
-
-def _series(k: int) -> dict[str, Any]:
-    """Style of an axis of the sensor; its marker tells it apart without colours too."""
-    return {"color": style.AXIS_COLOURS[k], "marker": "osD"[k], "markersize": 4, "capsize": 3, "label": AXES[k]}
+    axes.legend(ncols=3, **style.ABOVE)

@@ -114,7 +114,7 @@ def _conditions(c: Certificate) -> Iterator[tuple[str, str]]:
     yield "equation", f"{EQUATION}; V indication, a acceleration, S sensitivity, Q offset"
     t = c.temperature_degc
     yield "temperature", f"{t[0]:g} to {t[1]:g} °C" if t else "not recorded"
-    band, at = c.told.valid_band_hz, c.told.reference_frequency_hz
+    band, at = c.result.frequencies.valid_band_hz, c.result.frequencies.reference_frequency_hz
     if band is not None and at is not None:
         low, high = band
         yield "frequencies", f"S at {at:.3g} Hz; right within U/3 from {low:.3g} to {high:.3g} Hz"

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from agent.report import diagrams, signals, style, timelines
+from agent.report import diagrams, frequencies, signals, style, timelines
 from agent.report.material import Material
 from agent.report.trace import Residuals
 from agent.report.units import position_name
@@ -36,16 +36,20 @@ def draw(material: Material, shown: Residuals | None, directory: Path) -> list[D
 
 def _figures(material: Material, shown: Residuals | None) -> Iterator[tuple[str, str, Figure | None]]:
     results, unit = material.results, material.results[0].unit
-    for k, result in enumerate(results):
-        about = f", {result.label}" if len(results) > 1 else ""
-        number = f"-{k + 1}" if len(results) > 1 else ""
+    several = len(results) > 1
+    named = [(f"-{k + 1}" if several else "", f", {r.label}" if several else "", r) for k, r in enumerate(results)]
+    for number, about, result in named:
         caption = f"Rows of S as points{about}; without transverse sensitivities each point is on its axis."
         yield f"rows{number}", caption, diagrams.rows_in_space(result)
     yield "main", "Main sensitivities with their expanded uncertainties.", diagrams.main_sensitivities(results)
     caption = "Transverse sensitivities in percent of the main one of their row, with expanded uncertainties."
     yield "transverse", caption, diagrams.transverse_sensitivities(results)
+    for number, about, result in named:
+        caption = f"Main sensitivities over frequency, relative to S, with expanded uncertainties{about}."
+        caption += " Dotted: the frequency at which S holds. Shaded: where S alone is right within a third of U."
+        yield f"response{number}", caption, frequencies.response(result)
     if shown is not None:
-        model = f" of {results[0].label}" if len(results) > 1 else ""
+        model = f" of {results[0].label}" if several else ""
         where = f"position {position_name(shown.position)}, {shown.time_s[0]:.1f} to {shown.time_s[-1]:.1f} s"
         caption = f"Indications (points) against S a + Q{model} (line): some cycles of the window in {where}."
         yield "indications", caption, signals.indications(shown, unit)
@@ -58,9 +62,7 @@ def _figures(material: Material, shown: Residuals | None) -> Iterator[tuple[str,
         if shown.frequency_hz:
             caption += f" Dotted: mean frequency of the motion, {shown.frequency_hz:.3g} Hz."
         yield "residuals", caption, signals.left_over(shown, unit)
-    for k, result in enumerate(results):
-        about = f", {result.label}" if len(results) > 1 else ""
-        number = f"-{k + 1}" if len(results) > 1 else ""
+    for number, about, result in named:
         caption = f"Uncertainty budget: share of each source in the variance{about}."
         yield f"budget{number}", caption, timelines.budget(result)
         yield f"windows{number}", f"Windows and their verdicts{about}.", timelines.windows(result.windows)

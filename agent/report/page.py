@@ -73,6 +73,8 @@ def _numbers(material: Material, seen: Sequence[Residuals]) -> Iterator[str]:
         yield f"<h2>Numbers{about}</h2>"
         if result.determined.any():
             yield "<h3>Parameters</h3>" + tables.parameters(result)
+        if result.frequencies.bands:
+            yield "<h3>Main sensitivities over frequency, with U</h3>" + tables.over_frequency(result)
         if result.budget and result.determined.any():
             yield "<h3>Uncertainty budget: u by source</h3>" + tables.budget(result)
         if result.fields.get("nuisances"):

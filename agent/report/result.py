@@ -17,6 +17,8 @@ from agent.core.events import CalibrationUpdate
 from calib.model import PARAMETERS, Array
 
 Item = TypeVar("Item")
+Row = tuple[float | None, float | None, float | None]
+Matrix = tuple[Row, Row, Row]
 
 PLACES = {"sensitivity": (3, 3), "offset": (3,)}
 # Members with their own place in the report. All further members of the object are shown in one more table.
@@ -24,7 +26,7 @@ SHOWN = frozenset(
     {
         "sensitivity", "offset", "standard_uncertainty", "expanded_uncertainty", "covariance", "determined",
         "degrees_of_freedom", "nuisances", "budget", "status", "reasons", "windows", "statistics", "options", "files",
-        "shared_errors",
+        "shared_errors", "response",
     }
 )  # fmt: skip
 
@@ -44,6 +46,30 @@ class WindowVerdict(msgspec.Struct, frozen=True):
     left_out: int = 0
     position: str = ""
     kind: str = ""
+
+
+class Band(msgspec.Struct, frozen=True):
+    """The complex sensitivity in one third octave; None where it is not known."""
+
+    low_hz: float
+    high_hz: float
+    sensitivity_re: Matrix | None
+    sensitivity_im: Matrix | None
+    standard_uncertainty: Matrix | None
+
+
+class Frequencies(msgspec.Struct, frozen=True):
+    """Where S holds, as the result tells it; None where it does not."""
+
+    reference_frequency_hz: float | None = None
+    valid_band_hz: tuple[float, float] | None = None
+    response: tuple[Band, ...] | None = None
+
+    @property
+    def bands(self) -> tuple[Band, ...]:
+        """Those that are known."""
+        known = self.response or ()
+        return tuple(b for b in known if b.sensitivity_re and b.sensitivity_im and b.standard_uncertainty)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,6 +96,7 @@ class CalibrationResult:
     unit: str
     budget: Mapping[str, Array] = field(default_factory=dict)
     files: tuple[SourceFile, ...] = ()
+    frequencies: Frequencies = field(default_factory=Frequencies)
     fields: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -121,6 +148,7 @@ def parse(fields: Mapping[str, Any], name: str) -> CalibrationResult:
         unit=str(fields.get("output_unit") or ""),
         budget={source: _source(part, f"budget.{source}") for source, part in (fields.get("budget") or {}).items()},
         files=tuple(_list_of(SourceFile, fields.get("files"), "files")),
+        frequencies=_frequencies(fields),
         fields=fields,
     )
 
@@ -193,6 +221,13 @@ def plain(value: Any) -> Any:
 
 def _split(values: NDArray[Any]) -> dict[str, Any]:
     return {"sensitivity": values[:9].reshape(3, 3), "offset": values[9:]}
+
+
+def _frequencies(fields: Mapping[str, Any]) -> Frequencies:
+    try:
+        return msgspec.convert(fields, Frequencies)
+    except msgspec.ValidationError as error:
+        raise ResultError(f"{error}; make the result again with `fieldcal calibrate`") from None
 
 
 def _parts(part: Any, where: str) -> tuple[Array, Array]:

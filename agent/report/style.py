@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 WIDTH_IN = 5.0  # 480 px: on a phone of 360 px the 10 pt letters are still 9 px high
+ABOVE: Any = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.0}  # of a legend, over the axes
 INK, PALE, PAPER = "#1b1e23", "#c9ced6", "#ffffff"
 USED, REFUSED = "#2a7f62", "#b3431b"
 AXIS_COLOURS = ("#0068b5", "#c2500a", "#00805e")  # x, y, z; colour-blind people can distinguish them too
@@ -100,3 +101,8 @@ def bare(axes: Axes) -> None:
     """Switch off the grid along y, because the rows are names."""
     axes.grid(visible=False, axis="y")
     axes.tick_params(axis="y", length=0)
+
+
+def series(k: int) -> dict[str, Any]:
+    """Style of the axis `k` of the sensor with its uncertainty; the marker tells it apart without colours too."""
+    return {"color": AXIS_COLOURS[k], "marker": "osD"[k], "markersize": 4, "capsize": 3, "label": "xyz"[k]}

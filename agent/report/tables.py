@@ -128,6 +128,21 @@ def _are_runs(value: list[Any]) -> bool:
     return bool(value) and all(isinstance(run, Mapping) for run in value)
 
 
+def over_frequency(result: CalibrationResult) -> str:
+    """|S_ii| with U in each band of frequency in which it is known."""
+    k = result.coverage_factor[[0, 4, 8]]
+    rows = []
+    for band in result.frequencies.bands:
+        re, im, u = (
+            np.diag(np.array(m, dtype=float))
+            for m in (band.sensitivity_re, band.sensitivity_im, band.standard_uncertainty)
+        )
+        known = zip(np.hypot(re, im), k * u, strict=True)
+        cells = [plus_minus(float(S), float(U)) if np.isfinite(S) else NOT_KNOWN for S, U in known]
+        rows.append([f"{band.low_hz:.3g} to {band.high_hz:.3g}", *cells])
+    return table(["Hz", *(f"|S{axis}{axis}|" for axis in AXES)], rows)
+
+
 def left_over(seen: Sequence[Residuals], result: CalibrationResult) -> str:
     """Root mean square of the residual of each window, in the output unit and as acceleration."""
     unit = output_unit(result.unit)

@@ -11,12 +11,11 @@ from matplotlib.patches import Patch
 
 from agent.core.events import CalibrationUpdate
 from agent.report.result import CalibrationResult, WindowVerdict
-from agent.report.style import AXIS_COLOURS, INK, PALE, REFUSED, SHADES, USED, bare, figure
+from agent.report.style import INK, PALE, REFUSED, SHADES, USED, bare, figure, series
 from agent.report.units import output_unit, position_name
 from agent.terminal.text import figure_text
 from calib.model import PARAMETERS
 
-AXES = "xyz"
 LANES = 16  # a figure has room for so many positions; if there are more, windows are arranged by verdict
 MAIN = [0, 4, 8]
 SOURCES = 7  # so many of the largest sources are named; the others are added up
@@ -71,9 +70,8 @@ def history(updates: Sequence[CalibrationUpdate], unit: str) -> Figure | None:
     drawn = figure(5.0)
     upper, lower = drawn.subplots(2, 1, sharex=True)
     for k in range(3):
-        style = {"color": AXIS_COLOURS[k], "marker": "osD"[k], "markersize": 4, "capsize": 3, "label": AXES[k]}
-        upper.errorbar(when, 100 * (S[:, k] / S[-1, k] - 1), 100 * U[:, MAIN[k]] / abs(S[-1, k]), **style)
-        lower.errorbar(when, Q[:, k], U[:, 9 + k], **style)
+        upper.errorbar(when, 100 * (S[:, k] / S[-1, k] - 1), 100 * U[:, MAIN[k]] / abs(S[-1, k]), **series(k))
+        lower.errorbar(when, Q[:, k], U[:, 9 + k], **series(k))
     upper.set(title="main sensitivities", ylabel="% difference from the newest")
     lower.set(title="offsets", ylabel=f"Q in {figure_text(output_unit(unit))}", xlabel="UTC")
     handles, labels = upper.get_legend_handles_labels()

@@ -110,7 +110,7 @@ def check_alone(seen: Page) -> None:
 def test_a_data_directory(recorded: tuple[Path, Truth], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     directory, truth = recorded
     assert run(capsys, directory, "-o", tmp_path / "out") == (0, "")
-    check_figures(tmp_path / "out", "rows", "main", "transverse", "indications", "residuals", "windows")
+    check_figures(tmp_path / "out", "rows", "main", "transverse", "response", "indications", "residuals", "windows")
     seen = Page(tmp_path / "out" / "report.html")
     check_alone(seen)
     for words in (

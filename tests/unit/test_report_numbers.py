@@ -8,12 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from agent.report import tables
+from agent.report.frequencies import over_frequency, response
 from agent.report.result import CalibrationResult, ResultError, from_update, parse
 from agent.report.timelines import SOURCES, variance_shares
 from agent.report.trace import PHASE_BINS, Trace, by_phase, residuals, spans, spectrum
 from agent.report.units import output_unit, said, sensitivity_unit
 from calib.geometry import along, clamp
 from calib.model import PARAMETERS
+from calib.rounding import plus_minus
 from tests.unit.results import calibration
 
 S = np.array([[10.0, -0.1, 0.05], [0.2, 9.9, 0.1], [-0.1, 0.15, 10.2]])
@@ -46,6 +49,22 @@ def test_a_result_is_read_in_the_order_of_the_parameters() -> None:
     assert found.determined.all()
     assert not found.refused
     assert result().label == "name"
+
+
+def test_the_response_is_told_in_per_cent_of_s_and_as_numbers() -> None:
+    re, im = 1.1 * S, np.zeros((3, 3))
+    im[0, 0], re[1, 1] = 0.2 * S[0, 0], 0.9 * S[1, 1]
+    known = {"low_hz": 2.0, "high_hz": 8.0, "sensitivity_re": re.tolist(), "sensitivity_im": im.tolist()}
+    silent = {"low_hz": 8.0, "high_hz": 9.0, "sensitivity_re": None, "sensitivity_im": None}
+    bands = [known | {"standard_uncertainty": [[0.01] * 3] * 3}, silent | {"standard_uncertainty": None}]
+    found = result(response=bands, reference_frequency_hz=4.0, valid_band_hz=[3.0, 5.0])
+    middle_hz, relative, U = over_frequency(found)
+    np.testing.assert_allclose(middle_hz, [4.0], rtol=1e-12)
+    np.testing.assert_allclose(relative, [[np.hypot(1.1, 0.2) - 1.0, -0.1, 0.1]], rtol=1e-12)
+    np.testing.assert_allclose(U, [0.02 / np.abs(np.diag(S))], rtol=1e-12)
+    assert f"<td>2 to 8</td><td>{plus_minus(np.hypot(1.1, 0.2) * S[0, 0], 0.02)}</td>" in tables.over_frequency(found)
+    assert response(found) is not None
+    assert response(result(response=bands[1:])) is None
 
 
 def test_null_is_not_determined() -> None:
