@@ -15,6 +15,7 @@ from agent.core.stream import UNCOUNTED, DeviceStream
 from calib.estimate.recursion import Recursion
 from calib.excitation.placing import Knowledge, Placed, clamp_angles, mean_output, nearest_stop
 from calib.excitation.standing import KEPT, MEAN_S, Standing
+from calib.excitation.window_verdict import Limits
 from calib.model import Array, Pose
 from calib.signal.samples import Samples
 from hw.block import SampleBlock
@@ -22,7 +23,10 @@ from hw.block import SampleBlock
 FOUND_WITHIN_S = KEPT * MEAN_S  # of samples that may still turn out to belong to a stretch
 # A garbled line may say 1e20; beside it every departure would look small. No motion that gravity is seen in is larger.
 LARGEST_MPS2 = 200.0
+TURN_S = 2.0  # a shorter time between two stretches is too short to turn the sensor to another position and back
 LEAST_SHARE = 0.5  # of a short mean's samples; with fewer nobody knows what happened meanwhile
+NONE_BEFORE = (-math.inf, np.zeros(3))  # end of the newest stretch that ended, and its mean output
+NONE_STOOD = (0, "", False)  # the newest stretch that was placed: serial, position, whether the sensor slipped
 # How it stands in a stretch before `place` has looked.
 OPEN = Pose("unknown", np.zeros((3, 0)), np.full(3, np.nan))
 
@@ -32,12 +36,15 @@ class Stretch:
     """Between two changes of position; the newest one has no end yet.
 
     `serial` counts them. `smoothing_s` is how long the sensor's output must be averaged, because of slow motion.
+    `moved_mps2`: the difference of its mean output from that with which the stretch before began; 0 where more than
+    TURN_S lie between them.
     """
 
     serial: int
     start_s: float
     stop_s: float
     smoothing_s: float
+    moved_mps2: float = 0.0
 
 
 class FoundPositions:
@@ -53,6 +60,7 @@ class FoundPositions:
         self._told: list[Stance] = []  # by operators, each until the next change
         self._angles: dict[int, Pose] = {}  # by serial: what is found first holds as long as nothing changes
         self._serial = 0
+        self._before, self._stood = NONE_BEFORE, NONE_STOOD
         self._after_s = 0.0
         self._expected: int | None = None  # index of the next sample
         self._origin = (0, 0)  # index of a sample and number of the mean that begins with it
@@ -130,7 +138,7 @@ class FoundPositions:
             return Placed(None, f"less than {shortest_s:g} s of samples, which is too short to find the position", {})
         knowledge, calibration = self._knowledge(known.scale), known.law(day).at(cut.temperature_degc)
         if self._stops:
-            return nearest_stop(mean, self._stops, calibration, knowledge)
+            return self._unless_slipped(stretch, nearest_stop(mean, self._stops, calibration, knowledge))
         serial = stretch.serial
         if serial in self._angles:
             return Placed(self._angles[serial], "", {})
@@ -140,6 +148,24 @@ class FoundPositions:
         if placed.pose is not None:
             self._angles[serial] = placed.pose
         return placed
+
+    def _unless_slipped(self, stretch: Stretch, placed: Placed) -> Placed:
+        """A sensor that moved, and was not turned to another position, does not stand as that position is stated."""
+        if placed.pose is None:
+            return placed
+        u, position = self._channel.uncertainty, placed.pose.position
+        most_mps2 = Limits.of(u.offset_mps2, math.radians(u.angle_deg)).most_step_mps2
+        serial, stood, slipped = self._stood
+        if stretch.serial != serial:
+            slipped = position == stood and stretch.moved_mps2 > (0.0 if slipped else most_mps2)
+            self._stood = (stretch.serial, position, slipped)
+        if not slipped:
+            return placed
+        moved = f"the sensor slipped at {position}: its mean changed by {stretch.moved_mps2:.3g} m/s2 without a turn"
+        most = f"{most_mps2:.3g} m/s2 at most by the stated uncertainties"
+        return Placed(
+            None, f"{moved}, {most}; turn it to a position again", placed.numbers | {"slipped_mps2": stretch.moved_mps2}
+        )
 
     def _knowledge(self, scale: float) -> Knowledge:
         u = self._channel.uncertainty
@@ -174,6 +200,7 @@ class FoundPositions:
         """The stream has dropped its samples, which are of another device: there are no windows of them."""
         self._standing.interrupt()
         self._stretches, self._angles, self._expected = [], {}, None
+        self._before, self._stood = NONE_BEFORE, NONE_STOOD
 
     def _average(self, values: Array, size: int, stream: DeviceStream) -> None:
         """Means of `size` samples, as they become whole; missing ones (NaN) have their place."""
@@ -200,7 +227,9 @@ class FoundPositions:
         if not stood and self._standing.first is not None:
             self._serial += 1
             start_s = self._time_of(self._standing.first, size, stream)
-            self._stretches.append(Stretch(self._serial, start_s, math.inf, self._standing.smoothing_s))
+            ended_s, centre = self._before
+            moved_mps2 = float(np.linalg.norm(self._standing.centre - centre)) if start_s - ended_s < TURN_S else 0.0
+            self._stretches.append(Stretch(self._serial, start_s, math.inf, self._standing.smoothing_s, moved_mps2))
 
     def _end(self, number: int | None, size: int, stream: DeviceStream, *, before_restart: bool = False) -> None:
         """The stretch ends before the mean of this number, if any."""
@@ -208,6 +237,7 @@ class FoundPositions:
             return
         newest = self._stretches[-1]
         newest.stop_s = max(self._time_of(number, size, stream, before_restart=before_restart), newest.start_s)
+        self._before = (newest.stop_s, self._standing.centre)
         if newest.stop_s - newest.start_s <= 2.0 * self._channel.guard_s:
             self._stretches.pop()
         self._told = list(self._ended(newest.stop_s)) + [t for t in self._told if t.start_s >= newest.stop_s]
@@ -228,6 +258,8 @@ class FoundPositions:
             "told": [told.snapshot() for told in self._told],
             "angles": [[serial, _pose_state(pose)] for serial, pose in self._angles.items()],
             "serial": self._serial,
+            "before": [self._before[0], self._before[1].copy()],
+            "stood": list(self._stood),
             "after_s": self._after_s,
             "expected": self._expected,
             "origin": list(self._origin),
@@ -245,6 +277,9 @@ class FoundPositions:
         self._origin = (state["origin"][0], state["origin"][1])
         self._sum, self._count, self._passed = np.array(state["mean"][0]), state["mean"][1], state["mean"][2]
         self._cleared_s, self._oldest_s = state["edges_s"]
+        ended, stood = state.get("before"), state.get("stood")  # not in recordings of earlier versions
+        if ended is not None and stood is not None:
+            self._before, self._stood = (ended[0], np.array(ended[1])), (stood[0], stood[1], stood[2])
 
 
 def _pose_state(pose: Pose) -> dict[str, Any]:

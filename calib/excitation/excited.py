@@ -20,6 +20,7 @@ from calib.model import Array, Window, WindowSums, own_channels
 # tenth of that error, which is then at most 1 %.
 OVER_NOISE = 10.0
 OF_STRONGEST = 1e-4  # least power relative to that of the strongest channel: 1 % of its amplitude
+WEAK = 1e-2  # of a channel with less of the strongest channel's power, what is 90 deg ahead of that one is shared too
 MOST_NOISE = 0.5  # largest part of a segment's power that the correction may subtract
 CORRECTION_SHARE = 0.1  # relative standard uncertainty of the noise's power, from a spectrum of some hundred lines
 
@@ -45,9 +46,10 @@ def excited(window: Window) -> Excitation:
     m = own_channels(window.sums.reference_channels)
     if m == 0:
         return Excitation(window, np.zeros((3, 0)), 0.0)
-    power = window.sums.scatter.sum(axis=0)[:m, :m] / window.sums.count.sum()
+    both = _power(window)
+    power = both[:m, :m]
     noise = np.zeros((2, m)) if window.reference_noise is None else window.reference_noise**2
-    own = _own_power(power, noise[0])
+    own = _own_power(both, noise[0])
     live = own > 0.0
     if live.all() and window.reference_noise is None and window.bands is None:  # nothing to remove or to subtract
         return Excitation(window, np.linalg.qr(window.pose.direction[:, :m])[0], 0.0)
@@ -62,21 +64,35 @@ def excited(window: Window) -> Excitation:
     return Excitation(_reduced(window, live, along, ahead, noise), basis, CORRECTION_SHARE * share)
 
 
+def _power(window: Window) -> Array:
+    """(2 m, 2 m) covariance of u and du/dt of a reference's own channels."""
+    m, channels = own_channels(window.sums.reference_channels), window.sums.reference_channels
+    columns = np.r_[0:m, channels : channels + m]
+    return np.asarray(window.sums.scatter.sum(axis=0)[np.ix_(columns, columns)] / window.sums.count.sum())
+
+
 def _own_power(power: Array, noise: Array) -> Array:
     """(m,) power of each channel that the stronger channels do not explain; 0 for a silent channel.
 
-    `power` (m, m) is the covariance of all channels, `noise` (m,) the power of their noise. A motion in one direction
-    that is oblique to the channels appears in all of them, but it excites one direction only: the strongest channel
-    represents it, and the remainder in the other channels is noise.
+    `power` (2 m, 2 m) is the covariance of u and du/dt of all channels, `noise` (m,) the power of the noise of u. A
+    motion in one direction that is oblique to the channels appears in all of them, but it excites one direction only:
+    the strongest channel represents it, and the remainder in the other channels is noise. A WEAK channel may share the
+    part of a stronger one that is 90 deg ahead as well: du/dt stands beside u in the regression, so only what neither
+    explains tells a slope. Strong channels keep that part: motion in a circle excites two directions.
     """
-    own, rest, strongest = np.zeros(len(power)), power.copy(), power.diagonal().max(initial=0.0)
+    m = len(noise)
+    own, strongest = np.zeros(m), power.diagonal()[:m].max(initial=0.0)
+    rest, beside = power[:m, :m].copy(), power.copy()
     for _ in own:
         left = np.where(own > 0.0, 0.0, rest.diagonal())
         k = int(np.argmax(left))
-        if left[k] <= max(OF_STRONGEST * strongest, OVER_NOISE * noise[k]):
+        alone = beside[k, k] if left[k] < WEAK * strongest else left[k]
+        if left[k] <= OF_STRONGEST * strongest or alone <= OVER_NOISE * noise[k]:
             break
-        own[k] = left[k]
+        own[k] = alone
         rest -= np.outer(rest[:, k], rest[k]) / left[k]
+        for column in (k, m + k):
+            beside -= np.outer(beside[:, column], beside[column]) / max(beside[column, column], np.finfo(float).tiny)
     return own
 
 
@@ -84,9 +100,7 @@ def _shared(window: Window, live: NDArray[np.bool_], noise: Array) -> tuple[Arra
     """The shared motion of the silent channels (rows): (m, m) on u of the live channels (columns), and (m, m) in s on
     their du/dt. The elements of other rows and columns are 0. `noise` (2, m) is the power of the reference's noise.
     """
-    m, channels = len(live), window.sums.reference_channels
-    columns = np.r_[0:m, channels : channels + m]
-    power = window.sums.scatter.sum(axis=0)[np.ix_(columns, columns)] / window.sums.count.sum()
+    m, power = len(live), _power(window)
     found = np.zeros((m, 2 * m))
     if live.any() and not live.all():
         moving = np.flatnonzero(np.tile(live, 2))

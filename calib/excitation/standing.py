@@ -50,6 +50,11 @@ class Standing:
         return self._next
 
     @property
+    def centre(self) -> Array:
+        """(3,) the mean output at the beginning of the newest stretch."""
+        return self._centre.copy()
+
+    @property
     def smoothing_s(self) -> float:
         """Length of the longest smoothing: motion in the stretch has periods of half of it at most."""
         return self._longest * MEAN_S

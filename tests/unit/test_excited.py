@@ -105,3 +105,22 @@ def test_a_silent_channel_that_moves_ahead_of_the_others_turns_the_motion_s_deri
     live = np.diag(data.root[0]) > 0.0
     # Four rows of three outputs at most; without the motion ahead the row of the derivative is 30 SDs off.
     assert np.abs(rows.slope[0][live]).max() < 4.0
+
+
+@pytest.mark.parametrize(("share", "channels"), [(0.01, 1), (0.09, 2), (1.0, 2)])
+def test_a_weak_channel_90_deg_ahead_is_no_motion_of_its_own_unless_the_derivative_leaves_more_than_noise(
+    share: float, channels: int
+) -> None:
+    """x is the motion along y, 90 deg ahead at all frequencies, times `share`; beside u and du/dt of y little is left."""
+    n, random = 6000, np.random.default_rng(2)
+    lines = np.fft.rfftfreq(n, 1 / RATE_HZ)
+    y = ((lines > 0.5) & (lines < 10.0)) * (random.normal(size=(len(lines), 2)) @ [1, 1j])
+    a = np.fft.irfft(np.column_stack([1j * share * y, y, 0 * y]), n, axis=0)
+    scale = 0.32 / a[:, 1].std()
+    da = np.fft.irfft(np.fft.rfft(a, axis=0) * (2j * np.pi * lines[:, None]), n, axis=0)
+    u = scale * a + NOISE_MPS2 * random.normal(size=a.shape)
+    du = scale * da + NOISE_MPS2 * 30.0 * random.normal(size=a.shape)
+    sums = window_sums(u, du, scale * a @ S.T + 0.005 * random.normal(size=a.shape), np.arange(0, n + 1, 50))
+    noise = np.array([np.full(3, NOISE_MPS2), np.full(3, 30.0 * NOISE_MPS2)])
+    found = excited(Window(0.0, 60.0, beside(np.eye(3)), sums, True, "", n, 0, reference_noise=noise))
+    assert found.directions.shape == (3, channels)

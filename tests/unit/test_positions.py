@@ -118,6 +118,17 @@ def test_a_position_that_nobody_stated_is_unknown_and_its_window_refused() -> No
     assert found[2].numbers["position_chi2"] > 21.2
 
 
+def test_what_comes_after_a_slip_is_refused_until_the_sensor_is_turned() -> None:
+    slip_rad = np.deg2rad(1.5)
+    slipped = G_MPS2 * np.array([np.sin(slip_rad), 0.0, np.cos(slip_rad)])
+    stays = [turned([face], seed=k) for k, face in enumerate((FACES[0], slipped))]
+    found = windows(np.vstack([*stays, turned([slipped, FACES[1], FACES[0], FACES[2]], seed=2)]))
+    by_position = [(w.position, w.used) for w in found]
+    assert by_position == [(NAMES[0], True), ("unknown", False), (NAMES[1], True), (NAMES[0], True)]
+    assert f"the sensor slipped at {NAMES[0]}: its mean changed by 0.25" in found[1].reason
+    assert found[1].numbers["slipped_mps2"] == pytest.approx(G_MPS2 * slip_rad, abs=0.01)
+
+
 def test_two_stops_near_each_other_are_told_apart_once_the_offset_is_known() -> None:
     lean = G_MPS2 * np.array([np.sin(np.deg2rad(5.0)), 0.0, np.cos(np.deg2rad(5.0))])
     stops = [*FACES, -FACES[0], -FACES[1], lean]
