@@ -111,7 +111,7 @@ def test_a_silent_channel_that_moves_ahead_of_the_others_turns_the_motion_s_deri
 def test_a_weak_channel_90_deg_ahead_is_no_motion_of_its_own_unless_the_derivative_leaves_more_than_noise(
     share: float, channels: int
 ) -> None:
-    """x is the motion along y, 90 deg ahead at all frequencies, times `share`; beside u and du/dt of y little is left."""
+    """x is the motion along y, 90 deg ahead at all frequencies, times `share`: u and du/dt of y explain most of it."""
     n, random = 6000, np.random.default_rng(2)
     lines = np.fft.rfftfreq(n, 1 / RATE_HZ)
     y = ((lines > 0.5) & (lines < 10.0)) * (random.normal(size=(len(lines), 2)) @ [1, 1j])
