@@ -19,6 +19,7 @@ from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 from agent.cli.tls_options import tls_files, tls_options
 from agent.config.key_file import KeyFileError
 from agent.config.known_keys import KnownKeys, WatchedKeys
+from agent.delivery.hearing import Hearing
 from agent.delivery.keys import PREFIX, parse_key
 from agent.delivery.session import EndpointError, session_config
 from agent.keys.files import write_new
@@ -29,6 +30,7 @@ from agent.terminal.text import say
 INBOX = 1000  # heads that may wait; the oldest are dropped, and each gateway publishes a new one within a minute
 CONNECT_MS = 10_000
 CLOSE_S = 2.0  # s to wait at the end until a head that has arrived is kept
+LOOK_S = 1.0  # s between two looks whether the router still hears
 TOLD_S = 10.0  # s between two heads that are said to be refused, since strangers may publish them without end
 HEADS = f"{PREFIX}/*/*/head"
 
@@ -123,12 +125,18 @@ def _follow(session: zenoh.Session, key: str, kept: Witness, stop: threading.Eve
     thread = threading.Thread(target=take_all, name="witness", daemon=True)
     thread.start()
     say(f"keeping the heads of {key}")
-    stop.wait()
+    hearing = Hearing()
+    hearing.begin(session)
+    heard = True
+    while heard and not stop.wait(LOOK_S):
+        heard = not hearing.lost()
     subscriber.undeclare()
     thread.join(CLOSE_S)
+    if not heard:
+        say("fieldcal witness: the router does not answer any more; start this command again", err=True)
     for fault in faults:
         say(f"fieldcal witness: {fault}", err=True)
-    return 1 if faults else 0
+    return 1 if faults or not heard else 0
 
 
 def _signer(directory: Path) -> Signer:

@@ -19,6 +19,7 @@ import zenoh
 from agent.config.known_keys import WatchedKeys
 from agent.config.tls import TlsFiles
 from agent.delivery.asking import Asking
+from agent.delivery.hearing import Hearing
 from agent.delivery.holding import Held
 from agent.delivery.keys import PREFIX
 from agent.delivery.memory import Memory
@@ -31,6 +32,8 @@ from agent.delivery.verifying import Refusals, UnverifiedError, Verifier
 
 INBOX = 1000  # samples that may wait; further ones are dropped and later fetched from the gateway's store
 CONNECT_S = 10.0
+RECONNECT_S = 2.0  # s between two attempts to reach a router again with another session
+LOOK_S = 1.0  # s between two looks whether the router still hears
 CLOSE_S = 2.0  # that closing waits for the thread that takes samples; it ends at once unless the inbox is full
 
 
@@ -70,6 +73,7 @@ class Consumer:
     signed, with the fields that were signed. Others are refused: logged, and counted by gateway in `refused`. The file
     is read again when it changes. `trust_first`: a gateway without a key in the list gets the key of its first result,
     which is added to the list.
+    A session that the router does not hear is replaced by another one (agent.delivery.hearing).
     `close` may be called from another thread than the one that iterates. Ctrl-C while the consumer waits for a result
     ends the iteration, as `close` does. At the end of the program the consumer closes itself.
     Raises EndpointError, ConnectionError, MemoryFileError or KeyFileError; iterating raises OSError where `memory`
@@ -96,24 +100,53 @@ class Consumer:
         self._dialogues: dict[str, Dialogue] = {}  # by source: the gateways that are being asked
         self._held = Held()
         self._asking = Asking(key, self._progress, self._held)
-        config = session_config("client", connect=endpoints, tls=tls)
-        config.insert_json5("connect/timeout_ms", json.dumps(int(CONNECT_S * 1000)))
-        self._open = ExitStack()
-        try:
-            session = self._open.enter_context(zenoh.open(config))
-        except zenoh.ZError:
-            raise ConnectionError(f"no Zenoh router answers at {', '.join(endpoints)}") from None
-        self._questions = Questions(session, self._inbox.put)
-        # A plain one: an advanced subscriber asks each publisher of each gateway for its history after a lost
-        # connection and gets heartbeats of all of them, which a router of 1,000 gateways cannot stand (docs/fleet.md).
-        subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(INBOX))
-        self._open.callback(subscriber.undeclare)
-        self._presence = Presence(session, key, lambda: self._inbox.put(_Wake.NEWS))
-        self._open.callback(self._presence.close)
-        self._taking = threading.Thread(target=self._take_samples, args=(subscriber,), name="consumer", daemon=True)
-        self._taking.start()
+        self._config = session_config("client", connect=endpoints, tls=tls)
+        self._config.insert_json5("connect/timeout_ms", json.dumps(int(CONNECT_S * 1000)))
+        self._key, self._endpoints = key, endpoints
+        self._hearing = Hearing()
+        self._changing = threading.Lock()  # held while the session is replaced or closed
+        self._closed = threading.Event()
+        self._connect()
         # Where Zenoh's thread still runs when the interpreter ends, Python aborts the process.
         atexit.register(self.close)
+
+    def _connect(self) -> None:
+        """Open a session, and all that is declared in it. Raises ConnectionError."""
+        opened = ExitStack()
+        try:
+            session = opened.enter_context(zenoh.open(self._config))
+        except zenoh.ZError:
+            raise ConnectionError(f"no Zenoh router answers at {', '.join(self._endpoints)}") from None
+        with self._changing:
+            self._open = opened
+            self._questions = Questions(session, self._inbox.put)
+            # A plain one: an advanced subscriber asks each publisher of each gateway for its history after a lost
+            # connection and gets heartbeats of all of them, which a router of 1,000 gateways cannot stand
+            # (docs/fleet.md).
+            subscriber = session.declare_subscriber(self._key, zenoh.handlers.RingChannel(INBOX))
+            opened.callback(subscriber.undeclare)
+            self._presence = Presence(session, self._key, lambda: self._inbox.put(_Wake.NEWS))
+            opened.callback(self._presence.close)
+            self._taking = threading.Thread(target=self._take_samples, args=(subscriber,), name="consumer", daemon=True)
+            self._taking.start()
+            self._hearing.begin(session)
+            if self._closed.is_set():
+                self._questions.close(opened.close)
+
+    def _is_lost(self) -> bool:
+        with self._changing:
+            return not self._closed.is_set() and self._hearing.lost()
+
+    def _reconnect(self) -> None:
+        """Open another session in place of this one, as soon as a router answers."""
+        self._questions.close(self._open.close)
+        while not self._closed.is_set():
+            try:
+                self._connect()
+            except ConnectionError:
+                self._closed.wait(RECONNECT_S)
+            else:
+                return
 
     def __iter__(self) -> Iterator[Received]:
         for batch in self.batches(1):
@@ -141,6 +174,8 @@ class Consumer:
             if self._inbox.empty():
                 yield None
             try:
+                if self._is_lost():
+                    self._reconnect()
                 item = self._inbox.get(timeout=self._wait_s())
             except queue.Empty:
                 pass
@@ -156,9 +191,9 @@ class Consumer:
             for source in self._held.due():
                 yield from self._begin(source)
 
-    def _wait_s(self) -> float | None:
-        waits = self._held.wait_s(), self._presence.wait_s() if self._held.room() else None
-        return min((wait_s for wait_s in waits if wait_s is not None), default=None)
+    def _wait_s(self) -> float:
+        waits = LOOK_S, self._held.wait_s(), self._presence.wait_s() if self._held.room() else None
+        return min(wait_s for wait_s in waits if wait_s is not None)
 
     def _take(self, item: zenoh.Sample | Replies) -> Iterator[Received]:
         if isinstance(item, Replies):
@@ -170,7 +205,10 @@ class Consumer:
 
     def close(self) -> None:
         """End the iteration and the session. May be called twice, from any thread."""
-        self._questions.close(self._open.close)
+        self._closed.set()
+        with self._changing:
+            self._questions.close(self._open.close)
+        self._inbox.put(_Wake.CLOSED)
         self._taking.join(CLOSE_S)
         atexit.unregister(self.close)
 
@@ -184,7 +222,6 @@ class Consumer:
         for sample in subscriber:
             self._room.acquire()
             self._inbox.put(sample)
-        self._inbox.put(_Wake.CLOSED)  # the subscriber is undeclared
 
     @property
     def last_sequence(self) -> dict[str, int]:

@@ -17,6 +17,7 @@ from zenoh.ext import AdvancedPublisher, CacheConfig, MissDetectionConfig, decla
 
 from agent.config.tls import TlsFiles, expiry_warning
 from agent.delivery.answers import answer_queries, attachment_of
+from agent.delivery.hearing import Hearing
 from agent.delivery.history import History, Record, StoreError
 from agent.delivery.keys import gateway_key, result_key
 from agent.delivery.session import session_config
@@ -30,6 +31,7 @@ CACHE_SAMPLES = 100  # samples per channel for subscribers that come later; olde
 HEARTBEAT_S = 10.0  # s between messages that let a subscriber notice a missed last sample; 40 bytes for each subscriber
 RECENT_MAX = 1000  # newest results; those that the store could not write are published from here
 BLOCKS_MAX = 64  # blocks of the corrected stream that may wait, half a minute of one sensor; older ones are dropped
+UNHEARD = "the router was connected and did not answer; the session was opened anew, and is not yet known to be heard"
 CLOSE_S = 1.2  # s to wait at the end; a router that does not respond blocks a put for 5 s
 
 _log = logging.getLogger(__name__)
@@ -37,13 +39,17 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class PublicationState:
-    """The state of the publisher. `connected`: whether to a router. `published`: the last published result."""
+    """The state of the publisher. `connected`: whether to a router. `published`: the last published result.
+
+    `reopened`: sessions that were closed because the router did not hear them (agent.delivery.hearing).
+    """
 
     key: str
     endpoints: tuple[str, ...]
     connected: bool
     published: int
     fault: str  # "" where there is none
+    reopened: int = 0
 
 
 class Publisher:
@@ -51,7 +57,8 @@ class Publisher:
 
     The store is the outbox. Zenoh does not acknowledge, so a result counts as published when it was put while a router
     was connected. Results lost with a broken connection are still in the publisher's cache, and consumers can query
-    them (`?after=<sequence>`, see agent.delivery.answers).
+    them (`?after=<sequence>`, see agent.delivery.answers). A session that the router does not hear is closed, and
+    another one opened (agent.delivery.hearing).
     The attachment of each sample begins with the number of the result put before it, or "0" where this number has no
     meaning: for a result that is put again at the start, or that the store could not write. A consumer that has another
     last number has missed results, or must ask. Where the gateway has a key, a line break and the signed result follow.
@@ -94,6 +101,7 @@ class Publisher:
         self._publishers: dict[str, AdvancedPublisher] = {}
         self._told: dict[str, bytes] = {}  # the newest of what the gateway says of itself, by the end of its key
         self._told_put: dict[str, bytes] = {}
+        self._hearing = Hearing()
         self._thread = threading.Thread(target=self._run, name="publication", daemon=True)
 
     def start(self) -> None:
@@ -130,7 +138,11 @@ class Publisher:
 
     def state(self) -> PublicationState:
         """The present state, for the terminal and the gateway's status."""
-        return PublicationState(self._key, self._endpoints, self._connected, self._store.published(), self._fault)
+        unheard = UNHEARD if self._hearing.doubtful else ""
+        return PublicationState(
+            self._key, self._endpoints, self._connected, self._store.published(), self._fault or unheard,
+            self._hearing.reopened,
+        )  # fmt: skip
 
     def close(self, timeout_s: float = CLOSE_S) -> bool:
         """Publish what waits if a router is connected, and close; give up after `timeout_s` s. May be called twice.
@@ -174,6 +186,7 @@ class Publisher:
             open_things.callback(token.undeclare)
             # Before the session closes, otherwise Zenoh leaks the memory of the publishers.
             open_things.callback(self._undeclare_publishers)
+            self._hearing.begin(session)
             for record in history.latest():
                 if record.sequence <= self._store.published():
                     self._put(session, record, previous=0)
@@ -185,6 +198,8 @@ class Publisher:
                     self._send_told(session)
                     self._send_waiting(session, history)
                     self._send_blocks(session)
+                if self._hearing.lost():
+                    return
                 self._wake.wait(0 if stopping else self._poll_s)
                 self._wake.clear()
 

@@ -14,6 +14,7 @@ import zenoh
 from agent.config.key_file import KeyFileError
 from agent.config.tls import TlsFiles
 from agent.delivery.consumer import Consumer
+from agent.delivery.hearing import Hearing
 from agent.delivery.keys import PREFIX, parse_key
 from agent.delivery.session import session_config
 from agent.monitor.database import Database
@@ -21,6 +22,7 @@ from agent.monitor.fleet import Fleet
 
 RECONNECT_S = 2.0  # s between two attempts to reach a router
 CLOSE_S = 2.0
+LOOK_S = 1.0  # s between two looks whether the router still hears
 # Results in one transaction at most: what PostgreSQL takes for one is shared, and SQLite delays no question for long.
 BATCH = 100
 TOKENS = 10_000  # changes of presence that may wait
@@ -47,6 +49,7 @@ class Following:
         self._config = session_config("client", connect=endpoints, tls=tls)
         self._database, self._fleet = database, fleet
         self._stop = threading.Event()
+        self._hearing = Hearing()  # of the session for presence and health; the consumer looks after its own
         self._open = ExitStack()
         for place in database.newest():
             fleet.take(*place, fresh=False)
@@ -89,14 +92,20 @@ class Following:
                 f"{PREFIX}/*/*/alive", zenoh.handlers.FifoChannel(TOKENS), history=True
             )
             told = session.declare_subscriber(f"{PREFIX}/*/*/status", zenoh.handlers.RingChannel(TOKENS))
-            threads = [threading.Thread(target=self._watch, args=(tokens,), name="presence", daemon=True),
-                       threading.Thread(target=self._hear, args=(told,), name="health", daemon=True)]  # fmt: skip
+            self._hearing.begin(session)
+            ended = threading.Event()
+            threads = [
+                threading.Thread(target=self._watch, args=(tokens,), name="presence", daemon=True),
+                threading.Thread(target=self._hear, args=(told,), name="health", daemon=True),
+                threading.Thread(target=self._look, args=(consumer, ended), name="look", daemon=True),
+            ]
             for thread in threads:
                 thread.start()
             self.fault = ""
             try:
                 self._take(consumer)
             finally:
+                ended.set()
                 tokens.undeclare()
                 told.undeclare()
                 for thread in threads:
@@ -114,6 +123,12 @@ class Following:
             for result in shown:
                 a = result.address
                 self._fleet.take(a.site, a.gateway, a.sensor, a.what, result.fields)
+
+    def _look(self, consumer: Consumer, ended: threading.Event) -> None:
+        while not ended.wait(LOOK_S):
+            if self._hearing.lost():
+                consumer.close()  # then both sessions are opened anew
+                return
 
     def _watch(self, tokens: zenoh.Subscriber[zenoh.Handler[zenoh.Sample]]) -> None:
         for token in tokens:

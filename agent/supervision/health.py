@@ -50,12 +50,16 @@ class RecordingHealth(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PublicationHealth(msgspec.Struct, frozen=True, kw_only=True):
-    """The publication. `unpublished`: results that wait in the store; null where the store cannot be read."""
+    """The publication. `unpublished`: results that wait in the store; null where the store cannot be read.
+
+    `reopened`: Zenoh sessions of this run that were closed because the router did not hear them.
+    """
 
     enabled: bool
     connected: bool
     unpublished: int | None
     fault: str
+    reopened: int = 0
 
 
 class ProcessHealth(msgspec.Struct, frozen=True, kw_only=True):

@@ -47,6 +47,7 @@ GATEWAY_METRICS: dict[str, tuple[str, bool, Callable[[GatewayStatus], Number]]] 
     "recording_file_bytes": ("Size of the file being written", False, lambda s: s.recording.size_bytes),
     "disk_free_bytes": ("Free bytes on the disk of the data directory", False, lambda s: s.disk_free_bytes),
     "publication_connected": ("Whether a Zenoh router is connected", False, lambda s: s.publication.connected),
+    "reopened_sessions": ("Zenoh sessions that the router did not hear", True, lambda s: s.publication.reopened),
     "unpublished_results": ("Stored results that are not published yet", False, lambda s: s.publication.unpublished),
     "threads": ("Threads of the agent", False, lambda s: s.process.threads if s.process else None),
 }

@@ -105,8 +105,9 @@ class Plant:
             return PublicationHealth(enabled=False, connected=False, unpublished=0, fault="")
         state = self.publisher.state()
         return PublicationHealth(
-            enabled=True, connected=state.connected, unpublished=self.outbox.count(), fault=state.fault
-        )
+            enabled=True, connected=state.connected, unpublished=self.outbox.count(), fault=state.fault,
+            reopened=state.reopened,
+        )  # fmt: skip
 
 
 def _disk_free_bytes(directory: Path) -> int | None:

@@ -28,7 +28,7 @@ def store(tmp_path: Path) -> Iterator[Store]:
 
 def plant(data_dir: Path, store: Store, **parts: Any) -> Plant:
     recorder = SimpleNamespace(path=data_dir / "fieldcal-000001.mcap.active", size_bytes=7, fault="")
-    publisher = SimpleNamespace(state=lambda: SimpleNamespace(connected=True, fault=""))
+    publisher = SimpleNamespace(state=lambda: SimpleNamespace(connected=True, fault="", reopened=0))
     found: dict[str, Any] = {
         "events": EventQueue(2), "writer": SimpleNamespace(waiting=3), "recorder": recorder, "publisher": publisher,
         "outbox": Outbox(store),

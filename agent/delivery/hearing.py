@@ -1,0 +1,95 @@
+"""Whether the router hears a session that counts as connected.
+
+A router gives a new link 10 s (`transport/unicast/accept_timeout`). Where the time ends after the router has agreed,
+but before it begins to read, Zenoh 1.10 leaves a link on which it sends and never reads. The session then counts as
+connected for ever, and nothing that it declares or sends arrives. This happens when many gateways come back to a router
+at once.
+"""
+
+from __future__ import annotations
+
+import logging
+import random
+import time
+
+import zenoh
+
+from agent.delivery.keys import PREFIX
+
+NOBODY = f"{PREFIX}/nobody"  # no gateway has such a token, so that the answer has no bytes
+ASK_S = 60.0  # s between two questions, half as much at least and once more as much at most
+LONGEST_S = 3600.0  # s; at most so long from a new session to its first question
+# s to wait for an answer: as long as Zenoh waits for a sign of life. A router that stands still for longer loses the
+# link.
+ANSWER_S = 10.0
+MISSES = 2  # questions in a row without answer: the first may have been lost with a link that was then replaced
+
+_log = logging.getLogger(__name__)
+
+
+class Hearing:
+    """Asks the router now and then; for one thread, over all sessions that this thread opens one after the other.
+
+    The question is for a liveliness token that nobody has. A router answers at once, also where its access rules do not
+    allow this question. `reopened`: the number of sessions that no router heard.
+    The time to the first question is twice as long after each such session, LONGEST_S at most, until a router answers:
+    a router that never answers is not flooded with new sessions.
+    """
+
+    def __init__(self) -> None:
+        self.reopened = 0
+        self._in_a_row = 0  # sessions that no router heard
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether the session before this one was not heard, and this one is not known to be."""
+        return self._in_a_row > 0
+
+    def begin(self, session: zenoh.Session) -> None:
+        """A session was opened. The next questions are about this one."""
+        self._session = session
+        self._routers: list[zenoh.ZenohId] = []
+
+    def lost(self) -> bool:
+        """Ask if it is time; True once where no router hears the session: close it, and open another one."""
+        routers = self._session.info.routers_zid()
+        if routers != self._routers:
+            self._routers, self._misses, self._question = routers, 0, None
+            self._plan(min(ASK_S * 2**self._in_a_row, LONGEST_S))
+        if not routers or time.monotonic() < self._next_s:
+            return False
+        if self._question is None:
+            self._question = _Question(self._session)
+        if not self._question.ended:
+            return False
+        answered, self._question = self._question.answered, None
+        self._misses = 0 if answered else self._misses + 1
+        if answered:
+            self._in_a_row = 0
+            self._plan(ASK_S)
+        if self._misses < MISSES:
+            return False
+        self._in_a_row += 1
+        self.reopened += 1
+        what = "a connected router has not answered for %.0f s; the session is opened anew (number %d of this run)"
+        _log.warning(what, MISSES * ANSWER_S, self.reopened)
+        return True
+
+    def _plan(self, after_s: float) -> None:
+        self._next_s = time.monotonic() + after_s * random.uniform(0.5, 1.5)
+
+
+class _Question:
+    """Asked when it is made. `ended`, and then `answered`, are set by a thread of Zenoh."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self.answered, self.ended = True, False
+        handler = zenoh.handlers.Callback(self._take, self._end, indirect=False)
+        session.liveliness().get(NOBODY, handler, timeout=ANSWER_S)
+
+    def _take(self, reply: zenoh.Reply) -> None:
+        if reply.ok is None:  # that the time is over
+            self.answered = False
+
+    def _end(self) -> None:
+        self.ended = True
