@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import sqlite3
 import threading
+from collections import Counter
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -12,10 +13,14 @@ from pathlib import Path
 import zenoh
 
 from agent.config.key_file import KeyFileError
+from agent.config.known_keys import WatchedKeys
 from agent.config.tls import TlsFiles
 from agent.delivery.consumer import Consumer
+from agent.delivery.guide import WHAT, read_guide
 from agent.delivery.keys import PREFIX, parse_key
 from agent.delivery.session import session_config
+from agent.delivery.verifying import Refusals, UnverifiedError
+from agent.monitor.benches import Benches
 from agent.monitor.database import Database
 from agent.monitor.fleet import Fleet
 
@@ -24,6 +29,7 @@ CLOSE_S = 2.0
 # Results in one transaction at most: what PostgreSQL takes for one is shared, and SQLite delays no question for long.
 BATCH = 100
 TOKENS = 10_000  # changes of presence that may wait
+GUIDES = 100  # messages of benches that may wait; each one says all
 
 _log = logging.getLogger(__name__)
 
@@ -31,8 +37,9 @@ _log = logging.getLogger(__name__)
 class Following:
     """Takes all results from the routers at `endpoints`, in threads, until `close`.
 
-    `unconfirmed` counts results that were not kept, because the store of their gateway did not have them.
-    `keys`: the list of known keys; results that their gateway did not sign are then refused.
+    `unconfirmed` counts results that were not kept, because the store of their gateway did not have them. `benches`:
+    the guides of `fieldcal bench`.
+    `keys`: the list of known keys; results and guides that their gateway did not sign are then refused.
     Raises EndpointError for an invalid endpoint.
     """
 
@@ -41,6 +48,9 @@ class Following:
     ) -> None:
         self.unconfirmed = 0
         self.keys = keys
+        self.benches = Benches()
+        self._known = WatchedKeys(keys) if keys is not None else None
+        self._refused_guides = Refusals()
         self._consumer: Consumer | None = None
         self.fault = ""  # why nothing is received or kept; "" where all is well
         self._endpoints, self._tls = endpoints, tls
@@ -55,8 +65,9 @@ class Following:
 
     @property
     def refused(self) -> dict[str, int]:
-        """The number of results that were not verified, by the gateway in whose name they were published."""
-        return self._consumer.refused if self._consumer is not None else {}
+        """The number of messages that were not verified, by the gateway in whose name they were published."""
+        results = Counter(self._consumer.refused if self._consumer is not None else {})
+        return results + self._refused_guides.counts
 
     def close(self, timeout_s: float = CLOSE_S) -> bool:
         """End the threads. May be called twice.
@@ -89,8 +100,10 @@ class Following:
                 f"{PREFIX}/*/*/alive", zenoh.handlers.FifoChannel(TOKENS), history=True
             )
             told = session.declare_subscriber(f"{PREFIX}/*/*/status", zenoh.handlers.RingChannel(TOKENS))
+            guides = session.declare_subscriber(f"{PREFIX}/*/*/{WHAT}", zenoh.handlers.RingChannel(GUIDES))
             threads = [threading.Thread(target=self._watch, args=(tokens,), name="presence", daemon=True),
-                       threading.Thread(target=self._hear, args=(told,), name="health", daemon=True)]  # fmt: skip
+                       threading.Thread(target=self._hear, args=(told,), name="health", daemon=True),
+                       threading.Thread(target=self._read, args=(guides,), name="guides", daemon=True)]  # fmt: skip
             for thread in threads:
                 thread.start()
             self.fault = ""
@@ -99,6 +112,7 @@ class Following:
             finally:
                 tokens.undeclare()
                 told.undeclare()
+                guides.undeclare()
                 for thread in threads:
                     thread.join(CLOSE_S)
 
@@ -124,3 +138,16 @@ class Following:
         for sample in told:
             if (address := parse_key(str(sample.key_expr))) is not None:
                 self._fleet.set_told(address.site, address.gateway, sample.payload.to_bytes())
+
+    def _read(self, guides: zenoh.Subscriber[zenoh.Handler[zenoh.Sample]]) -> None:
+        for sample in guides:
+            if (address := parse_key(str(sample.key_expr))) is None:
+                continue
+            signed = sample.attachment.to_bytes() if sample.attachment is not None else b""
+            try:
+                guide = read_guide(sample.payload.to_bytes(), signed, address.source, self._known)
+            except UnverifiedError as error:
+                self._refused_guides.count(address.source, str(error))
+                continue
+            if guide is not None:
+                self.benches.take(address.site, address.gateway, guide)
