@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 
 from agent.bench.capture import Capture
 from agent.bench.measuring import Taken
-from agent.bench.session import Fit, Session
+from agent.bench.screen import Screen, count, pair, told_u
+from agent.bench.session import Fit, Outlook, Session
 from agent.bench.stops import Stop
 from agent.bench.thinking import Thinking
-from calib.estimate.next_stop import MAIN
 from calib.model import Array
 
 LOOK_S = 1.0  # from one look at the samples to the next
@@ -35,8 +35,8 @@ class Stay:
 class Dialogue:
     """Leads a person through a session. `taken` are the stops that are used.
 
-    `ask` gives the answer to a prompt, None at the end of input. `say` shows a line, `progress` one that the next
-    replaces. `turn` turns a virtual sensor and gives the seconds that it takes; None where a person turns the sensor.
+    `screen` is what the person sees, and asks. `turn` turns a virtual sensor and gives the seconds that it takes; None
+    where a person turns the sensor.
     """
 
     def __init__(
@@ -44,13 +44,11 @@ class Dialogue:
         mind: Thinking,
         capture: Capture,
         stay: Stay,
-        ask: Callable[[str], str | None],
-        say: Callable[[str], None],
-        progress: Callable[[str], None],
+        screen: Screen,
         turn: Callable[[Stop], float] | None = None,
     ) -> None:
         self._mind, self._capture = mind, capture
-        self._stay, self._ask, self._say, self._progress, self._turn = stay, ask, say, progress, turn
+        self._stay, self._screen, self._say, self._turn = stay, screen, screen.say, turn
         self.taken: list[Taken] = []
         self._refused: tuple[str, ...] = ()
         self._standing: Stop | None = None  # where the sensor was put last
@@ -68,37 +66,39 @@ class Dialogue:
                 break
             self._take(stop)
         else:
-            self._say(f"reached after {_count(len(self.taken))}: U {told_u(self._session.joint.expanded)}")
+            self._screen.outlook([f"reached after {count(len(self.taken))}: U {told_u(self._session.joint.expanded)}"])
 
     def _begin(self) -> None:
         wanted, (_, outlook) = self._session.wanted, self._mind.next_stop()
         self._say(f"wanted: U (k = 2) {pair(wanted.main, wanted.transverse)}, apart from the reference's own error")
+        self._screen.outlook(self._outlook(outlook))
+
+    def _outlook(self, outlook: Outlook) -> list[str]:
         if outlook.stops is not None:
             more = "" if outlook.mostly == outlook.stops else f"; {outlook.mostly} are enough in 19 of 20 sessions"
-            self._say(f"this takes about {_count(outlook.stops)}{more}")
-            return
-        self._say(f"this bench does not reach it: after 100 stops U would still be {pair(*outlook.best)}")
+            return [f"this takes about {count(outlook.stops)}{more}"]
+        lines = [f"this bench does not reach it: after 100 stops U would still be {pair(*outlook.best)}"]
+        stops = self._session.stops
         if outlook.because:
-            self._say(
+            lines.append(
                 f"the reason is {outlook.because}, which all stops share: U never becomes less than "
                 f"{pair(*outlook.floor)}; state a smaller uncertainty of it if you know it better, or end with q"
             )
-        elif len({s.pose.theta_rad for s in self._session.stops}) == 1 and self._session.stops[0].columns.get(
-            "theta_deg"
-        ):
-            self._say("one inclination does not tell theta from the sensitivities: add a second one with --thetas")
+        elif len({s.pose.theta_rad for s in stops}) == 1 and stops[0].columns.get("theta_deg"):
+            lines.append("one inclination does not tell theta from the sensitivities: add a second one with --thetas")
+        return lines
 
     def _next_stop(self) -> Stop | None:
         """The stop that the person takes; None to end the session."""
         best, outlook = self._mind.next_stop()
-        stop, left = self._session.stops[best.stop], outlook.stops
-        self._say(f"stop {len(self.taken) + 1}: {stop.told}")
-        more = "" if left is None or left < 2 else f"; {_count(left - 1)} more then to what is wanted"
-        self._say(f"  U will be {told_u(best.expanded)}{more}")
+        stop = self._session.stops[best.stop]
+        self._screen.turn(len(self.taken) + 1, stop, best, self._session, outlook)
         while True:
-            answer = self._ask(f"  Enter when it stands ({stop.name}); another position as typed; u: undo; q: end > ")
+            answer = self._screen.ask(
+                f"  Enter when it stands ({stop.name}); another position as typed; u: undo; q: end > "
+            )
             for line in self._capture.said():
-                self._say(line)
+                self._screen.warn(line)
             if answer is None or answer == "q":
                 return None
             if answer == "u":
@@ -129,7 +129,8 @@ class Dialogue:
             return
         gone = self.taken.pop()
         self._say(f"  stop {len(self.taken) + 1} ({gone.stop.name}) is not used")
-        self._refused = self._mind.take(self._capture.record(), self.taken)
+        self._adjust()
+        self._screen.kept(self._names, self._session.joint.expanded)
 
     def _take(self, stop: Stop) -> None:
         """Stay at a stop, and use it if it is sound."""
@@ -141,7 +142,7 @@ class Dialogue:
                 return
             if fit.fits:
                 break
-            answer = self._ask(self._misfit(stop, fit))
+            answer = self._screen.ask(self._misfit(stop, fit))
             if answer == "y" and fit.instead is not None:
                 stop = self._session.stops[fit.instead]
                 break
@@ -156,12 +157,20 @@ class Dialogue:
             if self._turn is not None:
                 self._put(stop)
         self.taken.append(Taken(stop, start_s, stop_s))
-        self._refused = self._mind.take(self._capture.record(), self.taken)
-        self._say(f"  stop {len(self.taken)}, {stop.name}: U is now {told_u(self._session.joint.expanded)}")
+        self._adjust()
+        self._screen.took(self._names, self._session.joint.expanded)
         for line in self._session.doubts():
-            self._say(f"  {line}")
+            self._screen.warn(line)
         for reason in self._refused:
-            self._say(f"  U is as wanted, but the result would be refused: {reason}")
+            self._screen.warn(f"U is as wanted, but the result would be refused: {reason}")
+
+    @property
+    def _names(self) -> list[str]:
+        return [each.stop.name for each in self.taken]
+
+    def _adjust(self) -> None:
+        self._screen.computing()
+        self._refused = self._mind.take(self._capture.record(), self.taken)
 
     def _earlier(self, start_s: float) -> int:
         """The number of the stop in which a window began at this time."""
@@ -172,20 +181,21 @@ class Dialogue:
         self.taken[k] = replace(self.taken[k], stop=self._session.stops[instead])
 
     def _misfit(self, stop: Stop, fit: Fit) -> str:
-        self._say(f"  this does not look like {stop.name}: chi2 {fit.chi2:.4g}, {fit.limit:.4g} at most")
+        wrong = f"this does not look like {stop.name} (chi2 {fit.chi2:.4g}, {fit.limit:.4g} at most)"
         if fit.earlier is not None:
             start_s, instead = fit.earlier
             k, name = self._earlier(start_s), self._session.stops[instead].name
-            self._say(f"  stop {k + 1} ({self.taken[k].stop.name}) may be the wrong one: it looks like {name}")
+            other = f"stop {k + 1} ({self.taken[k].stop.name}) may be the wrong one: it looks like {name}"
+            self._screen.warn(f"{wrong}; {other}")
             again = f"c: stop {k + 1} is at {name}, keep both; Enter: measure this one again"
             return f"  {again}; k: keep it as told; q: leave it out > "
         if fit.instead is None:
-            self._say("  it fits no position: is the sensor loose, or turned another way?")
+            self._screen.warn(f"{wrong}; it fits no position: is the sensor loose, or turned another way?")
             return "  Enter: measure again after turning it; k: keep it as told; q: leave it out > "
         like = self._session.stops[fit.instead]
         last = self.taken[-1].stop.name if self.taken else ""
         why = "the sensor was not turned" if like.name == last else "it looks turned"
-        self._say(f"  {why}: it stands as at {like.name}")
+        self._screen.warn(f"{wrong}; {why}: it stands as at {like.name}")
         return (
             f"  Enter: measure again after turning it; y: it is at {like.name}; k: keep it as told; q: leave it out > "
         )
@@ -199,38 +209,32 @@ class Dialogue:
             now_s = self._capture.now_s
             stayed_s = now_s - start_s
             for line in self._capture.said():
-                self._say(f"  {line}")
+                self._screen.warn(line)
             if (dumb := self._capture.silent(self._mind.measuring.devices, now_s, STALE_S)) is not None:
-                self._say(f"  no samples of {dumb} for {STALE_S:g} s: check its cable")
+                self._screen.warn(f"no samples of {dumb} for {STALE_S:g} s: check its cable")
                 return None, now_s
             if stayed_s < FIT_FROM_S:
+                self._show_stay(stop, max(stayed_s, 0.0), None)
                 continue
             look = self._mind.look(self._capture.record(start_s - BEFORE_S), Taken(stop, start_s, now_s))
             if look.reason:
                 if stayed_s >= told_from_s and look.reason.translate(NO_DIGITS) != reason:
-                    self._say(f"  {look.reason}")
+                    self._screen.warn(look.reason)
                     reason = look.reason.translate(NO_DIGITS)
+                self._show_stay(stop, stayed_s, None)
                 if stayed_s > self._stay.most_s:
                     return None, now_s
                 continue
             assert look.fit is not None
             assert look.expanded is not None
             if look.left_out > knocked:
-                self._say(f"  knocks: {look.left_out} of {look.points} samples are left out; do not touch the table")
+                left_out = f"{look.left_out} of {look.points} samples are left out"
+                self._screen.warn(f"knocks: {left_out}; do not touch the table")
                 knocked = 2 * look.left_out
-            self._progress(f"  {stayed_s:3.0f} s: U will be {told_u(look.expanded)}")
+            self._show_stay(stop, stayed_s, look.expanded)
             enough = stayed_s >= self._stay.least_s and look.gain < GAIN
             if enough or not look.fit.fits or stayed_s > self._stay.most_s:
                 return look.fit, now_s
 
-
-def _count(stops: int) -> str:
-    return f"{stops} stop{'' if stops == 1 else 's'}"
-
-
-def pair(main: float, transverse: float) -> str:
-    return f"{100.0 * main:.2g} % (main), {100.0 * transverse:.2g} % (transverse)"
-
-
-def told_u(expanded: Array) -> str:
-    return pair(float(expanded[MAIN].max()), float(expanded[~MAIN].max()))
+    def _show_stay(self, stop: Stop, stayed_s: float, u: Array | None) -> None:
+        self._screen.stay(stop, stayed_s, self._stay.least_s, self._stay.most_s, u)

@@ -15,7 +15,7 @@ from agent.config import Channel
 from calib.estimate.adjustment import adjust
 from calib.estimate.lag_search import without_lag
 from calib.estimate.nuisances import Applied, Priors
-from calib.excitation.front_end import Settings
+from calib.excitation.front_end import Settings, most_margin_s
 from calib.excitation.window_verdict import Limits
 from calib.model import Array, Window
 from calib.recorded.adjusting import adjusted, over_frequency, with_response
@@ -53,6 +53,11 @@ class Measuring:
     def devices(self) -> list[str]:
         """The sensor, and its reference if it has one."""
         return [self._channel.sensor, *([self._channel.reference] if self._channel.reference else [])]
+
+    @property
+    def margin_s(self) -> float:
+        """How long samples are needed before and after a stop, for filters."""
+        return most_margin_s(self._channel.instrument)
 
     def newest(self, record: Record, taken: Taken) -> list[Window]:
         """The windows of the stop that is being taken, used or not; empty where there are too few samples yet."""

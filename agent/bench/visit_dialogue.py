@@ -11,8 +11,9 @@ import numpy as np
 
 from agent.bench.capture import Capture
 from agent.bench.clamp_words import as_object, findings
-from agent.bench.dialogue import BEFORE_S, GAIN, SETTLED_S, STALE_S, told_u
+from agent.bench.dialogue import BEFORE_S, GAIN, SETTLED_S, STALE_S
 from agent.bench.measuring import Taken
+from agent.bench.screen import told_u
 from agent.bench.stops import Stop
 from agent.bench.visiting import Ahead, Visiting, VisitLook
 from calib.estimate.clamping import Clamping

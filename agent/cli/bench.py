@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -18,7 +20,14 @@ from agent.config import Channel, Config, ConfigError, load_config, parse_config
 from agent.terminal.text import say
 
 if TYPE_CHECKING:
+    from agent.bench.capture import Capture
+    from agent.bench.measuring import Measuring
+    from agent.bench.screen import Screen
+    from agent.bench.session import Session
     from agent.bench.stops import Stop
+    from agent.delivery.guide import Guide
+    from agent.delivery.guide_publication import GuidePublisher
+    from calib.estimate.next_stop import Wanted
 
 FIRST_S = 2.0  # of samples that tell how much the shaker moves
 THETAS_DEG, ALPHA_STEP_DEG = "35,55", 15
@@ -62,7 +71,12 @@ class _Angles(click.ParamType):  # type: ignore[type-arg]
               help="The virtual bench, without CONFIG.")  # fmt: skip
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=1, show_default=True,
               help="Seed of the virtual bench's random numbers.")  # fmt: skip
-def bench(config: Path | None, output: Path, sensor: str | None, virtual: str, seed: int, **options: Any) -> int:
+@click.option("--connect", "routers", multiple=True, metavar="ENDPOINT", default=["tcp/127.0.0.1:7447"],
+              show_default=True, help="Router behind which a monitor shows the session, without CONFIG.")  # fmt: skip
+def bench(
+    config: Path | None, output: Path, sensor: str | None, virtual: str, seed: int, routers: tuple[str, ...],
+    **options: Any,
+) -> int:  # fmt: skip
     """Calibrate at a bench, led from position to position to a wanted uncertainty.
 
     \b
@@ -77,7 +91,7 @@ def bench(config: Path | None, output: Path, sensor: str | None, virtual: str, s
     """
     try:
         if config is None:
-            with _virtual_bench(virtual, seed) as (settings, turn):  # type: ignore[arg-type]
+            with _virtual_bench(virtual, seed, routers) as (settings, turn):  # type: ignore[arg-type]
                 return _session(settings, settings.channels[0], output, options, turn)
         settings = load_config(config)
         return _session(settings, _channel(settings, sensor, config), output, options, None)
@@ -107,56 +121,123 @@ def _channel(settings: Config, sensor: str | None, path: Path) -> Channel:
 
 
 def _session(settings: Config, channel: Channel, output: Path, options: dict[str, Any], turn: Turn | None) -> int:
-    from agent.bench.aside import Aside
-    from agent.bench.capture import Capture
-    from agent.bench.dialogue import Dialogue, Stay
-    from agent.bench.kinds import stated, stops_of, write_prior
-    from agent.bench.measuring import Measuring
-    from agent.bench.session import START, Session
-    from agent.bench.thinking import Thinking
-    from agent.calibrate.stated import options_of
-    from calib.estimate.next_stop import Wanted
-    from calib.excitation.band_to_keep import LEAST_MOTION_MPS2
-    from calib.excitation.front_end import most_margin_s
-
-    stops = stops_of(channel, options["thetas"], options["alphas"])
-    devices = [channel.sensor, *([channel.reference] if channel.reference else [])]
     if output.exists():
         raise FileExistsError
     if options["stated"] is not None:
         check_stated(options["stated"])
-    with Capture(settings, devices) as capture:
-        info = opened(capture, devices)
-        output.mkdir(parents=True)
-        scale = write_prior(channel, info.get("nominal_sensitivity"), output / "prior.json")
-        arguments = [*stated(channel, output), f"--json={output / 'result.json'}"]
-        told = parsed(arguments)
-        measuring = Measuring(channel, options_of(told))
-        wanted = Wanted(options["u_main_pct"] / 100.0, options["u_transverse_pct"] / 100.0)
-        time.sleep(FIRST_S)
-        moved = measuring.moved_mps2(capture.record(capture.now_s - FIRST_S))
-        expected = replace(START, rms_mps2=moved) if moved > LEAST_MOTION_MPS2 else START
-        stay = Stay(options["stay_s"], max(options["most_s"], options["stay_s"]))
-        with Aside() as aside:
-            mind = Thinking(Session(stops, measuring.priors, wanted, scale, expected), measuring, aside)
-            dialogue = Dialogue(mind, capture, stay, ask, say, progress, turn)
-            try:
-                dialogue.run()
-            finally:  # also after Ctrl-C: what was measured is kept
-                if dialogue.taken:
-                    time.sleep(most_margin_s(channel.instrument))  # for the samples that filters need after a stop
-                    measuring.write(capture.record(), dialogue.taken, output)
-                    say("the samples are kept; the result is made by: fieldcal calibrate " + " ".join(arguments))
-        if not dialogue.taken:
-            (output / "prior.json").unlink()
-            output.rmdir()
-            say("no stop was taken, so there is no result", err=True)
-            return 3
-    return made(told, output, options["stated"])
+    publisher = _publisher(settings)
+    if publisher is None:
+        return _led(settings, channel, output, options, turn, lambda _: None)
+    with publisher:
+        status = _led(settings, channel, output, options, turn, publisher.show)
+    if publisher.blocked:
+        sys.stdout.flush()
+        os._exit(status)
+    return status
+
+
+def _publisher(settings: Config) -> GuidePublisher | None:
+    """What shows the session on the page of the monitor; None where it cannot, which is said."""
+    from agent.config.key_file import KeyFileError
+    from agent.delivery.guide_publication import GuidePublisher
+    from agent.delivery.session import EndpointError
+    from agent.recording.signing import Signer
+
+    zenoh, key = settings.zenoh, settings.recording.signing_key
+    if not zenoh.enabled:
+        return None
+    try:
+        tls, signer = zenoh.tls.files if zenoh.tls else None, Signer.load(key) if key else None
+        return GuidePublisher(settings.gateway.site, settings.gateway.name, zenoh.connect, tls, signer)
+    except (EndpointError, KeyFileError) as error:
+        say(f"the page of the monitor does not show this session: {error}", err=True)
+        return None
+
+
+def _led(
+    settings: Config,
+    channel: Channel,
+    output: Path,
+    options: dict[str, Any],
+    turn: Turn | None,
+    publish: Callable[[Guide], None],
+) -> int:
+    """Lead through the positions, and make the result."""
+    from agent.bench.capture import Capture
+    from agent.bench.kinds import stated, stops_of, write_prior
+    from agent.bench.measuring import Measuring
+    from agent.bench.screen import Screen
+    from agent.calibrate.stated import options_of
+    from calib.estimate.next_stop import Wanted
+
+    stops = stops_of(channel, options["thetas"], options["alphas"])
+    devices = [channel.sensor, *([channel.reference] if channel.reference else [])]
+    wanted, status = Wanted(options["u_main_pct"] / 100.0, options["u_transverse_pct"] / 100.0), 1
+    screen = Screen(channel.sensor, wanted, ask, say, progress, publish)
+    try:
+        with Capture(settings, devices) as capture:
+            info = opened(capture, devices)
+            output.mkdir(parents=True)
+            scale = write_prior(channel, info.get("nominal_sensitivity"), output / "prior.json")
+            arguments = [*stated(channel, output), f"--json={output / 'result.json'}"]
+            told = parsed(arguments)
+            measuring = Measuring(channel, options_of(told))
+            session = _begun(stops, measuring, wanted, scale, capture)
+            if not _measured(session, measuring, capture, screen, output, options, turn, arguments):
+                (output / "prior.json").unlink()
+                output.rmdir()
+                say("no stop was taken, so there is no result", err=True)
+                status = 3
+                return status
+        status = made(told, output, options["stated"])
+        return status
+    finally:
+        screen.ended(output, status)
+
+
+def _begun(stops: list[Stop], measuring: Measuring, wanted: Wanted, scale: float, capture: Capture) -> Session:
+    """A session that knows how much the reference moves."""
+    from agent.bench.session import START, Session
+    from calib.excitation.band_to_keep import LEAST_MOTION_MPS2
+
+    time.sleep(FIRST_S)
+    moved = measuring.moved_mps2(capture.record(capture.now_s - FIRST_S))
+    expected = replace(START, rms_mps2=moved) if moved > LEAST_MOTION_MPS2 else START
+    return Session(stops, measuring.priors, wanted, scale, expected)
+
+
+def _measured(
+    session: Session,
+    measuring: Measuring,
+    capture: Capture,
+    screen: Screen,
+    output: Path,
+    options: dict[str, Any],
+    turn: Turn | None,
+    arguments: list[str],
+) -> bool:
+    """Whether stops were taken; their samples are then in the directory, also after Ctrl-C."""
+    from agent.bench.aside import Aside
+    from agent.bench.dialogue import Dialogue, Stay
+    from agent.bench.thinking import Thinking
+
+    stay = Stay(options["stay_s"], max(options["most_s"], options["stay_s"]))
+    with Aside() as aside:
+        dialogue = Dialogue(Thinking(session, measuring, aside), capture, stay, screen, turn)
+        try:
+            dialogue.run()
+        finally:
+            if dialogue.taken:
+                time.sleep(measuring.margin_s)  # for the samples that filters need after a stop
+                measuring.write(capture.record(), dialogue.taken, output)
+                say("the samples are kept; the result is made by: fieldcal calibrate " + " ".join(arguments))
+    return bool(dialogue.taken)
 
 
 @contextmanager
-def _virtual_bench(kind: Literal["clamp", "triad", "gravity"], seed: int) -> Iterator[tuple[Config, Turn]]:
+def _virtual_bench(
+    kind: Literal["clamp", "triad", "gravity"], seed: int, routers: tuple[str, ...]
+) -> Iterator[tuple[Config, Turn]]:
     """A bench of virtual devices under the real drivers, and what turns its sensor."""
     from hw.virtual.hand_bench import HandBench
     from hw.virtual.presets import by_hand
@@ -178,7 +259,8 @@ def _virtual_bench(kind: Literal["clamp", "triad", "gravity"], seed: int) -> Ite
             channel["reference"] = "reference"
         if kind == "triad":
             channel["rotation"] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
-        raw = {"gateway": {"site": "virtual", "name": "bench"}, "devices": devices, "channels": [channel]}
+        raw = {"gateway": {"site": "virtual", "name": "bench"}, "devices": devices, "channels": [channel],
+               "zenoh": {"connect": routers}}  # fmt: skip
 
         def turn(stop: Stop) -> float:
             held_s, columns = float("inf"), np.array(list(stop.columns.values()))

@@ -145,7 +145,6 @@ def _visit(
     from agent.bench.visiting import Visiting
     from agent.calibrate.stated import options_of
     from calib.estimate.next_stop import COVERAGE_FACTOR, Wanted
-    from calib.excitation.front_end import most_margin_s
 
     assert channel.reference is not None
     output = options["data_dir"] / channel.sensor
@@ -167,10 +166,8 @@ def _visit(
         )  # fmt: skip
         visited = dialogue.run(mounted(channel))
         if visited.taken is not None:
-            time.sleep(most_margin_s(channel.instrument))  # for the samples that filters need after the visit
-            measuring.write(
-                capture.record(visited.taken.start_s - most_margin_s(channel.instrument)), [visited.taken], output
-            )
+            time.sleep(measuring.margin_s)  # for the samples that filters need after the visit
+            measuring.write(capture.record(visited.taken.start_s - measuring.margin_s), [visited.taken], output)
     if visited.ending == "quit":
         return None
     return _result(channel, visited, arguments, options, tell)

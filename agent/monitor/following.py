@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import sqlite3
 import threading
+from collections import Counter
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -12,11 +13,15 @@ from pathlib import Path
 import zenoh
 
 from agent.config.key_file import KeyFileError
+from agent.config.known_keys import WatchedKeys
 from agent.config.tls import TlsFiles
 from agent.delivery.consumer import Consumer
+from agent.delivery.guide import WHAT, read_guide
 from agent.delivery.hearing import Hearing
 from agent.delivery.keys import PREFIX, parse_key
 from agent.delivery.session import session_config
+from agent.delivery.verifying import Refusals, UnverifiedError
+from agent.monitor.benches import Benches
 from agent.monitor.database import Database
 from agent.monitor.fleet import Fleet
 
@@ -26,6 +31,7 @@ LOOK_S = 1.0  # s between two looks whether the router still hears
 # Results in one transaction at most: what PostgreSQL takes for one is shared, and SQLite delays no question for long.
 BATCH = 100
 TOKENS = 10_000  # changes of presence that may wait
+GUIDES = 100  # messages of benches that may wait; each one says all
 
 _log = logging.getLogger(__name__)
 
@@ -33,8 +39,9 @@ _log = logging.getLogger(__name__)
 class Following:
     """Takes all results from the routers at `endpoints`, in threads, until `close`.
 
-    `unconfirmed` counts results that were not kept, because the store of their gateway did not have them.
-    `keys`: the list of known keys; results that their gateway did not sign are then refused.
+    `unconfirmed` counts results that were not kept, because the store of their gateway did not have them. `benches`:
+    the guides of `fieldcal bench`.
+    `keys`: the list of known keys; results and guides that their gateway did not sign are then refused.
     Raises EndpointError for an invalid endpoint.
     """
 
@@ -43,6 +50,9 @@ class Following:
     ) -> None:
         self.unconfirmed = 0
         self.keys = keys
+        self.benches = Benches()
+        self._known = WatchedKeys(keys) if keys is not None else None
+        self._refused_guides = Refusals()
         self._consumer: Consumer | None = None
         self.fault = ""  # why nothing is received or kept; "" where all is well
         self._endpoints, self._tls = endpoints, tls
@@ -58,8 +68,9 @@ class Following:
 
     @property
     def refused(self) -> dict[str, int]:
-        """The number of results that were not verified, by the gateway in whose name they were published."""
-        return self._consumer.refused if self._consumer is not None else {}
+        """The number of messages that were not verified, by the gateway in whose name they were published."""
+        results = Counter(self._consumer.refused if self._consumer is not None else {})
+        return results + self._refused_guides.counts
 
     def close(self, timeout_s: float = CLOSE_S) -> bool:
         """End the threads. May be called twice.
@@ -92,11 +103,13 @@ class Following:
                 f"{PREFIX}/*/*/alive", zenoh.handlers.FifoChannel(TOKENS), history=True
             )
             told = session.declare_subscriber(f"{PREFIX}/*/*/status", zenoh.handlers.RingChannel(TOKENS))
+            guides = session.declare_subscriber(f"{PREFIX}/*/*/{WHAT}", zenoh.handlers.RingChannel(GUIDES))
             self._hearing.begin(session)
             ended = threading.Event()
             threads = [
                 threading.Thread(target=self._watch, args=(tokens,), name="presence", daemon=True),
                 threading.Thread(target=self._hear, args=(told,), name="health", daemon=True),
+                threading.Thread(target=self._read, args=(guides,), name="guides", daemon=True),
                 threading.Thread(target=self._look, args=(consumer, ended), name="look", daemon=True),
             ]
             for thread in threads:
@@ -108,6 +121,7 @@ class Following:
                 ended.set()
                 tokens.undeclare()
                 told.undeclare()
+                guides.undeclare()
                 for thread in threads:
                     thread.join(CLOSE_S)
 
@@ -139,3 +153,16 @@ class Following:
         for sample in told:
             if (address := parse_key(str(sample.key_expr))) is not None:
                 self._fleet.set_told(address.site, address.gateway, sample.payload.to_bytes())
+
+    def _read(self, guides: zenoh.Subscriber[zenoh.Handler[zenoh.Sample]]) -> None:
+        for sample in guides:
+            if (address := parse_key(str(sample.key_expr))) is None:
+                continue
+            signed = sample.attachment.to_bytes() if sample.attachment is not None else b""
+            try:
+                guide = read_guide(sample.payload.to_bytes(), signed, address.source, self._known)
+            except UnverifiedError as error:
+                self._refused_guides.count(address.source, str(error))
+                continue
+            if guide is not None:
+                self.benches.take(address.site, address.gateway, guide)

@@ -78,6 +78,8 @@ def application(
             Route("/api/live", access.reading_async(live.stream)),
             Route("/api/advice", access.reading(data.advice)),
             Route("/advice.csv", access.reading(data.advice_csv)),
+            Route("/api/bench", access.reading(data.bench)),
+            Route("/bench.csv", access.reading(data.bench_csv)),
             Route("/api/events", access.reading(data.events)),
             Route("/events.csv", access.reading(data.events_csv)),
             Route("/api/me", access.me),
@@ -136,6 +138,14 @@ class _Data:
     def events_csv(self, _: Request) -> Response:
         return _csv("events.csv", self._fleet.events())
 
+    def bench(self, request: Request) -> Response:
+        """All sessions of `fieldcal bench`, and the guide of the one that is asked for."""
+        benches, (site, gateway, _) = self._following.benches, _place(request)
+        return _json({"benches": benches.rows(), "guide": benches.guide(site, gateway)})
+
+    def bench_csv(self, request: Request) -> Response:
+        return _csv("bench.csv", self._following.benches.stops(*_place(request)[:2]))
+
     def advice(self, request: Request) -> Response:
         return _json(self._advisor.advice(_place(request)))
 
@@ -172,13 +182,17 @@ class _Data:
         return StreamingResponse(self._tell(), 200, None, "text/event-stream")
 
     async def _tell(self) -> AsyncIterator[str]:
-        me, told = object(), -1
+        me, told, benches = object(), -1, self._following.benches
+        guided = benches.version
         self._listeners.add(me)
         try:
             while not self._stopping.is_set():
                 if self._fleet.version != told:
                     told = self._fleet.version
                     yield f"data: {told}\n\n"
+                if benches.version != guided:
+                    guided = benches.version
+                    yield f"event: bench\ndata: {guided}\n\n"
                 await asyncio.sleep(TELL_S)
         finally:
             self._listeners.discard(me)

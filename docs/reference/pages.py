@@ -106,11 +106,13 @@ def _helps(command: click.Command, context: click.Context) -> Iterator[str]:
 def messages() -> Iterator[str]:
     """All fields of all results and events."""
     from agent.core import events
+    from agent.delivery import guide
 
     yield from _head(
         "Messages",
         "Every field of every result (published over Zenoh as JSON under `fieldcal/v1/SITE/GATEWAY/SENSOR/WHAT`, and "
-        "recorded) and of every event (recorded under `/events`). [recording.md](../recording.md) explains the file, "
+        "recorded), of every event (recorded under `/events`), and of the guide of `fieldcal bench`. "
+        "[recording.md](../recording.md) explains the file, "
         "[online.md](../online.md) what the results mean.",
     )
     common = events.Result
@@ -122,6 +124,16 @@ def messages() -> Iterator[str]:
         yield from [f"## Part `{kind.__name__}`", "", _flat(kind.__doc__), "", *_fields(kind, set())]
     for kind in (events.RunStart, events.DeviceChange, events.Gap, events.Command, events.Pruned, events.Tick):
         yield from [f"## Event `{kind.__name__}`", "", _flat(kind.__doc__), "", *_fields(kind, set())]
+    yield from ["## The guide of fieldcal bench", "", _flat(guide.Guide.__doc__), ""]
+    yield from [
+        f"JSON under `fieldcal/v1/SITE/GATEWAY/{guide.WHAT}`, at most {guide.LARGEST_GUIDE >> 10} KiB, neither kept "
+        f"nor recorded. A text has at most {guide.TEXT_MAX} characters.",
+        "",
+        *_fields(guide.Guide, set()),
+    ]
+    parts = (guide.Expanded, guide.NextStop, guide.Staying, guide.TakenStop, guide.Warned, guide.Ending, guide.MadeFile)
+    for kind in parts:
+        yield from [f"## Part `{kind.__name__}`", "", _flat(kind.__doc__), "", *_fields(kind, set())]
 
 
 def _fields(kind: type[msgspec.Struct], left_out: set[str]) -> Iterator[str]:
@@ -218,7 +230,7 @@ def _type(annotation: Any) -> str:
         return " or ".join(kinds)
     if "dict" in origin:
         return f"{kinds[1]} by {kinds[0]}"
-    if "Annotated" in type(annotation).__name__ or "Annotated" in str(annotation):
+    if "Annotated" in type(annotation).__name__:
         return kinds[0] if kinds else str(annotation)
     if len(kinds) > 1 and len(set(kinds)) == 1:
         return f"{len(kinds)} × {kinds[0]}"

@@ -11,6 +11,17 @@ import pytest
 from msgspec import structs
 
 from agent.core.events import DriftReport, Estimate, Result, SharedError
+from agent.delivery.guide import (
+    Ending,
+    Expanded,
+    Guide,
+    MadeFile,
+    NextStop,
+    Staying,
+    TakenStop,
+    Warned,
+    read_guide,
+)
 from agent.delivery.keys import Address
 from agent.delivery.received import Received
 from tests.attacks.signed_site import KEY, OTHER, Gateway, listed
@@ -169,6 +180,20 @@ def results() -> list[tuple[str, Result]]:
     return [(result.what, result) for result in each]
 
 
+def hostile_guide() -> Guide:
+    """A guide whose texts are all hostile, and whose numbers are extreme."""
+    text, u = HOSTILE[:63], Expanded(1e308, -1e-308)
+    made = Guide(
+        t_utc_ns=2**63 - 1, sensor=text, stage="measuring", wanted=u, expanded=u, outlook=[HOSTILE], prompt=HOSTILE,
+        next=NextStop(10**6, text, HOSTILE, HOSTILE, u, 10**6), staying=Staying(text, -1e308, 1e308, 0.0, u),
+        taken=[TakenStop(text, u)] * 2, warnings=[Warned(0, HOSTILE)],
+        ending=Ending("valid", [HOSTILE], [[text] * 4], -1e308, [MadeFile(HOSTILE, text)]),
+    )  # fmt: skip
+    read = read_guide(msgspec.json.encode(made), b"", "site/gw", None)
+    assert read == made
+    return made
+
+
 @needs_chromium
 def test_no_text_of_the_bus_becomes_part_of_the_page(served: Served) -> None:
     for number, (what, result) in enumerate(results(), start=1):
@@ -181,16 +206,22 @@ def test_no_text_of_the_bus_becomes_part_of_the_page(served: Served) -> None:
     told = {"state": HOSTILE, "reasons": [HOSTILE], "version": HOSTILE, "t_utc_ns": 1}
     served.fleet.set_told("site", "gw", msgspec.json.encode(told))
     served.fleet.set_alive("site", "gw", True)
+    served.following.benches.take("site", "gw", hostile_guide())
     sensor = "site=site&gateway=gw&sensor=mems"
     with chromium() as browser:
         watched = Watched(browser, served.address)
-        for view in ("", f"#{sensor}", "#view=events", "#view=<img src=x>", f"#site={HOSTILE}&gateway=g&sensor=s",
+        for view in ("", f"#{sensor}", "#view=events", "#view=bench", "#view=<img src=x>",
+                     f"#view=bench&site={HOSTILE}&gateway={HOSTILE}", f"#site={HOSTILE}&gateway=g&sensor=s",
                      f"#filter={HOSTILE}&sort={HOSTILE}&from={HOSTILE}&to=1"):  # fmt: skip
             page = watched.open(view)
             page.wait_for_function("() => document.getElementById('summary').textContent.startsWith('Sensors: 1')")
             if view == f"#{sensor}":
                 page.get_by_role("heading", name="Devices and certificates").wait_for()
                 assert page.locator("td", has_text="document.title").count() >= 8
+            if view == "#view=bench":
+                page.get_by_role("heading", name="Files", exact=False).wait_for()
+                for part in ("now", "stay", "warnings", "end", "tables"):
+                    assert "document.title" in page.locator(f"#bench-{part}").inner_text(), part
             assert page.locator("img, main script, main iframe").count() == 0, view
             assert page.title().startswith("fieldcal: ")
             assert "\u202e" not in page.locator("main").inner_text()

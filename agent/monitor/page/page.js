@@ -1,10 +1,11 @@
 // Which view is shown, who is logged in, and what changed.
+import { leaveBench, showBench } from "./bench.js";
 import { $, get, make, NeedsLogin, text, view } from "./common.js";
 import { keysSection, setUser } from "./commands.js";
 import { showEvents, showFleet, startFleet } from "./fleet.js";
 import { leaveSensor, showSensor, startSensor } from "./sensor.js";
 
-const VIEWS = ["fleet", "sensor", "events", "keys"];
+const VIEWS = ["fleet", "sensor", "bench", "events", "keys"];
 let told = null, me = { needs_login: false, user: "", verbs: [], token: "" }, changes = null, loading = false, again = false, keysShown = false;
 
 function go(given) {
@@ -18,11 +19,13 @@ async function show() {
   if (!told) return;
   const now = view(), chosen = now.has("sensor") ? "sensor" : VIEWS.includes(now.get("view")) ? now.get("view") : "fleet";
   for (const id of VIEWS) $(id).hidden = id !== chosen;
-  for (const id of ["fleet", "events", "keys"]) id === chosen ? $(`to-${id}`).setAttribute("aria-current", "page") : $(`to-${id}`).removeAttribute("aria-current");
+  for (const id of ["fleet", "bench", "events", "keys"]) id === chosen ? $(`to-${id}`).setAttribute("aria-current", "page") : $(`to-${id}`).removeAttribute("aria-current");
   document.title = `fieldcal: ${chosen === "sensor" ? now.get("sensor") : chosen}`;
   if (chosen !== "sensor") leaveSensor();
+  if (chosen !== "bench") leaveBench();
   try {
     if (chosen === "sensor") await showSensor(told, go);
+    else if (chosen === "bench") await showBench();
     else if (chosen === "events") showEvents(await get("api/events"));
     else if (chosen === "keys" && !keysShown) $("key-rows").replaceChildren(...await keysSection());
     else if (chosen === "fleet") showFleet(told);
@@ -63,10 +66,13 @@ async function load() {
   if (again) { again = false; setTimeout(load, 500); }
 }
 
+const showOpenBench = () => { if (told && !$("bench").hidden) showBench().catch(failed); };
+
 function follow() {
   changes?.close();
   changes = new EventSource("api/changes");
   changes.onmessage = load;
+  changes.addEventListener("bench", showOpenBench);
   changes.onerror = () => { say("the monitor does not answer"); if (changes.readyState === EventSource.CLOSED) setTimeout(begin, 2000); };
 }
 
@@ -109,8 +115,9 @@ $("login").addEventListener("submit", async (event) => {
   if (answer.ok) await begin();
 });
 addEventListener("hashchange", show);
-matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { leaveSensor(); show(); });
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { leaveSensor(); leaveBench(); show(); });
 startFleet(go);
 startSensor(go);
 setInterval(() => { if (told && !$("fleet").hidden) showFleet(told); }, 30000); // ages grow without a change
+setInterval(showOpenBench, 5000); // so does the silence of a bench
 begin();

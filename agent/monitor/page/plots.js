@@ -104,3 +104,14 @@ export function curves(box, title, x, series, log, time = false) {
   box.replaceChildren();
   return new uPlot({ title, width: width(box), height: 240, axes: [axis, { ...axis, size: 70 }], scales: { x: { time, distr: log ? 3 : 1 } }, series: drawn, bands, cursor: { drag: { setScale: !log } } }, data, box);
 }
+
+// U after each stop on a logarithmic axis, with what is wanted as dashed lines.
+export function descent(box, taken, wanted) {
+  const axis = axisOf(), x = taken.map((_, i) => i + 1), kinds = [["main", "main_pct"], ["transverse", "transverse_pct"]];
+  const series = kinds.flatMap(([kind], i) => [
+    { label: `U (${kind}), %`, stroke: COLOURS[i], width: 2, points: { show: true } },
+    { label: `wanted (${kind})`, stroke: COLOURS[i], dash: [6, 4], points: { show: false } }]);
+  const data = [x, ...kinds.flatMap(([, key]) => [taken.map((t) => t.expanded[key]), x.map(() => wanted[key])])];
+  return new uPlot({ title: "U (k = 2) after each stop, %", width: width(box), height: 220, axes: [{ ...axis, incrs: [1, 2, 5, 10, 20] }, { ...axis, size: 70 }],
+    scales: { x: { time: false, range: (_, low, high) => [low - 0.2, high + 0.2] }, y: { distr: 3 } }, series: [{ label: "stop" }, ...series], legend: { live: false }, cursor: { drag: { x: false, y: false } } }, data, box);
+}
