@@ -1,13 +1,14 @@
 """Memory and time of `fieldcal calibrate` and `fieldcal export` on files of ten minutes to a day.
 
 `python -m benchmarks.long_files --minutes 10 40 240 1440 --formats parquet csv mcap`. A sensor with three axes and a
-reference, both at 1 kHz: a uniaxial one, with a clamp that turns by 30 degrees every 150 s, or with
-`--reference-axes 3` one beside the sensor that feels gravity, without poses.
+reference, both at 1 kHz: a uniaxial one, with a clamp that turns by 30 degrees every 150 s, and a tri-axial one beside
+the sensor that feels gravity, without poses.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import resource
 import subprocess
@@ -179,17 +180,16 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--minutes", nargs="+", type=int, default=[10, 40, 240, 1440])
     parser.add_argument("--formats", nargs="+", choices=[*WRITERS], default=[*WRITERS])
-    parser.add_argument("--reference-axes", type=int, choices=[1, 3], default=1)
+    parser.add_argument("--reference-axes", nargs="+", type=int, choices=[1, 3], default=[1, 3])
     parser.add_argument("--directory", type=Path, help="where the files are made; a day takes 6 GB")
     parser.add_argument("--write", action="store_true", help="write docs/performance.md")
     asked = parser.parse_args()
     rows = []
-    for ending in asked.formats:
-        for count in asked.minutes:
-            with tempfile.TemporaryDirectory(dir=asked.directory) as name:
-                rows += list(_rows(Path(name), ending, count, asked.reference_axes))
-    head = ["| command | file | length, min | bytes read | CPU time, s | peak memory, MB | error of S over U, worst |",
-            "| --- | --- | --- | --- | --- | --- | --- |"]  # fmt: skip
+    for axes, ending, count in itertools.product(asked.reference_axes, asked.formats, asked.minutes):
+        with tempfile.TemporaryDirectory(dir=asked.directory) as name:
+            rows += list(_rows(Path(name), ending, count, axes))
+    head = ["| command | file | axes of the reference | length, min | bytes read | CPU time, s | peak memory, MB "
+            "| error of S over U, worst |", "| --- | --- | --- | --- | --- | --- | --- | --- |"]  # fmt: skip
     if asked.write:
         told = f"`python -m benchmarks.long_files --write` on {machine()}; goal: {LIMIT_MB:g} MB at any length."
         write_part("long_files", "\n".join([told, "", *head, *rows]))
@@ -199,12 +199,14 @@ def _rows(directory: Path, ending: str, count: int, axes: int) -> Iterator[str]:
     sensor, reference = WRITERS[ending](directory, count, axes)
     size = sum(path.stat().st_size for path in {sensor, reference})
     took_s, peak, worst = calibrate(sensor, reference, pose_options(directory, count, axes))
-    yield _row(f"| calibrate | {ending} | {count} | {size:.3g} | {took_s:.0f} | {peak:.0f} | {worst:.2f} |")
+    yield _row(f"| calibrate | {ending} | {axes} | {count} | {size:.3g} | {took_s:.0f} | {peak:.0f} | {worst:.2f} |")
     if ending == "mcap":
         for to in ("samples.parquet", "samples.csv", "samples.wav", "plots.mcap"):
             option = "--mcap" if to.startswith("plots") else "--to"
             took_s, peak, _ = measured(["export", str(sensor), option, str(directory / to)])
-            yield _row(f"| export {option} {to} | {ending} | {count} | {size:.3g} | {took_s:.0f} | {peak:.0f} | |")
+            yield _row(
+                f"| export {option} {to} | {ending} | {axes} | {count} | {size:.3g} | {took_s:.0f} | {peak:.0f} | |"
+            )
             (directory / to).unlink()
 
 

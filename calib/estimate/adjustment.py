@@ -65,8 +65,8 @@ class Grounds:
         return tuple(reasons(self.windows, self.solution, self.shares, self.determined, self._turned))
 
     def _turned(self, static: int, polarity: int) -> Solution:
-        reduced = [excited(w).window for w in turned_windows(self.windows, static, polarity)]
-        return _solution(reduced, self.data, self.priors, self.applied, self.scatter)
+        turned = [excited(w).pose for w in turned_windows(self.windows, static, polarity)]
+        return _solution(turned, self.data, self.priors, self.applied, self.scatter)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,19 +138,19 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
     plain = not any(priors.values.values())  # with every nuisance fixed it is Method 3: all points weigh the same
     one_frequency = priors.response_terms == 1.0
     to_hz = np.inf if one_frequency else priors.response_hz
-    reduced, powers = [e.window for e in found], priors.response_powers
-    data = condense(reduced, alike=plain, response_hz=to_hz, one_frequency=one_frequency, powers=powers)
+    data = condense(found, alike=plain, response_hz=to_hz, one_frequency=one_frequency, powers=priors.response_powers)
     if not plain:
         data = effective(data, np.array([w.independent for w in used]))
     u_lag_s = [max(w.u_lag_s, priors.lag_window_s) if priors.lag_s > 0.0 else 0.0 for w in used]
     scatter = SlopeScatter.of(data, u_lag_s, [e.attenuation for e in found])
-    solution = _solution([e.window for e in found], data, priors, applied, scatter)
+    held = [e.pose for e in found]
+    solution = _solution(held, data, priors, applied, scatter)
     for _ in range(SCATTER_TURNS if priors.lag_s > 0.0 else 0):
         larger = estimated(scatter, *slope_residuals(solution), data.type_a.slopes)
         if larger.lag_s.max() <= (1.0 + SCATTER_SETTLED) * scatter.lag_s.max():
             break
         scatter = larger
-        solution = _solution([e.window for e in found], data, priors, applied, scatter)
+        solution = _solution(held, data, priors, applied, scatter)
     shares = budget(solution, priors.offset_mps2, priors.known_u)
     mean, covariance = solution.x[:12], shares.covariance[:12, :12]
     told = determined(mean, np.sqrt(np.diag(covariance)), _prior_u(stated), solution.equations.seen)
@@ -209,13 +209,13 @@ def _response(
 
 
 def _solution(
-    windows: Sequence[Window], data: Condensed, priors: Priors, applied: Applied, scatter: SlopeScatter
+    held: Sequence[Pose], data: Condensed, priors: Priors, applied: Applied, scatter: SlopeScatter
 ) -> Solution:
+    """`held`: the pose of each window."""
     poses: list[Pose] = []
     index: dict[tuple[str, bytes], int] = {}
     pose_of = []
-    for window in windows:
-        pose = window.pose
+    for pose in held:
         seen = [pose.direction, pose.gravity_mps2, pose.along, pose.along_rate_s]
         key = (pose.position, b"".join(b"-" if part is None else part.tobytes() for part in seen))
         if key not in index:

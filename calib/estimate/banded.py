@@ -7,7 +7,7 @@ takes out what is known of h; what is left is small, so that all is linear in it
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from calib.distributions import chi2_quantile
 from calib.excitation.bands import HIGHEST
 from calib.excitation.sums import NOISE_FLOOR
-from calib.model import Array, BandSums, Window
+from calib.model import Array, BandSums
 from calib.signal.order_statistics import distinct
 from calib.signal.response import POWERS, Complex, by_term
 
@@ -113,7 +113,7 @@ class Banded:
 
 
 def banded(
-    windows: Sequence[Window],
+    bands: Iterable[BandSums | None],
     channels: int,
     to_hz: float,
     mean_omega2: Array,
@@ -122,33 +122,24 @@ def banded(
     one_frequency: bool = False,
     powers: int = len(POWERS),
 ) -> Banded:
-    """The bands up to `to_hz` of W windows with `channels` reference channels at most.
+    """The `bands` up to `to_hz` of W windows with `channels` reference channels at most.
 
     The power of du/dt over that of u, in rad2/s2: `mean_omega2` (W,) of all channels of a window together, at which a
     window without such bands moves, and `omega2` (W, M) of each channel. `one_frequency`: the bands are those of a few
     sines and of their harmonics, which tell no term of the response. `powers`: how many terms there are.
     """
     projected = np.array([_at_one_frequency(np.sqrt(square), channels, powers) for square in mean_omega2.tolist()])
-    found = []
-    for w, window in enumerate(windows):
-        if window.bands is None or window.bands.reference_channels != channels:
+    together = _Together(powers)
+    for w, own in enumerate(bands):
+        if own is None or own.reference_channels != channels:
             continue
-        kept = np.flatnonzero(window.bands.high_hz <= HIGHEST * to_hz)
+        kept = np.flatnonzero(own.high_hz <= HIGHEST * to_hz)
         if kept.size:
-            factors = Factors(window.bands, kept)
+            factors = Factors(own, kept)
             projected[w] = _projected(factors, powers, omega2[w])
-            found += [] if one_frequency else [_told(factors, powers)]
-    if not found:
-        return Banded(projected, np.zeros(0), np.zeros((0, powers)), Deviations())
-    residual, moves = np.concatenate([t.residual for t in found]), np.vstack([t.moves for t in found])
-    # Only what the terms can change is kept: as many rows as there are terms.
-    scale = _unit(np.sum(moves**2, axis=0))
-    triangle = np.asarray(np.linalg.qr(np.column_stack([moves / scale, residual]), mode="r"), dtype=np.float64)
-    fitted, *_ = np.linalg.lstsq(moves / scale, residual, rcond=None)
-    left = residual - moves / scale @ fitted
-    size, deviations = powers, _deviations(found, left, powers)
-    triangle /= np.sqrt(deviations.times_noise)
-    return Banded(projected, triangle[:size, size], triangle[:size, :size] * scale, deviations)
+            if not one_frequency:
+                together.add(_told(factors, powers))
+    return together.result(projected)
 
 
 class Factors:
@@ -287,20 +278,51 @@ def _fitted(columns: Array, observed: Array) -> Array:
     return np.asarray((np.linalg.pinv(columns / unit, RELATED) @ observed[..., None]) / unit.transpose(0, 2, 1))
 
 
-def _deviations(found: Sequence[_Told], left: Array, powers: int) -> Deviations:
-    """The sums of what the best response with so many terms leaves (R,)."""
-    signal, at_hz, noise = (
-        np.concatenate([getattr(part, of) for part in found]) for of in ("signal", "at_hz", "noise")
-    )
-    size, variance = signal**2, noise**2
-    power = float(np.sum(size * variance))
-    freedom = float(np.count_nonzero(size) - sum(part.free for part in found) - powers)
-    moved = left * signal * variance
-    third: NDArray[np.int64] = np.round(3.0 * np.log2(at_hz)).astype(np.int64)
-    own = {k: third == k for k in distinct(third).tolist()}
-    worst = max(own, key=lambda k: abs(float(moved[own[k]].sum())))
-    largest = abs(float(moved[own[worst]].sum())) / max(float(np.sum((size * variance)[own[worst]])), TINY)
-    return Deviations(
-        freedom, float(np.sum(left**2)), float(size.sum()), float(moved.sum()), power,
-        float(np.sum(size * variance**2)), float(np.exp2(worst / 3.0)), largest,
-    )  # fmt: skip
+class _Together:
+    """What the windows say of the terms together: only what the terms can change is kept of the rows of all windows,
+    as many rows as there are terms, and the sums of Deviations. So memory does not grow with the windows."""
+
+    def __init__(self, powers: int) -> None:
+        self._powers, self._rows, self._free = powers, 0, 0
+        self._triangle = np.zeros((0, powers + 1))  # R of the rows [moves, residual]
+        self._sums = np.zeros(4)  # of size, size variance, size variance^2, and of the rows with a signal
+        # For each third of an octave: sums of signal variance [moves, residual], and of size variance.
+        self._thirds: dict[int, Array] = {}
+
+    def add(self, told: _Told) -> None:
+        """Add what a window says."""
+        rows = np.column_stack([told.moves, told.residual])
+        self._triangle = np.asarray(np.linalg.qr(np.vstack([self._triangle, rows]), mode="r"), dtype=np.float64)
+        size, variance = told.signal**2, told.noise**2
+        parts = (size.sum(), size @ variance, size @ variance**2, np.count_nonzero(size))
+        self._sums += np.array(parts, dtype=np.float64)
+        self._rows, self._free = self._rows + len(rows), self._free + told.free
+        moved = np.column_stack([(told.signal * variance)[:, None] * rows, size * variance])
+        third: NDArray[np.int64] = np.round(3.0 * np.log2(told.at_hz)).astype(np.int64)
+        for k in distinct(third).tolist():
+            self._thirds[k] = self._thirds.get(k, np.zeros(self._powers + 2)) + moved[third == k].sum(axis=0)
+
+    def result(self, projected: Array) -> Banded:
+        """What the bands say; `projected` as in Banded."""
+        size = self._powers
+        if not self._thirds:
+            return Banded(projected, np.zeros(0), np.zeros((0, size)), Deviations())
+        triangle = self._triangle.copy()
+        moves, residual = triangle[:, :size], triangle[:, size]
+        scale = _unit(np.sum(moves**2, axis=0))
+        fitted, *_ = np.linalg.lstsq(moves / scale, residual, rcond=self._rows * np.finfo(float).eps)
+        fitted = fitted / scale
+        deviations = self._deviations(fitted, float(np.sum((residual - moves @ fitted) ** 2)))
+        triangle /= np.sqrt(deviations.times_noise)
+        return Banded(projected, triangle[:size, size], triangle[:size, :size], deviations)
+
+    def _deviations(self, fitted: Array, square: float) -> Deviations:
+        """The sums of what the best response, with the terms `fitted` (K,), leaves; `square` is that of the rows."""
+        signal, power, variance, rows = self._sums.tolist()
+        freedom = rows - self._free - self._powers
+        moved = {k: float(own[-2] - own[:-2] @ fitted) for k, own in self._thirds.items()}
+        worst = max(sorted(moved), key=lambda k: abs(moved[k]))
+        largest = abs(moved[worst]) / max(float(self._thirds[worst][-1]), TINY)
+        return Deviations(
+            freedom, square, signal, sum(moved.values()), power, variance, float(np.exp2(worst / 3.0)), largest
+        )

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
 from calib.estimate.banded import Banded, banded
 from calib.estimate.type_a import FEWEST_FREEDOM, LEAST_INFLATION, Index, Segments, TypeA, in_order, pooled
 from calib.excitation.excited import OF_STRONGEST
-from calib.model import Array, Window, own_channels
+from calib.model import Array, BandSums, WindowSums, own_channels
 from calib.signal.response import POWERS
 
 PIVOT_FLOOR = 1e-9  # of a channel's power: a smaller remainder, after the channels before it, is a rounding error
@@ -23,6 +24,22 @@ PIVOT_FLOOR = 1e-9  # of a channel's power: a smaller remainder, after the chann
 # reference would be taken for a motion that the sensor does not follow. Half the limit of calib.excitation.excited: a
 # channel that it found to be excited stays so after the noise was subtracted, which is a tenth of its power at most.
 EXCITED = 0.5 * OF_STRONGEST
+
+
+class Summed(Protocol):
+    """What is condensed: a calib.model.Window, or what calib.excitation.excited leaves of it."""
+
+    @property
+    def sums(self) -> WindowSums: ...
+
+    @property
+    def bands(self) -> BandSums | None: ...
+
+    @property
+    def reference_noise(self) -> Array | None: ...
+
+    @property
+    def independent(self) -> float: ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,7 +63,7 @@ class Condensed:
 
 
 def condense(
-    windows: Sequence[Window],
+    windows: Sequence[Summed],
     *,
     alike: bool = False,
     response_hz: float = 0.0,
@@ -58,11 +75,17 @@ def condense(
     `alike` as in calib.estimate.type_a.pooled. `response_hz`: upper end of the motion that is to tell the response
     over frequency; 0 where that is no unknown. `one_frequency`, `powers`: see calib.estimate.banded.
     """
-    channels = max(w.sums.reference_channels for w in windows)
-    parts = _segments(windows, channels)
+    sums = [w.sums for w in windows]
+    channels = max(own.reference_channels for own in sums)
+    parts = _segments(windows, sums, channels)
+    del sums  # of a day, as much memory as the parts
     powers_of = [part.xx.sum(1) for part in parts]
     roots, whiteners = zip(*map(_roots, powers_of), strict=True)
     omega2, of_each = (in_order(parts, own) for own in zip(*(_omega2(p, channels) for p in powers_of), strict=True))
+    told = None
+    if response_hz:
+        bands = (w.bands for w in windows)
+        told = banded(bands, channels, response_hz, omega2, of_each, one_frequency=one_frequency, powers=powers)
     return Condensed(
         channels=channels,
         root=in_order(parts, roots),
@@ -72,9 +95,7 @@ def condense(
         mean_v=in_order(parts, [part.mean[:, -3:] for part in parts]),
         count=in_order(parts, [part.count.sum(1) for part in parts]),
         type_a=pooled(parts, roots, whiteners, alike=alike),
-        bands=banded(windows, channels, response_hz, omega2, of_each, one_frequency=one_frequency, powers=powers)
-        if response_hz
-        else None,
+        bands=told,
     )
 
 
@@ -110,33 +131,34 @@ def effective(data: Condensed, independent: Array) -> Condensed:
     )
 
 
-def _segments(windows: Sequence[Window], channels: int) -> list[Segments]:
+def _segments(windows: Sequence[Summed], sums: Sequence[WindowSums], channels: int) -> list[Segments]:
     """Sums of the windows by segment, centred on each window's mean; windows of one shape together."""
     shapes: dict[tuple[int, int], list[int]] = {}
-    for w, window in enumerate(windows):
-        shapes.setdefault((window.sums.reference_channels, len(window.sums.count)), []).append(w)
-    return [_alike(np.array(at), [windows[w] for w in at], channels) for at in shapes.values()]
+    for w, own in enumerate(sums):
+        shapes.setdefault((own.reference_channels, len(own.count)), []).append(w)
+    return [_alike(np.array(at), windows, [sums[w] for w in at], channels) for at in shapes.values()]
 
 
-def _alike(at: Index, windows: Sequence[Window], channels: int) -> Segments:
-    """Sums of windows with equal numbers of segments and channels; channels that they do not have are zeros."""
-    own = windows[0].sums.reference_channels
-    keep = [*range(own), *range(channels, channels + own), *range(2 * channels, 2 * channels + 3)]
+def _alike(at: Index, windows: Sequence[Summed], sums: Sequence[WindowSums], channels: int) -> Segments:
+    """`sums` of the windows `at`, equal in segments and channels; channels that they do not have are zeros."""
+    own = sums[0].reference_channels
+    keep = np.array([*range(own), *range(channels, channels + own), *range(2 * channels, 2 * channels + 3)])
     size = 2 * channels + 3
-    count = np.array([w.sums.count for w in windows], dtype=np.float64)
+    count = np.array([each.count for each in sums], dtype=np.float64)
     mean = np.zeros((*count.shape, size))
-    mean[..., keep] = [w.sums.mean for w in windows]
-    scatter = np.zeros((*count.shape, size, size))
-    scatter[..., np.array(keep)[:, None], keep] = [w.sums.scatter for w in windows]
+    mean[..., keep] = [each.mean for each in sums]
     centre = (count[:, None] @ mean)[:, 0] / count.sum(1)[:, None]
     mean -= centre[:, None]
-    scatter += count[..., None, None] * mean[..., :, None] * mean[..., None, :]
-    x = slice(0, 2 * channels)
-    noise = np.zeros((len(windows), 2 * channels))
-    for own_noise, window in zip(noise, windows, strict=True):
-        if window.reference_noise is not None:
-            for powers, first in zip(window.reference_noise**2, (0, channels), strict=True):
+    scatter = np.zeros((*count.shape, size, size))
+    for held, each, weight, away in zip(scatter, sums, count, mean, strict=True):  # one by one: no copy of them all
+        held[:, keep[:, None], keep] = each.scatter
+        held += weight[:, None, None] * away[:, :, None] * away[:, None, :]
+    noise = np.zeros((len(sums), 2 * channels))
+    for own_noise, w in zip(noise, at.tolist(), strict=True):
+        if (rms := windows[w].reference_noise) is not None:
+            for powers, first in zip(rms**2, (0, channels), strict=True):
                 own_noise[first : first + len(powers)] = powers
+    x = slice(0, 2 * channels)
     return Segments(
         at,
         count,
@@ -146,7 +168,7 @@ def _alike(at: Index, windows: Sequence[Window], channels: int) -> Segments:
         count[..., None] * mean,
         centre,
         noise,
-        np.array([w.independent for w in windows]),
+        np.array([windows[w].independent for w in at.tolist()]),
     )
 
 

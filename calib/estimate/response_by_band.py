@@ -17,7 +17,7 @@ from calib.estimate.banded import PROBABILITY, Factors
 from calib.estimate.quantities import LAG, RESPONSE
 from calib.estimate.response_told import BandSensitivity, Known, ResponseTold
 from calib.excitation.excited import excited
-from calib.model import Array, Window
+from calib.model import Array, BandSums, Pose, Window
 from calib.signal.response import Complex
 
 PER_OCTAVE = 6  # bands, as many as those of a window
@@ -33,7 +33,7 @@ def told_by_band(found: Adjustment, windows: Sequence[Window]) -> ResponseTold |
     u has all that the adjustment knows besides: angles, reference, mounting. NaN where a band tells nothing.
     """
     told, grounds = found.response, found.grounds
-    used = [excited(w).window for w in windows if w.used]
+    used = _moved(windows)
     if told is None or not used or grounds.priors.response_terms == 1.0:
         return told
     terms, k = grounds.solution.equations.nuisances, PER_OCTAVE * len(told.bands) // 3
@@ -48,7 +48,16 @@ def told_by_band(found: Adjustment, windows: Sequence[Window]) -> ResponseTold |
     return replace(told, bands=_bands(used, edges_hz, taken, stated))
 
 
-def _bands(windows: Sequence[Window], edges_hz: Array, taken: Complex, stated: Array) -> tuple[BandSensitivity, ...]:
+_Moved = tuple[Pose, BandSums]  # how a window stands, and its bands
+
+
+def _moved(windows: Sequence[Window]) -> list[_Moved]:
+    """What is used of the windows that have bands."""
+    found = [(own.pose, own.bands) for own in (excited(w) for w in windows if w.used)]
+    return [(pose, bands) for pose, bands in found if bands is not None]
+
+
+def _bands(windows: Sequence[_Moved], edges_hz: Array, taken: Complex, stated: Array) -> tuple[BandSensitivity, ...]:
     """The complex sensitivities at the middles of the bands between `edges_hz` (B + 1,).
 
     `taken` (B,): what the data were divided by. `stated` (3, 3): the standard uncertainty of S by all that has nothing
@@ -77,23 +86,20 @@ class _Rows:
     incoherent: Array
 
     @classmethod
-    def of(cls, windows: Sequence[Window], low_hz: float, high_hz: float) -> _Rows:
+    def of(cls, windows: Sequence[_Moved], low_hz: float, high_hz: float) -> _Rows:
         """Those of the windows' bands whose middles are in this band."""
         parts, power, square = [(np.zeros((0, 6)), np.zeros((0, 3)), np.zeros((0, 3)))], 0.0, 0.0
         told, lost, at_hz = np.zeros(3), np.zeros(3), float(np.sqrt(low_hz * high_hz))
-        for window in windows:
-            bands = window.bands
-            if bands is None:
-                continue
+        for pose, bands in windows:
             middle_hz, m = np.sqrt(bands.low_hz * bands.high_hz), bands.reference_channels
             inside = (middle_hz >= low_hz) & (middle_hz < high_hz)
             around = (bands.low_hz <= at_hz) & (bands.high_hz > at_hz) & (bands.high_hz < NARROW * bands.low_hz)
             kept = np.flatnonzero(inside | around)
             if not kept.size:
                 continue
-            factors, along = Factors(bands, kept), window.pose.direction[:, :m]
-            if window.pose.along is not None:  # a silent channel shares the motion of the others
-                along = along @ window.pose.along[:m, :m]
+            factors, along = Factors(bands, kept), pose.direction[:, :m]
+            if pose.along is not None:  # a silent channel shares the motion of the others
+                along = along @ pose.along[:m, :m]
             real, imaginary = factors.root[..., :m] @ along.T, factors.root[..., m:] @ along.T
             both = np.concatenate([real, imaginary / factors.omega[:, None, None]], axis=2)
             own = (both.reshape(-1, 6), factors.slopes.reshape(-1, 3), np.repeat(factors.noise, 2 * m, axis=0))

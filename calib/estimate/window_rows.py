@@ -92,10 +92,9 @@ class Summary:
         mean = sums.count @ sums.mean[:, :m] / sums.count.sum()
         held = window.pose.gravity_mps2 + window.pose.direction @ mean
         motion_hz = motion_band_hz([window])
-        data = condense([found.window], response_hz=to_hz, one_frequency=motion_hz is None)
-        moved = found.window.pose
+        data = condense([found], response_hz=to_hz, one_frequency=motion_hz is None)
         return cls(
-            window.pose, moved, held, data, found.directions, found.attenuation, day, lag_s, temperature_degc,
+            window.pose, found.pose, held, data, found.directions, found.attenuation, day, lag_s, temperature_degc,
             window.u_lag_s, window.independent, reference, window.response, motion_hz,
         )  # fmt: skip
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.excitation.bands import without_noise
-from calib.model import Array, Window, WindowSums, own_channels
+from calib.model import Array, BandSums, Pose, Window, WindowSums, own_channels
 
 # Least power of an excited channel, relative to its noise. Noise reduces the slopes; the correction for it leaves a
 # tenth of that error, which is then at most 1 %.
@@ -29,13 +29,63 @@ CORRECTION_SHARE = 0.1  # relative standard uncertainty of the noise's power, fr
 class Excitation:
     """A window after the correction: silent channels are removed, and the noise's power is subtracted from the others.
 
-    `directions` (3, k) are orthonormal vectors that span the excited directions, in the sensor's frame. `attenuation`
-    is the relative standard uncertainty of all slopes of the window that the correction leaves.
+    `window` is the one before. `pose` tells the shared motion of silent channels. `directions` (3, k) are orthonormal
+    vectors that span the excited directions, in the sensor's frame. `attenuation` is the relative standard uncertainty
+    of all slopes of the window that the correction leaves. `live` (m,) flags the channels that were excited, `noise`
+    (2, m) is the power of the reference's noise in u and du/dt.
+
+    `sums` and `bands` are made anew whenever they are asked for: to keep those of all windows of a day would take as
+    much memory as the windows.
     """
 
     window: Window
+    pose: Pose
     directions: Array
     attenuation: float
+    live: NDArray[np.bool_]
+    noise: Array
+
+    @property
+    def reference_noise(self) -> Array | None:
+        """As that of the window."""
+        return self.window.reference_noise
+
+    @property
+    def independent(self) -> float:
+        """As that of the window."""
+        return self.window.independent
+
+    @property
+    def sums(self) -> WindowSums:
+        """The sums after the correction."""
+        sums, live = self.window.sums, self.live
+        if live.all() and not self.noise.any():
+            return sums
+        channels = sums.reference_channels  # m, or 2 m if the integrals follow (see calib.signal.corner)
+        both = _columns(live, channels)
+        scatter = sums.scatter.copy() if live.all() else np.where(np.outer(both, both), sums.scatter, 0.0)
+        for power, at in zip(self.noise, (0, channels), strict=True):
+            for k in np.flatnonzero(live):
+                own = scatter[:, at + k, at + k]
+                scatter[:, at + k, at + k] = own - np.minimum(sums.count * power[k], MOST_NOISE * own)
+        if live.all():
+            return WindowSums(channels, sums.count, sums.mean, scatter)
+        # Each segment gets the window's mean of a silent channel: differences between segments would count as motion
+        # again. The mean itself is kept, because the sensor is subject to it too (gravity, if the reference is
+        # DC-coupled).
+        mean = sums.count @ sums.mean / sums.count.sum()
+        return WindowSums(channels, sums.count, np.where(both, sums.mean, mean), scatter)
+
+    @property
+    def bands(self) -> BandSums | None:
+        """The bands with motion after the correction."""
+        bands, live = self.window.bands, self.live
+        if bands is None or bands.reference_channels != len(live):
+            return None
+        if not live.all():
+            both = _columns(live, len(live))
+            bands = replace(bands, products=np.where(np.outer(both, both), bands.products, 0.0))
+        return without_noise(bands, np.sqrt(self.noise))
 
 
 def excited(window: Window) -> Excitation:
@@ -44,15 +94,15 @@ def excited(window: Window) -> Excitation:
     A window at rest, or of a uniaxial reference whose noise is not known, is not changed.
     """
     m = own_channels(window.sums.reference_channels)
+    noise = np.zeros((2, m)) if window.reference_noise is None else window.reference_noise**2
     if m == 0:
-        return Excitation(window, np.zeros((3, 0)), 0.0)
+        return Excitation(window, window.pose, np.zeros((3, 0)), 0.0, np.ones(0, dtype=bool), noise)
     both = _power(window)
     power = both[:m, :m]
-    noise = np.zeros((2, m)) if window.reference_noise is None else window.reference_noise**2
     own = _own_power(both, noise[0])
     live = own > 0.0
     if live.all() and window.reference_noise is None and window.bands is None:  # nothing to remove or to subtract
-        return Excitation(window, np.linalg.qr(window.pose.direction[:, :m])[0], 0.0)
+        return Excitation(window, window.pose, np.linalg.qr(window.pose.direction[:, :m])[0], 0.0, live, noise)
     share = float(np.max(noise[0][live] / own[live], initial=0.0))
     along, ahead = _shared(window, live, noise)
     # The shared motion of a silent channel turns the excited direction if it is more than noise and more than 1 %.
@@ -61,7 +111,24 @@ def excited(window: Window) -> Excitation:
     direction = window.pose.direction[:, :m]
     turned = direction + direction @ np.where(askew[:, None], along, 0.0)
     basis, _ = np.linalg.qr(turned[:, np.flatnonzero(live)])
-    return Excitation(_reduced(window, live, along, ahead, noise), basis, CORRECTION_SHARE * share)
+    pose = window.pose if live.all() else _shared_in(window.pose, live, along, ahead)
+    return Excitation(window, pose, basis, CORRECTION_SHARE * share, live, noise)
+
+
+def _columns(live: NDArray[np.bool_], channels: int) -> NDArray[np.bool_]:
+    """(2 channels + 3,) flags of the columns of a window's sums that stay."""
+    every = np.tile(live, channels // len(live))
+    return np.concatenate([every, every, [True] * 3])
+
+
+def _shared_in(pose: Pose, live: NDArray[np.bool_], along: Array, ahead: Array) -> Pose:
+    """The pose with the motion that silent channels share. The stated directions stay: the silent channel measured the
+    shared motion, and its error is in `along`."""
+    pairs = np.eye(pose.direction.shape[1] // len(live))
+    moving, rate = (
+        np.asarray(np.kron(pairs, part), dtype=float) for part in (np.diag(live.astype(float)) + along, ahead)
+    )
+    return replace(pose, along=moving, along_rate_s=rate)
 
 
 def _power(window: Window) -> Array:
@@ -110,36 +177,3 @@ def _shared(window: Window, live: NDArray[np.bool_], noise: Array) -> tuple[Arra
         solved = np.linalg.pinv(clean[np.ix_(moving, moving)] / np.outer(unit, unit), OF_STRONGEST, hermitian=True)
         found[np.ix_(~live, np.tile(live, 2))] = power[np.ix_(np.flatnonzero(~live), moving)] / unit @ solved / unit
     return found[:, :m], found[:, m:]
-
-
-def _reduced(window: Window, live: NDArray[np.bool_], along: Array, ahead: Array, noise: Array) -> Window:
-    sums, pose, m = window.sums, window.pose, len(live)
-    channels = sums.reference_channels  # m, or 2 m if the integrals follow (see calib.signal.corner)
-    every = np.tile(live, channels // m)
-    both = np.concatenate([every, every, [True] * 3])
-    scatter = np.where(np.outer(both, both), sums.scatter, 0.0)
-    for power, at in zip(noise, (0, channels), strict=True):
-        for k in np.flatnonzero(live):
-            own = scatter[:, at + k, at + k]
-            scatter[:, at + k, at + k] = own - np.minimum(sums.count * power[k], MOST_NOISE * own)
-    bands = None
-    if window.bands is not None and channels == m:
-        bands = without_noise(
-            replace(window.bands, products=np.where(np.outer(both, both), window.bands.products, 0.0)), np.sqrt(noise)
-        )
-    if live.all():
-        return replace(window, sums=replace(sums, scatter=scatter), bands=bands)
-    pairs = np.eye(channels // m)
-    moving, rate = (
-        np.asarray(np.kron(pairs, part), dtype=float) for part in (np.diag(live.astype(float)) + along, ahead)
-    )
-    # Each segment gets the window's mean of a silent channel: differences between segments would count as motion again.
-    # The mean itself is kept, because the sensor is subject to it too (gravity, if the reference is DC-coupled).
-    mean = sums.count @ sums.mean / sums.count.sum()
-    return replace(
-        window,
-        # The stated directions stay: the silent channel measured the shared motion, and its error is in `along`.
-        pose=replace(pose, along=moving, along_rate_s=rate),
-        sums=WindowSums(channels, sums.count, np.where(both, sums.mean, mean), scatter),
-        bands=bands,
-    )

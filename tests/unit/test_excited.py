@@ -9,7 +9,7 @@ from calib.estimate.condense import condense
 from calib.estimate.equations import Equations
 from calib.estimate.nuisances import Applied, Nuisances, Priors
 from calib.estimate.slope_scatter import SlopeScatter
-from calib.excitation.excited import excited
+from calib.excitation.excited import Excitation, excited
 from calib.excitation.sums import window_sums
 from calib.geometry import beside
 from calib.model import Window
@@ -36,7 +36,7 @@ def window(directions: np.ndarray, level_mps2: float = 0.1, n: int = 6000) -> Wi
     return Window(0.0, 60.0, beside(np.eye(3)), sums, True, "", n, 0, reference_noise=noise)
 
 
-def slopes(found: Window) -> tuple[np.ndarray, np.ndarray]:
+def slopes(found: Excitation) -> tuple[np.ndarray, np.ndarray]:
     """S D of the channels that moved (3, k), and the variance ratio of the slopes by segments."""
     data = condense([found])
     live = np.flatnonzero(np.diag(data.root[0])[:3])
@@ -53,7 +53,7 @@ def test_a_motion_in_one_direction_is_one_channel_whichever_way_it_goes(directio
     assert found.directions.shape == (3, 1)
     # 6000 points at 0.1 m/s2: the reference's noise turns the direction by 2e-4 rad, four of them
     assert abs(found.directions[:, 0] @ along) > 1 - 0.5 * (8e-4) ** 2
-    seen, scatter = slopes(found.window)
+    seen, scatter = slopes(found)
     strongest = int(np.argmax(np.abs(along)))
     # sensor's noise 0.005 over 0.1 m/s2 and 6000 points: 7e-4 relative, four of them, over the channel's own share
     assert np.abs(seen[:, 0] - S @ along / along[strongest]).max() < 4 * 7e-4 / abs(along[strongest])
@@ -78,7 +78,7 @@ def test_noise_alone_is_no_motion() -> None:
 def test_what_is_excited_stays_so_in_the_equations(share: float) -> None:
     """A weak motion of 1 % with ten times the power of its noise: subtracting that noise must not make it silent."""
     found = excited(window(np.array([[0.0, 1.0, 0.0], [share, 0.0, 0.0]]), level_mps2=0.35))
-    rows = int(np.count_nonzero(np.diag(condense([found.window]).root[0])[:3]))
+    rows = int(np.count_nonzero(np.diag(condense([found]).root[0])[:3]))
     assert rows == found.directions.shape[1]
 
 
@@ -93,7 +93,7 @@ def test_a_silent_channel_that_moves_ahead_of_the_others_turns_the_motion_s_deri
     V = a @ S.T + 1e-3 * random.normal(size=a.shape)
     sums = window_sums(u, du, V, np.arange(0, n + 1, 50))
     noise = np.full((2, 3), 1e-4)
-    found = excited(Window(0.0, 60.0, beside(np.eye(3)), sums, True, "", n, 0, reference_noise=noise)).window
+    found = excited(Window(0.0, 60.0, beside(np.eye(3)), sums, True, "", n, 0, reference_noise=noise))
     assert found.pose.along is not None
     assert found.pose.along_rate_s is not None
     u_slope = 1e-3 / (np.sqrt(n) * y.std())  # of a slope of V on y; that on its derivative is omega times smaller
