@@ -46,7 +46,7 @@ function tables([place, expanded, next, taken, wanted]) {
   const rows = KINDS.map(([kind, key]) => [kind, percent(expanded, key), percent(next?.after, key), percent(wanted, key), reached(key)]);
   const stops = taken.map((t, i) => [i + 1, t.name, percent(t.expanded, "main_pct"), percent(t.expanded, "transverse_pct")]);
   return [
-    make("h3", "U (k = 2), apart from the reference's own error"), table("U so far", ["Of", "So far", "Next", "Wanted", "Reached"], rows),
+    make("h3", "U (k = 2), apart from the reference's own error"), table("U so far", ["Of", "So far", "Next", "Wanted", "Met"], rows),
     make("h3", "Positions that are used"), table("Positions that are used", ["Stop", "Position", "U (main)", "U (transverse)"], stops), make("p", make("a", "CSV", { href: `bench.csv?${place}` })),
   ];
 }
