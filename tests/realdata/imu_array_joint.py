@@ -3,7 +3,7 @@
 `python -m tests.realdata.imu_array_joint`. The board rests in an unknown direction, in which all IMUs feel gravity. The
 unknowns are these directions, and S and Q of each IMU, constant in a recording. Where Q hardly drifts (recordings 2
 and 3) such a Q has a third of the uncertainty of the norm fit of one IMU. So it tells the errors of both norm fits that
-the test compares, and that of the transfer from IMU 1. In recording 1 the scatter tells that a constant Q does not hold.
+the test compares, and that of the transfer from IMU 1. In recording 1 the scatter tells that Q is not constant.
 """
 
 from __future__ import annotations
