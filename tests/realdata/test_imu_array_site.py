@@ -31,16 +31,21 @@ options = {{ rotation = "{rotation}", u-rotation-deg = 0.5, u-offset-mps2 = 0.00
 """
 
 
+def rests(recording: int) -> tuple[np.ndarray, np.ndarray]:
+    """Times (n,) in s and indications (8, n, 3) of the part with rests."""
+    held = np.load(dataset("imu_array") / f"recording{recording}.npz")
+    still = held["time_s"] < RESTS_END_S
+    return held["time_s"][still], held["acceleration_count"][still].astype(float).swapaxes(0, 1)
+
+
 def deviations(recording: int, imus: tuple[int, ...], directory: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of each IMU: relative deviations of the singular values (n, 3), and of Q in m/s2 (n, 3).
 
     The third array (n, 3) in m/s2 is the standard uncertainty that the norm fits of both IMUs give this deviation of Q.
     """
-    held = np.load(dataset("imu_array") / f"recording{recording}.npz")
-    still = held["time_s"] < RESTS_END_S
-    time_s, counts = held["time_s"][still], held["acceleration_count"][still].astype(float)
+    time_s, counts = rests(recording)
     for k in (1, *imus):
-        table = np.column_stack([time_s, counts[:, k - 1]])
+        table = np.column_stack([time_s, counts[k - 1]])
         header = "time_s,vx,vy,vz"
         np.savetxt(directory / f"imu{k}.csv", table, delimiter=",", header=header, comments="", fmt="%.9g")
     first = ["--sensor", str(directory / "imu1.csv"), "--gravity", str(GRAVITY_MPS2)]
@@ -49,7 +54,7 @@ def deviations(recording: int, imus: tuple[int, ...], directory: Path) -> tuple[
     (directory / "site.toml").write_text(site + "".join(LINK.format(k=k, rotation=ROTATIONS[k % 2]) for k in imus))
     assert run_cli(["fleet", "adjust", str(directory / "site.toml"), "--json", str(directory / "site.json")]) == 0
     told = json.loads((directory / "site.json").read_text())
-    fits = {k: norm_fit(rests_anywhere(time_s, counts[:, k - 1], GRAVITY_MPS2), GRAVITY_MPS2) for k in (1, *imus)}
+    fits = {k: norm_fit(rests_anywhere(time_s, counts[k - 1], GRAVITY_MPS2), GRAVITY_MPS2) for k in (1, *imus)}
     singular, offset, u = [], [], []
     for k in imus:
         own, found = fits[k].calibration, told["devices"][f"IMU {k}"]
