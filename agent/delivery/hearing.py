@@ -19,9 +19,9 @@ from agent.delivery.keys import PREFIX
 NOBODY = f"{PREFIX}/nobody"  # no gateway has such a token, so that the answer has no bytes
 ASK_S = 60.0  # s between two questions, half as much at least and once more as much at most
 LONGEST_S = 3600.0  # s; at most so long from a new session to its first question
-# s to wait for an answer: as long as Zenoh waits for a sign of life. A router that stands still for longer loses the
-# link.
-ANSWER_S = 10.0
+# s to wait for an answer. Longer than 10 s, after which Zenoh gives a link up that shows no sign of life: a router that
+# stands still loses its links by itself, and one that is slow because all gateways come back gets no more work.
+ANSWER_S = 30.0
 MISSES = 2  # questions in a row without answer: the first may have been lost with a link that was then replaced
 
 _log = logging.getLogger(__name__)
