@@ -10,10 +10,10 @@ from typing import Any
 import click
 import numpy as np
 
-from agent.calibrate.reference_certificate import read_reference_certificate
 from agent.config.earlier import EarlierError, read_earlier
 from agent.reading.source import TableError
 from calib.model import Array
+from calib.recorded.certificate import ReferenceCertificate
 from calib.recorded.errors import OptionError
 from calib.recorded.options import Options
 from calib.recorded.priors import prior_of
@@ -30,7 +30,7 @@ def options_of(params: Mapping[str, Any]) -> Options:
     named = {f.name: params.get(NAMES.get(f.name, f.name)) for f in fields(Options)}
     convert: dict[str, Callable[[Any], Any]] = {
         "method": int, "static_sign": int, "rotation": _rotation, "prior": read_prior,
-        "reference_certificate": read_reference_certificate,
+        "reference_certificate": _reference_certificate,
     }  # fmt: skip
     told = {name: convert[name](value) if name in convert else value
             for name, value in named.items() if value is not None}  # fmt: skip
@@ -45,6 +45,13 @@ def read_prior(path: Path) -> tuple[Array, Array]:
         raise TableError(f"{path}: {error.problem}") from None
     except EarlierError as error:
         raise TableError(str(error)) from None
+
+
+def _reference_certificate(path: Path) -> ReferenceCertificate:
+    """As `read_reference_certificate`, which loads pydantic and the configuration: few commands name a certificate."""
+    from agent.calibrate.reference_certificate import read_reference_certificate
+
+    return read_reference_certificate(path)
 
 
 def _rotation(text: str) -> Array:

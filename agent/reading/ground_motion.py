@@ -9,7 +9,6 @@ from typing import Literal
 
 import msgspec
 import numpy as np
-from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 
 from agent.reading.seismic import MiniSeed
 from agent.reading.source import Array, Arrays, Column, Grid, TableError
@@ -121,6 +120,8 @@ def flattened(counts: Array, rate_hz: float, component: Component) -> Array:
     most MOST_AMPLIFIED. A straight line between the ends is taken out before and, where the instrument feels gravity,
     added again.
     """
+    from scipy.fft import irfft, next_fast_len, rfft, rfftfreq  # takes 0.15 s to load
+
     n = len(counts)
     line = np.linspace(counts[0], counts[-1], n)
     if component.feels_gravity:

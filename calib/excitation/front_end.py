@@ -28,6 +28,7 @@ from calib.signal.holes import Mask
 from calib.signal.instrument import Instrument
 from calib.signal.resampling import (
     HALF,
+    as_slice,
     differentiate,
     differentiator_lost,
     resample,
@@ -183,14 +184,15 @@ def aligned(
     usable = np.isfinite(columns).all(axis=1) & inside
     if usable.sum() < 2:
         return None
-    raw_inside = _within(reference.time_s, span_s)
+    raw_inside = _within(reference.time_s, span_s) if raw_filled.any() or odd.any() else raw_filled
     independent *= (1.0 - _share(filled, usable)) * (1.0 - _share(raw_filled, raw_inside))
     counts = {
         "filled_samples": (filled & usable).sum(),
         "reference_filled_samples": (raw_filled & raw_inside).sum(),
         "reference_glitches": (odd & raw_inside).sum(),
     }
-    points = Points(time_s[usable], *np.split(columns.T[:, usable].T, [3, 3 + k], axis=1))
+    kept = as_slice(np.flatnonzero(usable))
+    points = Points(time_s[kept], *np.split(columns.T[:, kept].T, [3, 3 + k], axis=1))
     noise = not_more_than_incoherent(noise, points.u[:, :m], points.V)
     told = {name: float(count) for name, count in counts.items() if count}
     return Aligned(points, noise, clipped, independent, band_hz if settings.limit_band else None, told)

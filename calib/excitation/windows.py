@@ -208,7 +208,7 @@ def _motion(
     if len(V) < max(limits.least_points, 2 * u.shape[1] + 2):
         sums = _sums(V, u, du, rate_hz, limits)
         return _window(kind, pose, t, sums, judge(sums, np.zeros(len(V), dtype=bool), {}, limits), 0)
-    basis = np.column_stack([np.ones(len(u)), u, du])
+    basis = np.vstack([np.ones(len(u)), u.T, du.T]).T
     finest = detection.least_step(V)
     struck, residual = detection.knocked(V, basis, finest)
     stepped = stepped or step(residual, rate_hz)
@@ -218,12 +218,13 @@ def _motion(
         rest = _motion(kind, pose, left, rate_hz, limits, leave_out, taper, stepped)
         return _without_segments(rest, int((~sound).sum()))
     clean = sums = _sums(V, u, du, rate_hz, limits)
+    kept: slice | NDArray[np.bool_] = slice(None)
     if struck.any():
         kept = ~struck
         clean = _sums(V[kept], u[kept], du[kept], rate_hz, limits)
         if leave_out:
             sums = clean
-    numbers = motion_numbers(clean, basis[~struck], V[~struck], rate_hz, stepped, limits)
+    numbers = motion_numbers(clean, basis[kept], V[kept], rate_hz, stepped, limits)
     numbers |= nonlinearity(V, residual, rate_hz)
     numbers["stuck_axes"] = float(np.sum(np.ptp(V, axis=0) == 0.0))
     numbers["clipped_points"] = float(detection.clipped(V, residual, finest))
@@ -234,7 +235,8 @@ def _motion(
     if not (taper and verdict.used):
         return window
     # Without a knock's points the others would not be evenly spaced: the window's own regression takes their places.
-    return replace(window, bands=band_sums(u, du, np.where(struck[:, None], V - residual, V), rate_hz, taper))
+    whole = np.where(struck[:, None], V - residual, V) if struck.any() else V
+    return replace(window, bands=band_sums(u, du, whole, rate_hz, taper))
 
 
 def _sound(struck: NDArray[np.bool_], rate_hz: float, limits: Limits) -> NDArray[np.bool_]:
@@ -297,7 +299,9 @@ def _unbroken(time_s: Array) -> Iterator[tuple[int, int]]:
     if len(time_s) < 2:
         return
     steps = np.diff(time_s)
-    cuts = np.flatnonzero(steps > 2.5 * median(steps)) + 1
+    # No median is needed where no step is long: it is no less than the smallest step.
+    long = steps.max() > 2.5 * steps.min()
+    cuts = np.flatnonzero(steps > 2.5 * median(steps)) + 1 if long else np.zeros(0, dtype=np.int64)
     yield from ((a, b) for a, b in itertools.pairwise([0, *cuts.tolist(), len(time_s)]) if b - a > 1)
 
 

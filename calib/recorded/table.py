@@ -107,6 +107,14 @@ def ends_s(time_s: Slices) -> tuple[float, float]:
     return float(time_s[:1][0]), float(time_s[len(time_s) - 1 :][0])
 
 
+def _most_late_s(time_s: Slices) -> float:
+    """By how much a stamp may be earlier than the previous one."""
+    try:
+        return 0.0 if kind_of(np.asarray(time_s[:ROWS_AT_ONCE])) == "grid" else LATEST_STAMP_S
+    except ValueError:
+        return 0.0
+
+
 def check_time(time_s: Slices, column: str, place: str) -> None:
     """Check that time increases. Stamps may decrease by LATEST_STAMP_S, but not if they are on an exact grid.
 
@@ -118,16 +126,15 @@ def check_time(time_s: Slices, column: str, place: str) -> None:
             f"the time runs from {ends[0]:.10g} s to {ends[1]:.10g} s, which is no time since 1970 in s",
             "state its unit, or convert it to s", place=place, column=column, value=ends[0],
         )  # fmt: skip
-    try:
-        allowed = 0.0 if kind_of(np.asarray(time_s[:ROWS_AT_ONCE])) == "grid" else LATEST_STAMP_S
-    except ValueError:
-        allowed = 0.0
     newest = -math.inf
     for first in range(0, len(time_s), ROWS_AT_ONCE):
         part = np.asarray(time_s[first : first + ROWS_AT_ONCE])
+        if part[0] >= newest and bool((part[1:] >= part[:-1]).all()):
+            newest = float(part[-1])
+            continue
         before = np.maximum.accumulate(np.append(newest, part))
         newest = float(before[-1])
-        wrong = np.flatnonzero(before[:-1] - part > allowed)
+        wrong = np.flatnonzero(before[:-1] - part > _most_late_s(time_s))
         if len(wrong):
             at = int(wrong[0])
             raise InputError(

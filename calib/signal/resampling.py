@@ -16,7 +16,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from calib.model import Array
-from calib.signal.order_statistics import distinct, median
+from calib.signal.order_statistics import distinct
 from calib.signal.timing import ClockFit
 
 TAPS, DEGREE = 16, 7
@@ -60,17 +60,20 @@ def resample(x: Array, clock: ClockFit, time_s: Array, first_index: int = 0, mar
     usable = (start >= margin) & (start + TAPS + margin <= len(x))
     for gap in clock.gaps:
         usable &= np.abs(base - gap) > HALF + margin + NODES
-    before_s, after_s = clock.time_of(clock.index_of(median(time_s)) + np.array([-0.5, 0.5])).tolist()
+    middle_s = 0.5 * (time_s[(len(time_s) - 1) // 2] + time_s[len(time_s) // 2])
+    before_s, after_s = clock.time_of(clock.index_of(middle_s) + np.array([-0.5, 0.5])).tolist()
     rate = 1.0 / (after_s - before_s)
     # A channel a row: what is done to a channel afterwards finds its samples side by side.
     u, du = np.zeros((x.shape[1], len(position))), np.zeros((x.shape[1], len(position)))
     inside = np.nonzero(usable)[0]
     for k in range(0, len(inside), CHUNK):
-        part = inside[k : k + CHUNK]
-        low, high = int(start[part].min()), int(start[part].max()) + TAPS
+        part = as_slice(inside[k : k + CHUNK])
+        first = start[part]  # rises, as the times do
+        low, high = int(first[0]), int(first[-1]) + TAPS
+        at = as_slice(first - low)
         for channel in range(x.shape[1]):
             taps = np.ascontiguousarray(sliding_window_view(x[low:high, channel], TAPS).T)
-            value, slope = _horner((_weights() @ taps).take(start[part] - low, axis=1), fraction[part])
+            value, slope = _horner((_weights() @ taps)[:, at], fraction[part])
             u[channel, part], du[channel, part] = value, slope * rate
     return Resampled(u.T, du.T, usable)
 
@@ -127,6 +130,13 @@ def differentiator_lost(rate_hz: float, order: int) -> int:
 def differentiated_band_hz(rate_hz: float) -> float:
     """Up to where a derivative is right."""
     return min(DIFFERENTIATED_BAND_HZ, DIFFERENTIATED_BAND_LARGEST * rate_hz)
+
+
+def as_slice(numbers: NDArray[np.int64]) -> NDArray[np.int64] | slice:
+    """Rising numbers (n,), n >= 1, of samples; as a slice where none is left out, with which numpy copies nothing."""
+    first, stop = int(numbers[0]), int(numbers[-1]) + 1
+    consecutive = stop - first == len(numbers) and bool((np.diff(numbers) == 1).all())
+    return slice(first, stop) if consecutive else numbers
 
 
 def _horner(sums: Array, fraction: Array) -> tuple[Array, Array]:

@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-import numpy as np
-
 from calib.model import Array
 from calib.signal.timing import ClockFit
 
@@ -38,7 +36,7 @@ class Samples:
     @property
     def time_s(self) -> Array:
         """(n,) time of each sample in s, by `clock`."""
-        return self.clock.time_of(self.first_index + np.arange(len(self.values)))
+        return self.clock.times_of(self.first_index, len(self.values))
 
 
 class Stream(Protocol):

@@ -98,6 +98,19 @@ def test_white_noise_is_no_knock() -> None:
     np.testing.assert_allclose(residual, V - V[~struck].mean(axis=0), atol=1e-12)
 
 
+@pytest.mark.parametrize("pairs", [500, 501])
+@pytest.mark.parametrize(("times", "knocks"), [(1.0 - 1e-9, 0), (1.0 + 1e-9, 2)])
+def test_the_limit_is_exact(pairs: int, times: float, knocks: int) -> None:
+    """A pair of opposite values just below or just beyond five robust SDs."""
+    half = np.random.default_rng(pairs).normal(size=(pairs, 3))
+    half[np.abs(half) > 3.0] = 1.0
+    for _ in range(2):  # the pair itself counts in the median
+        half[7, 1] = times * detection.KNOCK_SD * 1.4826 * np.median(np.abs(half[:, 1]))
+    V = np.concatenate([half, -half])
+    struck, _ = detection.knocked(V, np.ones((len(V), 1)), np.zeros(3))
+    assert np.flatnonzero(struck).tolist() == [7, 7 + pairs][:knocks]
+
+
 def test_counts_that_hardly_change_are_no_knocks() -> None:
     V = np.zeros((5000, 3))
     V[::100] = 1.0  # one in a hundred a count higher: the median deviation is 0

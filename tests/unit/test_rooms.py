@@ -42,6 +42,15 @@ def test_a_run_loads_nothing_while_devices_are_read() -> None:
     assert run.stdout.splitlines()[-1] == ""
 
 
+def test_calibrate_from_text_loads_no_configuration_and_no_scipy() -> None:
+    """To load them takes a quarter of a second."""
+    code = "import sys, agent.cli.calibrate\nprint(*sorted({name.partition('.')[0] for name in sys.modules}))"
+    run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    loaded = run.stdout.split()
+    assert "numpy" in loaded
+    assert {"pydantic", "scipy", "obspy", "cryptography"}.isdisjoint(loaded)
+
+
 def test_no_file_is_too_long() -> None:
     generated = ROOT / "agent" / "proto"
     files = [path for room in ("agent", "calib", "hw", "tests", "benchmarks", "examples", "docs")

@@ -155,6 +155,17 @@ def test_index_is_the_inverse_of_time() -> None:
     assert np.all(np.diff(fit.time_of(numbers)) > 0)
 
 
+@pytest.mark.parametrize("knots", [1, 2, 3, 40])
+def test_consecutive_samples_have_the_same_times_bit_for_bit(knots: int) -> None:
+    at = np.sort(np.random.default_rng(knots).uniform(0.0, 5000.0, knots))
+    period = 1e-3 + 1e-6 * np.sin(at)
+    clock = ClockFit(
+        at, 1e-3 * at + 1e-5 * np.cos(at), period, 5000, 1000.0, 0.0, 5.0, 0.0, np.empty(0, dtype=np.int64)
+    )
+    for first, count in ((-100, 6000), (0, 1), (17, 0), (2000, 500), (6000, 3)):
+        np.testing.assert_array_equal(clock.times_of(first, count), clock.time_of(first + np.arange(count)))
+
+
 def test_a_rate_that_cannot_be_is_refused() -> None:
     with pytest.raises(ValueError, match="above 0 Hz, is 0"):
         ClockModel(0.0)
