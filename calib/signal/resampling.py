@@ -68,8 +68,8 @@ def resample(x: Array, clock: ClockFit, time_s: Array, first_index: int = 0, mar
     inside = np.nonzero(usable)[0]
     for k in range(0, len(inside), CHUNK):
         part = as_slice(inside[k : k + CHUNK])
-        first = start[part]  # rises, as the times do
-        low, high = int(first[0]), int(first[-1]) + TAPS
+        first = start[part]
+        low, high = int(first.min()), int(first.max()) + TAPS
         at = as_slice(first - low)
         for channel in range(x.shape[1]):
             taps = np.ascontiguousarray(sliding_window_view(x[low:high, channel], TAPS).T)
