@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from tests.unit.browser import Watched, chromium, needs_chromium
-from tests.unit.zenoh_site import Site
+from tests.unit.zenoh_site import Site, wait_for
 
 pytest.importorskip("starlette", reason="the extra monitor is not installed")
 pytest.importorskip("uvicorn", reason="the extra monitor is not installed")
@@ -100,15 +100,19 @@ def test_a_killed_program_is_shown_as_silent(site: Site, tmp_path: Path, browser
     monitor = Monitor(site.endpoint, tmp_path / "monitor")
     command = [sys.executable, "-m", "agent", "bench", "-o", str(tmp_path / "out"), "--virtual", "gravity"]
     program = subprocess.Popen(
-        [*command, "--connect", site.endpoint], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL
-    )
+        [*command, "--connect", site.endpoint], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL,
+    )  # fmt: skip
     try:
         watched = Watched(browser, monitor.address)
         page = watched.open("#view=bench")  # of one session alone, its name is not needed
         page.get_by_text("Stop 1: put the sensor on a level table").wait_for()
         assert page.locator("#bench-silent").inner_text() == ""
+        helpers = Path(f"/proc/{program.pid}/task/{program.pid}/children").read_text().split()
         program.kill()
+        program.wait()
         page.get_by_text("The program is silent").wait_for(timeout=SILENT_MS)
+        assert helpers
+        wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in helpers))  # none is left behind
         watched.close()
     finally:
         program.kill()
