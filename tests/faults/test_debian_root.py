@@ -6,6 +6,7 @@ They take five minutes and the time of `make test`, so they are run by hand, as 
     FIELDCAL_DEBIAN_ROOT=DIR .venv/bin/python -m pytest -m faults tests/faults/test_debian_root.py
 
 The version before is the revision FIELDCAL_BEFORE, by default the oldest one that has the package.
+tests/faults/test_debian_root_arm64.py does the same on an emulated 64-bit Arm.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +35,10 @@ DATA, CONFIG, UNIT = "/var/lib/fieldcal", "/etc/fieldcal/gateway.toml", "/lib/sy
 AGENT = 'agent() { setpriv --reuid=fieldcal --regid=fieldcal --init-groups fieldcal "$@"; }\n'
 SHOW = f"agent show --data-dir {DATA} --json -"
 RUN = f"agent run {CONFIG} --data-dir {DATA} --duration {RUN_S}"
+MOUNTS = (
+    'mount --bind "$0" "$0" && mount -t proc proc "$0/proc" && mount --rbind /dev "$0/dev" && '
+    'exec chroot "$0" sh -ec "$1"'
+)
 # A bench on two serial ports that every user may open, while the command in its place runs.
 BENCH = """
 fieldcal simulate --preset plain --link /tmp/bench > /tmp/served & bench=$!
@@ -72,36 +78,39 @@ class DebianRoot:
 
     def run(self, script: str, environment: Mapping[str, str] | None = None, status: int | None = 0) -> str:
         """What was printed; the errors too where the exit status may be another one than 0 (`status` None: any)."""
-        mounts = (
-            'mount --bind "$0" "$0" && mount -t proc proc "$0/proc" && mount --rbind /dev "$0/dev" && '
-            'exec chroot "$0" sh -ec "$1"'
-        )
-        done = subprocess.run(
-            ["unshare", "--mount", "sh", "-c", mounts, self.path, AGENT + script],
-            capture_output=True, text=True, check=False, env={**os.environ, **(environment or {})},
-        )  # fmt: skip
+        done = self.entered([MOUNTS, str(self.path), AGENT + script], {**os.environ, **(environment or {})})
         assert status in (None, done.returncode), done.stdout + done.stderr
         return done.stdout + ("" if status == 0 else done.stderr)
+
+    def entered(self, shell: list[str], environment: Mapping[str, str]) -> subprocess.CompletedProcess[str]:
+        """Run `sh -c` with these arguments where it may mount."""
+        return subprocess.run(
+            ["unshare", "--mount", "sh", "-c", *shell], capture_output=True, text=True, check=False, env=environment
+        )
 
     def install(self, version: str) -> None:
         self.run(f"dpkg -i /tmp/fieldcal_{version}_*.deb")
         assert self.run("dpkg-query -Wf '${Version}' fieldcal") == version
 
 
-@pytest.fixture
-def debian(tmp_path: Path) -> Iterator[DebianRoot]:
-    """A copy of the fresh root."""
-    path = tmp_path / "root"
-    subprocess.run(["cp", "-a", FRESH, path], check=True)
+@contextmanager
+def copied(fresh: str, path: Path) -> Iterator[Path]:
+    """A copy of a fresh root."""
+    subprocess.run(["cp", "-a", fresh, path], check=True)
     (path / "etc/hosts").write_text("127.0.0.1 localhost\n")  # the installer of Debian writes it, debootstrap does not
-    yield DebianRoot(path)
+    yield path
     shutil.rmtree(path)
 
 
-def build(checkout: Path, version: str, output: Path) -> None:
-    subprocess.run(
-        [checkout / "deploy/debian/build.sh", "--output", output, "--version", version], check=True, capture_output=True
-    )
+@pytest.fixture
+def debian(tmp_path: Path) -> Iterator[DebianRoot]:
+    with copied(FRESH, tmp_path / "root") as path:
+        yield DebianRoot(path)
+
+
+def build(checkout: Path, version: str, output: Path, *more: str) -> None:
+    command = [checkout / "deploy/debian/build.sh", "--output", output, "--version", version, *more]
+    subprocess.run(command, check=True, capture_output=True)
 
 
 @pytest.fixture
@@ -146,6 +155,11 @@ def test_a_life_of_the_package(debian: DebianRoot) -> None:
         assert "VALID, restored from the previous run" in said
     assert in_force(debian)["windows"] > before["windows"]
 
+    remove_and_purge(debian)
+
+
+def remove_and_purge(debian: DebianRoot) -> None:
+    """The state stays at the first, and nothing at the second."""
     debian.run("dpkg -r fieldcal")
     assert (debian.path / DATA[1:] / "state.sqlite").exists()
     assert (debian.path / CONFIG[1:]).exists()
