@@ -81,9 +81,8 @@ class Kind:
     another "filter", a "remount" (the sensor or the reference was mounted again, or the stated poses changed).
     `of_reference`: it belongs to the reference. It stays in the state when another reference takes its place, and is
     used again when that reference comes back.
-    `of_place`: it belongs to the place of the reference. The next reference in this place takes it over, and it may
-    differ from then on. Nobody states how alike the errors of two references in one place are; so the difference is an
-    unknown, and S owes its direction to the first of them.
+    `of_place`: it belongs to the place of the reference. The next reference there takes it over, and may differ in it:
+    nobody states how alike two references in one place are, so S owes its direction to the first of them.
     `straight`: the change up to which its product with S counts as linear; LINEAR if it is not multiplied by S.
     `stated`: the prior is a statement that the data may contradict; if false, only the data determine the value.
     `since_certificate`: it grows from the date of the reference's certificate on, without a limit. `prior` is then its
@@ -306,8 +305,7 @@ RESPONSE = Kind(
 ROTATION = Kind(
     "mounting rotation", "rad", "mounting rotation",
     prior=Statement("rotation_rad", _deg(0.2), ("uncertainty.rotation_deg",), option="u_rotation_deg", convert=_deg),
-    of_reference=True, of_place=True,
-    loosened_by=("remount",),
+    of_reference=True, of_place=True, loosened_by=("remount",),
 )  # fmt: skip
 TRANSVERSE = Kind(
     "transverse motion", "1", "transverse motion",
