@@ -23,6 +23,7 @@ from agent.reading.source import Array, Column, Progress, Source, TableError
 CHUNK_BYTES = 1 << 23
 BLOCK_BYTES = 1 << 20  # pyarrow parses blocks of a chunk on all cores
 LONGEST_LINE = 1 << 20
+NEWLINE = ord("\n")
 
 
 class Delimited(Source):
@@ -47,7 +48,7 @@ class Delimited(Source):
         line = 1
         with self.path.open("rb") as file:
             for text in _whole_lines(self.path, file, self.dialect, progress):
-                lines = text.count(b"\n")
+                lines = int(np.count_nonzero(np.frombuffer(text, np.uint8) == NEWLINE))
                 skip = self.dialect.first_line - line
                 line += lines
                 if skip >= lines:
@@ -115,13 +116,13 @@ def _whole_lines(path: Path, file: IO[bytes], dialect: Dialect, progress: Progre
     while data := file.read(CHUNK_BYTES):
         if progress is not None:
             progress(len(data))
-        rest += decode(data).encode() if decode else data.removeprefix(codecs.BOM_UTF8)
-        cut = rest.rfind(b"\n") + 1
-        if not cut and len(rest) > LONGEST_LINE:
-            raise TableError(f"{path}, line 1: the line is longer than {LONGEST_LINE} bytes; is the file text?")
+        data = decode(data).encode() if decode else data.removeprefix(codecs.BOM_UTF8)
+        cut = data.rfind(b"\n") + 1
         if cut:
-            yield rest[:cut].replace(b"\r", b"")
-        rest = rest[cut:]
+            yield b"".join((rest, memoryview(data)[:cut])).replace(b"\r", b"")
+            rest = data[cut:]
+        elif len(rest := rest + data) > LONGEST_LINE:
+            raise TableError(f"{path}, line 1: the line is longer than {LONGEST_LINE} bytes; is the file text?")
     if rest.strip():
         yield rest.replace(b"\r", b"") + b"\n"
 

@@ -11,6 +11,7 @@ for live data.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -64,8 +65,7 @@ class SlopeScatter:
         """Slope rows (B, 6M, ...) multiplied by (1 + covariance)^-1/2."""
         if not (self.lag_s.any() or self.attenuation.any()):
             return rows
-        _, size, ways = np.linalg.svd(self.loaded, full_matrices=False)
-        less = 1.0 - 1.0 / np.sqrt(1.0 + size**2)
+        less, ways = _less(self)
         along = np.einsum("bkd,bd...->bk...", ways, rows)
         return np.asarray(rows - np.einsum("bk,bkd,bk...->bd...", less, ways, along))
 
@@ -82,6 +82,13 @@ class SlopeScatter:
         if self.attenuation.any():
             found["correction for the reference's noise"] = parts[1].T @ parts[1], np.inf
         return found
+
+
+@lru_cache(maxsize=2)  # each step of a solution asks for it
+def _less(scatter: SlopeScatter) -> tuple[Array, Array]:
+    """By which share (B, 2) rows lose weight along directions (B, 2, 6M)."""
+    _, size, ways = np.linalg.svd(scatter.loaded, full_matrices=False)
+    return 1.0 - 1.0 / np.sqrt(1.0 + size**2), ways
 
 
 def estimated(stated: SlopeScatter, residual: Array, rows: Array, covariance: Array) -> SlopeScatter:

@@ -70,10 +70,9 @@ def resample(x: Array, clock: ClockFit, time_s: Array, first_index: int = 0, mar
         part = as_slice(inside[k : k + CHUNK])
         first = start[part]
         low, high = int(first.min()), int(first.max()) + TAPS
-        at = as_slice(first - low)
         for channel in range(x.shape[1]):
             taps = np.ascontiguousarray(sliding_window_view(x[low:high, channel], TAPS).T)
-            value, slope = _horner((_weights() @ taps)[:, at], fraction[part])
+            value, slope = _horner((_weights() @ taps).take(first - low, axis=1), fraction[part])
             u[channel, part], du[channel, part] = value, slope * rate
     return Resampled(u.T, du.T, usable)
 
@@ -133,10 +132,10 @@ def differentiated_band_hz(rate_hz: float) -> float:
 
 
 def as_slice(numbers: NDArray[np.int64]) -> NDArray[np.int64] | slice:
-    """Rising numbers (n,), n >= 1, of samples; as a slice where none is left out, with which numpy copies nothing."""
+    """Numbers (n,), n >= 1, of samples, each larger than the one before; as a slice where none is left out between
+    them, with which numpy copies nothing."""
     first, stop = int(numbers[0]), int(numbers[-1]) + 1
-    consecutive = stop - first == len(numbers) and bool((np.diff(numbers) == 1).all())
-    return slice(first, stop) if consecutive else numbers
+    return slice(first, stop) if stop - first == len(numbers) else numbers
 
 
 def _horner(sums: Array, fraction: Array) -> tuple[Array, Array]:
