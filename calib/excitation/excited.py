@@ -21,6 +21,7 @@ from calib.model import Array, BandSums, Pose, Window, WindowSums, own_channels
 OVER_NOISE = 10.0
 OF_STRONGEST = 1e-4  # least power relative to that of the strongest channel: 1 % of its amplitude
 WEAK = 1e-2  # of a channel with less of the strongest channel's power, what is 90 deg ahead of that one is shared too
+ROUNDING = 1e-12  # of a channel's power, what is left may be a rounding error
 MOST_NOISE = 0.5  # largest part of a segment's power that the correction may subtract
 CORRECTION_SHARE = 0.1  # relative standard uncertainty of the noise's power, from a spectrum of some hundred lines
 
@@ -159,7 +160,8 @@ def _own_power(power: Array, noise: Array) -> Array:
         own[k] = alone
         rest -= np.outer(rest[:, k], rest[k]) / left[k]
         for column in (k, m + k):
-            beside -= np.outer(beside[:, column], beside[column]) / max(beside[column, column], np.finfo(float).tiny)
+            if beside[column, column] > ROUNDING * power[column, column]:
+                beside -= np.outer(beside[:, column], beside[column]) / beside[column, column]
     return own
 
 
