@@ -54,18 +54,22 @@ def resample(x: Array, clock: ClockFit, time_s: Array, first_index: int = 0, mar
         between = knots[(knots > time_s[0]) & (knots < time_s[-1])]
         nodes = distinct(np.concatenate([nodes, between]))
     position = np.interp(time_s, nodes, clock.index_of(nodes))
-    base = np.floor(position).astype(np.int64)
+    # A time that is hours away, or not known, has a number that no integer can be.
+    near = (position > first_index - TAPS) & (position < first_index + len(x) + TAPS)
+    base = np.floor(np.where(near, position, first_index)).astype(np.int64)
     fraction = position - base
     start = base - first_index - (HALF - 1)
-    usable = (start >= margin) & (start + TAPS + margin <= len(x))
+    usable = near & (start >= margin) & (start + TAPS + margin <= len(x))
     for gap in clock.gaps:
         usable &= np.abs(base - gap) > HALF + margin + NODES
-    middle_s = 0.5 * (time_s[(len(time_s) - 1) // 2] + time_s[len(time_s) // 2])
-    before_s, after_s = clock.time_of(clock.index_of(middle_s) + np.array([-0.5, 0.5])).tolist()
-    rate = 1.0 / (after_s - before_s)
     # A channel a row: what is done to a channel afterwards finds its samples side by side.
     u, du = np.zeros((x.shape[1], len(position))), np.zeros((x.shape[1], len(position)))
     inside = np.nonzero(usable)[0]
+    if not len(inside):
+        return Resampled(u.T, du.T, usable)
+    middle_s = 0.5 * (time_s[(len(time_s) - 1) // 2] + time_s[len(time_s) // 2])
+    before_s, after_s = clock.time_of(clock.index_of(middle_s) + np.array([-0.5, 0.5])).tolist()
+    rate = 1.0 / (after_s - before_s)
     for k in range(0, len(inside), CHUNK):
         part = as_slice(inside[k : k + CHUNK])
         first = start[part]

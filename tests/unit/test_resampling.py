@@ -101,3 +101,8 @@ def test_a_second_derivative_damps_what_is_above_the_band() -> None:
 def test_another_order_is_refused() -> None:
     with pytest.raises(ValueError, match="a derivative of order 3 is not known, only of order 1 and 2"):
         differentiate(np.zeros((4000, 1)), 1000.0, 3)
+
+
+@pytest.mark.parametrize("time_s", [1e25, -1e25, np.nan])
+def test_a_time_whose_number_no_integer_can_be_is_not_usable(time_s: float) -> None:
+    assert not resample(np.zeros((5000, 1)), CLOCK, np.full(3, time_s)).usable.any()
