@@ -150,7 +150,7 @@ def _publisher(settings: Config) -> GuidePublisher | None:
         tls, signer = zenoh.tls.files if zenoh.tls else None, Signer.load(key) if key else None
         return GuidePublisher(settings.gateway.site, settings.gateway.name, zenoh.connect, tls, signer)
     except (EndpointError, KeyFileError) as error:
-        say(f"the page of the monitor does not show this session: {error}", err=True)
+        say(f"the page of the monitor does not show this bench: {error}", err=True)
         return None
 
 

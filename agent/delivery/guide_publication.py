@@ -81,7 +81,7 @@ class GuidePublisher:
                 with zenoh.open(self._config) as session:
                     self._serve(session)
             except zenoh.ZError as error:
-                _log.warning("the page of the monitor does not show this session: %s", error)
+                _log.warning("the page of the monitor does not show this bench: %s", error)
                 self._stop.wait(REOPEN_S)
 
     def _serve(self, session: zenoh.Session) -> None:

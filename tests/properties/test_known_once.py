@@ -226,22 +226,24 @@ def test_changed_uncertainties_of_one_reference_are_no_new_reference(changes: in
     assert life.recursion.result().standard_uncertainty[0] > 2.99e-3
 
 
-def test_two_references_in_turn_are_two_and_not_eight() -> None:
-    life = begun(6)
+def in_turn(seed: int) -> Life:
+    """Four windows beside each of two references, eight times in turn."""
+    life = begun(seed)
     for k in range(8):
         life.swap("AB"[k % 2])
         for _ in range(4):
             life.window()
+    return life
+
+
+def test_two_references_in_turn_are_two_and_not_eight() -> None:
+    life = in_turn(6)
     u = life.recursion.result().standard_uncertainty[0]
     assert 0.999 * 3e-3 / np.sqrt(2.0) < u < 1.01 * 3e-3 / np.sqrt(2.0)
     assert life.recursion.references == ["A", "B"]
 
 
 def test_references_in_one_place_may_share_the_error_of_their_rotation() -> None:
-    life = begun(7)
-    for k in range(8):
-        life.swap("AB"[k % 2])
-        for _ in range(4):
-            life.window()
+    life = in_turn(7)
     u = life.recursion.result().standard_uncertainty
     assert np.all(u[[1, 2, 3, 5, 6, 7]] > 0.99 * (U[1] ** -2 + 3e-3**-2) ** -0.5)

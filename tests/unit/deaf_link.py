@@ -28,12 +28,14 @@ class Relay:
         self._deaf = deaf
         self._listener = socket.create_server(("127.0.0.1", 0))
         self._open: list[socket.socket] = [self._listener]
+        self._closed = threading.Event()
         self.accepted_s: list[float] = []
         self.endpoint = f"tcp/127.0.0.1:{self._listener.getsockname()[1]}"
         threading.Thread(target=self._accept, daemon=True).start()
 
     def close(self) -> None:
         """End all links."""
+        self._closed.set()
         for opened in self._open:
             with suppress(OSError):
                 opened.shutdown(socket.SHUT_RDWR)
@@ -66,6 +68,5 @@ class Relay:
 
     def _keep_alive(self, client: socket.socket) -> None:
         with suppress(OSError):
-            while True:
-                time.sleep(KEEP_ALIVE_S)
+            while not self._closed.wait(KEEP_ALIVE_S):
                 client.sendall(KEEP_ALIVE)

@@ -87,11 +87,9 @@ def test_every_part_has_a_writer_and_every_writer_a_part() -> None:
     assert set(writers()) == set(parts())
 
 
-@pytest.mark.parametrize("name", sorted(parts()))
+@pytest.mark.parametrize("name", sorted(name for name, module in writers().items() if module))
 def test_the_columns_are_those_that_the_command_writes(name: str) -> None:
     module = writers()[name]
-    if not module:
-        return
     known = [*cells(module), *(cells("benchmarks.online.pages") if module.startswith("benchmarks.online") else ())]
     headers = HEADER.findall(parts()[name])
     strange = [
