@@ -132,6 +132,7 @@ def pair(
     seed: int,
     response: Filter,
     *,
+    of_outputs: Filter = flat,
     band_hz: tuple[float, float] = (0.5, 10.0),
     rate_hz: float = 100.0,
     seconds: float = 120.0,
@@ -145,6 +146,8 @@ def pair(
 ) -> Pair:
     """Random motion in `band_hz`, the same power at all its frequencies; `reference_error` is relative.
 
+    The sensor's input axes show the motion through `response` and its outputs through `of_outputs`, both alike in all
+    axes (F,) or by axis (3, F).
     `known`: what is stated of the filters, whatever they are. `disturbed`: what is added to both signals. The samples
     of the reference are taken `reference_late_s` after those of the sensor.
     """
@@ -156,12 +159,12 @@ def pair(
     lines = (random.normal(size=(3, len(moved))) + 1j * random.normal(size=(3, len(moved)))) * moved
     lines *= level_mps2 / np.fft.irfft(lines, n).std()
     middle_hz = float(np.sqrt(band_hz[0] * band_hz[1]))
-    at_middle = float(abs(response(np.array([middle_hz]))[0]))
+    at_middle, outputs_at_middle = (np.abs(own(np.array([middle_hz]))) for own in (response, of_outputs))
     sensitivity = np.eye(3) + 0.02 * random.normal(size=(3, 3))
     inside = slice(int(BEYOND_S * rate_hz), int((BEYOND_S + seconds) * rate_hz))
     u = np.fft.irfft(lines * np.exp(2j * np.pi * frequency_hz * reference_late_s), n).T[inside]
-    felt = np.fft.irfft(lines * response(frequency_hz) / at_middle, n)
-    V = (sensitivity @ felt).T[inside] + OFFSET
+    felt = sensitivity @ (lines * response(frequency_hz) / at_middle)
+    V = np.fft.irfft(felt * of_outputs(frequency_hz) / outputs_at_middle, n).T[inside] + OFFSET
     V += noise_mps2 * random.normal(size=V.shape)
     u = u * (1.0 + reference_error) + reference_noise_mps2 * random.normal(size=u.shape)
     to_sensor, to_reference = disturbed(random, u, rate_hz)

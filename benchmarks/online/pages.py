@@ -75,9 +75,9 @@ def _coverage(workers: int, runs: int | None) -> tuple[Path, str]:
 
 
 def _touched(workers: int, runs: int | None) -> tuple[Path, str]:
-    seeds = range(runs or touched.SEEDS)
-    told = iter(spread(touched.one, [(line, seed) for line in range(len(touched.LINES)) for seed in seeds], workers))
-    return ONLINE, touched.table([[next(told) for _ in seeds] for _ in touched.LINES])
+    counts = [runs or line.runs for line in touched.LINES]
+    told = iter(spread(touched.one, [(line, seed) for line, n in enumerate(counts) for seed in range(n)], workers))
+    return ONLINE, touched.table([[next(told) for _ in range(n)] for n in counts])
 
 
 def _year(workers: int, runs: int | None) -> tuple[Path, str]:

@@ -10,6 +10,7 @@ prior of S and the certificates of the references say together (`exact_batch_pct
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -31,6 +32,7 @@ from hw.virtual.motion import sine
 from hw.virtual.schedule import rotation
 
 SEED, SEEDS = 70_000, 100
+SOUND_WINDOWS = 20_000  # at least, of a line in which nothing is wrong
 U_REFERENCE_PCT = 0.3
 STATED = Stated(main_pct=3.0, transverse_pct=1.5, offset_mps2=0.5, reference_pct=U_REFERENCE_PCT)
 # The limit of max_change for the transverse sensitivities is the default then, so that a turn of 2 deg is beyond it.
@@ -46,12 +48,18 @@ SLIP_DEG = 1.5
 @dataclass(frozen=True, slots=True)
 class Line:
     """One kind of touch. `run` simulates it with a seed. `references`: how many instruments the windows had in turn,
-    None where the reference changes. `sound`: nothing is wrong with the data, so no window may be held."""
+    None where the reference changes. `sound`: how many windows a run has of which none may be held, since nothing is
+    wrong with the data; 0 where something is wrong."""
 
     name: str
     run: Callable[[int], Told]
     references: int | None = 1
-    sound: bool = False
+    sound: int = 0
+
+    @property
+    def runs(self) -> int:
+        """How many runs are simulated: with enough windows to count false holds, where there may be none."""
+        return max(SEEDS, math.ceil(SOUND_WINDOWS / self.sound)) if self.sound else SEEDS
 
 
 # --- buildings
@@ -246,18 +254,18 @@ def _times(count: int, off_u: float | None = None) -> Callable[[int], Told]:
 
 
 LINES = (
-    *(Line(f"configuration changed at {n} restarts", _times(n), sound=True) for n in (0, 1, 2, 4, 8)),
-    Line("references A and B in turn, 8 swaps", swapped, references=2, sound=True),
-    Line("8 changed configurations, reference off by 1 u", _times(8, 1.0), sound=True),
-    Line("8 swaps, both references off by 1 u", lambda seed: swapped(seed, off_u=1.0), references=2, sound=True),
+    *(Line(f"configuration changed at {n} restarts", _times(n), sound=18) for n in (0, 1, 2, 4, 8)),
+    Line("references A and B in turn, 8 swaps", swapped, references=2, sound=18),
+    Line("8 changed configurations, reference off by 1 u", _times(8, 1.0), sound=18),
+    Line("8 swaps, both references off by 1 u", lambda seed: swapped(seed, off_u=1.0), references=2, sound=18),
     Line("turned by 2 to 4 deg about z, an operator accepts", turned),
     Line("stamps of one device shift by 10 to 40 ms", shifted),
-    Line("motion along one axis, 0.5 to 1 % on the others", along_one_axis, sound=True),
+    Line("motion along one axis, 0.5 to 1 % on the others", along_one_axis, sound=200),
     Line("clamp slips by 1.5 deg in the first window", slipping, references=None),
     Line("drift of 10 % a year, stated 0.1 %", drifting),
     Line("reference + 3 % in mid-life", reference_steps, references=None),
-    Line("motion at 0.2 Hz, positions found", slow, references=None, sound=True),
-    Line("3 % of the samples lost, level below 0.08 m/s²", losing, sound=True),
+    Line("motion at 0.2 Hz, positions found", slow, references=None, sound=12),
+    Line("3 % of the samples lost, level below 0.08 m/s²", losing, sound=200),
 )
 
 

@@ -1,0 +1,86 @@
+"""Axes whose filters differ: is S covered by U, and what does U cost?
+
+    python -m benchmarks.response_axes [--runs 12] [--write]
+
+As `python -m benchmarks.response`, with a motion of 0.5 to 20 Hz and low-pass filters whose corners differ from axis to
+axis by a normally distributed error. The estimator has one response for all axes, so that the bands of an axis deviate
+from it.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import argparse
+import itertools
+
+import numpy as np
+
+from benchmarks.page import machine, write_part
+from benchmarks.response import PAGE, U_REFERENCE
+from calib.estimate.nuisances import Priors
+from calib.model import Array
+from calib.recorded.adjusting import adjusted
+from tests.pair import Filter, flat, lowpass, pair
+
+BAND_HZ = (0.5, 20.0)
+RATIOS = (1.5, 3.0)  # of the corner over the upper end of the motion
+ORDERS = (1, 2, 4)
+SPREAD_PCT = (0.0, 1.0, 2.0, 5.0)
+MAIN = np.eye(3, dtype=bool)
+
+
+def one(order: int, ratio: float, spread_pct: float, in_reference: bool, seed: int) -> tuple[Array, Array] | None:
+    """Errors of S over u (3, 3), and u (3, 3); None where the data were refused."""
+    random = np.random.default_rng([29, seed, order, round(10.0 * ratio), int(in_reference)])
+    corners_hz = ratio * BAND_HZ[1] * (1.0 + spread_pct / 100.0 * random.normal(size=3))
+    own = [lowpass(order, corner_hz) for corner_hz in corners_hz.tolist()]
+    by_axis: Filter = lambda f: np.stack([h(f) for h in own])  # noqa: E731
+    undone: Filter = lambda f: 1.0 / by_axis(f)  # noqa: E731
+    made = pair(
+        seed, undone if in_reference else flat, of_outputs=flat if in_reference else by_axis, band_hz=BAND_HZ,
+        rate_hz=200.0, seconds=300.0, reference_error=float(U_REFERENCE * random.normal()),
+    )  # fmt: skip
+    stated = Priors(reference=U_REFERENCE, reference_frequency_hz=made.reference_frequency_hz)
+    found = adjusted(made.files, stated).calibration
+    if found is None:
+        return None
+    u = found.standard_uncertainty[:9].reshape(3, 3)
+    return (found.sensitivity - made.sensitivity) / u, u
+
+
+def table(runs: int) -> list[str]:
+    """The lines of the table."""
+    lines = [
+        "| filter | corner over motion | differs by axis by, % | in | refused | u of main S, %"
+        " | main S within 2 u | most |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    for order, ratio, in_reference, spread in itertools.product(ORDERS, RATIOS, (False, True), SPREAD_PCT):
+        told = [found for k in range(runs) if (found := one(order, ratio, spread, in_reference, k)) is not None]
+        z, u = (np.array([both[k][MAIN] for both in told]) for k in (0, 1))
+        within = np.count_nonzero(np.abs(z) <= 2.0)
+        lines.append(
+            f"| low-pass, order {order} | {ratio:g} | {spread:g} | {'reference' if in_reference else 'sensor'} "
+            f"| {runs - len(told)} of {runs} | {100.0 * u.mean():.3f} | {within} of {z.size} "
+            f"| {np.abs(z).max():.1f} |"
+        )
+        print(lines[-1], flush=True)
+    return lines
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--runs", type=int, default=12)
+    parser.add_argument("--write", action="store_true", help="write docs/response.md")
+    arguments = parser.parse_args()
+    lines = table(arguments.runs)
+    if arguments.write:
+        write_part("axes", "\n".join([*lines, "", f"{arguments.runs} runs a line; {machine()}."]), PAGE)
+
+
+if __name__ == "__main__":
+    main()
