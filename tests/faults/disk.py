@@ -81,6 +81,7 @@ def power_cut(directory: Path, kind: str, cuts: int) -> Outcome:
             _mount(directory / f"{kind}.image", mount)
             if rig.data_dir.exists():
                 ledger.inspect(witness.before(at_s))
+            witness.forget_since(at_s)
         outcome = Outcome(f"power cut on {kind}", f"{cuts} cuts, journal dropped, seed {SEED}", ledger.findings)
         outcome.also = f"{ledger.findings.restored} runs began with the calibration in force before"
     return outcome

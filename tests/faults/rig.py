@@ -100,8 +100,13 @@ class Witness:
             self.received.append((time.monotonic(), result))
 
     def before(self, t_s: float) -> list[Received]:
-        """The results that had arrived by `t_s`."""
+        """The results that had arrived by `t_s`, without those that were forgotten."""
         return [result for came_s, result in self.received if came_s <= t_s]
+
+    def forget_since(self, t_s: float) -> None:
+        """Forget the results that have arrived since `t_s`: an agent whose disk has failed goes on publishing, and
+        nobody promises that these results are in the store."""
+        self.received = [(came_s, result) for came_s, result in self.received if came_s <= t_s]
 
     def close(self) -> None:
         """Stop listening."""
