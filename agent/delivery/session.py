@@ -18,6 +18,7 @@ LARGEST_MESSAGE = 1 << 20
 # Clients of a router. Zenoh refuses number 1,001 by default. A client takes 2 open files of the router.
 ROUTER_SESSIONS = 10_000
 ROUTER_ACCEPTS = 1000  # clients that may be connecting at the same time: all gateways of a site after an outage
+ROUTER_ACCEPT_S = 30.0  # for one of them to connect; Zenoh's 10 s may end in the middle (agent.delivery.hearing)
 
 # s between two attempts to reach a router again: drawn for the first, twice as long after each, at most the last one.
 # 1,000 gateways that all came at once would keep a router busy for so long that connections time out.
@@ -64,6 +65,7 @@ def session_config(
     if mode == "router":
         config.insert_json5("transport/unicast/max_sessions", json.dumps(ROUTER_SESSIONS))
         config.insert_json5("transport/unicast/accept_pending", json.dumps(ROUTER_ACCEPTS))
+        config.insert_json5("transport/unicast/accept_timeout", json.dumps(int(ROUTER_ACCEPT_S * 1000)))
     for key, endpoints in (("connect/endpoints", connect), ("listen/endpoints", listen)):
         try:
             config.insert_json5(key, json.dumps(list(endpoints)))

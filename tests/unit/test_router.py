@@ -58,6 +58,7 @@ def test_a_thousand_gateways_and_more_may_connect(monkeypatch: pytest.MonkeyPatc
     for config in (session_config("router"), zenoh.Config.from_json5(example.read_text())):
         assert int(config.get_json("transport/unicast/max_sessions")) == 10_000
         assert int(config.get_json("transport/unicast/accept_pending")) == 1000
+        assert int(config.get_json("transport/unicast/accept_timeout")) == 30_000
     monkeypatch.setattr(session, "ROUTER_SESSIONS", 2)
     site = Site()
     with site.client(), site.client():
