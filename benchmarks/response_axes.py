@@ -59,7 +59,7 @@ def table(runs: int) -> list[str]:
     lines = [
         "| filter | corner over motion | differs by axis by, % | in | refused | u, % | RMS error, %"
         " | within 2 u | most, u |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- |",
+        "| --- |" + " --- |" * 8,
     ]
     for order, ratio, in_reference, spread in itertools.product(ORDERS, RATIOS, (False, True), SPREAD_PCT):
         told = [found for k in range(runs) if (found := one(order, ratio, spread, in_reference, k)) is not None]

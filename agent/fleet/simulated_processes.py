@@ -76,6 +76,9 @@ class FleetProcesses(AbstractContextManager["FleetProcesses"]):
         return sorted(gateway.name for gateway in self.gateways if gateway.behaviour == behaviour)
 
     def __exit__(self, *_: object) -> None:
+        for process in self._parts:  # all at the same time; _leave then waits for each
+            with suppress(BrokenProcessPool):
+                process.submit(_close)
         self._opened.close()
 
     def _each(self, what: Callable[..., Value], *arguments: Any) -> list[Value]:
