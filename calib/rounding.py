@@ -15,3 +15,9 @@ def plus_minus(value: float | None, expanded: float | None) -> str:
         return f"{value:.6g} ± ?"
     decimals = max(0, 1 - math.floor(math.log10(expanded)))
     return f"{value:.{decimals}f} ± {expanded:.{decimals}f}"
+
+
+def from_to(low: float, high: float) -> str:
+    """`low to high`, with as many digits, three at least, as show that they differ."""
+    texts = [(f"{low:.{digits}g}", f"{high:.{digits}g}") for digits in range(3, 8)]
+    return " to ".join(next((both for both in texts if both[0] != both[1]), texts[0]))

@@ -45,17 +45,9 @@ def _print_calibration(console: Any, outcome: Outcome) -> None:
     if np.any(np.isfinite(outcome.values) & ~outcome.determined):
         console.print_line(f"  {KNOWN_BEFORE} known before: the data do not halve its uncertainty")
     _print_sources(console, outcome)
-    _print_frequencies(console, outcome)
+    if outcome.where_it_holds:
+        console.print_line(f"  {outcome.where_it_holds}")
     console.print_line(f"  method {outcome.method}, {sum(w.used for w in outcome.windows)} windows")
-
-
-def _print_frequencies(console: Any, outcome: Outcome) -> None:
-    if outcome.more.get("valid_band_hz"):
-        low_hz, high_hz = outcome.more["valid_band_hz"]
-        at_hz = outcome.more["reference_frequency_hz"]
-        console.print_line(
-            f"  S holds at {at_hz:.3g} Hz; from {low_hz:.3g} to {high_hz:.3g} Hz it is right within a third of U"
-        )
 
 
 def _print_sources(console: Any, outcome: Outcome) -> None:

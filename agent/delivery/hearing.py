@@ -1,9 +1,9 @@
 """Whether the router hears a session that counts as connected.
 
-A router gives a new link some time (`transport/unicast/accept_timeout`, 10 s if nobody sets it). Where the time ends after
-the router has agreed, but before it begins to read, Zenoh 1.10 leaves a link on which it sends and never reads. The
-session then counts as connected for ever, and nothing that it declares or sends arrives. This happens when many gateways
-come back to a router at once.
+A router gives a new link some time (`transport/unicast/accept_timeout`, 10 s if nobody sets it). Where the time ends
+after the router has agreed, but before it begins to read, Zenoh 1.10 leaves a link on which it sends and never reads.
+The session then counts as connected for ever, and nothing that it declares or sends arrives. This happens when many
+gateways come back to a router at once.
 """
 
 from __future__ import annotations

@@ -52,10 +52,8 @@ def _notes(outcome: Outcome) -> Iterator[str]:
     yield f"S in output unit per m/s², Q in output unit, ± U with k = {outcome.coverage_factor:.3g}{kind}"
     if any(KNOWN_BEFORE in cell for cell in outcome.cells()):
         yield f"{KNOWN_BEFORE} known before: the data do not halve its uncertainty"
-    if outcome.reference_frequency_hz:
-        band = outcome.more.get("valid_band_hz")
-        span = f"; from {band[0]:.3g} to {band[1]:.3g} Hz it is right within a third of U" if band else ""
-        yield f"S holds at {outcome.reference_frequency_hz:.3g} Hz{span}"
+    if outcome.where_it_holds:
+        yield outcome.where_it_holds
     if outcome.lag_s is not None:
         yield f"The sensor lags by {1000.0 * outcome.lag_s:.3g} ms"
     yield f"Sampling rate {outcome.rate_hz:.7g} Hz"

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from calib import __version__
 from calib.estimate.response_told import BandSensitivity
 from calib.model import Array, Calibration, Window
-from calib.rounding import KNOWN_BEFORE, plus_minus
+from calib.rounding import KNOWN_BEFORE, from_to, plus_minus
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -98,6 +98,15 @@ class Outcome:
         """The frequency at which S holds; 0 where only rests were seen; None where the method has none."""
         told: float | None = self.more.get("reference_frequency_hz")
         return told
+
+    @property
+    def where_it_holds(self) -> str:
+        """The frequency at which S holds and the band in which it is right, as a sentence; "" where nothing is told."""
+        if not self.reference_frequency_hz:
+            return ""
+        band = self.more.get("valid_band_hz")
+        within = f"; from {from_to(*band)} Hz it is right within a third of U" if band else ""
+        return f"S holds at {self.reference_frequency_hz:.3g} Hz{within}"
 
     @property
     def response(self) -> tuple[BandSensitivity, ...]:

@@ -17,7 +17,7 @@ from agent.terminal.screen import Picture, Screen
 from agent.terminal.state import DeviceState, RecordingState, ViewState
 from agent.terminal.view import Lines, open_view
 from agent.terminal.wording import gap_line, truth_line
-from calib.rounding import plus_minus
+from calib.rounding import from_to, plus_minus
 from tests.unit.results import calibration, status, window
 
 
@@ -211,6 +211,14 @@ def test_a_value_is_written_to_the_second_digit_of_its_uncertainty(
     value: float | None, expanded: float | None, words: str
 ) -> None:
     assert plus_minus(value, expanded) == words
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "words"),
+    [(0.5, 20.0, "0.5 to 20"), (2.9972, 3.0028, "2.997 to 3.003"), (3.0, 3.0, "3 to 3")],
+)
+def test_the_ends_of_a_range_have_digits_enough_to_differ(low: float, high: float, words: str) -> None:
+    assert from_to(low, high) == words
 
 
 def test_sizes_and_durations_are_written_for_people() -> None:
