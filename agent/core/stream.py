@@ -205,17 +205,17 @@ class DeviceStream:
         times_s = clock.time_of(np.arange(first, stop))
         within = start_s - 1 / rate_hz <= times_s[0] and times_s[-1] <= stop_s + 1 / rate_hz
         in_time = bool(within and (np.diff(times_s) > 0).all())
-        held = np.full((stop - first, axes), np.nan)
+        held = np.full((axes, stop - first), np.nan)  # the samples of an axis lie side by side
         saturated, temperatures = False, []
         for block in blocks:
             a, b = max(first, block.first_index), min(stop, block.first_index + block.n)
             if a < b:
                 if block.temperature_degc is not None:
                     temperatures.append(block.temperature_degc)
-                held[a - first : b - first] = block.indications[a - block.first_index : b - block.first_index]
+                held[:, a - first : b - first] = block.indications[a - block.first_index : b - block.first_index].T
                 saturated |= bool(block.flags & BlockFlags.SATURATED)
         degc = float(np.mean(temperatures)) if temperatures else float("nan")
-        return Samples(self._name, first, held, clock, saturated, in_time, degc)
+        return Samples(self._name, first, held.T, clock, saturated, in_time, degc)
 
     def _run_of(self, start_s: float, stop_s: float) -> Run | None:
         held = [run for run in self._runs if run.blocks]

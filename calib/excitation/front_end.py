@@ -167,10 +167,12 @@ def aligned(
         V = without_corner(V, sensor_rate_hz, instrument.sensor_corner_hz)
     u = passed(instrument.known.passed(u, rate_hz), rate_hz, response)
     at = resample(u, reference.clock, time_s - lag_s, reference.first_index, lost)
-    columns = np.vstack([V.T, at.u.T, at.du.T]).T  # the samples of a channel lie side by side, also in what is kept
-    columns[~at.usable] = np.nan
+    k, rows = u.shape[1], np.empty((3 + 2 * u.shape[1], len(V)))  # here and in what is kept: a channel is a row
+    rows[:3], rows[3 : 3 + k], rows[3 + k :] = V.T, at.u.T, at.du.T
+    rows[:, ~at.usable] = np.nan
+    columns = rows.T
     band_hz, noise = band_to_keep(raw, at.u[at.usable][:, :m], V, instrument, (rate_hz, sensor_rate_hz), settings.to_hz)
-    clipped, independent, k, unfiltered = 0, 1.0, u.shape[1], columns
+    clipped, independent, unfiltered = 0, 1.0, columns
     if band_hz is not None and settings.limit_band:
         independent = min(1.0, 2.0 * FILTER_BAND * band_hz / sensor_rate_hz)
         columns = lowpass(columns, sensor_rate_hz, band_hz)

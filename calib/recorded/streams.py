@@ -45,10 +45,10 @@ class TableStream:
         first, stop = (int(edge) for edge in np.clip(edges, 0, self._count))
         if stop <= first:
             return None
-        held = np.full((stop - first, self.axes), np.nan)
+        held = np.full((self.axes, stop - first), np.nan)  # the samples of an axis lie side by side
         ends = [*self._rows.tolist(), len(self._values)]
         for (row, next_row), number in zip(itertools.pairwise(ends), self._numbers.tolist(), strict=True):
             a, b = max(first, number), min(stop, number + next_row - row)
             if a < b:
-                held[a - first : b - first] = self._values[row + a - number : row + b - number]
-        return Samples(self._name, first, held, self.clock)
+                held[:, a - first : b - first] = self._values[row + a - number : row + b - number].T
+        return Samples(self._name, first, held.T, self.clock)
