@@ -15,7 +15,7 @@ from agent.core.positions import FOUND_WITHIN_S, FoundPositions
 from agent.core.schedule import Piece, ToldTimes, pose_beside
 from agent.core.stream import DeviceStream
 from agent.core.time_shift import Anew
-from agent.core.windows import Found, margin_of, refused, windows_in
+from agent.core.windows import Found, limits_of, margin_of, refused, windows_in
 from calib.estimate.lag_search import without_lag
 from calib.excitation.front_end import most_margin_s
 from calib.excitation.placing import Placed
@@ -58,6 +58,7 @@ class Streams:
     def __init__(self, channel: Channel) -> None:
         self._channel = channel
         self._beside = channel.by_reference
+        self._limits = [limits_of(beside) for beside in self._beside]
         self._number = 0  # of the piece that is due next
         self.by_device: dict[str, DeviceStream] = {}
         self._finder = FoundPositions(channel) if channel.positions else None
@@ -109,8 +110,10 @@ class Streams:
         before the samples that are kept are left out, whatever their number is.
         """
         first_s = self._sensor.first_sample_s
-        made = 0
-        while (piece := self._places.piece) is not None and first_s is not None and self._due(piece, first_s, now_s):
+        made, margin_s = 0, self._margin_s
+        while (piece := self._places.piece) is not None and first_s is not None:
+            if not self._due(first_s + piece.stop_s + margin_s, now_s):
+                break
             made += 1
             if made == MOST_DUE:
                 self._places.pass_over(now_s - first_s - self._channel.late_horizon_s - 2.0 * self._horizon_s)
@@ -118,7 +121,7 @@ class Streams:
             yield piece
             self._places.done(piece)
             self._number += 1
-        around_s = 2.0 * self._margin_s
+        around_s = 2.0 * margin_s
         keep_from_s = now_s - around_s
         if first_s is not None:
             keep_from_s = min(keep_from_s, first_s + self._places.keep_from_s - around_s)
@@ -233,8 +236,7 @@ class Streams:
             self._margin_at = rates_hz, max(margin_of(beside, self.by_device) for beside in self._beside)
         return self._margin_at[1]
 
-    def _due(self, piece: Piece, first_s: float, now_s: float) -> bool:
-        end_s = first_s + piece.stop_s + self._margin_s
+    def _due(self, end_s: float, now_s: float) -> bool:
         return now_s > end_s + self._channel.late_horizon_s or all(s.reaches(end_s) for s in self._in_use.values())
 
     def _unsound(self, start_s: float, stop_s: float) -> str:
@@ -293,4 +295,5 @@ class Streams:
         return found.because(estimation.lag_watch.beyond), lag_s, None
 
     def _make(self, piece: Piece, first_s: float, response: Response, to_hz: float, lag_s: float) -> Found:
-        return windows_in(piece, first_s, self._beside[self.place], self.by_device, lag_s, response, to_hz)
+        beside, limits = self._beside[self.place], self._limits[self.place]
+        return windows_in(piece, first_s, beside, self.by_device, lag_s, response, to_hz, limits)

@@ -12,7 +12,7 @@ from agent.core.schedule import Piece
 from agent.core.stream import DeviceStream
 from calib.excitation.bands import ABOVE, HIGHEST, share_above
 from calib.excitation.front_end import LEAST_MARGIN_S, Settings, Unusable, margin_s, nothing_in, windows_of
-from calib.excitation.window_verdict import Limits
+from calib.excitation.window_verdict import DEFAULT_LIMITS, Limits
 from calib.model import Window
 from calib.signal.response import FLAT, Response
 
@@ -52,11 +52,13 @@ def windows_in(
     lag_s: float,
     response: Response = FLAT,
     to_hz: float = np.inf,
+    limits: Limits = DEFAULT_LIMITS,
 ) -> Found:
     """The windows of a stretch in one pose, each with its verdict; one unused window where there is nothing to judge.
 
     `first_s` is the time of the sensor's first sample; the windows' times count from it. The sensor's indications are
     taken to come late by `lag_s`, and to be what `response` makes of the motion. Motion above `to_hz` is filtered out.
+    `limits` as `limits_of` gives them.
     """
     start_s, stop_s = first_s + piece.start_s, first_s + piece.stop_s
     around_s = margin_of(channel, streams)
@@ -68,8 +70,7 @@ def windows_in(
         reference = streams[channel.reference].cut(start_s - around_s, stop_s + around_s)
         if reference is None:
             return Found([refused(piece, f"no samples of the reference {channel.reference}")])
-    known = channel.priors(fixed_mount=channel.fixed_mount)
-    limits, span_s = Limits.of(known.offset_mps2, known.angle_rad, channel.window_s), (start_s, stop_s)
+    span_s = start_s, stop_s
 
     def made(limit_hz: float | None) -> list[Window]:
         settings = Settings(limits, bands=True, to_hz=limit_hz)
@@ -87,6 +88,12 @@ def windows_in(
         return Found([refused(piece, "the samples of sensor and reference do not overlap in time")])
     found = [replace(w, start_s=w.start_s - first_s, stop_s=w.stop_s - first_s) for w in found]
     return Found(found, sensor.temperature_degc)
+
+
+def limits_of(channel: Channel) -> Limits:
+    """What the windows of a channel must keep to be used."""
+    known = channel.priors(fixed_mount=channel.fixed_mount)
+    return Limits.of(known.offset_mps2, known.angle_rad, channel.window_s)
 
 
 def margin_of(channel: Channel, streams: Mapping[str, DeviceStream]) -> float:

@@ -131,11 +131,10 @@ def _segments(u: Array, du: Array, V: Array, count: int) -> tuple[Array, Array]:
     m = u.shape[1]
     z = np.empty((2 * m + 3, len(u)))  # one channel per row: 1.6 times as fast as one sample per row
     z[:m], z[m : 2 * m], z[2 * m :] = u.T, du.T, V.T
-    size = len(u) // count
-    segments, ones = [z[:, k : k + size] for k in range(0, len(u), size)], np.ones(size)
-    centre = np.array([segment @ ones for segment in segments]) / size
-    z -= np.repeat(centre.T, size, axis=1)
-    return centre, np.array([segment @ segment.T for segment in segments])
+    segments = z.reshape(len(z), count, -1).transpose(1, 0, 2)
+    centre = segments @ np.ones(segments.shape[2]) / segments.shape[2]
+    segments -= centre[:, :, None]
+    return centre, segments @ segments.transpose(0, 2, 1)
 
 
 def _pool(count: Array, mean: Array, scatter: Array) -> tuple[Array, Array]:

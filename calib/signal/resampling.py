@@ -76,7 +76,7 @@ def resample(x: Array, clock: ClockFit, time_s: Array, first_index: int = 0, mar
         low, high = int(first.min()), int(first.max()) + TAPS
         for channel in range(x.shape[1]):
             taps = np.ascontiguousarray(sliding_window_view(x[low:high, channel], TAPS).T)
-            value, slope = _horner((_weights() @ taps).take(first - low, axis=1), fraction[part])
+            value, slope = _horner(_taken(_weights() @ taps, first - low), fraction[part])
             u[channel, part], du[channel, part] = value, slope * rate
     return Resampled(u.T, du.T, usable)
 
@@ -140,6 +140,13 @@ def as_slice(numbers: NDArray[np.int64]) -> NDArray[np.int64] | slice:
     them, with which numpy copies nothing."""
     first, stop = int(numbers[0]), int(numbers[-1]) + 1
     return slice(first, stop) if stop - first == len(numbers) else numbers
+
+
+def _taken(columns: Array, numbers: NDArray[np.int64]) -> Array:
+    """The columns (p, n) with these numbers (k,); nothing is copied where these are all, one after the other."""
+    if len(numbers) == columns.shape[1] and np.array_equal(numbers, np.arange(len(numbers))):
+        return columns
+    return columns.take(numbers, axis=1)
 
 
 def _horner(sums: Array, fraction: Array) -> tuple[Array, Array]:
