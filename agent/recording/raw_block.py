@@ -14,6 +14,7 @@ from hw.block import BlockFlags, SampleBlock
 
 FASTEST_HZ = 1e6  # of any device; memory for a window is reserved by the rate. A sound card has 1.9e5
 COUNTS, DECIMALS = ("x_counts", "y_counts", "z_counts"), ("x", "y", "z")
+INT32, INT64, FLOAT64 = np.dtype("<i4"), np.dtype("<i8"), np.dtype("<f8")
 
 
 def encode_block(event_sequence: int, block: SampleBlock) -> bytes:
@@ -49,20 +50,20 @@ def decode_block(data: bytes) -> tuple[int, SampleBlock]:
     Raises ValueError or protobuf's DecodeError where the bytes are not a block or its arrays differ in length.
     """
     m = pb.RawBlockBytes.FromString(data)
-    if m.axes not in (1, 3):
-        raise ValueError(f"the block says {m.axes} axes; only 1 and 3 are possible")
+    axes = m.axes
+    if axes not in (1, 3):
+        raise ValueError(f"the block says {axes} axes; only 1 and 3 are possible")
     if not 0 < m.nominal_rate_hz <= FASTEST_HZ:
         raise ValueError(f"the block says {m.nominal_rate_hz:g} samples a second; at most {FASTEST_HZ:g} are possible")
-    arrival = np.frombuffer(m.burst_t_monotonic_ns, "<i8")
-    count = np.frombuffer(m.burst_count, "<i4")
-    names, kind = (DECIMALS, "<f8") if m.decimal else (COUNTS, "<i4")
-    columns = [np.frombuffer(getattr(m, name), kind) for name in names[: m.axes]]
+    arrival, count = np.frombuffer(m.burst_t_monotonic_ns, INT64), np.frombuffer(m.burst_count, INT32)
+    names, kind = (DECIMALS, FLOAT64) if m.decimal else (COUNTS, INT32)
+    columns = [np.frombuffer(getattr(m, name), kind) for name in names[:axes]]
     n = len(columns[0])
-    if len(arrival) != len(count) or not len(count) or count[0] < 0 or (count[1:] < count[:-1]).any():
+    if len(arrival) != len(count) or not len(count) or count[0] < 0 or np.count_nonzero(count[1:] < count[:-1]):
         raise ValueError(f"{len(arrival)} times of bursts, but {len(count)} counts, which must not decrease")
-    if count[-1] != n or any(len(c) != n for c in columns):
+    if count[-1] != n or axes == 3 and not n == len(columns[1]) == len(columns[2]):
         raise ValueError(f"x has {n} samples; the number of samples in the bursts or on another axis is different")
-    indications = np.empty((n, m.axes), columns[0].dtype)
+    indications = np.empty((n, axes), kind)
     for axis, column in enumerate(columns):
         indications[:, axis] = column
     return m.event_sequence, SampleBlock(

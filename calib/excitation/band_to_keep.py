@@ -57,8 +57,8 @@ def _told_hz(
     if not instrument.derivatives and rate_hz > AS_FAST * sensor_rate_hz:
         if found_hz is not None or (raw.shape[1] == 3 and feels_gravity(raw[np.isfinite(raw).all(axis=1)])):
             return None  # with a reference that feels gravity, rests count: a filter costs their ends
-        share, power = power_share_above(raw, rate_hz, BAND * rate_hz), float(np.nanvar(raw, axis=0).sum())
-        wide = share > TOO_FAST and share * power > LEAST_MOTION_MPS2**2
+        share = power_share_above(raw, rate_hz, BAND * rate_hz)
+        wide = share > TOO_FAST and share * float(np.nanvar(raw, axis=0).sum()) > LEAST_MOTION_MPS2**2
         return BAND * rate_hz / STOP_BAND if wide else None
     right_hz = differentiated_band_hz(rate_hz) if instrument.derivatives else BAND * rate_hz
     felt_hz, _ = band_above_noise(V, sensor_rate_hz)

@@ -38,9 +38,12 @@ DISTINCT = 0.99  # if this part of the points within the range differ, three poi
 ROUNDING = 1e-9  # of the range: smaller residuals are rounding errors, not noise
 
 
-def moving(u: Array, rate_hz: float) -> list[Stretch]:
-    """Stretches in which the reference u (n, m) moves: its level is high enough compared with its strongest part."""
-    width = band_width(u, rate_hz, white_noise(u))
+def moving(u: Array, rate_hz: float, noise: Array) -> list[Stretch]:
+    """Stretches in which the reference u (n, m) moves: its level is high enough compared with its strongest part.
+
+    `noise` (m,) is the SD of its white noise (`white_noise`).
+    """
+    width = band_width(u, rate_hz, noise)
     slow = averaged(u - median(u.T), width) if len(u) else u
     size = max(1, round(FRAME_S * rate_hz / width))
     frames = len(slow) // size

@@ -11,15 +11,17 @@ from calib.model import Array, WindowSums
 
 
 def motion_numbers(
-    sums: WindowSums, basis: Array, V: Array, rate_hz: float, stepped: tuple[float, float], limits: Limits
-) -> dict[str, float]:
+    sums: WindowSums, basis: Array, V: Array, rate_hz: float, stepped: tuple[float, float], limits: Limits,
+    noise: Array | None = None,
+) -> dict[str, float]:  # fmt: skip
     """Statistics for the verdict: level, noise and coherence in the band of the motion, drift and step of the mean.
 
-    `basis` (n, 1 + 2 m) is [1, u, du]; `stepped` is a step and its standard uncertainty in output unit. A motion that
-    fills the spectrum looks like white noise: what of it the sensor shows as well is none.
+    `basis` (n, 1 + 2 m) is [1, u, du]; `stepped` is a step and its standard uncertainty in output unit. `noise` (m,) is
+    the SD of the white noise in u, None where nobody has found it yet. A motion that fills the spectrum looks like
+    white noise: what of it the sensor shows as well is none.
     """
     u = basis[:, 1 : 1 + sums.reference_channels]
-    noise = detection.white_noise(u)
+    noise = detection.white_noise(u) if noise is None else noise
     numbers, scale = _in_band(basis, V, rate_hz, noise)
     if numbers["reference_rms_mps2"] <= limits.least_level * numbers["reference_noise_mps2"]:
         numbers, scale = _in_band(basis, V, rate_hz, np.minimum(noise, detection.incoherent(u, V)))

@@ -56,19 +56,21 @@ def motion_windows(
     If `leave_out` is false, the sums hold all points, knocks included (Method 3 as printed). With a `taper` (the share
     of a window at each end), windows hold sums in bands of frequency as well.
     """
-    return [
-        window
-        for kind, first, stop in motion_parts(points.u, _rate(points.time_s))
-        for window in judged(kind, pose, points.part(first, stop), limits, leave_out=leave_out, taper=taper)
-    ]
+    noise = detection.white_noise(points.u)
+    windows = []
+    for kind, first, stop in motion_parts(points.u, _rate(points.time_s), noise):
+        known = noise if stop - first == len(points.u) else None
+        part = points.part(first, stop)
+        windows += judged(kind, pose, part, limits, leave_out=leave_out, taper=taper, noise=known)
+    return windows
 
 
-def motion_parts(u: Array, rate_hz: float) -> list[tuple[Kind, int, int]]:
+def motion_parts(u: Array, rate_hz: float, noise: Array) -> list[tuple[Kind, int, int]]:
     """Parts (kind, first, stop) of a reference's samples u (n, m), cut where it begins or stops to move.
 
-    Pauses shorter than SHORTEST_QUIET_S make no part.
+    `noise` (m,) is the SD of its white noise. Pauses shorter than SHORTEST_QUIET_S make no part.
     """
-    edges = [0, *itertools.chain(*detection.moving(u, rate_hz)), len(u)]
+    edges = [0, *itertools.chain(*detection.moving(u, rate_hz, noise)), len(u)]
     parts: list[tuple[Kind, int, int]] = []
     for k, (first, stop) in enumerate(itertools.pairwise(edges)):
         if k % 2:
@@ -80,18 +82,20 @@ def motion_parts(u: Array, rate_hz: float) -> list[tuple[Kind, int, int]]:
 
 def judged(
     kind: Kind, pose: Pose, points: Points, limits: Limits = DEFAULT_LIMITS, *, leave_out: bool = True,
-    taper: float = 0.0,
+    taper: float = 0.0, noise: Array | None = None,
 ) -> list[Window]:  # fmt: skip
     """The windows of one part (see `motion_parts`), with their verdicts.
 
-    The part is cut where samples are missing, and into windows not longer than `limits.longest_s`.
+    The part is cut where samples are missing, and into windows not longer than `limits.longest_s`. `noise` (m,) is the
+    SD of the white noise of all its u, None where nobody has found it yet.
     """
     windows = []
     for first, stop in _unbroken(points.time_s):
         longest = round(limits.longest_s * _rate(points.time_s[first:stop]))
         for a, b in _pieces(first, stop, longest):
             part = points.part(a, b)
-            windows.append(_motion(kind, pose, part, _rate(part.time_s), limits, leave_out, taper))
+            known = noise if b - a == len(points.time_s) else None
+            windows.append(_motion(kind, pose, part, _rate(part.time_s), limits, leave_out, taper, noise=known))
     return windows
 
 
@@ -197,6 +201,7 @@ def _motion(
     leave_out: bool,
     taper: float,
     stepped: tuple[float, float] | None = None,
+    noise: Array | None = None,
 ) -> Window:
     """One window. It is judged without the knocks, also where they stay in its sums.
 
@@ -220,11 +225,11 @@ def _motion(
     clean = sums = _sums(V, u, du, rate_hz, limits)
     kept: slice | NDArray[np.bool_] = slice(None)
     if struck.any():
-        kept = ~struck
+        kept, noise = ~struck, None
         clean = _sums(V[kept], u[kept], du[kept], rate_hz, limits)
         if leave_out:
             sums = clean
-    numbers = motion_numbers(clean, basis[kept], V[kept], rate_hz, stepped, limits)
+    numbers = motion_numbers(clean, basis[kept], V[kept], rate_hz, stepped, limits, noise)
     numbers |= nonlinearity(V, residual, rate_hz)
     numbers["stuck_axes"] = float(np.sum(np.ptp(V, axis=0) == 0.0))
     numbers["clipped_points"] = float(detection.clipped(V, residual, finest))

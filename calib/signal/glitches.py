@@ -59,6 +59,6 @@ def _usual(bend: Array) -> Array:
     """(n,) the median curvature of the block of each sample or of a neighbouring block, whichever is largest."""
     blocks = len(bend) // BLOCK
     medians = median(bend[: blocks * BLOCK].reshape(blocks, BLOCK))
-    padded = np.pad(medians, 1, mode="edge")
+    padded = np.concatenate([medians[:1], medians, medians[-1:]])
     largest = np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:])
     return np.repeat(np.append(largest, largest[-1]), BLOCK)[: len(bend)]

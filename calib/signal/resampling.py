@@ -70,12 +70,13 @@ def resample(x: Array, clock: ClockFit, time_s: Array, first_index: int = 0, mar
     middle_s = 0.5 * (time_s[(len(time_s) - 1) // 2] + time_s[len(time_s) // 2])
     before_s, after_s = clock.time_of(clock.index_of(middle_s) + np.array([-0.5, 0.5])).tolist()
     rate = 1.0 / (after_s - before_s)
+    sixteen = [sliding_window_view(channel, TAPS).T for channel in x.T]
     for k in range(0, len(inside), CHUNK):
         part = as_slice(inside[k : k + CHUNK])
         first = start[part]
         low, high = int(first.min()), int(first.max()) + TAPS
-        for channel in range(x.shape[1]):
-            taps = np.ascontiguousarray(sliding_window_view(x[low:high, channel], TAPS).T)
+        for channel, views in enumerate(sixteen):
+            taps = np.ascontiguousarray(views[:, low : high + 1 - TAPS])
             value, slope = _horner(_taken(_weights() @ taps, first - low), fraction[part])
             u[channel, part], du[channel, part] = value, slope * rate
     return Resampled(u.T, du.T, usable)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 from calib.model import Array
 from calib.signal.timing import ClockFit
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Samples:
     """Consecutive samples of a device; a missing sample is a row of NaN.
 
@@ -33,9 +34,9 @@ class Samples:
         """Number of the device's axes."""
         return int(self.values.shape[1])
 
-    @property
+    @cached_property
     def time_s(self) -> Array:
-        """(n,) time of each sample in s, by `clock`."""
+        """(n,) time of each sample in s, by `clock`; computed when it is first asked for."""
         return self.clock.times_of(self.first_index, len(self.values))
 
 

@@ -215,7 +215,7 @@ def test_motion_that_begins_late_and_pauses() -> None:
         moving[int(start * RATE_HZ) : int(stop * RATE_HZ)] = 0.0
     u, _ = sine(len(moving))
     u = u * moving[:, None] + 0.01 * np.random.default_rng(7).normal(size=u.shape)
-    parts = motion_parts(u, RATE_HZ)
+    parts = motion_parts(u, RATE_HZ, detection.white_noise(u))
     assert [kind for kind, _, _ in parts] == ["quiet", "motion", "quiet", "motion"]
     edges = np.array([[a, b] for _, a, b in parts]) / RATE_HZ
     np.testing.assert_allclose(edges, [[0, 5], [5, 20], [20, 26], [26, 40]], atol=0.26)  # a frame
@@ -230,7 +230,8 @@ def test_weak_tri_axial_motion_half_of_it_calm() -> None:
     u = np.zeros((n, 3))
     for f in (1.3, 2.1, 3.4, 5.2, 7.7):
         u += np.sin(2 * np.pi * f * t[:, None] + rng.uniform(0, 6.28, 3)) * 0.02 / np.sqrt(15 / 2) * level[:, None]
-    parts = motion_parts(u + 0.006 / np.sqrt(3) * rng.normal(size=u.shape), RATE_HZ)
+    shown = u + 0.006 / np.sqrt(3) * rng.normal(size=u.shape)
+    parts = motion_parts(shown, RATE_HZ, detection.white_noise(shown))
     assert [kind for kind, _, _ in parts] == ["motion", "quiet"] * 3
     np.testing.assert_allclose([a / RATE_HZ for _, a, _ in parts], np.arange(0, 600, 100), atol=1.1)
     du = np.gradient(u, axis=0) * RATE_HZ
