@@ -61,7 +61,7 @@ def decode_block(data: bytes) -> tuple[int, SampleBlock]:
     n = len(columns[0])
     if len(arrival) != len(count) or not len(count) or count[0] < 0 or np.count_nonzero(count[1:] < count[:-1]):
         raise ValueError(f"{len(arrival)} times of bursts, but {len(count)} counts, which must not decrease")
-    if count[-1] != n or axes == 3 and not n == len(columns[1]) == len(columns[2]):
+    if count[-1] != n or any(len(c) != n for c in columns):
         raise ValueError(f"x has {n} samples; the number of samples in the bursts or on another axis is different")
     indications = np.empty((n, axes), kind)
     for axis, column in enumerate(columns):
