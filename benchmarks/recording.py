@@ -5,71 +5,41 @@ from __future__ import annotations
 import tempfile
 import time
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import msgspec
-import numpy as np
 import zstandard
 
 from agent.config import Config
-from agent.core.events import Event, RunStart
+from agent.core.events import Event, RunStart, WindowReport
 from agent.core.pipeline import Pipeline
 from agent.recording.integrity import check_integrity
 from agent.recording.reading import RecordingReader
 from agent.recording.records import walk
 from agent.recording.writer import Recorder
+from benchmarks.online import day
+from benchmarks.online.runner import EPOCH_NS
 from benchmarks.page import machine, write_part
 from hw.block import SampleBlock
 
-RATE_HZ = 1000.0
 BLOCK_S = 0.5
 DURATION_S = 1800.0
 FLUSH_S = 2.0
-SECOND = 1_000_000_000
 
 
-def blocks(seed: int) -> Iterator[SampleBlock]:
-    """A tri-axial device with counts (ADXL355: 256000 per g, noise 100 rms) and a uniaxial one with decimals, 1 kHz."""
-    rng = np.random.default_rng(seed)
-    n = int(RATE_HZ * BLOCK_S)
-    for number in range(int(DURATION_S / BLOCK_S)):
-        time_s = (number * n + np.arange(n)) / RATE_HZ
-        motion_mps2 = np.sin(2 * np.pi * 2.0 * time_s)
-        counts = np.rint(rng.normal(0.0, 100.0, (n, 3)) + 26000.0 * np.outer(motion_mps2, [0.1, 0.05, 1.0]))
-        arrivals_ns = ((number * n + np.arange(32, n + 32, 32)) * 1e9 / RATE_HZ).astype(np.int64)
-        bursts = np.minimum(np.arange(32, n + 32, 32), n).astype(np.int32)
-        for device, indications in (("mems", counts.astype(np.int32)), ("reference", motion_mps2[:, None].round(4))):
-            yield SampleBlock(
-                device, "boot", int(arrivals_ns[-1]), number * n, RATE_HZ, arrivals_ns, bursts, indications
-            )
-
-
-def configuration() -> Config:
-    """A channel whose sensor stands for ten seconds at each of three angles, repeatedly."""
-    poses = [
-        {"start_s": start_s, "stop_s": start_s + 10, "theta_deg": 35, "alpha_deg": alpha_deg}
-        for start_s, alpha_deg in ((3, 0), (16, 30), (29, 120))
-    ]
-    channel: dict[str, Any] = {"sensor": "mems", "reference": "reference", "poses": poses, "poses_repeat_s": 39}
-    channel |= {"prior": {"sensitivity": 26000.0}}
-    devices = [{"name": name, "driver": "adxl355"} for name in ("mems", "reference")]
-    return Config.model_validate({"devices": devices, "channels": [channel]})
-
-
-def record(directory: Path, events: list[Event]) -> Path:
+def record(directory: Path, config: Config, events: list[Event]) -> Path:
     """Record the events and the results of the pipeline, flushed and synced like a live agent's."""
-    config = configuration()
-    pipeline = Pipeline.begin(config, "r", 0, 0, {})
-    recorder = Recorder(directory, ["mems", "reference"], ["mems"], max_bytes=1 << 40)
+    pipeline = Pipeline.begin(config, "r", 0, EPOCH_NS, {})
+    recorder = Recorder(directory, ["sensor", "reference"], ["sensor"], max_bytes=1 << 40)
     start = RunStart(
-        run_id="r", site="s", gateway="g", boot_id="b", t_monotonic_ns=0, t_utc_ns=0,
+        run_id="r", site="s", gateway="g", boot_id="b", t_monotonic_ns=0, t_utc_ns=EPOCH_NS,
         config_json=config.model_dump_json(), versions={}, fingerprint={}, snapshot=pipeline.snapshot(),
         file_sequence=1, event_sequence=0,
     )  # fmt: skip
     recorder.record(0, start, [])
-    flush_each = int(2 * FLUSH_S / BLOCK_S)
+    flush_each = int(3 * FLUSH_S / BLOCK_S)  # two blocks and a tick
     for number, event in enumerate(events, start=1):
         recorder.record(number, event, pipeline.step(event))
         if number % flush_each == 0:
@@ -95,20 +65,20 @@ def read(path: Path) -> None:
 def replay(path: Path) -> None:
     """All events through the pipeline: `fieldcal replay` without its start."""
     pipeline: Pipeline | None = None
-    results = 0
+    windows = 0
     for step in RecordingReader(path).steps():
         if isinstance(step.event, RunStart):
             pipeline = Pipeline.restore(step.event.config_json, step.event.snapshot)
         assert pipeline is not None
         computed = pipeline.step(step.event)
-        # As text, since a NaN does not equal itself.
-        assert _text(computed) == _text(step.results)
-        results += len(computed)
-    assert results > DURATION_S / 39
+        assert _plain(computed) == _plain(step.results)
+        windows += sum(isinstance(result, WindowReport) and result.used for result in computed)
+    assert windows > DURATION_S / 60 - 2
 
 
-def _text(results: Sequence[object]) -> bytes:
-    return msgspec.json.encode(results, order="sorted")
+def _plain(results: Sequence[object]) -> Any:
+    """Without NaN, which does not equal itself."""
+    return msgspec.json.decode(msgspec.json.encode(results))
 
 
 def check(path: Path) -> None:
@@ -129,24 +99,27 @@ def cpu_s(work: Callable[[Path], object], path: Path) -> float:
 
 def main() -> None:
     """Measure and write the table."""
-    events: list[Event] = list(blocks(seed=1))
+    bench = day.bench()
+    events = list(day.events(bench, DURATION_S, BLOCK_S))
     with tempfile.TemporaryDirectory() as directory:
         start = time.process_time()
-        path = record(Path(directory), events)
+        path = record(Path(directory), day.config(bench), events)
         writing_s = time.process_time() - start
         size = path.stat().st_size
         plain_s = cpu_s(decompress_and_check, path)
         rows = [(name, cpu_s(work, path)) for name, work in WORK]
-    samples = sum(event.indications.size for event in events if isinstance(event, SampleBlock))
+    blocks = [event for event in events if isinstance(event, SampleBlock)]
+    samples = sum(block.indications.size for block in blocks)
     rows = [("decompressing and CRC alone", plain_s), *rows]
     lines = [f"| {name} | {DURATION_S / s:,.0f} | {s / plain_s:.1f} |" for name, s in rows]
-    writing_us = writing_s / len(events) * 1e6
+    writing_us = writing_s / len(blocks) * 1e6
     write_part(
         "recording",
         f"""
-`python -m benchmarks recording` on {machine()}: half an hour of a sensor (1 kHz x 3) and a reference (1 kHz), blocks of
-0.5 s, flushed and synced every {FLUSH_S:g} s. To make the results and write them takes {writing_us:.0f} us of CPU for
-each block, and {size / samples:.2f} bytes for each number.
+`python -m benchmarks recording` on {machine()}: half an hour of the bench of `benchmarks.online day`,
+a window a minute: a sensor (1 kHz x 3) and a reference (1 kHz), blocks of 0.5 s, flushed and synced each {FLUSH_S:g} s.
+To make the results and write them takes {writing_us:.0f} us of CPU for each block, and {size / samples:.2f} bytes for
+each number.
 
 | work | speed, in multiples of real time | CPU time, divided by that of decompressing and CRC alone |
 | --- | --- | --- |

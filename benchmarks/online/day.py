@@ -73,10 +73,10 @@ def bench() -> Bench:
     )
 
 
-def events(bench: Bench, duration_s: float) -> Iterator[Event]:
-    """Openings, then blocks for `duration_s`, each followed by a tick."""
-    n = round(BLOCK_S * RATE_HZ)
-    blocks = round(CYCLES * bench.parameters.schedule.period_s / BLOCK_S)
+def events(bench: Bench, duration_s: float, block_s: float = BLOCK_S) -> Iterator[Event]:
+    """Openings, then blocks of `block_s` for `duration_s`, each followed by a tick."""
+    n = round(block_s * RATE_HZ)
+    blocks = round(CYCLES * bench.parameters.schedule.period_s / block_s)
     held = [(bench.sensor_counts(k * n, n), bench.reference_values(k * n, n)) for k in range(blocks)]
     count = np.arange(BURST, n + 1, BURST, dtype=np.int32)
     late_ns = np.random.default_rng(1).exponential(2e5, len(count)).astype(np.int64)
@@ -86,13 +86,13 @@ def events(bench: Bench, duration_s: float) -> Iterator[Event]:
             "reference": DeviceInfo("serial-csv", "virtual", "2", "m/s2", 1, RATE_HZ),
         }
     )
-    for k in range(int(duration_s / BLOCK_S)):
+    for k in range(int(duration_s / block_s)):
         arrivals_ns = ((k * n + count) * (1e9 / RATE_HZ)).astype(np.int64) + late_ns
         counts, reference = held[k % blocks]
         common = ("boot", int(arrivals_ns[-1]), k * n, RATE_HZ, arrivals_ns, count)
         yield SampleBlock("sensor", *common, counts)
         yield SampleBlock("reference", *common, reference)
-        yield tick((k + 1) * BLOCK_S)
+        yield tick((k + 1) * block_s)
 
 
 def measure(duration_s: float) -> tuple[float, int, int]:
