@@ -39,6 +39,7 @@ class FifoSensor(ABC):
 
     options_model: ClassVar[type[Options]]
     word_bytes: ClassVar[int]  # bytes that the FIFO stores at a time
+    filter_settings: ClassVar[tuple[str, ...]] = ()  # as in DeviceInfo
 
     def __init__(
         self,
@@ -283,4 +284,6 @@ class FifoSensor(ABC):
             range_mps2=-self._limits()[0] / counts_per_g * STANDARD_GRAVITY_MPS2,
             nominal_sensitivity=counts_per_g / STANDARD_GRAVITY_MPS2,
             settings={name: f"0x{value:02X}" for name, value in registers.items()},
+            filters=self._options.known_filters,
+            filter_settings=self.filter_settings,
         )
