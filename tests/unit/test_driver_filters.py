@@ -21,6 +21,7 @@ from agent.core.events import Acceleration, CalibrationUpdate, DeviceChange, Eve
 from agent.core.kept import OTHER_FILTERS, keep, take_up
 from agent.core.pipeline import Pipeline
 from agent.core.snapshot import pack
+from agent.recording.reading import RecordingReader
 from benchmarks.online import chip
 from benchmarks.online.life import Gateway
 from benchmarks.online.node import Node, Stated, Timing, node
@@ -109,12 +110,79 @@ def test_a_restored_state_goes_on_bit_for_bit(cut: int) -> None:
 
 
 def test_a_recording_carries_them_so_that_its_audit_gives_the_same_results(tmp_path: Path) -> None:
-    run = Run(drawn().config, tmp_path)
-    found = [result for event in events(STATED) for result in run.feed(event)]
-    run.close()
-    assert any(isinstance(result, CalibrationUpdate) for result in found)
-    (path,) = tmp_path.glob("*.mcap*")
+    path = recorded(tmp_path / "data", STATED)
+    results = [result for step in RecordingReader(path).steps() for result in step.results]
+    assert any(isinstance(result, CalibrationUpdate) for result in results)
     assert run_cli(["audit", str(path)]) == 0
+
+
+def recorded(directory: Path, filters: dict[str, tuple[str, ...]]) -> Path:
+    """A recording of the visits of `building`."""
+    directory.mkdir()
+    run = Run(drawn().config, directory)
+    for event in events(filters):
+        run.feed(event)
+    run.close()
+    (path,) = directory.glob("*.mcap*")
+    return path
+
+
+def calibrated(path: Path, *options: str) -> list[list[float]]:
+    """S of `fieldcal calibrate` from both devices of a recording."""
+    of = ["--sensor", path, "--columns", "group=sensor", "--reference", path, "--reference-columns", "group=reference"]
+    out = path.with_suffix(".json")
+    assert run_cli(["calibrate", *map(str, of), "--rotation", "1,0,0,0,1,0,0,0,1", "--json", str(out), *options]) == 0
+    return json.loads(out.read_text())["sensitivity"]  # type: ignore[no-any-return]
+
+
+def test_calibrate_uses_the_filters_in_a_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with_them, without = recorded(tmp_path / "a", STATED), recorded(tmp_path / "b", {})
+    options = ["--sensor-filter", NEAR_TEXT[0], "--reference-filter", "flat"]
+    stated = calibrated(without, *options)
+    capsys.readouterr()
+    assert calibrated(with_them) == stated
+    assert f"--sensor-filter '{NEAR_TEXT[0]}', as its driver states in the recording" in capsys.readouterr().err
+    assert calibrated(without) != stated
+    assert calibrated(with_them, "--sensor-filter", "flat") == calibrated(
+        without, "--sensor-filter", "flat", *options[2:]
+    )
+    calibrated(with_them, "--plain")  # takes no filters
+    csv = tmp_path / "sensor.csv"
+    assert run_cli(["convert", str(with_them), "--columns", "group=sensor", "-o", str(csv)]) == 0
+    assert f"calibrate with --sensor-filter '{NEAR_TEXT[0]}'" in capsys.readouterr().err
+
+
+def test_check_tells_which_filters_are_used_and_who_states_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lines = [
+        "[[devices]]", 'name = "a"', 'driver = "adxl345"', "[devices.options]", "rate_hz = 100",
+        "[[devices]]", 'name = "b"', 'driver = "serial-csv"', "[devices.options]", 'port = "/dev/b"', "rate_hz = 50",
+        'filters = ["mean points=4 rate_hz=200"]',
+        "[[devices]]", 'name = "c"', 'driver = "serial-csv"', "[devices.options]", 'port = "/dev/c"', "rate_hz = 50",
+        "[[channels]]", 'sensor = "a"', 'reference = "b"', "rotation = [1, 0, 0, 0, 1, 0, 0, 0, 1]",
+        "[channels.prior]", "[channels.check_reference]", 'device = "c"',
+        "[[channels]]", 'sensor = "b"', 'reference = "c"', "rotation = [1, 0, 0, 0, 1, 0, 0, 0, 1]",
+        "[channels.prior]", 'filters = ["flat"]', "[channels.certificate]", 'filters = ["flat u_pct=1"]',
+    ]  # fmt: skip
+    path = tmp_path / "site.toml"
+    path.write_text("\n".join(lines) + "\n")
+    assert run_cli(["check", str(path)]) == 0
+    assert capsys.readouterr().out.splitlines()[1:] == [
+        "  filters of a, stated by the driver adxl345: lowpass order=1 corner_hz=50 u_corner_pct=50",
+        "  filters of b, stated by the driver serial-csv: mean points=4 rate_hz=200",
+        "  filters of c: none stated; its response is estimated with S",
+        "  filters of b, stated by prior.filters: flat",
+        "  filters of c, stated by the certificate: flat u_pct=1",
+    ]
+    assert run_cli(["check", str(path), "--json", "-"]) == 0
+    told = json.loads(capsys.readouterr().out)["filters"]
+    assert told[1] == {
+        "sensor": "a", "device": "b", "lines": ["mean points=4 rate_hz=200"], "stated_by": "the driver serial-csv",
+    }  # fmt: skip
+    path.write_text("\n".join(lines).replace("mean points=4", "mean points=x") + "\n")
+    assert run_cli(["check", str(path)]) == 2
+    assert "devices.1.options.filters: points: 'x' is no number" in capsys.readouterr().err
 
 
 class Chip(Building):
