@@ -21,7 +21,8 @@ def identity_of(info_json: str) -> str:
 def device_of(info: Mapping[str, Any]) -> str:
     """The same without the settings that change nothing but the rate and the filters that the driver states: a
     calibration stays valid but for what the filters change."""
-    return _identity(info, WAYS.union(info.get("filter_settings", ())))
+    named = info.get("filter_settings", ())
+    return _identity(info, WAYS.union(name for name in named if isinstance(name, str)))
 
 
 def _identity(info: Mapping[str, Any], but: Set[str]) -> str:

@@ -123,3 +123,15 @@ def test_what_drivers_state_can_be_read_at_every_rate(chip: Any, rates_hz: tuple
     for rate_hz in rates_hz:
         filters = [filter_of(line) for line in chip.filters(rate_hz)]
         assert filters or rate_hz < 2.0
+
+
+def test_of_a_clone_nothing_is_known_not_even_which_settings_are_its_filters() -> None:
+    twin = Mpu6050Twin(lambda _, n: np.zeros((n, 3), np.int32), int, lambda: 0.0)
+    found = []
+    for clone in (False, True):
+        options: Any = Mpu6050.options_model.model_validate({"rate_hz": 100.0, "clone": clone})
+        with installed({"/dev/i2c-1": I2CBus({0x68: twin})}):
+            found.append(Mpu6050("sensor", options, sleep=lambda _: None).open())
+    assert found[0].filters == ("lowpass order=1 corner_hz=44 u_corner_pct=50",)
+    assert set(found[0].filter_settings) == {"SMPLRT_DIV", "CONFIG", "ACCEL_CONFIG_2"}
+    assert (found[1].filters, found[1].filter_settings) == ((), ())
