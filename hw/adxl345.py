@@ -32,6 +32,11 @@ class Adxl345Options(FifoOptions):
     rate_hz: float = Field(800.0, description=f"one of {', '.join(f'{rate:g}' for rate in chip.RATE_CODES)}")
     range_g: Literal[2, 4, 8, 16] = Field(16, description="range, plus and minus; all ranges have the same resolution")
 
+    @property
+    def known_filters(self) -> tuple[str, ...]:
+        """As the data sheet says."""
+        return chip.filters(self.rate_hz)
+
 
 class Adxl345(FifoSensor):
     """Reads the number of FIFO entries, then the samples, one register read per sample, up to 21 reads per transfer.
@@ -44,6 +49,7 @@ class Adxl345(FifoSensor):
 
     options_model = Adxl345Options
     word_bytes = 6
+    filter_settings = ("BW_RATE",)
 
     def _kind(self) -> str:
         return "ADXL345"

@@ -24,6 +24,7 @@ RANGE_CODES: Mapping[int, int] = {2: 0, 4: 1, 8: 2, 16: 3}
 # At 3200 and 1600 Hz the lowest bit is lost, and the samples do not fit a 400 kHz bus: the data sheet gives 800 Hz as
 # the highest rate for it.
 RATE_CODES: Mapping[float, int] = {800.0 / 2.0**step: 0x0D - step for step in range(10)}
+LOWEST_STATED_HZ = 2.0  # of the rates whose filter is stated
 SETTING_NAMES: Mapping[int, str] = {
     **dict(enumerate(("THRESH_TAP", "OFSX", "OFSY", "OFSZ", "DUR", "LATENT", "WINDOW", "THRESH_ACT"), 0x1D)),
     **dict(enumerate(("THRESH_INACT", "TIME_INACT", "ACT_INACT_CTL", "THRESH_FF", "TIME_FF", "TAP_AXES"), 0x25)),
@@ -53,6 +54,16 @@ def settings(rate_hz: float, range_g: int) -> dict[int, tuple[str, int]]:
     values[DATA_FORMAT] = _FULL_RESOLUTION | RANGE_CODES[range_g]
     values[FIFO_CTL] = STREAM
     return {register: (SETTING_NAMES[register], value) for register, value in values.items()}
+
+
+def filters(rate_hz: float) -> tuple[str, ...]:
+    """The filter at an output data rate, as in DeviceInfo.
+
+    Data sheet, table 1: the bandwidth (-3 dB) is half the output data rate. It tells no order: the standard uncertainty
+    is so large that first and second order lie within U. Below 2 Hz nothing is stated: such a filter remembers longer
+    than the windows can spare.
+    """
+    return (f"lowpass order=1 corner_hz={rate_hz / 2.0:g} u_corner_pct=50",) if rate_hz >= LOWEST_STATED_HZ else ()
 
 
 def self_test(range_g: int) -> SelfTest:

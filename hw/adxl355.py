@@ -31,6 +31,11 @@ class Adxl355Options(FifoOptions):
     rate_hz: float = Field(1000.0, description=f"one of {', '.join(f'{rate:g}' for rate in chip.RATES_HZ)}")
     range_g: Literal[2, 4, 8] = Field(2, description="range, plus and minus")
 
+    @property
+    def known_filters(self) -> tuple[str, ...]:
+        """As the data sheet says."""
+        return chip.filters(self.rate_hz)
+
 
 class Adxl357Options(Adxl355Options):
     """Options of `adxl357` and `adxl359`."""
@@ -48,6 +53,7 @@ class Adxl355(FifoSensor):
     options_model: ClassVar[type[Options]] = Adxl355Options
     part: ClassVar[chip.Part] = chip.ADXL355
     word_bytes = 3
+    filter_settings = ("FILTER",)
 
     def _kind(self) -> str:
         return self.part.kind

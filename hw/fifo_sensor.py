@@ -39,6 +39,7 @@ class FifoSensor(ABC):
 
     options_model: ClassVar[type[Options]]
     word_bytes: ClassVar[int]  # bytes that the FIFO stores at a time
+    filter_settings: ClassVar[tuple[str, ...]] = ()  # as in DeviceInfo, where the options tell the filters
 
     def __init__(
         self,
@@ -271,7 +272,7 @@ class FifoSensor(ABC):
 
     def _info(self, driver: str, rate_hz: float, found: Mapping[str, int]) -> DeviceInfo:
         """Build the result of `open`; `found` are registers that were read but not set, by name."""
-        counts_per_g = self._counts_per_g()
+        counts_per_g, filters = self._counts_per_g(), self._options.known_filters
         registers = dict(found) | dict(self._settings().values())
         return DeviceInfo(
             driver=driver,
@@ -283,4 +284,6 @@ class FifoSensor(ABC):
             range_mps2=-self._limits()[0] / counts_per_g * STANDARD_GRAVITY_MPS2,
             nominal_sensitivity=counts_per_g / STANDARD_GRAVITY_MPS2,
             settings={name: f"0x{value:02X}" for name, value in registers.items()},
+            filters=filters,
+            filter_settings=self.filter_settings if filters else (),
         )

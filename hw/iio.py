@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import math
 import os
 import time
 from collections import deque
@@ -26,6 +27,8 @@ LONGEST_GAP = 100  # samples; the length of a longer gap is uncertain if the rat
 AXES = ("accel_x", "accel_y", "accel_z")
 OFF = ("in_accel_x_calibbias", "in_accel_y_calibbias", "in_accel_z_calibbias")
 HIGH_PASS = "in_accel_filter_high_pass_3db_frequency"
+LOW_PASS = "in_accel_filter_low_pass_3db_frequency"
+LOWEST_STATED_HZ = 1.0  # of the corners: a lower one remembers longer than the windows can spare
 
 
 class IioOptions(Options):
@@ -81,6 +84,7 @@ class Iio:
             self._file = os.open(DEV / self._directory.name, os.O_RDONLY | os.O_NONBLOCK)
             settings = self._configure()
             scale = _number(self._directory / "in_accel_scale") if "in_accel_scale" in settings else 0.0
+            filters = _filters(self._directory / LOW_PASS)
         except OSError as error:
             self.close()
             message = f"IIO device {self._options.device}: {error.filename or ''}: {error.strerror}"
@@ -103,6 +107,7 @@ class Iio:
             range_mps2=-self._cutter.lowest * scale if scale > 0 else None,
             nominal_sensitivity=1 / scale if scale > 0 else None,
             settings=settings,
+            filters=filters,
         )
 
     def close(self) -> None:
@@ -258,3 +263,15 @@ def _same_number(found: str, wanted: str) -> bool:
         return abs(float(found) - float(wanted)) <= 1e-3 * abs(float(wanted))
     except ValueError:
         return False
+
+
+def _filters(low_pass: Path) -> tuple[str, ...]:
+    """The low-pass filter that the kernel driver names in a file of sysfs, as in DeviceInfo; the high-pass one is off.
+
+    The kernel tells where the filter is 3 dB down and no order: the standard uncertainty is so large that first and
+    second order lie within U.
+    """
+    corner_hz = _number(low_pass) if low_pass.exists() else 0.0
+    if not LOWEST_STATED_HZ <= corner_hz < math.inf:
+        return ()
+    return (f"lowpass order=1 corner_hz={corner_hz:g} u_corner_pct=50",)

@@ -32,6 +32,11 @@ class Lsm6dsoOptions(FifoOptions):
     rate_hz: float = Field(833.0, description=f"one of {', '.join(f'{rate:g}' for rate in chip.RATES_HZ)}")
     range_g: Literal[2, 4, 8, 16] = Field(2, description="range, plus and minus")
 
+    @property
+    def known_filters(self) -> tuple[str, ...]:
+        """As ST's application note says."""
+        return chip.filters(self.rate_hz)
+
 
 class Lsm6dso(FifoSensor):
     """Reads FIFO_STATUS in one transfer, then the number of words that it states.

@@ -41,6 +41,15 @@ def actual_rate_hz(rate_hz: float, freq_fine: int) -> float:
     return float(_INTERNAL_HZ * (1 + _FINE_STEP * signed) / divider)
 
 
+def filters(rate_hz: float) -> tuple[str, ...]:
+    """The filter at an output data rate, as in DeviceInfo.
+
+    AN5192, accelerometer bandwidth: without the second filter the bandwidth is half the output data rate. It tells no
+    order: the standard uncertainty is so large that first and second order lie within U.
+    """
+    return (f"lowpass order=1 corner_hz={rate_hz / 2.0:g} u_corner_pct=50",)
+
+
 def self_test(rate_hz: float) -> SelfTest:
     """Positive self-test. Data sheet DS12140, table 2: 50 to 1700 mg at any range.
 

@@ -20,6 +20,7 @@ from hw.vendor_library import vendor_library
 
 BASE_RATE_HZ, DIVIDERS = 51_200.0, range(1, 257)
 RATE_TOLERANCE = 1e-3
+FILTER_SAMPLES = 39  # by which the board's filter delays
 SYNC_POLL_S, SYNC_POLLS = 0.01, 200  # the converters need 128 periods to synchronise: 0.64 s at the slowest rate
 MV_PER_V = 1e3
 UNSCALED = 1000.0  # mV per unit: the library then returns volts
@@ -54,6 +55,11 @@ class Mcc172Options(Options):
     def tells_sensitivity(self) -> bool:
         """It tells mV; the sensitivity is that of the sensor behind it."""
         return False
+
+    @property
+    def known_filters(self) -> tuple[str, ...]:
+        """The delay of the board's filter. Of the sensor behind the board nothing is known, nor of its corner."""
+        return (f"delay delay_s={FILTER_SAMPLES / self.rate_hz:.6g}",)
 
 
 class Mcc172(BufferedSensor):
@@ -90,6 +96,7 @@ class Mcc172(BufferedSensor):
             axes=1,
             nominal_rate_hz=options.rate_hz,
             settings=settings,
+            filters=options.known_filters,
         )
 
     def _configure(self, library: Any) -> dict[str, str]:

@@ -34,6 +34,11 @@ class Mpu6050Options(FifoOptions):
     range_g: Literal[2, 4, 8, 16] = Field(2, description="range, plus and minus")
     clone: bool = Field(False, description="treat a part with an unknown WHO_AM_I as an MPU-6500")
 
+    @property
+    def known_filters(self) -> tuple[str, ...]:
+        """As the register maps say; nothing is known of a clone."""
+        return () if self.clone else chip.filters(self.rate_hz)
+
 
 class Mpu6050(FifoSensor):
     """Reads the overflow flag and the byte count in one transfer, then the bytes of all complete samples.
@@ -45,6 +50,7 @@ class Mpu6050(FifoSensor):
 
     options_model = Mpu6050Options
     word_bytes = chip.SAMPLE_BYTES
+    filter_settings = ("SMPLRT_DIV", "CONFIG", "ACCEL_CONFIG_2")
     _part = chip.PARTS[0x68]
 
     def _kind(self) -> str:

@@ -70,6 +70,15 @@ def low_pass_code(rate_hz: float) -> int:
     return min((code for code, hz in _BANDWIDTH_HZ.items() if hz <= rate_hz / 2), default=6)
 
 
+def filters(rate_hz: float) -> tuple[str, ...]:
+    """The filter at a sample rate, as in DeviceInfo.
+
+    The register maps tell the bandwidth of each code, which differs by up to 15 % between the parts, and no order: the
+    standard uncertainty is so large that first and second order lie within U.
+    """
+    return (f"lowpass order=1 corner_hz={_BANDWIDTH_HZ[low_pass_code(rate_hz)]:g} u_corner_pct=50",)
+
+
 def settings(part: Part, rate_hz: float, range_g: int) -> dict[int, tuple[str, int]]:
     """Register -> (name, value) while measuring: only the accelerometer in the FIFO, no self-test.
 

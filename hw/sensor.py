@@ -58,6 +58,11 @@ class Options(BaseModel):
         """What the certificate's sensitivity must state where this device is a reference; "" where 1 may be right."""
         return ""
 
+    @property
+    def known_filters(self) -> tuple[str, ...]:
+        """The filters of the device as these options set it, as in DeviceInfo; empty where they are not known."""
+        return ()
+
 
 @runtime_checkable
 class Sensor(Protocol):

@@ -15,7 +15,7 @@ from hw.block import LARGEST, BlockFlags, DeviceInfo
 from hw.cutting import Break, Cutter, follow
 from hw.frame_stream import Decoded, FrameStream
 from hw.frames import CHECKSUMS, WIDTH, ByteOrder, ChecksumName, Found, Layout, NumberType, numbers
-from hw.serial_sensor import LONGEST_GAP_S, SerialOptions, SerialSensor
+from hw.serial_sensor import LONGEST_GAP_S, Filters, SerialOptions, SerialSensor
 from hw.units import Unit, asked_of_certificate, nominal_sensitivity, tells_sensitivity
 
 BITS_A_BYTE = 10  # with start and stop bit
@@ -58,6 +58,7 @@ class SerialBinaryOptions(SerialOptions):
     unit: Unit = Field("count", description="of the indications")
     full_scale: float | None = Field(None, gt=0, description="indications of this size or more are saturated")
     serial_number: str = Field("", description="of the device, as on its label")
+    filters: Filters = ()
 
     @field_validator("start")
     @classmethod
@@ -88,6 +89,11 @@ class SerialBinaryOptions(SerialOptions):
                 f"{bits_hz:g} bit/s; baud_rate is only {self.baud_rate}"
             )
         return self
+
+    @property
+    def known_filters(self) -> tuple[str, ...]:
+        """As the user states them."""
+        return self.filters
 
     @property
     def tells_sensitivity(self) -> bool:

@@ -10,7 +10,7 @@ import time
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
-from typing import Any, ClassVar, Protocol
+from typing import Annotated, Any, ClassVar, Protocol
 
 import serial
 from pydantic import Field
@@ -36,6 +36,14 @@ def reason_of(error: Exception) -> str:
     if number == errno.EWOULDBLOCK:
         return "another program has locked it"
     return os.strerror(number) if number else str(error)
+
+
+Filters = Annotated[
+    tuple[str, ...],
+    Field(
+        max_length=8, description="known filters of the device, of its data sheet, as 'lowpass order=2 corner_hz=31'"
+    ),
+]
 
 
 class SerialOptions(Options):
@@ -177,4 +185,10 @@ class SerialSensor(ABC):
         """Build the result of `open`; `known` are its fields except driver, rate and the settings of the port."""
         options = self._options
         port = {"port": options.port, "baud_rate": str(options.baud_rate)}
-        return DeviceInfo(driver=driver, nominal_rate_hz=options.rate_hz, settings=port | settings, **known)
+        return DeviceInfo(
+            driver=driver,
+            nominal_rate_hz=options.rate_hz,
+            settings=port | settings,
+            filters=options.known_filters,
+            **known,
+        )

@@ -11,7 +11,7 @@ from pydantic import Field
 from hw.block import DeviceInfo
 from hw.cutting import Cutter
 from hw.line_stream import LineStream
-from hw.serial_sensor import LONGEST_GAP_S, SerialOptions, SerialSensor
+from hw.serial_sensor import LONGEST_GAP_S, Filters, SerialOptions, SerialSensor
 from hw.units import Unit, asked_of_certificate, nominal_sensitivity, tells_sensitivity
 
 
@@ -26,6 +26,12 @@ class SerialCsvOptions(SerialOptions):
     unit: Unit = Field("m/s2", description="of the indications")
     full_scale: float | None = Field(None, gt=0, description="indications of this size or more are saturated")
     serial_number: str = Field("", description="of the device, as on its label")
+    filters: Filters = ()
+
+    @property
+    def known_filters(self) -> tuple[str, ...]:
+        """As the user states them."""
+        return self.filters
 
     @property
     def tells_sensitivity(self) -> bool:

@@ -57,6 +57,8 @@ def stated(channel: Channel, directory: Path) -> list[str]:
     options += [f"--gravity={channel.gravity_mps2!r}", f"--static-sign={channel.static_sign:+d}"]
     if kind != "gravity":
         options.append(f"--reference={directory / 'reference.csv'}")
+        options += [f"--sensor-filter={line}" for line in channel.prior.filters]
+        options += [f"--reference-filter={line}" for line in channel.certificate.filters]
     if channel.rotation is not None:
         options += ["--rotation=" + ",".join(map(repr, channel.rotation)), "--reference-coupling=dc"]
     one_each = {s.option: s for s in PRIORS.values() if s.option and s.configuration}

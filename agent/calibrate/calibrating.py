@@ -70,11 +70,30 @@ def _stated(
 ) -> tuple[Options, PosesFile]:
     """The options and the poses, with what the metadata of a station say. Raises TableError."""
     stated = by_metadata(options, sensor.components, reference.components if reference is not None else ())
+    stated = _with_filters(stated, sensor, reference)
     if poses is None and reference is not None and reference.components and sensor.components:
         values = pose_of_station(sensor.components, reference.components, stated)
         row = PoseRow(*ends_s(reference.time_s), values)
         return stated, PosesFile.of_metadata(Poses("the metadata", [row]))
     return stated, PosesFile(poses)
+
+
+def _with_filters(options: Options, sensor: SensorFile, reference: ReferenceFile | None) -> Options:
+    """The options with the filters that drivers state in recordings, where they and the certificate state none."""
+    if reference is None or options.method != 3 or options.plain:
+        return options
+    certificate = options.reference_certificate
+    certified = certificate is not None and bool(certificate.filters)
+    of_sensor = () if options.sensor_filter else sensor.filters
+    of_reference = () if options.reference_filter or certified else reference.filters
+    for name, lines in (("sensor", of_sensor), ("reference", of_reference)):
+        for line in lines:
+            say(f"--{name}-filter '{line}', as its driver states in the recording", err=True)
+    return replace(
+        options,
+        sensor_filter=options.sensor_filter or of_sensor,
+        reference_filter=options.reference_filter or of_reference,
+    )
 
 
 def _check_metadata(params: dict[str, Any]) -> None:

@@ -34,16 +34,18 @@ ELECTRICAL = ("indication", "count")
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorFile(SensorTable):
     """The samples of a sensor's file. `components`: what the metadata of a station say of the three outputs; empty
-    where there are none."""
+    where there are none. `filters`: the known filters that its driver states in a recording of `fieldcal run`."""
 
     components: tuple[Component, ...] = ()
+    filters: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReferenceFile(ReferenceTable):
-    """The samples of a reference's file. `components` as those of a sensor."""
+    """The samples of a reference's file. `components` and `filters` as those of a sensor."""
 
     components: tuple[Component, ...] = ()
+    filters: tuple[str, ...] = ()
 
 
 def read_sensor(
@@ -58,8 +60,9 @@ def read_sensor(
         chosen = choice.in_one_group(_sensor_columns)
         times, values = _rows(source, chosen, progress, np.ones(len(chosen) - 1))
         said, components = _described(source, choice, chosen[1:4])
+        filters = source.filters.get(chosen[1].column.group, ())
     temperature_degc = Spooled(values, 3) if len(chosen) > 4 else None
-    return SensorFile(str(path), times, Spooled(values, slice(0, 3)), temperature_degc, said, components)
+    return SensorFile(str(path), times, Spooled(values, slice(0, 3)), temperature_degc, said, components, filters)
 
 
 def _described(
@@ -111,9 +114,10 @@ def read_reference(
         scale = np.array([_si(choice, c, sensitivity) for c in chosen[1:]])
         times, values = _rows(source, chosen, progress, scale)
         said, components = _described(source, choice, chosen[1:])
+        filters = source.filters.get(chosen[1].column.group, ())
     column, header = str(chosen[1].column), source.header
     channels = Spooled(values, slice(None))
-    return ReferenceFile(str(path), times, channels, quantity, column, header, said, components)
+    return ReferenceFile(str(path), times, channels, quantity, column, header, said, components, filters)
 
 
 def _reference_columns(choice: Choice, sensitivity: Sensitivity | None) -> tuple[list[Chosen], str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -15,7 +16,7 @@ import click
 import numpy as np
 
 from agent.cli.finite import Finite
-from agent.cli.led import ask, check_stated, made, opened, parsed, progress
+from agent.cli.led import ask, check_stated, made, opened, parsed, progress, with_filters
 from agent.config import Channel, Config, ConfigError, load_config, parse_config
 from agent.terminal.text import say
 
@@ -177,6 +178,7 @@ def _led(
     try:
         with Capture(settings, devices) as capture:
             info = opened(capture, devices)
+            channel = with_filters(channel, capture)
             output.mkdir(parents=True)
             scale = write_prior(channel, info.get("nominal_sensitivity"), output / "prior.json")
             arguments = [*stated(channel, output), f"--json={output / 'result.json'}"]
@@ -230,7 +232,7 @@ def _measured(
             if dialogue.taken:
                 time.sleep(measuring.margin_s)  # for the samples that filters need after a stop
                 measuring.write(capture.record(), dialogue.taken, output)
-                say("the samples are kept; the result is made by: fieldcal calibrate " + " ".join(arguments))
+                say("the samples are kept; the result is made by: fieldcal calibrate " + shlex.join(arguments))
     return bool(dialogue.taken)
 
 

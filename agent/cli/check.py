@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import click
 
 from agent.config import Config, ConfigError, load_config
 from agent.config.tls import expiry_warning
+from agent.setup.known_filters import stated_filters
 from agent.terminal.quantity import counted
 from agent.terminal.text import say
 
@@ -21,8 +23,11 @@ from agent.terminal.text import say
 def check(config: Path, json_to: str | None) -> int:
     """Report every fault in CONFIG, with its line, its setting and what to do. Exit status 2 if there is a fault.
 
+    Of a good one, tell which filters of each device are divided out, and who states them.
+
     JSON: `good`, `faults` and `warnings` (lists of texts), and of a good one `devices`, `channels`, `poses` and
-    `positions` (their numbers).
+    `positions` (their numbers), and `filters` (of each sensor and reference: `sensor` of the channel, `device`,
+    `lines`, `stated_by`).
     """
     try:
         loaded = load_config(config)
@@ -40,14 +45,18 @@ def check(config: Path, json_to: str | None) -> int:
         "poses": sum(len(channel.poses) for channel in loaded.channels),
         "positions": sum(len(channel.stops) for channel in loaded.channels),
     }
+    filters = list(stated_filters(loaded))
     if json_to:
-        click.echo(json.dumps({"good": True, "faults": [], "warnings": warnings, **counts}))
+        more = {**counts, "filters": [asdict(one) for one in filters]}
+        click.echo(json.dumps({"good": True, "faults": [], "warnings": warnings, **more}))
         return 0
     for warning in warnings:
         say(warning, err=True)
     told = [counted(count, name) for name, count in counts.items() if count or name in ("devices", "channels")]
     found = ", which the agent finds by gravity" if counts["positions"] else ""
     say(f"{config}: good; {', '.join(told)}{found}")
+    for one in dict.fromkeys(one.told for one in filters):
+        say(f"  {one}")
     return 0
 
 

@@ -40,11 +40,13 @@ def convert(file: Path, output: Path, role: str, columns: str | None, sensitivit
     try:
         if role == "sensor":
             sensor = sensor_of(file, columns, None, described)
+            filters = sensor.filters
             names, values = [*SENSOR], [sensor.time_s, sensor.v]
             if sensor.temperature_degc is not None:
                 names, values = [*names, TEMPERATURE], [*values, sensor.temperature_degc]
         else:
             reference = reference_of(file, columns, sensitivity, None, described)
+            filters = reference.filters
             names = ["time_s", *_names(reference.quantity, reference.channels)]
             values = [reference.time_s, reference.x]
         rows = _write(output, names, values)
@@ -55,6 +57,8 @@ def convert(file: Path, output: Path, role: str, columns: str | None, sensitivit
         say(f"fieldcal convert: {output}: the file exists; remove it, or choose another name", err=True)
         return 2
     say(f"{output}: {rows} rows of {','.join(names)}")
+    for line in filters:
+        say(f"its driver states a filter, which the CSV cannot hold; calibrate with --{role}-filter '{line}'", err=True)
     return 0
 
 

@@ -19,6 +19,7 @@ from agent.config.sinks import Zenoh
 from agent.setup import channel as tables
 from agent.setup.asking import Asking, Stated, driver_options
 from agent.setup.devices import TEXT_LINES, Chosen, Found, Role, complete, listen, tables_of
+from agent.setup.known_filters import stated_filters
 from agent.setup.toml import written
 from agent.terminal.text import say
 from calib.signal.instrument import QUANTITIES
@@ -139,7 +140,7 @@ def init(config: Path, **given: Any) -> int:
 def _write(path: Path, text: str) -> int:
     """Check the text as `fieldcal check` does, and write it to a new file."""
     try:
-        parse_config(tomllib.loads(text), "what init would write", text)
+        made = parse_config(tomllib.loads(text), "what init would write", text)
     except ConfigError as error:
         for fault in error.faults:
             say(f"fieldcal init: {fault}", err=True)
@@ -150,6 +151,8 @@ def _write(path: Path, text: str) -> int:
     except OSError as error:
         say(f"fieldcal init: {path}: {error.strerror}", err=True)
         return 2
+    for one in stated_filters(made):
+        say(one.told)
     say(f"{path}: written; read it, then:")
     say(f"  fieldcal check {path}")
     say(f"  fieldcal run {path} --data-dir data")

@@ -11,6 +11,7 @@ from agent.terminal.text import for_drawing, say
 
 if TYPE_CHECKING:
     from agent.bench.capture import Capture
+    from agent.config import Channel
 
 OPEN_S = 20.0  # for the devices to be opened and to send their first block
 
@@ -26,6 +27,17 @@ def opened(capture: Capture, devices: list[str]) -> dict[str, Any]:
         time.sleep(0.1)
     silent = [device for device in devices if capture.newest_s(device) is None]
     raise ValueError(f"no samples of {', '.join(silent)} within {OPEN_S:g} s; `fieldcal probe` shows what answers")
+
+
+def with_filters(channel: Channel, capture: Capture) -> Channel:
+    """The channel with the filters that the drivers of the opened devices state, where it states none."""
+    from agent.core.driver_filters import DriverFilters
+
+    filters = DriverFilters(channel)
+    for device in (channel.sensor, channel.reference):
+        if device is not None and (fault := filters.hear(device, capture.info(device) or {})):
+            say(fault, err=True)
+    return filters.channel
 
 
 def parsed(arguments: list[str]) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import shlex
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -16,7 +17,7 @@ import click
 import numpy as np
 
 from agent.cli.finite import Finite
-from agent.cli.led import ask, check_stated, made, opened, parsed, progress
+from agent.cli.led import ask, check_stated, made, opened, parsed, progress, with_filters
 from agent.config import Channel, Config, ConfigError, load_config, parse_config
 from agent.terminal.text import say
 
@@ -152,6 +153,7 @@ def _visit(
     devices = [channel.sensor, channel.reference]
     with Capture(settings, devices) as capture:
         write_prior(channel, opened(capture, devices).get("nominal_sensitivity"), output / "prior.json")
+        channel = with_filters(channel, capture)
         arguments = [*stated(channel, output), f"--json={output / 'result.json'}"]
         measuring = Measuring(channel, options_of(parsed(arguments)))
         across = options["u_transverse_pct"]
@@ -190,7 +192,7 @@ def _result(
     if visited.taken is None:
         reasons = [sentence for _, sentence in visited.found] or ["this sensor was left out"]
         return told | {"status": "refused", "reasons": reasons}
-    tell(f"  the samples are kept; the result is made by: fieldcal calibrate {' '.join(arguments)}")
+    tell(f"  the samples are kept; the result is made by: fieldcal calibrate {shlex.join(arguments)}")
     to_error = contextlib.redirect_stdout(sys.stderr) if options["apart"] else contextlib.nullcontext()
     with to_error:
         made(parsed(arguments), output, options["stated"])

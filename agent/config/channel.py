@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Literal
 
 from pydantic import Discriminator, FailFast, Field, Tag, model_validator
@@ -87,6 +88,17 @@ class Channel(Knowledge):
             "rotation": check.rotation or self.rotation,
         }
         return [self, self.model_copy(update=other)]
+
+    def with_filters_of(self, drivers: Mapping[str, tuple[str, ...]]) -> Channel:
+        """The channel with the filters that drivers state, by device, where the configuration states none."""
+        filled: dict[str, Section] = {}
+        if not self.prior.filters:
+            filled["prior"] = self.prior.model_copy(update={"filters": drivers.get(self.sensor, ())})
+        filled["certificate"] = self.certificate.with_filters(drivers.get(self.reference or "", ()))
+        if (check := self.check_reference) is not None:
+            certificate = check.certificate.with_filters(drivers.get(check.device, ()))
+            filled["check_reference"] = check.model_copy(update={"certificate": certificate})
+        return self.model_copy(update=filled)
 
     @model_validator(mode="after")
     def _second_reference(self) -> Channel:

@@ -10,6 +10,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from agent.config.certified import filled_in
+from agent.config.filters import FiltersError, filters_of
 from agent.config.key_file import KeyFileError, load_private_key
 from agent.config.known_keys import read_known_keys
 from agent.config.lines import Path
@@ -60,8 +61,11 @@ def _options(raw: Mapping[str, Any], faults: list[Told]) -> Iterator[tuple[str, 
         try:
             held = load_driver(driver).options_model.model_validate(options)
             held.check_installed()
+            filters_of(held.known_filters)
         except DeviceError as error:
             faults.append((("devices", i, "driver"), str(error)))
+        except FiltersError as error:
+            faults.append((("devices", i, "options", "filters"), str(error)))
         except ValidationError as error:
             faults += [(("devices", i, "options", *path), what) for path, what in told(error, options)]
         except (Exception, SystemExit) as error:  # of a plug-in

@@ -18,6 +18,22 @@ def _filter(text: str) -> str:
     return text
 
 
+class FiltersError(ValueError):
+    """What a driver states of its filters cannot be used; the text says why."""
+
+
+def filters_of(stated: object) -> tuple[str, ...]:
+    """The lines that a driver states, if each is a filter. Raises FiltersError."""
+    if not isinstance(stated, list | tuple) or not all(isinstance(line, str) for line in stated):
+        raise FiltersError("a list of texts is needed, one for each filter")
+    if len(stated) > MOST_FILTERS:
+        raise FiltersError(f"there are {len(stated)} filters, at most {MOST_FILTERS} are allowed")
+    try:
+        return tuple(map(_filter, stated))
+    except ValueError as error:
+        raise FiltersError(str(error)) from None
+
+
 Filters = Annotated[
     tuple[Annotated[str, AfterValidator(_filter)], ...],
     Field(max_length=MOST_FILTERS, description="known filters, one after the other, as 'lowpass order=2 corner_hz=31'"),

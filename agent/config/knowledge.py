@@ -138,6 +138,10 @@ class Certificate(Section):
         table = () if self.response is None else (self.response.filter(),)
         return (*map(filter_of, self.filters), *table)
 
+    def with_filters(self, stated: tuple[str, ...]) -> Certificate:
+        """The certificate with the filters that the driver of the reference states, where it states none itself."""
+        return self if self.known_filters else self.model_copy(update={"filters": stated})
+
     @property
     def date(self) -> datetime | None:
         """The date `calibrated`, midnight UTC; None where it is not stated."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from agent.config import Config
+from agent.core.driver_filters import DriverFilters
 from agent.core.estimation import Estimation
 from agent.core.references import References
 from agent.core.snapshot import pack, unpack
@@ -19,8 +20,10 @@ def anew(config: Config, snapshot: bytes) -> bytes:
     for channel in config.channels:
         held = state["channels"][channel.sensor]
         if held["estimation"] is not None:
-            estimation, references = Estimation(channel, held["nominal"]), References(channel)
+            filters, references = DriverFilters(channel), References(channel)
+            filters.load(held["filters"])
             references.load(held)
+            estimation = Estimation(filters.channel, held["nominal"])
             references.meet(estimation)
             held["estimation"] = estimation.snapshot()
             held["status"] = "INVALID" if held["status"] == "INVALID" else estimation.gate.status

@@ -10,12 +10,13 @@ import msgspec
 
 from agent.config import Channel
 from agent.core.clocks import Clocks
-from agent.core.corrected import acceleration_block
+from agent.core.corrected import accelerations
+from agent.core.driver_filters import DriverFilters
 from agent.core.estimation import DAY_S, Estimation
-from agent.core.events import Acceleration, CalibrationUpdate, Command, DeviceChange, Estimate, Output, Result, Tick
+from agent.core.events import CalibrationUpdate, Command, DeviceChange, Estimate, Output, Result, Tick
 from agent.core.fault import told
-from agent.core.identity import identity_of, nominal_of
-from agent.core.kept import keep, plain, shelved, take_up, update_of
+from agent.core.identity import device_of, identity_of, nominal_of
+from agent.core.kept import keep, kept_as, plain, restated, shelved, take_up, update_of
 from agent.core.operators import CommandError, answer, commanded_pose
 from agent.core.outcome import Source, again, calibration_update, drift_report, estimate, status_change, window_report
 from agent.core.references import References
@@ -26,8 +27,6 @@ from calib.model import Calibration, Pose, Window
 from hw.block import SampleBlock
 
 REFUSED_IN_A_ROW = 3
-# Longest pause between two runs that is believed. A longer one means that a clock was wrong, and counts as no pause.
-LONGEST_PAUSE_DAYS = 3650.0
 
 
 class ChannelState:
@@ -40,9 +39,9 @@ class ChannelState:
     def __init__(self, channel: Channel) -> None:
         self._channel = channel
         self.sensor = channel.sensor
-        self.identity = ""
-        self._streams = Streams(channel)
-        self._unit = ""
+        self.identity, self._device = "", ""  # the device is the identity without the settings of its filters
+        self._filters = DriverFilters(channel)
+        self._streams, self._unit = Streams(channel), ""
         self._nominal: float | None = None  # sensitivity by the data sheet of the device
         self._references = References(channel)
         self._estimation: Estimation | None = None
@@ -51,8 +50,7 @@ class ChannelState:
         self._first_day = 0.0  # days that the estimation had counted when this run began
         self._status = ""  # no status was published yet
         self._refused = 0  # how many windows in a row were refused
-        self._clocks = Clocks()
-        self._time = RunTime()
+        self._clocks, self._time = Clocks(), RunTime()
 
     def begin(self, origin_ns: int, kept: Mapping[str, bytes]) -> None:
         """Begin a new run. Seconds count from `origin_ns`. `kept`: a state (`memory`) for each identity of a sensor."""
@@ -74,12 +72,12 @@ class ChannelState:
                 self._estimation.gate.regain("")
                 results += self._say_status(f"{self.sensor} sends data again")
             self._streams.look_where(block, self._estimation)
-            results += self._corrected(block, self._estimation)
+            taken = self._streams.by_device[self.sensor], self._time.origin_utc_ns
+            results += accelerations(block, *taken, self._channel, self._estimation, self._in_force)
         return results + list(self._close_windows()) + self._clock_reports()
 
     def on_tick(self, tick: Tick) -> list[Result]:
-        """Time passed: windows whose samples come too late are refused; a sensor without data gets the status
-        INVALID."""
+        """Time passed: windows whose samples come too late are refused; a sensor without data becomes INVALID."""
         self._time.update(tick.t_monotonic_ns, tick.t_utc_ns)
         return list(self._close_windows()) + self._watch_silence() + self._explain() + self._clock_reports()
 
@@ -124,42 +122,54 @@ class ChannelState:
 
     def _identify(self, info_json: str) -> list[Result]:
         info, identity = json.loads(info_json), identity_of(info_json)
-        reason = f"{self.sensor} opened"
-        results: list[Result] = []
+        reason, results = f"{self.sensor} opened", list[Result]()
         if self._estimation is None or identity != self.identity:
+            belongs = ", ".join(sorted(self._kept))
             if self._estimation is not None:
                 self._kept = shelved(self._kept, self.identity, self.memory())
                 self._streams.forget_sensor()
+                belongs, self._estimation = "", None
                 reason = f"{self.sensor} is another device now: {identity} instead of {self.identity}"
-            elif self._kept and identity not in self._kept:
-                reason = (
-                    f"the stored calibration belongs to {', '.join(sorted(self._kept))}, but this device is {identity}"
-                )
-            self.identity, self._unit, self._in_force = identity, info["unit"], None
+            known_as = kept_as(self._kept, identity, device_of(info))
+            if belongs and not known_as:
+                reason = f"the stored calibration belongs to {belongs}, but this device is {identity}"
+            self.identity, self._device, self._unit, self._in_force = identity, device_of(info), info["unit"], None
+            results += self._hear_filters(self.sensor, info)
             self._status = "" if self._status == "INVALID" else self._status  # the silent device was another one
             try:
                 self._nominal = nominal_of(info)
-                self._estimation = Estimation(self._channel, self._nominal)
+                self._estimation = Estimation(self._filters.channel, self._nominal)
             except ValueError as error:
-                self._estimation = None
                 return self._change("INVALID", str(error))
-            if identity in self._kept:
-                results, reason = self._remember(self._kept.pop(identity))
+            if known_as:
+                found, reason = self._remember(self._kept.pop(known_as))
+                results += found
             results += self._meet_references()
+        else:
+            results += self._hear_filters(self.sensor, info)
         if self._status == "INVALID":
             # An open port does not prove that the sensor sends data: the status stays INVALID until a block comes.
             self._estimation.gate.lose("")
         return results + self._say_status(reason)
 
     def _identify_reference(self, device: str, info_json: str) -> list[Result]:
-        place, before = self._references.identify(device, info_json)
-        now, not_certified = self._references.identities[place], self._references.not_certified[place]
-        results = self._meet_references()
+        before, now, not_certified = self._references.identify(device, info_json)
+        results = self._hear_filters(device, json.loads(info_json))
         if not before or before == now:
             return results + ([self._told(f"S and Q are not updated: {not_certified}")] if not_certified else [])
         self._streams.by_device[device].clear()
         reason = not_certified or f"the reference is another device now: {now} instead of {before}"
         return results + (self._say_status(reason) or [self._told(reason)])
+
+    def _hear_filters(self, device: str, info: Mapping[str, Any]) -> list[Result]:
+        """What the driver of a device that was opened states of its filters; other ones are another response."""
+        before, told, changed = self._filters.channel, self._filters.hear(device, info), False
+        if (now := self._filters.channel) is not before:
+            self._streams.state(now)
+            if self._estimation is not None:
+                self._estimation, told, changed = restated(self._estimation, before, now, self._nominal, told)
+        results = [self._told(told)] if told else []
+        return [*results, *([self._put_in_force()] if changed else []), *self._meet_references()]
 
     def _meet_references(self) -> list[Result]:
         return [self._put_in_force()] if self._references.meet(self._estimation) else []
@@ -194,16 +204,6 @@ class ChannelState:
 
     def _told(self, reason: str) -> Result:
         return status_change(self._source(), self._status or "UNCALIBRATED", self._status, reason)
-
-    def _corrected(self, block: SampleBlock, estimation: Estimation) -> list[Acceleration]:
-        if self._channel.acceleration == "off":
-            return []
-        found = acceleration_block(
-            block, self._streams.by_device[self.sensor], self._time.origin_utc_ns,
-            estimation.law, estimation.residual_sd, self._in_force,
-            dynamic_only=self._channel.coupling == "ac", recorded=self._channel.acceleration == "record",
-        )  # fmt: skip
-        return [] if found is None else [found]
 
     # --- windows
 
@@ -261,8 +261,7 @@ class ChannelState:
         yield from self._say_status(decision.reason)
 
     def _put_in_force(self, earlier: CalibrationUpdate | None = None) -> CalibrationUpdate:
-        """The update that puts the estimation's calibration in force. `earlier` is the update that made this
-        calibration, if it was made before."""
+        """The update that puts the estimation's calibration in force. `earlier` made it, if it was made before."""
         assert self._estimation is not None
         update = self._update(self._estimation.in_force)
         self._in_force = update if earlier is None else again(update, earlier)
@@ -292,7 +291,7 @@ class ChannelState:
         """State of the device that is connected now, for later runs."""
         assert self._estimation is not None
         day = self._first_day + self._time.now_s / DAY_S
-        return keep(self._channel, self._estimation, self._in_force, day, self._time.utc_ns)
+        return keep(self._filters, self._device, self._estimation, self._in_force, day, self._time.utc_ns)
 
     def memories(self) -> dict[str, bytes]:
         """`memory` by identity: of the device that is connected now and of those that were connected before."""
@@ -300,17 +299,17 @@ class ChannelState:
         return self._kept | ({self.identity: self.memory()} if taught else {})
 
     def _remember(self, memory: bytes) -> tuple[list[Result], str]:
-        kept = take_up(memory, self._channel, self._nominal)
+        kept = take_up(memory, self._filters, self._nominal)
+        self._streams.state(self._filters.channel)
         self._estimation = kept.estimation
         self._estimation.gate.regain("")
-        pause_days = (self._time.utc_ns - kept.t_utc_ns) * 1e-9 / DAY_S
-        pause_days = pause_days if 0.0 <= pause_days <= LONGEST_PAUSE_DAYS else 0.0
-        self._first_day = kept.day + pause_days - self._time.now_s / DAY_S
+        self._first_day = kept.first_day(self._time.utc_ns, self._time.now_s)
         if kept.in_force is None:
             return [], kept.reason
         if kept.moved:
             return [self._put_in_force()], kept.reason
-        self._in_force = again(msgspec.structs.replace(kept.in_force, t_utc_ns=self._time.utc_ns), kept.in_force)
+        now = {"t_utc_ns": self._time.utc_ns, "identity": self.identity}
+        self._in_force = again(msgspec.structs.replace(kept.in_force, **now), kept.in_force)
         return [self._in_force], kept.reason
 
     def snapshot(self) -> dict[str, Any]:
@@ -320,6 +319,8 @@ class ChannelState:
             **self._streams.snapshot(),
             "unit": self._unit,
             "identity": self.identity,
+            "device": self._device,
+            "filters": self._filters.snapshot(),
             **self._references.snapshot(),
             "nominal": self._nominal,
             "estimation": None if self._estimation is None else self._estimation.snapshot(),
@@ -334,15 +335,16 @@ class ChannelState:
     def load(self, state: Mapping[str, Any]) -> None:
         """Take the state that `snapshot` gave."""
         self._time.load(state)
+        self._filters.load(state["filters"])
+        self._streams.state(self._filters.channel)
         self._streams.load(self._time.origin_ns, state)
-        self._unit, self.identity = state["unit"], state["identity"]
+        self._unit, self.identity, self._device = state["unit"], state["identity"], state["device"]
         self._references.load(state)
         self._nominal, self._estimation = state["nominal"], None
         if state["estimation"] is not None:
-            self._estimation = Estimation(self._channel, self._nominal)
+            self._estimation = Estimation(self._filters.channel, self._nominal)
             self._estimation.load(state["estimation"])
         self._in_force = update_of(state["in_force"])
         self._kept = dict(state["kept"])
-        self._first_day, self._status = state["first_day"], state["status"]
-        self._refused = state["refused"]
+        self._first_day, self._status, self._refused = state["first_day"], state["status"], state["refused"]
         self._clocks.load(state)

@@ -266,13 +266,17 @@ class Estimation:
     def restate(self, gravity_mps2: tuple[float, float] | None, *, remounted: bool, size: float | None = None) -> bool:
         """After `load` of a state that was made with another configuration: see Recursion.restate.
 
-        `remounted`: the stated poses changed. `size`: other filters are stated, and those of the sensor pass so many
+        `remounted`: the stated poses changed. `size`: other filters are known, and those of the sensor pass so many
         times what they did. Returns whether the calibration in force changed.
         """
         follows = self._follows_state()
         if size is not None:
-            S = self.recursion.result().sensitivity.ravel()
-            self.recursion.loosen(np.append((size - 1.0) * S, np.zeros(3)), line=True, another_filter=True)
+            u_S = (size - 1.0) * self.recursion.result().sensitivity.ravel()
+            for place in range(len(self._beside)):
+                self.use(place)
+                self.recursion.loosen(np.append(u_S, np.zeros(3)), line=True, another_filter=True)
+                u_S = np.zeros(9)
+            self.use(0)
             self._held = []
         if remounted:
             self.recursion.remount(of_reference=False)

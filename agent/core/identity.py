@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from typing import Any
 
 from agent.config.knowledge import Certificate
@@ -15,8 +15,18 @@ WAYS = frozenset({"port", "baud_rate", "bus"})
 
 def identity_of(info_json: str) -> str:
     """Identity of a device with its settings. A calibration is valid for this identity only."""
-    info = json.loads(info_json)
-    settings = {k: v for k, v in info["settings"].items() if k not in WAYS}
+    return _identity(json.loads(info_json), WAYS)
+
+
+def device_of(info: Mapping[str, Any]) -> str:
+    """The same without the settings that change nothing but the rate and the filters that the driver states: a
+    calibration stays valid but for what the filters change."""
+    named = info.get("filter_settings", ())
+    return _identity(info, WAYS.union(name for name in named if isinstance(name, str)))
+
+
+def _identity(info: Mapping[str, Any], but: Set[str]) -> str:
+    settings = {k: v for k, v in info["settings"].items() if k not in but}
     held = [info["driver"], info["kind"], info["serial_number"], info["unit"], info["axes"], sorted(settings.items())]
     digest = hashlib.sha256(json.dumps(held).encode()).hexdigest()[:12]
     return " ".join(part for part in (info["kind"], info["serial_number"], digest) if part)

@@ -20,7 +20,8 @@ from agent.config import Channel
 from agent.config.knowledge import Certificate, Prior
 from agent.config.pose import Stop
 from agent.config.section import Section
-from agent.core.estimation import Estimation
+from agent.core.driver_filters import DriverFilters, alike
+from agent.core.estimation import DAY_S, Estimation
 from agent.core.events import CalibrationUpdate
 from agent.core.memory import MOST_MEMORIES
 from agent.core.outcome import calibration_of
@@ -34,6 +35,9 @@ MOUNT = frozenset(
     {"rotation", "rotation_gravity_mps2", "clamp_theta_deg", "poses", "positions", "fixed_mount", "check_rotation"}
 )
 WINDOWS = frozenset({"coupling", "static_sign"})  # by which windows are made, as is certificate.quantity
+# Longest pause between two runs that is believed. A longer one means that a clock was wrong, and counts as no pause.
+LONGEST_PAUSE_DAYS = 3650.0
+OTHER_FILTERS = "other filters are stated, so that response and lag are found anew"
 MALFORMED = (ValueError, KeyError, TypeError, AttributeError, IndexError)  # a state of other fields or shapes
 
 
@@ -53,19 +57,28 @@ class Kept:
     reason: str
     moved: bool = False
 
+    def first_day(self, t_utc_ns: int, now_s: float) -> float:
+        """Days that the estimation has counted when the seconds of this run begin; now, `now_s` of them have passed."""
+        pause_days = (t_utc_ns - self.t_utc_ns) * 1e-9 / DAY_S
+        pause_days = pause_days if 0.0 <= pause_days <= LONGEST_PAUSE_DAYS else 0.0
+        return self.day + pause_days - now_s / DAY_S
+
 
 def keep(
-    channel: Channel,
+    filters: DriverFilters,
+    device: str,
     estimation: Estimation,
     in_force: CalibrationUpdate | None,
     day: float,
     t_utc_ns: int,
 ) -> bytes:
-    """The state for `take_up`, as bytes."""
+    """The state for `take_up`, as bytes. `device` is the sensor, see agent.core.identity.device_of."""
     return pack(
         {
             "in_force": plain(in_force),
-            "basis": _basis(channel),
+            "basis": _basis(filters.configured),
+            "filters": filters.snapshot(),
+            "device": device,
             "estimation": estimation.snapshot(),
             "day": day,
             "t_utc_ns": t_utc_ns,
@@ -73,34 +86,42 @@ def keep(
     )
 
 
-def take_up(kept: bytes, channel: Channel, nominal: float | None) -> Kept:
-    """The estimation from the bytes of `keep`, as far as it is still valid. Raises ValueError as Estimation does."""
-    fresh = Estimation(channel, nominal)
+def take_up(kept: bytes, filters: DriverFilters, nominal: float | None) -> Kept:
+    """The estimation from the bytes of `keep`, as far as it is still valid. Raises ValueError as Estimation does.
+
+    What the drivers stated of devices that have not been opened yet is taken over into `filters`.
+    """
+    configured = filters.configured
     try:
         state = unpack(kept)
         in_force, day, t_utc_ns = update_of(state["in_force"]), float(state["day"]), int(state["t_utc_ns"])
     except MALFORMED as error:
-        return Kept(fresh, None, 0.0, 0, f"begun again from the prior: the stored state cannot be read: {_said(error)}")
+        reason = f"begun again from the prior: the stored state cannot be read: {_said(error)}"
+        return Kept(Estimation(filters.channel, nominal), None, 0.0, 0, reason)
     try:
-        changed = _changed(state["basis"], channel)
-        if wrong := _made_otherwise(changed, state["basis"], channel):
+        were = DriverFilters(_as_before(state["basis"], configured))
+        were.load(state["filters"])
+        filters.take({**were.by_device, **filters.by_device})
+        fresh = Estimation(filters.channel, nominal)
+        changed = _changed(state["basis"], configured)
+        if wrong := _made_otherwise(changed, state["basis"], configured):
             reason = f"begun again from the prior: windows were made with other settings: {', '.join(wrong)}"
             return Kept(fresh, None, day, t_utc_ns, reason)
         stated = fresh.recursion.result()
         fresh.load(state["estimation"])
         if "prior" in changed and (beyond := fresh.gate.anchor_at(stated, fresh.in_force)):
             reason = f"begun again from the prior: the calibration in force contradicts the changed prior: {beyond}"
-            return Kept(Estimation(channel, nominal), None, day, t_utc_ns, reason)
-        size = _size(state["basis"], channel, fresh.recursion.reference_frequency_hz)
-        gravity = _gravity(changed, state["basis"], channel)
+            return Kept(Estimation(filters.channel, nominal), None, day, t_utc_ns, reason)
+        size = _size(were.channel, filters.channel, fresh.recursion.reference_frequency_hz)
+        gravity = _gravity(changed, state["basis"], configured)
         moved = fresh.restate(gravity, remounted=bool(MOUNT & changed), size=size)
     except MALFORMED as error:
-        return _from_in_force(state, in_force, channel, nominal, day, t_utc_ns, _said(error))
+        return _from_in_force(state, in_force, filters.channel, nominal, day, t_utc_ns, _said(error))
     reason = "restored from the previous run"
     if changed:
         reason += f"; these settings have changed and were exchanged in the state: {', '.join(sorted(changed))}"
     if size is not None:
-        reason += "; other filters are stated, so that response and lag are found anew"
+        reason += f"; {OTHER_FILTERS}"
     return Kept(fresh, in_force, day, t_utc_ns, reason, moved)
 
 
@@ -128,6 +149,22 @@ def _from_in_force(
             return Kept(Estimation(channel, nominal), None, day, t_utc_ns, reason)
     fresh.roll_back(calibration_of(in_force))
     return Kept(fresh, in_force, day, t_utc_ns, f"begun again from the calibration in force: {why}")
+
+
+def kept_as(kept: Mapping[str, bytes], identity: str, device: str) -> str:
+    """The identity of the newest kept state of a sensor, with its present settings or with others of its filters; ""
+    where there is none."""
+    told = {name: _device_and_time(state) for name, state in kept.items()}
+    own = [name for name, (of, _) in told.items() if name == identity or of == device]
+    return max(own, key=lambda name: told[name][1], default="")
+
+
+def _device_and_time(kept: bytes) -> tuple[str, int]:
+    try:
+        state = unpack(kept)
+        return str(state["device"]), int(state["t_utc_ns"])
+    except MALFORMED:
+        return "", 0
 
 
 def shelved(kept: Mapping[str, bytes], identity: str, memory: bytes) -> dict[str, bytes]:
@@ -167,15 +204,35 @@ def _made_otherwise(changed: Iterable[str], before: Mapping[str, str], channel: 
     return found if quantity == channel.certificate.quantity else [*found, "certificate.quantity"]
 
 
-def _size(before: Mapping[str, str], channel: Channel, frequency_hz: float) -> float | None:
-    """What the sensor's stated filters pass at the frequency at which S holds, over what those before did; None if the
-    same filters are stated of both instruments."""
+def restated(
+    estimation: Estimation, before: Channel, channel: Channel, nominal: float | None, told: str
+) -> tuple[Estimation, str, bool]:
+    """The estimation where the driver of a device that was opened states other filters than were known `before`.
+
+    Also what the operator is told, besides `told`, and whether the calibration in force changed.
+    """
+    fresh = Estimation(channel, nominal)
+    fresh.load(estimation.snapshot())
+    if not fresh.recursion.windows:
+        return fresh, told, fresh.restate(None, remounted=False)
+    size = _size(before, channel, fresh.recursion.reference_frequency_hz)
+    changed = fresh.restate(None, remounted=False, size=size)
+    return fresh, "; ".join(filter(None, (told, OTHER_FILTERS))), changed
+
+
+def _as_before(before: Mapping[str, str], channel: Channel) -> Channel:
+    """The channel with the sections that state filters as they were in the configuration."""
     prior, certificate = (msgspec.json.decode(before[name]) for name in ("prior", "certificate"))
-    stated = Prior.model_validate(prior), Certificate.model_validate(certificate)
-    were = channel.model_copy(update=dict(zip(("prior", "certificate"), stated, strict=True))).known
-    if were == channel.known:
+    stated = {"prior": Prior.model_validate(prior), "certificate": Certificate.model_validate(certificate)}
+    return channel.model_copy(update=stated)
+
+
+def _size(were: Channel, channel: Channel, frequency_hz: float) -> float | None:
+    """What the sensor's known filters pass at the frequency at which S holds, over what those before did; None if the
+    same filters are known of all instruments."""
+    if alike(were, channel):
         return None
-    return channel.known.sensor_size(frequency_hz) / were.sensor_size(frequency_hz)
+    return channel.known.sensor_size(frequency_hz) / were.known.sensor_size(frequency_hz)
 
 
 def _gravity(changed: Iterable[str], before: Mapping[str, str], channel: Channel) -> tuple[float, float] | None:

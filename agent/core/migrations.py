@@ -196,9 +196,16 @@ def from_version_4(state: dict[str, Any]) -> None:
             holder["recursion"]["over"]["late_s"] = None
 
 
+def from_version_5(state: dict[str, Any]) -> None:
+    """Version 5 knew no filters that drivers state, and kept a sensor by its identity alone."""
+    for holder in [state, *state.get("channels", {}).values()]:
+        holder |= {"filters": {}, "device": ""}
+
+
 MIGRATIONS: Mapping[int, Callable[[dict[str, Any]], None]] = {
     1: from_version_1,
     2: from_version_2,
     3: from_version_3,
     4: from_version_4,
+    5: from_version_5,
 }

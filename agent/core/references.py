@@ -23,12 +23,13 @@ class References:
         self.identities = [""] * len(self._beside)
         self.not_certified = [""] * len(self._beside)
 
-    def identify(self, device: str, info_json: str) -> tuple[int, str]:
-        """A reference was opened. Returns its place, and the identity of the device that was there before."""
+    def identify(self, device: str, info_json: str) -> tuple[str, str, str]:
+        """A reference was opened. Returns the identities of the device that was there before and of the present one,
+        and why that may not be used, "" if it may."""
         place = [beside.reference for beside in self._beside].index(device)
         before, self.identities[place] = self.identities[place], identity_of(info_json)
         self.not_certified[place] = not_certified(info_json, self._beside[place].certificate)
-        return place, before
+        return before, self.identities[place], self.not_certified[place]
 
     def meet(self, estimation: Estimation | None) -> bool:
         """Tell the estimation which references are connected, and what their certificates state now.

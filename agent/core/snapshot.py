@@ -9,7 +9,7 @@ import numpy as np
 
 from agent.core.migrations import MIGRATIONS
 
-VERSION = 5
+VERSION = 6
 _ARRAY = 1  # msgpack extension code for a numpy array
 
 

@@ -236,6 +236,12 @@ class DeviceStream:
                 run.blocks.popleft()
         self._runs = [run for run in self._runs[:-1] if run.blocks] + newest
 
+    def look_back(self, horizon_s: float) -> None:
+        """The clock models must give times this far back from now on."""
+        self._horizon_s = horizon_s
+        for run in self._runs:
+            run.model.horizon_s = horizon_s
+
     def clear(self) -> None:
         """Drop all samples: they are of another device than the next ones."""
         self._runs = self._runs[-1:]

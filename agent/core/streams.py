@@ -71,6 +71,12 @@ class Streams:
         names = [self._channel.sensor, *(beside.reference for beside in self._beside)]
         self.by_device = {name: DeviceStream(name, origin_ns, self._horizon_s) for name in names if name}
 
+    def state(self, channel: Channel) -> None:
+        """Other filters are known of the devices from now on: their windows need more samples around them, or fewer."""
+        self._channel, self._beside, self._margin_at = channel, channel.by_reference, ([], 0.0)
+        for stream in self.by_device.values():
+            stream.look_back(self._horizon_s)
+
     @property
     def place(self) -> int:
         """The place of the reference of the piece that is due next.

@@ -18,6 +18,7 @@ import numpy as np
 from agent.calibrate.faults import as_table_error
 from agent.config import Channel
 from agent.config.recorded import recorded_config
+from agent.core.driver_filters import DriverFilters
 from agent.core.events import DeviceChange, RunStart
 from agent.core.identity import identity_of, nominal_of, not_certified
 from agent.core.schedule import pose_beside, pose_of
@@ -102,7 +103,10 @@ def _channels(path: Path, start: RunStart) -> Iterator[Recorded]:
         if isinstance(step.event, DeviceChange) and step.event.info_json
     }
     for channel in config.channels:
-        for beside in channel.by_reference:
+        filters = DriverFilters(channel)
+        for device, info_json in infos.items():
+            filters.hear(device, json.loads(info_json))
+        for beside in filters.channel.by_reference:
             yield _recorded(path, start, beside, infos)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from agent.config.filters import FiltersError, filters_of
 from agent.core.events import DeviceChange, RunStart
 from agent.reading.source import Array, Column, Progress, Source, TableError
 from agent.recording.reading import RecordingReader, first_event
@@ -36,15 +37,18 @@ class Recording(Source):
             raise self._fault(f"it begins {start.t_utc_ns} ns after 1970, {start.t_monotonic_ns} ns after a boot")
         devices = self._told(start.config_json, "devices")
         units: dict[str, str] = {}
+        filters: dict[str, tuple[str, ...]] = {}
         columns: dict[str, list[Column]] = {}
         for event in self._events():
             if isinstance(event, DeviceChange) and event.info_json:
                 units[event.device] = str(self._told(event.info_json, "unit"))
+                filters[event.device] = self._filters(event)
             if isinstance(event, SampleBlock) and event.device not in columns:
                 columns[event.device] = _columns(event, units.get(event.device, "count"))
                 if isinstance(devices, list) and len(columns) == len(devices):
                     break
         self.columns = [column for name in sorted(columns) for column in columns[name]]
+        self.filters = filters
 
     def _told(self, text: str, name: str) -> Any:
         """What the configuration or the description of a device says. Raises TableError."""
@@ -52,6 +56,13 @@ class Recording(Source):
             return json.loads(text)[name]
         except (ValueError, KeyError, TypeError, IndexError, RecursionError):
             raise self._fault(f"what it says of its devices has no {name!r}") from None
+
+    def _filters(self, opened: DeviceChange) -> tuple[str, ...]:
+        """What the driver of a device states of its filters; none in recordings of earlier versions."""
+        try:
+            return filters_of(json.loads(opened.info_json).get("filters", ()))
+        except FiltersError as error:
+            raise self._fault(f"the filters of {opened.device!r:.70} cannot be used: {error}") from None
 
     def _fault(self, what: str) -> TableError:
         return TableError(f"{self.path}: {what}; `fieldcal audit {self.path}` says more")

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Self
 
 import numpy as np
@@ -45,11 +46,15 @@ class Column:
 
 
 class Source(ABC):
-    """An opened file. `columns`: what it has. `header`: the place where it names them, for messages."""
+    """An opened file. `columns`: what it has. `header`: the place where it names them, for messages.
+
+    `filters`: the known filters of its devices, by group, each in one line of text (calib.signal.known_filters).
+    """
 
     path: Path
     columns: Sequence[Column]
     header = "columns"
+    filters: Mapping[str, tuple[str, ...]] = MappingProxyType({})
 
     @abstractmethod
     def pieces(self, columns: Sequence[Column], progress: Progress | None) -> Iterator[Array]:

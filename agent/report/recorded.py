@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -11,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from agent.config import Channel, Config, recorded_config
+from agent.core.driver_filters import DriverFilters
 from agent.core.events import CalibrationUpdate, DeviceChange, Event, Output, RunStart, StatusChange, WindowReport
 from agent.core.schedule import pieces
 from agent.core.snapshot import unpack
@@ -127,16 +129,24 @@ class _Windows:
     """The streams of a channel as they were when the pipeline judged a window."""
 
     def __init__(self, channel: Channel, start: RunStart) -> None:
-        self._channel = channel
         held = unpack(start.snapshot)["channels"][channel.sensor]
+        self._filters = DriverFilters(channel)
+        self._filters.load(held["filters"])
         self._streams = {n: DeviceStream.restore(n, held["origin_ns"], s) for n, s in held["streams"].items()}
-        self._keep_s = channel.window_s + channel.late_horizon_s + 2 * most_margin_s(channel.instrument)
+
+    @property
+    def _channel(self) -> Channel:
+        return self._filters.channel
 
     def update(self, event: Event) -> None:
+        if isinstance(event, DeviceChange) and event.info_json:
+            self._filters.hear(event.device, json.loads(event.info_json))
         if isinstance(event, SampleBlock) and event.device in self._streams:
             stream = self._streams[event.device]
             stream.update(event)
-            stream.forget_before((stream.newest_arrival_s or 0.0) - self._keep_s)
+            channel = self._channel
+            keep_s = channel.window_s + channel.late_horizon_s + 2 * most_margin_s(channel.instrument)
+            stream.forget_before((stream.newest_arrival_s or 0.0) - keep_s)
 
     def trace(self, window: WindowReport) -> Trace | None:
         """The points of a window; None if its pose or its samples cannot be found."""

@@ -10,7 +10,20 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from benchmarks.online import agreement, bench, cost, coverage, day, drifting, filters, harm, references, touched, year
+from benchmarks.online import (
+    agreement,
+    bench,
+    chip,
+    cost,
+    coverage,
+    day,
+    drifting,
+    filters,
+    harm,
+    references,
+    touched,
+    year,
+)
 from benchmarks.page import PAGE, machine, write_part
 from hw.virtual.building import Building
 from hw.virtual.harm_kinds import KINDS
@@ -63,6 +76,10 @@ def _harm(workers: int, runs: int | None) -> tuple[Path, str]:
 
 def _filters(workers: int, runs: int | None) -> tuple[Path, str]:
     return RESPONSE, filters.table(spread(filters.one, filters.jobs(runs or filters.RUNS), workers))
+
+
+def _chip(workers: int, runs: int | None) -> tuple[Path, str]:
+    return RESPONSE, chip.table(spread(chip.one, chip.jobs(runs or chip.RUNS), workers))
 
 
 def _one_harm(job: tuple[str, int]) -> harm.Outcome:
@@ -141,6 +158,7 @@ PARTS: dict[str, Callable[[int, int | None], tuple[Path, str]]] = {
     "harm": _harm,
     "coverage": _coverage,
     "filters": _filters,
+    "chip": _chip,
     "touched": _touched,
     "drift": _drift,
     "references": _references,

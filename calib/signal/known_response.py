@@ -16,7 +16,7 @@ import numpy as np
 
 from calib.model import Array
 from calib.signal.band import convolved
-from calib.signal.known_filters import Complex, Filter, filter_of
+from calib.signal.known_filters import Complex, Delay, Filter, Flat, filter_of
 from calib.signal.response import POWERS, by_term, in_units
 
 REACHES_S = tuple(float(0.04 * 2.0 ** (0.5 * k)) for k in range(15))  # of the filter to each side: the first that is
@@ -46,13 +46,13 @@ class KnownResponse:
 
     @property
     def is_complete(self) -> bool:
-        """Whether the filters of both are stated."""
-        return self.sensor is not None and self.reference is not None
+        """Whether the filters of both are stated. Who states a delay alone says nothing of the size."""
+        return all(of is not None and any(not isinstance(f, Delay) for f in of) for of in (self.sensor, self.reference))
 
     @property
     def is_flat(self) -> bool:
-        """Whether there is nothing to divide out."""
-        return not (self.sensor or self.reference)
+        """Whether there is nothing to divide out: no filter that changes a size or a shape."""
+        return all(isinstance(one, Delay | Flat) for one in self._all)
 
     @property
     def group_delay_s(self) -> float:

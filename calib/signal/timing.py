@@ -117,13 +117,16 @@ class ClockFit:
 
 
 class ClockModel:
-    """Clock model of one device. `update` takes the arrivals of its bursts, `result` gives the clock. Deterministic."""
+    """Clock model of one device. `update` takes the arrivals of its bursts, `result` gives the clock. Deterministic.
+
+    `horizon_s`: bursts that are older are forgotten.
+    """
 
     def __init__(self, nominal_rate_hz: float, horizon_s: float = HORIZON_S) -> None:
         if not nominal_rate_hz > 0:
             raise ValueError(f"nominal rate must be above 0 Hz, is {nominal_rate_hz} Hz")
         self._nominal_rate_hz = nominal_rate_hz
-        self._horizon_s = horizon_s
+        self.horizon_s = horizon_s
         self.restart()
 
     def restart(self) -> None:
@@ -151,7 +154,7 @@ class ClockModel:
             last = np.append(later, True)
             self._index, self._arrival_s = self._index[last], self._arrival_s[last]
         if len(self._index):
-            oldest = np.searchsorted(self._arrival_s, self._arrival_s[-1] - self._horizon_s)
+            oldest = np.searchsorted(self._arrival_s, self._arrival_s[-1] - self.horizon_s)
             first = max(int(oldest), len(self._index) - MAX_BURSTS)
             self._index, self._arrival_s = self._index[first:], self._arrival_s[first:]
 
@@ -181,7 +184,7 @@ class ClockModel:
         self._join()
         return {
             "nominal_rate_hz": self._nominal_rate_hz,
-            "horizon_s": self._horizon_s,
+            "horizon_s": self.horizon_s,
             "index": self._index.copy(),
             "arrival_s": self._arrival_s.copy(),
         }

@@ -8,11 +8,17 @@ from __future__ import annotations
 import numpy as np
 
 from hw.virtual.fifo_twin import Counts, FifoTwin
+from hw.virtual.response import Response, lowpass
 
 DEVID, FIRST_SETTING, BW_RATE, POWER_CTL, INT_SOURCE, DATA_FORMAT, DATA, FIFO_CTL, FIFO_STATUS = (
     *(0x00, 0x1D, 0x2C, 0x2D, 0x30, 0x31, 0x32, 0x38, 0x39),
 )
 READ_ONLY = frozenset((0x2B, INT_SOURCE, *range(DATA, DATA + 6), FIFO_STATUS))
+
+
+def filters(rate_hz: float) -> Response:
+    """The filter of the chip at an output data rate. The data sheet tells no order; this one has the second."""
+    return lowpass(2, rate_hz / 2.0)
 
 
 class Adxl345Twin(FifoTwin):
@@ -33,6 +39,10 @@ class Adxl345Twin(FifoTwin):
     @property
     def _filling(self) -> bool:
         return bool(self.registers[POWER_CTL] & 0x08) and self.registers[FIFO_CTL] & 0xC0 == 0x80
+
+    @property
+    def response(self) -> Response:
+        return filters(3200.0 / 2 ** (0x0F - (self.registers[BW_RATE] & 0x0F)))
 
     def _encode(self, first: int, counts: Counts) -> bytes:  # noqa: ARG002 - the samples of this part carry no number
         return counts.astype("<i2").tobytes()

@@ -8,14 +8,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hw.virtual.fifo_twin import Counts, FifoTwin
+from hw.virtual.response import Response, delay, in_turn, lowpass, taps
 
 IDENTITY = bytes([0xAD, 0x1D, 0xED, 0x01])
 EMPTY_ENTRY = b"\x00\x00\x02"
 RESET_S = 0.005  # for this time after a reset the shadow registers are not loaded and settings are not accepted
 SHADOW = bytes([0x4C, 0x21, 0x9A, 0x05, 0x33])  # factory trim of this twin; any constant will do
 STATUS, FIFO_ENTRIES, TEMPERATURE, DATA, FIFO_DATA = 0x04, 0x05, 0x06, 0x08, 0x11
-FIRST_SETTING, LAST_SETTING, POWER_CTL, RESET, RESET_CODE, SHADOW_1 = 0x1E, 0x2E, 0x2D, 0x2F, 0x52, 0x50
+FIRST_SETTING, LAST_SETTING, FILTER, POWER_CTL, RESET, RESET_CODE, SHADOW_1 = 0x1E, 0x2E, 0x28, 0x2D, 0x2F, 0x52, 0x50
 RESET_VALUES = {0x27: 0x01, 0x29: 0x60, 0x2C: 0x81, POWER_CTL: 0x01}
+
+
+# Data sheet, "Digital filter group delay and profile": a fixed stage decimates to 4 kHz, a variable one to the rate.
+HALVING = np.array([1.0, 5.0, 10.0, 10.0, 5.0, 1.0])  # five means of two samples, at 8 kHz
+FIXED_HZ = 4000.0
+
+
+def filters(rate_hz: float) -> Response:
+    """The filters of the chip at an output data rate."""
+    decimation = round(FIXED_HZ / rate_hz)
+    variable = np.convolve(np.ones(decimation), np.ones(decimation))  # two means over the decimation, at 4 kHz
+    waiting = delay(0.17e-3 + 0.5 / rate_hz)
+    return in_turn(lowpass(1, 4700.0), taps(HALVING, 2.0 * FIXED_HZ), taps(variable, FIXED_HZ), waiting)
 
 
 def encode(counts: NDArray[np.int32]) -> bytes:
@@ -65,6 +79,10 @@ class Adxl355Twin(FifoTwin):
     @property
     def _filling(self) -> bool:
         return not self.registers[POWER_CTL] & 1
+
+    @property
+    def response(self) -> Response:
+        return filters(FIXED_HZ / 2 ** (self.registers[FILTER] & 0x0F))
 
     def _encode(self, first: int, counts: Counts) -> bytes:  # noqa: ARG002 - these entries carry no number
         return encode(counts)

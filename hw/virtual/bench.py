@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from hw.virtual.motion import ComplexArray
 from hw.virtual.noise import BLOCK, ColouredNoise, Stream, generator
 from hw.virtual.parameters import BenchParameters, ReferenceParameters, SensorParameters
+from hw.virtual.response import lowpass
 from hw.virtual.scene import Scene
 from hw.virtual.schedule import PoseInterval
 from hw.virtual.timebase import Bursts, Clock
@@ -233,8 +234,7 @@ def _sensor_response(sensor: SensorParameters, frequency_hz: Array) -> ComplexAr
     The second-order filter is a Butterworth filter.
     """
     highpass = _highpass(sensor.highpass_hz, frequency_hz)
-    if sensor.lowpass_hz is None:
-        return highpass
-    s = 1j * frequency_hz / sensor.lowpass_hz
-    denominator = 1 + s if sensor.lowpass_order == 1 else 1 + np.sqrt(2) * s + s**2
-    return np.asarray((1 if highpass is None else highpass) / denominator, dtype=np.complex128)
+    own = None if sensor.lowpass_hz is None else lowpass(sensor.lowpass_order, sensor.lowpass_hz)
+    passed = [of(frequency_hz) for of in (own, sensor.response) if of is not None]
+    found = [*([] if highpass is None else [highpass]), *passed]
+    return np.asarray(np.prod(found, axis=0)) if found else None

@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hw.block import BlockFlags, DeviceInfo, SampleBlock
-from hw.virtual.building_motion import Band, BuildingMotion, ComplexArray, Response
+from hw.virtual.building_motion import Band, BuildingMotion, ComplexArray
 from hw.virtual.harm import HARMLESS, Harm, Role, Visit
 from hw.virtual.noise import Stream, generator
+from hw.virtual.response import Response
 from hw.virtual.schedule import STANDARD_GRAVITY_MPS2, rotation
 from hw.virtual.timebase import Bursts, Clock
 
@@ -36,7 +37,7 @@ class Instrument:
     """One of the devices: its clock and its white noise.
 
     It sends its samples in bursts of `burst`. `late` gives the delay of a burst after its newest sample. `response` is
-    its response over frequency; None: it shows all frequencies alike.
+    its response over frequency; None: it shows all frequencies alike. `filters`: what its driver states of it.
     """
 
     noise_mps2: float
@@ -44,6 +45,7 @@ class Instrument:
     burst: int = 32
     late: Bursts = field(default_factory=Bursts)
     response: Response | None = None
+    filters: tuple[str, ...] = ()
 
     def bursts(self, time_s: float) -> int:
         """Number of complete bursts at `time_s`."""
@@ -144,9 +146,12 @@ class Building:
     def infos(self) -> dict[str, DeviceInfo]:
         """The devices by name, in the order in which they are opened."""
         return {
-            role: DeviceInfo("serial-csv", "virtual", f"building-{role}", "m/s2", 3, instrument.clock.nominal_rate_hz)
+            role: DeviceInfo(
+                "serial-csv", "virtual", f"building-{role}", "m/s2", 3, instrument.clock.nominal_rate_hz,
+                filters=instrument.filters,
+            )
             for role, instrument in self._instruments().items()
-        }
+        }  # fmt: skip
 
     def _instruments(self) -> dict[Role, Instrument]:
         p = self.parameters

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hw.virtual.response import Response
+
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
-Response = Callable[[Array], ComplexArray]  # a complex response at frequencies in Hz
 # Grid points per period of the upper end of the band: interpolation by cubic pieces is then accurate to 3e-6.
 POINTS_A_PERIOD = 32
 

@@ -10,6 +10,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from hw.virtual.response import Response, delay
+
 Counts = NDArray[np.int32]
 
 
@@ -71,6 +73,11 @@ class FifoTwin(ABC):
     def _deflection(self) -> Counts:
         """Change (3,) of the counts by the self-test."""
         return np.zeros(3, np.int32)
+
+    @property
+    def response(self) -> Response:
+        """What its filters, as the registers set them, make of a motion; `source` has to pass the motion through."""
+        return delay(0.0)
 
     def _newest(self) -> Counts:
         """Contents (3,) of the output registers: the newest sample; it does not change within one I2C message."""

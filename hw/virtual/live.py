@@ -5,12 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from hw.adxl355_registers import ADXL355
-from hw.virtual.adxl355_twin import Adxl355Twin
+from hw.virtual.adxl355_twin import Adxl355Twin, filters
 from hw.virtual.bench import Bench
 from hw.virtual.kernel import I2CBus, installed
 from hw.virtual.parameters import BenchParameters
@@ -33,7 +34,9 @@ class LiveBench:
     def __init__(
         self, parameters: BenchParameters, seed: int, *, bus: int = 1, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        self.bench = Bench(parameters, seed)
+        rate_hz = parameters.sensor.clock.nominal_rate_hz
+        chip = replace(parameters.sensor, response=filters(rate_hz))
+        self.bench = Bench(replace(parameters, sensor=chip), seed)
         self.time = BenchTime()
         twin = Adxl355Twin(
             self.bench.sensor_counts,
@@ -45,7 +48,7 @@ class LiveBench:
         self.sensor_options: dict[str, Any] = {
             "bus": bus,
             "address": ADDRESS,
-            "rate_hz": parameters.sensor.clock.nominal_rate_hz,
+            "rate_hz": rate_hz,
             "range_g": _range_g(parameters.sensor.nominal_sensitivity),
         }
         self._lines = serial_lines(self.bench, "reference", self.time)

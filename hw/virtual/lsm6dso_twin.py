@@ -5,12 +5,18 @@ from __future__ import annotations
 import numpy as np
 
 from hw.virtual.fifo_twin import Counts, FifoTwin
+from hw.virtual.response import Response, lowpass
 
 FIFO_CTRL1, FIFO_CTRL3, FIFO_CTRL4, WHO_AM_I, CTRL1_XL, CTRL3_C, CTRL9_XL, CTRL10_C = (
     *(0x07, 0x09, 0x0A, 0x0F, 0x10, 0x12, 0x18, 0x19),
 )
 TEMPERATURE, DATA, FIFO_STATUS, FREQ_FINE, USER_OFFSET, FIFO_DATA = 0x20, 0x28, 0x3A, 0x63, 0x73, 0x78
 SETTINGS = frozenset((*range(FIFO_CTRL1, FIFO_CTRL4 + 1), *range(CTRL1_XL, CTRL10_C + 1), *range(0x73, 0x76)))
+
+
+def filters(rate_hz: float) -> Response:
+    """The filter of the chip at an output data rate. The data sheet tells no order; this one has the second."""
+    return lowpass(2, rate_hz / 2.0)
 
 
 def words(tag: int, first: int, numbers: Counts) -> bytes:
@@ -41,6 +47,10 @@ class Lsm6dsoTwin(FifoTwin):
     def _filling(self) -> bool:
         batched = bool(self.registers[FIFO_CTRL3] & 0x0F) and bool(self.registers[CTRL1_XL] >> 4)
         return batched and self.registers[FIFO_CTRL4] & 7 == 6
+
+    @property
+    def response(self) -> Response:
+        return filters(6667.0 / 2 ** (10 - (self.registers[CTRL1_XL] >> 4)))
 
     def _encode(self, first: int, counts: Counts) -> bytes:
         return words(2, first, counts)

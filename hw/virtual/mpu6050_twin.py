@@ -5,10 +5,20 @@ from __future__ import annotations
 import numpy as np
 
 from hw.virtual.fifo_twin import Counts, FifoTwin
+from hw.virtual.response import Response, lowpass
 
-SMPLRT_DIV, FIFO_EN, INT_ENABLE, INT_STATUS, DATA, TEMPERATURE = 0x19, 0x23, 0x38, 0x3A, 0x3B, 0x41
+SMPLRT_DIV, CONFIG, FIFO_EN, INT_ENABLE, INT_STATUS, DATA, TEMPERATURE = 0x19, 0x1A, 0x23, 0x38, 0x3A, 0x3B, 0x41
 USER_CTRL, POWER_1, POWER_2, FIFO_COUNT, FIFO_DATA, WHO_AM_I = 0x6A, 0x6B, 0x6C, 0x72, 0x74, 0x75
 TRIM = bytes([0x12, 0x34, 0x56, 0x78, 0x9A, 0xBC])  # factory trim; any constant will do
+
+
+# Register map, accelerometer bandwidth in Hz by the code in CONFIG.
+BANDWIDTH_HZ = {1: 184.0, 2: 94.0, 3: 44.0, 4: 21.0, 5: 10.0, 6: 5.0}
+
+
+def filters(code: int) -> Response:
+    """The filter of the chip with this code in CONFIG. The register map tells no order; this one has the second."""
+    return lowpass(2, BANDWIDTH_HZ[code])
 
 
 class Mpu6050Twin(FifoTwin):
@@ -36,6 +46,10 @@ class Mpu6050Twin(FifoTwin):
     def _filling(self) -> bool:
         awake = not self.registers[POWER_1] & 0x40
         return awake and bool(self.registers[USER_CTRL] & 0x40) and bool(self.registers[FIFO_EN] & 0x08)
+
+    @property
+    def response(self) -> Response:
+        return filters(self.registers[CONFIG] & 7)
 
     def _encode(self, first: int, counts: Counts) -> bytes:  # noqa: ARG002 - these samples carry no number
         return counts.astype(">i2").tobytes()

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hw.virtual.motion import Motion, sine
+from hw.virtual.response import Response
 from hw.virtual.schedule import STANDARD_GRAVITY_MPS2, Schedule, clamped
 from hw.virtual.timebase import Bursts, Clock
 
@@ -21,7 +22,7 @@ class SensorParameters:
 
     `sensitivity` (3, 3) in output unit per m/s2, `offset` (3,) in output unit. Values in m/s2 are converted to the
     output unit by `nominal_sensitivity`. The filters act on all axes alike; `lag_s` is a pure delay, one value per
-    axis.
+    axis. `response` is that of a chip's own filters, over frequency in Hz.
     """
 
     sensitivity: Array = field(default_factory=lambda: np.eye(3))
@@ -39,6 +40,7 @@ class SensorParameters:
     lowpass_hz: float | None = None
     lowpass_order: Literal[1, 2] = 1
     highpass_hz: float | None = None  # corner of a first-order AC coupling; the sensor then does not indicate gravity
+    response: Response | None = None
     offset_by_position_mps2: Array | None = None  # (positions, 3)
     offset_by_window_mps2: float = 0.0  # standard deviation of an offset that changes with every window, per axis
     offset_per_k_mps2: tuple[float, float, float] = (0.0, 0.0, 0.0)

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hw.virtual.building_motion import Band, BuildingMotion, Response
+from hw.virtual.building_motion import Band, BuildingMotion
 from hw.virtual.noise import BLOCK, Stream, generator
+from hw.virtual.response import Response
 from hw.virtual.schedule import STANDARD_GRAVITY_MPS2, rotation
 from hw.virtual.serial_port import PtyDevice, SampleLines
 from hw.virtual.timebase import BenchTime, Clock

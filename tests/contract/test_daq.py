@@ -95,6 +95,7 @@ class TestMcc172(SensorContract):
 
     def test_how_it_is_set(self, rig: Mcc172Rig) -> None:
         info = rig.build(iepe=False, channel=1, serial_number="LW1234").open()
+        assert info.filters == (f"delay delay_s={39 / info.nominal_rate_hz:.6g}",)  # of the board alone
         assert (info.kind, info.unit, info.serial_number) == ("MCC 172", "mV", "LW1234")
         assert info.settings == {
             "iepe": "0", "mV per unit": "1000", "rate_hz": "3200", "channel": "1", "board": "01ABCDEF",

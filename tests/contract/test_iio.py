@@ -97,6 +97,18 @@ class TestIio(SensorContract):
         assert info.settings["current_timestamp_clock"] == "monotonic"
         assert (rig.twin.sysfs / "iio:device0/scan_elements/in_temp_en").read_text() == "0"
 
+    @pytest.mark.parametrize(
+        ("corner_hz", "stated"),
+        [("37.500000", ("lowpass order=1 corner_hz=37.5 u_corner_pct=50",)), ("0.4", ()), ("0", ()), ("inf", ())],
+    )
+    def test_states_the_low_pass_filter_that_the_kernel_names(
+        self, rig: IioRig, corner_hz: str, stated: tuple[str, ...]
+    ) -> None:
+        (rig.twin.sysfs / "iio:device0/in_accel_filter_low_pass_3db_frequency").write_text(corner_hz)
+        info = rig.sensor.open()
+        assert info.filters == stated
+        assert "in_accel_filter_low_pass_3db_frequency" not in info.settings  # it would be another device
+
     def test_a_rate_that_the_kernel_driver_rounds_is_refused(
         self, rig: IioRig, monkeypatch: pytest.MonkeyPatch
     ) -> None:

@@ -87,9 +87,9 @@ class TestSerialCsv(SerialContract):
 def test_a_unit_of_acceleration_tells_the_sensitivity(unit: str, nominal: float | None, tmp_path: Path) -> None:
     rig = CsvRig(tmp_path / "port")
     try:
-        sensor = rig.build(unit=unit)
+        sensor = rig.build(unit=unit, filters=["flat"])
         info = sensor.open()
-        assert (info.unit, info.nominal_sensitivity) == (unit, nominal)
+        assert (info.unit, info.nominal_sensitivity, info.filters) == (unit, nominal, ("flat",))
         assert nominal_of(asdict(info)) == {"g": nominal, "m/s2": 1.0, "count": None}[unit]
         sensor.close()
     finally:

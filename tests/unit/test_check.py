@@ -71,7 +71,10 @@ def test_a_sound_configuration_is_good(tmp_path: Path, capsys: pytest.CaptureFix
     path = tmp_path / "gateway.toml"
     path.write_text(GOOD)
     assert run_cli(["check", str(path)]) == 0
-    assert capsys.readouterr().out == f"{path}: good; 2 devices, 1 channel\n"
+    assert capsys.readouterr().out.splitlines() == [
+        f"{path}: good; 2 devices, 1 channel",
+        *(f"  filters of {device}: none stated; its response is estimated with S" for device in ("imu", "laser")),
+    ]
 
 
 @pytest.mark.parametrize("calibrated", ["2001-05-01", '"2001-05-01"'])
@@ -253,7 +256,9 @@ def test_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path.write_text(GOOD)
     assert run_cli(["check", str(path), "--json", "-"]) == 0
     counts = {"devices": 2, "channels": 1, "poses": 0, "positions": 0}
-    assert json.loads(capsys.readouterr().out) == {"good": True, "faults": [], "warnings": [], **counts}
+    filters = [{"sensor": "imu", "device": device, "lines": [], "stated_by": ""} for device in ("imu", "laser")]
+    told = {"good": True, "faults": [], "warnings": [], **counts, "filters": filters}
+    assert json.loads(capsys.readouterr().out) == told
     path.write_text(GOOD.replace("bridge", "a bridge").replace("axes = 1", "axes = 2"))
     assert run_cli(["check", str(path), "--json", "-"]) == 2
     said = capsys.readouterr()

@@ -10,6 +10,7 @@ import pytest
 
 from agent.cli.main import run_cli
 from agent.config import Channel, parse_config
+from agent.core.driver_filters import DriverFilters
 from agent.core.estimation import Estimation, Judged
 from agent.core.kept import keep, take_up
 from tests.building_windows import GRAVITY, building_window
@@ -211,10 +212,10 @@ def test_a_sensor_that_was_mounted_again_has_another_rotation_to_both() -> None:
 def test_a_second_reference_can_be_removed_and_added_again() -> None:
     found = sound(estimation())
     both, alone = configured(), configured(both=False)
-    single = take_up(keep(both, found, None, 12.0, 0), alone, None).estimation
+    single = take_up(keep(DriverFilters(both), "", found, None, 12.0, 0), DriverFilters(alone), None).estimation
     single.meet("A", "", 1.0)
     assert set(actions(judged(single, 110, 12, 4, turns=(FIRST,) * 4))) == {"take"}
-    again = met(take_up(keep(alone, single, None, 16.0, 0), both, None).estimation)
+    again = met(take_up(keep(DriverFilters(alone), "", single, None, 16.0, 0), DriverFilters(both), None).estimation)
     assert set(actions(judged(again, 111, 16, 8))) == {"take"}
     value, u = again.recursion.quantity("reference_y of B")
     assert (abs(value), u) < (0.003, 0.002)
@@ -222,8 +223,9 @@ def test_a_second_reference_can_be_removed_and_added_again() -> None:
 
 
 def test_a_changed_rotation_of_the_second_reference_loosens_the_mount() -> None:
-    kept = keep(configured(rotation=np.eye(3).ravel().tolist()), sound(estimation()), None, 12.0, 0)
-    turned = take_up(kept, configured(rotation=[0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]), None)
+    before, after = np.eye(3), np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    stated = [DriverFilters(configured(rotation=rotation.ravel().tolist())) for rotation in (before, after)]
+    turned = take_up(keep(stated[0], "", sound(estimation()), None, 12.0, 0), stated[1], None)
     assert "check_rotation" in turned.reason
     assert turned.estimation.recursion.quantity("rotation_x of B")[1] > np.deg2rad(0.2)
 

@@ -8,6 +8,7 @@ import msgspec
 import pytest
 
 from agent.config import Channel, parse_config
+from agent.core.driver_filters import DriverFilters
 from agent.core.estimation import Estimation
 from agent.core.kept import Kept, keep, take_up
 from agent.core.outcome import Source, calibration_update
@@ -34,11 +35,11 @@ def state_of(made_with: Channel) -> bytes:
     estimation = Estimation(made_with, None)
     state = estimation.recursion
     in_force = calibration_update(Source("s", "A", "m/s2", 5), estimation.in_force, state, state, lambda _: None)
-    return keep(made_with, estimation, in_force, 0.0, 5)
+    return keep(DriverFilters(made_with), "", estimation, in_force, 0.0, 5)
 
 
 def after(before: Channel, now: Channel) -> Kept:
-    return take_up(state_of(before), now, None)
+    return take_up(state_of(before), DriverFilters(now), None)
 
 
 @pytest.mark.parametrize(
@@ -80,7 +81,7 @@ def test_a_state_of_an_earlier_version_says_nothing_of_its_mount() -> None:
     state = unpack(state_of(channel(UP)))
     for name in ("poses", "positions", "clamp_theta_deg"):
         del state["basis"][name]
-    assert take_up(pack(state), channel(UP), None).reason == RESTORED
+    assert take_up(pack(state), DriverFilters(channel(UP)), None).reason == RESTORED
 
 
 def test_a_field_that_the_earlier_version_did_not_have_counts_with_its_default() -> None:
@@ -92,6 +93,8 @@ def test_a_field_that_the_earlier_version_did_not_have_counts_with_its_default()
         return pack(state)
 
     for section, field in (("prior", "u_offset_mps2"), ("certificate", "u_lag_s"), ("uncertainty", "lag_s")):
-        assert take_up(of_earlier(section, field), channel(UP), None).reason == RESTORED
+        assert take_up(of_earlier(section, field), DriverFilters(channel(UP)), None).reason == RESTORED
     stated = channel(UP, certificate={"u_lag_s": 1e-3})
-    assert take_up(of_earlier("certificate", "u_lag_s"), stated, None).reason.endswith("in the state: certificate")
+    assert take_up(of_earlier("certificate", "u_lag_s"), DriverFilters(stated), None).reason.endswith(
+        "in the state: certificate"
+    )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from scipy.signal import butter, freqs, freqz, group_delay
@@ -127,3 +129,15 @@ def _exactly(text: str) -> str:
     import re
 
     return "^" + re.escape(text)
+
+
+def test_a_delay_alone_says_nothing_of_the_size_and_leaves_the_samples_as_they_are() -> None:
+    delay = "delay delay_s=0.01"
+    alone, beside = known_of([delay], ["flat"]), known_of([delay, "flat u_pct=0.1"], ["flat"])
+    assert math.isinf(alone.u_response(10.0))
+    assert beside.u_response(10.0) < 0.1
+    u = np.random.default_rng(5).normal(size=(200, 1))
+    for known in (alone, beside):
+        assert known.group_delay_s == pytest.approx(0.01)
+        assert np.array_equal(known.passed(u, 100.0), u)
+        assert known.reach_s(100.0) == known.most_reach_s == 0.0

@@ -11,6 +11,7 @@ import pytest
 
 from agent.config import recorded_config
 from agent.config.knowledge import Certificate
+from agent.core.driver_filters import DriverFilters
 from agent.core.events import DeviceChange
 from agent.core.kept import take_up
 from agent.core.snapshot import VERSION, pack, unpack
@@ -49,7 +50,7 @@ def test_a_state_of_version_1_goes_on_whole(kept: bytes) -> None:
         for s in RecordingReader(FORMAT_1 / RECORDING).steps()
         if isinstance(s.event, DeviceChange) and s.event.device == "mems"
     )
-    taken = take_up(kept, channel, nominal.get("sensitivity"))
+    taken = take_up(kept, DriverFilters(channel), nominal.get("sensitivity"))
     assert taken.reason == "restored from the previous run"
     state = unpack(kept)["estimation"]["recursion"]["state"]
     names = raw(kept)["state"]["estimation"]["recursion"]["state"]["names"]
