@@ -17,17 +17,18 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from pyarrow import csv, parquet
 
+from agent.config import Config
 from agent.core.events import DeviceChange, RunStart
 from agent.core.pipeline import Pipeline
 from agent.recording.writer import Recorder
 from benchmarks.agent_cost import peak_mb
 from benchmarks.page import machine, write_part
-from benchmarks.recording import configuration
 from calib.geometry import clamp
 from calib.model import Array
 from hw.block import SampleBlock
@@ -100,6 +101,17 @@ def _written(
     for writer in writers:
         writer.close()  # type: ignore[attr-defined]
     return paths
+
+
+def configuration() -> Config:
+    """A channel whose sensor stands for ten seconds at each of three angles, repeatedly."""
+    poses = [
+        {"start_s": start_s, "stop_s": start_s + 10, "theta_deg": 35, "alpha_deg": alpha_deg}
+        for start_s, alpha_deg in ((3, 0), (16, 30), (29, 120))
+    ]
+    channel: dict[str, Any] = {"sensor": "mems", "reference": "reference", "poses": poses, "poses_repeat_s": 39}
+    devices = [{"name": name, "driver": "adxl355"} for name in ("mems", "reference")]
+    return Config.model_validate({"devices": devices, "channels": [channel | {"prior": {"sensitivity": 26000.0}}]})
 
 
 def write_recording(directory: Path, count: int, axes: int) -> tuple[Path, Path]:

@@ -57,7 +57,6 @@ class Gateway:
     def __init__(self, config: Config, truth: Array) -> None:
         self.truth = truth
         self.status = ""
-        self.told: list[str] = []  # the reasons of all statuses
         self.reports: list[WindowReport] = []
         self.estimate: Estimate | None = None  # the newest
         self.now_ns = 0
@@ -87,7 +86,6 @@ class Gateway:
                     self.reports.append(result)
                 elif isinstance(result, StatusChange):
                     self.status = result.status
-                    self.told.append(result.reason)
                 elif isinstance(result, Estimate):
                     self.estimate = result
                 elif isinstance(result, CalibrationUpdate):
