@@ -57,6 +57,7 @@ class Gateway:
     def __init__(self, config: Config, truth: Array) -> None:
         self.truth = truth
         self.status = ""
+        self.reasons: list[str] = []  # of all statuses
         self.reports: list[WindowReport] = []
         self.estimate: Estimate | None = None  # the newest
         self.now_ns = 0
@@ -86,6 +87,7 @@ class Gateway:
                     self.reports.append(result)
                 elif isinstance(result, StatusChange):
                     self.status = result.status
+                    self.reasons.append(result.reason)
                 elif isinstance(result, Estimate):
                     self.estimate = result
                 elif isinstance(result, CalibrationUpdate):

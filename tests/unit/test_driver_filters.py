@@ -210,9 +210,9 @@ def restarted(before: Building, after: Building) -> tuple[list[bool], list[str],
     gateway.feed(visits(before, range(WINDOWS)))
     assert all(report.used for report in gateway.reports)
     gateway.restart(drawn().config)
-    windows, told = len(gateway.reports), len(gateway.told)
+    windows, told = len(gateway.reports), len(gateway.reasons)
     gateway.feed(visits(after, range(WINDOWS, 2 * WINDOWS)))
-    return [report.used for report in gateway.reports[windows:]], gateway.told[told:], gateway.status
+    return [report.used for report in gateway.reports[windows:]], gateway.reasons[told:], gateway.status
 
 
 def test_another_output_data_rate_at_the_next_start_is_another_filter_and_no_drift() -> None:
