@@ -54,6 +54,9 @@ KINDS: dict[str, Made] = {
     "noise of the reference that grows with frequency, 3 % of the motion in the middle": lambda low, high: noise(
         lambda f: 0.03 * _density(low, high) * f / np.sqrt(low * high), of_reference=True
     ),
+    "noise of the reference, 10 % of the motion at its frequencies, none elsewhere": lambda low, high: noise(
+        lambda f: 0.1 * _density(low, high) * ((f >= low) & (f <= high)), of_reference=True
+    ),
 }  # fmt: skip
 
 

@@ -17,7 +17,7 @@ from agent.cli.main import run_cli
 from agent.config import Config
 from agent.core.driver_filters import DriverFilters
 from agent.core.estimation import Estimation
-from agent.core.events import Acceleration, CalibrationUpdate, DeviceChange, Event, StatusChange
+from agent.core.events import CalibrationUpdate, DeviceChange, Event, StatusChange
 from agent.core.kept import OTHER_FILTERS, keep, take_up
 from agent.core.pipeline import Pipeline
 from agent.core.snapshot import pack
@@ -30,7 +30,7 @@ from hw import adxl355_registers
 from hw.block import DeviceInfo
 from hw.virtual import adxl355_twin
 from hw.virtual.building import Building
-from tests.unit.test_known_online import NEAR, NEAR_TEXT, filtered, stating
+from tests.unit.test_known_online import NEAR, NEAR_TEXT, assert_goes_on, filtered, stating
 from tests.unit.test_response_online import SEED
 
 WINDOWS = 4
@@ -98,15 +98,7 @@ def test_s_is_right_beside_the_filters_of_an_adxl355_and_held_where_nobody_state
 
 @pytest.mark.parametrize("cut", [1, 2, 60])  # between the openings of the devices, after them, within a window
 def test_a_restored_state_goes_on_bit_for_bit(cut: int) -> None:
-    config, of = drawn().config, events(STATED)
-    whole, first = Run(config), Run(config)
-    expected = [result for event in of for result in whole.feed(event)]
-    found = [result for event in of[:cut] for result in first.feed(event)]
-    again = Pipeline.restore(config.model_dump_json(), first.pipeline.snapshot())
-    found += [r for event in of[cut:] for r in again.step(event) if not isinstance(r, Acceleration)]
-    assert found == expected
-    for run in (whole, first):
-        run.close()
+    assert_goes_on(drawn().config, list(events(STATED)), cut)
 
 
 def test_a_recording_carries_them_so_that_its_audit_gives_the_same_results(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from agent.cli.main import run_cli
 from agent.config import Config
-from agent.core.events import Acceleration, CalibrationUpdate
+from agent.core.events import Acceleration, CalibrationUpdate, Event
 from agent.core.pipeline import Pipeline
 from benchmarks.online.life import Gateway
 from benchmarks.online.node import Node, Stated, Timing, node
@@ -103,7 +103,12 @@ def test_a_restored_state_goes_on_bit_for_bit() -> None:
     drawn = node(SEED, all_axes=True, stated=Stated(lag_s=0.01), timing=Timing(20.0, 60.0, 4))
     config = stating(drawn.config, prior=NEAR_TEXT, certificate=["flat"])
     events = list(visits(filtered(drawn, "sensor", NEAR), range(4)))
-    whole, first, cut = Run(config), Run(config), len(events) // 2
+    assert_goes_on(config, events, len(events) // 2)
+
+
+def assert_goes_on(config: Config, events: list[Event], cut: int) -> None:
+    """Check that a pipeline restored after `cut` events gives the same results as one that was never stopped."""
+    whole, first = Run(config), Run(config)
     expected = [result for event in events for result in whole.feed(event)]
     found = [result for event in events[:cut] for result in first.feed(event)]
     again = Pipeline.restore(config.model_dump_json(), first.pipeline.snapshot())
