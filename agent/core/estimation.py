@@ -295,7 +295,8 @@ class Estimation:
     def _follow(self) -> None:
         """Steps so small that each window alone was consistent, and drifts: the state may follow them.
 
-        A drift has made S or Q wrong since its onset. U covers this, and the rate becomes unknown.
+        A drift has made S or Q wrong since its onset. U covers this, and the rate becomes unknown. What looks like a
+        change of S may be another filter, so that the response over frequency is found anew with S.
         """
         loose, rate = np.zeros(12), np.zeros(12)
         for k, verdict in enumerate(self.drift.result()):
@@ -305,7 +306,8 @@ class Estimation:
                 rate[k] = np.hypot(verdict.rate, verdict.u_rate)
             loose[k] = np.hypot(verdict.change, verdict.u_change)
         if loose.any():
-            self.recursion.loosen(loose, tilt_rad(loose[9:], self.recursion.scale), u_rate=rate)
+            leaning_rad, another_filter = tilt_rad(loose[9:], self.recursion.scale), bool(loose[:9].any())
+            self.recursion.loosen(loose, leaning_rad, u_rate=rate, another_filter=another_filter)
             self.drift.restart(loose > 0.0)
 
     # --- state

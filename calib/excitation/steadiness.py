@@ -8,6 +8,7 @@ strong, its output is not proportional to the motion, and no S is right for the 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.model import Array
 from calib.signal.order_statistics import median, quantile
@@ -15,8 +16,9 @@ from calib.signal.order_statistics import median, quantile
 # The change of the mean is searched at the edges of such blocks. The scatter of the blocks shows how well it is known.
 BLOCK_S = 1.0
 FEWEST_BLOCKS = 4  # fewer blocks have two differences at most, too few to know their scatter
-FEWEST_STRONG = 8  # of fewer blocks a robust scatter is too uncertain
+FEWEST_BLOCKS_TOLD = 8  # of fewer blocks a robust scatter is too uncertain
 STRONG = 0.9  # share of the points with less motion than those that are called strong
+MODERATE = 0.5  # and of those with less motion than moderate ones, which have as much power as the strong ones
 # The median of chi-squared with three degrees of freedom over its mean.
 MEDIAN_OF_THREE = 0.789
 
@@ -51,25 +53,41 @@ def step(residual: Array, rate_hz: float) -> tuple[float, float]:
 
 def nonlinearity(V: Array, residual: Array, rate_hz: float) -> dict[str, float]:
     """By how many per cent the sensitivity to the strongest tenth of the motion differs from that of the whole window
-    (`nonlinearity_pct`), and the standard uncertainty of this, from the scatter of blocks (`u_nonlinearity_pct`).
+    (`nonlinearity_pct`), and the standard uncertainty of this (`u_nonlinearity_pct`).
 
     `V` (n, 3) in output unit, `residual` (n, 3) from its regression on the motion, knocks included: a sensor that slips
-    where the motion is strong looks as if it were knocked there. Blocks with a slip are few, and do not count in the
-    scatter, which is robust. Both are 0 if the strong points are in fewer than FEWEST_STRONG blocks. `motion_kurtosis`
-    is 3 for Gaussian motion along one line and 1.5 for a sine.
+    where the motion is strong looks as if it were knocked there. The uncertainty is that of the points with moderate
+    motion, where such a sensor does not slip. Both are 0 if the strong points are in fewer than FEWEST_BLOCKS_TOLD
+    blocks. `motion_kurtosis` is 3 for Gaussian motion along one line and 1.5 for a sine.
     """
     moved = V - residual
     moved -= moved.mean(axis=0)
     power = np.einsum("ni,ni->n", moved, moved)
     kurtosis = float(np.mean(power**2)) / max(float(np.mean(power)) ** 2, np.finfo(float).tiny)
-    strong = np.flatnonzero(power >= quantile(power, STRONG))
-    block = strong // max(round(BLOCK_S * rate_hz), 1)
-    in_block = np.bincount(block, power[strong])
-    along = np.bincount(block, np.einsum("ni,ni->n", residual[strong], moved[strong]))[in_block > 0.0]
-    in_block = in_block[in_block > 0.0]
+    size, least = max(round(BLOCK_S * rate_hz), 1), quantile(power, STRONG)
+    strong = np.flatnonzero(power >= least)
+    along, in_block = _in_blocks(strong, size, moved, residual, power)
     gain = u = 0.0
-    if len(in_block) >= FEWEST_STRONG:
+    if len(in_block) >= FEWEST_BLOCKS_TOLD:
         gain = float(along.sum() / in_block.sum())
-        scatter = np.abs(along - gain * in_block) / np.sqrt(in_block)
-        u = 1.4826 * float(median(scatter)) / float(np.sqrt(in_block.sum()))
+        moderate = np.flatnonzero((power >= quantile(power, MODERATE)) & (power < least))
+        others = _in_blocks(moderate, size, moved, residual, power)
+        scatter = _scatter(*others) if len(others[1]) >= FEWEST_BLOCKS_TOLD else _scatter(along, in_block)
+        u = scatter / float(np.sqrt(in_block.sum()))
     return {"nonlinearity_pct": 100.0 * abs(gain), "u_nonlinearity_pct": 100.0 * u, "motion_kurtosis": kurtosis}
+
+
+def _in_blocks(at: NDArray[np.intp], size: int, moved: Array, residual: Array, power: Array) -> tuple[Array, Array]:
+    """Of the points `at`: the residual along the motion times the motion, and its power, summed up by block of `size`
+    points. Blocks without such points are left out."""
+    block = at // size
+    in_block = np.bincount(block, power[at])
+    along = np.bincount(block, np.einsum("ni,ni->n", residual[at], moved[at]))
+    return along[in_block > 0.0], in_block[in_block > 0.0]
+
+
+def _scatter(along: Array, in_block: Array) -> float:
+    """The standard deviation of the residual along the motion, from its scatter between blocks; a few blocks with knocks
+    do not count."""
+    gain = float(along.sum() / in_block.sum())
+    return 1.4826 * float(median(np.abs(along - gain * in_block) / np.sqrt(in_block)))

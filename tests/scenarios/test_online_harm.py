@@ -37,6 +37,24 @@ def test_pieces_between_lost_samples_are_not_believed_too_much(seed: int) -> Non
     assert harm.harmed("10 % lost", seed).wrong == ""
 
 
+@pytest.mark.parametrize("seed", [20279, 20433])
+def test_a_sensor_that_slips_in_motion_hardly_above_its_noise_is_refused(seed: int) -> None:
+    """A regression test. The slips themselves made the nonlinearity look uncertain: S_yy was wrong by 5 and 7 u."""
+    outcome = harm.harmed("slips on its mount", seed)
+    assert outcome.wrong == ""
+    assert outcome.windows >= 12
+    assert outcome.used == 0
+
+
+def test_a_filter_that_looks_like_a_step_of_the_sensitivity_makes_the_response_unknown() -> None:
+    """A regression test. A low-pass filter at 36 Hz came in mid-life. The drift test saw a step of S_yy, only S was set
+    free, and the response over frequency stayed that without a filter: S_yy was wrong by 6 u."""
+    outcome = harm.harmed("low-pass filter", 20304)
+    assert outcome.wrong == ""
+    assert outcome.drifts > 0
+    assert outcome.used > 0
+
+
 def test_harmless_windows_are_taken() -> None:
     outcomes = [harm.harmed("", harm.SEED + 100_000 + k) for k in range(12)]
     assert [o.wrong for o in outcomes] == [""] * 12

@@ -48,6 +48,19 @@ def test_a_sensor_that_slips_where_the_motion_is_strong_is_refused(above: float)
     assert window(u, output(u, 1)).used
 
 
+def test_slips_do_not_hide_in_noise_nor_make_themselves_uncertain() -> None:
+    """50 seeds of 20 s, noise a tenth of the motion, slips above twice its rms: all are refused. The strong points
+    scatter by their slips; how uncertain their sensitivity is, the moderate points tell."""
+    seconds = slice(0, round(20 * RATE_HZ))
+    for seed in range(50):
+        u = random_motion(seed)[seconds]
+        noise = 0.1 * np.random.default_rng([seed, 2]).normal(size=(len(u), 3))
+        slipping, sound = (window(u, output(felt, seed) + noise) for felt in (np.clip(u, -2.0, 2.0), u))
+        assert not slipping.used
+        assert slipping.reason.startswith("the output is not proportional to the motion")
+        assert sound.used
+
+
 def test_an_output_that_rises_more_than_the_motion_is_refused_as_well() -> None:
     u = random_motion(2)
     found = window(u, output(u + 0.02 * u**3, 2))
