@@ -87,7 +87,7 @@ def _in_blocks(at: NDArray[np.intp], size: int, moved: Array, residual: Array, p
 
 
 def _scatter(along: Array, in_block: Array) -> float:
-    """The standard deviation of the residual along the motion, from its scatter between blocks; a few blocks with knocks
-    do not count."""
+    """The standard deviation of the residual along the motion, from its scatter between blocks; a few blocks with
+    knocks do not count."""
     gain = float(along.sum() / in_block.sum())
     return 1.4826 * float(median(np.abs(along - gain * in_block) / np.sqrt(in_block)))
