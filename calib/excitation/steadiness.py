@@ -81,8 +81,8 @@ def _in_blocks(at: NDArray[np.intp], size: int, moved: Array, residual: Array, p
     """Of the points `at`: the residual along the motion times the motion, and its power, summed up by block of `size`
     points. Blocks without such points are left out."""
     block = at // size
-    in_block = np.bincount(block, power[at])
-    along = np.bincount(block, np.einsum("ni,ni->n", residual[at], moved[at]))
+    in_block: Array = np.bincount(block, power[at]).astype(np.float64)
+    along: Array = np.bincount(block, np.einsum("ni,ni->n", residual[at], moved[at])).astype(np.float64)
     return along[in_block > 0.0], in_block[in_block > 0.0]
 
 
