@@ -3,7 +3,8 @@
     python -m benchmarks.response [--known] [--runs 100] [--write]
 
 A sensor and a tri-axial reference move together for 300 s; a filter is in the sensor or (its inverse) in the reference.
-The reference's error is drawn from its stated uncertainty of 0.1 %. With --known the filters are stated, and their
+The reference's error is drawn from its stated uncertainty of 0.1 %, and the corners of the axes from theirs of 1 %
+about their mean. With --known the filters are stated, and their
 corners differ from what is stated by errors drawn from their uncertainty of 10 %.
 """
 
@@ -22,10 +23,11 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.page import machine, write_part
+from calib.estimate.deviations import U_CORNER
 from calib.estimate.nuisances import Priors
 from calib.recorded.adjusting import adjusted
 from calib.signal.known_response import UNKNOWN, known_of
-from tests.pair import Filter, decimator, highpass, lowpass, moving_mean, pair, resonance, sinc3
+from tests.pair import Filter, decimator, flat, highpass, lowpass, moving_mean, pair, resonance, sinc3
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "response.md"
 U_REFERENCE = 1e-3
@@ -61,7 +63,7 @@ KNOWN: dict[str, Callable[[float], tuple[str, Callable[[float], Filter]]]] = {
         f"sinc order=3 points=4096 rate_hz={4096.0 * f / 0.2625!r} u_rate_pct=10", lambda by: sinc3(0.2625 / f / by)
     ),
 }  # fmt: skip
-U_CORNER, KNOWN_RATIOS, KNOWN_BAND_HZ = 0.1, (1.2, 1.5, 2.0, 5.0), (0.5, 20.0)
+U_KNOWN, KNOWN_RATIOS, KNOWN_BAND_HZ = 0.1, (1.2, 1.5, 2.0, 5.0), (0.5, 20.0)
 Job = tuple[str, float, tuple[float, float], bool, int]
 Result = tuple[bool, float, float]  # refused; relative error of S_xx without the reference's, over its u with it
 
@@ -69,11 +71,18 @@ Result = tuple[bool, float, float]  # refused; relative error of S_xx without th
 def one(job: Job) -> Result:
     """One run: whether it was refused, the relative error of S_xx besides the reference's, and error over u."""
     name, ratio, band_hz, in_reference, seed = job
-    made_of = CORNERS[name](band_hz[0] / ratio) if name in CORNERS else FILTERS[name](ratio * band_hz[1])
-    response: Filter = (lambda f: 1.0 / made_of(f)) if in_reference else made_of
     key = [seed, [*FILTERS, *CORNERS].index(name), round(10.0 * ratio), round(band_hz[1]), int(in_reference)]
-    error = U_REFERENCE * np.random.default_rng(key).normal()
-    made = pair(seed, response, band_hz=band_hz, rate_hz=10.0 * band_hz[1], seconds=300.0, reference_error=float(error))
+    random = np.random.default_rng(key)
+    error, differs = U_REFERENCE * random.normal(), random.normal(size=3)
+    times = 1.0 + U_CORNER * np.sqrt(1.5) * (differs - differs.mean())
+    corner_hz, make = (band_hz[0] / ratio, CORNERS) if name in CORNERS else (ratio * band_hz[1], FILTERS)
+    own = [make[name](corner_hz * by) for by in times.tolist()]
+    by_axis: Filter = lambda f: np.stack([h(f) for h in own])  # noqa: E731
+    undone: Filter = lambda f: 1.0 / by_axis(f)  # noqa: E731
+    made = pair(
+        seed, undone if in_reference else flat, of_outputs=flat if in_reference else by_axis, band_hz=band_hz,
+        rate_hz=10.0 * band_hz[1], seconds=300.0, reference_error=float(error),
+    )  # fmt: skip
     stated = Priors(
         reference=U_REFERENCE,
         reference_frequency_hz=made.reference_frequency_hz,
@@ -92,7 +101,7 @@ def one_known(job: tuple[str, float, bool, int]) -> tuple[Result, Result]:
     name, ratio, in_reference, seed = job
     line, filter_by = KNOWN[name](ratio * KNOWN_BAND_HZ[1])
     random = np.random.default_rng([23, seed, [*KNOWN].index(name), round(10.0 * ratio), int(in_reference)])
-    acts, error = filter_by(1.0 + U_CORNER * random.normal()), U_REFERENCE * random.normal()
+    acts, error = filter_by(1.0 + U_KNOWN * random.normal()), U_REFERENCE * random.normal()
     response: Filter = (lambda f: 1.0 / acts(f)) if in_reference else acts
     found = []
     for known in (known_of(["flat"], [line]) if in_reference else known_of([line], ["flat"]), UNKNOWN):

@@ -143,13 +143,15 @@ def pair(
     known: KnownResponse = UNKNOWN,
     disturbed: Disturbance = undisturbed,
     reference_late_s: float = 0.0,
+    stated_noise_mps2: float = 0.0,
 ) -> Pair:
     """Random motion in `band_hz`, the same power at all its frequencies; `reference_error` is relative.
 
     The sensor's input axes show the motion through `response` and its outputs through `of_outputs`, both alike in all
     axes (F,) or by axis (3, F).
     `known`: what is stated of the filters, whatever they are. `disturbed`: what is added to both signals. The samples
-    of the reference are taken `reference_late_s` after those of the sensor.
+    of the reference are taken `reference_late_s` after those of the sensor. `stated_noise_mps2`: what is stated of its
+    noise.
     """
     random = np.random.default_rng(seed)
     n = int((seconds + 2.0 * BEYOND_S) * rate_hz)
@@ -175,7 +177,7 @@ def pair(
         SensorTable("sensor.csv", time_s, V),
         ReferenceTable("reference.csv", time_s + reference_late_s, u, "acceleration", "ax_mps2"),
         [PoseInterval(0.0, float(time_s[-1]), pose)],
-        Instrument(known=known),
+        Instrument(noise=stated_noise_mps2, known=known),
         Making(Settings(bands=True)),
     )
     return Pair(files, sensitivity, middle_hz)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.estimate.banded import Deviations
+from calib.estimate.deviations import Deviations, LeftOpen
 from calib.estimate.quantities import (
     ALPHA,
     ALPHA_BY_POSITION,
@@ -202,10 +202,23 @@ def from_version_5(state: dict[str, Any]) -> None:
         holder |= {"filters": {}, "device": ""}
 
 
+def from_version_6(state: dict[str, Any]) -> None:
+    """Version 6 did not sum up what bands leave open; it counts from now on."""
+    for estimation in _estimations(state):
+        recursions = [estimation["recursion"], *(proposal["recursion"] for proposal in estimation["proposed"])]
+        for recursion in recursions:
+            recursion["over"]["left_open"] = asdict(LeftOpen())
+        recent = (summary for recursion in recursions for summary in recursion["recent"])
+        for summary in (*recent, *estimation["held"], *estimation["witnesses"]):
+            if (bands := summary["data"]["bands"]) is not None:
+                bands["left_open"] = asdict(LeftOpen())
+
+
 MIGRATIONS: Mapping[int, Callable[[dict[str, Any]], None]] = {
     1: from_version_1,
     2: from_version_2,
     3: from_version_3,
     4: from_version_4,
     5: from_version_5,
+    6: from_version_6,
 }

@@ -9,7 +9,7 @@ import numpy as np
 
 from agent.core.migrations import MIGRATIONS
 
-VERSION = 6
+VERSION = 7
 _ARRAY = 1  # msgpack extension code for a numpy array
 
 

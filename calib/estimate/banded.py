@@ -8,88 +8,22 @@ takes out what is known of h; what is left is small, so that all is linear in it
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.distributions import chi2_quantile
-from calib.excitation.bands import HIGHEST
+from calib.estimate.deviations import BetweenBands, Deviations, LeftOpen
+from calib.excitation.bands import HIGHEST, RELATED
 from calib.excitation.sums import NOISE_FLOOR
 from calib.model import Array, BandSums
 from calib.signal.order_statistics import distinct
 from calib.signal.response import POWERS, Complex, by_term
 
-PROBABILITY = 0.99  # confidence of the test for scatter between bands
 TINY = float(np.finfo(float).tiny)
+U_WHITE = 0.1  # relative standard uncertainty of the power of white noise, from a spectrum of some hundred lines
 NARROW = 1e-3  # SD of omega^2 relative to its mean
 MOST_TAPERED = 2.0  # times: power of a band in the whole window over that in the tapered one
-RELATED = 1e-9  # relative eigenvalue of the channels' scatter below which a direction was not excited
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class BetweenBands:
-    """How far bands deviate, beyond their noise, from the response that fits all of them best (see Deviations).
-
-    `scatter` is the relative SD, 0 where noise explains all. A narrow feature raises the noise of its band and so has
-    little weight in it: `shift` is how far the deviations move the slopes of whole windows, relative; 0 where noise
-    explains that. `at_hz` is the frequency that contributes most, and `largest` the deviation there.
-    """
-
-    scatter: float = 0.0
-    shift: float = 0.0
-    at_hz: float = 0.0
-    largest: float = 0.0
-
-    @property
-    def relative_u(self) -> float:
-        """Relative standard uncertainty of S."""
-        return max(self.scatter, self.shift)
-
-
-@dataclass(frozen=True, slots=True)
-class Deviations:
-    """Sums over the bands of windows, from which `between` follows. The sums of several windows add.
-
-    `square` of the rows that the best response leaves, in units of their noise, with `freedom` degrees of freedom;
-    `signal` of the rows themselves; `moved`, `power` and `variance`: how far the deviations move the slopes of whole
-    windows, their size, and the variance that noise alone gives to `moved`. `at_hz`, `largest` as in BetweenBands.
-    """
-
-    freedom: float = 0.0
-    square: float = 0.0
-    signal: float = 0.0
-    moved: float = 0.0
-    power: float = 0.0
-    variance: float = 0.0
-    at_hz: float = 0.0
-    largest: float = 0.0
-
-    def plus(self, other: Deviations) -> Deviations:
-        """Those of both; the frequency is that of the larger deviation."""
-        worst = max(self, other, key=lambda one: one.largest)
-        added = {name: getattr(self, name) + getattr(other, name) for name in _ADDED}
-        return replace(worst, **added)
-
-    @property
-    def times_noise(self) -> float:
-        """The variance of the rows over that of their noise; 1 where noise alone shows as much in one of 100 cases."""
-        if self.freedom < 1.0 or self.square <= chi2_quantile(PROBABILITY, self.freedom):
-            return 1.0
-        return max(self.square / self.freedom, 1.0)
-
-    @property
-    def between(self) -> BetweenBands:
-        """The deviations beyond noise, which shows as much in one of 100 cases."""
-        if self.freedom < 1.0:
-            return BetweenBands()
-        excess = self.square - self.freedom if self.times_noise > 1.0 else 0.0
-        shifted = self.moved**2 > chi2_quantile(PROBABILITY, 1.0) * self.variance
-        shift = abs(self.moved) / self.power if shifted else 0.0
-        return BetweenBands(float(np.sqrt(max(excess, 0.0) / self.signal)), shift, self.at_hz, self.largest)
-
-
-_ADDED = ("freedom", "square", "signal", "moved", "power", "variance")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,13 +32,14 @@ class Banded:
 
     `projected` (W, K, 2M, M): derivatives, by the terms, of the slopes of h u on [u, du/dt] of the whole window.
     `residual` (R,) and `moves` (R, K): whitened rows of the terms alone, of all windows together; where the bands
-    deviate by more than their noise, their noise is taken as much larger.
+    deviate by more than their noise, their noise is taken as much larger. `left_open`: what the bands cannot tell.
     """
 
     projected: Array
     residual: Array
     moves: Array
     deviations: Deviations
+    left_open: LeftOpen
 
     @property
     def between(self) -> BetweenBands:
@@ -129,7 +64,7 @@ def banded(
     sines and of their harmonics, which tell no term of the response. `powers`: how many terms there are.
     """
     projected = np.array([_at_one_frequency(np.sqrt(square), channels, powers) for square in mean_omega2.tolist()])
-    together = _Together(powers)
+    together, left_open = _Together(powers), LeftOpen()
     for w, own in enumerate(bands):
         if own is None or own.reference_channels != channels:
             continue
@@ -137,9 +72,10 @@ def banded(
         if kept.size:
             factors = Factors(own, kept)
             projected[w] = _projected(factors, powers, omega2[w])
+            left_open = left_open.plus(_left_open(factors, powers))
             if not one_frequency:
                 together.add(_told(factors, powers))
-    return together.result(projected)
+    return together.result(projected, left_open)
 
 
 class Factors:
@@ -147,6 +83,8 @@ class Factors:
 
     `gram` (B, 2M, 2M) is that of [u, du/dt], `root` (B, 2M, 2M) its factor, `slopes` (B, 2M, 3) = root b, `noise`
     (B, 3) their noise. `omega` (B,) in rad/s is that of the motion in the band, `middle_hz` (B,) the band's middle.
+    `told` and `left` (B, 3): the power of V that the motion explains, and the rest; `white` (B, 3): what white noise of
+    sensor and reference has in it. Of the `points` (B,), the rest has `free` (B,) degrees of freedom.
     """
 
     def __init__(self, bands: BandSums, kept: NDArray[np.int64]) -> None:
@@ -165,10 +103,13 @@ class Factors:
         self.slopes = inverse * (ways @ (cross / scale[..., None]))
         b = (vectors @ (inverse * self.slopes)) / scale[..., None]
         total = powers[:, 2 * m :]
-        left = total - np.sum(self.slopes**2, axis=1) + np.einsum("br,bri->bi", bands.noise[kept], b**2)
-        left = np.maximum(left, NOISE_FLOOR**2 * total)
+        reference = np.einsum("br,bri->bi", bands.noise[kept, : 2 * m], b**2)
+        left = np.maximum(total - np.sum(self.slopes**2, axis=1) + reference, NOISE_FLOOR**2 * total)
+        self.told, self.left = np.maximum(total - left, 0.0), left
+        self.points, self.white = bands.points[kept], reference + bands.noise[kept, 2 * m :]
         # The mean of 1 / noise^2 is right if two degrees of freedom fewer are counted (the inverse of a chi-squared).
         freedom = bands.points[kept] - np.count_nonzero(live, axis=1) - 2.0
+        self.free = freedom + 2.0
         self.noise = np.maximum(np.sqrt(left / freedom[:, None] / bands.independent), TINY)
 
     def seen(self, response: Complex) -> Array:
@@ -267,6 +208,21 @@ def _told(factors: Factors, powers: int) -> _Told:
     return _Told(rows[:, 0], rows[:, 1:], observed.ravel(), at_hz, noise, 3 * free.shape[2])
 
 
+def _left_open(factors: Factors, powers: int) -> LeftOpen:
+    rest = factors.left * (factors.points / factors.free)[:, None]
+    white = np.where(np.isfinite(factors.white), factors.white, rest)
+    chance = 2.0 * rest**2 / factors.free[:, None] + (U_WHITE * white) ** 2
+    rows, third = np.hstack([factors.told, rest - white, chance]), _third(factors.middle_hz)
+    thirds = [(k, tuple(rows[third == k].sum(axis=0).tolist())) for k in distinct(third).tolist()]
+    moments = factors.told.sum(axis=1) @ by_term(factors.omega, powers).real
+    return LeftOpen(tuple(thirds), tuple(moments.tolist()))
+
+
+def _third(frequency_hz: Array) -> NDArray[np.int64]:
+    """The numbers of the thirds of an octave."""
+    return np.round(3.0 * np.log2(frequency_hz)).astype(np.int64)
+
+
 def _length(columns: Array) -> Array:
     """(A, 1, p) length of each column (A, R, p), 1 where it is zero."""
     return _unit(np.sum(columns**2, axis=1, keepdims=True))
@@ -298,15 +254,15 @@ class _Together:
         self._sums += np.array(parts, dtype=np.float64)
         self._rows, self._free = self._rows + len(rows), self._free + told.free
         moved = np.column_stack([(told.signal * variance)[:, None] * rows, size * variance])
-        third: NDArray[np.int64] = np.round(3.0 * np.log2(told.at_hz)).astype(np.int64)
+        third = _third(told.at_hz)
         for k in distinct(third).tolist():
             self._thirds[k] = self._thirds.get(k, np.zeros(self._powers + 2)) + moved[third == k].sum(axis=0)
 
-    def result(self, projected: Array) -> Banded:
-        """What the bands say; `projected` as in Banded."""
+    def result(self, projected: Array, left_open: LeftOpen) -> Banded:
+        """What the bands say; `projected` and `left_open` as in Banded."""
         size = self._powers
         if not self._thirds:
-            return Banded(projected, np.zeros(0), np.zeros((0, size)), Deviations())
+            return Banded(projected, np.zeros(0), np.zeros((0, size)), Deviations(), left_open)
         triangle = self._triangle.copy()
         moves, residual = triangle[:, :size], triangle[:, size]
         scale = _unit(np.sum(moves**2, axis=0))
@@ -314,7 +270,7 @@ class _Together:
         fitted = fitted / scale
         deviations = self._deviations(fitted, float(np.sum((residual - moves @ fitted) ** 2)))
         triangle /= np.sqrt(deviations.times_noise)
-        return Banded(projected, triangle[:size, size], triangle[:size, :size], deviations)
+        return Banded(projected, triangle[:size, size], triangle[:size, :size], deviations, left_open)
 
     def _deviations(self, fitted: Array, square: float) -> Deviations:
         """The sums of what the best response, with the terms `fitted` (K,), leaves; `square` is that of the rows."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.estimate.banded import BetweenBands
+from calib.estimate.deviations import BetweenBands
 from calib.estimate.gauss_newton import Solution, slope_residuals
 from calib.estimate.scatter import between_windows
 from calib.model import Array
@@ -56,6 +56,7 @@ def budget(solution: Solution, stated_offset_scatter_mps2: float, known_u: float
         sources["response between bands"] = (_alike(solution, bands.relative_u), np.inf)
     if known_u > 0.0:
         sources["known filters"] = (_alike(solution, known_u), np.inf)
+    sources |= {name: (middle, np.inf) for name, middle in _left_open(solution).items()}
     half = solution.half
     sources["prior of S and Q"] = (half[:12].T @ solution.prior_precision[:12, :12] @ half[:12], np.inf)
     terms = solution.equations.nuisances.terms
@@ -94,9 +95,24 @@ def _type_a(solution: Solution) -> Array:
     return _quadratic(slope_rows, type_a.slopes) + _quadratic(mean_rows, type_a.means) + band_rows.T @ band_rows
 
 
-def _alike(solution: Solution, relative: float) -> Array:
-    """(N, N) of a relative standard uncertainty that all slopes share."""
-    S = np.append(solution.x[:9], np.zeros(len(solution.x) - 9))
+def _left_open(solution: Solution) -> dict[str, Array]:
+    """The sources that no band of frequency tells of (calib.estimate.deviations.LeftOpen)."""
+    equations, sources = solution.equations, dict[str, Array]()
+    if equations.data.bands is None:
+        return sources
+    left_open = equations.data.bands.left_open
+    if (u_lost := left_open.u_lost(equations.nuisances.reference_frequency_hz)) > 0.0:
+        sources["whose noise it is"] = _alike(solution, u_lost)
+    if (u_alike := equations.nuisances.u_alike(solution.x[12:], left_open)) > 0.0:
+        rows = [slice(3 * row, 3 * row + 3) for row in range(3)]
+        sources["response by axis"] = np.sum([_alike(solution, u_alike, row) for row in rows], axis=0)
+    return sources
+
+
+def _alike(solution: Solution, relative: float, elements: slice = slice(9)) -> Array:
+    """(N, N) of a relative standard uncertainty that these elements of S share."""
+    S = np.zeros(len(solution.x))
+    S[elements] = solution.x[elements]
     rows = slope_residuals(solution)[1]
     rows = rows.reshape(-1, rows.shape[-1])
     loading = rows.T @ (rows @ np.linalg.solve(solution.half, S))

@@ -21,6 +21,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.estimate.deviations import LeftOpen
 from calib.estimate.quantities import (
     LAG,
     PRIORS,
@@ -243,6 +244,7 @@ class Nuisances:
         self.sensor_corner = self._stacked("sensor_corner", (1,))[:, 0]
         self.response = self._stacked("response", (priors.response_powers,))
         # Of ln |h| at the reference frequency by the terms, when the response is 1 at 0 Hz.
+        self.reference_frequency_hz = priors.reference_frequency_hz
         at = np.array([2.0 * np.pi * priors.reference_frequency_hz])
         self._at_reference = (1.0 - priors.reference_share) * by_term(at, priors.response_powers)[0].real
         self._applied_response = self._applied() @ self.response
@@ -281,6 +283,11 @@ class Nuisances:
         """The sensitivity at 0 Hz over that at the reference frequency, and the derivatives (J,) of its logarithm."""
         away = self._at_reference @ (self._applied_response + z @ self.response) + self._known_size
         return float(np.exp(-away)), -(self.response @ self._at_reference)
+
+    def u_alike(self, z: Array, left_open: LeftOpen) -> float:
+        """Relative standard uncertainty of a row of S because the axes do not respond quite alike."""
+        powers = ALL_POWERS[: len(self._at_reference)]
+        return left_open.u_alike(self._applied_response + z @ self.response, self._at_reference, powers)
 
     def at(self, z: Array) -> Inputs:
         """The inputs when the nuisances have the values `z` (J,)."""

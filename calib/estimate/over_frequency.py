@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from typing import Any, Self
 
 import numpy as np
 
-from calib.estimate.banded import Deviations
 from calib.estimate.condense import Condensed, mean_frequency_hz
+from calib.estimate.deviations import Deviations, LeftOpen
 from calib.estimate.joint_state import JointState
 from calib.estimate.nuisances import Priors
 from calib.estimate.quantities import RESPONSE, Quantity
@@ -31,10 +31,11 @@ _ENDS: Complex = by_term(np.array([0.5, 1.0]) / WIDER) * in_units(1.0 / (2.0 * n
 class OverFrequency:
     """`motion_hz` is the band of the first window whose motion tells a response; None before. S means the same ever
     after: it holds at one frequency, and motion above `to_hz` is not used. `deviations` of all windows from one
-    response."""
+    response, and what they leave open."""
 
     motion_hz: tuple[float, float] | None = None
     deviations: Deviations = field(default_factory=Deviations)
+    left_open: LeftOpen = field(default_factory=LeftOpen)
     first_hz: float = 0.0  # mean frequency of the first window with motion; 0 before
     late_s: float | None = None  # the lag at this frequency, where it was the only one; None where a band told more
 
@@ -65,7 +66,10 @@ class OverFrequency:
 
     def taken(self, data: Condensed) -> Self:
         """After a window with these data."""
-        return self if data.bands is None else replace(self, deviations=self.deviations.plus(data.bands.deviations))
+        if (bands := data.bands) is None:
+            return self
+        deviations, left_open = self.deviations.plus(bands.deviations), self.left_open.plus(bands.left_open)
+        return replace(self, deviations=deviations, left_open=left_open)
 
     def reference_hz(self, priors: Priors) -> float:
         """The frequency at which S holds; 0 if nothing moved yet."""
@@ -108,16 +112,33 @@ class OverFrequency:
         u, u_was = (np.linalg.norm(_ENDS @ one.factor[k], axis=1) for one, k in ((state, own), (earlier, was)))
         return bool(np.any(moved > np.maximum(MOVED, SURELY * np.hypot(u, u_was))))
 
-    def factor(self, state: JointState, known_u: float) -> Array:
-        """A factor of the covariance of a state (N, N) or (N, N + 1), with what the bands deviate from one response,
-        and `known_u`, relative, of S."""
-        relative = self.deviations.between.relative_u
-        relative = float(np.hypot(relative, known_u)) if known_u else relative
-        if not relative:
+    def factor(self, state: JointState, reference: str, priors: Priors) -> Array:
+        """A factor (N, N + 4) of the covariance of a state beside a reference, with what known filters, the bands'
+        deviations and what they leave open add to that of S. (N, N) before any band.
+        """
+        parts = [priors.known_u, self.deviations.between.relative_u, self.left_open.u_lost(self.reference_hz(priors))]
+        alike = self.left_open.u_alike(*self._terms(state, reference, priors))
+        if not any(parts) and not alike:
             return state.factor
-        deviating = np.zeros((len(state), 1))
-        deviating[:9, 0] = relative * state.mean[:9]
-        return np.hstack([state.factor, deviating])
+        more = np.zeros((len(state), 4))
+        more[:9, 0] = float(np.linalg.norm(parts)) * state.mean[:9]
+        for row in range(3):
+            own = slice(3 * row, 3 * row + 3)
+            more[own, 1 + row] = alike * state.mean[own]
+        return np.hstack([state.factor, more])
+
+    def _terms(self, state: JointState, reference: str, priors: Priors) -> tuple[Array, Array]:
+        """The terms (K,) of the response beside a reference, and their effects (K,) on ln |h| where S holds."""
+        own, unit = self._unknowns(state, reference)
+        terms = np.zeros(len(POWERS))
+        terms[: len(own)] = unit[: len(own)] * state.mean[own]
+        return terms, self._at_reference(priors)
+
+    def _at_reference(self, priors: Priors) -> Array:
+        """(K,) effects of the terms on ln |h| at the reference frequency, as far as they are the sensor's."""
+        stated = self.stated(priors)
+        at_reference = by_term(np.array(2.0 * np.pi * stated.reference_frequency_hz)).real
+        return np.asarray((1.0 - stated.reference_share) * at_reference)
 
     def told(self, state: JointState, reference: str, priors: Priors, coverage_factor: float) -> ResponseTold | None:
         """The response beside a reference; None where it is no unknown."""
@@ -127,7 +148,7 @@ class OverFrequency:
         if not own:
             return None
         chosen, effects = [*range(9), *own], np.diag(in_units(self.to_hz))
-        factor, hz = self.factor(state, priors.known_u)[chosen], self.stated(priors).reference_frequency_hz
+        factor, hz = self.factor(state, reference, priors)[chosen], self.stated(priors).reference_frequency_hz
         return response_told(
             state.mean[chosen], factor @ factor.T, effects, hz, self.motion_hz, coverage_factor, per_octave=1.0,
             known=Known.of(self.stated(priors)),
@@ -136,11 +157,9 @@ class OverFrequency:
     def steady(self, state: JointState, reference: str, priors: Priors) -> dict[str, float]:
         """Derivatives, by the key of each term, of the logarithm of the sensitivity at 0 Hz over that at the reference
         frequency."""
-        stated = self.stated(priors)
-        at_reference = by_term(np.array(2.0 * np.pi * stated.reference_frequency_hz)).real
-        at_reference = (1.0 - stated.reference_share) * at_reference
         own, unit = self._unknowns(state, reference)
-        return {state.keys[k]: float(by) for k, by in zip(own, -(at_reference * unit)[: len(own)], strict=True)}
+        by_unknown = -(self._at_reference(priors) * unit)[: len(own)]
+        return {state.keys[k]: float(by) for k, by in zip(own, by_unknown, strict=True)}
 
     def log_h(self, state: JointState, reference: str, frequency_hz: float) -> float:
         """ln |h| beside a reference at a frequency, 0 at 0 Hz."""
@@ -162,7 +181,7 @@ class OverFrequency:
         if not own:
             return None
         chosen, effects = [*range(9), *own], attenuating(self.first_hz)[None]
-        factor, hz = self.factor(state, priors.known_u)[chosen], self.stated(priors).reference_frequency_hz
+        factor, hz = self.factor(state, reference, priors)[chosen], self.stated(priors).reference_frequency_hz
         band_hz = (self.first_hz, self.first_hz)
         return told_at_one_frequency(
             state.mean[chosen], factor @ factor.T, effects, hz, band_hz, coverage_factor, Known.of(self.stated(priors))
@@ -170,14 +189,15 @@ class OverFrequency:
 
     def snapshot(self) -> dict[str, Any]:
         """Plain values, for `load`."""
-        return {f.name: getattr(self, f.name) for f in fields(self)} | {"deviations": asdict(self.deviations)}
+        return asdict(self)
 
     @classmethod
     def load(cls, state: Mapping[str, Any]) -> OverFrequency:
         """The object whose snapshot this is."""
         band = state["motion_hz"]
         motion_hz = None if band is None else (band[0], band[1])
-        return cls(**{**state, "motion_hz": motion_hz, "deviations": Deviations(**state["deviations"])})
+        sums = {"deviations": Deviations(**state["deviations"]), "left_open": LeftOpen.load(state["left_open"])}
+        return cls(**{**state, "motion_hz": motion_hz, **sums})
 
 
 def terms_of(state: JointState, reference: str) -> list[int]:

@@ -13,7 +13,8 @@ import numpy as np
 
 from calib.distributions import chi2_quantile
 from calib.estimate.adjustment import Adjustment
-from calib.estimate.banded import PROBABILITY, Factors
+from calib.estimate.banded import Factors
+from calib.estimate.deviations import PROBABILITY
 from calib.estimate.quantities import LAG, RESPONSE
 from calib.estimate.response_told import BandSensitivity, Known, ResponseTold
 from calib.excitation.excited import excited
@@ -104,6 +105,7 @@ class _Rows:
             both = np.concatenate([real, imaginary / factors.omega[:, None, None]], axis=2)
             own = (both.reshape(-1, 6), factors.slopes.reshape(-1, 3), np.repeat(factors.noise, 2 * m, axis=0))
             parts.append(own)
+            told, lost = told + factors.told.sum(axis=0), lost + factors.left.sum(axis=0)
             moved = np.diagonal(factors.gram, axis1=1, axis2=2)
             power, square = power + float(moved[:, :m].sum()), square + float(moved[:, m:].sum())
         moved_hz = float(np.sqrt(square / power)) / (2.0 * np.pi) if power > 0.0 else np.nan

@@ -70,15 +70,15 @@ class ResponseTold:
     bands: tuple[BandSensitivity, ...]
     covariance: Array
 
-    def is_taken_out(self, taken: Response) -> bool:
-        """Whether `taken` differs from it by less than NEAR or a part of its uncertainty: what is left is small enough
-        to be estimated by linear equations."""
+    def is_taken_out(self, taken: Response, left_u: float = LEFT_U) -> bool:
+        """Whether `taken` differs from it by less than NEAR or `left_u` of its standard uncertainty: what is left is
+        small enough to be estimated by linear equations."""
         low_hz, high_hz = max(self.terms.from_hz, taken.from_hz), max(self.terms.to_hz, taken.to_hz)
         frequency_hz = np.linspace(low_hz, high_hz, 50)
         effects = by_term(2.0 * np.pi * frequency_hz, len(self.covariance))
         u = np.sqrt(np.maximum(np.sum((effects @ self.covariance) * effects.conj(), axis=1).real, 0.0))
         left = np.abs(self.terms.at(frequency_hz) - taken.at(frequency_hz))
-        return bool(np.all(left < np.maximum(NEAR, LEFT_U * u)))
+        return bool(np.all(left < np.maximum(NEAR, left_u * u)))
 
 
 def response_told(

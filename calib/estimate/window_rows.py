@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from calib.estimate.banded import Banded, Deviations
+from calib.estimate.banded import Banded
 from calib.estimate.condense import Condensed, condense
+from calib.estimate.deviations import Deviations, LeftOpen
 from calib.estimate.equations import Equations
 from calib.estimate.equations import Rows as Linear
 from calib.estimate.joint_state import JointState
@@ -111,7 +112,7 @@ class Summary:
         data["type_a"] = {f.name: getattr(self.data.type_a, f.name) for f in fields(self.data.type_a)}
         if (bands := self.data.bands) is not None:
             of_bands = {f.name: getattr(bands, f.name) for f in fields(bands)}
-            data["bands"] = of_bands | {"deviations": asdict(bands.deviations)}
+            data["bands"] = of_bands | {name: asdict(of_bands[name]) for name in ("deviations", "left_open")}
         poses = {
             name: {f.name: getattr(pose, f.name) for f in fields(pose)}
             for name, pose in (("pose", self.pose), ("moved", self.moved))
@@ -123,7 +124,8 @@ class Summary:
         """The summary whose snapshot this is."""
         data = {**state["data"], "type_a": TypeA(**state["data"]["type_a"])}
         if (bands := data["bands"]) is not None:
-            data["bands"] = Banded(**{**bands, "deviations": Deviations(**bands["deviations"])})
+            sums = {"deviations": Deviations(**bands["deviations"]), "left_open": LeftOpen.load(bands["left_open"])}
+            data["bands"] = Banded(**{**bands, **sums})
         poses = {name: Pose(**state[name]) for name in ("pose", "moved")}
         band = state["motion_hz"]
         told = {"response": tuple(state["response"]), "motion_hz": None if band is None else (band[0], band[1])}

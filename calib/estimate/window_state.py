@@ -94,7 +94,7 @@ class WindowState:
 
     def _factor(self) -> Array:
         """A factor of the covariance of the state, with what the response over frequency adds to it."""
-        return self._over.factor(self._joint.state, self._stated.priors.known_u)
+        return self._over.factor(self._joint.state, self.reference, self._stated.priors)
 
     @property
     def shares(self) -> list[ReferenceShare]:

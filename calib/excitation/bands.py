@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -22,10 +23,12 @@ HANN = 0.5
 TAPER = 0.1  # of the window, at each end: longer than the impulse response of any filter of an instrument
 MORE_LINES = 6  # in a band, beside those that the regression on u and du/dt uses; a band with fewer joins the next one
 FEWEST_BANDS = 4
+RELATED = 1e-9  # relative eigenvalue of the channels' scatter below which a direction was not excited
 # A band is used if the motion is so many times the reference's noise, in power: the correction leaves a tenth of it.
 OVER_NOISE = 100.0
 # A response is told by motion that has so large a share of its power in so many third octaves.
 LEAST_SHARE, FEWEST_THIRDS = 1e-2, 4
+LEAST_SHOWN = 0.25  # of V in a band, by the motion: with less, the reference's noise may look like motion
 HIGHEST = 1.001  # times the upper end of the motion: a band that ends there is rounded
 BELOW, ABOVE = 1e-2, 1e-3  # shares of the motion's power outside its band: a response differs more above than below
 
@@ -51,8 +54,16 @@ def band_sums(u: Array, du: Array, V: Array, rate_hz: float, share: float = TAPE
     edges = _edges(frequency_hz, fewest)
     products = np.array([(lines[:, a:b] @ lines[:, a:b].conj().T).real for a, b in itertools.pairwise(edges.tolist())])
     ends_hz = np.append(frequency_hz, 0.5 * rate_hz)[edges]
-    nothing = np.zeros((len(products), 2 * m))
+    nothing = np.zeros((len(products), 2 * m + 3))
     return BandSums(m, ends_hz[:-1], ends_hz[1:], 2.0 * np.diff(edges), density, 2.0 / n * products, nothing)
+
+
+def beside_noise(bands: BandSums, sensor_noise: Array) -> BandSums:
+    """The same bands with the white noise of V: `sensor_noise` (3,) is its rms of a point: 0 where nobody knows it,
+    inf where all noise that is not the reference's white noise is V's."""
+    noise = bands.noise.copy()
+    noise[:, -3:] = bands.points[:, None] * sensor_noise**2
+    return replace(bands, noise=noise)
 
 
 def without_noise(bands: BandSums, noise: Array) -> BandSums:
@@ -61,7 +72,8 @@ def without_noise(bands: BandSums, noise: Array) -> BandSums:
     `noise` (2, m): its rms in u and du/dt. Their ratio tells up to which frequency it is.
     """
     m, total = noise.shape[1], float(bands.points.sum())
-    power = np.zeros((len(bands.points), 2 * m))
+    power = np.zeros_like(bands.noise)
+    power[:, -3:] = bands.noise[:, -3:]
     kept = np.ones(len(power), dtype=bool)
     own = bands.products.diagonal(axis1=1, axis2=2)
     moved, moved_rate = own[:, :m].sum(axis=1), own[:, m : 2 * m].sum(axis=1)
@@ -73,7 +85,7 @@ def without_noise(bands: BandSums, noise: Array) -> BandSums:
         kept &= (moved > OVER_NOISE * power[:, k]) & (moved_rate > OVER_NOISE * power[:, m + k])
         kept &= bands.high_hz <= end_hz
     products = bands.products.copy()
-    products[:, range(2 * m), range(2 * m)] -= power
+    products[:, range(2 * m), range(2 * m)] -= power[:, : 2 * m]
     low_hz, high_hz, points = (part[kept] for part in (bands.low_hz, bands.high_hz, bands.points))
     return BandSums(m, low_hz, high_hz, points, bands.independent, products[kept], power[kept])
 
@@ -164,6 +176,27 @@ def _end(edge: Array, order: Array, power: Array, outside: float) -> float:
 
 
 def _powers(bands: BandSums) -> tuple[Array, Array]:
-    """The power of the motion and of its derivative, in each band of a window."""
+    """The power of the motion and of its derivative, in each band of a window; 0 in bands that are incoherent."""
     m, powers = bands.reference_channels, np.diagonal(bands.products, axis1=1, axis2=2)
-    return powers[:, :m].sum(axis=1), powers[:, m : 2 * m].sum(axis=1)
+    power, square = powers[:, :m].sum(axis=1), powers[:, m : 2 * m].sum(axis=1)
+    seen = _coherent(bands)
+    return np.where(seen, power, 0.0), np.where(seen, square, 0.0)
+
+
+def _coherent(bands: BandSums) -> NDArray[np.bool_]:
+    """(B,) whether the motion explains at least LEAST_SHOWN of V in a band, at any lag."""
+    m = bands.reference_channels
+    x, V, both = (bands.products[:, rows, columns] for rows, columns in _parts(m))
+    unit = np.sqrt(np.where((own := np.diagonal(x, axis1=1, axis2=2)) > 0.0, own, 1.0))
+    inverse = np.linalg.pinv(x / (unit[:, :, None] * unit[:, None]), RELATED, hermitian=True)
+    both = both / unit[:, :, None]
+    total = np.trace(V, axis1=1, axis2=2)
+    told = np.einsum("bri,brs,bsi->b", both, inverse, both)
+    rest = (total - told) * bands.points / (bands.points - 2.0 * m)
+    return np.asarray(rest <= (1.0 - LEAST_SHOWN) * total)
+
+
+def _parts(m: int) -> tuple[tuple[slice, slice], ...]:
+    """Where x = [u, du/dt], V and their products are in the sums of a reference with m channels."""
+    x, V = slice(0, 2 * m), slice(2 * m, None)
+    return (x, x), (V, V), (x, V)

@@ -205,9 +205,16 @@ def incoherent(u: Array, V: Array) -> Array:
 
     A motion that fills the spectrum looks like white noise (`white_noise`), but the sensor shows it as well.
     """
+    told = incoherent_by_band(u, V)
+    return np.full(u.shape[1], np.inf) if told is None else np.sqrt(np.maximum(told[0].sum(axis=0), 0.0))
+
+
+def incoherent_by_band(u: Array, V: Array) -> tuple[Array, Array] | None:
+    """Variance (G, m) of what of the reference u (n, m) the sensor's V (n, 3) does not show at any lag, and of u, in G
+    bands of one width from 0 to half the sampling rate; None if both are too short."""
     parts, window = spectral_parts(np.hstack([u, V]))
     if parts is None or parts.shape[2] < 4 * LINES_TOGETHER:
-        return np.full(u.shape[1], np.inf)
+        return None
     m, lines = u.shape[1], np.fft.rfft((parts - parts.mean(axis=2, keepdims=True)) * window)[..., 1:-1]
     groups = lines.shape[2] // LINES_TOGETHER
     together = lines[..., : groups * LINES_TOGETHER].reshape(len(lines), -1, groups, LINES_TOGETHER)
@@ -217,10 +224,11 @@ def incoherent(u: Array, V: Array) -> Array:
     left = own - both @ np.linalg.pinv(seen, RELATED, hermitian=True) @ both.conj().transpose(0, 2, 1)
     # Neighbouring lines of a Hann window, and segments that overlap, tell less than as many independent ones.
     independent = HANN_LINES * LINES_TOGETHER * min(parts.shape[1], len(u) / parts.shape[2])
-    power = independent / (independent - V.shape[1]) * np.diagonal(left, axis1=1, axis2=2).real.sum(axis=0)
     # The variance of a channel is the sum of its lines on both sides of the spectrum.
     size, segments = 2 * (lines.shape[2] + 1), parts.shape[1]
-    return np.asarray(np.sqrt(np.maximum(2.0 * power, 0.0) / (segments * size * np.sum(window**2))))
+    unit = 2.0 / (segments * size * np.sum(window**2))
+    power, alone = (unit * np.diagonal(of, axis1=1, axis2=2).real for of in (own, left))
+    return np.asarray(independent / (independent - V.shape[1]) * alone), np.asarray(power)
 
 
 def spectral_parts(x: Array) -> tuple[Array | None, Array]:

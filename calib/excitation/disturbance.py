@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.excitation.detection import RELATED, incoherent
+from calib.excitation.detection import RELATED, incoherent_by_band
 from calib.excitation.turning import feels_gravity, standing_parts
 from calib.excitation.windows import Points
-from calib.model import Array
+from calib.model import Array, BandSums
 from calib.signal.band import convolved, hanning
 from calib.signal.order_statistics import distinct
 from calib.signal.response import Complex
@@ -31,54 +31,58 @@ MOVES = 1e-3  # of the strongest band's motion: a band that holds less of it tel
 CYCLES = 3.0  # of the lowest motion, which the filter reaches to each side
 MOST_LOST = 0.1  # of the samples at each end
 LEAST_WEIGHT = 1e-3
+STRAYS = 1e-3  # of the motion: more of the reference's noise at frequencies without motion makes S smaller
 MATTERS = 1e-2  # of the power of the reference: less of its noise moves S by less than that
 CLEARLY = 2.0  # times: white noise of both instruments never looks so
+MORE_POINTS = 4  # in a band, beside those that the regression on u and du/dt uses
 TINY = 1e-300
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NoiseFilter:
-    """Taps (2 k + 1,) of the filter, and its amplitude (F,) at frequencies (F,) from 0 to half the sampling rate."""
+    """Taps (2 k + 1,) of the filter, its amplitude (F,) at frequencies (F,) from 0 to half the sampling rate, and the
+    white noise (2, m) of the reference that it leaves in u and du/dt."""
 
     taps: Array
     frequency_hz: Array
     amplitude: Array
+    reference_noise: Array
 
     def passed(self, columns: Array) -> Array:
         """Samples (n, k) after the filter. A mean stays what it is; rows near an end or a missing sample are NaN."""
         mean = np.nanmean(columns, axis=0)
         return np.asarray(convolved(columns - mean, self.taps) + mean)
 
-    @property
-    def independent(self) -> float:
-        """The share of the points that stay independent."""
-        power = self.amplitude**2
-        return float(np.sum(power) ** 2 / (len(power) * np.sum(power**2)))
+    def independent(self, to_hz: float) -> float:
+        """The share of the points that stay independent after this filter and one that ends at `to_hz`."""
+        power = self.amplitude[self.frequency_hz <= to_hz] ** 2
+        return float(np.sum(power) ** 2 / (len(self.amplitude) * np.sum(power**2)))
 
-    def noise(self, rms: Array) -> Array:
-        """(2, m) rms in u and du/dt after the filter, of noise that is white up to some frequency; `rms` (2, m) before.
+    def left_in(self, bands: BandSums) -> BandSums:
+        """Bands of what passed the filter, with the points that stay independent in each; those that keep too few are
+        lost."""
+        power = np.append(0.0, np.cumsum(self.amplitude**2)), np.append(0.0, np.cumsum(self.amplitude**4))
+        first = np.minimum(np.searchsorted(self.frequency_hz, bands.low_hz), len(self.amplitude) - 1)
+        stop = np.maximum(np.searchsorted(self.frequency_hz, bands.high_hz), first + 1)
+        own, square = (part[stop] - part[first] for part in power)
+        points = bands.points * own**2 / np.maximum((stop - first) * square, TINY)
+        kept = points >= 2 * bands.reference_channels + MORE_POINTS
+        noise = bands.noise * (own / (stop - first))[:, None]
+        low_hz, high_hz, products, noise = (part[kept] for part in (bands.low_hz, bands.high_hz, bands.products, noise))
+        return BandSums(bands.reference_channels, low_hz, high_hz, points[kept], bands.independent, products, noise)
 
-        The ratio of both tells this frequency.
-        """
-        out = rms.copy()
-        for k in np.flatnonzero(rms[0] > 0.0):
-            end_hz = np.sqrt(3.0) * rms[1, k] / rms[0, k] / (2.0 * np.pi)
-            inside = np.maximum(1, np.searchsorted(self.frequency_hz, end_hz))
-            power, square = self.amplitude[:inside] ** 2, self.frequency_hz[:inside] ** 2
-            out[:, k] *= np.sqrt([power.mean(), power @ square / max(square.sum(), TINY)])
-        return out
 
-
-def against_noise(points: Points, channels: int, *, knocked: bool) -> NoiseFilter | None:
-    """The filter for these points, of whose reference the first `channels` count; None where all bands are about as
-    noisy, or where there are too few points to tell. `knocked`: many points look like knocks, perhaps because of noise
-    beside the motion."""
+def against_noise(points: Points, reference_noise: Array, *, knocked: bool) -> NoiseFilter | None:
+    """The filter for these points; None where all bands are about as noisy, or where there are too few points to tell.
+    `reference_noise` (2, m) is that of the first m channels, which count. `knocked`: many points look like knocks,
+    perhaps because of noise beside the motion."""
+    channels = reference_noise.shape[1]
     u, rate_hz = points.u[:, :channels], float((len(points.u) - 1) / (points.time_s[-1] - points.time_s[0]))
     size = 2 * (len(u) // (SEGMENTS + 1))
     edges = _edges(size // 2)
     if len(edges) < 3 or _is_turned(u, rate_hz):
         return None
-    motion, noise = _powers(np.hstack([points.V, u]), size, edges)
+    motion, noise, alone = _powers(np.hstack([points.V, u]), size, edges)
     lines = np.diff(edges).astype(np.float64)
     moved = motion > MOVES * motion.max()
     if not (motion > noise).any() or not (noise > 0.0).all():
@@ -89,25 +93,29 @@ def against_noise(points: Points, channels: int, *, knocked: bool) -> NoiseFilte
     gain = float(np.sum(told * noise) / told.sum()) / usual
     loud = ~moved & (noise > LOUD * usual)
     rattles = knocked and bool(np.sum((noise * lines)[loud]) > np.sum((noise * lines)[moved]))
-    if gain < LEAST_GAIN and not rattles:
+    strays = bool(np.sum((alone * lines)[~moved]) > STRAYS * told.sum())
+    if gain < LEAST_GAIN and not rattles and not strays:
         return None
     # Noise of the reference beside hardly any motion tells nothing and makes S smaller.
     weights = np.clip(np.sqrt(np.minimum(usual / noise, 1.0) * motion / (motion + noise)), LEAST_WEIGHT, 1.0)
     weights[: int(np.flatnonzero(moved)[0])] = 1.0  # slow changes of the mean are judged, not hidden
     lowest_hz = float(edges[np.flatnonzero(moved)[0]]) * rate_hz / size
-    return _filter(weights, edges, size, rate_hz, lowest_hz, len(u))
+    return _filter(weights, edges, size, rate_hz, lowest_hz, len(u), reference_noise)
 
 
-def not_more_than_incoherent(noise: Array, u: Array, V: Array) -> Array:
+def not_more_than_incoherent(noise: Array, u: Array, V: Array, rate_hz: float) -> Array:
     """The reference's noise (2, m) in u and du/dt, no larger than what of u the sensor does not show.
 
     Noise that is thought to be white may be coloured, or a motion that fills the spectrum. Where both contradict each
-    other clearly, half of what is incoherent counts as the noise of the reference.
+    other clearly at the frequencies of the motion, half of what is incoherent there counts as white noise.
     """
     power = noise[0] ** 2
-    if not len(u) or np.all(power <= MATTERS * np.var(u, axis=0)):
+    if not len(u) or np.all(power <= MATTERS * np.var(u, axis=0)) or (told := incoherent_by_band(u, V)) is None:
         return noise
-    most = incoherent(u, V) ** 2
+    alone, moved = told[0], np.maximum(told[1] - told[0], 0.0)
+    end_hz = np.sqrt(3.0) * np.divide(noise[1], noise[0], out=np.zeros_like(power), where=power > 0.0) / (2.0 * np.pi)
+    bands = np.clip(2.0 * end_hz / rate_hz, 1.0 / len(alone), 1.0) * len(alone)  # that have this noise
+    most = np.sum(moved * alone, axis=0) / np.maximum(moved.sum(axis=0), TINY) * bands
     size = np.sqrt(np.divide(0.5 * most, power, out=np.ones_like(power), where=power > CLEARLY * most))
     return np.asarray(noise * size)
 
@@ -131,16 +139,16 @@ def _edges(lines: int) -> NDArray[np.int64]:
     return np.array([*starts, lines], dtype=np.int64)
 
 
-def _powers(rows: Array, size: int, edges: NDArray[np.int64]) -> tuple[Array, Array]:
+def _powers(rows: Array, size: int, edges: NDArray[np.int64]) -> tuple[Array, Array, Array]:
     """The power of V, the first three columns of `rows` (n, 3 + m), a line in each band: what the motion explains at
-    any lag, and the noise.
+    any lag, the noise, and what of the reference V does not show.
 
     Both are found in cells of CELL lines, in which no response changes much: two instruments that respond differently
     are not noisy. The noise is that of V, or that of the reference as V would show it, whichever is stronger.
     """
     window, starts = hanning(size), range(0, len(rows) - size + 1, size // 2)
-    parts = np.stack([rows[k : k + size].T for k in starts], axis=1)
-    lines = np.fft.rfft((parts - parts.mean(axis=2, keepdims=True)) * window, axis=2).transpose(2, 0, 1)[: edges[-1]]
+    cut = np.stack([rows[k : k + size].T for k in starts], axis=1)
+    lines = np.fft.rfft((cut - cut.mean(axis=2, keepdims=True)) * window, axis=2).transpose(2, 0, 1)[: edges[-1]]
     cells = distinct(np.concatenate([np.arange(edges[0], edges[-1], CELL), edges[:-1]]))
     cross = np.add.reduceat(lines @ lines.conj().transpose(0, 2, 1), cells, axis=0)
     count = np.diff(np.append(cells, edges[-1])) * len(starts)
@@ -148,9 +156,10 @@ def _powers(rows: Array, size: int, edges: NDArray[np.int64]) -> tuple[Array, Ar
     shown, alone = _parted(cross[:, 3:, 3:], cross[:, :3, :3], cross[:, 3:, :3], count)
     scale = felt.sum() / max(float(shown.sum()), TINY)  # of V over the reference, squared
     first = np.searchsorted(cells, edges[:-1])
-    motion, noise = (np.add.reduceat(part, first) for part in (felt, np.maximum(told, scale * alone)))
+    parts = (felt, np.maximum(told, scale * alone), scale * alone)
     of_each = np.diff(edges) * len(starts)
-    return motion / of_each, noise / of_each
+    motion, noise, alone = (np.add.reduceat(part, first) / of_each for part in parts)
+    return motion, noise, alone
 
 
 def _parted(power: Complex, other: Complex, both: Complex, count: NDArray[np.int64]) -> tuple[Array, Array]:
@@ -164,11 +173,26 @@ def _parted(power: Complex, other: Complex, both: Complex, count: NDArray[np.int
 
 
 def _filter(
-    weights: Array, edges: NDArray[np.int64], size: int, rate_hz: float, lowest_hz: float, samples: int
+    weights: Array, edges: NDArray[np.int64], size: int, rate_hz: float, lowest_hz: float, samples: int, noise: Array
 ) -> NoiseFilter:
-    """A filter with these weights in the bands, of linear phase around its middle tap."""
+    """A filter with these weights in the bands, of linear phase around its middle tap; `noise` (2, m) before it."""
     frequency_hz = np.arange(size // 2 + 1) * rate_hz / size
     amplitude = np.concatenate([np.full(int(edges[0]), weights[0]), np.repeat(weights, np.diff(edges)), weights[-1:]])
     half = int(min(CYCLES * rate_hz / lowest_hz, MOST_LOST * samples, size // 2 - 1))
     taps = np.roll(np.fft.irfft(amplitude, size), half)[: 2 * half + 1] * hanning(2 * half + 3)[1:-1]
-    return NoiseFilter(taps, frequency_hz, np.abs(np.fft.rfft(np.roll(np.pad(taps, (0, size - len(taps))), -half))))
+    passed = np.abs(np.fft.rfft(np.roll(np.pad(taps, (0, size - len(taps))), -half)))
+    return NoiseFilter(taps, frequency_hz, passed, _left_of(noise, frequency_hz, passed))
+
+
+def _left_of(noise: Array, frequency_hz: Array, amplitude: Array) -> Array:
+    """(2, m) rms in u and du/dt after a filter, of noise that is white up to some frequency; `noise` (2, m) before.
+
+    The ratio of both tells this frequency.
+    """
+    out = noise.copy()
+    for k in np.flatnonzero(noise[0] > 0.0):
+        end_hz = np.sqrt(3.0) * noise[1, k] / noise[0, k] / (2.0 * np.pi)
+        inside = np.maximum(1, np.searchsorted(frequency_hz, end_hz))
+        power, square = amplitude[:inside] ** 2, frequency_hz[:inside] ** 2
+        out[:, k] *= np.sqrt([power.mean(), power @ square / max(square.sum(), TINY)])
+    return out

@@ -15,13 +15,13 @@ import numpy as np
 
 from calib.excitation import detection
 from calib.excitation.band_to_keep import FILTER_BAND, LEAST_MOTION_MPS2, band_to_keep
-from calib.excitation.bands import TAPER
+from calib.excitation.bands import TAPER, beside_noise
 from calib.excitation.disturbance import NoiseFilter, against_noise, not_more_than_incoherent
 from calib.excitation.turning import feels_gravity, standing_parts
 from calib.excitation.window_verdict import DEFAULT_LIMITS, Limits
 from calib.excitation.windows import Points, at_rest, motion_windows, rest_window, still_window
-from calib.model import Array, Pose, Window, WindowSums, own_channels
-from calib.signal.band import lowpass, without_short_holes
+from calib.model import Array, BandSums, Pose, Window, WindowSums
+from calib.signal.band import band_above_noise, lowpass, without_short_holes
 from calib.signal.corner import integral, with_integral, without_corner
 from calib.signal.glitches import glitches
 from calib.signal.holes import Mask
@@ -72,9 +72,10 @@ DEFAULT_SETTINGS = Settings()
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Aligned:
-    """The sensor's samples with the reference at their times, in the band of the motion, and the reference's noise.
+    """The sensor's samples with the reference at their times, in the band of the motion, and the noise of both.
 
-    `reference_noise` (2, m) as in calib.model.Window. `clipped_points`: samples at the end of the sensor's range,
+    `reference_noise` (2, m) as in calib.model.Window; `sensor_noise` (3,) is the rms of V's white noise in all
+    frequencies together, 0 where none shows it alone. `clipped_points`: samples at the end of the sensor's range,
     counted before the filter, which hides them. `independent`: the share of the points that the filter leaves
     independent; filled samples are none. `band_hz`: where the filter ends, None where there is none. `filled`: how many
     samples of a device were missing and filled, by the name that this number has in a window; empty where none was.
@@ -82,6 +83,7 @@ class Aligned:
 
     points: Points
     reference_noise: Array
+    sensor_noise: Array
     clipped_points: int
     independent: float
     band_hz: float | None
@@ -180,7 +182,7 @@ def aligned(
         columns[filled] = np.nan  # without a filter, a filled sample would only repeat what the others tell
     if against is not None:
         columns = against.passed(np.where(inside[:, None], columns, np.nan))  # beyond, the sensor may be turned
-        noise, independent = against.noise(noise), independent * against.independent
+        independent = against.independent(FILTER_BAND * band_hz if settings.limit_band and band_hz else np.inf)
     if columns is not unfiltered:
         clipped = _clipped(unfiltered[np.isfinite(unfiltered).all(axis=1) & inside & ~filled])
     usable = np.isfinite(columns).all(axis=1) & inside
@@ -195,9 +197,11 @@ def aligned(
     }
     kept = as_slice(np.flatnonzero(usable))
     points = Points(time_s[kept], *np.split(columns.T[:, kept].T, [3, 3 + k], axis=1))
-    noise = not_more_than_incoherent(noise, points.u[:, :m], points.V)
+    noise = noise if against is None else against.reference_noise
+    noise = not_more_than_incoherent(noise, points.u[:, :m], points.V, sensor_rate_hz)
     told = {name: float(count) for name, count in counts.items() if count}
-    return Aligned(points, noise, clipped, independent, band_hz if settings.limit_band else None, told)
+    sensor_noise = np.sqrt(0.5 * sensor_rate_hz) * band_above_noise(V, sensor_rate_hz)[1]
+    return Aligned(points, noise, sensor_noise, clipped, independent, band_hz if settings.limit_band else None, told)
 
 
 def nothing_in(pose: Pose, start_s: float, stop_s: float, reason: str) -> Window:
@@ -250,21 +254,35 @@ def _motion(
     if instrument.has_corner:
         pose = with_integral(pose)
     made = _beside(pose, found, settings)
-    knocked = any(window.numbers.get("left_out_pct", 0.0) > KNOCKED_PCT for window in made)
+    knocked = any(100.0 * w.left_out > KNOCKED_PCT * (w.points + w.left_out) for w in made)
+    against = None
     if settings.limit_band and (knocked or any(w.numbers.get("coherence", 1.0) < COHERENT for w in made)):
-        against = against_noise(found.points, own_channels(pose.direction.shape[1]), knocked=knocked)
-        if against is not None and (better := align(against=against)) is not None:
-            found, made = better, _beside(pose, better, settings)
+        against = against_noise(found.points, found.reference_noise, knocked=knocked)
+        better = None if against is None else align(against=against)
+        if better is None:
+            against = None
+        else:
+            found, made = better, _beside(pose, better, settings, before=found.points)
     u_lag_s = float(np.hypot(sensor.clock.u_offset_s, reference.clock.u_offset_s))
     taken = () if response.is_flat else response.terms
-    return [replace(_told(w, found), u_lag_s=u_lag_s, response=taken) for w in made]
+    made = [replace(_told(w, found), u_lag_s=u_lag_s, response=taken) for w in made]
+    # Where the noise of the reference is stated, all other noise is the sensor's.
+    sensor_noise = np.full(3, np.inf) if instrument.noise > 0.0 else found.sensor_noise
+    return [w if w.bands is None else replace(w, bands=_noisy(w.bands, sensor_noise, against)) for w in made]
 
 
-def _beside(pose: Pose, found: Aligned, settings: Settings) -> list[Window]:
-    """Windows in motion and, where the reference feels gravity, at rest; each in one position against gravity."""
+def _noisy(bands: BandSums, sensor_noise: Array, against: NoiseFilter | None) -> BandSums:
+    """The bands with the sensor's white noise in them; `against`: the filter that they passed."""
+    bands = beside_noise(bands, sensor_noise)
+    return bands if against is None else against.left_in(bands)
+
+
+def _beside(pose: Pose, found: Aligned, settings: Settings, before: Points | None = None) -> list[Window]:
+    """Windows in motion and, where the reference feels gravity, at rest; each in one position against gravity.
+    `before` as in motion_windows."""
     points, limits, leave_out = found.points, settings.limits, settings.leave_out
     taper = settings.taper if settings.bands else 0.0
-    in_motion = partial(motion_windows, pose, limits=limits, leave_out=leave_out, taper=taper)
+    in_motion = partial(motion_windows, pose, limits=limits, leave_out=leave_out, taper=taper, before=before)
     if points.u.shape[1] != 3 or not feels_gravity(points.u):
         return in_motion(points)
     rate_hz = (len(points.time_s) - 1) / (points.time_s[-1] - points.time_s[0])

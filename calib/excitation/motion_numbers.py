@@ -6,8 +6,9 @@ import numpy as np
 
 from calib.excitation import detection
 from calib.excitation.sums import factor
-from calib.excitation.window_verdict import Limits
+from calib.excitation.window_verdict import DRIFT_SD, Limits
 from calib.model import Array, WindowSums
+from calib.signal.order_statistics import median
 
 
 def motion_numbers(
@@ -25,7 +26,10 @@ def motion_numbers(
     numbers, scale = _in_band(basis, V, rate_hz, noise)
     if numbers["reference_rms_mps2"] <= limits.least_level * numbers["reference_noise_mps2"]:
         numbers, scale = _in_band(basis, V, rate_hz, np.minimum(noise, detection.incoherent(u, V)))
-    changes = {"drift_mps2": _drift(sums), "step_mps2": stepped[0], "u_step_mps2": stepped[1]}
+    drifted, u_drift = _drift(sums)
+    changes = {"drift_mps2": drifted, "step_mps2": stepped[0], "u_step_mps2": stepped[1]}
+    if scale > 0 and DRIFT_SD * u_drift > limits.most_drift_mps2 * scale:  # else it changes no verdict
+        changes["u_drift_mps2"] = u_drift
     return numbers | {name: change / scale if scale > 0 else np.inf for name, change in changes.items()}
 
 
@@ -48,11 +52,15 @@ def _in_band(basis: Array, V: Array, rate_hz: float, noise: Array) -> tuple[dict
     return numbers, float(np.linalg.norm(solution[1 : 1 + m], 2))
 
 
-def _drift(sums: WindowSums) -> float:
-    """Largest difference between a segment's mean and its value by the window's own regression, in output unit."""
+def _drift(sums: WindowSums) -> tuple[float, float]:
+    """Largest difference between a segment's mean and its value by the window's own regression, in output unit; and the
+    standard uncertainty that noise gives such a difference, from those of neighbours, which drift hardly apart."""
     m = sums.reference_channels
     part = factor(sums, derivative=True)
     solution, *_ = np.linalg.lstsq(part.r, part.rhs, rcond=1e-12)
     whole = sums.count >= 0.5 * sums.count.max()
     basis = np.hstack([np.ones((len(sums.count), 1)), sums.mean[:, : 2 * m]])
-    return float(np.abs((sums.mean[:, 2 * m :] - basis @ solution)[whole]).max())
+    away = (sums.mean[:, 2 * m :] - basis @ solution)[whole]
+    apart = np.abs(np.diff(away, axis=0))
+    u = 1.4826 * float(np.max(median(apart.T))) / np.sqrt(2.0) if len(apart) else 0.0
+    return float(np.abs(away).max()), float(u)

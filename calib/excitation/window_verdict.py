@@ -13,6 +13,8 @@ from calib.model import WindowSums
 
 LEAST_STEP_MPS2 = 0.02  # 2 mg: a smaller change of the mean is possible whatever is stated
 NONLINEAR_SD = 4.0  # a difference by so many standard uncertainties, of few blocks, may be noise
+# The means of a window's segments by so many of their standard uncertainties may be noise, in some hundred of them.
+DRIFT_SD = 5.0
 STEP_SD = 5.0  # a step of the mean by so many of its standard uncertainties may be noise, wherever it is searched
 
 
@@ -73,8 +75,9 @@ def judge(sums: WindowSums, struck: NDArray[np.bool_], numbers: Mapping[str, flo
 
     `struck` (n,) flags the points that were found to be knocks. `numbers` are the statistics: for motion
     reference_rms_mps2, reference_noise_mps2, coherence, drift_mps2, stuck_axes, clipped_points and those of
-    `steadiness.nonlinearity`; for a rest sd_over_floor, if there are other rests to compare with; for both step_mps2
-    and u_step_mps2. The verdict's numbers hold the limit of each statistic beside it, as `<name>_threshold`.
+    `steadiness.nonlinearity`, and u_drift_mps2 where it matters; for a rest sd_over_floor, if there are other rests to
+    compare with; for both step_mps2 and u_step_mps2. The verdict's numbers hold the limit of each statistic beside it,
+    as `<name>_threshold`.
     """
     points = float(sums.count.sum())
     left_out = 100.0 * float(struck.mean()) if len(struck) else 0.0
@@ -91,7 +94,8 @@ def _thresholds(n: Mapping[str, float], limits: Limits) -> dict[str, float]:
         limit["clipped_points"] = 0.0
         limit["stuck_axes"] = 0.0
         limit["coherence"] = limits.least_coherence
-        limit["drift_mps2"] = max(limits.most_drift_mps2, limits.most_drift_pct / 100.0 * n["reference_rms_mps2"])
+        steady = max(limits.most_drift_mps2, limits.most_drift_pct / 100.0 * n["reference_rms_mps2"])
+        limit["drift_mps2"] = max(steady, DRIFT_SD * n.get("u_drift_mps2", 0.0))
     if "nonlinearity_pct" in n:
         # Of a reference with noise, the strongest values are those to which the noise adds, and the sensor shows less
         # there: by 60 % of noise over motion for a sine, 150 % for a square wave, nothing for Gaussian motion.

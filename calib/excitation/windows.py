@@ -23,7 +23,7 @@ from calib.excitation.rests import find_rests
 from calib.excitation.steadiness import nonlinearity, step
 from calib.excitation.sums import pool, window_sums
 from calib.excitation.window_verdict import DEFAULT_LIMITS, Limits, Verdict, judge
-from calib.model import Array, Pose, Window, WindowSums
+from calib.model import Array, BandSums, Pose, Window, WindowSums
 from calib.signal.order_statistics import median
 
 SHORTEST_QUIET_S = 1.0  # a shorter pause makes no window of kind "quiet"
@@ -47,20 +47,27 @@ class Points(NamedTuple):
         """The samples [first, stop)."""
         return Points(*(column[first:stop] for column in self))
 
+    def within(self, start_s: float, stop_s: float) -> Points:
+        """The samples from one time to another, both included."""
+        first, stop = np.searchsorted(self.time_s, start_s), np.searchsorted(self.time_s, stop_s, "right")
+        return self.part(int(first), int(stop))
+
 
 def motion_windows(
-    pose: Pose, points: Points, limits: Limits = DEFAULT_LIMITS, *, leave_out: bool = True, taper: float = 0.0
-) -> list[Window]:
+    pose: Pose, points: Points, limits: Limits = DEFAULT_LIMITS, *, leave_out: bool = True, taper: float = 0.0,
+    before: Points | None = None,
+) -> list[Window]:  # fmt: skip
     """The windows in samples of one pose: kind "motion" where the reference moves, kind "quiet" where it hardly moves.
 
     If `leave_out` is false, the sums hold all points, knocks included (Method 3 as printed). With a `taper` (the share
-    of a window at each end), windows hold sums in bands of frequency as well.
+    of a window at each end), windows hold sums in bands of frequency as well. `before`: the samples before a filter,
+    in which the motion begins and stops; what passed the filter may swell and fade.
     """
-    noise = detection.white_noise(points.u)
-    windows = []
-    for kind, first, stop in motion_parts(points.u, _rate(points.time_s), noise):
-        known = noise if stop - first == len(points.u) else None
-        part = points.part(first, stop)
+    seen = points if before is None else before
+    noise, windows = detection.white_noise(seen.u), []
+    for kind, first, stop in motion_parts(seen.u, _rate(seen.time_s), noise):
+        known = noise if stop - first == len(points.u) and before is None else None
+        part = points.within(seen.time_s[first], seen.time_s[stop - 1])
         windows += judged(kind, pose, part, limits, leave_out=leave_out, taper=taper, noise=known)
     return windows
 
@@ -220,8 +227,9 @@ def _motion(
     sound = _sound(struck, rate_hz, limits)
     if leave_out and not sound.all():
         left = Points(*(column[sound] for column in points))
-        rest = _motion(kind, pose, left, rate_hz, limits, leave_out, taper, stepped)
-        return _without_segments(rest, int((~sound).sum()))
+        rest = _motion(kind, pose, left, rate_hz, limits, leave_out, 0.0, stepped)
+        bands = _bands(points, struck | ~sound, residual, rate_hz, taper) if taper and rest.used else None
+        return _without_segments(replace(rest, bands=bands), int((~sound).sum()))
     clean = sums = _sums(V, u, du, rate_hz, limits)
     kept: slice | NDArray[np.bool_] = slice(None)
     if struck.any():
@@ -239,9 +247,16 @@ def _motion(
     window = _window(kind, pose, t, sums, verdict, int(struck.sum()) if leave_out else 0)
     if not (taper and verdict.used):
         return window
-    # Without a knock's points the others would not be evenly spaced: the window's own regression takes their places.
-    whole = np.where(struck[:, None], V - residual, V) if struck.any() else V
-    return replace(window, bands=band_sums(u, du, whole, rate_hz, taper))
+    return replace(window, bands=_bands(points, struck, residual, rate_hz, taper))
+
+
+def _bands(
+    points: Points, left_out: NDArray[np.bool_], residual: Array, rate_hz: float, taper: float
+) -> BandSums | None:
+    """The sums in bands of a window's points. Without those that are `left_out` (n,) the others would not be evenly
+    spaced: the window's own regression, from which V has this `residual` (n, 3), takes their places."""
+    whole = np.where(left_out[:, None], points.V - residual, points.V) if left_out.any() else points.V
+    return band_sums(points.u, points.du, whole, rate_hz, taper)
 
 
 def _sound(struck: NDArray[np.bool_], rate_hz: float, limits: Limits) -> NDArray[np.bool_]:

@@ -15,7 +15,7 @@ from calib.estimate.norm_fit import norm_fit
 from calib.estimate.nuisances import Applied, Priors
 from calib.estimate.reference_share import ReferenceShare
 from calib.estimate.response_by_band import told_by_band
-from calib.estimate.response_told import ResponseTold
+from calib.estimate.response_told import LEFT_U, ResponseTold
 from calib.excitation.bands import lowest_hz, motion_band_hz
 from calib.excitation.windows import rests_anywhere
 from calib.geometry import STANDARD_GRAVITY_MPS2
@@ -78,7 +78,8 @@ def _turned(search: _Search, priors: Priors, applied: Applied, turn: int, rate_h
         found = _attenuated(found, windows, priors, applied)
         return _outcome(found, windows, rate_hz), found.share
     told = found.response
-    if not (told is None or told.is_taken_out(applied.response) or (turn >= HOPELESS and found.reasons)):
+    left_u = LEFT_U if turn <= HOPELESS else 2.0 * LEFT_U  # noisy windows change a little with the response, to and fro
+    if not (told is None or told.is_taken_out(applied.response, left_u) or (turn >= HOPELESS and found.reasons)):
         return replace(applied, response=_next_response(told.terms, applied.response))
     outcome = _outcome(found, windows, rate_hz)
     if outcome.calibration is None:

@@ -67,8 +67,9 @@ def test_all_that_was_recorded_is_refused_and_its_response_told() -> None:
             u.append(band["standard_uncertainty"][0][0] / SCALE / size)
     assert len(away) >= 25
     assert np.median(u) < 0.005
-    assert np.abs(away).max() < 0.025
-    assert np.count_nonzero(np.abs(away) < 2.0 * np.array(u)) >= 0.7 * len(away)  # Welch's spectra scatter as well
+    over_u = np.abs(away) / u
+    assert over_u.max() < 3.0
+    assert np.count_nonzero(over_u < 2.0) >= 0.85 * len(away)  # Welch's spectra scatter as well
 
 
 def test_the_response_in_a_band_is_that_of_the_spectra() -> None:
