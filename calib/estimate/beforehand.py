@@ -70,11 +70,9 @@ class Beforehand:
         effect of a quantity that is uncertain now, the base is lost, and the estimation begins with the recent windows.
         """
         now = self._priors_of(joint.base, before.priors, reference)
+        for state in (joint.state, joint.base):
+            self._fill(state, now)
         base, known = joint.base, {key: k for k, key in enumerate(joint.base.keys)}
-        for key, (mean, _) in now.items():
-            if np.isnan(base.stated_mean[known[key]]):  # in a state of version 2
-                base.stated_mean[known[key]] = mean
-        base.stated_mean[:12] = np.where(np.isnan(base.stated_mean[:12]), self.mean, base.stated_mean[:12])
         same = before.equals(self) and all(
             prior == (base.stated_mean[known[key]], base.stated_u[known[key]]) for key, prior in now.items()
         )
@@ -99,6 +97,15 @@ class Beforehand:
                 base.exchange(k, 0.0, 0.0)
         joint.keep_in_base([not lost for lost in gone])
         return True
+
+    def _fill(self, state: JointState, now: Mapping[str, tuple[float, float]]) -> None:
+        """The means of the priors that a state of version 2 did not keep."""
+        for k in np.flatnonzero(np.isnan(state.stated_mean)).tolist():
+            key = replace(state.quantities[k], first=False).key
+            if k < len(S_AND_Q):
+                state.stated_mean[k] = self.mean[k]
+            elif key in now:
+                state.stated_mean[k] = now[key][0]
 
     def _priors_of(self, state: JointState, before: Priors, reference: str) -> dict[str, tuple[float, float]]:
         """The prior (mean, standard uncertainty) of each quantity of a state but S and Q, by key.

@@ -152,3 +152,24 @@ def test_a_calibration_put_back_does_not_count_the_error_of_the_reference_again(
             window = building_window(np.random.default_rng(k), level_mps2=(0.1, 0.1, 0.1))
             found.update(Summary.of(window, 1.0 + turn + k * HOUR, reference="A"))
         assert found.result().standard_uncertainty[0] > 2.99e-3
+
+
+@pytest.mark.parametrize("recent", [False, True])
+def test_a_state_without_stated_means_is_finite_after_swaps_and_changes(recent: bool) -> None:
+    """A regression test. A state of version 2 has no means of its priors. Those of the state, beside its base, stayed
+    unknown; a swap of the reference kept them as first values; and the next change of a prior made all of it NaN."""
+    snapshot = lived().snapshot()
+    for of in ("state", "base"):
+        snapshot[of]["stated_mean"] = np.full_like(snapshot[of]["stated_mean"], np.nan)
+    if not recent:
+        snapshot["recent"] = []
+        snapshot["base"] = snapshot["state"]
+    found = fresh(STATED)
+    found.load(snapshot)
+    found.restate()
+    for reference in ("A", "B"):
+        found.meet(reference)
+    found = restarted(found, fresh(STATED | {"rotation_rad": 3.3e-3}))
+    assert np.isfinite(found.lag_s)
+    assert np.isfinite(found.result().covariance).all()
+    assert np.isfinite(found.result().sensitivity).all()
