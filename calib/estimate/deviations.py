@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -125,18 +126,7 @@ class LeftOpen:
         It is the median of the bands within an octave: noise in a few bands makes these bands deviate, and is no part
         of a smooth response. Of the axis where it is largest; axes that hardly moved do not count.
         """
-        if not self.thirds:
-            return 0.0
-        octaves = np.array([k for k, _ in self.thirds]) / 3.0 - (np.log2(at_hz) if at_hz > 0.0 else 0.0)
-        near = np.abs(octaves) <= 1.0
-        sums = np.array([own for _, own in self.thirds]).reshape(-1, 3, 3)[near if near.any() else slice(None)]
-        shown, unshown, variance = sums.transpose(1, 2, 0)  # each (3, bands)
-        share = unshown / np.maximum(shown, TINY)
-        u_each = np.sqrt(variance) / np.maximum(shown, TINY)
-        u = MEDIAN_U * np.sqrt(np.mean(u_each**2, axis=1) / u_each.shape[1])
-        middle, total = median(share), shown.sum(axis=1)
-        counted = (middle > SURELY * u) & (total > LEAST_SHOWN * total.max())
-        return float(np.max(middle[counted], initial=0.0))
+        return _lost(self.thirds, at_hz)
 
     def u_lost(self, at_hz: float) -> float:
         """Relative standard uncertainty of S by that: an error between 0 and `lost`, all as likely, not corrected."""
@@ -148,12 +138,37 @@ class LeftOpen:
 
         A term is proportional to the inverse of the corner to its power.
         """
-        total = sum(sum(own[:3]) for _, own in self.thirds)
-        if not total > 0.0:
+        if not terms.any() or not self.thirds:
             return 0.0
-        away = np.array(self.moments) / total - at_reference
+        away = _mean_effects(self) - at_reference
         return float(U_CORNER * abs(np.sum(np.array(powers) * terms * away)))
 
 
 def _sum(one: tuple[float, ...], other: tuple[float, ...]) -> tuple[float, ...]:
     return tuple(a + b for a, b in zip(one, other, strict=True))
+
+
+# A state is asked several times between two windows.
+@lru_cache(maxsize=8)
+def _mean_effects(of: LeftOpen) -> Array:
+    """(K,) the mean effect of each term on ln |h|, weighted by the power of V that the motion explains. Read-only."""
+    found = np.array(of.moments) / max(sum(sum(own[:3]) for _, own in of.thirds), TINY)
+    found.flags.writeable = False
+    return found
+
+
+@lru_cache(maxsize=8)
+def _lost(thirds: tuple[Third, ...], at_hz: float) -> float:
+    """As LeftOpen.lost."""
+    if not thirds:
+        return 0.0
+    octaves = np.array([k for k, _ in thirds]) / 3.0 - (np.log2(at_hz) if at_hz > 0.0 else 0.0)
+    near = np.abs(octaves) <= 1.0
+    sums = np.array([own for _, own in thirds]).reshape(-1, 3, 3)[near if near.any() else slice(None)]
+    shown, unshown, variance = sums.transpose(1, 2, 0)  # each (3, bands)
+    share = unshown / np.maximum(shown, TINY)
+    u_each = np.sqrt(variance) / np.maximum(shown, TINY)
+    u = MEDIAN_U * np.sqrt(np.mean(u_each**2, axis=1) / u_each.shape[1])
+    middle, total = median(share), shown.sum(axis=1)
+    counted = (middle > SURELY * u) & (total > LEAST_SHOWN * total.max())
+    return float(np.max(middle[counted], initial=0.0))

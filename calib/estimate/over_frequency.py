@@ -46,6 +46,8 @@ class OverFrequency:
 
     def stated(self, priors: Priors) -> Priors:
         """The priors with those of the response, once it is an unknown."""
+        if self.motion_hz is not None and priors.response_hz == self.to_hz:
+            return priors  # they have them already
         if self.late_s is not None:
             priors = priors.at_one_frequency(self.first_hz, self.late_s)
         return priors if self.motion_hz is None else priors.with_response(self.motion_hz, self.to_hz)
@@ -116,8 +118,10 @@ class OverFrequency:
         """A factor (N, N + 4) of the covariance of a state beside a reference, with what known filters, the bands'
         deviations and what they leave open add to that of S. (N, N) before any band.
         """
-        parts = [priors.known_u, self.deviations.between.relative_u, self.left_open.u_lost(self.reference_hz(priors))]
-        alike = self.left_open.u_alike(*self._terms(state, reference, priors))
+        stated = self.stated(priors)
+        hz = stated.reference_frequency_hz or self.first_hz
+        parts = [priors.known_u, self.deviations.between.relative_u, self.left_open.u_lost(hz)]
+        alike = self.left_open.u_alike(self._terms(state, reference), _at_reference(stated))
         if not any(parts) and not alike:
             return state.factor
         more = np.zeros((len(state), 4))
@@ -127,18 +131,12 @@ class OverFrequency:
             more[own, 1 + row] = alike * state.mean[own]
         return np.hstack([state.factor, more])
 
-    def _terms(self, state: JointState, reference: str, priors: Priors) -> tuple[Array, Array]:
-        """The terms (K,) of the response beside a reference, and their effects (K,) on ln |h| where S holds."""
+    def _terms(self, state: JointState, reference: str) -> Array:
+        """The terms (K,) of the response beside a reference."""
         own, unit = self._unknowns(state, reference)
         terms = np.zeros(len(POWERS))
         terms[: len(own)] = unit[: len(own)] * state.mean[own]
-        return terms, self._at_reference(priors)
-
-    def _at_reference(self, priors: Priors) -> Array:
-        """(K,) effects of the terms on ln |h| at the reference frequency, as far as they are the sensor's."""
-        stated = self.stated(priors)
-        at_reference = by_term(np.array(2.0 * np.pi * stated.reference_frequency_hz)).real
-        return np.asarray((1.0 - stated.reference_share) * at_reference)
+        return terms
 
     def told(self, state: JointState, reference: str, priors: Priors, coverage_factor: float) -> ResponseTold | None:
         """The response beside a reference; None where it is no unknown."""
@@ -158,7 +156,7 @@ class OverFrequency:
         """Derivatives, by the key of each term, of the logarithm of the sensitivity at 0 Hz over that at the reference
         frequency."""
         own, unit = self._unknowns(state, reference)
-        by_unknown = -(self._at_reference(priors) * unit)[: len(own)]
+        by_unknown = -(_at_reference(self.stated(priors)) * unit)[: len(own)]
         return {state.keys[k]: float(by) for k, by in zip(own, by_unknown, strict=True)}
 
     def log_h(self, state: JointState, reference: str, frequency_hz: float) -> float:
@@ -198,6 +196,19 @@ class OverFrequency:
         motion_hz = None if band is None else (band[0], band[1])
         sums = {"deviations": Deviations(**state["deviations"]), "left_open": LeftOpen.load(state["left_open"])}
         return cls(**{**state, "motion_hz": motion_hz, **sums})
+
+
+def _at_reference(stated: Priors) -> Array:
+    """(K,) effects of the terms on ln |h| at the reference frequency, as far as they are the sensor's."""
+    return np.asarray((1.0 - stated.reference_share) * _at(stated.reference_frequency_hz))
+
+
+@lru_cache(maxsize=16)
+def _at(frequency_hz: float) -> Array:
+    """(K,) effects of the terms on ln |h| at a frequency. Read-only."""
+    found = by_term(np.array(2.0 * np.pi * frequency_hz)).real
+    found.flags.writeable = False
+    return found
 
 
 def terms_of(state: JointState, reference: str) -> list[int]:

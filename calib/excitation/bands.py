@@ -135,7 +135,8 @@ def motion_band_hz(windows: Sequence[Window]) -> tuple[float, float] | None:
     if not bands:
         return None
     low, high = (np.concatenate([getattr(b, name) for b in bands]) for name in ("low_hz", "high_hz"))
-    power, square = (np.concatenate(part) for part in zip(*map(_powers, bands), strict=True))
+    each = [_powers(b) for b in bands]
+    power, square = (np.concatenate(part) for part in zip(*each, strict=True))
     if not power.sum() > 0.0:
         return None
     third = np.round(3.0 * np.log2(np.sqrt(low * high))).astype(np.int64)
@@ -143,8 +144,8 @@ def motion_band_hz(windows: Sequence[Window]) -> tuple[float, float] | None:
     if np.count_nonzero(shares > LEAST_SHARE) < FEWEST_THIRDS:
         return None
     below, above = _narrowed(low, high, power, square)
-    surely_low = max(_end(b.low_hz, b.low_hz, _powers(b)[0], BELOW) for b in bands)
-    surely_high = min(_end(b.high_hz, -b.high_hz, _powers(b)[0], ABOVE) for b in bands)
+    surely_low = max(_end(b.low_hz, b.low_hz, own, BELOW) for b, (own, _) in zip(bands, each, strict=True))
+    surely_high = min(_end(b.high_hz, -b.high_hz, own, ABOVE) for b, (own, _) in zip(bands, each, strict=True))
     low_hz, high_hz = _end(below, below, power, BELOW), _end(above, -above, power, ABOVE)
     return min(low_hz, surely_low), max(high_hz, surely_high)
 
@@ -188,10 +189,9 @@ def _coherent(bands: BandSums) -> NDArray[np.bool_]:
     m = bands.reference_channels
     x, V, both = (bands.products[:, rows, columns] for rows, columns in _parts(m))
     unit = np.sqrt(np.where((own := np.diagonal(x, axis1=1, axis2=2)) > 0.0, own, 1.0))
-    inverse = np.linalg.pinv(x / (unit[:, :, None] * unit[:, None]), RELATED, hermitian=True)
-    both = both / unit[:, :, None]
+    both, x = both / unit[:, :, None], x / (unit[:, :, None] * unit[:, None])
     total = np.trace(V, axis1=1, axis2=2)
-    told = np.einsum("bri,brs,bsi->b", both, inverse, both)
+    told = np.sum(both * np.linalg.solve(x + RELATED * np.eye(2 * m), both), axis=(1, 2))
     rest = (total - told) * bands.points / (bands.points - 2.0 * m)
     return np.asarray(rest <= (1.0 - LEAST_SHOWN) * total)
 
