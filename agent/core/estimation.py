@@ -24,6 +24,7 @@ from calib.model import Calibration, Window, WindowSums
 from calib.signal.response import Response
 
 DAY_S = 86400.0
+SAME = 1e-6  # standard uncertainties: what rounding moves when the windows are taken again
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -285,8 +286,11 @@ class Estimation:
         return changed and follows and self._update_in_force()
 
     def _follows_state(self) -> bool:
-        """Whether the calibration in force is that of the state."""
-        return self.gate.calibrated and np.array_equal(self.recursion.result().covariance, self.in_force.covariance)
+        """Whether the calibration in force is that of the state, but for rounding."""
+        now, u = self.recursion.result(), self.in_force.standard_uncertainty
+        moved = np.append((now.sensitivity - self.in_force.sensitivity).ravel(), now.offset - self.in_force.offset)
+        wider = now.standard_uncertainty - u
+        return self.gate.calibrated and bool(np.all(np.maximum(np.abs(moved), np.abs(wider)) <= SAME * u))
 
     def _update_in_force(self) -> bool:
         self.in_force, self.law = self.recursion.result(), self.recursion.law()

@@ -114,6 +114,23 @@ def test_another_reference_is_late_as_its_certificate_says_until_windows_tell() 
     assert found.lag_s == -0.01
 
 
+def test_a_larger_uncertainty_is_in_force_although_rounding_moved_the_state() -> None:
+    """A regression test. Where the sensor opens before the reference, it may be late by another time, and its windows
+    are taken again: S and Q of the state then move by a rounding error. What the configuration states of the reference
+    came in force with the next window only."""
+    stated = {"certificate": {"u_sensitivity_pct": 0.3}}
+    before = settled(np.random.default_rng(6), **stated)
+    before.meet("A", "", 1.0)
+    for rounding in (0.0, 1e-12):
+        found = estimation(**stated, uncertainty={"rotation_deg": 0.4})
+        found.load(unpack(pack(before.snapshot())))
+        found.restate(None, remounted=False)
+        found.in_force = replace(found.in_force, covariance=found.in_force.covariance * (1.0 + rounding))
+        assert found.meet("A", "", 1.0)
+        ratio = found.in_force.standard_uncertainty / before.in_force.standard_uncertainty
+        assert ratio[[1, 7]].min() > 1.1, f"rounding {rounding:g}"  # the motion is along y
+
+
 def test_a_wild_window_among_the_held_ones_does_not_stand_in_the_way() -> None:
     random = np.random.default_rng(5)
     found = settled(random)
