@@ -1,4 +1,4 @@
-"""A state of version 1 is brought up to date: every unknown gets its kind, and the estimation goes on from it."""
+"""A state of an older version is brought up to date, and the estimation goes on from it."""
 
 from __future__ import annotations
 
@@ -12,12 +12,15 @@ import pytest
 from agent.config import recorded_config
 from agent.config.knowledge import Certificate
 from agent.core.driver_filters import DriverFilters
-from agent.core.events import DeviceChange
+from agent.core.events import CalibrationUpdate, DeviceChange
 from agent.core.kept import take_up
+from agent.core.pipeline import Pipeline
 from agent.core.snapshot import VERSION, pack, unpack
 from agent.delivery.history import History
 from agent.delivery.store import Store
 from agent.recording.reading import RecordingReader
+from benchmarks.online.node import Node, Timing, node
+from benchmarks.online.runner import Run, visits
 from calib.estimate.quantities import KINDS
 from tests.replay.golden_files import FORMATS, RECORDING, STATE, config_of
 
@@ -109,3 +112,27 @@ def test_a_version_that_is_not_known_is_named() -> None:
     newer = msgspec.msgpack.encode({"version": VERSION + 1, "state": {}})
     with pytest.raises(ValueError, match=f"version {VERSION + 1}, but this program reads versions 1 to {VERSION} only"):
         unpack(newer)
+
+
+def test_a_state_of_version_6_goes_on_and_sums_up_what_its_bands_leave_open_from_now_on() -> None:
+    drawn = node(3, all_axes=True, timing=Timing(20.0, 60.0, 6))
+    run = Run(drawn.config)
+    updates = [update for k in range(4) for update in of_visit(run, drawn, k)]
+    state = unpack(run.pipeline.snapshot())
+    (channel,) = state["channels"].values()
+    recursion = channel["estimation"]["recursion"]
+    assert recursion["over"].pop("left_open")["thirds"]
+    for summary in recursion["recent"]:
+        assert "left_open" in summary["data"]["bands"]
+        del summary["data"]["bands"]["left_open"]
+    old = raw(pack(state)) | {"version": 6}
+    run.pipeline = Pipeline.restore(drawn.config.model_dump_json(), msgspec.msgpack.encode(old))
+    newer = of_visit(run, drawn, 4)
+    (channel,) = unpack(run.pipeline.snapshot())["channels"].values()
+    assert channel["estimation"]["recursion"]["over"]["left_open"]["thirds"]
+    np.testing.assert_allclose(newer[-1].sensitivity, updates[-1].sensitivity, atol=2e-3)
+
+
+def of_visit(run: Run, drawn: Node, number: int) -> list[CalibrationUpdate]:
+    results = [r for event in visits(drawn.building, range(number, number + 1)) for r in run.feed(event)]
+    return [r for r in results if isinstance(r, CalibrationUpdate)]
