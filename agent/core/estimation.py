@@ -106,8 +106,7 @@ class Estimation:
         return self.recursion.response
 
     def _summary(self, window: Window, day: float, lag_s: float, temperature_degc: float) -> Summary:
-        known = self.recursion
-        return Summary.of(window, day, lag_s, temperature_degc, known.reference, known.motion_to_hz)
+        return Summary.of(window, day, lag_s, temperature_degc, self.recursion.reference, self.recursion.motion_to_hz)
 
     def date_certificate(self, day: float, utc_ns: int) -> None:
         """Tell the state the date of the certificate of the reference in use. `utc_ns` is the UTC of `day`."""
@@ -288,9 +287,8 @@ class Estimation:
     def _follows_state(self) -> bool:
         """Whether the calibration in force is that of the state, but for rounding."""
         now, u = self.recursion.result(), self.in_force.standard_uncertainty
-        moved = np.append((now.sensitivity - self.in_force.sensitivity).ravel(), now.offset - self.in_force.offset)
-        wider = now.standard_uncertainty - u
-        return self.gate.calibrated and bool(np.all(np.maximum(np.abs(moved), np.abs(wider)) <= SAME * u))
+        moved = np.append(now.sensitivity - self.in_force.sensitivity, now.offset - self.in_force.offset)
+        return self.gate.calibrated and bool(np.all(np.abs([moved, now.standard_uncertainty - u]) <= SAME * u))
 
     def _update_in_force(self) -> bool:
         self.in_force, self.law = self.recursion.result(), self.recursion.law()
