@@ -4,8 +4,8 @@
 
 A sensor and a tri-axial reference move together for 300 s; a filter is in the sensor or (its inverse) in the reference.
 The reference's error is drawn from its stated uncertainty of 0.1 %, and the corners of the axes from theirs of 1 %
-about their mean. With --known the filters are stated, and their
-corners differ from what is stated by errors drawn from their uncertainty of 10 %.
+about their mean. With --known the filters are stated, and their corners differ from what is stated by errors drawn from
+their uncertainty of 10 %.
 """
 
 from __future__ import annotations

@@ -186,17 +186,11 @@ def _powers(bands: BandSums) -> tuple[Array, Array]:
 
 def _coherent(bands: BandSums) -> NDArray[np.bool_]:
     """(B,) whether the motion explains at least LEAST_SHOWN of V in a band, at any lag."""
-    m = bands.reference_channels
-    x, V, both = (bands.products[:, rows, columns] for rows, columns in _parts(m))
+    m, products = bands.reference_channels, bands.products
+    x, V, both = products[:, : 2 * m, : 2 * m], products[:, 2 * m :, 2 * m :], products[:, : 2 * m, 2 * m :]
     unit = np.sqrt(np.where((own := np.diagonal(x, axis1=1, axis2=2)) > 0.0, own, 1.0))
     both, x = both / unit[:, :, None], x / (unit[:, :, None] * unit[:, None])
     total = np.trace(V, axis1=1, axis2=2)
     told = np.sum(both * np.linalg.solve(x + RELATED * np.eye(2 * m), both), axis=(1, 2))
     rest = (total - told) * bands.points / (bands.points - 2.0 * m)
     return np.asarray(rest <= (1.0 - LEAST_SHOWN) * total)
-
-
-def _parts(m: int) -> tuple[tuple[slice, slice], ...]:
-    """Where x = [u, du/dt], V and their products are in the sums of a reference with m channels."""
-    x, V = slice(0, 2 * m), slice(2 * m, None)
-    return (x, x), (V, V), (x, V)
