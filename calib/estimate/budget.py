@@ -100,10 +100,10 @@ def _left_open(solution: Solution) -> dict[str, Array]:
     equations, sources = solution.equations, dict[str, Array]()
     if equations.data.bands is None:
         return sources
-    left_open = equations.data.bands.left_open
+    left_open, between = equations.data.bands.left_open, equations.data.bands.between
     if (u_lost := left_open.u_lost(equations.nuisances.reference_frequency_hz)) > 0.0:
         sources["whose noise it is"] = _alike(solution, u_lost)
-    if (u_alike := equations.nuisances.u_alike(solution.x[12:], left_open)) > 0.0:
+    if (u_alike := equations.nuisances.u_alike(solution.x[12:], left_open, between)) > 0.0:
         rows = [slice(3 * row, 3 * row + 3) for row in range(3)]
         sources["response by axis"] = np.sum([_alike(solution, u_alike, row) for row in rows], axis=0)
     return sources

@@ -132,16 +132,21 @@ class LeftOpen:
         """Relative standard uncertainty of S by that: an error between 0 and `lost`, all as likely, not corrected."""
         return self.lost(at_hz) / float(np.sqrt(3.0))
 
-    def u_alike(self, terms: Array, at_reference: Array, powers: Sequence[int] = POWERS) -> float:
+    def u_alike(
+        self, terms: Array, at_reference: Array, between: BetweenBands, powers: Sequence[int] = POWERS
+    ) -> float:
         """Relative standard uncertainty of a row of S because the corner of one axis differs by U_CORNER from that of
-        all. `terms` (K,) of the response, their effects `at_reference` (K,) where S holds, and their `powers`.
+        all, beyond that of the bands' deviations `between`. `terms` (K,) of the response, their effects `at_reference`
+        (K,) where S holds, and their `powers`.
 
-        A term is proportional to the inverse of the corner to its power.
+        A term is proportional to the inverse of the corner to its power. Corners that differ make bands deviate too,
+        so that their effect would otherwise count twice.
         """
         if not terms.any() or not self.thirds:
             return 0.0
         away = _mean_effects(self) - at_reference
-        return float(U_CORNER * abs(np.sum(np.array(powers) * terms * away)))
+        u = float(U_CORNER * abs(np.sum(np.array(powers) * terms * away)))
+        return float(np.sqrt(max(u**2 - between.relative_u**2, 0.0)))
 
 
 def _sum(one: tuple[float, ...], other: tuple[float, ...]) -> tuple[float, ...]:

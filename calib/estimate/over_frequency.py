@@ -120,8 +120,9 @@ class OverFrequency:
         """
         stated = self.stated(priors)
         hz = stated.reference_frequency_hz or self.first_hz
-        parts = [priors.known_u, self.deviations.between.relative_u, self.left_open.u_lost(hz)]
-        alike = self.left_open.u_alike(self._terms(state, reference), _at_reference(stated))
+        between = self.deviations.between
+        parts = [priors.known_u, between.relative_u, self.left_open.u_lost(hz)]
+        alike = self.left_open.u_alike(self._terms(state, reference), _at_reference(stated), between)
         if not any(parts) and not alike:
             return state.factor
         more = np.zeros((len(state), 4))

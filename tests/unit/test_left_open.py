@@ -11,7 +11,7 @@ from scipy.integrate import quad
 
 from calib.estimate.adjustment import adjust
 from calib.estimate.condense import condense
-from calib.estimate.deviations import U_CORNER, LeftOpen
+from calib.estimate.deviations import U_CORNER, BetweenBands, LeftOpen
 from calib.estimate.nuisances import Priors
 from calib.estimate.recursion import Recursion
 from calib.estimate.wander import TemperatureModel, Wander
@@ -47,6 +47,13 @@ def errors(of: Pair, found: Outcome) -> tuple[Array, Array]:
     assert found.calibration is not None, found.reasons
     away = np.diag(found.calibration.sensitivity) - np.diag(of.sensitivity)
     return away, found.calibration.standard_uncertainty[[0, 4, 8]]
+
+
+def of_bands(of: Pair) -> LeftOpen:
+    """What the bands of all windows together leave open."""
+    bands = condense([excited(w) for w in of.files.windows(0.0) if w.used], response_hz=22.0).bands
+    assert bands is not None
+    return bands.left_open
 
 
 @pytest.mark.parametrize("of_reference", [True, False])
@@ -137,22 +144,25 @@ def test_sums_add_and_are_kept() -> None:
     of, _ = made(within(0.01, of_reference=True), 1)
     windows = [excited(w) for w in of.files.windows(0.0) if w.used]
     parts = [condense([w], response_hz=22.0).bands for w in windows]
-    together = condense(windows, response_hz=22.0).bands
-    assert together is not None
+    together = of_bands(of)
     added = LeftOpen()
     for part in parts:
         assert part is not None
         added = added.plus(part.left_open)
-    assert added.lost(3.16) == pytest.approx(together.left_open.lost(3.16), rel=1e-9)
+    assert added.lost(3.16) == pytest.approx(together.lost(3.16), rel=1e-9)
     kept = msgspec.msgpack.decode(msgspec.msgpack.encode(asdict(added)))
     assert LeftOpen.load(kept) == added
     assert LeftOpen().plus(added) == added == added.plus(LeftOpen())
-    assert LeftOpen().lost(3.16) == LeftOpen().u_alike(np.ones(5), np.zeros(5)) == 0.0
+    assert LeftOpen().lost(3.16) == LeftOpen().u_alike(np.ones(5), np.zeros(5), BetweenBands()) == 0.0
 
 
-def test_the_agent_says_what_files_say() -> None:
-    """One window after another: the same noise and the same axes in U."""
-    of, _ = made(within(0.01, of_reference=True), 1, lowpass(1, 30.0))
+@pytest.mark.parametrize(
+    ("disturbed", "source", "least"),
+    [(within(0.01, of_reference=True), "whose noise it is", 0.004), (undisturbed, "response by axis", 5e-4)],
+)
+def test_the_agent_says_what_files_say(disturbed: Disturbance, source: str, least: float) -> None:
+    """One window after another: the same noise, or the same axes, in U."""
+    of, _ = made(disturbed, 1, lowpass(1, 30.0))
     windows = [w for w in of.files.windows(0.0) if w.used]
     stated = Priors(reference=U_REFERENCE, reference_frequency_hz=of.reference_frequency_hz)
     found = Recursion(MEAN, U, stated, replace(Wander.none(), offset_rate_mps2=1e-9), TemperatureModel(), fixed=False)
@@ -162,7 +172,16 @@ def test_the_agent_says_what_files_say() -> None:
     assert band_hz is not None
     at_once = adjust(windows, Priors(stated.values, MEAN, np.diag(U**2)).with_response(band_hz, 1.1 * band_hz[1]))
     u = np.sqrt(np.diag(at_once.covariance)[:9])
-    assert at_once.contributions["whose noise it is"][0] > 0.004
-    assert at_once.contributions["response by axis"][0] > 5e-4
+    assert at_once.contributions[source][0] > least
     ratio = found.result().standard_uncertainty[[0, 4, 8]] / u[[0, 4, 8]]
     assert ((ratio > 0.9) & (ratio < 1.1)).all(), ratio
+
+
+def test_axes_that_make_bands_deviate_count_once() -> None:
+    """What the bands' deviations already contain is no more in the part of axes that differ."""
+    of, _ = made(undisturbed, 2, lowpass(1, 30.0))
+    left_open, terms, at = of_bands(of), np.array([1e-3, 0.0, 0.0, 0.0, 0.0]), np.zeros(5)  # of (i omega)^2
+    alone = left_open.u_alike(terms, at, BetweenBands())
+    assert alone > 0.0
+    assert left_open.u_alike(terms, at, BetweenBands(scatter=0.6 * alone)) == pytest.approx(0.8 * alone)
+    assert left_open.u_alike(terms, at, BetweenBands(shift=1.1 * alone)) == 0.0
