@@ -13,11 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from agent.core.events import CalibrationUpdate, StatusChange, WindowReport
-from benchmarks.online.node import Stated, Timing, node
+from benchmarks.online.node import Stated, Timing, adxl355, node
 from benchmarks.online.runner import EPOCH_NS, Run, visits
 from calib.model import Array
-from hw import adxl355_registers
-from hw.virtual import adxl355_twin
 from hw.virtual.building import Building
 from hw.virtual.building_motion import Band
 
@@ -55,10 +53,9 @@ def one(job: Job) -> Outcome:
     (rate_hz, to_hz, u_lag_s), kind, seed = job
     stated = Stated(main_pct=3.0, transverse_pct=1.5, offset_mps2=0.5, lag_s=u_lag_s)
     drawn = node(seed, all_axes=True, stated=stated, timing=TIMING)
-    parameters, chip = drawn.building.parameters, adxl355_twin.filters(rate_hz)
-    filters = adxl355_registers.filters(rate_hz) if kind != "nothing" else ()
-    clock = replace(parameters.sensor.clock, nominal_rate_hz=rate_hz)
-    sensor = replace(parameters.sensor, clock=clock, response=chip, filters=filters)
+    parameters = drawn.building.parameters
+    sensor = adxl355(parameters.sensor, rate_hz)
+    sensor = replace(sensor, filters=sensor.filters if kind != "nothing" else ())
     reference = replace(parameters.reference, filters=("flat",) if kind == "both" else ())
     building = Building(replace(parameters, band=Band(0.5, to_hz), sensor=sensor, reference=reference), seed)
     run, first, update, status, used = Run(drawn.config), None, None, "", 0
@@ -73,7 +70,7 @@ def one(job: Job) -> Outcome:
     if first is None or update is None:
         return Outcome(job, *(np.full(n, np.nan) for n in (12, 3, 3, 9, 3)), used, status == "HELD")
     truth = building.truth((update.t_utc_ns - EPOCH_NS) * 1e-9)
-    size = abs(complex(chip(np.array([update.reference_frequency_hz]))[0]))
+    size = building.size(update.reference_frequency_hz)
     S, true_S = np.array(update.sensitivity).ravel(), truth.sensitivity.ravel()
     error = np.append(S - size * true_S, np.array(update.offset) - truth.offset_at_mean)
     first_u, expanded = (one.coverage_factor * np.array(one.standard_uncertainty) for one in (first, update))

@@ -17,19 +17,21 @@ SEED = 50_000
 RUNS = 300
 TIMING = Timing(30.0, 120.0, 16)
 # As in a data sheet rather than a certificate, so that the data halve the u of every parameter.
+CHIP_HZ = 125.0  # output data rate of the sensor, an ADXL355
 STATED = Stated(main_pct=3.0, transverse_pct=1.5, offset_mps2=0.5)
 LEVEL = 0.999  # of the band over all parameters together (Bonferroni)
 
 
 def one(seed: int) -> NDArray[np.float64]:
     """Error over U (12,) of the calibration in force after the last window; NaN where a parameter is not determined."""
-    drawn = node(seed, all_axes=True, timing=TIMING, stated=STATED)
+    drawn = node(seed, all_axes=True, timing=TIMING, stated=STATED, chip_hz=CHIP_HZ)
     run = Run(drawn.config)
     results = [r for event in visits(drawn.building, range(TIMING.windows)) for r in run.feed(event)]
     update = [r for r in results if isinstance(r, CalibrationUpdate)][-1]
     truth = drawn.building.truth((update.t_utc_ns - EPOCH_NS) * 1e-9)
     value = np.append(np.ravel(update.sensitivity), update.offset)
-    error = value - np.append(truth.sensitivity.ravel(), truth.offset_at_mean)
+    sensitivity = drawn.building.size(update.reference_frequency_hz) * truth.sensitivity
+    error = value - np.append(sensitivity.ravel(), truth.offset_at_mean)
     expanded = update.coverage_factor * np.array(update.standard_uncertainty)
     return np.where(update.determined, error / expanded, np.nan)
 

@@ -64,7 +64,7 @@ def one(job: Job) -> Outcome:
     if update is None:
         return Outcome(job, np.full(12, np.nan), np.full(3, np.nan), status == "HELD")
     truth = building.truth((update.t_utc_ns - EPOCH_NS) * 1e-9)
-    size = abs(complex(FILTERS[name](np.array([update.reference_frequency_hz]))[0])) ** (1 if where == "sensor" else -1)
+    size = building.size(update.reference_frequency_hz)
     S = np.array(update.sensitivity)
     error = np.append(S.ravel() - size * truth.sensitivity.ravel(), np.array(update.offset) - truth.offset_at_mean)
     expanded = update.coverage_factor * np.array(update.standard_uncertainty)

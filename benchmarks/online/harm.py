@@ -18,6 +18,7 @@ from hw.virtual.harm_kinds import KINDS
 
 SEED = 20_000
 TIMING = Timing(20.0, 60.0, 12)
+CHIP_HZ = 125.0  # output data rate of the sensor, an ADXL355
 KNOWN_WINDOWS = 4  # windows before the fault, in every other run
 # A parameter is wrong if it differs from the truth by more standard uncertainties (for k = 2; else in proportion)
 FACTOR_U = 4.0
@@ -47,7 +48,7 @@ def harmed(kind: str, seed: int) -> Outcome:
     random = np.random.default_rng([seed, 7])
     harm = KINDS[kind](random) if kind else HARMLESS
     since = KNOWN_WINDOWS * int(random.integers(2)) if kind else 0
-    drawn = node(seed, all_axes=bool(random.integers(2)), harm=harm, harmed_from=since, timing=TIMING)
+    drawn = node(seed, all_axes=bool(random.integers(2)), harm=harm, harmed_from=since, timing=TIMING, chip_hz=CHIP_HZ)
     run = Run(drawn.config)
     results = [r for event in visits(drawn.building, range(TIMING.windows)) for r in run.feed(event)]
     return _outcome(kind, harm.name, seed, drawn, since, results)
@@ -80,7 +81,7 @@ def wrong(update: CalibrationUpdate, drawn: Node, harmed: bool) -> str:
     building = drawn.building
     output = building.harm.output if harmed else np.eye(3)
     true = building.truth((update.t_utc_ns - EPOCH_NS) * 1e-9)
-    size = building.harm.size(update.reference_frequency_hz) if harmed else 1.0
+    size = building.size(update.reference_frequency_hz)
     truth = np.concatenate([(size * output @ true.sensitivity).ravel(), output @ true.offset_at_mean])
     value = np.concatenate([np.ravel(update.sensitivity), update.offset])
     determined = np.array(update.determined)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from agent.config import Config
 from benchmarks.online.config import building_config
+from hw import adxl355_registers
+from hw.virtual import adxl355_twin
 from hw.virtual.building import Building, BuildingParameters, Instrument, Weather
 from hw.virtual.building_motion import Band
 from hw.virtual.harm import HARMLESS, Harm
@@ -83,6 +85,16 @@ class Node:
     stated: Stated = field(default_factory=Stated)
 
 
+def adxl355(instrument: Instrument, rate_hz: float) -> Instrument:
+    """The instrument as an ADXL355 at this output data rate: with the chip's filters, which its driver states."""
+    return replace(
+        instrument,
+        clock=replace(instrument.clock, nominal_rate_hz=rate_hz),
+        response=adxl355_twin.filters(rate_hz),
+        filters=tuple(adxl355_registers.filters(rate_hz)),
+    )
+
+
 def node(
     seed: int,
     *,
@@ -92,8 +104,9 @@ def node(
     stated: Stated | None = None,
     timing: Timing | None = None,
     transverse: tuple[complex, complex] = (0.0, 0.0),
+    chip_hz: float | None = None,
 ) -> Node:
-    """Draw everything from `seed`, at 100 Hz.
+    """Draw everything from `seed`, at 100 Hz; with `chip_hz` the sensor is an ADXL355 at this output data rate.
 
     The building moves along all axes independently, or along y. `transverse`: how much of the motion along y there is
     along x and z, in phase (real part) and 90 deg ahead (imaginary part).
@@ -118,6 +131,8 @@ def node(
         sensor=Instrument(0.005, Clock(RATE_HZ, 1e-4 * random.standard_normal(), 0.0013, 20e-6)),
         reference=Instrument(0.001, Clock(RATE_HZ, 1e-4 * random.standard_normal(), 0.0004)),
     )
+    if chip_hz is not None:
+        parameters = replace(parameters, sensor=adxl355(parameters.sensor, chip_hz))
     building = Building(parameters, seed, harm, harmed_from)
     return Node(building, building_config(building, **stated.keys()), stated)
 

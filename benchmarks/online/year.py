@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 from agent.config import Config
 from agent.core.events import CalibrationUpdate, DriftReport, StatusChange, WindowReport
 from benchmarks.online.config import building_config
+from benchmarks.online.node import adxl355
 from benchmarks.online.runner import EPOCH_NS, Run, visits
 from hw.virtual.building import DAY_S, Building, BuildingParameters
 
 Array = NDArray[np.float64]
 MONTH_DAYS = 30.4
+CHIP_HZ = 250.0  # output data rate of the sensor, an ADXL355
 STEP_DAY = 150.0  # in month 5
 STEP = 0.01  # change of S_yy
 LOUD_MPS2 = 0.1
@@ -32,6 +34,7 @@ def parameters(seed: int, elsewhere: float = 0.0) -> BuildingParameters:
     step[1, 1] = STEP * sensitivity[1, 1]
     axis = random.standard_normal(3) * [1.0, 1.0, 0.0]
     return BuildingParameters(
+        sensor=adxl355(BuildingParameters().sensor, CHIP_HZ),
         elsewhere=elsewhere,
         sensitivity=sensitivity,
         steps=((STEP_DAY * DAY_S, step),),
@@ -176,7 +179,8 @@ def _note(year: Year, building: Building, update: CalibrationUpdate) -> None:
     truth = building.truth(now_s)
     S, u = np.array(update.sensitivity), np.array(update.standard_uncertainty)
     year.time_s.append(now_s)
-    year.syy_error.append(S[1, 1] / truth.sensitivity[1, 1] - 1)
+    true_syy = building.size(update.reference_frequency_hz) * truth.sensitivity[1, 1]
+    year.syy_error.append(S[1, 1] / true_syy - 1)
     year.u_syy.append(u[SYY])
     held = np.array(update.sensitivity_at_0hz.sensitivity or update.sensitivity)
     year.mean_error_mps2.append(held @ GRAVITY + at_temperature(update, truth.temperature_degc) - truth.mean_output)

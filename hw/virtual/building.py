@@ -47,6 +47,10 @@ class Instrument:
     response: Response | None = None
     filters: tuple[str, ...] = ()
 
+    def size(self, frequency_hz: float) -> float:
+        """How much of a motion at this frequency it shows; 1 without a filter."""
+        return 1.0 if self.response is None else float(abs(self.response(np.array([frequency_hz]))[0]))
+
     def bursts(self, time_s: float) -> int:
         """Number of complete bursts at `time_s`."""
         return int(self.clock.due(time_s)) // self.burst
@@ -177,6 +181,11 @@ class Building:
         offset = at_mean + (degc - p.weather.mean_degc) * p.offset_per_k
         gravity = _turned(p.tilt_rad_a_day * days) @ p.gravity_mps2
         return BuildingTruth(sensitivity, offset, at_mean, gravity, degc, sensitivity @ gravity + offset)
+
+    def size(self, frequency_hz: float) -> float:
+        """The response of the harmed sensor over that of the reference at a frequency, by which it multiplies S."""
+        p = self.parameters
+        return self.harm.size(frequency_hz) * p.sensor.size(frequency_hz) / p.reference.size(frequency_hz)
 
     def level_mps2(self, visit: int) -> float:
         """Level of the motion in a visit, rms."""
