@@ -188,10 +188,12 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
 def _response(
     solution: Solution, covariance: Array, priors: Priors, windows: Sequence[Window], k: float
 ) -> ResponseTold | None:
-    one_frequency = priors.response_terms == 1.0
-    band_hz = (priors.response_hz,) * 2 if one_frequency else motion_band_hz(windows)
-    if not priors.response or band_hz is None:
+    if not priors.response:
         return None
+    one_frequency = priors.response_terms == 1.0
+    band_hz = None if one_frequency else motion_band_hz(windows)
+    if band_hz is None:  # of a broad motion: what is left of it once the response is taken out is too narrow
+        band_hz = (priors.response_hz if one_frequency else priors.reference_frequency_hz, priors.response_hz)
     nuisances = solution.equations.nuisances
     own = np.flatnonzero([t.kind is RESPONSE for t in nuisances.terms])
     applied = np.array([nuisances.terms[j].applied for j in own])

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calib.estimate.banded import Banded
 from calib.estimate.deviations import BetweenBands
 from calib.estimate.gauss_newton import Solution, slope_residuals
 from calib.estimate.scatter import between_windows
@@ -50,13 +51,11 @@ def budget(solution: Solution, stated_offset_scatter_mps2: float, known_u: float
         sources["offset between windows"] = (larger**2 * seen.offset.term, freedom)
     if seen.slope.scatter > 0.0:
         sources["slopes between windows"] = (seen.slope.scatter**2 * seen.slope.term, seen.slope.degrees_of_freedom)
-    banded = solution.equations.data.bands
-    bands = BetweenBands() if banded is None else banded.between
-    if bands.relative_u > 0.0:
-        sources["response between bands"] = (_alike(solution, bands.relative_u), np.inf)
     if known_u > 0.0:
         sources["known filters"] = (_alike(solution, known_u), np.inf)
-    sources |= {name: (middle, np.inf) for name, middle in _left_open(solution).items()}
+    banded = solution.equations.data.bands
+    if banded is not None:
+        sources |= {name: (middle, np.inf) for name, middle in _of_bands(solution, banded).items()}
     half = solution.half
     sources["prior of S and Q"] = (half[:12].T @ solution.prior_precision[:12, :12] @ half[:12], np.inf)
     terms = solution.equations.nuisances.terms
@@ -74,7 +73,7 @@ def budget(solution: Solution, stated_offset_scatter_mps2: float, known_u: float
         degrees_of_freedom=effective,
         offset_scatter_mps2=seen.offset.scatter,
         slope_scatter=seen.slope.scatter,
-        between_bands=bands,
+        between_bands=BetweenBands() if banded is None else banded.between,
         consistency=seen.consistency,
     )
 
@@ -95,17 +94,17 @@ def _type_a(solution: Solution) -> Array:
     return _quadratic(slope_rows, type_a.slopes) + _quadratic(mean_rows, type_a.means) + band_rows.T @ band_rows
 
 
-def _left_open(solution: Solution) -> dict[str, Array]:
-    """The sources that no band of frequency tells of (calib.estimate.deviations.LeftOpen)."""
-    equations, sources = solution.equations, dict[str, Array]()
-    if equations.data.bands is None:
-        return sources
-    left_open, between = equations.data.bands.left_open, equations.data.bands.between
-    if (u_lost := left_open.u_lost(equations.nuisances.reference_frequency_hz)) > 0.0:
+def _of_bands(solution: Solution, banded: Banded) -> dict[str, Array]:
+    """The sources that the bands of frequency show, and those that they leave open (calib.estimate.deviations)."""
+    nuisances, sources = solution.equations.nuisances, dict[str, Array]()
+    by_axis = nuisances.by_axis(solution.x[12:], banded.left_open)
+    if (u_between := banded.between.beyond(by_axis.explains)) > 0.0:
+        sources["response between bands"] = _alike(solution, u_between)
+    if (u_lost := banded.left_open.u_lost(nuisances.reference_frequency_hz)) > 0.0:
         sources["whose noise it is"] = _alike(solution, u_lost)
-    if (u_alike := equations.nuisances.u_alike(solution.x[12:], left_open, between)) > 0.0:
+    if by_axis.u > 0.0:
         rows = [slice(3 * row, 3 * row + 3) for row in range(3)]
-        sources["response by axis"] = np.sum([_alike(solution, u_alike, row) for row in rows], axis=0)
+        sources["response by axis"] = np.sum([_alike(solution, by_axis.u, row) for row in rows], axis=0)
     return sources
 
 

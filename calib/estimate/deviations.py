@@ -8,20 +8,22 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from calib.distributions import chi2_quantile
 from calib.model import Array
 from calib.signal.order_statistics import median
-from calib.signal.response import POWERS
+from calib.signal.response import POWERS, by_term
 
 PROBABILITY = 0.99  # confidence of the test for scatter between bands
 SURELY = 3.0  # standard uncertainties of noise beyond the white noise that chance does not explain
 LEAST_SHOWN = 0.1  # of the motion of the axis that moved most: noise of an axis with less says little of the reference
 MEDIAN_U = 1.2533  # standard uncertainty of a median over that of a mean
 TINY = 1e-300
+# Mean square, over that of one axis, by which three axes differ from their mean in 95 of 100 cases: chi^2_2(0.95) / 3.
+EXPLAINED = -2.0 * float(np.log(0.05)) / 3.0
 U_CORNER = 0.01  # standard uncertainty of the corner of an axis, relative to that of all axes; c_2 then differs by 2 %
 
 
@@ -41,8 +43,12 @@ class BetweenBands:
 
     @property
     def relative_u(self) -> float:
-        """Relative standard uncertainty of S."""
-        return max(self.scatter, self.shift)
+        """Relative standard uncertainty of S if nothing else explains the deviations."""
+        return self.beyond(0.0)
+
+    def beyond(self, explained: float) -> float:
+        """Relative standard uncertainty of S by the part of the deviations that exceeds a relative SD `explained`."""
+        return max(float(np.sqrt(max(self.scatter**2 - explained**2, 0.0))), self.shift)
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +99,14 @@ _ADDED = ("freedom", "square", "signal", "moved", "power", "variance")
 Third = tuple[int, tuple[float, ...]]
 
 
+class ByAxis(NamedTuple):
+    """What axes do that do not respond quite alike. `u`: relative standard uncertainty of a row of S. `explains`:
+    relative SD of the bands' deviations that they explain in 95 of 100 cases."""
+
+    u: float = 0.0
+    explains: float = 0.0
+
+
 @dataclass(frozen=True, slots=True)
 class LeftOpen:
     """Sums over the bands of windows for what no band tells: whose noise it is, and whether all axes respond alike.
@@ -132,21 +146,18 @@ class LeftOpen:
         """Relative standard uncertainty of S by that: an error between 0 and `lost`, all as likely, not corrected."""
         return self.lost(at_hz) / float(np.sqrt(3.0))
 
-    def u_alike(
-        self, terms: Array, at_reference: Array, between: BetweenBands, powers: Sequence[int] = POWERS
-    ) -> float:
-        """Relative standard uncertainty of a row of S because the corner of one axis differs by U_CORNER from that of
-        all, beyond that of the bands' deviations `between`. `terms` (K,) of the response, their effects `at_reference`
-        (K,) where S holds, and their `powers`.
+    def by_axis(self, terms: Array, at_reference: Array, powers: Sequence[int] = POWERS) -> ByAxis:
+        """What it does that the corner of each axis differs by U_CORNER from that of all. `terms` (K,) of the response,
+        their effects `at_reference` (K,) where S holds, and their `powers`.
 
-        A term is proportional to the inverse of the corner to its power. Corners that differ make bands deviate too,
-        so that their effect would otherwise count twice.
+        A term is proportional to the inverse of the corner to its power.
         """
         if not terms.any() or not self.thirds:
-            return 0.0
+            return ByAxis()
+        by_corner = np.array(powers) * terms
         away = _mean_effects(self) - at_reference
-        u = float(U_CORNER * abs(np.sum(np.array(powers) * terms * away)))
-        return float(np.sqrt(max(u**2 - between.relative_u**2, 0.0)))
+        u = float(U_CORNER * abs(np.sum(by_corner * away)))
+        return ByAxis(u, U_CORNER * float(np.sqrt(EXPLAINED * _beside_gain_and_lag(self.thirds, by_corner))))
 
 
 def _sum(one: tuple[float, ...], other: tuple[float, ...]) -> tuple[float, ...]:
@@ -160,6 +171,18 @@ def _mean_effects(of: LeftOpen) -> Array:
     found = np.array(of.moments) / max(sum(sum(own[:3]) for _, own in of.thirds), TINY)
     found.flags.writeable = False
     return found
+
+
+def _beside_gain_and_lag(thirds: tuple[Third, ...], terms: Array) -> float:
+    """The mean square of the effect of `terms` (K,) on ln h that neither a gain nor a lag explains. The weights are the
+    powers of V that the motion explains."""
+    weight = np.array([sum(own[:3]) for _, own in thirds])
+    weight = weight / max(weight.sum(), TINY)
+    omega = 2.0 * np.pi * np.exp2(np.array([k for k, _ in thirds]) / 3.0)
+    effect = by_term(omega, len(terms)) @ terms
+    lag_s = (weight @ (omega * effect.imag)) / max(weight @ omega**2, TINY)
+    left = effect - weight @ effect.real - 1j * omega * lag_s
+    return float(weight @ np.abs(left) ** 2)
 
 
 @lru_cache(maxsize=8)

@@ -21,7 +21,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.estimate.deviations import BetweenBands, LeftOpen
+from calib.estimate.deviations import ByAxis, LeftOpen
 from calib.estimate.quantities import (
     LAG,
     PRIORS,
@@ -284,10 +284,10 @@ class Nuisances:
         away = self._at_reference @ (self._applied_response + z @ self.response) + self._known_size
         return float(np.exp(-away)), -(self.response @ self._at_reference)
 
-    def u_alike(self, z: Array, left_open: LeftOpen, between: BetweenBands) -> float:
-        """Relative standard uncertainty of a row of S because the axes do not respond quite alike."""
+    def by_axis(self, z: Array, left_open: LeftOpen) -> ByAxis:
+        """What it does that the axes do not respond quite alike."""
         terms, powers = self._applied_response + z @ self.response, ALL_POWERS[: len(self._at_reference)]
-        return left_open.u_alike(terms, self._at_reference, between, powers)
+        return left_open.by_axis(terms, self._at_reference, powers)
 
     def at(self, z: Array) -> Inputs:
         """The inputs when the nuisances have the values `z` (J,)."""

@@ -120,16 +120,15 @@ class OverFrequency:
         """
         stated = self.stated(priors)
         hz = stated.reference_frequency_hz or self.first_hz
-        between = self.deviations.between
-        parts = [priors.known_u, between.relative_u, self.left_open.u_lost(hz)]
-        alike = self.left_open.u_alike(self._terms(state, reference), _at_reference(stated), between)
-        if not any(parts) and not alike:
+        by_axis = self.left_open.by_axis(self._terms(state, reference), _at_reference(stated))
+        parts = [priors.known_u, self.deviations.between.beyond(by_axis.explains), self.left_open.u_lost(hz)]
+        if not any(parts) and not by_axis.u:
             return state.factor
         more = np.zeros((len(state), 4))
         more[:9, 0] = float(np.linalg.norm(parts)) * state.mean[:9]
         for row in range(3):
             own = slice(3 * row, 3 * row + 3)
-            more[own, 1 + row] = alike * state.mean[own]
+            more[own, 1 + row] = by_axis.u * state.mean[own]
         return np.hstack([state.factor, more])
 
     def _terms(self, state: JointState, reference: str) -> Array:

@@ -128,6 +128,14 @@ def test_what_no_smooth_response_explains_is_refused(response: Filter) -> None:
     assert calibrated(pair(3, response)).reasons
 
 
+@pytest.mark.parametrize("seed", [2, 3, 4, 17])
+def test_a_resonance_of_the_reference_within_slow_motion_is_refused(seed: int) -> None:
+    """Once a response is taken out, less than four thirds of an octave move: no band was seen any more, S was told as a
+    constant, and was 1.3 to 5 % off (3 to 8 u)."""
+    made = pair(seed, lambda f: 1.0 / resonance(1.4, 50.0)(f), band_hz=(0.3, 2.0), rate_hz=20.0, seconds=300.0)
+    assert calibrated(made, reference=1e-3).calibration is None
+
+
 @pytest.mark.parametrize("side", ["sensor", "reference"])
 @pytest.mark.parametrize("seed", [1, 5])
 def test_a_resonance_at_one_and_a_half_times_slow_motion(side: str, seed: int) -> None:
