@@ -16,8 +16,8 @@ from calib.model import PARAMETERS
 SEED = 50_000
 RUNS = 300
 TIMING = Timing(30.0, 120.0, 16)
-# As in a data sheet rather than a certificate, so that the data halve the u of every parameter.
 CHIP_HZ = 125.0  # output data rate of the sensor, an ADXL355
+# As in a data sheet rather than a certificate, so that the data halve the u of every parameter.
 STATED = Stated(main_pct=3.0, transverse_pct=1.5, offset_mps2=0.5)
 LEVEL = 0.999  # of the band over all parameters together (Bonferroni)
 

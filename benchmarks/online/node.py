@@ -91,7 +91,7 @@ def adxl355(instrument: Instrument, rate_hz: float) -> Instrument:
         instrument,
         clock=replace(instrument.clock, nominal_rate_hz=rate_hz),
         response=adxl355_twin.filters(rate_hz),
-        filters=tuple(adxl355_registers.filters(rate_hz)),
+        filters=adxl355_registers.filters(rate_hz),
     )
 
 

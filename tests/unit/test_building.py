@@ -17,6 +17,7 @@ from hw.virtual.harm import (
     ClockStep,
     DeadChannel,
     FarAway,
+    Filtered,
     Harm,
     KnockedOff,
     Lossy,
@@ -24,6 +25,7 @@ from hw.virtual.harm import (
     Unplugged,
 )
 from hw.virtual.harm_kinds import KINDS
+from hw.virtual.response import lowpass
 from hw.virtual.schedule import rotation
 from hw.virtual.timebase import Clock
 
@@ -232,3 +234,23 @@ def test_an_imaginary_share_moves_a_quarter_of_a_period_ahead() -> None:
     np.testing.assert_allclose(moved[:, 2], 0.02 * moved[:, 1], atol=1e-12)
     assert np.std(moved[:, 0] - 0.01 * ahead[:, 1]) < 0.03 * np.std(moved[:, 0])
     assert 0.009 < np.std(moved[:, 0]) / np.std(moved[:, 1]) < 0.011
+
+
+def test_filters_of_instruments_multiply_s_at_a_frequency() -> None:
+    """A low-pass of first order at 10 Hz shows 0.707 of 10 Hz: in the sensor S is smaller by that, in the reference
+    larger; what the building's devices indicate agrees."""
+    parameters = small(
+        all_axes=True, offset=np.zeros(3), sensor=Instrument(0.0, EXACT), reference=Instrument(0.0, EXACT)
+    )
+    filtered = replace(parameters, sensor=replace(parameters.sensor, response=lowpass(1, 10.0)))
+    undone = replace(parameters, reference=replace(parameters.reference, response=lowpass(1, 10.0)))
+    assert Building(parameters, 2).size(10.0) == 1.0
+    assert Building(filtered, 2).size(10.0) == pytest.approx(np.sqrt(0.5))
+    assert Building(undone, 2).size(10.0) == pytest.approx(np.sqrt(2.0))
+    harm = Filtered("low-pass", "sensor", lowpass(1, 10.0))
+    assert Building(filtered, 2, harm).size(10.0) == pytest.approx(0.5)
+    plain, less = (values(Building(p, 2).visit(1), "sensor")[:, 0] for p in (parameters, filtered))
+    spectra = [np.abs(np.fft.rfft((v - v.mean()) * np.hanning(len(v)))) ** 2 for v in (plain, less)]
+    hz = np.fft.rfftfreq(len(plain), 0.01)
+    near = (hz > 9.5) & (hz < 10.5)
+    assert np.sqrt(spectra[1][near].sum() / spectra[0][near].sum()) == pytest.approx(np.sqrt(0.5), rel=0.02)
