@@ -100,8 +100,8 @@ Third = tuple[int, tuple[float, ...]]
 
 
 class ByAxis(NamedTuple):
-    """What axes do that do not respond quite alike. `u`: relative standard uncertainty of a row of S. `explains`:
-    relative SD of the bands' deviations that they explain in 95 of 100 cases."""
+    """The effect of axes that do not respond quite alike. `u`: relative standard uncertainty of a row of S. `explains`:
+    relative SD of the bands' deviations that such axes explain in 95 of 100 cases."""
 
     u: float = 0.0
     explains: float = 0.0
@@ -147,8 +147,8 @@ class LeftOpen:
         return self.lost(at_hz) / float(np.sqrt(3.0))
 
     def by_axis(self, terms: Array, at_reference: Array, powers: Sequence[int] = POWERS) -> ByAxis:
-        """What it does that the corner of each axis differs by U_CORNER from that of all. `terms` (K,) of the response,
-        their effects `at_reference` (K,) where S holds, and their `powers`.
+        """The effect of corners that differ by U_CORNER from axis to axis. `terms` (K,) of the response, their effects
+        `at_reference` (K,) where S holds, and their `powers`.
 
         A term is proportional to the inverse of the corner to its power.
         """

@@ -285,7 +285,7 @@ class Nuisances:
         return float(np.exp(-away)), -(self.response @ self._at_reference)
 
     def by_axis(self, z: Array, left_open: LeftOpen) -> ByAxis:
-        """What it does that the axes do not respond quite alike."""
+        """The effect of axes that do not respond quite alike, at the values `z` (J,) of the nuisances."""
         terms, powers = self._applied_response + z @ self.response, ALL_POWERS[: len(self._at_reference)]
         return left_open.by_axis(terms, self._at_reference, powers)
 

@@ -47,7 +47,7 @@ def test_a_sensor_that_slips_in_motion_hardly_above_its_noise_is_refused(seed: i
 
 
 def test_a_filter_that_looks_like_a_step_of_the_sensitivity_makes_the_response_unknown() -> None:
-    """A regression test. A low-pass filter at 36 Hz came in mid-life. The drift test saw a step of S_yy, only S was set
+    """A regression test. A low-pass filter came in mid-life. The drift test saw a step of S_yy, only S was set
     free, and the response over frequency stayed that without a filter: S_yy was wrong by 4 u."""
     outcome = harm.harmed("low-pass filter", 20399)
     assert outcome.wrong == ""
