@@ -13,7 +13,6 @@ from hw.block import DeviceInfo
 from hw.fifo import Burst, FifoSamples, plain_samples
 from hw.fifo_options import FifoOptions
 from hw.fifo_sensor import FifoSensor, Registers
-from hw.i2c import READS_MAX
 from hw.self_test import SelfTest
 from hw.sensor import IdentityError
 
@@ -27,6 +26,7 @@ class Adxl345Options(FifoOptions):
     fifo_samples = chip.FIFO_SAMPLES
     bytes_a_sample = 11  # one read per sample: address, register, address, INT_SOURCE, DATA_FORMAT, six data bytes
     bytes_a_poll = 4  # address, register, address, FIFO_STATUS
+    reads_a_sample, reads_a_poll = 1, 1
 
     address: Literal[0x53, 0x1D] = Field(0x53, description="83 (0x53), or 29 (0x1D) with ALT ADDRESS high")
     rate_hz: float = Field(800.0, description=f"one of {', '.join(f'{rate:g}' for rate in chip.RATE_CODES)}")
@@ -39,16 +39,17 @@ class Adxl345Options(FifoOptions):
 
 
 class Adxl345(FifoSensor):
-    """Reads the number of FIFO entries, then the samples, one register read per sample, up to 21 reads per transfer.
+    """Reads the number of FIFO entries, then the samples, one register read per sample.
 
     Each register read starts at INT_SOURCE, two registers before the data, because reading the data clears the overrun
-    bit in INT_SOURCE, and the adapter may stall between two reads of one transfer. The samples of this part carry no
+    bit in INT_SOURCE, and the adapter may stall between two reads. The samples of this part carry no
     counter. If samples were lost during a poll, the driver discards all samples of that poll and flags the next block
     RESTART.
     """
 
     options_model = Adxl345Options
     word_bytes = 6
+    read_bytes = chip.SAMPLE_BYTES
     filter_settings = ("BW_RATE",)
 
     def _kind(self) -> str:
@@ -83,14 +84,10 @@ class Adxl345(FifoSensor):
         retries = self._device.retries
         arrival_ns, utc_ns, (status,) = self._device.read_stamped([(chip.FIFO_STATUS, 1)], self._clock)
         left = status & chip.ENTRIES_MASK
-        data, lost = b"", False
-        while left:
-            samples = min(left, READS_MAX)
-            answer = self._device.read_each([(chip.INT_SOURCE, chip.SAMPLE_BYTES)] * samples)
-            reads = np.frombuffer(answer, np.uint8).reshape(samples, chip.SAMPLE_BYTES)
-            lost |= bool((reads[:, 0] & chip.OVERRUN).any()) or self._device.retries > retries
-            data += reads[:, -self.word_bytes :].tobytes()
-            left -= samples
+        answer = self._device.read_each([(chip.INT_SOURCE, chip.SAMPLE_BYTES)] * left)
+        reads = np.frombuffer(answer, np.uint8).reshape(left, chip.SAMPLE_BYTES)
+        lost = bool((reads[:, 0] & chip.OVERRUN).any()) or self._device.retries > retries
+        data = reads[:, -self.word_bytes :].tobytes()
         if lost:
             self._drop(LOST, len(data) // self.word_bytes)
             data = b""

@@ -44,7 +44,7 @@ class Adxl357Options(Adxl355Options):
 
 
 class Adxl355(FifoSensor):
-    """Reads STATUS and the number of FIFO entries in one transfer, then as many entries as make whole samples.
+    """Reads STATUS and the number of FIFO entries together, then as many entries as make whole samples.
 
     If a poll comes too late, OVERRUN is set. If a read is interrupted, it may have removed entries from the FIFO.
     Entries that do not form x, y, z are dropped up to the next entry with the X marker.
@@ -52,7 +52,7 @@ class Adxl355(FifoSensor):
 
     options_model: ClassVar[type[Options]] = Adxl355Options
     part: ClassVar[chip.Part] = chip.ADXL355
-    word_bytes = 3
+    word_bytes, sample_words = 3, 3
     filter_settings = ("FILTER",)
 
     def _kind(self) -> str:
@@ -77,6 +77,9 @@ class Adxl355(FifoSensor):
             wanted = self.part.identity.hex(" ")
             raise IdentityError(f"{self._device.name}: expected the IDs {wanted}, found {found[:3].hex(' ')}")
         return {"REVID": found[chip.REVISION]}
+
+    def _trims(self) -> Mapping[int, str]:
+        return {chip.SHADOW + i: f"SHADOW_{i + 1}" for i in range(chip.SHADOW_BYTES)}
 
     def _set_up(self, identity: Mapping[str, int]) -> DeviceInfo:
         self._reset()
@@ -111,9 +114,9 @@ class Adxl355(FifoSensor):
         retries = self._device.retries
         # STATUS is read again after the data: the FIFO may have overrun between the count and the data, even if the
         # count was low.
-        answer = self._device.read_each([(chip.FIFO_DATA, 3 * whole), (chip.STATUS, 1)])
-        lost |= bool(answer[-1] & chip.OVERRUN) or self._device.retries > retries
-        data = chip.without_empty(answer[:-1])
+        data = chip.without_empty(self._device.read(chip.FIFO_DATA, 3 * whole))
+        (status,) = self._device.read(chip.STATUS, 1)
+        lost |= bool(status & chip.OVERRUN) or self._device.retries > retries
         return Burst(arrival_ns, utc_ns, data, lost)
 
     def _decode(self, data: bytes) -> FifoSamples:

@@ -30,6 +30,8 @@ class FifoOptions(Options):
     fifo_samples: ClassVar[int]
     bytes_a_sample: ClassVar[int]
     bytes_a_poll: ClassVar[int]  # addresses, registers, status and count
+    reads_a_sample: ClassVar[int] = 0  # register reads, where each sample needs its own
+    reads_a_poll: ClassVar[int] = 3  # register reads besides: status, data, status
 
     bus: int = Field(1, ge=0, description="N of /dev/i2c-N")
     rate_hz: float

@@ -1,65 +1,73 @@
-"""Common part of all drivers that poll a FIFO over I2C: polls, blocks, losses.
+"""Common part of all drivers that poll a FIFO over I2C: bursts, settings, self-test.
 
 A subclass adds the registers of its chip.
 """
 
 from __future__ import annotations
 
-import time
-from abc import ABC, abstractmethod
-from collections import Counter, deque
-from collections.abc import Callable, Mapping
+import math
+from abc import abstractmethod
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
-from hw.block import BlockFlags, DeviceInfo, Drop, SampleBlock
+from hw.block import BlockFlags, DeviceInfo
 from hw.cutting import Break, Cutter, Stretch
 from hw.fifo import Burst, FifoSamples
-from hw.i2c import I2CDevice
+from hw.fifo_options import BUS_SHARE_MAX
+from hw.i2c import READS_MAX, I2CDevice
+from hw.pace import Pace
+from hw.polling import PollingSensor
 from hw.self_test import SelfTest, SelfTestReport
-from hw.sensor import GOLDEN, Clock, ConfigurationError, DeviceError, DeviceLost, Options, system_clock
+from hw.sensor import ConfigurationError, DeviceError, DeviceLost
 
 STANDARD_GRAVITY_MPS2 = 9.80665
-BLOCK_S = 0.5
+PROOF_POLLS = 8  # the golden ratio lets every second poll or third prove that no sample is missing
 OUT_OF_STEP = "incomplete samples in the FIFO"
+UNCHECKED = "samples behind which the settings did not read back as they were set"
+TAKEN = "samples among which others are missing: does another program read the FIFO?"
 
 Registers = Mapping[int, tuple[str, int]]
 """Settings: register -> (name, value)."""
 
 
-class FifoSensor(ABC):
-    """Polls a FIFO for half a second and makes blocks of the samples.
+class FifoSensor(PollingSensor):
+    """Polls a FIFO and makes blocks of the samples.
 
-    The number of lost samples is unknown if the FIFO overran, if a read was interrupted, or if FIFO entries did not
-    form complete samples. The next block then carries RESTART. A subclass implements the abstract methods; `options`
-    must be FifoOptions with an `address`.
+    The number of lost samples is unknown if the FIFO overran, if a read was interrupted, if FIFO entries did not form
+    complete samples, or if the count of the samples falls behind the clock. The next block then carries RESTART.
+
+    Another program on the bus may change a register. Therefore the settings are read back behind the samples of each
+    block, and the block is returned only if they are as they were set; else the device is lost.
+
+    A subclass implements the abstract methods; `options` must be FifoOptions with an `address`.
     """
 
-    options_model: ClassVar[type[Options]]
     word_bytes: ClassVar[int]  # bytes that the FIFO stores at a time
+    sample_words: ClassVar[int] = 1
+    read_bytes: ClassVar[int] = 0  # least bytes of a read; 0: those of a sample
+    auto_increment: ClassVar[int] = 0  # bits that a register number needs for a read of several registers
+    identity_register: ClassVar[int] = 0  # reading on from it, before the device is set up, does no harm
     filter_settings: ClassVar[tuple[str, ...]] = ()  # as in DeviceInfo, where the options tell the filters
 
-    def __init__(
-        self,
-        name: str,
-        options: Any,
-        *,
-        clock: Clock = system_clock,
-        sleep: Callable[[float], None] = time.sleep,
-    ) -> None:
-        self._options = options
-        self._clock = clock
-        self._sleep = sleep
-        self._device = I2CDevice(self._kind(), options.bus, options.address, sleep)
+    def __init__(self, name: str, options: Any, **timing: Any) -> None:
+        super().__init__(name, options, **timing)
+        self._device = I2CDevice(
+            self._kind(),
+            options.bus,
+            options.address,
+            self._sleep,
+            self.read_bytes or self.word_bytes * self.sample_words,
+        )
         self._cutter = Cutter(name, options.rate_hz, *self._limits())
-        self._ready: deque[SampleBlock] = deque()
-        self._loss: DeviceLost | None = None
-        self._dropped: Counter[str] = Counter()  # number of words by reason
+        self._pace = Pace(options.rate_hz)
+        self._held: Registers = {}  # what must read the same behind each block: settings, and trims as found
+        self._bursts: list[Burst] = []
         self._rest = b""
         self._next_poll_ns = 0
-        self._phase = 0.0
 
     @abstractmethod
     def _kind(self) -> str:
@@ -98,33 +106,76 @@ class FifoSensor(ABC):
         """Samples in the words of half a second; `data` begins with the rest of the words before."""
 
     def _temperature(self) -> tuple[int | None, float | None]:
-        """Raw value and degC; called before the first poll of each block."""
+        """Raw value and degC; called at the end of each block."""
         return None, None
+
+    def _trims(self) -> Mapping[int, str]:
+        """Registers with trims of the factory, which this driver does not set, and their names, in ascending order."""
+        return {}
 
     def _forget(self) -> None:
         """Discard the incomplete sample, because the next word does not follow the last one."""
         self._drop(OUT_OF_STEP, len(self._rest) // self.word_bytes)
         self._rest = b""
 
-    def open(self) -> DeviceInfo:
-        """Identify the device, reset it, write the settings and read them back.
+    def _where(self) -> str:
+        return self._device.name
 
-        Raises ConfigurationError (a kernel driver holds the address, or a setting was not accepted), IdentityError, or
-        DeviceLost (no bus, or no device answers).
-        """
+    def _start(self) -> DeviceInfo:
+        """Identify the device, reset it, write the settings and read them back."""
         self._device.open()
-        try:
-            info = self._set_up(self._identify())
-        except BaseException:
-            self.close()
-            raise
-        self._loss = None
-        self._rest = b""
+        self._device.lock()
+        identity = self._identify()
+        self._device.learn(self.identity_register | self.auto_increment, self._longest_read(), self._clock)
+        self._check_speed()
+        info = self._set_up(identity)
+        trims = self._trims()
+        self._held = dict(self._settings()) | {r: (trims[r], value) for r, value in self._read_back(trims).items()}
+        self._bursts, self._rest = [], b""
+        self._pace = Pace(info.nominal_rate_hz)
         self._forget()
         self._cutter.nominal_rate_hz = info.nominal_rate_hz
         self._cutter.flag(BlockFlags.RESTART)
         self._next_poll_ns = self._clock()[0]
         return info
+
+    def _stop(self) -> None:
+        """Release the bus; the device goes on measuring until the next reset."""
+        self._device.close()
+
+    def _longest_read(self) -> int:
+        """Bytes of the samples that one poll usually finds."""
+        options = self._options
+        return int(options.interval_s * options.rate_hz + 2) * self.word_bytes * self.sample_words
+
+    def _check_speed(self) -> None:
+        """Raise ConfigurationError if reading takes too much of the time of this adapter, as measured by `learn`."""
+        share = self._busy(self._options)
+        if share <= BUS_SHARE_MAX:
+            return
+        possible = []
+        for rate_hz in self._options.rates_hz:
+            try:
+                slower = type(self._options).model_validate(self._options.model_dump() | {"rate_hz": rate_hz})
+            except ValidationError:
+                continue
+            if self._busy(slower) <= BUS_SHARE_MAX:
+                possible.append(rate_hz)
+        highest = f"the highest rate_hz that can be read is {max(possible):g}" if possible else "no rate can be read"
+        raise ConfigurationError(
+            f"{self._device.name}: at rate_hz {self._options.rate_hz:g} reading takes {share:.0%} of the time of this "
+            f"adapter ({1e3 * self._device.time_s(1, 1):.2g} ms for a byte), at most {BUS_SHARE_MAX:.0%} may be used: "
+            f"{highest}; use a faster adapter or another rate"
+        )
+
+    def _busy(self, options: Any) -> float:
+        """Share of the time that reading takes on this adapter with these options."""
+        samples = options.interval_s * options.rate_hz
+        parts = max(0, math.ceil(samples * options.bytes_a_sample / self._device.longest) - 1)
+        joined = READS_MAX if self._device.joins else 1
+        transfers = options.reads_a_poll + max(parts, samples * options.reads_a_sample / joined)
+        data_bytes = options.bytes_a_poll + samples * options.bytes_a_sample
+        return float(self._device.time_s(transfers, data_bytes) / options.interval_s)
 
     def identify(self) -> str:
         """Name the device at the address. Reads only the identity registers, so a device in use is not disturbed.
@@ -136,7 +187,7 @@ class FifoSensor(ABC):
             self._device.check_free()
             identity = self._identify()
         finally:
-            self.close()
+            self._device.close()
         return f"{self._kind()} ({', '.join(f'{name} 0x{value:02X}' for name, value in identity.items())})"
 
     def self_test(self) -> SelfTestReport:
@@ -149,6 +200,9 @@ class FifoSensor(ABC):
         still = self._settled(0.0)
         for register, value in test.writes:
             self._device.write(register, value)
+        self._held = dict(self._held) | {r: (self._held[r][0], value) for r, value in test.writes}
+        self._bursts = []
+        self._pace.restart()
         change = (self._settled(test.settle_s).mean(axis=0) - still.mean(axis=0)) / g
         noise = still.std(axis=0) / g
         self.close()
@@ -163,103 +217,103 @@ class FifoSensor(ABC):
             raise DeviceLost(f"{self._device.name}: sent no samples during the self-test")
         return block.indications
 
-    def close(self) -> None:
-        """Release the bus; the device goes on measuring until the next reset."""
-        self._device.close()
-
-    def take_drops(self) -> list[Drop]:
-        """Bytes of FIFO entries that became no sample since the last call, by reason."""
-        drops = [Drop(self.word_bytes * words, "bytes", reason) for reason, words in self._dropped.items() if words]
-        self._dropped.clear()
-        return drops
-
-    def read_block(self) -> SampleBlock | None:
-        """The next block, or None if no sample came. Raises DeviceLost."""
-        if not self._ready and self._loss is None:
-            self._gather()
-        if self._ready:
-            return self._ready.popleft()
-        if self._loss is not None:
-            raise self._loss
-        return None
-
-    def _gather(self) -> None:
-        """Poll for BLOCK_S, or until samples or the device are lost."""
-        bursts: list[Burst] = []
-        raw_degc: tuple[int | None, float | None] = None, None
-        end_ns = self._next_poll_ns + round(BLOCK_S * 1e9)
-        try:
-            raw_degc = self._temperature()
-            while self._next_poll_ns < end_ns and not self._ready:
-                self._wait()
-                burst = self._poll()
-                if burst.lost:
-                    self._finish(bursts, raw_degc)
-                    self._forget()
-                    self._cutter.flag(BlockFlags.RESTART | BlockFlags.OVERRUN)
-                    bursts = []
-                    end_ns = self._next_poll_ns + round(BLOCK_S * 1e9)
-                bursts.append(burst)
-            if not any(burst.data for burst in bursts):
-                self._check_settings(DeviceLost)
-        except DeviceLost as loss:
-            self._loss = loss  # raised after all earlier samples have been returned
-        self._finish(bursts, raw_degc)
-
     def _wait(self) -> None:
-        """Sleep until the next poll.
-
-        The polls are spread over a sample period by the golden ratio, so that polls and sample clock do not beat and
-        the arrivals of each second cover the whole sample period.
-        """
         now_ns, _ = self._clock()
         self._next_poll_ns += round(self._options.interval_s * 1e9)
-        self._phase = (self._phase + GOLDEN) % 1.0
-        wait_s = (self._next_poll_ns - now_ns) * 1e-9 + self._phase / self._cutter.nominal_rate_hz
+        wait_s = (self._next_poll_ns - now_ns) * 1e-9 + self._next_phase() / self._rate_hz
         if wait_s > 0:
             self._sleep(wait_s)
         else:
             self._next_poll_ns = now_ns
 
-    def _finish(self, bursts: list[Burst], raw_degc: tuple[int | None, float | None]) -> None:
-        """Decode the bursts and make blocks of the samples."""
-        if not bursts:
+    def _poll_once(self) -> bool:
+        burst = self._poll()
+        if burst.lost:
+            self._hand_on()
+            self._begin_again()
+        else:
+            samples = len(burst.data) // (self.word_bytes * self.sample_words)
+            self._pace.add(burst.arrival_ns, self._device.stamp_half_ns, samples)
+        self._bursts.append(burst)
+        return True
+
+    def _begin_again(self) -> None:
+        """The samples from now on do not follow those before."""
+        self._forget()
+        self._pace.restart()
+        self._cutter.flag(BlockFlags.RESTART | BlockFlags.OVERRUN)
+        self._extend()
+
+    def _finish(self) -> None:
+        if self._loss is not None:
+            self._discard(UNCHECKED)
             return
+        for _ in range(PROOF_POLLS):
+            if self._pace.proved:
+                break
+            self._wait()
+            self._poll_once()
+        self._hand_on()
+
+    def _hand_on(self) -> None:
+        """Read the settings back, compare the count of the samples with the clock, then make blocks of the bursts."""
+        temperature = self._temperature()
+        self._check_settings(DeviceLost)
+        if not self._bursts:
+            return
+        bursts, self._bursts = self._bursts, []
         lengths = [len(burst.data) // self.word_bytes for burst in bursts]
         words_read = len(self._rest) // self.word_bytes + np.cumsum(lengths)
         found = self._decode(self._rest + b"".join(burst.data for burst in bursts))
         self._rest = found.rest
         self._drop(OUT_OF_STEP, found.dropped)
+        if found.breaks:
+            self._pace.restart()  # the words themselves tell where samples are missing
+        elif self._pace.missing:
+            self._drop(TAKEN, sum(lengths))
+            self._begin_again()
+            return
         stretch = Stretch(
             indications=found.counts,
             burst_t_monotonic_ns=np.array([burst.arrival_ns for burst in bursts]),
             burst_count=np.searchsorted(found.last, words_read),
             t_utc_ns=bursts[-1].utc_ns,
-            temperature_raw=raw_degc[0],
-            temperature_degc=raw_degc[1],
+            temperature_raw=temperature[0],
+            temperature_degc=temperature[1],
         )
         self._ready.extend(self._cutter.cut(stretch, [Break(at, BlockFlags.RESTART) for at in found.breaks]))
 
-    def _drop(self, reason: str, words: int) -> None:
-        self._dropped[reason] += words
+    def _discard(self, reason: str) -> None:
+        """Discard the bursts that wait."""
+        self._drop(reason, sum(len(burst.data) for burst in self._bursts) // self.word_bytes)
+        self._bursts = []
 
-    def _check_settings(self, error: type[DeviceError] = ConfigurationError) -> None:
-        """Read every setting back (neighbouring registers in one read) and raise `error` if one differs."""
-        settings = self._settings()
+    def _drop(self, reason: str, words: int) -> None:
+        self._dropped["bytes", reason] += self.word_bytes * words
+
+    def _read_back(self, registers: Mapping[int, object]) -> dict[int, int]:
+        """Contents of these registers; neighbours are read together."""
         runs: list[list[int]] = []
-        for register in settings:
-            if runs and register == runs[-1][-1] + 1:
+        for register in registers:
+            if runs and register == runs[-1][-1] + 1 and len(runs[-1]) < self._device.longest:
                 runs[-1].append(register)
             else:
                 runs.append([register])
-        found = self._device.read_each([(run[0], len(run)) for run in runs])
+        reads = [(run[0] | (self.auto_increment if len(run) > 1 else 0), len(run)) for run in runs]
+        return dict(zip(registers, self._device.read_each(reads), strict=True)) if reads else {}
+
+    def _check_settings(self, error: type[DeviceError] = ConfigurationError) -> None:
+        """Read every setting and trim back and raise `error` if one differs."""
+        held = self._held if error is DeviceLost else self._settings()
+        found = self._read_back(held)
         wrong = [
-            f"{name} is 0x{value:02X}, not 0x{wanted:02X}"
-            for value, (name, wanted) in zip(found, settings.values(), strict=True)
-            if value != wanted
+            f"{name} is 0x{found[register]:02X}, not 0x{wanted:02X}"
+            for register, (name, wanted) in held.items()
+            if found[register] != wanted
         ]
         if wrong:
-            raise error(f"{self._device.name} does not hold its settings (did it lose power?): {', '.join(wrong)}")
+            why = "did it lose power, or did another program write to it?"
+            raise error(f"{self._device.name} does not hold its settings ({why}): {', '.join(wrong)}")
 
     def _write_settings(self, *, last: int) -> None:
         """Write all settings, register `last` after the others, and read them back."""

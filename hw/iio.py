@@ -6,22 +6,20 @@ import contextlib
 import errno
 import math
 import os
-import time
-from collections import deque
-from collections.abc import Callable
 from pathlib import Path
-from typing import ClassVar
+from typing import Any
 
 import numpy as np
 from pydantic import Field
 
 from hw import iio_scan
-from hw.block import BlockFlags, DeviceInfo, Drop, SampleBlock
+from hw.block import BlockFlags, DeviceInfo
 from hw.cutting import Break, Cutter, Stretch
-from hw.sensor import Clock, ConfigurationError, DeviceLost, Options, system_clock
+from hw.polling import PollingSensor
+from hw.sensor import ConfigurationError, DeviceLost, Options
 
 SYSFS, DEV = Path("/sys/bus/iio/devices"), Path("/dev")
-BLOCK_S, POLL_S, BUFFER_S = 0.5, 0.05, 4.0
+BUFFER_S = 4.0  # length of the kernel's buffer
 READ_BYTES = 1 << 20
 LONGEST_GAP = 100  # samples; the length of a longer gap is uncertain if the rate is 1 % off
 AXES = ("accel_x", "accel_y", "accel_z")
@@ -39,40 +37,29 @@ class IioOptions(Options):
     trigger: str | None = Field(None, description="name of the trigger; needed if the kernel driver sets none itself")
 
 
-class Iio:
+class Iio(PollingSensor):
     """Reads the files in sysfs and the device's node; needs no library.
 
     The kernel stamps every sample at its interrupt (CLOCK_MONOTONIC), so each sample is a burst with this arrival time.
     A larger step between two stamps tells how many samples the buffer dropped.
     """
 
-    options_model: ClassVar[type[Options]] = IioOptions
+    options_model = IioOptions
+    poll_s = 0.05
 
-    def __init__(
-        self,
-        name: str,
-        options: IioOptions,
-        *,
-        clock: Clock = system_clock,
-        sleep: Callable[[float], None] = time.sleep,
-    ) -> None:
-        self._options = options
-        self._clock = clock
-        self._sleep = sleep
+    def __init__(self, name: str, options: IioOptions, **timing: Any) -> None:
+        super().__init__(name, options, **timing)
         self._cutter = Cutter(name, options.rate_hz)
         self._file: int | None = None
         self._directory = SYSFS
-        self._ready: deque[SampleBlock] = deque()
-        self._loss: DeviceLost | None = None
-        self._rest = b""
+        self._data = b""  # scans that were read, and the beginning of the next one
         self._last_ns: int | None = None
 
-    def open(self) -> DeviceInfo:
-        """Find the device, write its settings, read them back, start its buffer.
+    def _where(self) -> str:
+        return f"IIO device {self._options.device} (/dev/{self._directory.name})"
 
-        Raises DeviceLost or ConfigurationError.
-        """
-        self.close()
+    def _start(self) -> DeviceInfo:
+        """Find the device, write its settings, read them back, start its buffer."""
         self._directory = self._find()
         if not (self._directory / "buffer").is_dir():
             raise ConfigurationError(
@@ -86,15 +73,10 @@ class Iio:
             scale = _number(self._directory / "in_accel_scale") if "in_accel_scale" in settings else 0.0
             filters = _filters(self._directory / LOW_PASS)
         except OSError as error:
-            self.close()
             message = f"IIO device {self._options.device}: {error.filename or ''}: {error.strerror}"
             held = error.errno == errno.EBUSY
             raise (ConfigurationError if held else DeviceLost)(message) from error
-        except BaseException:
-            self.close()
-            raise
-        self._loss = None
-        self._rest = b""
+        self._data = b""
         self._last_ns = None
         self._cutter.flag(BlockFlags.RESTART)
         return DeviceInfo(
@@ -110,7 +92,7 @@ class Iio:
             filters=filters,
         )
 
-    def close(self) -> None:
+    def _stop(self) -> None:
         """Close the node and stop the buffer."""
         file, self._file = self._file, None
         if file is not None:
@@ -119,32 +101,18 @@ class Iio:
             with contextlib.suppress(OSError):
                 (self._directory / "buffer" / "enable").write_text("0")
 
-    def take_drops(self) -> list[Drop]:
-        """Always empty: samples that the kernel dropped appear as gaps."""
-        return []
+    def _wait(self) -> None:
+        self._sleep(self.poll_s)  # the stamps are the kernel's: polls need not be spread over a sample period
 
-    def read_block(self) -> SampleBlock | None:
-        """The next block, or None if no sample came. Raises DeviceLost."""
-        if not self._ready and self._loss is None:
-            if self._file is None:
-                raise DeviceLost(f"IIO device {self._options.device} (/dev/{self._directory.name}) is not open")
-            self._gather(self._file)
-        if self._ready:
-            return self._ready.popleft()
-        if self._loss is not None:
-            raise self._loss
-        return None
+    def _poll_once(self) -> bool:
+        assert self._file is not None
+        self._data += self._read(self._file)
+        return True
 
-    def _gather(self, file: int) -> None:
-        data = self._rest
-        end_ns = self._clock()[0] + round(BLOCK_S * 1e9)
-        while self._loss is None and self._clock()[0] < end_ns:
-            self._sleep(POLL_S)
-            data += self._read(file)
+    def _finish(self) -> None:
         now_ns, utc_ns = self._clock()
-        whole = len(data) // self._scan.itemsize * self._scan.itemsize
-        self._rest = data[whole:]
-        scans = np.frombuffer(data[:whole], self._scan)
+        whole = len(self._data) // self._scan.itemsize * self._scan.itemsize
+        scans, self._data = np.frombuffer(self._data[:whole], self._scan), self._data[whole:]
         if not len(scans):
             return
         stamps_ns = self._elements["timestamp"].value(scans["timestamp"])
@@ -167,10 +135,9 @@ class Iio:
         except BlockingIOError:
             return b""
         except OSError as error:
-            self._loss = DeviceLost(f"/dev/{self._directory.name}: {error.strerror}")
-            return b""
+            raise DeviceLost(f"/dev/{self._directory.name}: {error.strerror}") from error
         if not data:
-            self._loss = DeviceLost(f"/dev/{self._directory.name}: the device returned end of file")
+            raise DeviceLost(f"/dev/{self._directory.name}: the device returned end of file")
         return data
 
     def _find(self) -> Path:

@@ -49,6 +49,7 @@ class Lsm6dso(FifoSensor):
 
     options_model = Lsm6dsoOptions
     word_bytes = chip.WORD_BYTES
+    identity_register = chip.WHO_AM_I
     _counter: int | None = None
 
     def _kind(self) -> str:
@@ -106,9 +107,8 @@ class Lsm6dso(FifoSensor):
         if words:
             # FIFO_STATUS is read again after the data: the FIFO may have overrun between the count and the data, even
             # if the count was low.
-            answer = self._device.read_each([(chip.FIFO_DATA, chip.WORD_BYTES * words), (chip.FIFO_STATUS, 2)])
-            data = answer[:-2]
-            lost |= bool(answer[-1] & chip.OVERRUN)
+            data = self._device.read(chip.FIFO_DATA, chip.WORD_BYTES * words)
+            lost |= bool(self._device.read(chip.FIFO_STATUS, 2)[1] & chip.OVERRUN)
         return Burst(arrival_ns, utc_ns, data, lost or self._device.retries > retries)
 
     def _decode(self, data: bytes) -> FifoSamples:

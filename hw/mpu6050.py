@@ -27,7 +27,8 @@ class Mpu6050Options(FifoOptions):
     rates_hz = chip.RATES_HZ
     fifo_samples = 512 // chip.SAMPLE_BYTES  # of the MPU-6500 and later; the FIFO of the MPU-6050 holds twice as much
     bytes_a_sample = 6
-    bytes_a_poll = 12  # INT_STATUS, FIFO_COUNT, and the start of the read
+    bytes_a_poll = 16  # address, register, address each for INT_STATUS, FIFO_COUNT, data, INT_STATUS; their 4 bytes
+    reads_a_poll = 4
 
     address: Literal[0x68, 0x69] = Field(0x68, description="104 (0x68), or 105 (0x69) with AD0 high")
     rate_hz: float = Field(1000.0, description=f"one of {', '.join(f'{rate:g}' for rate in chip.RATES_HZ)}")
@@ -41,7 +42,7 @@ class Mpu6050Options(FifoOptions):
 
 
 class Mpu6050(FifoSensor):
-    """Reads the overflow flag and the byte count in one transfer, then the bytes of all complete samples.
+    """Reads the overflow flag and the byte count, then the bytes of all complete samples.
 
     The samples carry no marker, and the size of the FIFO is not a multiple of a sample. After an overrun it is unknown
     where a sample starts. The driver therefore resets the FIFO if it overran or almost did, if a read was interrupted,
@@ -50,6 +51,7 @@ class Mpu6050(FifoSensor):
 
     options_model = Mpu6050Options
     word_bytes = chip.SAMPLE_BYTES
+    identity_register = chip.WHO_AM_I
     filter_settings = ("SMPLRT_DIV", "CONFIG", "ACCEL_CONFIG_2")
     _part = chip.PARTS[0x68]
 
@@ -98,10 +100,12 @@ class Mpu6050(FifoSensor):
         self._sleep(START_WAIT_S)
         self._write_settings(last=chip.USER_CTRL)
         self._reset_fifo()
-        offset = self._part.accel_offset
-        trim = self._device.read(offset[0], len(offset))
-        untouched = {f"ACCEL_OFFSET_{i}": value for i, value in enumerate(trim)}
+        trims = self._trims()
+        untouched = {trims[register]: value for register, value in self._read_back(trims).items()}
         return self._info("mpu6050", self._options.rate_hz, {**identity, **untouched})
+
+    def _trims(self) -> Mapping[int, str]:
+        return {register: f"ACCEL_OFFSET_{i}" for i, register in enumerate(self._part.accel_offset)}
 
     def _reset_fifo(self) -> None:
         self._device.write(chip.USER_CTRL, chip.FIFO_RESET)
@@ -112,10 +116,11 @@ class Mpu6050(FifoSensor):
 
     def _poll(self) -> Burst:
         retries = self._device.retries
-        arrival_ns, utc_ns, found = self._device.read_stamped([(chip.INT_STATUS, 1), (chip.FIFO_COUNT, 2)], self._clock)
-        count = int.from_bytes(found[1:], "big")
+        (status,) = self._device.read(chip.INT_STATUS, 1)
+        arrival_ns, utc_ns, found = self._device.read_stamped([(chip.FIFO_COUNT, 2)], self._clock)
+        count = int.from_bytes(found, "big")
         # A failed read of INT_STATUS has cleared the flag
-        lost = bool(found[0] & chip.OVERFLOW) or self._device.retries > retries
+        lost = bool(status & chip.OVERFLOW) or self._device.retries > retries
         lost |= count > self._part.fifo_bytes - FREE_SAMPLES_MIN * self.word_bytes
         if count % self.word_bytes:
             again = int.from_bytes(self._device.read(chip.FIFO_COUNT, 2), "big")

@@ -152,7 +152,7 @@ class Mqtt(MessageSensor):
         if code.value >= REFUSED:
             raise ConfigurationError(f"{self._where()}: the broker refuses {what}: {code}")
 
-    def _disconnect(self) -> None:
+    def _stop(self) -> None:
         client, self._client = self._client, None
         if client is not None:
             with contextlib.suppress(OSError, ValueError):
@@ -195,7 +195,7 @@ class Mqtt(MessageSensor):
                 if block is not None:
                     yield self._piece(block, now_ns, utc_ns)
             except PayloadError as error:
-                self._drops["bytes", str(error)] += len(message.payload)
+                self._dropped["bytes", str(error)] += len(message.payload)
                 self._before = BlockFlags.RESTART
 
     def _decode(self, message: Any) -> Block | None:

@@ -90,7 +90,7 @@ class Seedlink(MessageSensor):
             settings={"port": f"{o.host}:{o.port}", "channels": ", ".join(self._axis)},
         )
 
-    def _disconnect(self) -> None:
+    def _stop(self) -> None:
         link, self._link = self._link, None
         if link is not None:
             link.close()
@@ -112,7 +112,7 @@ class Seedlink(MessageSensor):
                 flags, missing = BlockFlags.NONE, 0
         for reason, count in ((ALONE, self._alignment.alone), (REPEATED, self._alignment.repeated)):
             if count:
-                self._drops["samples", reason] += count
+                self._dropped["samples", reason] += count
         self._alignment.alone = self._alignment.repeated = 0
 
     def _add(self, data: bytes) -> None:
@@ -120,11 +120,11 @@ class Seedlink(MessageSensor):
         try:
             record = miniseed.decode(data)
         except miniseed.RecordError:
-            self._drops["bytes", UNREADABLE] += len(data)
+            self._dropped["bytes", UNREADABLE] += len(data)
             return
         axis = self._axis.get(record.channel)
         if axis is None:
-            self._drops["samples", "samples of a channel that was not asked for"] += len(record.samples)
+            self._dropped["samples", "samples of a channel that was not asked for"] += len(record.samples)
             return
         rate_hz = self._options.rate_hz
         if abs(record.rate_hz - rate_hz) > RATE_TOLERANCE * rate_hz:
@@ -133,4 +133,4 @@ class Seedlink(MessageSensor):
         if self._is_timely(last_ns):
             self._alignment.add(axis, record.start_ns, record.samples)
         else:
-            self._drops["samples", OUTSIDE] += len(record.samples)
+            self._dropped["samples", OUTSIDE] += len(record.samples)

@@ -32,6 +32,10 @@ class ConfigurationError(DeviceError):
     """
 
 
+class AdapterError(ConfigurationError):
+    """The adapter of the bus refuses a kind of transfer that this driver needs."""
+
+
 class IdentityError(ConfigurationError):
     """A device answers, but it is not the configured one."""
 

@@ -1,4 +1,4 @@
-"""Common part of all drivers on a serial port: the port, bursts and losses. A subclass decodes the bytes."""
+"""Common part of all drivers on a serial port: the port and the bursts. A subclass decodes the bytes."""
 
 from __future__ import annotations
 
@@ -6,19 +6,16 @@ import contextlib
 import errno
 import os
 import termios
-import time
-from abc import ABC, abstractmethod
-from collections import deque
-from collections.abc import Callable
-from typing import Annotated, Any, ClassVar, Protocol
+from abc import abstractmethod
+from typing import Annotated, Any, Protocol
 
 import serial
 from pydantic import Field
 
 from hw.block import DeviceInfo, Drop, SampleBlock
-from hw.sensor import GOLDEN, Clock, ConfigurationError, DeviceLost, Options, system_clock
+from hw.polling import BLOCK_S, PollingSensor
+from hw.sensor import ConfigurationError, DeviceLost, Options
 
-BLOCK_S = 0.5
 GATHER_S = 0.010  # at 1 kHz one wake-up serves ten samples; 115 bytes of the kernel's 4 kB at 115200 baud
 # Below this rate each sample is read as it arrives: the port wakes the reader, GATHER_SLOW_S lets the sample finish
 SLOW_RATE_HZ = 100.0
@@ -71,28 +68,14 @@ class Stream(Protocol):
         """Data since the last call that became no sample."""
 
 
-class SerialSensor(ABC):
+class SerialSensor(PollingSensor):
     """Lets bytes collect, stamps each burst with the time at which its read returned, decodes the bursts into
     blocks."""
 
-    options_model: ClassVar[type[Options]]
-
-    def __init__(
-        self,
-        name: str,
-        options: Any,
-        *,
-        clock: Clock = system_clock,
-        sleep: Callable[[float], None] = time.sleep,
-    ) -> None:
-        self._options = options
-        self._clock = clock
-        self._sleep = sleep
+    def __init__(self, name: str, options: Any, **timing: Any) -> None:
+        super().__init__(name, options, **timing)
         self._stream = self._build_stream(name)
         self._port: serial.Serial | None = None
-        self._loss: DeviceLost | None = None
-        self._ready: deque[SampleBlock] = deque()
-        self._phase = 0.0
 
     @abstractmethod
     def _build_stream(self, name: str) -> Stream:
@@ -102,35 +85,22 @@ class SerialSensor(ABC):
     def _set_up(self, port: serial.Serial) -> DeviceInfo:
         """Identify and set up the device once its port is open."""
 
-    def open(self) -> DeviceInfo:
-        """Open the port and set up the device.
+    def _where(self) -> str:
+        return f"port {self._options.port}"
 
-        Raises DeviceLost (the port does not exist, is in use or may not be opened) or ConfigurationError (the port does
-        not support the settings).
-        """
-        self.close()
+    def _start(self) -> DeviceInfo:
         options = self._options
         try:
-            port = serial.Serial(options.port, options.baud_rate, timeout=BLOCK_S, exclusive=True)
+            self._port = serial.Serial(options.port, options.baud_rate, timeout=BLOCK_S, exclusive=True)
+            info = self._set_up(self._port)
         except LOST as error:
-            raise DeviceLost(f"port {options.port}: {reason_of(error)}") from error
+            raise DeviceLost(f"{self._where()}: {reason_of(error)}") from error
         except ValueError as error:
-            raise ConfigurationError(f"port {options.port}, baud_rate {options.baud_rate}: {error}") from error
-        self._port = port
-        try:
-            info = self._set_up(port)
-        except LOST as error:
-            self.close()
-            raise DeviceLost(f"port {options.port}: {reason_of(error)}") from error
-        except BaseException:
-            self.close()
-            raise
-        self._loss = None
+            raise ConfigurationError(f"{self._where()}, baud_rate {options.baud_rate}: {error}") from error
         self._stream.begin()
         return info
 
-    def close(self) -> None:
-        """Release the port."""
+    def _stop(self) -> None:
         port, self._port = self._port, None
         if port is not None:
             with contextlib.suppress(*LOST):
@@ -140,46 +110,23 @@ class SerialSensor(ABC):
         """Data since the last call that became no sample."""
         return self._stream.take_drops()
 
-    def read_block(self) -> SampleBlock | None:
-        """The next block, or None if no sample came. Raises DeviceLost."""
-        if not self._ready and self._loss is None:
-            if self._port is None:
-                raise DeviceLost(f"port {self._options.port} is not open")
-            self._gather(self._port)
-        if self._ready:
-            return self._ready.popleft()
-        if self._loss is not None:
-            raise self._loss
-        return None
+    def _wait(self) -> None:
+        """Let a burst collect; at slow rates the port wakes the reader, and the rest of a sample follows."""
+        slow = self._options.rate_hz < SLOW_RATE_HZ
+        self._sleep(GATHER_SLOW_S if slow else GATHER_S + self._next_phase() / self._rate_hz)
 
-    def _gather(self, port: serial.Serial) -> None:
-        """Read bursts for BLOCK_S, or until the device is silent or lost, and decode them."""
-        now_ns, _ = self._clock()
-        end_ns = now_ns + round(BLOCK_S * 1e9)
-        while now_ns < end_ns and self._stream.size < BLOCK_BYTES:
-            self._sleep(self._pause_s())
-            try:
-                data = port.read(min(max(1, port.in_waiting), READ_BYTES))
-            except LOST as error:
-                # Raised after all earlier samples have been returned
-                self._loss = DeviceLost(f"port {self._options.port}: {reason_of(error)}")
-                break
-            now_ns, utc_ns = self._clock()
-            if not data:
-                break
-            self._stream.feed(data, now_ns, utc_ns)
+    def _poll_once(self) -> bool:
+        assert self._port is not None
+        try:
+            data = self._port.read(min(max(1, self._port.in_waiting), READ_BYTES))
+        except LOST as error:
+            raise DeviceLost(f"{self._where()}: {reason_of(error)}") from error
+        if data:
+            self._stream.feed(data, *self._clock())
+        return bool(data) and self._stream.size < BLOCK_BYTES
+
+    def _finish(self) -> None:
         self._ready.extend(self._stream.blocks())
-
-    def _pause_s(self) -> float:
-        """Time in s in which a burst collects.
-
-        The reads are spread over a sample period by the golden ratio, so that reads and sample clock do not beat and
-        the arrivals of each second cover the whole sample period.
-        """
-        if self._options.rate_hz < SLOW_RATE_HZ:
-            return GATHER_SLOW_S
-        self._phase = (self._phase + GOLDEN) % 1.0
-        return GATHER_S + self._phase / float(self._options.rate_hz)
 
     def _info(self, driver: str, settings: dict[str, str], **known: Any) -> DeviceInfo:
         """Build the result of `open`; `known` are its fields except driver, rate and the settings of the port."""

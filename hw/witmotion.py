@@ -135,10 +135,10 @@ class WitMotion(SerialSensor):
             nominal_sensitivity=wit.COUNTS_PER_G / STANDARD_GRAVITY_MPS2,
         )
 
-    def _gather(self, port: serial.Serial) -> None:
-        super()._gather(port)
+    def _finish(self) -> None:
+        super()._finish()
         if self._stream.restarted and self._loss is None:
-            self._loss = DeviceLost(f"port {port.port}: the clock of the WitMotion jumped (did it lose power?)")
+            raise DeviceLost(f"{self._where()}: the clock of the WitMotion jumped (did it lose power?)")
 
     def _registers(self, port: serial.Serial, first: int) -> dict[int, int]:
         """Read the four registers from `first` on, by number. Frames that the device sends on its own are skipped."""

@@ -9,15 +9,17 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from smbus2.smbus2 import I2cFunc
 
 from hw.block import BlockFlags
 from hw.conformance.sensor import Rig, SensorContract
-from hw.fifo_sensor import FifoSensor
-from hw.sensor import ConfigurationError, DeviceLost, IdentityError
+from hw.fifo_sensor import UNCHECKED, FifoSensor
+from hw.sensor import AdapterError, ConfigurationError, DeviceLost, IdentityError
 from hw.virtual.fifo_twin import FifoTwin
-from hw.virtual.kernel import FUNCTIONS, I2CBus, installed
+from hw.virtual.kernel import ADAPTERS, PLAIN, SMBUS_FUNCTIONS, Adapter, I2CBus, installed
 
 LAP = 1000
+FEWER_SAMPLES = 20_000
 
 
 @functools.cache
@@ -41,6 +43,7 @@ class I2cRig(Rig):
     address: ClassVar[int]
     full: ClassVar[int]
     options: ClassVar[dict[str, Any]] = {}
+    adapter: ClassVar[Adapter] = PLAIN
 
     sensor: FifoSensor
 
@@ -53,7 +56,7 @@ class I2cRig(Rig):
         self.saturated = range(0)
         self.temperature_raw: int | None = None
         self.twin = self.build_twin()
-        self.bus = I2CBus({self.address: self.twin})
+        self.bus = I2CBus({self.address: self.twin}, adapter=self.adapter)
         self._kernel = installed({"/dev/i2c-1": self.bus})
         self._kernel.__enter__()
         self.sensor = self.build()
@@ -119,6 +122,13 @@ class I2cContract(SensorContract):
     temperature: ClassVar[tuple[int, float] | None]  # a raw value and its degC
     self_test_range: ClassVar[float] = 1.0  # range during the self-test as a multiple of the range that is set
 
+    @pytest.fixture(autouse=True, params=ADAPTERS, ids=lambda adapter: adapter.name)
+    def adapter(self, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Every test runs on every kind of adapter; the most samples are read on the plain one."""
+        monkeypatch.setattr(I2cRig, "adapter", request.param)
+        if request.param is not PLAIN:
+            monkeypatch.setattr(self, "samples", min(self.samples, FEWER_SAMPLES))
+
     @pytest.mark.parametrize("number", [errno.ENXIO, errno.EREMOTEIO])
     def test_nobody_at_the_address(self, rig: I2cRig, number: int) -> None:
         with installed({"/dev/i2c-1": I2CBus({}, absent_errno=number)}):
@@ -146,10 +156,24 @@ class I2cContract(SensorContract):
             rig.sensor.open()
         assert bytes(rig.twin.registers) == before
 
-    def test_smbus_only_adapter(self, rig: I2cRig) -> None:
-        rig.bus.functions = FUNCTIONS & ~1
-        with pytest.raises(ConfigurationError, match="plain I2C"):
+    def test_adapter_that_reads_single_bytes(self, rig: I2cRig) -> None:
+        single = Adapter("bytes", functions=SMBUS_FUNCTIONS & ~I2cFunc.SMBUS_READ_I2C_BLOCK)
+        rig.bus.adapter = single
+        with pytest.raises(AdapterError, match=r"/dev/i2c-1: the adapter can neither do plain I2C transfers nor"):
             rig.sensor.open()
+
+    def test_adapter_whose_messages_are_too_short(self, rig: I2cRig) -> None:
+        rig.bus.adapter = Adapter("short", longest=5)
+        with pytest.raises(AdapterError, match=f"{rig.name}: the adapter "):
+            rig.sensor.open()
+
+    def test_a_second_reader_of_the_address_is_kept_off(self, rig: I2cRig) -> None:
+        rig.sensor.open()
+        with pytest.raises(DeviceLost, match=rf"{rig.name}: .* uses it; end that first"):
+            rig.build().open()
+        rig.read()
+        rig.sensor.close()
+        rig.build().open()
 
     def test_the_dump_is_what_the_device_holds(self, rig: I2cRig) -> None:
         info = rig.sensor.open()
@@ -235,11 +259,30 @@ class I2cContract(SensorContract):
         rig.read()
         rig.twin.power_cycle()
         rig.sleep(0.02)
-        with pytest.raises(DeviceLost, match=r"did it lose power\?"):
+        with pytest.raises(DeviceLost, match=r"did it lose power, or"):
             rig.sensor.read_block()
         rig.sensor.open()
         flags, _ = rig.read()
         assert flags == BlockFlags.RESTART
+
+    def test_what_came_before_the_loss_is_returned_first(self, rig: I2cRig) -> None:  # type: ignore[override]
+        # Only what was checked: the settings cannot be read back behind the last samples.
+        rig.sensor.open()
+        list(rig.blocks(0.6))
+        rig.sensor.take_drops()
+        sleep, start_s = rig.sleep, rig.t_s
+
+        def unplugged_underway(seconds: float) -> None:
+            sleep(seconds)
+            if rig.t_s > start_s + 0.2:
+                rig.unplug()
+
+        rig.sleep = unplugged_underway  # type: ignore[method-assign]
+        with pytest.raises(DeviceLost):
+            list(rig.blocks(1.0))
+        (drop,) = rig.sensor.take_drops()
+        assert drop.reason == UNCHECKED
+        assert 0.15 * rig.rate_hz < drop.count / rig.twin_class.sample_bytes < 0.3 * rig.rate_hz
 
     def test_temperature(self, rig: I2cRig) -> None:
         raw, degc = self.temperature or (None, None)

@@ -12,7 +12,8 @@ import ctypes
 import errno
 import os
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any, Protocol
 
@@ -22,6 +23,28 @@ MAX_MESSAGES = 42
 MAX_MESSAGE_BYTES = 8192
 READ = 1  # I2C_M_RD
 FUNCTIONS = 0x0EFF0009  # I2C, and the SMBus calls that the kernel implements with it
+
+
+SMBUS_FUNCTIONS = s2.I2cFunc.SMBUS_BYTE_DATA | s2.I2cFunc.SMBUS_I2C_BLOCK
+
+
+@dataclass(frozen=True, slots=True)
+class Adapter:
+    """What an adapter takes. A transfer that it refuses fails with EOPNOTSUPP, as in Linux, i2c_check_for_quirks."""
+
+    name: str
+    functions: int = FUNCTIONS
+    read_only_last: bool = False  # a read must be the last message of its transfer
+    write_then_read: bool = False  # a transfer is a write, a read, or a write and a read
+    longest: int = MAX_MESSAGE_BYTES  # bytes of a message
+
+
+PLAIN = Adapter("plain")
+BCM2835 = Adapter("bcm2835", read_only_last=True)  # Raspberry Pi Zero to 4: Linux, bcm2835_i2c_xfer
+WRITE_THEN_READ = Adapter("write-then-read", write_then_read=True)  # MCP2221, CP2112
+SHORT_MESSAGES = Adapter("32-byte messages", longest=32)
+SMBUS_ONLY = Adapter("SMBus only", functions=SMBUS_FUNCTIONS)
+ADAPTERS = (PLAIN, BCM2835, WRITE_THEN_READ, SHORT_MESSAGES, SMBUS_ONLY)
 
 
 class I2CTarget(Protocol):
@@ -35,22 +58,33 @@ class I2CTarget(Protocol):
 
 
 class I2CBus:
-    """An adapter with its targets by address. A kernel driver holds the addresses in `claimed`."""
+    """An adapter with its targets by address. A kernel driver holds the addresses in `claimed`.
+
+    Where `spend` is given, it is called with the time of each transfer in s: `transfer_s`, and 9 bits at `clock_hz` for
+    each address and byte.
+    """
 
     def __init__(
         self,
         targets: Mapping[int, I2CTarget],
         *,
         absent_errno: int = errno.EREMOTEIO,
-        functions: int = FUNCTIONS,
+        adapter: Adapter = PLAIN,
+        spend: Callable[[float], None] | None = None,
+        transfer_s: float = 0.0,
+        clock_hz: float = 400e3,
     ) -> None:
         self.targets = dict(targets)
         self.claimed: set[int] = set()
-        self.functions = functions
+        self.adapter = adapter
         self.plugged = True
         self.generation = 0  # increases with each unplug: files opened before are invalid
         self.transfers = 0
+        self.bytes = 0  # on the bus, addresses among them
+        self.node = os.memfd_create("i2c")  # a file of its own, as the node of each real adapter is: it can be locked
         self._absent_errno = absent_errno
+        self._spend = spend
+        self._transfer_s, self._byte_s = transfer_s, 9 / clock_hz
         self._lock = threading.Lock()
 
     def unplug(self) -> None:
@@ -66,7 +100,23 @@ class I2CBus:
         """Do all messages (address, bytes to write or number of bytes to read); return the bytes read, by message."""
         with self._lock:
             self.transfers += 1
+            count = sum(1 + (content if isinstance(content, int) else len(content)) for _, content in messages)
+            self.bytes += count
+            if self._spend is not None:
+                self._spend(self._transfer_s + count * self._byte_s)
             return [self._message(address, content) for address, content in messages]
+
+    def refuses(self, messages: list[tuple[int, int | bytes]]) -> bool:
+        """Whether the adapter refuses such a transfer."""
+        reads = [isinstance(content, int) for _, content in messages]
+        return (
+            (self.adapter.read_only_last and any(reads[:-1]))
+            or (self.adapter.write_then_read and reads not in ([False], [True], [False, True]))
+            or any((c if isinstance(c, int) else len(c)) > self.adapter.longest for _, c in messages)
+        )
+
+    def __del__(self) -> None:
+        os.close(self.node)
 
     def _message(self, address: int, content: int | bytes) -> bytes | None:
         target = self.targets.get(address)
@@ -94,7 +144,7 @@ class Kernel:
         bus = self._nodes.get(path)
         if bus is None or not bus.plugged:
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), path)
-        file = os.open(os.devnull, flags)
+        file = os.open(f"/proc/self/fd/{bus.node}", flags)
         self._files[file] = bus, bus.generation
         return file
 
@@ -111,7 +161,7 @@ class Kernel:
             raise _error(errno.EIO)
         match request:
             case s2.I2C_FUNCS:
-                argument.value = bus.functions
+                argument.value = bus.adapter.functions
             case s2.I2C_SLAVE | s2.I2C_SLAVE_FORCE:
                 if request == s2.I2C_SLAVE and argument in bus.claimed:
                     raise _error(errno.EBUSY)
@@ -126,12 +176,15 @@ class Kernel:
 
 
 def _rdwr(bus: I2CBus, argument: Any) -> int:
-    if not bus.functions & s2.I2cFunc.I2C:
+    if not bus.adapter.functions & s2.I2cFunc.I2C:
         raise _error(errno.EOPNOTSUPP)
     messages = [argument.msgs[i] for i in range(min(argument.nmsgs, MAX_MESSAGES + 1))]
     if len(messages) > MAX_MESSAGES or any(message.len > MAX_MESSAGE_BYTES for message in messages):
         raise _error(errno.EINVAL)
-    results = bus.transfer([(m.addr, m.len if m.flags & READ else ctypes.string_at(m.buf, m.len)) for m in messages])
+    contents = [(m.addr, m.len if m.flags & READ else ctypes.string_at(m.buf, m.len)) for m in messages]
+    if bus.refuses(contents):
+        raise _error(errno.EOPNOTSUPP)
+    results = bus.transfer(contents)
     for message, result in zip(messages, results, strict=True):
         if result is not None:
             ctypes.memmove(message.buf, result, len(result))

@@ -16,9 +16,8 @@ from agent.core.events import DeviceChange, Event, Tick
 from agent.recording.device import Replay, ReplayOptions
 from agent.recording.reading import RecordingReader
 from hw.block import BlockFlags, DeviceInfo, SampleBlock
-from hw.buffered_sensor import GOLDEN
 from hw.conformance.sensor import Rig, SensorContract
-from hw.sensor import ConfigurationError, DeviceLost
+from hw.sensor import GOLDEN, ConfigurationError, DeviceLost
 from tests.unit.recorded_bench import EPOCH_NS, record
 
 FULL = 2**19 - 1

@@ -131,7 +131,7 @@ class TinyUsb:
                 return None if descriptor is None else descriptor[:length]
             return bytes(2)[:length] if kind & TO_HOST else b""
         if request == GET_FUNCTIONS:
-            return struct.pack("<I", self._bus.functions)
+            return struct.pack("<I", self._bus.adapter.functions)
         if request == SET_DELAY:
             return b""
         if request == GET_STATUS:

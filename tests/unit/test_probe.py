@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from smbus2.smbus2 import I2cFunc
 
 from agent.cli.main import run_cli
 from hw.virtual.adxl345_twin import Adxl345Twin
 from hw.virtual.adxl355_twin import Adxl355Twin
-from hw.virtual.kernel import FUNCTIONS, I2CBus, installed
+from hw.virtual.kernel import SMBUS_FUNCTIONS, Adapter, I2CBus, installed
 from hw.virtual.mpu6050_twin import Mpu6500Twin
 
 
@@ -77,7 +78,7 @@ def test_self_test_of_sound_and_stuck_parts(bus: I2CBus, capsys: pytest.CaptureF
 def test_buses_that_cannot_be_asked(bus: I2CBus, capsys: pytest.CaptureFixture[str]) -> None:
     assert run_cli(["probe", "--bus", "9"]) == 1
     assert capsys.readouterr().out == "/dev/i2c-9: No such file or directory\n"
-    bus.functions = FUNCTIONS & ~1
+    bus.adapter = Adapter("bytes", functions=SMBUS_FUNCTIONS & ~I2cFunc.SMBUS_READ_I2C_BLOCK)
     assert run_cli(["probe", "--bus", "4"]) == 1
     assert "plain I2C" in capsys.readouterr().out
 
