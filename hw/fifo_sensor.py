@@ -110,7 +110,7 @@ class FifoSensor(PollingSensor):
         return None, None
 
     def _trims(self) -> Mapping[int, str]:
-        """Registers with trims of the factory, which this driver does not set, and their names, in ascending order."""
+        """Names of more registers that must not change, such as trims of the factory, which `_settings` does not have."""
         return {}
 
     def _forget(self) -> None:
@@ -266,6 +266,11 @@ class FifoSensor(PollingSensor):
         words_read = len(self._rest) // self.word_bytes + np.cumsum(lengths)
         found = self._decode(self._rest + b"".join(burst.data for burst in bursts))
         self._rest = found.rest
+        if len(found.breaks) > 1 or (sum(lengths) >= self.sample_words and not len(found.counts)):
+            self._drop(OUT_OF_STEP, sum(lengths))
+            raise DeviceLost(
+                f"{self._device.name}: the contents of the FIFO do not form samples; does another program read the FIFO?"
+            )
         self._drop(OUT_OF_STEP, found.dropped)
         if found.breaks:
             self._pace.restart()  # the words themselves tell where samples are missing

@@ -83,6 +83,9 @@ class Lsm6dso(FifoSensor):
         self._device.write(chip.FIFO_CTRL4, chip.CONTINUOUS)
         return self._info("lsm6dso", rate_hz, {**identity, "INTERNAL_FREQ_FINE": freq_fine})
 
+    def _trims(self) -> Mapping[int, str]:
+        return {chip.FUNC_CFG_ACCESS: "FUNC_CFG_ACCESS"}  # selects which registers answer
+
     def _reset(self) -> None:
         self._device.write(chip.CTRL3_C, chip.SOFTWARE_RESET)
         for _ in range(RESET_ATTEMPTS):

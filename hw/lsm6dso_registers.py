@@ -16,6 +16,7 @@ from hw.self_test import SelfTest
 WHO_AM_I, IDENTITY = 0x0F, 0x6C
 FIRST_FIFO_SETTING, FIFO_CTRL3, FIFO_CTRL4, FIFO_STATUS, FIFO_DATA = 0x07, 0x09, 0x0A, 0x3A, 0x78
 CTRL1_XL, CTRL3_C, CTRL5_C, TEMPERATURE, FREQ_FINE, USER_OFFSET = 0x10, 0x12, 0x14, 0x20, 0x63, 0x73
+FUNC_CFG_ACCESS = 0x01
 SOFTWARE_RESET = 0x01  # in CTRL3_C, clears itself
 BYPASS, CONTINUOUS = 0x00, 0x06  # FIFO_CTRL4
 OVERRUN = 0x48  # in the second byte of FIFO_STATUS: overrun now, and overrun latched until FIFO_STATUS is read

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import functools
+import itertools
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import numpy as np
@@ -11,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from smbus2.smbus2 import I2cFunc
 
-from hw.block import BlockFlags
+from hw.block import BlockFlags, SampleBlock
 from hw.conformance.sensor import Rig, SensorContract
 from hw.fifo_sensor import UNCHECKED, FifoSensor
 from hw.sensor import AdapterError, ConfigurationError, DeviceLost, IdentityError
@@ -20,6 +22,8 @@ from hw.virtual.kernel import ADAPTERS, PLAIN, SMBUS_FUNCTIONS, Adapter, I2CBus,
 
 LAP = 1000
 FEWER_SAMPLES = 20_000
+FOREIGN_ACCESSES = 24
+NOTICED_S = 2.0  # after an access by another program
 
 
 @functools.cache
@@ -108,6 +112,30 @@ class I2cRig(Rig):
         self.sensor.close()
         self._kernel.__exit__(None, None, None)
 
+    def at(self, moment_s: float, act: Callable[[], object]) -> None:
+        """Let another program act once, when the time comes."""
+        sleep, acted = self.sleep, []
+
+        def until(seconds: float) -> None:
+            end_s = self.t_s + seconds
+            if not acted and end_s >= moment_s:
+                sleep(max(0.0, moment_s - self.t_s))
+                acted.append(act())
+            sleep(end_s - self.t_s)
+
+        self.sleep = until  # type: ignore[method-assign]
+
+    def read_until(self, end_s: float) -> tuple[list[SampleBlock], DeviceLost | None]:
+        """The blocks until `end_s`, or until the device is lost, and the loss."""
+        blocks: list[SampleBlock] = []
+        try:
+            while self.t_s < end_s:
+                block = self.sensor.read_block()
+                blocks += [] if block is None else [block]
+        except DeviceLost as loss:
+            return blocks, loss
+        return blocks, None
+
     def read(self) -> tuple[BlockFlags, NDArray[np.int64]]:
         block = self.sensor.read_block()
         assert block is not None
@@ -115,6 +143,8 @@ class I2cRig(Rig):
 
 
 class I2cContract(SensorContract):
+    """What every driver on I2C must do, on every kind of adapter."""
+
     filter_register: ClassVar[tuple[int, str]]  # a settings register, and its name in messages
     # Registers (offsets, high-pass filter, self-test) with values that somebody may have left in them
     trimmed: ClassVar[dict[int, int]]
@@ -122,9 +152,14 @@ class I2cContract(SensorContract):
     temperature: ClassVar[tuple[int, float] | None]  # a raw value and its degC
     self_test_range: ClassVar[float] = 1.0  # range during the self-test as a multiple of the range that is set
 
-    @pytest.fixture(autouse=True, params=ADAPTERS, ids=lambda adapter: adapter.name)
+    def pytest_generate_tests(self, metafunc: pytest.Metafunc) -> None:
+        """Every test runs on every kind of adapter, but for those of other programs, which are many."""
+        adapters = ADAPTERS[:1] if "another_program" in metafunc.function.__name__ else ADAPTERS
+        metafunc.parametrize("adapter", adapters, indirect=True, ids=lambda adapter: adapter.name)
+
+    @pytest.fixture(autouse=True)
     def adapter(self, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-        """Every test runs on every kind of adapter; the most samples are read on the plain one."""
+        """The most samples are read on the plain adapter."""
         monkeypatch.setattr(I2cRig, "adapter", request.param)
         if request.param is not PLAIN:
             monkeypatch.setattr(self, "samples", min(self.samples, FEWER_SAMPLES))
@@ -329,3 +364,58 @@ class I2cContract(SensorContract):
         assert len(faults) == 6
         assert "x changes by 0.000 g, the limits are" in faults[0]
         assert "may be dead" in faults[1]
+
+    @pytest.mark.parametrize("seed", range(FOREIGN_ACCESSES))
+    def test_what_another_program_writes_is_noticed(self, rig: I2cRig, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        rig.sensor.open()
+        list(rig.blocks(rng.uniform(0.5, 2.0)))
+        held = [*rig.sensor._settings(), *rig.sensor._trims()]
+        register = int(rng.choice(held)) if seed % 4 else int(rng.integers(256))
+        value = int(rng.integers(256))
+        before = bytes(rig.twin.registers[r] for r in held)
+        moment_s = rig.t_s + rng.uniform(0.0, 0.6)
+        rig.at(moment_s, lambda: rig.bus.transfer([(rig.address, bytes([register, value]))]))
+        blocks, loss = rig.read_until(moment_s + NOTICED_S)
+        check_joints(rig, blocks)
+        if bytes(rig.twin.registers[r] for r in held) == before:
+            return
+        assert loss is not None, f"0x{value:02X} in register 0x{register:02X} was not noticed"
+        assert "did it lose power, or did another program write to it?" in str(loss)
+        assert all(block.t_monotonic_ns < moment_s * 1e9 for block in blocks)
+        rig.sensor.open()
+        assert rig.read()[0] == BlockFlags.RESTART
+
+    @pytest.mark.parametrize("seed", range(FOREIGN_ACCESSES))
+    def test_what_another_program_reads_is_noticed(self, rig: I2cRig, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        rig.sensor.open()
+        list(rig.blocks(rng.uniform(1.0, 3.0)))
+        register = rig.fifo_register if seed % 2 else int(rng.integers(256))
+        count = int(rng.integers(1, 65))
+        dump = seed % 4 == 0  # as i2cdump does: every register by itself
+        reads = [(r, 1) for r in range(256)] if dump else [(register, count)]
+
+        def read() -> None:
+            for first, n in reads:
+                rig.bus.transfer([(rig.address, bytes([first])), (rig.address, n)])
+
+        moment_s = rig.t_s + rng.uniform(0.0, 0.6)
+        rig.at(moment_s, read)
+        blocks, loss = rig.read_until(moment_s + NOTICED_S)
+        check_joints(rig, blocks)
+        if loss is None:
+            assert blocks[-1].t_monotonic_ns > (moment_s + NOTICED_S - 0.7) * 1e9
+            return
+        assert "does another program read the FIFO?" in str(loss)
+        rig.sensor.open()
+        assert rig.read()[0] == BlockFlags.RESTART
+
+
+def check_joints(rig: I2cRig, blocks: list[SampleBlock]) -> None:
+    """Neighbours in a block must be neighbours in the device, and a block that does not follow must say so."""
+    for block in blocks:
+        assert (np.diff(rig.number(block.indications)) == 1).all()
+    for a, b in itertools.pairwise(blocks):
+        if int(rig.number(b.indications)[0] - rig.number(a.indications)[-1]) != 1:
+            assert b.flags & (BlockFlags.GAP | BlockFlags.RESTART)

@@ -27,7 +27,11 @@ def words(tag: int, first: int, numbers: Counts) -> bytes:
 
 
 class Lsm6dsoTwin(FifoTwin):
-    """See FifoTwin. `freq_fine` is the register with which the part states its own rate."""
+    """See FifoTwin. `freq_fine` is the register with which the part states its own rate.
+
+    Seven registers from FIFO_DATA on hold the oldest word; it leaves the FIFO when the last of them is read (ST,
+    lsm6dsox_reg.c, reads the first by itself, then the other six).
+    """
 
     fifo_bytes = 512 * 7
     sample_bytes = 7
@@ -55,6 +59,10 @@ class Lsm6dsoTwin(FifoTwin):
     def _encode(self, first: int, counts: Counts) -> bytes:
         return words(2, first, counts)
 
+    def _read_fifo(self, count: int) -> bytes:
+        whole = count // 7 * 7
+        return self._take(whole) + (bytes(self._fifo[:7]) + bytes(7))[: count - whole]
+
     def _deflection(self) -> Counts:
         return np.array([6000, 7000, 8000] if self.registers[0x14] & 3 == 1 else [0, 0, 0], np.int32)
 
@@ -70,6 +78,11 @@ class Lsm6dsoTwin(FifoTwin):
             return raw.to_bytes(2, "little", signed=True)[register - TEMPERATURE]
         if DATA <= register < DATA + 6:
             return self._newest().astype("<i2").tobytes()[register - DATA]
+        if FIFO_DATA < register < FIFO_DATA + 7:
+            word = (bytes(self._fifo[:7]) + bytes(7))[:7]
+            if register == FIFO_DATA + 6:
+                self._take(7)
+            return word[register - FIFO_DATA]
         return self.registers[register]
 
     def _set(self, register: int, value: int) -> None:
