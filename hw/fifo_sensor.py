@@ -110,7 +110,7 @@ class FifoSensor(PollingSensor):
         return None, None
 
     def _trims(self) -> Mapping[int, str]:
-        """Names of more registers that must not change, such as trims of the factory, which `_settings` does not have."""
+        """Names of registers besides `_settings` that must not change, such as trims of the factory."""
         return {}
 
     def _forget(self) -> None:
@@ -180,7 +180,7 @@ class FifoSensor(PollingSensor):
     def identify(self) -> str:
         """Name the device at the address. Reads only the identity registers, so a device in use is not disturbed.
 
-        Raises the same errors as `open`.
+        Each register is read in a transfer of its own, as `open` and `read_block` do. Raises the same errors as `open`.
         """
         self._device.open()
         try:
@@ -189,6 +189,10 @@ class FifoSensor(PollingSensor):
         finally:
             self._device.close()
         return f"{self._kind()} ({', '.join(f'{name} 0x{value:02X}' for name, value in identity.items())})"
+
+    def used_by(self) -> str:
+        """The process that has this device open, e.g. "process 812 (fieldcal)"; "" where none is known."""
+        return self._device.used_by()
 
     def self_test(self) -> SelfTestReport:
         """Run the self-test of the open device; takes about 3 s. Open the device again afterwards.
@@ -269,7 +273,7 @@ class FifoSensor(PollingSensor):
         if len(found.breaks) > 1 or (sum(lengths) >= self.sample_words and not len(found.counts)):
             self._drop(OUT_OF_STEP, sum(lengths))
             raise DeviceLost(
-                f"{self._device.name}: the contents of the FIFO do not form samples; does another program read the FIFO?"
+                f"{self._device.name}: the contents of the FIFO form no samples; does another program read the FIFO?"
             )
         self._drop(OUT_OF_STEP, found.dropped)
         if found.breaks:

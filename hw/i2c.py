@@ -16,7 +16,7 @@ from typing import TypeVar
 from smbus2 import SMBus, i2c_msg
 from smbus2.smbus2 import I2cFunc
 
-from hw.bus_lock import lock
+from hw.bus_lock import holder, lock
 from hw.sensor import AdapterError, Clock, ConfigurationError, DeviceLost
 
 T = TypeVar("T")
@@ -82,6 +82,10 @@ class I2CDevice:
         assert self._bus is not None
         assert self._bus.fd is not None
         lock(self._bus.fd, self.path, self._address, self.name)
+
+    def used_by(self) -> str:
+        """The process that holds the lock on this address; "" for none."""
+        return holder(self.path, self._address)
 
     def close(self) -> None:
         """Release the bus; never raises."""

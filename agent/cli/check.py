@@ -12,6 +12,8 @@ import click
 
 from agent.config import Config, ConfigError, load_config
 from agent.config.tls import expiry_warning
+from agent.setup.device_checks import answer_findings, loaded_options
+from agent.setup.finding import Finding
 from agent.setup.known_filters import stated_filters
 from agent.terminal.quantity import counted
 from agent.terminal.text import say
@@ -23,7 +25,9 @@ from agent.terminal.text import say
 def check(config: Path, json_to: str | None) -> int:
     """Report every fault in CONFIG, with its line, its setting and what to do. Exit status 2 if there is a fault.
 
-    Of a good one, tell which filters of each device are divided out, and who states them.
+    Of a good one, tell which filters of each device are divided out, and who states them, and ask the devices on I2C
+    buses of this machine who they are. A device that does not answer is a warning; an adapter that refuses the
+    transfers of the driver is a fault.
 
     JSON: `good`, `faults` and `warnings` (lists of texts), and of a good one `devices`, `channels`, `poses` and
     `positions` (their numbers), and `filters` (of each sensor and reference: `sensor` of the channel, `device`,
@@ -31,6 +35,7 @@ def check(config: Path, json_to: str | None) -> int:
     """
     try:
         loaded = load_config(config)
+        answers = _answers(config, loaded)
     except ConfigError as error:
         if json_to:
             click.echo(json.dumps({"good": False, "faults": error.faults, "warnings": []}))
@@ -38,7 +43,7 @@ def check(config: Path, json_to: str | None) -> int:
             for fault in error.faults:
                 say(fault, err=True)
         return 2
-    warnings = list(_warnings(config, loaded))
+    warnings = [*_warnings(config, loaded), *(f"{a.says}; {a.remedy}" for a in answers if a.verdict != "good")]
     counts = {
         "devices": len(loaded.devices),
         "channels": len(loaded.channels),
@@ -55,9 +60,17 @@ def check(config: Path, json_to: str | None) -> int:
     told = [counted(count, name) for name, count in counts.items() if count or name in ("devices", "channels")]
     found = ", which the agent finds by gravity" if counts["positions"] else ""
     say(f"{config}: good; {', '.join(told)}{found}")
-    for one in dict.fromkeys(one.told for one in filters):
-        say(f"  {one}")
+    for line in dict.fromkeys([one.told for one in filters] + [a.says for a in answers if a.verdict == "good"]):
+        say(f"  {line}")
     return 0
+
+
+def _answers(path: Path, config: Config) -> list[Finding]:
+    """What answers on the I2C buses of this machine. Raises ConfigError where an adapter refuses the transfers."""
+    answers = list(answer_findings(config, loaded_options(config)))
+    if faults := [f"{path}: {answer.says}" for answer in answers if answer.check == "adapter"]:
+        raise ConfigError(faults)
+    return answers
 
 
 def _warnings(path: Path, config: Config) -> Iterator[str]:

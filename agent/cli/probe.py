@@ -25,13 +25,14 @@ class Answer:
     """Answer at an address.
 
     `drivers` are those that recognise the device (several if the part does not tell which of them it is); `note` is
-    what the other drivers or the kernel report.
+    what the other drivers, the adapter or the kernel report; `used_by` is the process that has the device open.
     """
 
     address: int
     drivers: list[str] = field(default_factory=list)
     identity: str = ""
     note: str = ""
+    used_by: str = ""
     self_test: dict[str, Any] | None = None
 
 
@@ -138,7 +139,8 @@ def _at(bus: int, address: int, drivers: dict[str, type[FifoSensor]], self_test:
     if not known:
         return Answer(address, note="; ".join(notes))
     result = tested(next(iter(known.values()))) if self_test else None
-    return Answer(address, list(known), " or ".join(identities), self_test=result)
+    used_by = next(iter(known.values())).used_by()
+    return Answer(address, list(known), " or ".join(identities), used_by=used_by, self_test=result)
 
 
 def tested(sensor: FifoSensor) -> dict[str, Any]:
@@ -176,7 +178,8 @@ def _print(buses: list[Bus], ports: list[dict[str, str]]) -> None:
         for answer in bus.answers:
             say(f"  0x{answer.address:02X}  {answer.identity or answer.note}")
             if answer.drivers:
-                say(f"        driver {' or '.join(answer.drivers)}")
+                used_by = f", used by {answer.used_by}" if answer.used_by else ""
+                say(f"        driver {' or '.join(answer.drivers)}{used_by}")
             for line in _self_test_lines(answer.self_test):
                 say(f"        {line}")
     for port in ports:

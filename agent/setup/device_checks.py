@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import cast
 
 from pydantic import ValidationError
 
@@ -17,7 +18,8 @@ from agent.setup.buses import bus_clock_khz
 from agent.setup.finding import Finding
 from hw.block import BlockFlags
 from hw.fifo_options import FifoOptions
-from hw.sensor import DeviceError, Options, Sensor, load_driver
+from hw.fifo_sensor import FifoSensor
+from hw.sensor import AdapterError, DeviceError, Options, Sensor, load_driver
 
 RATE_WITHIN = 0.02  # relative; oscillators of MEMS are off by 1 % or less
 CPU_SHARE_MAX = 0.5  # of one core, for reading alone
@@ -60,6 +62,30 @@ def _access(name: str, node: Path) -> Finding:
             f"sudo usermod -aG {group} {user}, then log in anew (or restart the service)",
         )  # fmt: skip
     return Finding("device", "good", f"{name}: {user} may read and write {node}")
+
+
+def answer_findings(config: Config, options: Mapping[str, Options]) -> Iterator[Finding]:
+    """Does each device on an I2C bus of this machine answer, to transfers as its driver does them?
+
+    Nothing is said of a bus that is not here, and no register is written. A finding of the check `adapter` is one that
+    no other device at the address mends.
+    """
+    for device in config.devices:
+        held = options[device.name]
+        if not isinstance(held, FifoOptions) or not Path(f"/dev/i2c-{held.bus}").exists():
+            continue
+        sensor = cast(FifoSensor, load_driver(device.driver)(device.name, held))
+        try:
+            identity, used_by = sensor.identify(), sensor.used_by()
+        except AdapterError as error:
+            yield Finding("adapter", "fault", f"{device.name}: {error}")
+        except DeviceError as error:
+            remedy = "connect the device, or correct its options; `fieldcal probe` lists what answers"
+            yield Finding("device", "fault", f"{device.name}: {error}", remedy)
+        else:
+            used = f", used by {used_by}" if used_by else ""
+            says = f"{device.name}: {identity} answers on /dev/i2c-{held.bus}, one register read a transfer{used}"
+            yield Finding("device", "good", says)
 
 
 def bus_findings(options: Mapping[str, Options], sysfs: Path = Path("/sys")) -> Iterator[Finding]:

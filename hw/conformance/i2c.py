@@ -114,7 +114,8 @@ class I2cRig(Rig):
 
     def at(self, moment_s: float, act: Callable[[], object]) -> None:
         """Let another program act once, when the time comes."""
-        sleep, acted = self.sleep, []
+        sleep = self.sleep
+        acted: list[object] = []
 
         def until(seconds: float) -> None:
             end_s = self.t_s + seconds

@@ -12,6 +12,7 @@ import ctypes
 import errno
 import os
 import threading
+import weakref
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -82,6 +83,7 @@ class I2CBus:
         self.transfers = 0
         self.bytes = 0  # on the bus, addresses among them
         self.node = os.memfd_create("i2c")  # a file of its own, as the node of each real adapter is: it can be locked
+        weakref.finalize(self, os.close, self.node)
         self._absent_errno = absent_errno
         self._spend = spend
         self._transfer_s, self._byte_s = transfer_s, 9 / clock_hz
@@ -114,9 +116,6 @@ class I2CBus:
             or (self.adapter.write_then_read and reads not in ([False], [True], [False, True]))
             or any((c if isinstance(c, int) else len(c)) > self.adapter.longest for _, c in messages)
         )
-
-    def __del__(self) -> None:
-        os.close(self.node)
 
     def _message(self, address: int, content: int | bytes) -> bytes | None:
         target = self.targets.get(address)

@@ -13,7 +13,7 @@ import numpy as np
 from hw.adxl355_registers import ADXL355
 from hw.virtual.adxl355_twin import Adxl355Twin, filters
 from hw.virtual.bench import Bench
-from hw.virtual.kernel import I2CBus, installed
+from hw.virtual.kernel import BCM2835, I2CBus, installed
 from hw.virtual.parameters import BenchParameters
 from hw.virtual.schedule import STANDARD_GRAVITY_MPS2
 from hw.virtual.serial_bench import serial_lines, serial_options
@@ -44,7 +44,7 @@ class LiveBench:
             clock,
             temperature_raw=self._temperature_raw,
         )
-        self.bus = I2CBus({ADDRESS: twin})
+        self.bus = I2CBus({ADDRESS: twin}, adapter=BCM2835)
         self.sensor_options: dict[str, Any] = {
             "bus": bus,
             "address": ADDRESS,

@@ -1,4 +1,7 @@
-"""The installed program, as a process, on simulated chips (register-level twins) that libumockdev presents to it."""
+"""The installed program, as a process, on simulated chips (register-level twins) that libumockdev presents to it.
+
+The adapter takes what that of a Raspberry Pi Zero to 4 takes.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from smbus2.smbus2 import I2cFunc
 
 from agent.core.events import DeviceChange, Gap
 from agent.recording.reading import RecordingReader
@@ -20,7 +24,7 @@ from hw.block import BlockFlags, SampleBlock
 from hw.virtual.adxl345_twin import Adxl345Twin
 from hw.virtual.adxl355_twin import Adxl355Twin
 from hw.virtual.fifo_twin import FifoTwin
-from hw.virtual.kernel import I2CBus
+from hw.virtual.kernel import BCM2835, SMBUS_FUNCTIONS, Adapter, I2CBus
 from hw.virtual.lsm6dso_twin import Lsm6dsoTwin
 from hw.virtual.mpu6050_twin import Mpu6050Twin
 from hw.virtual.serial_port import PtyDevice, SampleLines
@@ -45,7 +49,8 @@ SERIAL_HZ = 100.0
 @pytest.fixture
 def bus() -> I2CBus:
     return I2CBus(
-        {address: twin(numbered, since_now(rate_hz), time.monotonic) for twin, address, rate_hz in DEVICES.values()}
+        {address: twin(numbered, since_now(rate_hz), time.monotonic) for twin, address, rate_hz in DEVICES.values()},
+        adapter=BCM2835,
     )
 
 
@@ -119,6 +124,45 @@ def test_probe_names_a_bus_that_is_not_there(site: UmockdevSite) -> None:
     out, _ = process.communicate(timeout=30)
     assert process.returncode == 1
     assert "/dev/i2c-7: No such file or directory" in out
+
+
+def test_check_and_doctor_ask_the_devices(tmp_path: Path, site: UmockdevSite, bus: I2CBus, port: PtyDevice) -> None:
+    config = configuration(tmp_path, port)
+    out, _ = (process := program(site, "check", config)).communicate(timeout=30)
+    assert process.returncode == 0, out
+    assert "  adxl355: ADXL355 (REVID 0x01) answers on /dev/i2c-1, one register read a transfer" in out.splitlines()
+    del bus.targets[0x6A]
+    out, _ = (process := program(site, "check", config)).communicate(timeout=30)
+    assert process.returncode == 0, out
+    assert "lsm6dso: LSM6DSO at 0x6A on /dev/i2c-1: Remote I/O error" in out
+    process = program(site, "doctor", config, "--data-dir", tmp_path / "data", "--json", "-")
+    findings = json.loads(process.communicate(timeout=60)[0])["findings"]
+    said = {finding["says"]: finding["verdict"] for finding in findings if finding["check"] == "device"}
+    assert said["mpu6050: MPU-6050 (WHO_AM_I 0x68) answers on /dev/i2c-1, one register read a transfer"] == "good"
+    assert said["lsm6dso: LSM6DSO at 0x6A on /dev/i2c-1: Remote I/O error"] == "fault"
+    bus.adapter = Adapter("single bytes", functions=SMBUS_FUNCTIONS & ~I2cFunc.SMBUS_READ_I2C_BLOCK)
+    out, _ = (process := program(site, "check", config)).communicate(timeout=30)
+    assert process.returncode == 2, out
+    assert "the adapter can neither do plain I2C transfers nor read an I2C block over SMBus" in out
+
+
+def test_who_uses_a_device_is_told(tmp_path: Path, site: UmockdevSite, port: PtyDevice) -> None:
+    data_dir = tmp_path / "data"
+    config = configuration(tmp_path, port)
+    running = program(site, "run", config, "--data-dir", data_dir)
+    try:
+        wait_until(lambda: all(of(name, events(data_dir)) for name in DEVICES), 30, "samples of all come")
+        out, _ = (process := program(site, "probe", "--json", "-")).communicate(timeout=30)
+        assert process.returncode == 0, out
+        used = {answer["address"]: answer["used_by"] for answer in json.loads(out)["i2c"][0]["answers"]}
+        assert set(used) == {0x1D, 0x53, 0x68, 0x6A}
+        assert all(f"process {running.pid} (" in by for by in used.values())
+        process = program(site, "run", config, "--data-dir", tmp_path / "second", "--duration", "2")
+        out, _ = process.communicate(timeout=30)
+        assert f"ADXL355 at 0x1D on /dev/i2c-1: process {running.pid} (" in out
+    finally:
+        interrupt(running)
+        running.communicate(timeout=30)
 
 
 def test_a_run_loses_no_sample_of_any_device(tmp_path: Path, site: UmockdevSite, port: PtyDevice) -> None:
