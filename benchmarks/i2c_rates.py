@@ -117,7 +117,8 @@ def run(name: str, adapter: Adapter, clock_khz: float, rate_hz: float) -> Run | 
 
 def table() -> str:
     """The table, in Markdown."""
-    lines = ["| driver | adapter | bus | highest rate | bytes/s on the bus | CPU |", "| --- | --- | --- | --- | --- | --- |"]
+    head = ("driver", "adapter", "bus", "highest rate", "bytes/s on the bus", "CPU")
+    lines = [f"| {' | '.join(head)} |", "| --- " * len(head) + "|"]
     for name in TWINS:
         rates_hz = sorted(load_driver(name).options_model.rates_hz, reverse=True)  # type: ignore[attr-defined]
         for adapter, added_s in ADDED_S.items():
