@@ -25,6 +25,7 @@ from hw import adxl355_registers, iio_scan, lsm6dso_registers, miniseed
 from hw.block import SampleBlock
 from hw.cutting import Cutter
 from hw.fifo import plain_samples
+from hw.line_columns import columns_of
 from hw.line_stream import LineStream
 from hw.mqtt_payload import Json, PayloadError, Sparkplug
 from hw.sensor import ConfigurationError
@@ -39,6 +40,7 @@ STREAMS = 1_000_000
 LONGEST = 120  # bytes of a random stream
 REOPEN = 50  # a port is opened again after this many streams
 WARM_UP = 2_000  # streams after which the caches are full and memory is measured
+LINE = columns_of(3, sequence=True)
 COUNTS = np.arange(30, dtype=np.int32).reshape(10, 3)
 
 Parse = Callable[[bytes, int], object]
@@ -76,7 +78,7 @@ def parsers() -> dict[str, tuple[bytes, Parse]]:
         "adxl345, mpu6050": (bytes(60), lambda data, i: plain_samples(_whole(data, 6), "<>"[i % 2])),
         "witmotion": (wit, _fed(WitStream(Cutter("w", 200.0), 200.0))),
         "serial-binary": (frames, _fed(BinaryStream(Cutter("b", 100.0), binary))),
-        "serial-csv": (lines, _fed(LineStream(Cutter("l", 100.0), 3, sequence=True, longest_gap=1000.0))),
+        "serial-csv": (lines, _fed(LineStream(Cutter("l", 100.0), LINE, longest_gap=1000.0))),
         "seedlink": (seedlink_twin.record("AM.R1.00.ENZ", 0, 100, COUNTS[:, 0]), _miniseed),
         "mqtt, sparkplug-b": (_sparkplug(), _payload(Sparkplug(("x",), "n"))),
         "mqtt, json": (b'{"x": [1, 2.5], "n": 7, "timestamp": 1e12}', _payload(Json(("x",), "n"))),

@@ -1,19 +1,25 @@
-"""Makes sample blocks of bursts of bytes in the serial text protocol `[seq,]x,y,z` or `[seq,]a`; needs no port."""
+"""Makes sample blocks of bursts of bytes in the serial text protocol, one sample a line; needs no port."""
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hw.block import BlockFlags, Drop, SampleBlock
-from hw.cutting import Break, Cutter, Stretch, follow
-from hw.lines import MAX_LINE_BYTES, decode
+from hw.block import LARGEST, BlockFlags, Drop, SampleBlock
+from hw.cutting import Break, Cutter, Stretch
+from hw.line_columns import IGNORED, TICKS_HZ, Column, DeviceTime, SampleCounter, kind_of
+from hw.lines import MAX_LINE_BYTES, UNREADABLE, decode, with_newlines
 
-UNREADABLE = "line without the expected decimal numbers"
 OVERLONG = f"no newline within {MAX_LINE_BYTES} bytes"
+TELL_LOSSES: tuple[Column, ...] = ("seq", "micros", "millis")  # the first one of them that a line has
+NOT_COUNTED = "line whose sample counter (seq) is not a whole number"
+MOST_BREAKS = 8  # in the half second of a call of `blocks`, and one after the other
+RECENT_NUMBERS = 64  # of the counter or time: enough to tell what they are
+TEMPERATURE_DEGC = -100.0, 200.0  # outside, the thermometer is at fault: no electronics works there
 
 
 class LineStream:
@@ -21,17 +27,24 @@ class LineStream:
 
     Between calls it keeps at most one incomplete line.
 
-    With a sequence number, missing samples are a GAP of known length; a number that repeats, goes back or jumps by more
-    than `longest_gap` samples is a RESTART. Without a sequence number, a bad line may have been any number of samples:
-    RESTART.
+    `columns` names the fields of a line. A counter or a time tells which samples are missing; see `hw.line_columns`.
+    Without them a bad line may have been any number of samples: RESTART. A stretch with more than MOST_BREAKS breaks is
+    dropped with the reason: blocks of one sample are of no use and would fill the queue to the pipeline.
     """
 
-    def __init__(self, cutter: Cutter, axes: int, *, sequence: bool, longest_gap: float) -> None:
+    def __init__(self, cutter: Cutter, columns: Sequence[Column], *, longest_gap: float) -> None:
         self._cutter = cutter
-        self._columns = axes + sequence
-        self._sequence = sequence
-        self._longest_gap = longest_gap
-        self._drops: Counter[tuple[Literal["lines", "bytes"], str]] = Counter()
+        self._columns = tuple(columns)
+        self._ignored = frozenset(at for at, name in enumerate(columns) if name == IGNORED)
+        read = [name for name in columns if name != IGNORED]
+        self._axes = [at for at, name in enumerate(read) if name in ("x", "y", "z", "a")]
+        self._temperature = read.index("temperature") if "temperature" in read else None
+        told_by = next((name for name in TELL_LOSSES if name in read), None)
+        self._numbered = None if told_by is None else read.index(told_by)
+        self._numbers: SampleCounter | DeviceTime = SampleCounter(longest_gap)
+        if told_by is not None and told_by != "seq":
+            self._numbers = DeviceTime(TICKS_HZ[told_by], cutter.nominal_rate_hz, longest_gap)
+        self._drops: Counter[tuple[Literal["samples", "lines", "bytes"], str]] = Counter()
         self.begin()
 
     def begin(self) -> None:
@@ -41,7 +54,9 @@ class LineStream:
         """
         self._listening = False
         self._tail = b""
-        self._last_sequence: float | None = None
+        self._numbers.begin()
+        self._recent = np.empty(0)  # the newest numbers of the counter or times
+        self._broken = 0  # samples in a row that do not follow the one before
         self._text: list[bytes] = []
         self._lines: list[int] = []
         self._arrivals_ns: list[int] = []
@@ -51,6 +66,7 @@ class LineStream:
 
     def feed(self, data: bytes, arrival_ns: int, utc_ns: int) -> None:
         """Add one burst and its arrival time, ns. Of an overlong line only the beginning is kept."""
+        data = with_newlines(data)
         if not self._listening:
             _, newline, data = data.partition(b"\n")
             self._listening = bool(newline)
@@ -72,34 +88,73 @@ class LineStream:
         """Decode everything fed since the last call and return its blocks."""
         if not self._text:
             return []
-        decoded = decode(b"".join(self._text), self._columns)
+        decoded = decode(b"".join(self._text), len(self._columns), self._ignored)
         burst_lines = np.cumsum(self._lines)
         arrivals_ns = np.array(self._arrivals_ns, np.int64)
         self._text, self._lines, self._arrivals_ns, self.size = [], [], [], 0
-        self._drops["lines", UNREADABLE] += decoded.bad_lines
         self._drops["bytes", OVERLONG] += decoded.bad_bytes
-        line, values = decoded.line, decoded.values
-        if self._sequence:
-            counted = (values[:, 0] >= 0) & (values[:, 0] % 1 == 0)
-            self._drops["lines", UNREADABLE] += int(np.count_nonzero(~counted))
-            line, values = line[counted], values[counted]
-            breaks = self._follow(values[:, 0])
-            values = np.ascontiguousarray(values[:, 1:])
-        else:
-            lost_at = set(np.searchsorted(line, decoded.bad_at).tolist())
-            breaks = [Break(at, BlockFlags.RESTART) for at in sorted(lost_at)]
-        return self._cutter.cut(Stretch(values, arrivals_ns, np.searchsorted(line, burst_lines), self._utc_ns), breaks)
+        for reason, lines in decoded.bad_lines.items():
+            self._drops["lines", reason] += lines
+        sound = self._sound(decoded.values)
+        line, values = decoded.line[sound], decoded.values[sound]
+        breaks = self._breaks(values, np.searchsorted(line, [*decoded.bad_at, *decoded.line[~sound]]))
+        self._broken = self._broken + len(breaks) if len(breaks) >= len(values) else 0
+        if max(len(breaks), self._broken) > MOST_BREAKS:
+            self._drops["samples", self._fault()] += len(values)
+            self._cutter.flag(BlockFlags.RESTART)
+            return []
+        stretch = Stretch(
+            np.ascontiguousarray(values[:, self._axes]),
+            arrivals_ns,
+            np.searchsorted(line, burst_lines),
+            self._utc_ns,
+            temperature_degc=self._temperature_degc(values),
+        )
+        return self._cutter.cut(stretch, breaks)
 
     def take_drops(self) -> list[Drop]:
-        """Bad lines and bytes of overlong lines since the last call."""
+        """Bad lines, bytes of overlong lines, and samples of dropped stretches since the last call."""
         drops = [Drop(count, unit, reason) for (unit, reason), count in self._drops.items() if count]
         self._drops.clear()
         return drops
 
-    def _follow(self, sequence: NDArray[np.float64]) -> list[Break]:
-        """Breaks where the sequence number does not increase by one."""
-        if not len(sequence):
+    def _sound(self, values: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Whether each line (n,) has possible indications, and a whole number where it has a counter."""
+        possible = np.asarray((np.abs(values[:, self._axes]) <= LARGEST).all(axis=1))
+        self._drops["lines", UNREADABLE] += int(np.count_nonzero(~possible))
+        if self._numbered is None or isinstance(self._numbers, DeviceTime):
+            return possible
+        whole = values[:, self._numbered] % 1 == 0
+        self._drops["lines", NOT_COUNTED] += int(np.count_nonzero(possible & ~whole))
+        return np.asarray(possible & whole)
+
+    def _breaks(self, values: NDArray[np.float64], lost_at: NDArray[np.int64]) -> list[Break]:
+        """Breaks by the counter or time; without one, where a line was lost."""
+        if self._numbered is None:
+            return [Break(at, BlockFlags.RESTART) for at in sorted(set(lost_at.tolist()))]
+        if not len(values):
             return []
-        before = sequence[0] - 1 if self._last_sequence is None else self._last_sequence
-        self._last_sequence = float(sequence[-1])
-        return follow(np.diff(sequence, prepend=before), self._longest_gap)
+        numbers = values[:, self._numbered]
+        self._recent = np.concatenate([self._recent, numbers])[-RECENT_NUMBERS:]
+        return self._numbers.breaks(numbers)
+
+    def _fault(self) -> str:
+        """Why so many samples do not follow the one before."""
+        if self._numbered is None:
+            return f"samples among lines that cannot be read: more than {MOST_BREAKS} such places in half a second"
+        rate_hz = self._cutter.nominal_rate_hz
+        if isinstance(self._numbers, DeviceTime):
+            return f"the time of the device does not rise as at rate_hz = {rate_hz:g}: the rate is another or varies"
+        kind = kind_of(self._recent, rate_hz)
+        if kind not in TICKS_HZ:
+            return f"the sample counter does not rise by one: more than {MOST_BREAKS} jumps in half a second"
+        columns = ", ".join(f'"{kind if name == "seq" else name}"' for name in self._columns)
+        return f"the sample counter does not rise by one: it is a time; set columns = [{columns}], no sequence"
+
+    def _temperature_degc(self, values: NDArray[np.float64]) -> float | None:
+        """Temperature in the last line; None without one, or if no thermometer can be so cold or hot."""
+        if self._temperature is None or not len(values):
+            return None
+        low, high = TEMPERATURE_DEGC
+        degc = float(values[-1, self._temperature])
+        return degc if low <= degc <= high else None

@@ -15,6 +15,7 @@ from pydantic import Field
 from hw.block import DeviceInfo, Drop, SampleBlock
 from hw.polling import BLOCK_S, PollingSensor
 from hw.sensor import ConfigurationError, DeviceLost, Options
+from hw.serial_ports import ports_there
 
 GATHER_S = 0.010  # at 1 kHz one wake-up serves ten samples; 115 bytes of the kernel's 4 kB at 115200 baud
 # Below this rate each sample is read as it arrives: the port wakes the reader, GATHER_SLOW_S lets the sample finish
@@ -94,7 +95,8 @@ class SerialSensor(PollingSensor):
             self._port = serial.Serial(options.port, options.baud_rate, timeout=BLOCK_S, exclusive=True)
             info = self._set_up(self._port)
         except LOST as error:
-            raise DeviceLost(f"{self._where()}: {reason_of(error)}") from error
+            there = f"; {ports_there()}" if getattr(error, "errno", None) == errno.ENOENT else ""
+            raise DeviceLost(f"{self._where()}: {reason_of(error)}{there}") from error
         except ValueError as error:
             raise ConfigurationError(f"{self._where()}, baud_rate {options.baud_rate}: {error}") from error
         self._stream.begin()

@@ -9,7 +9,7 @@ from typing import Any, get_args
 
 import click
 
-from agent.cli.probe import i2c_buses, i2c_drivers, on_bus, serial_ports
+from agent.cli.probe import i2c_buses, i2c_drivers, on_bus
 from agent.config import ConfigError
 from agent.config.channel import Channel
 from agent.config.devices import Gateway
@@ -25,6 +25,7 @@ from agent.terminal.text import say
 from calib.signal.instrument import QUANTITIES
 from hw.fifo_sensor import FifoSensor
 from hw.sensor import load_driver
+from hw.serial_ports import lasting_name, serial_ports
 from hw.units import nominal_sensitivity
 
 ALPHAS_DEG = (0.0, 120.0, 240.0)  # three different ones determine all twelve parameters
@@ -116,7 +117,7 @@ def init(config: Path, **given: Any) -> int:
         return 2
     asking = Asking()
     devices = _devices(asking, given)
-    listen(devices, asking.faults)
+    listen(devices, asking)
     for device in devices:
         complete(device, asking)
     answers = None if asking.faults else _answers(asking, devices, given)
@@ -164,20 +165,18 @@ def _devices(asking: Asking, given: dict[str, Any]) -> list[Chosen]:
     roles: list[Role] = ["sensor"] if given["no_reference"] or given["mount"] == "rests" else ["sensor", "reference"]
     open_roles = [role for role in roles if not given[role] and not given[f"{role}_port"]]
     found = _found() if open_roles else []
-    used = {given[f"{role}_port"] for role in roles}
+    used = {lasting_name(port) for role in roles if (port := given[f"{role}_port"])}
     chosen = []
     for role in roles:
         stated = driver_options(given[f"{role}_options"], f"--{role}-option")
         options = {name: Stated(value, f"option --{role}-option") for name, value in stated.items()}
         if port := given[f"{role}_port"]:
-            options["port"] = Stated(port, f"option --{role}-port")
+            options["port"] = Stated(lasting_name(port), f"option --{role}-port {port}")
         if role not in open_roles:
             driver, source = given[role] or TEXT_LINES, f"option --{role}" if given[role] else "default for a port"
             chosen.append(Chosen(role, Stated(driver, source), options))
             continue
-        candidates = [
-            device for device in found if device.options.get("port") not in used or not device.options.get("port")
-        ]
+        candidates = [device for device in found if device.options.get("port") not in used]
         device = _pick(asking, role, candidates)
         if device is not None:
             found.remove(device)

@@ -16,6 +16,7 @@ from hw.fifo_sensor import FifoSensor
 from hw.i2c import I2CDevice
 from hw.self_test import SelfTestReport
 from hw.sensor import ConfigurationError, DeviceError, DeviceLost, IdentityError, driver_names, load_driver
+from hw.serial_ports import serial_ports
 
 MICRO = 1e6
 
@@ -73,22 +74,6 @@ def i2c_buses() -> list[int]:
     """Numbers N of the I2C adapters /dev/i2c-N of this machine."""
     nodes = (path.name.removeprefix("i2c-") for path in Path("/dev").glob("i2c-*"))
     return sorted(int(number) for number in nodes if number.isdigit())
-
-
-def serial_ports() -> list[dict[str, str]]:
-    """Serial ports and the system's information about them. No port is opened: opening resets some boards."""
-    from serial.tools.list_ports import comports
-
-    by_id = {str(path.resolve()): str(path) for path in Path("/dev/serial/by-id").glob("*")}
-    return [
-        {
-            "port": by_id.get(port.device, port.device),
-            "device": port.device,
-            "description": port.description or "",
-            "serial_number": port.serial_number or "",
-        }
-        for port in sorted(comports(), key=lambda port: port.device)
-    ]
 
 
 def i2c_drivers() -> dict[str, type[FifoSensor]]:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
+import click
 from pydantic import ValidationError
 
 from agent.setup.asking import Asking, Stated
@@ -14,12 +15,13 @@ from agent.setup.drivers import describe, unit_of
 from agent.setup.listening import Heard, hear
 from agent.setup.toml import Setting, Table
 from hw.fifo_options import FifoOptions
+from hw.line_columns import IGNORED, Column, columns_of
 from hw.sensor import ConfigurationError, load_driver
+from hw.serial_stream import SerialCsvOptions
 from hw.units import STANDARD_GRAVITY_MPS2
 
 Role = Literal["sensor", "reference"]
 TEXT_LINES = "serial-csv"
-HEARD_OPTIONS = ("axes", "sequence", "rate_hz")  # what lines of text tell
 BAUD_RATE = 115200  # default of all serial drivers
 # A sensor at rest indicates gravity. m/s2 and g are recognised by this length of the mean.
 GRAVITY_MPS2 = (8.0, 12.0)
@@ -54,38 +56,99 @@ class Chosen:
         return None if stated is None else stated.value
 
 
-def listen(devices: list[Chosen], faults: list[str]) -> None:
+def listen(devices: list[Chosen], asking: Asking) -> None:
     """Listen to the devices that write lines of text, as far as their options are not all stated."""
-    waiting = [
-        device
-        for device in devices
-        if device.driver.value == TEXT_LINES
-        and device.value("port")
-        and not all(name in device.options for name in HEARD_OPTIONS)
-    ]
+    waiting = []
+    for device in devices:
+        if device.driver.value != TEXT_LINES or not device.value("port"):
+            continue
+        if columns := _stated_columns(device):
+            _state_columns(device, columns, f"option --{device.role}-option")
+        if not columns or "rate_hz" not in device.options:
+            waiting.append(device)
     ports = {str(device.value("port")): int(device.value("baud_rate") or BAUD_RATE) for device in waiting}
     heard = hear(ports) if ports else {}
     for device in waiting:
         told = heard[str(device.value("port"))]
         if isinstance(told, str):
-            faults.append(
+            asking.faults.append(
                 f"{device.role}: port {device.value('port')}: {told}; connect the device, or state its lines with "
-                f"--{device.role}-option for each of rate_hz, axes, sequence (and baud_rate)"
+                f"--{device.role}-option for each of rate_hz, axes, sequence or columns (and baud_rate)"
             )
-            for name in HEARD_OPTIONS:  # the fault is told once
-                device.state(name, {"axes": 3, "sequence": False, "rate_hz": 1.0}[name], "missing")
+            device.state("rate_hz", 1.0, "missing")  # the fault is told once
         else:
-            _state_heard(device, told, faults)
+            device.state("rate_hz", told.nominal_hz, f"counted on the port: {told.counted_hz:.4g} Hz")
+            if columns := _columns(device, told, asking):
+                _state_unit(device, columns, told, asking.faults)
 
 
-def _state_heard(device: Chosen, heard: Heard, faults: list[str]) -> None:
-    device.state("axes", heard.axes, "counted on the port")
-    device.state("sequence", heard.sequence, "seen on the port")
-    device.state("rate_hz", heard.nominal_hz, f"counted on the port: {heard.counted_hz:.4g} Hz")
-    if "unit" in device.options or heard.axes != 3:
+def _stated_columns(device: Chosen) -> tuple[Column, ...]:
+    """The columns as the user states them: by `columns`, or by axes and sequence; () where they are not stated."""
+    stated = {name: held.value for name in ("columns", "axes", "sequence") if (held := device.options.get(name))}
+    if "columns" not in stated and len(stated) < 2:
+        return ()
+    try:
+        return SerialCsvOptions.model_validate({"port": "stated", "rate_hz": 1.0} | stated).line
+    except ValidationError:
+        return ()  # the check of the whole configuration names the fault
+
+
+def _columns(device: Chosen, heard: Heard, asking: Asking) -> tuple[Column, ...]:
+    """State the columns of the lines as heard, or as answered, unless the user has stated them; () where they are not
+    known or contradict what the user has stated."""
+    option, count = f"--{device.role}-option columns=[...]", len(heard.means)
+    held = Stated(_stated_columns(device) or heard.columns, "seen on the port")
+    if "columns" in device.options and not _stated_columns(device):
+        return ()
+    if not held.value:
+        question = (
+            f"{device.role}: what the {count} columns of its lines are, as in {heard.example}, in their order with "
+            f"commas; names: {' '.join(get_args(Column))} ({IGNORED} is not read)"
+        )
+        held = asking.value(option, None, question, kind=_names)
+    columns: tuple[Column, ...] = held.value or ()
+    if not columns:
+        return ()
+    expected = {"axes": _axes(columns), "sequence": "seq" in columns}
+    wrong = [f"{name} = {device.value(name)}" for name in expected if device.value(name) not in (None, expected[name])]
+    if wrong or len(columns) != count:
+        stated = wrong or [f"{len(columns)} columns"]
+        asking.faults.append(
+            f"{device.role}: {' and '.join(stated)} do not fit its lines of {count} columns, as {heard.example}; "
+            f"state {option} with {count} of {' '.join(get_args(Column))} ({IGNORED} is not read)"
+        )
+        return ()
+    _state_columns(device, columns, held.source)
+    return columns
+
+
+def _axes(columns: Sequence[Column]) -> int:
+    return sum(name in ("x", "y", "z", "a") for name in columns)
+
+
+def _state_columns(device: Chosen, columns: tuple[Column, ...], source: str) -> None:
+    """State axes and sequence, and the columns too where these two do not tell all."""
+    axes, sequence = _axes(columns), "seq" in columns
+    device.state("axes", axes, source)
+    device.state("sequence", sequence, source)
+    if columns != columns_of(axes, sequence):
+        device.state("columns", list(columns), source)
+
+
+def _names(answer: str) -> tuple[str, ...]:
+    """Names between commas. Raises click.BadParameter."""
+    names = tuple(name.strip() for name in answer.split(","))
+    if wrong := [name for name in names if name not in get_args(Column)]:
+        raise click.BadParameter(f"{wrong[0]!r} is none of {' '.join(get_args(Column))}")
+    return names
+
+
+def _state_unit(device: Chosen, columns: tuple[Column, ...], heard: Heard, faults: list[str]) -> None:
+    axes = [at for at, name in enumerate(columns) if name in ("x", "y", "z")]
+    if "unit" in device.options or not axes:
         return
-    length = sum(value**2 for value in heard.mean) ** 0.5
-    if heard.whole:
+    length = sum(heard.means[at] ** 2 for at in axes) ** 0.5
+    if all(heard.whole[at] for at in axes):
         device.state("unit", "count", "all indications on the port are whole numbers")
     elif GRAVITY_MPS2[0] <= length <= GRAVITY_MPS2[1]:
         device.state("unit", "m/s2", f"the mean on the port has the length {length:.3g}, as gravity has")

@@ -12,7 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import serial
 
-from hw.lines import decode
+from hw.line_columns import AXES, IGNORED, Column, kind_of
+from hw.lines import MOST_COLUMNS, Decoded, decode, with_newlines
 from hw.serial_sensor import LOST, READ_BYTES, reason_of
 
 FIRST_LINE_S = 5.0  # opening the port restarts some boards, which need two seconds
@@ -28,17 +29,22 @@ USUAL_HZ = (
 USUAL_WITHIN = 0.02  # relative
 
 
+MOST_UNREAD = 0.1  # part of the lines behind the first good one that may be unreadable
+EXAMPLE_BYTES = 60
+TRIED_LINES = 500  # from which the number of columns is found
+
+
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """Lines of one port: `axes` and `sequence` as the driver `serial-csv` needs them, the rate (Hz) as counted and as
-    it is probably meant, the mean of each axis, and whether all indications are whole numbers."""
+    """Lines of one port: the columns, None where they cannot be told apart, and the mean of each; the rate (Hz) as
+    counted and as it is probably meant; whether a column is of whole numbers only; the last line."""
 
-    axes: int
-    sequence: bool
+    columns: tuple[Column, ...] | None
+    means: tuple[float, ...]
+    whole: tuple[bool, ...]
     counted_hz: float
     nominal_hz: float
-    mean: tuple[float, ...]
-    whole: bool
+    example: str
 
 
 @dataclass(slots=True)
@@ -86,7 +92,7 @@ def _collect(lines: Mapping[str, _Line]) -> None:
                 if not data or len(line.data) > MOST_BYTES:
                     selector.unregister(key.fileobj)
                     continue
-                line.data += data
+                line.data += with_newlines(data)
                 line.arrivals.append((time.monotonic(), len(line.data)))
             if not ends and all(line.arrivals for line in lines.values()):
                 latest_s, ends = time.monotonic() + LISTEN_S, True
@@ -95,20 +101,60 @@ def _collect(lines: Mapping[str, _Line]) -> None:
 def _understood(line: _Line, baud_rate: int) -> Heard | str:
     if not line.arrivals:
         return f"nothing was sent within {FIRST_LINE_S:g} s"
-    begin, text = line.arrivals[0][1], bytes(line.data)
-    begin = text.find(b"\n", begin - 1) + 1  # the first arrival tells when counting begins
-    text = text[begin : text.rfind(b"\n") + 1]
-    columns = max(range(1, 5), key=lambda count: len(decode(text, count).line))
-    values = decode(text, columns).values
-    if len(values) < FEWEST_LINES or len(line.arrivals) < 2:
-        return f"no lines of numbers at {baud_rate} baud ([seq,]x,y,z or [seq,]a)"
-    sequence = columns in (2, 4)
-    axes = values[:, 1:] if sequence else values
-    counted_hz = _octets_per_s(line.arrivals) * len(values) / len(text)
+    begin = line.data.find(b"\n", line.arrivals[0][1] - 1) + 1  # the first arrival tells when counting begins
+    lines = bytes(line.data[begin:]).split(b"\n")[:-1]
+    last = _text(lines[-TRIED_LINES:])
+    count = max(range(1, MOST_COLUMNS + 1), key=lambda count: len(decode(last, count).line))
+    decoded = decode(_text(lines), count)
+    values = decoded.values
+    if len(values) < FEWEST_LINES:
+        return f"no lines of numbers at {baud_rate} baud{_why(decoded, lines, count)}"
+    first = int(decoded.line[0])  # before it, a board that was restarted may write what it likes
+    unread = sum(at > first for at in decoded.bad_at)
+    if unread > MOST_UNREAD * (len(values) + unread):
+        return f"{unread} of {len(values) + unread} lines cannot be read{_why(decoded, lines, count)}"
+    begin += len(_text(lines[:first]))
+    octets, arrivals = len(_text(lines[first:])), [arrival for arrival in line.arrivals if arrival[1] >= begin]
+    if len(arrivals) < 2:
+        return f"all lines came at once at {baud_rate} baud, so their rate is not known"
+    counted_hz = _octets_per_s(arrivals) * len(values) / octets
     return Heard(
-        axes.shape[1], sequence, counted_hz, _nominal(counted_hz), tuple(axes.mean(axis=0).tolist()),
-        bool(np.all(axes == np.round(axes))),
-    )  # fmt: skip
+        _columns([kind_of(column, counted_hz) for column in values.T]),
+        tuple(values.mean(axis=0).tolist()),
+        tuple((values % 1 == 0).all(axis=0).tolist()),
+        counted_hz,
+        _nominal(counted_hz),
+        _shown(lines[int(decoded.line[-1])]),
+    )
+
+
+def _text(lines: Sequence[bytes]) -> bytes:
+    return b"".join(line + b"\n" for line in lines)
+
+
+def _columns(kinds: Sequence[Column | None]) -> tuple[Column, ...] | None:
+    """The names of all columns, where one or three are left when counters and times are known; else None."""
+    if kinds.count(None) not in AXES:
+        return None
+    axes = iter(AXES[kinds.count(None)])
+    columns: list[Column] = []
+    for kind in kinds:
+        columns.append(next(axes) if kind is None else IGNORED if kind in columns else kind)
+    return tuple(columns)
+
+
+def _why(decoded: Decoded, lines: Sequence[bytes], count: int) -> str:
+    """What is wrong with the last line that cannot be read; "" without one."""
+    if not decoded.bad_at:
+        return ""
+    line = lines[decoded.bad_at[-1]]
+    reason = next(iter(decode(line + b"\n", count).bad_lines), "no newline within the longest line")
+    return f" ({reason}, as {_shown(line)})"
+
+
+def _shown(line: bytes) -> str:
+    """A line of a device for a message: characters that a terminal would obey are escaped."""
+    return repr(line[:EXAMPLE_BYTES].decode("ascii", "backslashreplace"))
 
 
 def _octets_per_s(arrivals: Sequence[tuple[float, int]]) -> float:

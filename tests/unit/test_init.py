@@ -161,21 +161,6 @@ def test_questions_are_asked_on_a_terminal_only(tmp_path: Path) -> None:
     assert "Source: answered." in path.read_text()
 
 
-@pytest.mark.parametrize(
-    ("line", "axes", "sequence", "whole"),
-    [("7", 1, False, True), ("1,0.5", 1, True, False), ("1,2,3", 3, False, True), ("5,0.1,0.2,9.8\r", 3, True, False)],
-)
-def test_lines_that_are_heard(
-    line: str, axes: int, sequence: bool, whole: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("agent.setup.listening.LISTEN_S", 1.5)
-    with sending(line.encode() + b"\n", 0.01) as port:
-        heard = hear({port: 115200})[port]
-    assert isinstance(heard, Heard), heard
-    assert (heard.axes, heard.sequence, heard.whole) == (axes, sequence, whole)
-    assert heard.nominal_hz == 100
-
-
 def test_a_stall_of_the_machine_does_not_change_the_rate() -> None:
     """100 Hz for 3 s. The lines of 0.3 s in the middle and of 0.3 s at the end come late, at once."""
     listened = _Line(None, bytearray())  # type: ignore[arg-type]
