@@ -53,11 +53,11 @@ class SampleCounter:
         """Breaks where the next of n > 0 numbers (n,) does not follow."""
         steps = np.diff(counts, prepend=counts[0] - 1 if self._last is None else self._last)
         self._last = float(counts[-1])
-        for size in COUNTER_SIZES:
-            wraps = (steps == 1 - size) & np.isin(counts, [0, -size // 2])
-            if wraps.any():
+        for at in np.flatnonzero(steps < 0).tolist():
+            size = int(1 - steps[at])
+            if size in COUNTER_SIZES and counts[at] in (0, -size // 2):
                 self._known_gap = self._longest_gap if size > self._longest_gap else 0
-                steps[wraps] = 1
+                steps[at] = 1
         return follow(steps, self._known_gap)
 
 

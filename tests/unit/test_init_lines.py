@@ -14,8 +14,8 @@ from serial.tools.list_ports_common import ListPortInfo
 from agent.cli.main import run_cli
 from agent.config import load_config
 from agent.setup.listening import Heard, hear
-from hw.block import BlockFlags
-from hw.sensor import load_driver
+from hw.block import BlockFlags, SampleBlock
+from hw.sensor import Sensor, load_driver
 from hw.serial_ports import lasting_name, serial_ports
 from hw.virtual.serial_port import PtyDevice
 from tests.scenarios.processes import answered
@@ -27,7 +27,7 @@ REST = "0.12,-0.05,9.80"
 
 @pytest.fixture(autouse=True)
 def _listen_shortly(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("agent.setup.listening.LISTEN_S", 1.5)
+    monkeypatch.setattr("agent.setup.listening.LISTEN_S", 1.2)
     monkeypatch.setattr("agent.setup.listening.FIRST_LINE_S", 2.0)
 
 
@@ -52,6 +52,17 @@ def writing(line: Callable[[int], str], greeting: bytes = b"", link: Path | None
 def init(path: Path, port: str, *options: str) -> int:
     stated = [word for option in options for word in ("--sensor-option", option)]
     return run_cli(["init", str(path), "--no-reference", "--sensor-port", port, *stated])
+
+
+def read(sensor: Sensor, samples: int) -> Iterator[SampleBlock]:
+    """Blocks until they hold so many samples; in ten seconds they must have come."""
+    ends_s = time.monotonic() + 10.0
+    while samples > 0:
+        assert time.monotonic() < ends_s, f"{samples} samples are missing"
+        block = sensor.read_block()
+        if block is not None:
+            samples -= block.n
+            yield block
 
 
 DECIDED: dict[str, tuple[Callable[[int], str], dict[str, Any]]] = {
@@ -90,18 +101,17 @@ def test_what_init_writes_is_read_without_a_loss(name: str, tmp_path: Path) -> N
         written = load_config(path).devices[0].options
         assert {name: written[name] for name in options} == options
         assert ("columns" in options) == bool(written["columns"])
-        assert (written["rate_hz"], written["unit"]) == (RATE_HZ, "m/s2")
+        assert written["unit"] == "m/s2"
+        assert written["rate_hz"] == pytest.approx(RATE_HZ, rel=0.1)  # how near, tests/unit/test_init.py says
         driver = load_driver("serial-csv")
         sensor = driver("sensor", driver.options_model.model_validate(written))
         sensor.open()
         try:
-            blocks = [block for block in (sensor.read_block() for _ in range(6)) if block is not None]
+            blocks = list(read(sensor, samples=120))
         finally:
             sensor.close()
-    flags = [block.flags for block in blocks]
     if "header" not in name:
-        assert flags == [BlockFlags.RESTART, *[BlockFlags.NONE] * 5]
-        assert sum(block.n for block in blocks) > 2.4 * RATE_HZ
+        assert [block.flags for block in blocks] == [BlockFlags.RESTART] + [BlockFlags.NONE] * (len(blocks) - 1)
         assert sensor.take_drops() == []
     assert {tuple(row) for block in blocks for row in block.indications.tolist()} == {(0.12, -0.05, 9.8)}
 
@@ -190,7 +200,7 @@ def test_a_board_that_starts_when_its_port_is_opened() -> None:
         heard = hear({port: 115200})[port]
     assert isinstance(heard, Heard), heard
     assert heard.columns == ("seq", "x", "y", "z")
-    assert heard.nominal_hz == RATE_HZ
+    assert heard.nominal_hz == pytest.approx(RATE_HZ, rel=0.1)  # with the 3 kB it would be half of it
 
 
 def adapters(folder: Path, *of: tuple[str, str | None, str]) -> list[ListPortInfo]:
