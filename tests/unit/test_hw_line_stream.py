@@ -246,6 +246,7 @@ def test_a_board_that_starts_again_costs_one_restart() -> None:
         ("millis", 1000, [k - (k % 7 == 3) for k in range(300)]),
         ("micros", 1000, [(2**32 - 1500 + 1000 * k) % 2**32 for k in range(300)]),
         (None, 100, [0] * 300),
+        (None, 100, [10 * (k % 20) for k in range(300)]),
         (None, 100, [2 * k for k in range(300)]),
         (None, 100, [k % 100 * (k % 2) for k in range(300)]),
         (None, 100, [20 + 1e-3 * k for k in range(300)]),
