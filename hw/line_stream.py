@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hw.block import LARGEST, BlockFlags, Drop, SampleBlock
 from hw.cutting import Break, Cutter, Stretch
-from hw.line_columns import IGNORED, TICKS_HZ, Column, DeviceTime, SampleCounter, kind_of
+from hw.line_columns import AXES, IGNORED, TICKS_HZ, Column, DeviceTime, SampleCounter, kind_of
 from hw.lines import MAX_LINE_BYTES, UNREADABLE, decode, with_newlines
 
 OVERLONG = f"no newline within {MAX_LINE_BYTES} bytes"
@@ -37,7 +37,7 @@ class LineStream:
         self._columns = tuple(columns)
         self._ignored = frozenset(at for at, name in enumerate(columns) if name == IGNORED)
         read = [name for name in columns if name != IGNORED]
-        self._axes = [at for at, name in enumerate(read) if name in ("x", "y", "z", "a")]
+        self._axes = [read.index(name) for name in (*AXES[3], *AXES[1]) if name in read]
         self._temperature = read.index("temperature") if "temperature" in read else None
         told_by = next((name for name in TELL_LOSSES if name in read), None)
         self._numbered = None if told_by is None else read.index(told_by)

@@ -204,6 +204,11 @@ def test_the_temperature_of_the_last_line(degrees: list[str], degc: float | None
     assert feed(stream(columns=X_Y_Z), b"1,2,3\n")[0].temperature_degc is None
 
 
+def test_axes_are_found_by_name() -> None:
+    (block,) = feed(stream(columns=("z", "-", "x", "seq", "y")), b"9.8,ok,0.1,7,0.2\n")
+    assert block.indications.tolist() == [[0.1, 0.2, 9.8]]
+
+
 @pytest.mark.parametrize("ending", [b"\n", b"\r\n", b"\r", b"\n\r", b"\r\r\n"])
 def test_any_end_of_line_cut_anywhere(ending: bytes) -> None:
     text = b"".join(b"%d,%d%s" % (k, k, ending) for k in range(4))
