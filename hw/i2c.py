@@ -30,7 +30,8 @@ RETRIES = 3
 # Time for another master's transfer or clock stretching to end; three waits are too short to fill a FIFO
 RETRY_WAIT_S = 0.0005
 TRANSIENT = frozenset((errno.ENXIO, errno.EREMOTEIO, errno.EIO, errno.ETIMEDOUT, errno.EAGAIN))
-REFUSED = frozenset((errno.EOPNOTSUPP, errno.EINVAL, errno.EMSGSIZE))  # Linux, i2c_check_for_quirks: EOPNOTSUPP
+# Linux, i2c_check_for_quirks: EOPNOTSUPP; drivers outside of it also return EOVERFLOW (allanbian1017/i2c-ch341-usb 2)
+REFUSED = frozenset((errno.EOPNOTSUPP, errno.EINVAL, errno.EMSGSIZE, errno.EOVERFLOW))
 TIMED_READS = 5  # the shortest of them counts: a read may have waited for another process or master
 
 
@@ -100,11 +101,11 @@ class I2CDevice:
         Sets `joins` and `longest` (at most `wanted` bytes), and measures the time of a transfer. Raises AdapterError
         where the adapter cannot read a sample.
         """
-        self.joins = not self._smbus_only and self._takes([(register, 1), (register, 1)])
+        self.joins = not self._smbus_only and self._takes(register, [1, 1])
         known, refused = 1, min(wanted, SMBUS_BYTES) + 1 if self._smbus_only else wanted + 1
         tried = self.longest = refused - 1
         while known < refused - 1:
-            if self._takes([(register, tried)]):
+            if self._takes(register, [tried]):
                 known = tried
             else:
                 refused = tried
@@ -130,7 +131,7 @@ class I2CDevice:
         transfers, each of whole samples.
         """
         if count <= self.longest:
-            return self._retry(lambda bus: self._register(bus, register, count))
+            return self._retry(lambda bus: self._transfer(bus, [(register, count)]))
         most = self.longest // self._unit * self._unit
         return b"".join(self.read(register, min(most, count - done)) for done in range(0, count, most))
 
@@ -139,7 +140,7 @@ class I2CDevice:
         if not self.joins:
             return b"".join(self.read(register, count) for register, count in reads)
         together = [reads[at : at + READS_MAX] for at in range(0, len(reads), READS_MAX)]
-        return b"".join(self._retry(lambda bus, some=some: self._joined(bus, some)) for some in together)  # type: ignore[misc]
+        return b"".join(self._retry(lambda bus, some=some: self._transfer(bus, some)) for some in together)  # type: ignore[misc]
 
     def read_stamped(self, reads: Sequence[Read], clock: Clock) -> tuple[int, int, bytes]:
         """As `read_each`; also returns the middle of the successful transfer, CLOCK_MONOTONIC and UTC, ns.
@@ -149,10 +150,8 @@ class I2CDevice:
 
         def stamped(bus: SMBus) -> tuple[int, int, bytes]:
             before_ns, _ = clock()
-            if self.joins:
-                data = self._joined(bus, reads)
-            else:
-                data = b"".join(self._register(bus, register, count) for register, count in reads)
+            transfers = [reads] if self.joins else [[read] for read in reads]
+            data = b"".join(self._transfer(bus, together) for together in transfers)
             after_ns, utc_ns = clock()
             half_ns = self.stamp_half_ns = (after_ns - before_ns) // 2
             return after_ns - half_ns, utc_ns - half_ns, data
@@ -170,16 +169,17 @@ class I2CDevice:
         """
         self._retry(lambda bus: bus.write_byte_data(self._address, register, value))
 
-    def _takes(self, reads: Sequence[Read]) -> bool:
-        """Whether the adapter does this transfer."""
+    def _takes(self, register: int, counts: Sequence[int]) -> bool:
+        """Whether the adapter does one transfer of reads of so many bytes from `register` on, and does it right."""
+        first = self.read(register, 1)
         try:
-            if len(reads) > 1:
-                self._retry(lambda bus: self._joined(bus, reads))
-            else:
-                self.read(*reads[0])
+            data = self._retry(lambda bus: self._transfer(bus, [(register, count) for count in counts]))
         except AdapterError:
             return False
-        return True
+        except DeviceLost:  # some adapters answer a read that is too long with EIO
+            self.read(register, 1)
+            return False
+        return data[:1] == first and data[-counts[-1] :][:1] == first
 
     def _shortest_s(self, register: int, count: int, clock: Clock) -> float:
         """Shortest time of some reads, s."""
@@ -190,12 +190,11 @@ class I2CDevice:
             times_ns.append(clock()[0] - before_ns)
         return min(times_ns) * 1e-9
 
-    def _register(self, bus: SMBus, register: int, count: int) -> bytes:
+    def _transfer(self, bus: SMBus, reads: Sequence[Read]) -> bytes:
+        """One transfer of all reads; over SMBus there is only one read a transfer."""
         if self._smbus_only:
+            ((register, count),) = reads
             return bytes(bus.read_i2c_block_data(self._address, register, count))
-        return self._joined(bus, [(register, count)])
-
-    def _joined(self, bus: SMBus, reads: Sequence[Read]) -> bytes:
         messages = []
         for register, count in reads:
             if register not in self._starts:

@@ -164,7 +164,7 @@ def _print(buses: list[Bus], ports: list[dict[str, str]]) -> None:
             say(f"  0x{answer.address:02X}  {answer.identity or answer.note}")
             if answer.drivers:
                 used_by = f", used by {answer.used_by}" if answer.used_by else ""
-                say(f"        driver {' or '.join(answer.drivers)}{used_by}")
+                say(f"        driver {' or '.join(answer.drivers)}, one register read a transfer as here{used_by}")
             for line in _self_test_lines(answer.self_test):
                 say(f"        {line}")
     for port in ports:
