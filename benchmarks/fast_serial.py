@@ -9,9 +9,11 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from hw.block import DeviceInfo
 from hw.sensor import Clock, system_clock
 from hw.serial_stream import SerialCsv
 
@@ -32,6 +34,10 @@ class FastSerialCsv(SerialCsv):
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         super().__init__(name, options, clock=lambda: _ahead(clock()), sleep=lambda pause_s: sleep(pause_s / SPEED))
+
+    def open(self) -> DeviceInfo:
+        """The stamps are of the fast clock."""
+        return replace(super().open(), own_clock=SPEED != 1)
 
 
 def _ahead(now: tuple[int, int]) -> tuple[int, int]:

@@ -35,6 +35,8 @@ class SampleBlock:
       scaled.
     - `first_index`: sample i of the block has index `first_index + i` in the device's own count. An index never repeats
       in a run.
+
+    The agent checks each block (hw.promises).
     """
 
     device: str
@@ -86,3 +88,4 @@ class DeviceInfo:
     # (docs/calibrate.md, "Known filters"); empty where no data sheet tells them.
     filters: tuple[str, ...] = ()
     filter_settings: tuple[str, ...] = ()  # names of the settings that change nothing but the rate and these filters
+    own_clock: bool = False  # the stamps are of played or simulated data, whose time runs faster or slower than here

@@ -1,6 +1,6 @@
 """Reader threads, one for each device, which fill one bounded queue.
 
-Devices may be unplugged and plugged in again. All dropped data are reported.
+Devices may be unplugged and plugged in again, and their drivers may have bugs. All dropped data are reported.
 """
 
 from __future__ import annotations
@@ -9,29 +9,39 @@ import json
 import queue
 import threading
 import time
+from collections import Counter
+from collections.abc import Callable
 from dataclasses import asdict, replace
-from typing import Any
+from typing import Any, TypeVar
 
-from agent.core.events import DeviceChange, Event, Gap
-from hw.block import BlockFlags, SampleBlock
-from hw.sensor import ConfigurationError, DeviceError, Sensor
+from agent.config.devices import Device
+from agent.core.events import IN_DRIVER, DeviceChange, Event, Gap
+from hw.block import BlockFlags, DeviceInfo, SampleBlock
+from hw.promises import BlockCheck, checked_drops, checked_info, driver_of, told_as, words
+from hw.sensor import AdapterError, ConfigurationError, DeviceError, DeviceLost, Sensor, load_driver, system_clock
 
 BLOCKS_A_SECOND = 2
 QUEUE_S = 30  # s of blocks of every device that the queue can hold
 BACK_OFF_S = (0.1, 5.0)  # first and longest pause between two attempts to open a device again
 CONFIGURATION_BACK_OFF_S = 5.0  # after a configuration error, which only a person can correct
+HANGS_S = 30.0  # s in a driver after which it is reported; blocks take 0.5 s, openings some seconds
+FAULTS_TOLD = 10  # faults of a driver in a row after which the report says what a person can do
+SHORTEST_CALL_S = 0.002  # s from one call of read_block to the next
+
+T = TypeVar("T")
 
 
 class EventQueue:
     """The queue from the readers to the main loop.
 
-    Only blocks are limited in number. When the queue is full a new block is dropped and counted; `take_gaps` gives the
-    counts as `Gap` events. Other events, at most a few per second, are always accepted.
+    Only blocks are limited in number, those of each device by themselves. Beyond that a new block is dropped and
+    counted; `take_gaps` gives the counts as `Gap` events. Other events, at most a few per second, are always accepted.
     """
 
     def __init__(self, devices: int) -> None:
         self._queue: queue.SimpleQueue[Event] = queue.SimpleQueue()
         self._size = QUEUE_S * BLOCKS_A_SECOND * devices
+        self._blocks: Counter[str] = Counter()  # that wait, by device
         self._dropped: dict[str, int] = {}
         self._flags: dict[str, BlockFlags] = {}  # of dropped blocks; the next block takes them over
         self._lock = threading.Lock()
@@ -40,10 +50,14 @@ class EventQueue:
         """Add an event, or count a block as dropped. Only the device's own thread may call it. Never blocks."""
         if isinstance(event, SampleBlock):
             flags = self._flags.pop(device, BlockFlags.NONE) | event.flags
-            if self._queue.qsize() >= self._size:
-                self._flags[device] = flags & ~BlockFlags.SATURATED
-                with self._lock:
+            with self._lock:
+                full = self._blocks[device] >= QUEUE_S * BLOCKS_A_SECOND
+                if full:
                     self._dropped[device] = self._dropped.get(device, 0) + 1
+                else:
+                    self._blocks[device] += 1
+            if full:
+                self._flags[device] = flags & ~BlockFlags.SATURATED
                 return
             event = replace(event, flags=flags)
         self._queue.put(event)
@@ -61,9 +75,13 @@ class EventQueue:
     def get(self, timeout_s: float) -> Event | None:
         """The next event, or None after `timeout_s`."""
         try:
-            return self._queue.get(timeout=max(0.0, timeout_s))
+            event = self._queue.get(timeout=max(0.0, timeout_s))
         except queue.Empty:
             return None
+        if isinstance(event, SampleBlock):
+            with self._lock:
+                self._blocks[event.device] -= 1
+        return event
 
     def take_gaps(self) -> list[Gap]:
         """The blocks dropped since the last call, as one Gap for each device; fast where there is none."""
@@ -79,60 +97,132 @@ class EventQueue:
 
 
 class Reader(threading.Thread):
-    """Opens a device and reads it until `stop`. Where the device is lost it opens it again, with growing pauses."""
+    """Opens a device and reads it until `stop`. Where the device is lost it opens it again, with growing pauses.
+
+    The driver may be a third party's, and may have a bug. What it returns is checked, what it raises is caught, and
+    each call is timed, so that `watch` can tell of a driver that does not return.
+    """
 
     def __init__(self, name: str, sensor: Sensor, events: EventQueue) -> None:
         super().__init__(name=f"reader-{name}", daemon=True)
         self.device = name
+        self.refused = ""  # what the adapter of the bus refuses, as long as no block has come
         self._sensor = sensor
+        self._driver = driver_of(sensor)
         self._events = events
         self._stop_request = threading.Event()
         self._said = ""
         self._attempt = 0  # attempts to open the device since the last block
+        self._faults = 0  # of the driver itself, since the last block
+        self._works = False  # whether a block has come in this run
+        self._call: tuple[str, float] | None = None  # the driver's method that runs now, and since when
+        self._hanging: tuple[str, float] | None = None  # the call that `watch` has told of
 
     def stop(self) -> None:
-        """Ask the thread to end. It ends within the time of one block."""
+        """Ask the thread to end. It ends within the time of one block, unless the driver does not return."""
         self._stop_request.set()
 
+    def watch(self) -> None:
+        """Report the device as lost where its driver does not return. The main loop calls this, at any time."""
+        call = self._call
+        if call is not None and call is not self._hanging and time.monotonic() - call[1] > HANGS_S:
+            self._hanging = call
+            self._report_lost(
+                f"{IN_DRIVER} {self._driver}: it has not returned from {call[0]} for {HANGS_S:g} s. Restart the agent; "
+                f"if it happens again, tell the author of the driver"
+            )
+
     def run(self) -> None:
-        """Read until `stop`. An exception in a driver is reported and does not end the thread."""
+        """Read until `stop`. No exception in a driver ends the thread."""
         while not self._stop_request.is_set():
             least_pause_s = 0.0
             try:
-                info = self._sensor.open()
-                self._report("open", f"{info.kind} {info.serial_number}".strip(), json.dumps(asdict(info)))
-                self._said = ""
                 self._read()
             except ConfigurationError as error:
                 least_pause_s = CONFIGURATION_BACK_OFF_S
-                self._report_lost(str(error))
+                if isinstance(error, AdapterError) and not self._works:
+                    self.refused = words(error)
+                self._report_lost(words(error))
             except DeviceError as error:
-                self._report_lost(str(error))
-            except (Exception, SystemExit) as error:  # a driver's own bug must not end the agent, nor this thread
-                self._report_lost(f"fault in the driver: {type(error).__name__}: {error}")
-            finally:
-                self._sensor.close()
+                self._report_lost(words(error))
+            except BaseException as error:  # also SystemExit, and what else ends a thread
+                self._report_fault(error)
+            self._close()
             back_off_s = min(BACK_OFF_S[1], BACK_OFF_S[0] * 2 ** min(self._attempt, 10))
             self._attempt += 1
             self._stop_request.wait(max(back_off_s, least_pause_s))
 
     def _read(self) -> None:
+        """Open the device and hand on its blocks until `stop`. Raises what the driver raises, and BadDriverError."""
+        opened = system_clock()
+        info = checked_info(self._within(self._sensor.open))
+        told = not self._faults  # after a fault of the driver, it is told when a block shows that the driver works
+        if told:
+            self._report_open(info)
+        check = BlockCheck(self.device, info, opened)
         while not self._stop_request.is_set():
-            block = self._sensor.read_block()
-            for drop in self._sensor.take_drops():
-                self._events.put(
-                    self.device,
-                    Gap(
-                        device=self.device,
-                        t_monotonic_ns=time.monotonic_ns(),
-                        dropped=drop.count,
-                        unit=drop.unit,
-                        reason=drop.reason,
-                    ),
-                )
+            began_s = time.monotonic()
+            block = self._next_block(check)
             if block is not None:
-                self._attempt = 0
+                if not told:
+                    self._report_open(info)
+                told, self._works, self.refused = True, True, ""
+                self._attempt = self._faults = 0
                 self._events.put(self.device, block)
+            if not info.own_clock and (early_s := began_s + SHORTEST_CALL_S - time.monotonic()) > 0:
+                self._stop_request.wait(early_s)  # a driver that does not wait must not take the processor
+
+    def _close(self) -> None:
+        try:
+            self._within(self._sensor.close)
+        except DeviceError as error:
+            self._report_lost(words(error))
+        except BaseException as error:
+            self._report_fault(error)
+
+    def _next_block(self, check: BlockCheck) -> SampleBlock | None:
+        """The next block, None if none came; what was dropped before it is put into the queue."""
+        block = self._within(self._sensor.read_block)
+        try:
+            for drop in checked_drops(self._within(self._sensor.take_drops)):
+                self._report_drop(drop.count, drop.unit, words(drop.reason))
+            return None if block is None else check.taken(block)
+        except BaseException as error:
+            if block is not None:
+                self._report_drop(1, "blocks", f"{IN_DRIVER}: {told_as(error)}")
+            raise
+
+    def _within(self, method: Callable[[], T]) -> T:
+        """Call a method of the driver. Raises DeviceLost where it returned after `watch` told that it does not."""
+        self._call = call = (method.__name__, time.monotonic())
+        try:
+            result = method()
+        finally:
+            self._call = None
+        if self._hanging is call:
+            raise DeviceLost(f"the driver {self._driver} returned from {call[0]}, but after more than {HANGS_S:g} s")
+        return result
+
+    def _report_drop(self, dropped: int, unit: Any, reason: str) -> None:
+        now_ns = time.monotonic_ns()
+        gap = Gap(device=self.device, t_monotonic_ns=now_ns, dropped=dropped, unit=unit, reason=reason)
+        self._events.put(self.device, gap)
+
+    def _report_open(self, info: DeviceInfo) -> None:
+        self._report("open", f"{info.kind} {info.serial_number}".strip(), json.dumps(asdict(info)))
+        self._said = ""
+
+    def _report_fault(self, error: BaseException) -> None:
+        """Report a fault of the driver itself; from the FAULTS_TOLD-th in a row on nothing more is reported."""
+        self._faults += 1
+        told = f"{IN_DRIVER} {self._driver}: {told_as(error)}"
+        if self._faults == FAULTS_TOLD:
+            told = (
+                f"{IN_DRIVER} {self._driver}, {FAULTS_TOLD} times in a row. Use another version of the driver, and "
+                f"tell its author; the agent tries again every {BACK_OFF_S[1]:g} s. The last fault: {told_as(error)}"
+            )
+        if self._faults <= FAULTS_TOLD:
+            self._report_lost(told)
 
     def _report_lost(self, message: str) -> None:
         # Only a new message is reported: the same one every few seconds for a month would fill the recording.
@@ -153,3 +243,9 @@ class Reader(threading.Thread):
                 attempt=self._attempt,
             ),
         )
+
+
+def reader_of(device: Device, events: EventQueue) -> Reader:
+    """The reader of a device of a configuration that has passed its check."""
+    factory = load_driver(device.driver)
+    return Reader(device.name, factory(device.name, factory.options_model.model_validate(device.options)), events)

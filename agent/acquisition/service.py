@@ -7,17 +7,17 @@ import os
 import threading
 import time
 import uuid
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
 from agent import __version__
 from agent.acquisition.arena import one_arena
-from agent.acquisition.reader import EventQueue, Reader
+from agent.acquisition.reader import EventQueue, Reader, reader_of
 from agent.acquisition.stalls import few_objects
 from agent.commanding.reception import Reception
-from agent.config import Config
-from agent.core.events import Acceleration, Event, Result, RunStart, Tick
+from agent.config import Channel, Config
+from agent.core.events import Acceleration, DeviceChange, Event, Result, RunStart, Tick
 from agent.core.memory import Memory
 from agent.core.pipeline import Pipeline
 from agent.delivery.history import History, Record, StoreError
@@ -37,7 +37,7 @@ from agent.supervision.notify import Notifier
 from agent.supervision.plant import Outbox, Plant
 from agent.supervision.supervisor import Supervisor
 from agent.terminal.watch import Watch
-from hw.sensor import Sensor, boot_id, load_driver
+from hw.sensor import boot_id
 
 _log = logging.getLogger(__name__)
 
@@ -55,6 +55,7 @@ class Service:
         self._watch = watch
         self._stop_request = threading.Event()
         self._sequence = 0
+        self.refused: list[str] = []  # why the run ended by itself: transfers that the adapters of all channels refuse
         self.begun = False  # whether the devices are read; before that, a stop is as harmless as a power cut
 
     def stop(self) -> None:
@@ -64,6 +65,7 @@ class Service:
     def run(self, duration_s: float | None) -> bool:
         """Read, calibrate, record and publish until `stop` is called or `duration_s` seconds have passed.
 
+        Ends by itself, with the reasons in `refused`, where adapters refuse transfers that every channel needs.
         Returns whether all threads have ended. Where it returns False, a router or disk that does not respond blocks
         one of them, and the caller must end the process with `os._exit`.
         Raises StoreError or OSError where the data directory cannot be used, OtherGatewayError where it is another
@@ -100,7 +102,7 @@ class Service:
         events = EventQueue(len(config.devices))
         self._reception = self._command_reception(events)
         self._publisher = self._publication()
-        readers = [Reader(d.name, _sensor(d.name, d.driver, d.options), events) for d in config.devices]
+        readers = [reader_of(device, events) for device in config.devices]
         self._begin()
         writer = RecordingThread(self._recorder, self._deliver, flush_s=config.recording.flush_s)
         plant = Plant(self._data_dir, events, writer, self._recorder, Outbox(self._store), self._publisher)
@@ -113,7 +115,7 @@ class Service:
             with few_objects():
                 for reader in readers:
                     reader.start()
-                self._loop(events, writer, duration_s)
+                self._loop(events, writer, readers, duration_s)
         finally:
             self._supervisor.closing()
             if self._reception is not None:
@@ -198,17 +200,24 @@ class Service:
             continuation=continuation,
         )
 
-    def _loop(self, events: EventQueue, writer: RecordingThread, duration_s: float | None) -> None:
+    def _loop(
+        self, events: EventQueue, writer: RecordingThread, readers: Sequence[Reader], duration_s: float | None
+    ) -> None:
         next_tick = time.monotonic() + TICK_S
         end = float("inf") if duration_s is None else time.monotonic() + duration_s
-        while not self._stop_request.is_set() and time.monotonic() < end:
+        while not (self._stop_request.is_set() or self.refused) and time.monotonic() < end:
             for gap in events.take_gaps():
                 self._step(gap, writer)
             event = events.get(min(POLL_S, next_tick - time.monotonic(), end - time.monotonic()))
             if event is not None:
                 self._step(event, writer)
+            if isinstance(event, DeviceChange):
+                refused = {reader.device: reader.refused for reader in readers if reader.refused}
+                self.refused = refusals(self._config.channels, refused)
             if time.monotonic() >= next_tick:
                 next_tick += TICK_S
+                for reader in readers:
+                    reader.watch()
                 self._step(Tick(t_monotonic_ns=time.monotonic_ns(), t_utc_ns=time.time_ns()), writer)
                 self._watch.health(self._recorder, self._publisher.state() if self._publisher else None)
             if (pruned := writer.take_pruning()) is not None:
@@ -255,6 +264,14 @@ class Service:
             self._publisher.publish(record)
 
 
-def _sensor(name: str, driver: str, options: dict[str, object]) -> Sensor:
-    factory = load_driver(driver)
-    return factory(name, factory.options_model.model_validate(options))
+def refusals(channels: Sequence[Channel], refused: Mapping[str, str]) -> list[str]:
+    """Why no channel can work, a line for each device; empty where one can.
+
+    `refused`: what the adapter refuses, by device. A channel can work if its sensor can, and a reference if it names
+    any. A device that is only absent may come.
+    """
+    for channel in channels:
+        references = {beside.reference for beside in channel.by_reference} - {None}
+        if channel.sensor not in refused and (not references or references - refused.keys()):
+            return []
+    return [f"{device}: {fault}" for device, fault in refused.items()]

@@ -12,12 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from agent.acquisition.reader import EventQueue, Reader
+from agent.acquisition.reader import EventQueue, reader_of
 from agent.config import Config
 from agent.core.events import DeviceChange, Event, Gap
 from calib.model import Array
 from hw.block import BlockFlags, SampleBlock
-from hw.sensor import load_driver
 
 POLL_S = 0.1
 STOP_S = 1.0
@@ -43,12 +42,7 @@ class Capture(threading.Thread):
     def __init__(self, config: Config, devices: list[str]) -> None:
         super().__init__(name="capture", daemon=True)
         self._events = EventQueue(len(devices))
-        self._readers = []
-        for device in config.devices:
-            if device.name in devices:
-                factory = load_driver(device.driver)
-                options = factory.options_model.model_validate(device.options)
-                self._readers.append(Reader(device.name, factory(device.name, options), self._events))
+        self._readers = [reader_of(device, self._events) for device in config.devices if device.name in devices]
         self._origin_ns = time.monotonic_ns()
         self._lock = threading.Lock()
         self._blocks: dict[str, list[SampleBlock]] = {name: [] for name in devices}
@@ -78,6 +72,8 @@ class Capture(threading.Thread):
             event = self._events.get(POLL_S)
             if event is not None:
                 self._take(event)
+            for reader in self._readers:
+                reader.watch()
 
     def _take(self, event: Event) -> None:
         if isinstance(event, SampleBlock):

@@ -102,12 +102,15 @@ def serve(config: Config, data_dir: Path, watch: Any, duration_s: float | None) 
     except (StoreError, OSError) as error:
         say(f"fieldcal run: {error}", err=True)
         return 1
+    for fault in service.refused:
+        say(f"fieldcal run: {fault}", err=True)
+    status = 2 if service.refused else 0
     if not ended:
         # A router or disk that does not respond blocks a thread. Do not wait for this thread.
         watch.__exit__()
         sys.stdout.flush()
-        os._exit(0)
-    return 0
+        os._exit(status)
+    return status
 
 
 @contextmanager

@@ -37,6 +37,9 @@ class RunStart(msgspec.Struct, frozen=True, kw_only=True):
     continuation: bool = False
 
 
+IN_DRIVER = "fault in the driver"  # so begins the message of a DeviceChange where the driver itself has failed
+
+
 class DeviceChange(msgspec.Struct, frozen=True, kw_only=True):
     """A device was opened, lost, or opened again. `info_json` is what its driver read of it (JSON of DeviceInfo)."""
 

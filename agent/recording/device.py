@@ -171,7 +171,8 @@ class Replay:
         self._sleep(max(0.0, (self._due_ns(event) - self._clock()[0]) * 1e-9))
         if isinstance(event, DeviceChange) and event.device == self._recorded_name:
             if event.state == "open":
-                self._info = replace(DeviceInfo(**json.loads(event.info_json)), driver="replay")
+                recorded = DeviceInfo(**json.loads(event.info_json))
+                self._info = replace(recorded, driver="replay", own_clock=self._options.speed != 1.0)
             else:
                 self._info, self._absence = None, event.message
         return event

@@ -11,17 +11,15 @@ import numpy as np
 
 from agent.proto import fieldcal_pb2 as pb
 from hw.block import BlockFlags, SampleBlock
+from hw.promises import block_fault
 
-FASTEST_HZ = 1e6  # of any device; memory for a window is reserved by the rate. A sound card has 1.9e5
 COUNTS, DECIMALS = ("x_counts", "y_counts", "z_counts"), ("x", "y", "z")
 INT32, INT64, FLOAT64 = np.dtype("<i4"), np.dtype("<i8"), np.dtype("<f8")
 
 
 def encode_block(event_sequence: int, block: SampleBlock) -> bytes:
-    """Encode a block as protobuf wire bytes. Raises ValueError where its indications are neither int32 nor float64."""
+    """Encode a block, of which `hw.promises.block_fault` says nothing, as protobuf wire bytes."""
     decimal = block.indications.dtype == np.float64
-    if not decimal and block.indications.dtype != np.int32:
-        raise ValueError(f"indications of {block.device} are {block.indications.dtype}, not int32 or float64")
     columns = np.ascontiguousarray(block.indications.T, "<f8" if decimal else "<i4")
     message = pb.RawBlockBytes(
         event_sequence=event_sequence,
@@ -47,26 +45,22 @@ def decode_block(data: bytes) -> tuple[int, SampleBlock]:
     """Decode wire bytes into (event_sequence, block).
 
     The arrays of bursts are read-only; the indications, (n, axes), are C-contiguous.
-    Raises ValueError or protobuf's DecodeError where the bytes are not a block or its arrays differ in length.
+    Raises ValueError or protobuf's DecodeError where the bytes are not a block, or one with a `block_fault`.
     """
     m = pb.RawBlockBytes.FromString(data)
     axes = m.axes
     if axes not in (1, 3):
         raise ValueError(f"the block says {axes} axes; only 1 and 3 are possible")
-    if not 0 < m.nominal_rate_hz <= FASTEST_HZ:
-        raise ValueError(f"the block says {m.nominal_rate_hz:g} samples a second; at most {FASTEST_HZ:g} are possible")
     arrival, count = np.frombuffer(m.burst_t_monotonic_ns, INT64), np.frombuffer(m.burst_count, INT32)
     names, kind = (DECIMALS, FLOAT64) if m.decimal else (COUNTS, INT32)
     columns = [np.frombuffer(getattr(m, name), kind) for name in names[:axes]]
     n = len(columns[0])
-    if len(arrival) != len(count) or not len(count) or count[0] < 0 or np.count_nonzero(count[1:] < count[:-1]):
-        raise ValueError(f"{len(arrival)} times of bursts, but {len(count)} counts, which must not decrease")
-    if count[-1] != n or any(len(c) != n for c in columns):
-        raise ValueError(f"x has {n} samples; the number of samples in the bursts or on another axis is different")
+    if any(len(column) != n for column in columns):
+        raise ValueError(f"x has {n} samples; another axis has another number of them")
     indications = np.empty((n, axes), kind)
     for axis, column in enumerate(columns):
         indications[:, axis] = column
-    return m.event_sequence, SampleBlock(
+    block = SampleBlock(
         device=m.device,
         boot_id=m.boot_id,
         t_utc_ns=m.t_utc_ns,
@@ -79,3 +73,6 @@ def decode_block(data: bytes) -> tuple[int, SampleBlock]:
         temperature_raw=m.temperature_raw if m.HasField("temperature_raw") else None,
         temperature_degc=m.temperature_degc if m.HasField("temperature_degc") else None,
     )
+    if fault := block_fault(block):
+        raise ValueError(fault)
+    return m.event_sequence, block

@@ -10,6 +10,7 @@ import numpy as np
 
 from agent.config import Channel, Config
 from agent.core.events import (
+    IN_DRIVER,
     CalibrationUpdate,
     Command,
     DeviceChange,
@@ -81,14 +82,15 @@ class Guide:
     def __init__(self, config: Config, *, turns_itself: bool) -> None:
         self._channels = {channel.sensor: channel for channel in config.channels}
         self._seen = {sensor: Seen() for sensor in self._channels}
-        self._lost: list[str] = []
+        self._lost: dict[str, str] = {}  # why, by device
         self._commands, self._turns_itself = config.commands.enabled, turns_itself
 
     def update(self, event: Event, results: Sequence[Result]) -> dict[str, str]:
         """Take an event and its results. What to do next by sensor; none before a sensor has a status."""
         if isinstance(event, DeviceChange):
-            self._lost = [name for name in self._lost if name != event.device]
-            self._lost += [event.device] if event.state == "lost" else []
+            self._lost.pop(event.device, None)
+            if event.state == "lost":
+                self._lost[event.device] = event.message
         elif isinstance(event, Command) and not event.refused:
             self._seen[event.sensor].obey(event, results)
         for result in results:
@@ -98,6 +100,9 @@ class Guide:
     def _next(self, channel: Channel, seen: Seen) -> str:
         devices = [channel.sensor, *(c.reference for c in channel.by_reference if c.reference)]
         lost = [name for name in devices if name in self._lost]
+        faulty = [name for name in lost if self._lost[name].startswith(IN_DRIVER)]
+        if faulty:
+            return f"use another version of the driver of {' and '.join(faulty)}, and tell its author of the fault"
         if lost or seen.status == "INVALID":
             which = " and ".join(lost or devices[:1])
             return f"check power and cable of {which}; the agent tries again by itself. `fieldcal doctor` names faults"

@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from hw.block import BlockFlags, DeviceInfo, SampleBlock
+from hw.promises import BlockCheck, block_fault, checked_drops, checked_info
 from hw.sensor import DeviceLost, Options, Sensor
 
 EPOCH_NS = 1_700_000_000_000_000_000
@@ -85,15 +86,10 @@ class Rig(ABC):
 
 def check_shape(block: SampleBlock, axes: int) -> None:
     """Check what a block promises by itself: shapes, types, order."""
-    assert block.n > 0
+    assert block_fault(block) == ""
     assert block.indications.shape == (block.n, axes)
-    assert block.indications.dtype in (np.int32, np.float64)
-    assert block.burst_t_monotonic_ns.dtype == np.int64
-    assert block.burst_count.dtype == np.int32
-    assert len(block.burst_count) == len(block.burst_t_monotonic_ns)
     assert block.burst_count[0] > 0
     assert (np.diff(block.burst_count) > 0).all()
-    assert block.burst_count[-1] == block.n
     assert (np.diff(block.burst_t_monotonic_ns) > 0).all()
     assert block.t_utc_ns - EPOCH_NS == block.t_monotonic_ns
     assert len(block.boot_id) == 36
@@ -143,6 +139,17 @@ class SensorContract(ABC):
             assert 0.4 * rig.rate_hz < block.n < 0.6 * rig.rate_hz
             index += block.n
         assert rig.sensor.take_drops() == []
+
+    def test_the_agent_takes_each_block(self, rig: Rig) -> None:
+        opened = rig.clock()
+        info = checked_info(rig.open())
+        blocks = list(rig.blocks(3.0))
+        check = BlockCheck(blocks[0].device, info, opened, rig.clock)
+        for block in blocks:
+            taken = check.taken(block)
+            assert taken.flags == block.flags
+            assert np.array_equal(taken.indications, block.indications)
+        checked_drops(rig.sensor.take_drops())
 
     def test_arrivals_are_late_by_less_than_a_sample(self, rig: Rig) -> None:
         # The simulated reads take no time: the burst must hold exactly the samples that existed at its arrival.

@@ -116,6 +116,7 @@ class Virtual(BufferedSensor):
             nominal_rate_hz=sensor.clock.nominal_rate_hz,
             range_mps2=sensor.limit / sensor.nominal_sensitivity if limited else None,
             nominal_sensitivity=sensor.nominal_sensitivity,
+            own_clock=self._options.speed != 1.0,
         )
 
     def _reference_info(self) -> DeviceInfo:
@@ -127,6 +128,7 @@ class Virtual(BufferedSensor):
             unit="m/s" if reference.quantity == "velocity" else "m/s2",
             axes=reference.channels,
             nominal_rate_hz=reference.clock.nominal_rate_hz,
+            own_clock=self._options.speed != 1.0,
         )
 
     def _ends(self, info: DeviceInfo) -> tuple[float, float]:  # noqa: ARG002 - the bench has the range

@@ -9,15 +9,16 @@ import numpy as np
 from agent.acquisition.reader import BLOCKS_A_SECOND, QUEUE_S, EventQueue, Reader
 from agent.core.events import DeviceChange, Event
 from hw.block import BlockFlags, DeviceInfo, Drop, SampleBlock
-from hw.sensor import DeviceLost, Options
+from hw.sensor import DeviceLost, Options, boot_id, system_clock
 from tests.scenarios.processes import wait_until
 
 CAPACITY = QUEUE_S * BLOCKS_A_SECOND
 
 
 def block(number: int, flags: BlockFlags = BlockFlags.NONE) -> SampleBlock:
-    arrival = np.array([number + 1], np.int64)
-    return SampleBlock("imu", "boot", number, number, 100.0, arrival, np.array([1], np.int32), np.zeros((1, 3)), flags)
+    arrival_ns, utc_ns = system_clock()
+    burst = np.array([arrival_ns], np.int64), np.array([1], np.int32)
+    return SampleBlock("imu", boot_id(), utc_ns, number, 100.0, *burst, np.zeros((1, 3)), flags)
 
 
 def change(message: str) -> DeviceChange:

@@ -1,0 +1,241 @@
+"""A driver with a bug: the agent lives, the other devices go on, and the recording can be read."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from agent.acquisition import reader
+from agent.acquisition.service import Service
+from agent.cli.audit import run_audit
+from agent.cli.given import recordings_of
+from agent.config import Config, parse_config
+from agent.core.events import DeviceChange, Event, Gap
+from agent.core.pipeline import Pipeline
+from agent.recording.reading import RecordingReader
+from agent.terminal.watch import Watch
+from hw.block import BlockFlags, SampleBlock
+from tests.scenarios.processes import recordings, wait_until
+from tests.unit.buggy_driver import BUGS, IN_BLOCKS, NOT_FIRST, install
+
+STANDS = {"start_s": 0, "stop_s": 3600, "gravity_mps2": [0, 0, 9.81]}
+TOGETHER = 24  # devices with a bug in one run
+
+
+def name_of(bug: str) -> str:
+    """The device that has this bug."""
+    return f"bug-{BUGS.index(bug)}" if bug in BUGS else "bug"
+
+
+def configuration(bugs: Sequence[str]) -> Config:
+    """A device for each bug, and a good one; each is the sensor of a channel."""
+    options = {name_of(bug): {"bug": bug} for bug in bugs} | {"good": {}}
+    return parse_config(
+        {
+            "gateway": {"site": "test", "name": "drivers"},
+            "devices": [{"name": name, "driver": "buggy", "options": of} for name, of in options.items()],
+            "channels": [{"sensor": name, "prior": {}, "poses": [STANDS]} for name in options],
+            "recording": {"flush_s": 0.2},
+            "zenoh": {"enabled": False},
+        },
+        "test",
+    )
+
+
+@dataclass
+class Run:
+    """What a run left. `raised`: what ended the agent; `ended`: it stopped when it was asked to, all threads ended."""
+
+    data_dir: Path
+    raised: list[BaseException]
+    ended: bool
+    stopped_s: float = 0.0  # from the request to stop to the end
+
+    @property
+    def events(self) -> list[Event]:
+        """All events that were recorded, in order."""
+        return [step.event for file in recordings(self.data_dir) for step in RecordingReader(file).steps()]
+
+    def of(self, device: str) -> list[Event]:
+        """The events of one device."""
+        return [event for event in self.events if getattr(event, "device", "") == device]
+
+    @property
+    def audit(self) -> int:
+        """The status with which `fieldcal audit` ends."""
+        return run_audit(recordings_of([self.data_dir]), Pipeline.restore, as_json=False)
+
+
+def run(config: Config, data_dir: Path, enough: Callable[[Run], bool], timeout_s: float = 40.0) -> Run:
+    """Run the agent on these devices until `enough`, at most `timeout_s`."""
+    found = Run(data_dir, [], ended=False)
+    with Watch(config, "test", None) as watch:
+        service = Service(config, data_dir, watch)
+
+        def guarded() -> None:
+            try:
+                found.ended = service.run(None)
+            except BaseException as error:
+                found.raised.append(error)
+
+        runner = threading.Thread(target=guarded)
+        runner.start()
+        try:
+            wait_until(lambda: not runner.is_alive() or enough(found), timeout_s, "enough")
+        finally:
+            asked_s = time.monotonic()
+            service.stop()
+            runner.join(10)
+            found.stopped_s = time.monotonic() - asked_s
+    assert not runner.is_alive()
+    return found
+
+
+def blocks_after(events: Sequence[Event], is_last: Callable[[Event], bool]) -> list[SampleBlock]:
+    """The blocks after the last event that is such a one."""
+    last = max((i for i, event in enumerate(events) if is_last(event)), default=-1)
+    return [event for event in events[last + 1 :] if isinstance(event, SampleBlock)] if last >= 0 else []
+
+
+def recovered(found: Run, device: str) -> list[SampleBlock]:
+    """The blocks of a device after its bug showed the last time."""
+    return blocks_after(found.of(device), lambda event: isinstance(event, DeviceChange) and event.state == "lost")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def plug_in(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    site = tmp_path_factory.mktemp("site")
+    install(site)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(site)
+        yield
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Run]:
+    """The run in which the agent met each bug, with TOGETHER - 1 other ones."""
+    found = {}
+    for begin in range(0, len(BUGS), TOGETHER):
+        bugs = BUGS[begin : begin + TOGETHER]
+
+        def enough(of: Run, bugs: Sequence[str] = bugs) -> bool:
+            return all(len(recovered(of, name_of(bug))) > 2 for bug in bugs)
+
+        of = run(configuration(bugs), tmp_path_factory.mktemp("data"), enough)
+        found |= dict.fromkeys(bugs, of)
+    return found
+
+
+@pytest.mark.parametrize("bug", BUGS)
+def test_a_bug_costs_what_it_breaks_and_nothing_else(runs: dict[str, Run], bug: str) -> None:
+    found = runs[bug]
+    assert found.raised == []
+    assert found.ended
+    assert found.audit == 0
+    events = found.of(name_of(bug))
+    told = [event.message for event in events if isinstance(event, DeviceChange) and event.state == "lost"]
+    assert told
+    again = recovered(found, name_of(bug))
+    assert again[0].flags & BlockFlags.RESTART
+    assert {block.n for block in again} == {10}
+    good = [event for event in found.of("good") if not isinstance(event, SampleBlock)]
+    assert [event.state for event in good if isinstance(event, DeviceChange)] == ["open"]
+    assert len(good) == 1
+    whole = [event for event in found.of("good") if isinstance(event, SampleBlock)]
+    assert [block.first_index for block in whole] == [10 * k for k in range(len(whole))]
+
+
+@pytest.mark.parametrize("bug", [*IN_BLOCKS, *NOT_FIRST])
+def test_a_bad_block_is_a_drop_with_its_reason(runs: dict[str, Run], bug: str) -> None:
+    gaps = [event for event in runs[bug].of(name_of(bug)) if isinstance(event, Gap)]
+    assert [(gap.dropped, gap.unit) for gap in gaps] == [(1, "blocks")] * 2
+    assert all(gap.reason for gap in gaps)
+
+
+def one(bug: str, times: int = 2) -> Config:
+    """One device with a bug and a good one."""
+    options = {"bug": bug, "times": times}
+    config = configuration([bug])
+    return config.model_copy(
+        update={"devices": (config.devices[0].model_copy(update={"options": options}), config.devices[1])}
+    )
+
+
+def losses(found: Run, bug: str) -> list[str]:
+    """What the losses of a device were told as."""
+    return [e.message for e in found.of(name_of(bug)) if isinstance(e, DeviceChange) and e.state == "lost"]
+
+
+def test_ten_faults_in_a_row_name_the_driver_and_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(reader, "BACK_OFF_S", (0.01, 0.02))
+    bug = "a negative count"
+    with caplog.at_level(logging.INFO, "fieldcal"):
+        found = run(one(bug, times=25), tmp_path, lambda found: len(recovered(found, name_of(bug))) > 2)
+    told = losses(found, bug)
+    assert len(told) == 2, "the same fault is told once, and once more after ten"
+    assert "tests.unit.buggy_driver.Buggy: a block that cannot be used: burst_count begins with -1" in told[0]
+    assert "10 times in a row. Use another version of the driver, and tell its author" in told[1]
+    states = [record.getMessage() for record in caplog.records if record.getMessage().startswith("degraded")]
+    assert any(f"{name_of(bug)} is lost: {told[1]}" in state for state in states), "the status says it"
+    gaps = [event for event in found.of(name_of(bug)) if isinstance(event, Gap)]
+    assert sum(gap.dropped for gap in gaps) == 25
+    opened = [e for e in found.of(name_of(bug)) if isinstance(e, DeviceChange) and e.state == "open"]
+    assert len(opened) == 2, "one before the first fault, one when the driver worked"
+    assert found.audit == 0
+
+
+HANGS = ["open", "read_block", "close"]
+
+
+@pytest.mark.parametrize("method", HANGS)
+def test_a_driver_that_does_not_return_is_named_and_the_agent_ends_in_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str
+) -> None:
+    monkeypatch.setattr(reader, "HANGS_S", 0.5)
+    bug = f"{method}: does not return"
+    config = one(bug, times=1)
+
+    def enough(found: Run) -> bool:
+        after = blocks_after(found.events, lambda e: isinstance(e, DeviceChange) and "has not returned" in e.message)
+        return any(block.device == "good" for block in after)
+
+    found = run(config, tmp_path, enough)
+    assert found.ended
+    assert found.stopped_s < 2.0
+    assert found.audit == 0
+    assert f"Buggy: it has not returned from {method} for 0.5 s" in losses(found, bug)[-1]
+
+
+def test_a_driver_that_returns_late_is_opened_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reader, "HANGS_S", 0.5)
+    bug = "read_block: returns after two seconds"
+    found = run(one(bug, times=1), tmp_path, lambda found: len(recovered(found, name_of(bug))) > 2)
+    assert "has not returned from read_block" in losses(found, bug)[0]
+    assert "returned from read_block, but after more than 0.5 s" in losses(found, bug)[1]
+    assert recovered(found, name_of(bug))[0].flags & BlockFlags.RESTART
+    assert found.audit == 0
+
+
+def test_arrays_that_the_driver_uses_again_are_recorded_as_they_were(tmp_path: Path) -> None:
+    bug = "one array for all blocks"
+    found = run(one(bug), tmp_path, lambda found: len(found.of(name_of(bug))) > 6)
+    blocks = [event for event in found.of(name_of(bug)) if isinstance(event, SampleBlock)]
+    assert [int(block.indications[0, 0]) for block in blocks] == list(range(len(blocks)))
+    assert found.audit == 0
+
+
+def test_a_flood_of_blocks_takes_nothing_from_another_device(tmp_path: Path) -> None:
+    bug = "a flood"
+    found = run(one(bug), tmp_path, lambda found: sum(isinstance(e, SampleBlock) for e in found.of("good")) > 20)
+    whole = [event for event in found.of("good") if isinstance(event, SampleBlock)]
+    assert [block.first_index for block in whole] == [10 * k for k in range(len(whole))]
+    assert not any(isinstance(event, Gap) for event in found.of("good"))
+    assert found.audit == 0
