@@ -246,6 +246,14 @@ class Reader(threading.Thread):
 
 
 def reader_of(device: Device, events: EventQueue) -> Reader:
-    """The reader of a device of a configuration that has passed its check."""
+    """The reader of a device of a configuration that has passed its check.
+
+    Raises ConfigurationError if its driver cannot be made with these options.
+    """
     factory = load_driver(device.driver)
-    return Reader(device.name, factory(device.name, factory.options_model.model_validate(device.options)), events)
+    try:
+        sensor = factory(device.name, factory.options_model.model_validate(device.options))
+    except (Exception, SystemExit) as error:
+        told = f"{device.name}: {IN_DRIVER} {device.driver!r}: it cannot be made: {told_as(error)}"
+        raise ConfigurationError(told) from error
+    return Reader(device.name, sensor, events)

@@ -69,7 +69,7 @@ class Service:
         Returns whether all threads have ended. Where it returns False, a router or disk that does not respond blocks
         one of them, and the caller must end the process with `os._exit`.
         Raises StoreError or OSError where the data directory cannot be used, OtherGatewayError where it is another
-        gateway's, KeyFileError for an unusable signing key.
+        gateway's, KeyFileError for an unusable signing key, ConfigurationError for a driver that cannot be made.
         """
         one_arena()
         self._data_dir.mkdir(parents=True, exist_ok=True)
@@ -100,9 +100,9 @@ class Service:
         )
         self._recorder.close_torn()
         events = EventQueue(len(config.devices))
+        readers = [reader_of(device, events) for device in config.devices]
         self._reception = self._command_reception(events)
         self._publisher = self._publication()
-        readers = [reader_of(device, events) for device in config.devices]
         self._begin()
         writer = RecordingThread(self._recorder, self._deliver, flush_s=config.recording.flush_s)
         plant = Plant(self._data_dir, events, writer, self._recorder, Outbox(self._store), self._publisher)

@@ -85,6 +85,7 @@ def serve(config: Config, data_dir: Path, watch: Any, duration_s: float | None) 
         from agent.acquisition.service import Service
         from agent.config.key_file import KeyFileError
         from agent.recording.owner import OtherGatewayError
+        from hw.sensor import ConfigurationError
 
     service = Service(config, data_dir, watch)
     try:
@@ -96,7 +97,7 @@ def serve(config: Config, data_dir: Path, watch: Any, duration_s: float | None) 
     except KeyFileError as error:
         say(f"fieldcal run: recording.signing_key: {error}", err=True)
         return 2
-    except OtherGatewayError as error:
+    except (OtherGatewayError, ConfigurationError) as error:
         say(f"fieldcal run: {error}", err=True)
         return 2
     except (StoreError, OSError) as error:

@@ -7,22 +7,26 @@ import os
 import pwd
 import time
 from collections.abc import Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from threading import Thread
 from typing import cast
 
 from pydantic import ValidationError
 
 from agent.config import Config
+from agent.config.devices import Device
+from agent.core.events import IN_DRIVER
 from agent.setup.buses import bus_clock_khz
 from agent.setup.finding import Finding
 from hw.block import BlockFlags
 from hw.fifo_options import FifoOptions
 from hw.fifo_sensor import FifoSensor
-from hw.sensor import AdapterError, DeviceError, Options, Sensor, load_driver
+from hw.promises import BlockCheck, checked_drops, checked_info, told_as
+from hw.sensor import AdapterError, DeviceError, Options, Sensor, load_driver, system_clock
 
 RATE_WITHIN = 0.02  # relative; oscillators of MEMS are off by 1 % or less
 CPU_SHARE_MAX = 0.5  # of one core, for reading alone
+RETURNS_S = 30.0  # s after which a driver that has not returned never will; an opening takes some seconds
 
 
 def loaded_options(config: Config) -> dict[str, Options]:
@@ -118,16 +122,22 @@ def bus_findings(options: Mapping[str, Options], sysfs: Path = Path("/sys")) -> 
 def measured_findings(config: Config, options: Mapping[str, Options], duration_s: float) -> list[Finding]:
     """Read all devices together for some seconds, as the agent does, and compare with their nominal rates."""
     began_s, cpu_s = time.monotonic(), time.process_time()
-    with ThreadPoolExecutor(len(config.devices)) as pool:
-        sensors = {
-            device.name: load_driver(device.driver)(device.name, options[device.name]) for device in config.devices
-        }
-        found = list(pool.map(lambda name: _measured(name, sensors[name], duration_s), sensors))
+    found: dict[str, Finding] = {}
+
+    def measure(device: Device) -> None:
+        found[device.name] = _measured(device, options[device.name], duration_s)
+
+    threads = [Thread(target=measure, args=[device], daemon=True) for device in config.devices]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(max(0.0, began_s + duration_s + RETURNS_S - time.monotonic()))
     share = (time.process_time() - cpu_s) / (time.monotonic() - began_s)
+    findings = [found.get(device.name) or _bad_driver(device, "it does not return") for device in config.devices]
     if share > CPU_SHARE_MAX:
         remedy = "lower rate_hz, or use a faster computer: the estimation needs time too"
-        found.append(Finding("throughput", "advice", f"reading alone needs {share:.0%} of one core", remedy))
-    return found
+        findings.append(Finding("throughput", "advice", f"reading alone needs {share:.0%} of one core", remedy))
+    return findings
 
 
 def rate_finding(device: str, rate_hz: float, nominal_hz: float, losses: str = "") -> Finding:
@@ -139,27 +149,43 @@ def rate_finding(device: str, rate_hz: float, nominal_hz: float, losses: str = "
     return Finding("throughput", "good", says)
 
 
-def _measured(name: str, sensor: Sensor, duration_s: float) -> Finding:
-    samples, overruns, first_ns, last_ns = 0, 0, 0, 0
+def _measured(device: Device, options: Options, duration_s: float) -> Finding:
     try:
-        nominal_hz = sensor.open().nominal_rate_hz
-        end_s = time.monotonic() + duration_s
-        while time.monotonic() < end_s:
-            block = sensor.read_block()
-            if block is None:
-                continue
-            overruns += bool(block.flags & BlockFlags.OVERRUN)
-            last_ns = block.t_monotonic_ns
-            if first_ns:  # counting begins after the first block
-                samples += block.n
-            first_ns = first_ns or last_ns
+        sensor = load_driver(device.driver)(device.name, options)
+        try:
+            return _read_for(device.name, sensor, duration_s)
+        finally:
+            sensor.close()
     except DeviceError as error:
-        return Finding("throughput", "fault", f"{name}: {error}", "connect the device, or correct its options")
-    finally:
-        sensor.close()
+        return Finding("throughput", "fault", f"{device.name}: {error}", "connect the device, or correct its options")
+    except BaseException as error:  # a third party's driver may raise anything
+        return _bad_driver(device, told_as(error))
+
+
+def _bad_driver(device: Device, fault: str) -> Finding:
+    remedy = "use another version of the driver, and tell its author of the fault"
+    return Finding("throughput", "fault", f"{device.name}: {IN_DRIVER} {device.driver!r}: {fault}", remedy)
+
+
+def _read_for(name: str, sensor: Sensor, duration_s: float) -> Finding:
+    samples, overruns, first_ns, last_ns = 0, 0, 0, 0
+    opened = system_clock()
+    info = checked_info(sensor.open())
+    check = BlockCheck(name, info, opened)
+    end_s = time.monotonic() + duration_s
+    while time.monotonic() < end_s:
+        read = sensor.read_block()
+        if read is None:
+            continue
+        block = check.taken(read)
+        overruns += bool(block.flags & BlockFlags.OVERRUN)
+        last_ns = block.t_monotonic_ns
+        if first_ns:  # counting begins after the first block
+            samples += block.n
+        first_ns = first_ns or last_ns
     if last_ns == first_ns:
         remedy = "check its power, its cable and its options"
         return Finding("throughput", "fault", f"{name}: no samples in {duration_s:g} s", remedy)
     lost = [f"{overruns} overruns"] if overruns else []
-    lost += [f"{drop.count} {drop.unit}: {drop.reason}" for drop in sensor.take_drops()]
-    return rate_finding(name, samples / ((last_ns - first_ns) * 1e-9), nominal_hz, "; ".join(lost))
+    lost += [f"{drop.count} {drop.unit}: {drop.reason}" for drop in checked_drops(sensor.take_drops())]
+    return rate_finding(name, samples / ((last_ns - first_ns) * 1e-9), info.nominal_rate_hz, "; ".join(lost))

@@ -235,6 +235,8 @@ class Buggy:
         clock: Clock = system_clock,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
+        if options.bug == "it cannot be made":
+            raise TypeError("unsupported operand type(s) for /: 'str' and 'int'")
         self._name, self._options, self._clock, self._sleep = name, options, clock, sleep
         self._left = options.times  # how often the bug still shows
         self._index = 0

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import logging
+import os
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -15,13 +17,15 @@ from agent.acquisition import reader
 from agent.acquisition.service import Service
 from agent.cli.audit import run_audit
 from agent.cli.given import recordings_of
+from agent.cli.main import run_cli
 from agent.config import Config, parse_config
 from agent.core.events import DeviceChange, Event, Gap
 from agent.core.pipeline import Pipeline
 from agent.recording.reading import RecordingReader
+from agent.setup import device_checks
 from agent.terminal.watch import Watch
 from hw.block import BlockFlags, SampleBlock
-from tests.scenarios.processes import recordings, wait_until
+from tests.scenarios.processes import ROOT, fieldcal, recordings, wait_until
 from tests.unit.buggy_driver import BUGS, IN_BLOCKS, NOT_FIRST, install
 
 STANDS = {"start_s": 0, "stop_s": 3600, "gravity_mps2": [0, 0, 9.81]}
@@ -114,6 +118,7 @@ def plug_in(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     install(site)
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(site)
+        patch.setenv("PYTHONPATH", f"{ROOT}{os.pathsep}{site}")
         yield
 
 
@@ -239,3 +244,48 @@ def test_a_flood_of_blocks_takes_nothing_from_another_device(tmp_path: Path) -> 
     assert [block.first_index for block in whole] == [10 * k for k in range(len(whole))]
     assert not any(isinstance(event, Gap) for event in found.of("good"))
     assert found.audit == 0
+
+
+def written(tmp_path: Path, bug: str) -> Path:
+    """The configuration of one device with a bug and a good one, as a file."""
+    path = tmp_path / "config.toml"
+    devices = ", ".join(
+        f"{{ name = {json.dumps(name)}, driver = 'buggy', options = {{ bug = {json.dumps(of)}, times = 1000000 }} }}"
+        for name, of in (("imu", bug), ("good", ""))
+    )
+    channels = "{ sensor = 'imu', prior = {} }, { sensor = 'good', prior = {} }"
+    path.write_text(f"zenoh = {{ enabled = false }}\ndevices = [{devices}]\nchannels = [{channels}]\n")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("bug", "says"),
+    [
+        ("counts without a sign", "a block that cannot be used: indications is an array of uint32"),
+        ("SystemExit", "SystemExit: 3"),
+        ("nothing from open", "open returned a NoneType, not a DeviceInfo"),
+        ("it cannot be made", "TypeError: unsupported operand"),
+        ("read_block: does not return", "it does not return"),
+        ("close: KeyboardInterrupt", "KeyboardInterrupt"),
+    ],
+)
+def test_doctor_names_a_driver_with_a_bug(
+    tmp_path: Path, bug: str, says: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(device_checks, "RETURNS_S", 1.0)
+    path = written(tmp_path, bug)
+    assert run_cli(["doctor", str(path), "--data-dir", str(tmp_path), "--measure", "1", "--json", "-"]) == 3
+    found = [f for f in json.loads(capsys.readouterr().out)["findings"] if f["check"] == "throughput"]
+    assert found[0]["says"].startswith(f"imu: fault in the driver 'buggy': {says}")
+    assert "author" in found[0]["remedy"]
+    assert found[1]["says"].startswith("good: ")
+    assert "samples a second" in found[1]["says"]
+
+
+def test_a_driver_that_cannot_be_made_is_a_fault_of_the_configuration(tmp_path: Path) -> None:
+    done = fieldcal("run", written(tmp_path, "it cannot be made"), "--data-dir", tmp_path / "data")
+    assert done.returncode == 2
+    assert done.stderr.splitlines() == [
+        "fieldcal run: imu: fault in the driver 'buggy': it cannot be made: TypeError: unsupported operand type(s) for "
+        "/: 'str' and 'int'"
+    ]
