@@ -203,6 +203,7 @@ class Service:
     def _loop(
         self, events: EventQueue, writer: RecordingThread, readers: Sequence[Reader], duration_s: float | None
     ) -> None:
+        by_device, refused = {reader.device: reader for reader in readers}, dict[str, str]()
         next_tick = time.monotonic() + TICK_S
         end = float("inf") if duration_s is None else time.monotonic() + duration_s
         while not (self._stop_request.is_set() or self.refused) and time.monotonic() < end:
@@ -212,7 +213,7 @@ class Service:
             if event is not None:
                 self._step(event, writer)
             if isinstance(event, DeviceChange):
-                refused = {reader.device: reader.refused for reader in readers if reader.refused}
+                refused[event.device] = by_device[event.device].refused
                 self.refused = refusals(self._config.channels, refused)
             if time.monotonic() >= next_tick:
                 next_tick += TICK_S
@@ -267,11 +268,12 @@ class Service:
 def refusals(channels: Sequence[Channel], refused: Mapping[str, str]) -> list[str]:
     """Why no channel can work, a line for each device; empty where one can.
 
-    `refused`: what the adapter refuses, by device. A channel can work if its sensor can, and a reference if it names
-    any. A device that is only absent may come.
+    `refused`: what the adapter refuses, by device; "" where it refuses nothing. A channel can work if its sensor can,
+    and a reference if it names any. A device that is only absent may come.
     """
+    faults = {device: fault for device, fault in refused.items() if fault}
     for channel in channels:
         references = {beside.reference for beside in channel.by_reference} - {None}
-        if channel.sensor not in refused and (not references or references - refused.keys()):
+        if channel.sensor not in faults and (not references or references - faults.keys()):
             return []
-    return [f"{device}: {fault}" for device, fault in refused.items()]
+    return [f"{device}: {fault}" for device, fault in faults.items()]

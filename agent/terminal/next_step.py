@@ -105,7 +105,10 @@ class Guide:
             return f"use another version of the driver of {' and '.join(faulty)}, and tell its author of the fault"
         if lost or seen.status == "INVALID":
             which = " and ".join(lost or devices[:1])
-            return f"check power and cable of {which}; the agent tries again by itself. `fieldcal doctor` names faults"
+            return (
+                f"check power and cable of {which}; its message names the fault. The agent tries again by itself, and "
+                "`fieldcal doctor` names faults too"
+            )
         if seen.on_hold:
             return f"`fieldcal command hold --release --sensor {channel.sensor}` lets the agent use windows again"
         if seen.estimate and (seen.status == "HELD" or channel.gate.policy == "propose"):

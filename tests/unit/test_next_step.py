@@ -133,6 +133,13 @@ def test_a_lost_device_is_named_until_it_is_back() -> None:
     assert "cable of mems" in said(guide, status(3, "INVALID", "no block of mems for more than 5 s"))
 
 
+def test_a_fault_of_a_driver_is_no_matter_of_cables() -> None:
+    guide = Guide(configured(positions=CLAMP), turns_itself=False)
+    change = DeviceChange(device="mems", state="lost", message=f"{IN_DRIVER} lab.Imu: KeyError: 'x'", **CLOCK)
+    told = said(guide, status(1, "INVALID"), event=change)
+    assert told == "use another version of the driver of mems, and tell its author of the fault"
+
+
 @pytest.mark.parametrize(
     ("name", "value", "threshold", "words"),
     [

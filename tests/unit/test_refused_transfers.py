@@ -3,19 +3,28 @@
 from __future__ import annotations
 
 import os
+import time
 from pathlib import Path
 from subprocess import CompletedProcess
 from typing import Any
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from agent.acquisition.service import refusals
+from agent.cli.run import serve
 from agent.config import Config, parse_config
 from agent.core.events import DeviceChange
 from agent.recording.reading import RecordingReader
+from agent.terminal.watch import Watch
+from hw.block import SampleBlock
+from hw.virtual.adxl345_twin import Adxl345Twin
+from hw.virtual.kernel import BCM2835, SMBUS_ONLY, Adapter, I2CBus, installed
 from tests.scenarios.processes import ROOT, fieldcal, recordings
 from tests.unit.buggy_driver import REFUSED, install
 
+TOO_SHORT = Adapter("messages of 5 bytes", longest=5)
 STANDS = {"start_s": 0, "stop_s": 3600}
 
 
@@ -113,3 +122,50 @@ def test_an_adapter_that_refuses_what_it_took_before_does_not_end_the_run(tmp_pa
     (file,) = recordings(tmp_path / "data")
     changes = [e for e in (step.event for step in RecordingReader(file).steps()) if isinstance(e, DeviceChange)]
     assert [change.state for change in changes if change.device == "imu"] == ["open", "lost", "open"]
+
+
+def bus(adapter: Adapter) -> I2CBus:
+    """A bus with an ADXL345 of 100 Hz at 0x53."""
+    began_s = time.monotonic()
+
+    def counts(first: int, n: int) -> NDArray[np.int32]:
+        return (
+            np.tile(np.array([0, 0, 256], np.int32), (n, 1)) + np.arange(first, first + n, dtype=np.int32)[:, None] % 2
+        )
+
+    twin = Adxl345Twin(counts, lambda now_s: int((now_s - began_s) * 100.0), time.monotonic)
+    return I2CBus({0x53: twin}, adapter=adapter)
+
+
+@pytest.mark.parametrize(
+    ("adapters", "status"),
+    [([TOO_SHORT], 2), ([TOO_SHORT, TOO_SHORT], 2), ([TOO_SHORT, BCM2835], 0), ([BCM2835, SMBUS_ONLY], 0)],
+    ids=["one refuses", "both refuse", "one refuses of two", "both take it"],
+)
+def test_adapters_of_the_twins(
+    tmp_path: Path, adapters: list[Adapter], status: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = [f"imu{k}" for k in range(len(adapters))]
+    options = [{"bus": k, "rate_hz": 100, "address": 0x53} for k in range(len(adapters))]
+    raw = {
+        "devices": [{"name": n, "driver": "adxl345", "options": o} for n, o in zip(names, options, strict=True)],
+        "channels": [channel(name) for name in names],
+        "recording": {"flush_s": 0.2},
+        "zenoh": {"enabled": False},
+    }
+    nodes = {f"/dev/i2c-{k}": bus(adapter) for k, adapter in enumerate(adapters)}
+    config = parse_config(raw, "test")
+    with installed(nodes), Watch(config, "test", None) as watch:
+        began_s = time.monotonic()
+        assert serve(config, tmp_path, watch, 4.0 if status == 0 else 60.0) == status
+        assert status == 0 or time.monotonic() - began_s < 20.0, "it ends at once"
+    refusing = [name for name, adapter in zip(names, adapters, strict=True) if adapter is TOO_SHORT]
+    said = capsys.readouterr()
+    lines = said.err.splitlines()
+    assert [line.split(": ")[:2] for line in lines] == ([["fieldcal run", name] for name in refusing] if status else [])
+    assert all("the adapter" in line for line in lines)
+    for name in refusing:
+        assert f"{name} is lost: ADXL345 at 0x53 on /dev/i2c-{names.index(name)}: the adapter" in said.out
+    (file,) = recordings(tmp_path)
+    blocks = {e.device for e in (step.event for step in RecordingReader(file).steps()) if isinstance(e, SampleBlock)}
+    assert blocks == {name for name in names if name not in refusing}
