@@ -62,7 +62,7 @@ def block_fault(block: SampleBlock) -> str:
 
 
 class BlockCheck:
-    """Checks the blocks of one device from its opening to its loss. One block takes some 20 microseconds."""
+    """Checks the blocks of one device from its opening to its loss. A block takes some 20 microseconds."""
 
     def __init__(self, device: str, info: DeviceInfo, opened: tuple[int, int], clock: Clock = system_clock) -> None:
         """`opened`: CLOCK_MONOTONIC and UTC in ns before the device was opened."""

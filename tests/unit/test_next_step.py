@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from agent.config import Config, parse_config
-from agent.core.events import Command, DeviceChange, Estimate, Result, Tick
+from agent.core.events import IN_DRIVER, Command, DeviceChange, Estimate, Result, Tick
 from agent.terminal.next_step import Guide
 from agent.terminal.state import ViewState
 from agent.terminal.view import Lines
