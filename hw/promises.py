@@ -104,8 +104,8 @@ class BlockCheck:
         raw, degc = block.temperature_raw, block.temperature_degc
         if raw is not None and not (isinstance(raw, int) and -(2**63) <= raw < 2**63):
             return f"temperature_raw is {shown(raw)}; it must be None or a whole number of 64 bits"
-        if degc is not None and not isinstance(degc, float | int):
-            return f"temperature_degc is {shown(degc)}; it must be None or a number"
+        if degc is not None and not isinstance(degc, float) and not (isinstance(degc, int) and abs(degc) <= LARGEST):
+            return f"temperature_degc is {shown(degc)}; it must be None or a number of at most {LARGEST:g}"
         return ""
 
     def _order_fault(self, block: SampleBlock) -> str:
@@ -204,6 +204,8 @@ def _info_fault(info: DeviceInfo) -> str:
         value = getattr(info, name)
         if value is not None and not (isinstance(value, float | int) and 1 / LARGEST <= value <= LARGEST):
             return f"{name} is {shown(value)}; it must be None or a number from {1 / LARGEST:g} to {LARGEST:g}"
+    if not isinstance(info.own_clock, bool):
+        return f"own_clock is {shown(info.own_clock)}; it must be True or False"
     if not isinstance(info.settings, dict) or not all(isinstance(name, str) for name in info.settings):
         return f"settings is {shown(info.settings)}; it must be a dictionary of texts"
     for name in ("filters", "filter_settings"):

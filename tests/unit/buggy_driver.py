@@ -144,6 +144,7 @@ IN_BLOCKS: dict[str, Callable[[SampleBlock], Any]] = {
     "flag 64": with_(flags=BlockFlags(64)),
     "no flags": with_(flags=None),
     "temperature as text": with_(temperature_degc="21"),
+    "temperature 10^400": with_(temperature_degc=10**400),
     "temperature register 2^70": with_(temperature_raw=2**70),
 }  # fmt: skip
 INSTEAD_OF_BLOCKS: dict[str, Callable[[SampleBlock], Any]] = {
@@ -186,6 +187,7 @@ IN_OPEN: dict[str, Callable[[DeviceInfo], Any]] = {
     "open: sensitivity 0": with_(nominal_sensitivity=0.0),
     "open: sensitivity 1e300": with_(nominal_sensitivity=1e300),
     "open: range as text": with_(range_mps2="8 g"),
+    "open: its clock as text": with_(own_clock="own"),
     "open: filters as text": with_(filters="lowpass order=2 corner_hz=31"),
     "open: filters that are numbers": with_(filters=(31.0,)),
     "open: SystemExit": raising(SystemExit(3)),
