@@ -298,6 +298,7 @@ class Buggy:
 
     def _one_sample(self) -> SampleBlock:
         """A block of one sample, whose x is the number of the block; a flood does not wait for it."""
+        self._array[0] = -1
         if self._options.bug != "a flood":
             self._sleep(BLOCK_S)
         arrival_ns, utc_ns = self._clock()

@@ -243,6 +243,9 @@ def test_a_flood_of_blocks_takes_nothing_from_another_device(tmp_path: Path) -> 
     whole = [event for event in found.of("good") if isinstance(event, SampleBlock)]
     assert [block.first_index for block in whole] == [10 * k for k in range(len(whole))]
     assert not any(isinstance(event, Gap) for event in found.of("good"))
+    flood = [event for event in found.of(name_of(bug)) if isinstance(event, SampleBlock)]
+    lasted_s = (flood[-1].t_monotonic_ns - flood[0].t_monotonic_ns) * 1e-9
+    assert flood[-1].first_index <= lasted_s / reader.SHORTEST_CALL_S + 1
     assert found.audit == 0
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -50,6 +51,20 @@ def test_a_full_queue_counts_blocks_lets_changes_in_and_hands_their_flags_on() -
         (passed,) = drained(events)
         assert isinstance(passed, SampleBlock)
         assert passed.flags == flags
+
+
+def test_a_device_that_floods_the_queue_leaves_the_other_its_share() -> None:
+    events = EventQueue(2)
+    for number in range(10 * CAPACITY):
+        events.put("flood", replace(block(number), device="flood"))
+    for number in range(CAPACITY):
+        events.put("imu", block(number))
+    (gap,) = events.take_gaps()
+    assert (gap.device, gap.dropped) == ("flood", 9 * CAPACITY)
+    assert len(drained(events)) == 2 * CAPACITY
+    events.put("flood", replace(block(0), device="flood"))
+    assert len(drained(events)) == 1
+    assert events.take_gaps() == []
 
 
 class Flapping:
