@@ -8,7 +8,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
@@ -54,31 +54,32 @@ def configuration(bugs: Sequence[str]) -> Config:
 
 @dataclass
 class Run:
-    """What a run left. `raised`: what ended the agent; `ended`: it stopped when it was asked to, all threads ended."""
+    """What a run left. `raised`: what ended the agent; `ended`: it stopped when it was asked to, all threads ended.
+
+    `stopped_s`: seconds from the request to the end. `events`: all that were recorded. `audit`: the status with which
+    `fieldcal audit` ends.
+    """
 
     data_dir: Path
-    raised: list[BaseException]
-    ended: bool
-    stopped_s: float = 0.0  # from the request to stop to the end
+    raised: list[BaseException] = field(default_factory=list)
+    ended: bool = False
+    stopped_s: float = 0.0
+    events: list[Event] = field(default_factory=list)
+    audit: int = -1
 
-    @property
-    def events(self) -> list[Event]:
-        """All events that were recorded, in order."""
-        return [step.event for file in recordings(self.data_dir) for step in RecordingReader(file).steps()]
+    def look(self) -> Run:
+        """Read the recordings as they are now."""
+        self.events = [step.event for file in recordings(self.data_dir) for step in RecordingReader(file).steps()]
+        return self
 
     def of(self, device: str) -> list[Event]:
         """The events of one device."""
         return [event for event in self.events if getattr(event, "device", "") == device]
 
-    @property
-    def audit(self) -> int:
-        """The status with which `fieldcal audit` ends."""
-        return run_audit(recordings_of([self.data_dir]), Pipeline.restore, as_json=False)
-
 
 def run(config: Config, data_dir: Path, enough: Callable[[Run], bool], timeout_s: float = 40.0) -> Run:
     """Run the agent on these devices until `enough`, at most `timeout_s`."""
-    found = Run(data_dir, [], ended=False)
+    found = Run(data_dir)
     with Watch(config, "test", None) as watch:
         service = Service(config, data_dir, watch)
 
@@ -91,14 +92,15 @@ def run(config: Config, data_dir: Path, enough: Callable[[Run], bool], timeout_s
         runner = threading.Thread(target=guarded)
         runner.start()
         try:
-            wait_until(lambda: not runner.is_alive() or enough(found), timeout_s, "enough")
+            wait_until(lambda: not runner.is_alive() or enough(found.look()), timeout_s, "enough")
         finally:
             asked_s = time.monotonic()
             service.stop()
             runner.join(10)
             found.stopped_s = time.monotonic() - asked_s
     assert not runner.is_alive()
-    return found
+    found.audit = run_audit(recordings_of([data_dir]), Pipeline.restore, as_json=False)
+    return found.look()
 
 
 def blocks_after(events: Sequence[Event], is_last: Callable[[Event], bool]) -> list[SampleBlock]:
