@@ -18,6 +18,7 @@ MOST_INFO = 64 << 10  # bytes of all that a driver tells of a device, as JSON
 MOST_DROPS = 100  # reasons at a time
 LARGEST_INDEX = 2**53  # the clock model computes with floating-point numbers; 285 years of the fastest device
 OLDEST_NS = 60_000_000_000  # what a port or a library may have kept from before the opening
+AHEAD_NS = 1_000_000_000  # by which the clock of a station on the network may be ahead of this machine's
 # A driver reads both clocks together, so they differ as the machine's do, unless UTC was set meanwhile. A day is more
 # than any time zone, and does not mislead what is kept for days or years.
 UTC_WITHIN_NS = 86_400_000_000_000
@@ -132,7 +133,7 @@ class BlockCheck:
         if self._info.own_clock:
             return ""
         now_ns, utc_ns = self._clock()
-        if (ahead_ns := block.t_monotonic_ns - now_ns) > 0:
+        if (ahead_ns := block.t_monotonic_ns - now_ns) > AHEAD_NS:
             return f"its last burst arrives in {ahead_ns * 1e-9:.3g} s from now"
         before_ns, self._utc_offset_ns = self._utc_offset_ns, utc_ns - now_ns
         low_ns, high_ns = sorted((before_ns, self._utc_offset_ns))

@@ -276,4 +276,4 @@ def refusals(channels: Sequence[Channel], refused: Mapping[str, str]) -> list[st
         references = {beside.reference for beside in channel.by_reference} - {None}
         if channel.sensor not in faults and (not references or references - faults.keys()):
             return []
-    return [f"{device}: {fault}" for device, fault in faults.items()]
+    return [f"{device}: {faults[device]}" for device in sorted(faults)]

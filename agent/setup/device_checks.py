@@ -9,7 +9,6 @@ import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from threading import Thread
-from typing import cast
 
 from pydantic import ValidationError
 
@@ -78,14 +77,18 @@ def answer_findings(config: Config, options: Mapping[str, Options]) -> Iterator[
         held = options[device.name]
         if not isinstance(held, FifoOptions) or not Path(f"/dev/i2c-{held.bus}").exists():
             continue
-        sensor = cast(FifoSensor, load_driver(device.driver)(device.name, held))
         try:
+            sensor = load_driver(device.driver)(device.name, held)
+            if not isinstance(sensor, FifoSensor):
+                continue
             identity, used_by = sensor.identify(), sensor.used_by()
         except AdapterError as error:
             yield Finding("adapter", "fault", f"{device.name}: {error}")
         except DeviceError as error:
             remedy = "connect the device, or correct its options; `fieldcal probe` lists what answers"
             yield Finding("device", "fault", f"{device.name}: {error}", remedy)
+        except Exception as error:  # a third party's driver may raise anything
+            yield _bad_driver(device, told_as(error))
         else:
             used = f", used by {used_by}" if used_by else ""
             says = f"{device.name}: {identity} answers on /dev/i2c-{held.bus}, one register read a transfer{used}"

@@ -127,7 +127,7 @@ IN_BLOCKS: dict[str, Callable[[SampleBlock], Any]] = {
     "arrivals before the boot": at(lambda t: t - 2**62),
     "arrivals of yesterday": at(lambda t: t - DAY_NS),
     "arrivals tomorrow": at(lambda t: t + DAY_NS),
-    "arrivals in a second": at(lambda t: t + 1_000_000_000),
+    "arrivals in two seconds": at(lambda t: t + 2_000_000_000),
     "arrivals in a million years": at(lambda t: np.full_like(t, 2**63 - 1)),
     "counts that decrease": counting(lambda c: np.array([c[-1] + 1, c[-1]], np.int32)),
     "counts that do not rise": counting(lambda c: np.array([c[-1], c[-1]], np.int32)),
