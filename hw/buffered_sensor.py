@@ -13,6 +13,9 @@ from hw.cutting import Cutter, Stretch
 from hw.polling import PollingSensor
 
 BUFFER_S = 1.0  # length of the buffer that a driver asks its library for: fifty polls
+# Of a device with IEPE of which nobody knows the corner: data sheets have 0.1 Hz (iba ibaM-4AI-IEPE), 0.78 Hz (MCC 172)
+# and 1 Hz; seldom more, such as 3 Hz (ADLINK PCI-9527).
+UNKNOWN_COUPLING = "highpass corner_hz=0.6 u_corner_pct=50"
 OVERFLOW = "input overflow"
 
 Indications = NDArray[np.int32] | NDArray[np.float64]

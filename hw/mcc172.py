@@ -1,9 +1,10 @@
 """Driver `mcc172`: an analog sensor on an MCC 172 (24 bit, IEPE, on the header of a Raspberry Pi), through daqhats.
 
 Names and meanings as in daqhats 1.4.1 (daqhats/mcc172.py, hats.py): it returns volts unless counts are requested, the
-range is +-5 V, the rate is 51.2 kHz divided by 1 to 256, a scan stops when its buffer overflows. The inputs are
-AC-coupled (MCC 172 data sheet). The board's filter delays by 39 samples (a_in_clock, trigger_config), which is a part
-of the reference's lag.
+range is +-5 V, the rate is 51.2 kHz divided by 1 to 256, a scan stops when its buffer overflows. The board's filter
+delays by 39 samples (a_in_clock, trigger_config), which is a part of the reference's lag. The inputs are AC-coupled:
+-3 dB at 0.78 Hz, and at most -0.1 dB at 5.2 Hz (ES MCC 172 rev. 2.1), as a filter of first order has it (-0.097 dB). No
+tolerance is printed; 10 % is that of usual capacitors.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from hw.vendor_library import vendor_library
 BASE_RATE_HZ, DIVIDERS = 51_200.0, range(1, 257)
 RATE_TOLERANCE = 1e-3
 FILTER_SAMPLES = 39  # by which the board's filter delays
+CORNER_HZ, U_CORNER_PCT = 0.78, 10
 SYNC_POLL_S, SYNC_POLLS = 0.01, 200  # the converters need 128 periods to synchronise: 0.64 s at the slowest rate
 MV_PER_V = 1e3
 UNSCALED = 1000.0  # mV per unit: the library then returns volts
@@ -58,8 +60,9 @@ class Mcc172Options(Options):
 
     @property
     def known_filters(self) -> tuple[str, ...]:
-        """The delay of the board's filter. Of the sensor behind the board nothing is known, nor of its corner."""
-        return (f"delay delay_s={FILTER_SAMPLES / self.rate_hz:.6g}",)
+        """The board's coupling, and the delay of its filter. Of the sensor behind the board nothing is known."""
+        coupling = f"highpass corner_hz={CORNER_HZ:g} u_corner_pct={U_CORNER_PCT:g}"
+        return coupling, f"delay delay_s={FILTER_SAMPLES / self.rate_hz:.6g}"
 
 
 class Mcc172(BufferedSensor):

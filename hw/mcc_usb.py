@@ -1,7 +1,8 @@
 """Driver `mcc-usb`: analog sensors on a USB or Ethernet board of MCC, through uldaq (MCC's library for Linux).
 
 Names and meanings as in uldaq 1.2.3 (ai_device.py, ul_structs.py, ul_enums.py): a continuous scan writes into a ring
-buffer, and the transfer status counts the scans written so far. This count is the only sign of an overrun.
+buffer, and the transfer status counts the scans written so far. This count is the only sign of an overrun. The library
+tells neither the delay of a board nor its filters, nor the corner of its AC coupling: they stand in the board's manual.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from hw.block import DeviceInfo
-from hw.buffered_sensor import BUFFER_S, BufferedSensor, Indications
+from hw.buffered_sensor import BUFFER_S, UNKNOWN_COUPLING, BufferedSensor, Indications
 from hw.sensor import ConfigurationError, DeviceLost, Options
 from hw.vendor_library import vendor_library
 
@@ -50,6 +51,11 @@ class MccUsbOptions(Options):
     def tells_sensitivity(self) -> bool:
         """It tells mV; the sensitivity is that of the sensor behind it."""
         return False
+
+    @property
+    def known_filters(self) -> tuple[str, ...]:
+        """With IEPE the AC coupling, whose corner is not known; of delay and filters nothing is known."""
+        return (UNKNOWN_COUPLING,) if self.iepe else ()
 
 
 class MccUsb(BufferedSensor):
@@ -96,6 +102,7 @@ class MccUsb(BufferedSensor):
                 "range_v": str(options.range_v),
                 "iepe": str(options.iepe),
             },
+            filters=options.known_filters,
         )
 
     def _find(self, library: Any) -> Any:

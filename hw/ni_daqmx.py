@@ -1,6 +1,9 @@
 """Driver `ni`: analog sensors on a device of National Instruments, through nidaqmx and NI-DAQmx.
 
-Names, error codes and meanings as in nidaqmx 1.7.0 (task/, stream_readers/, constants.py, error_codes.py).
+Names, error codes and meanings as in nidaqmx 1.7.0 (task/, stream_readers/, constants.py, error_codes.py). AC coupling
+is a filter of one pole (NI-DAQmx Device Considerations, "Input Coupling"); its corner, and the delay of a delta-sigma
+converter, which the library does not take out, stand in the documentation of each device (NI cDAQ-9178 user manual,
+"Analog Input"). The driver does not know them, nor which devices have a filter against aliases.
 """
 
 from __future__ import annotations
@@ -12,7 +15,7 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from hw.block import DeviceInfo
-from hw.buffered_sensor import BUFFER_S, BufferedSensor, Indications
+from hw.buffered_sensor import BUFFER_S, UNKNOWN_COUPLING, BufferedSensor, Indications
 from hw.sensor import ConfigurationError, DeviceLost, Options
 from hw.vendor_library import vendor_library
 
@@ -20,6 +23,7 @@ MV_PER_V = 1e3
 RATE_TOLERANCE = 0.01  # relative; a device uses the nearest rate its clock can make, a larger difference is refused
 # Samples were lost: buffer overwritten or full, on-board FIFO overrun (three codes).
 OVERRUNS = (-200279, -200222, -200361, -200010, -209829)
+AC_ONLY = ("9233", "449")  # parts of the names of devices that are always AC-coupled (NI-DAQmx Device Considerations)
 # Device unknown, not accessible or removed, transfer aborted, no device or resource of this name.
 LOST = (-200220, -201003, -200045, -50405, -88705, -88708)
 
@@ -52,6 +56,11 @@ class NiOptions(Options):
     def tells_sensitivity(self) -> bool:
         """It tells mV; the sensitivity is that of the sensor behind it."""
         return False
+
+    @property
+    def known_filters(self) -> tuple[str, ...]:
+        """With IEPE the AC coupling, whose corner is not known; of delay and filters nothing is known."""
+        return () if self.iepe_ma is None else (UNKNOWN_COUPLING,)
 
 
 class Ni(BufferedSensor):
@@ -104,6 +113,7 @@ class Ni(BufferedSensor):
                 "range_mv": f"{self._full_mv:g}",
                 "iepe_ma": str(options.iepe_ma),
             },
+            filters=(UNKNOWN_COUPLING,) if any(part in kind for part in AC_ONLY) else options.known_filters,
         )
 
     def _input(self, channel: str) -> Any:

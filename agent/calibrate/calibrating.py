@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -27,6 +27,7 @@ from calib.recorded.poses import PoseRow, Poses
 from calib.recorded.table import ends_s
 from calib.recorded.tables import Tables
 from calib.signal.instrument import Instrument
+from calib.signal.known_filters import corner_apart
 
 BAR_FROM_BYTES = 30_000_000  # smaller files are read too fast for a progress bar
 
@@ -84,16 +85,33 @@ def _with_filters(options: Options, sensor: SensorFile, reference: ReferenceFile
         return options
     certificate = options.reference_certificate
     certified = certificate is not None and bool(certificate.filters)
-    of_sensor = () if options.sensor_filter else sensor.filters
-    of_reference = () if options.reference_filter or certified else reference.filters
-    for name, lines in (("sensor", of_sensor), ("reference", of_reference)):
-        for line in lines:
-            say(f"--{name}-filter '{line}', as its driver states in the recording", err=True)
-    return replace(
-        options,
-        sensor_filter=options.sensor_filter or of_sensor,
-        reference_filter=options.reference_filter or of_reference,
-    )
+    found = {**by_driver("sensor", sensor.filters), **by_driver("reference", reference.filters)}
+    if certified:
+        found.pop("reference_filter", None)
+    for role in ("sensor", "reference"):
+        corner = (f"{role}_corner_hz", f"u_{role}_corner_hz")
+        for names in ((f"{role}_filter",), corner):
+            if any(getattr(options, name) for name in names):
+                found = {name: value for name, value in found.items() if name not in names}
+    for line in as_arguments(found):
+        say(f"{line}, as its driver states in the recording", err=True)
+    return replace(options, **found)
+
+
+def by_driver(role: str, lines: Sequence[str]) -> dict[str, Any]:
+    """The options of a role, "sensor" or "reference", by the filters that its driver states; none that says nothing."""
+    filters, (corner_hz, u_corner_hz) = corner_apart(lines)
+    found = {f"{role}_filter": filters, f"{role}_corner_hz": corner_hz, f"u_{role}_corner_hz": u_corner_hz}
+    return {name: value for name, value in found.items() if value}
+
+
+def as_arguments(options: Mapping[str, Any]) -> list[str]:
+    """Options that `by_driver` gave, as a user writes them."""
+    return [
+        f"--{name.replace('_', '-')} {value:g}" if isinstance(value, float) else f"--{name.replace('_', '-')} '{value}'"
+        for name, stated in options.items()
+        for value in (stated if isinstance(stated, tuple) else (stated,))
+    ]
 
 
 def _check_metadata(params: dict[str, Any]) -> None:

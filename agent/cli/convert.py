@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 import numpy as np
 
-from agent.calibrate.calibrating import reference_of, sensor_of
+from agent.calibrate.calibrating import as_arguments, by_driver, reference_of, sensor_of
 from agent.calibrate.tables import TEMPERATURE
 from agent.reading.formats import Description
 from agent.reading.source import ROWS_AT_ONCE, TableError
@@ -57,8 +57,8 @@ def convert(file: Path, output: Path, role: str, columns: str | None, sensitivit
         say(f"fieldcal convert: {output}: the file exists; remove it, or choose another name", err=True)
         return 2
     say(f"{output}: {rows} rows of {','.join(names)}")
-    for line in filters:
-        say(f"its driver states a filter, which the CSV cannot hold; calibrate with --{role}-filter '{line}'", err=True)
+    for argument in as_arguments(by_driver(role, filters)):
+        say(f"its driver states a filter, which the CSV cannot hold; calibrate with {argument}", err=True)
     return 0
 
 

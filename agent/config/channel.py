@@ -91,10 +91,10 @@ class Channel(Knowledge):
 
     def with_filters_of(self, drivers: Mapping[str, tuple[str, ...]]) -> Channel:
         """The channel with the filters that drivers state, by device, where the configuration states none."""
-        filled: dict[str, Section] = {}
-        if not self.prior.filters:
-            filled["prior"] = self.prior.model_copy(update={"filters": drivers.get(self.sensor, ())})
-        filled["certificate"] = self.certificate.with_filters(drivers.get(self.reference or "", ()))
+        filled: dict[str, Section] = {
+            "prior": self.prior.with_filters(drivers.get(self.sensor, ())),
+            "certificate": self.certificate.with_filters(drivers.get(self.reference or "", ())),
+        }
         if (check := self.check_reference) is not None:
             certificate = check.certificate.with_filters(drivers.get(check.device, ()))
             filled["check_reference"] = check.model_copy(update={"certificate": certificate})

@@ -7,14 +7,17 @@ from typing import Annotated
 from pydantic import AfterValidator, Field, model_validator
 
 from agent.config.section import Section
-from calib.signal.known_filters import MOST_NUMBERS, Filter, Table, filter_of
+from calib.signal.known_filters import MOST_NUMBERS, Filter, Highpass, Table, corner_apart, filter_of
 
 MOST_FILTERS = 8
 Numbers = Annotated[tuple[float, ...], Field(max_length=MOST_NUMBERS)]
 
 
 def _filter(text: str) -> str:
-    filter_of(text)
+    if isinstance(filter_of(text), Highpass):
+        raise ValueError(
+            "highpass is what a driver states; of an AC-coupled instrument state corner_hz, u_corner_hz here"
+        )
     return text
 
 
@@ -29,9 +32,18 @@ def filters_of(stated: object) -> tuple[str, ...]:
     if len(stated) > MOST_FILTERS:
         raise FiltersError(f"there are {len(stated)} filters, at most {MOST_FILTERS} are allowed")
     try:
-        return tuple(map(_filter, stated))
+        corner_apart(stated)
     except ValueError as error:
         raise FiltersError(str(error)) from None
+    return tuple(stated)
+
+
+def stated_by_driver(lines: tuple[str, ...], *, has_filters: bool, has_corner: bool) -> dict[str, object]:
+    """What the `lines` of a driver change in the section of its device: `filters` and the corner of an AC-coupled
+    instrument, each unless the section states it itself."""
+    filters, (corner_hz, u_corner_hz) = corner_apart(lines)
+    of_filters: dict[str, object] = {} if has_filters else {"filters": filters}
+    return of_filters if has_corner else of_filters | {"corner_hz": corner_hz, "u_corner_hz": u_corner_hz}
 
 
 Filters = Annotated[

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from agent.config.filters import Filters, ResponseTable
+from agent.config.filters import Filters, ResponseTable, stated_by_driver
 from agent.config.gate import DriftOptions, GateSettings
 from agent.config.section import Section, Vector
 from calib.estimate.nuisances import Priors
@@ -58,6 +58,11 @@ class Prior(Section):
     u_corner_hz: NotNegative = 0.0
     filters: Filters = ()
     reference_frequency_hz: NotNegative = 0.0
+
+    def with_filters(self, stated: tuple[str, ...]) -> Prior:
+        """The prior with the filters and the corner that the sensor's driver states, where it states none itself."""
+        has_corner = bool(self.corner_hz or self.u_corner_hz)
+        return self.model_copy(update=stated_by_driver(stated, has_filters=bool(self.filters), has_corner=has_corner))
 
     def mean(self, nominal: float | None) -> Array:
         """(12,) S row by row and Q. Raises ValueError where neither configuration nor device tells a sensitivity."""
@@ -139,8 +144,11 @@ class Certificate(Section):
         return (*map(filter_of, self.filters), *table)
 
     def with_filters(self, stated: tuple[str, ...]) -> Certificate:
-        """The certificate with the filters that the driver of the reference states, where it states none itself."""
-        return self if self.known_filters else self.model_copy(update={"filters": stated})
+        """The certificate with the filters and the corner that the driver of the reference states, where it states none
+        itself."""
+        has_corner = bool(self.corner_hz or self.u_corner_hz)
+        update = stated_by_driver(stated, has_filters=bool(self.known_filters), has_corner=has_corner)
+        return self.model_copy(update=update)
 
     @property
     def date(self) -> datetime | None:
@@ -232,9 +240,6 @@ class Knowledge(Section):
         """What is wrong with the statements on the reference; "" if nothing is."""
         if self.certificate.lag_s and not self.certificate.u_lag_s:
             return "certificate.lag_s needs certificate.u_lag_s"
-        if self.instrument.derivatives and self.instrument.has_corner:
-            quantity = self.certificate.quantity
-            return f"a {quantity} reference has no corner frequency to undo; leave corner_hz and u_corner_hz"
         return ""
 
     @property

@@ -53,5 +53,10 @@ class DriverFilters:
 
 
 def alike(one: Channel, other: Channel) -> bool:
-    """Whether the same filters are stated of the sensor and of each reference."""
-    return [beside.known for beside in one.by_reference] == [beside.known for beside in other.by_reference]
+    """Whether the same filters and corners are stated of the sensor and of each reference."""
+    return [_stated(beside) for beside in one.by_reference] == [_stated(beside) for beside in other.by_reference]
+
+
+def _stated(beside: Channel) -> tuple[object, ...]:
+    of = beside.instrument
+    return of.known, of.corner_hz, of.u_corner_hz, of.sensor_corner_hz, of.u_sensor_corner_hz

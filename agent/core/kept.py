@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from agent.config import Channel
 from agent.config.knowledge import Certificate, Prior
@@ -228,11 +229,18 @@ def _as_before(before: Mapping[str, str], channel: Channel) -> Channel:
 
 
 def _size(were: Channel, channel: Channel, frequency_hz: float) -> float | None:
-    """What the sensor's known filters pass at the frequency at which S holds, over what those before did; None if the
-    same filters are known of all instruments."""
+    """By how much S at the frequency at which it holds changes where other filters and corners are known than before,
+    as a factor; None if the same ones are known of all instruments."""
     if alike(were, channel):
         return None
-    return channel.known.sensor_size(frequency_hz) / were.known.sensor_size(frequency_hz)
+    return _known_size(channel, frequency_hz) / _known_size(were, frequency_hz)
+
+
+def _known_size(channel: Channel, frequency_hz: float) -> float:
+    """S at a frequency contains the sensor's known filters. Corners are undone: that of a reference makes S smaller."""
+    corners_hz = (channel.certificate.corner_hz, channel.prior.corner_hz)
+    reference, sensor = (np.hypot(1.0, corner_hz / frequency_hz) if frequency_hz else 1.0 for corner_hz in corners_hz)
+    return channel.known.sensor_size(frequency_hz) * float(sensor / reference)
 
 
 def _gravity(changed: Iterable[str], before: Mapping[str, str], channel: Channel) -> tuple[float, float] | None:

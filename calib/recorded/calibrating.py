@@ -54,7 +54,7 @@ def tables_of(
     instrument = instrument or Instrument()
     if reference is not None:
         instrument = replace(instrument, quantity=reference.quantity)
-        _check_quantity(reference, instrument, options.reference_quantity)
+        _check_quantity(reference, options.reference_quantity)
     setting = _setting(options, reference)
     instrument = replace(instrument, ac_coupled="ac" in (setting.coupling, setting.reference_coupling))
     if reference is not None and setting.reference_coupling == "dc":
@@ -66,16 +66,11 @@ def tables_of(
     return Tables(sensor, reference, intervals, instrument, Making(settings, align=more))
 
 
-def _check_quantity(reference: ReferenceTable, instrument: Instrument, stated: str | None) -> None:
+def _check_quantity(reference: ReferenceTable, stated: str | None) -> None:
     if stated and reference.quantity != stated:
         raise InputError(
             f"the column holds {reference.quantity}, but `reference_quantity` says {stated}",
             place=reference.place, column=reference.column,
-        )  # fmt: skip
-    if instrument.derivatives and instrument.has_corner:
-        raise InputError(
-            f"a {reference.quantity} reference takes no corner frequency", "leave out the corner options",
-            place=reference.name,
         )  # fmt: skip
 
 

@@ -13,7 +13,7 @@ from calib.model import Array
 from calib.recorded.certificate import ReferenceCertificate
 from calib.recorded.errors import OptionError
 from calib.signal.instrument import QUANTITIES
-from calib.signal.known_filters import filter_of
+from calib.signal.known_filters import Highpass, filter_of
 
 Coupling = Literal["dc", "ac"]
 CHOICES: Mapping[str, tuple[Any, ...]] = {
@@ -77,9 +77,14 @@ class Options:
             object.__setattr__(self, name, _lines(getattr(self, name)))
             for line in getattr(self, name):
                 try:
-                    filter_of(line)
+                    highpass = isinstance(filter_of(line), Highpass)
                 except ValueError as error:
                     raise OptionError(str(error), column=name, value=line) from None
+                if highpass:
+                    corner = name.replace("filter", "corner_hz")
+                    raise _wrong(
+                        name, line, f"state the corner of an AC-coupled instrument in `{corner}`, `u_{corner}`"
+                    )
         if self.rotation is not None and np.shape(self.rotation) != (3, 3):
             raise _wrong("rotation", self.rotation, "give a matrix of 3 x 3 numbers, a = R a_ref")
         for name in (f.name for f in fields(self) if f.type in ("float", "float | None")):

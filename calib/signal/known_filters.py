@@ -8,7 +8,7 @@ sensitivity of the certificate holds). How well it is known is part of it. Sourc
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
 from typing import get_type_hints
 
@@ -84,6 +84,24 @@ class Delay(Filter):
     @property
     def group_delay_s(self) -> float:
         return self.delay_s
+
+
+@dataclass(frozen=True)
+class Highpass(Filter):
+    """The filter of first order of an AC-coupled instrument, 3 dB down at its corner; 0 at 0 Hz.
+
+    It is not divided out: `corner_apart` takes it out of the lines, and its corner is undone (calib.signal.corner).
+    """
+
+    corner_hz: float
+    u_corner_pct: float = 10.0
+
+    def __post_init__(self) -> None:
+        _positive(corner_hz=self.corner_hz)
+        _percent(u_corner_pct=self.u_corner_pct)
+
+    def at(self, frequency_hz: Array) -> Complex:
+        return np.asarray(frequency_hz / (frequency_hz - 1j * self.corner_hz))
 
 
 @dataclass(frozen=True)
@@ -249,7 +267,8 @@ class Table(Filter):
 
 
 KINDS: Mapping[str, type[Filter]] = {
-    "flat": Flat, "delay": Delay, "lowpass": Lowpass, "mean": Sinc, "sinc": Sinc, "fir": Fir, "table": Table,
+    "flat": Flat, "delay": Delay, "highpass": Highpass, "lowpass": Lowpass, "mean": Sinc, "sinc": Sinc, "fir": Fir,
+    "table": Table,
 }  # fmt: skip
 
 
@@ -279,6 +298,17 @@ def filter_of(text: str) -> Filter:
     if missing:
         raise ValueError(f"{kind} needs {', '.join(f'{name}=...' for name in missing)}")
     return made(**values)
+
+
+def corner_apart(lines: Sequence[str]) -> tuple[tuple[str, ...], tuple[float, float]]:
+    """The lines of text without that of a high-pass filter, and its corner and standard uncertainty in Hz; (0, 0) where
+    there is none. Raises ValueError where a line states no filter, or two are high-pass filters."""
+    filters = [filter_of(line) for line in lines]
+    found = [one for one in filters if isinstance(one, Highpass)]
+    if len(found) > 1:
+        raise ValueError(f"there are {len(found)} high-pass filters; state one, with the corner of all together")
+    corner = (found[0].corner_hz, found[0].corner_hz * found[0].u_corner_pct / 100.0) if found else (0.0, 0.0)
+    return tuple(line for line, one in zip(lines, filters, strict=True) if one not in found), corner
 
 
 def _numbers(name: str, value: str) -> tuple[float, ...]:

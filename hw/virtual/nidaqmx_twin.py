@@ -67,6 +67,7 @@ class NidaqmxTwin:
         self.plugged = True
         self.installed = True  # whether NI-DAQmx itself is installed
         self.rate_error = 0.0
+        self.kind = "NI 9234"
         self.task: Task | None = None  # the newest task
         self.modules: dict[str, Any] = {
             "nidaqmx": self,
@@ -90,7 +91,7 @@ class NidaqmxTwin:
 
     def device(self, name: str) -> Any:  # noqa: ARG002 - there is only one device
         """Properties of a device."""
-        return SimpleNamespace(product_type="NI 9234", serial_num=0x1A2B3C)
+        return SimpleNamespace(product_type=self.kind, serial_num=0x1A2B3C)
 
     def check(self) -> None:
         """Raise DaqError if the device is not connected."""

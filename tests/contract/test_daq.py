@@ -95,7 +95,8 @@ class TestMcc172(SensorContract):
 
     def test_how_it_is_set(self, rig: Mcc172Rig) -> None:
         info = rig.build(iepe=False, channel=1, serial_number="LW1234").open()
-        assert info.filters == (f"delay delay_s={39 / info.nominal_rate_hz:.6g}",)  # of the board alone
+        delay = f"delay delay_s={39 / info.nominal_rate_hz:.6g}"
+        assert info.filters == ("highpass corner_hz=0.78 u_corner_pct=10", delay)  # of the board alone
         assert (info.kind, info.unit, info.serial_number) == ("MCC 172", "mV", "LW1234")
         assert info.settings == {
             "iepe": "0", "mV per unit": "1000", "rate_hz": "3200", "channel": "1", "board": "01ABCDEF",
@@ -172,6 +173,7 @@ class TestMccUsb(SensorContract):
         info = rig.open()
         assert (info.kind, info.unit, info.axes) == ("USB-1808X", "mV", rig.axes)
         assert (info.settings["board"], info.settings["range_v"]) == ("01F2A3B4", "10")
+        assert info.filters == ()
 
     def test_three_inputs_keep_their_order(self, rig: MccUsbRig) -> None:
         rig.open()
@@ -194,7 +196,7 @@ class TestMccUsb(SensorContract):
 
     def test_a_current_that_the_board_has_not(self, rig: MccUsbRig) -> None:
         rig.twin.iepe = False
-        rig.build(iepe=False).open()
+        assert rig.build(iepe=False).open().filters == ()
         with pytest.raises(ConfigurationError, match="iepe = true, but the board has no IEPE current"):
             rig.build(iepe=True).open()
 
@@ -256,6 +258,12 @@ class TestNi(SensorContract):
         (added,) = rig.twin.task.inputs
         assert (added.ai_coupling.name, added.ai_excit_src.name) == ("AC", "INTERNAL")
         assert (added.ai_excit_voltage_or_current.name, added.ai_excit_val) == ("USE_CURRENT", pytest.approx(2.1e-3))
+        assert info.filters == ("highpass corner_hz=0.6 u_corner_pct=50",)
+
+    @pytest.mark.parametrize(("kind", "coupled"), [("NI 9234", False), ("NI 9233", True), ("PXIe-4497", True)])
+    def test_devices_that_are_always_ac_coupled_say_so(self, rig: NiRig, kind: str, *, coupled: bool) -> None:
+        rig.twin.kind = kind
+        assert rig.open().filters == (("highpass corner_hz=0.6 u_corner_pct=50",) if coupled else ())
 
     def test_without_a_current_nothing_is_said_of_it(self, rig: NiRig) -> None:
         rig.open()

@@ -7,7 +7,7 @@ bench turns the sensor on a clamp beside a uniaxial reference, the building has 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +44,7 @@ class Devices:
     level_mps2: float = 0.3
     lines: int = 40  # of the motion of each axis
     lost: tuple[int, ...] = ()  # samples of the reference, by number
+    reference_filters: tuple[str, ...] = ()  # as its driver states them
 
 
 class Motion:
@@ -105,8 +106,8 @@ class Recording:
     def _feels(self) -> float:
         return 0.0 if self.devices.sensor_corner_hz else 1.0
 
-    def through_agent(self, **sections: Any) -> list[Result]:
-        """All results of a pipeline that is fed the recording."""
+    def through_agent(self, *, reference_stated_from_s: float = 0.0, **sections: Any) -> list[Result]:
+        """All results of a pipeline that is fed the recording. Before this time the reference's driver is silent."""
         d = self.devices
         axes = {"s": 3, "r": self.x.shape[1]}
         rates = {"s": d.rate_hz, "r": d.reference_rate_hz}
@@ -127,8 +128,11 @@ class Recording:
         serial = [{"name": n, "driver": "serial-csv", "options": {"port": n, "rate_hz": rates[n]}} for n in "sr"]
         run = Run(parse_config({"devices": serial, "channels": [channel | sections]}, ""))
         infos = {n: DeviceInfo("serial-csv", "serial-csv", n, "m/s2", axes[n], rates[n]) for n in "rs"}
+        stated = {"r": replace(infos["r"], filters=d.reference_filters)}
         blocks = [*self._blocks("s", self.V, d.rate_hz), *self._blocks("r", self.x, d.reference_rate_hz)]
-        events = [*opened(infos), *ticked(sorted(blocks, key=lambda b: b.t_monotonic_ns)), tick(self.duration_s + 20.0)]
+        whole = [*ticked(sorted(blocks, key=lambda b: b.t_monotonic_ns)), tick(self.duration_s + 20.0)]
+        first = sum(event.t_monotonic_ns <= reference_stated_from_s * 1e9 for event in whole)
+        events = [*opened(infos), *whole[:first], *opened(stated), *whole[first:]]
         return [result for event in events for result in run.feed(event)]
 
     def _blocks(self, device: str, values: np.ndarray, rate_hz: float) -> list[SampleBlock]:

@@ -127,6 +127,17 @@ def calibrated(path: Path, *options: str) -> list[list[float]]:
     return json.loads(out.read_text())["sensitivity"]  # type: ignore[no-any-return]
 
 
+def test_calibrate_uses_the_corner_in_a_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    coupled = {**STATED, "reference": ("flat", "highpass corner_hz=0.01")}
+    with_it, without = recorded(tmp_path / "a", coupled), recorded(tmp_path / "b", STATED)
+    stated = calibrated(without, "--reference-corner-hz", "0.01", "--u-reference-corner-hz", "0.001")
+    capsys.readouterr()
+    assert calibrated(with_it) == stated
+    assert "--reference-corner-hz 0.01, as its driver states in the recording" in capsys.readouterr().err
+    own = ["--reference-corner-hz", "0.008", "--u-reference-corner-hz", "0.001"]
+    assert calibrated(with_it, *own) == calibrated(without, *own) != stated
+
+
 def test_calibrate_uses_the_filters_in_a_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with_them, without = recorded(tmp_path / "a", STATED), recorded(tmp_path / "b", {})
     options = ["--sensor-filter", NEAR_TEXT[0], "--reference-filter", "flat"]
@@ -164,7 +175,7 @@ def test_check_tells_which_filters_are_used_and_who_states_them(
         "  filters of a, stated by the driver adxl345: lowpass order=1 corner_hz=50 u_corner_pct=50",
         "  filters of b, stated by the driver serial-csv: mean points=4 rate_hz=200",
         "  filters of c: none stated; its response is estimated with S",
-        "  filters of b, stated by prior.filters: flat",
+        "  filters of b, stated by prior: flat",
         "  filters of c, stated by the certificate: flat u_pct=1",
     ]
     assert run_cli(["check", str(path), "--json", "-"]) == 0
@@ -251,6 +262,7 @@ def test_a_state_of_the_version_before_goes_on_and_its_filters_are_others() -> N
     [
         (["lowpass corner=31"], "'corner=31': lowpass takes corner_hz=..., order=..., u_corner_pct=..."),
         (["flat"] * 9, "there are 9 filters, at most 8 are allowed"),
+        (["highpass corner_hz=1"] * 2, "there are 2 high-pass filters; state one, with the corner of all together"),
         ("flat", "a list of texts is needed, one for each filter"),
         ([1.0], "a list of texts is needed, one for each filter"),
     ],

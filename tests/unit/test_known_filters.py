@@ -63,7 +63,7 @@ def test_a_table_gives_its_rows_and_is_smooth_between() -> None:
 
 
 @pytest.mark.parametrize(("text", "told"), [
-    ("", "'' is no kind of filter; give one of flat, delay, lowpass"),
+    ("", "'' is no kind of filter; give one of flat, delay, highpass, lowpass"),
     ("low order=2", "'low' is no kind of filter"),
     ("lowpass", "lowpass needs corner_hz=..."),
     ("lowpass corner_hz=31 q=2", "'q=2': lowpass takes corner_hz=..., order=..., u_corner_pct=..."),
@@ -71,6 +71,8 @@ def test_a_table_gives_its_rows_and_is_smooth_between() -> None:
     ("lowpass corner_hz=inf", "corner_hz: 'inf' is not finite"),
     ("lowpass corner_hz=31,32", "corner_hz: 2 numbers; give one"),
     ("lowpass corner_hz=0.2", "corner_hz: 0.2; give a number from 1 on"),
+    ("highpass corner_hz=0", "corner_hz: 0; give a number above 0"),
+    ("highpass corner_hz=0.8 u_corner_pct=51", "u_corner_pct: 51; give a number from 0 to 50"),
     ("lowpass corner_hz=31 order=1.5", "order: 1.5; give a whole number"),
     ("lowpass corner_hz=31 corner_hz=31", "corner_hz is given twice"),
     ("sinc points=0 rate_hz=1", "points: 0; give a number from 1 to 1e+06"),
