@@ -21,7 +21,7 @@ import numpy as np
 
 from agent.recording.messages import MessageError, decode
 from agent.recording.raw_block import encode_block
-from hw import adxl355_registers, iio_scan, lsm6dso_registers, miniseed
+from hw import adxl355_registers, iio_scan, lsm6dso_registers, miniseed, shake_datagram
 from hw.block import SampleBlock
 from hw.cutting import Cutter
 from hw.fifo import plain_samples
@@ -33,7 +33,7 @@ from hw.serial_binary import BinaryStream, SerialBinaryOptions
 from hw.serial_sensor import Stream
 from hw.sound_card import read_plate
 from hw.sparkplug_pb2 import Payload
-from hw.virtual import adxl355_twin, lsm6dso_twin, seedlink_twin, witmotion_twin
+from hw.virtual import adxl355_twin, lsm6dso_twin, seedlink_twin, shake_twin, witmotion_twin
 from hw.witmotion import WitStream
 
 STREAMS = 1_000_000
@@ -80,6 +80,7 @@ def parsers() -> dict[str, tuple[bytes, Parse]]:
         "serial-binary": (frames, _fed(BinaryStream(Cutter("b", 100.0), binary))),
         "serial-csv": (lines, _fed(LineStream(Cutter("l", 100.0), LINE, longest_gap=1000.0))),
         "seedlink": (seedlink_twin.record("AM.R1.00.ENZ", 0, 100, COUNTS[:, 0]), _miniseed),
+        "shake-udp": (shake_twin.datagram("ENZ", 1_582_315_130_292_000_000, COUNTS[:, 0]), _shake),
         "mqtt, sparkplug-b": (_sparkplug(), _payload(Sparkplug(("x",), "n"))),
         "mqtt, json": (b'{"x": [1, 2.5], "n": 7, "timestamp": 1e12}', _payload(Json(("x",), "n"))),
         "iio": (b"le:s20/32>>12", _iio),
@@ -159,6 +160,11 @@ def _miniseed(data: bytes, i: int) -> None:
     whole[52] = (3, 4, 5, 10, 11)[i % 5]  # the encoding
     with contextlib.suppress(miniseed.RecordError):
         miniseed.decode(bytes(whole))
+
+
+def _shake(data: bytes, i: int) -> None:  # noqa: ARG001 - all streams are treated alike
+    with contextlib.suppress(shake_datagram.DatagramError):
+        shake_datagram.decode(data)
 
 
 def _payload(decoder: Sparkplug | Json) -> Parse:

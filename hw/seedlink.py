@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import ClassVar
 
 from pydantic import Field, field_validator
 
 from hw import miniseed
-from hw.alignment import Alignment
-from hw.block import BlockFlags, DeviceInfo
-from hw.message_sensor import OUTSIDE, MessageSensor, Piece
+from hw.block import DeviceInfo
 from hw.seedlink_link import Link
 from hw.sensor import DeviceLost, Options
+from hw.stamped_sensor import StampedSensor
 
 RATE_TOLERANCE = 0.01  # relative; records with another rate are another channel
-STEP_S = 0.1  # a record of several seconds becomes bursts of this length, whose times follow from its start time
 UNREADABLE = "bytes that are no record of miniSEED 2"
-ALONE = "samples that one axis had and another had not"
-REPEATED = "samples that came twice"
 
 
 class SeedlinkOptions(Options):
@@ -57,12 +52,8 @@ class SeedlinkOptions(Options):
         )
 
 
-class Seedlink(MessageSensor):
-    """Counts of one channel or three, at the times that the station stamped on its records.
-
-    Station and gateway must both follow UTC (GPS, NTP or PTP): the times of the samples are the station's, so an error
-    of either clock is a lag.
-    """
+class Seedlink(StampedSensor):
+    """Counts of one channel or three, at the times that the station stamped on its records."""
 
     options_model: ClassVar[type[Options]] = SeedlinkOptions
 
@@ -75,11 +66,10 @@ class Seedlink(MessageSensor):
     def _connect(self) -> DeviceInfo:
         o = self._options
         self._axis = {f"{o.network}.{o.station}.{o.location}.{channel}": k for k, channel in enumerate(o.channels)}
-        self._alignment = Alignment(len(o.channels), o.rate_hz)
         self._link = Link(self._where(), self._clock, self._sleep)
         selectors = [f"{o.location}{channel}.D" for channel in o.channels]
         self._link.connect(o.host, o.port, o.station, o.network, selectors)
-        self._follow_utc()
+        self._align()
         return DeviceInfo(
             driver="seedlink",
             kind="SeedLink",
@@ -95,27 +85,12 @@ class Seedlink(MessageSensor):
         if link is not None:
             link.close()
 
-    def _receive(self) -> Iterator[Piece]:
+    def _take_messages(self) -> None:
         assert self._link is not None
-        if self._follow_utc():
-            self._alignment.restart()
         for data in self._link.records():
-            self._add(data)
-        for together in self._alignment.take():
-            flags, missing = together.flags, together.missing
-            step = max(1, round(STEP_S * self._options.rate_hz))
-            for begin in range(0, len(together.indications), step):
-                part = together.indications[begin : begin + step]
-                last = (begin + len(part) - 1) / self._options.rate_hz
-                t_utc_ns = together.start_ns + round(last * 1e9)
-                yield Piece(part, t_utc_ns - self._utc_ns, t_utc_ns, flags, missing)
-                flags, missing = BlockFlags.NONE, 0
-        for reason, count in ((ALONE, self._alignment.alone), (REPEATED, self._alignment.repeated)):
-            if count:
-                self._dropped["samples", reason] += count
-        self._alignment.alone = self._alignment.repeated = 0
+            self._take(data)
 
-    def _add(self, data: bytes) -> None:
+    def _take(self, data: bytes) -> None:
         """Take one record. Raises DeviceLost where its rate is not the configured one."""
         try:
             record = miniseed.decode(data)
@@ -129,8 +104,4 @@ class Seedlink(MessageSensor):
         rate_hz = self._options.rate_hz
         if abs(record.rate_hz - rate_hz) > RATE_TOLERANCE * rate_hz:
             raise DeviceLost(f"{self._where()}: {record.channel} has {record.rate_hz:g} Hz, not rate_hz {rate_hz:g}")
-        last_ns = record.start_ns + round((len(record.samples) - 1) / rate_hz * 1e9) - self._utc_ns
-        if self._is_timely(last_ns):
-            self._alignment.add(axis, record.start_ns, record.samples)
-        else:
-            self._dropped["samples", OUTSIDE] += len(record.samples)
+        self._add(axis, record.start_ns, record.samples)

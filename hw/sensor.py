@@ -63,6 +63,11 @@ class Options(BaseModel):
         return ""
 
     @property
+    def quantity(self) -> str:
+        """What the device measures, "acceleration", "velocity" or "displacement"; "" where the driver does not know."""
+        return ""
+
+    @property
     def known_filters(self) -> tuple[str, ...]:
         """The filters of the device as these options set it, as in DeviceInfo; empty where they are not known."""
         return ()
@@ -124,6 +129,7 @@ BUILT_IN: Mapping[str, str] = {
     "seedlink": "hw.seedlink:Seedlink",
     "serial-binary": "hw.serial_binary:SerialBinary",
     "serial-csv": "hw.serial_stream:SerialCsv",
+    "shake-udp": "hw.shake_udp:ShakeUdp",
     "sound-card": "hw.sound_card:SoundCard",
     "virtual": "hw.virtual.device:Virtual",
     "witmotion": "hw.witmotion:WitMotion",

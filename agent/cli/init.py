@@ -24,7 +24,7 @@ from agent.setup.toml import written
 from agent.terminal.text import say
 from calib.signal.instrument import QUANTITIES
 from hw.fifo_sensor import FifoSensor
-from hw.sensor import load_driver
+from hw.sensor import Options, load_driver
 from hw.serial_ports import lasting_name, serial_ports
 from hw.units import nominal_sensitivity
 
@@ -254,7 +254,7 @@ def _answers(asking: Asking, devices: list[Chosen], given: dict[str, Any]) -> ta
         sensitivity=_sensitivity(asking, sensor, given["sensitivity"]),
         u_main_pct=of(Prior, "u_main_pct", "u_sensitivity_pct"),
         quantity=_quantity(given["reference_quantity"], reference),
-        reference_sensitivity=_reference_sensitivity(given["reference_sensitivity"], reference),
+        reference_sensitivity=_reference_sensitivity(asking, given["reference_sensitivity"], reference),
         u_reference_pct=of(Certificate, "u_sensitivity_pct", "u_reference_pct"),
         reference_serial=of(Certificate, "serial_number", "reference_serial"),
         calibrated=of(Certificate, "calibrated", "calibrated"),
@@ -281,6 +281,8 @@ def _axes(device: Chosen) -> int:
     """Number of axes: as an option states it; otherwise 3 of a chip or of another device with all its axes."""
     if (axes := device.value("axes")) is not None:
         return int(axes)
+    if isinstance(channels := device.value("channels"), list):
+        return len(channels)
     driver = load_driver(device.driver.value)
     chip = isinstance(driver, type) and issubclass(driver, FifoSensor)
     return 3 if chip or device.driver.value in ("iio", "witmotion") else 1
@@ -290,10 +292,8 @@ def _sensitivity(asking: Asking, sensor: Chosen, given: float | None) -> Stated[
     """The sensor's nominal sensitivity; None where its driver knows it."""
     if given is not None:
         return Stated(given, "option --sensitivity")
-    model = load_driver(sensor.driver.value).options_model
-    try:
-        options = model.model_validate({n: held.value for n, held in sensor.options.items() if held.value is not None})
-    except ValueError:
+    options = _options(sensor)
+    if options is None:
         return Stated(None, "missing")  # the check of the whole configuration names the fault
     if options.tells_sensitivity:
         return Stated(None, "the driver knows it")
@@ -301,12 +301,24 @@ def _sensitivity(asking: Asking, sensor: Chosen, given: float | None) -> Stated[
     return asking.value("--sensitivity", None, question + sensor.hint, kind=float)
 
 
-def _reference_sensitivity(given: float | None, reference: Chosen | None) -> Stated[Any]:
+def _options(device: Chosen) -> Options | None:
+    """The options of a device as its driver takes them; None where it refuses them."""
+    model = load_driver(device.driver.value).options_model
+    try:
+        return model.model_validate({n: held.value for n, held in device.options.items() if held.value is not None})
+    except ValueError:
+        return None
+
+
+def _reference_sensitivity(asking: Asking, given: float | None, reference: Chosen | None) -> Stated[Any]:
     """Indication of the reference per SI unit: as stated, or as its unit says."""
     if given is not None:
         return Stated(given, "option --reference-sensitivity")
     if reference is not None and (known := nominal_sensitivity(reference.value("unit"))) is not None:
         return Stated(known, "the unit of the reference is g")
+    options = None if reference is None else _options(reference)
+    if options is not None and (asked := options.asked_of_certificate):
+        return asking.value("--reference-sensitivity", None, f"sensitivity of the reference: {asked}", kind=float)
     return _default(Certificate, "sensitivity")
 
 
@@ -315,4 +327,5 @@ def _quantity(given: str | None, reference: Chosen | None) -> Stated[str]:
         return Stated(given, "option --reference-quantity")
     if reference is not None and reference.value("unit") == "m/s":
         return Stated("velocity", "unit of the reference")
-    return _default(Certificate, "quantity")
+    known = "" if reference is None or (options := _options(reference)) is None else options.quantity
+    return Stated(known, "the channels of the reference") if known else _default(Certificate, "quantity")

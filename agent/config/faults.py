@@ -89,17 +89,23 @@ def _unknown_sensitivities(raw: Mapping[str, Any], options: Mapping[str, Options
 
 
 def _uncertified_references(raw: Mapping[str, Any], options: Mapping[str, Options]) -> Iterator[Told]:
-    """References that do not indicate SI units, without the sensitivity in their certificate: it would be 1."""
+    """References that do not indicate SI units, without the sensitivity in their certificate: it would be 1; and those
+    that measure another quantity than their certificate says."""
     for i, channel in enumerate(_entries(raw, "channels")):
         beside = channel.get("check_reference")
         places: list[tuple[Path, Any, Any]] = [((), channel.get("reference"), channel.get("certificate"))]
         if isinstance(beside, Mapping):
             places.append((("check_reference",), beside.get("device"), beside.get("certificate")))
         for path, device, certificate in places:
-            held = certificate if isinstance(certificate, Mapping) else {}
+            if device not in options:
+                continue
+            held, driver = certificate if isinstance(certificate, Mapping) else {}, options[str(device)]
             stated = held.get("sensitivity") or held.get("file")
-            if stated is None and device in options and (asked := options[str(device)].asked_of_certificate):
+            if stated is None and (asked := driver.asked_of_certificate):
                 yield ("channels", i, *path, "certificate", "sensitivity"), f"is missing for {device!r}: {asked}"
+            if driver.quantity and held.get("quantity", "acceleration") != driver.quantity:
+                what = f'must be "{driver.quantity}": that is what {device!r} measures'
+                yield ("channels", i, *path, "certificate", "quantity"), what
 
 
 def _file_faults(raw: Mapping[str, Any]) -> Iterator[Told]:

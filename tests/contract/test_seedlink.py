@@ -16,8 +16,9 @@ from hw import miniseed
 from hw.block import BlockFlags, Drop
 from hw.conformance.network import NetworkRig
 from hw.conformance.sensor import EPOCH_NS, SensorContract
-from hw.seedlink import ALONE, REPEATED, Seedlink, SeedlinkOptions
+from hw.seedlink import Seedlink, SeedlinkOptions
 from hw.sensor import ConfigurationError, DeviceLost
+from hw.stamped_sensor import ALONE
 from hw.virtual.seedlink_twin import SeedLinkTwin, record
 
 LAP = 100_000
@@ -115,7 +116,7 @@ class TestSeedlink(SensorContract):
             rig.send(code, rig.server.next - 100, samples)
         block = next(rig.blocks(0.1))
         assert block.flags == BlockFlags.NONE
-        assert rig.sensor.take_drops() == [Drop(300, "samples", REPEATED)]
+        assert rig.sensor.take_drops() == [Drop(300, "samples", Seedlink.repeated)]
 
     def test_hostile_records(self, rig: SeedLinkRig) -> None:
         rig.open()

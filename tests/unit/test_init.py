@@ -113,6 +113,24 @@ def test_beside_a_reference_with_three_axes(tmp_path: Path) -> None:
     assert channel.rotation == (1, 0, 0, 0, 1, 0, 0, 0, 1)
 
 
+@pytest.mark.usefixtures("chip")
+def test_a_geophone_that_sends_datagrams(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    path = tmp_path / "gateway.toml"
+    options = stated("reference", 'channels=["EHE", "EHN", "EHZ"]', "source=192.168.1.7")
+    arguments = ["--reference", "shake-udp", *options]
+    assert "counts" in refused(capsys, path, *arguments)[0]
+    assert run_cli(["init", str(path), *arguments, "--reference-sensitivity", "399650000"]) == 0
+    config = load_config(path)
+    assert (config.devices[1].driver, config.devices[1].options["source"]) == ("shake-udp", "192.168.1.7")
+    (channel,) = config.channels
+    assert (channel.certificate.quantity, channel.certificate.sensitivity) == ("velocity", 399650000.0)
+    assert channel.rotation == (1, 0, 0, 0, 1, 0, 0, 0, 1)
+    assert run_cli(["check", str(path)]) == 0
+    path.write_text(path.read_text().replace('quantity = "velocity"', 'quantity = "acceleration"'))
+    assert run_cli(["check", str(path)]) == 2
+    assert 'certificate.quantity: must be "velocity": that is what' in capsys.readouterr().err
+
+
 def test_all_that_is_missing_is_told_at_once(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     path = tmp_path / "gateway.toml"
     sensor = ["--sensor-port", "/dev/a", *stated("sensor", "rate_hz=100", "axes=3", "sequence=true", "unit=count")]
