@@ -1,4 +1,9 @@
-"""Driver `iio`: an accelerometer that a Linux kernel driver (industrial I/O) reads, through the kernel's buffer."""
+"""Driver `iio`: an accelerometer that a Linux kernel driver (industrial I/O) reads, through the kernel's buffer.
+
+Kernel drivers that read the FIFO of a chip (adxl345, adxl372: drivers/iio/accel) pass its samples on together, without
+time stamps. The kernel's buffer (drivers/iio/buffer/kfifo_buf.c) has a length rounded up to a power of two; when it is
+full, new samples are dropped, and nobody is told.
+"""
 
 from __future__ import annotations
 
@@ -10,19 +15,26 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from hw import iio_scan
 from hw.block import BlockFlags, DeviceInfo
 from hw.cutting import Break, Cutter, Stretch
+from hw.pace import Pace
 from hw.polling import PollingSensor
 from hw.sensor import ConfigurationError, DeviceLost, Options
 
 SYSFS, DEV = Path("/sys/bus/iio/devices"), Path("/dev")
-BUFFER_S = 4.0  # length of the kernel's buffer
+BUFFER_S = 4.0  # least length of the kernel's buffer
+UNSTAMPED_POLL_S = 0.01  # between polls, where the arrival is the only stamp
 READ_BYTES = 1 << 20
 LONGEST_GAP = 100  # samples; the length of a longer gap is uncertain if the rate is 1 % off
 AXES = ("accel_x", "accel_y", "accel_z")
+STAMP = "timestamp"
+TOGETHER = ("watermark", "hwfifo_watermark")  # files in `buffer`: samples that come together
+MOST_MISSING = 4  # blocks one after the other that do not fit the clock: then the rate is another one
+MISSING = "samples among which others are missing, by their number against the clock"
 OFF = ("in_accel_x_calibbias", "in_accel_y_calibbias", "in_accel_z_calibbias")
 HIGH_PASS = "in_accel_filter_high_pass_3db_frequency"
 LOW_PASS = "in_accel_filter_low_pass_3db_frequency"
@@ -40,8 +52,10 @@ class IioOptions(Options):
 class Iio(PollingSensor):
     """Reads the files in sysfs and the device's node; needs no library.
 
-    The kernel stamps every sample at its interrupt (CLOCK_MONOTONIC), so each sample is a burst with this arrival time.
-    A larger step between two stamps tells how many samples the buffer dropped.
+    Where the kernel stamps every sample at its interrupt (CLOCK_MONOTONIC), each sample is a burst with this arrival
+    time, and a larger step between two stamps tells how many samples the buffer dropped. Where it does not, each read
+    is a burst. Samples are then lost, an unknown number, after a read that found the buffer full, and where the number
+    of samples falls behind the clock by more than those that come together and those of the time between two polls.
     """
 
     options_model = IioOptions
@@ -54,6 +68,10 @@ class Iio(PollingSensor):
         self._directory = SYSFS
         self._data = b""  # scans that were read, and the beginning of the next one
         self._last_ns: int | None = None
+        self._bursts: list[tuple[int, int]] = []  # arrival of each read, and the number of scans in `_data` then
+        self._polled_ns = 0  # the last poll
+        self._unfit = 0  # blocks one after the other that did not fit the clock
+        self._pace = Pace(options.rate_hz)
 
     def _where(self) -> str:
         return f"IIO device {self._options.device} (/dev/{self._directory.name})"
@@ -78,6 +96,9 @@ class Iio(PollingSensor):
             raise (ConfigurationError if held else DeviceLost)(message) from error
         self._data = b""
         self._last_ns = None
+        self._bursts, self._unfit = [], 0
+        self._pace = Pace(self._options.rate_hz, self._together())
+        self._polled_ns = self._clock()[0]
         self._cutter.flag(BlockFlags.RESTART)
         return DeviceInfo(
             driver="iio",
@@ -102,21 +123,51 @@ class Iio(PollingSensor):
                 (self._directory / "buffer" / "enable").write_text("0")
 
     def _wait(self) -> None:
-        self._sleep(self.poll_s)  # the stamps are the kernel's: polls need not be spread over a sample period
+        # The stamps are the kernel's, so that polls need not be spread; else they avoid a beat with the interrupts.
+        self._sleep(self.poll_s if self._stamped else UNSTAMPED_POLL_S * (0.5 + self._next_phase()))
 
     def _poll_once(self) -> bool:
         assert self._file is not None
-        self._data += self._read(self._file)
+        data = self._read(self._file)
+        self._data += data
+        while len(data) == READ_BYTES:
+            data = self._read(self._file)
+            self._data += data
+        if not self._stamped:
+            self._note_arrival()
         return True
 
+    def _note_arrival(self) -> None:
+        """The scans that this poll found came after the poll before. Of a full buffer what came next was dropped."""
+        before_ns, self._polled_ns = self._polled_ns, self._clock()[0]
+        count = len(self._data) // self._scan.itemsize
+        new = count - (self._bursts[-1][1] if self._bursts else 0)
+        if not new:
+            return
+        self._bursts.append((self._polled_ns, count))
+        self._pace.add((self._polled_ns + before_ns) // 2, (self._polled_ns - before_ns) // 2, new)
+        if new >= self._length:
+            self._finish()
+            self._begin_again()
+
+    def _begin_again(self) -> None:
+        """The samples from now on do not follow those before."""
+        self._pace.restart()
+        self._cutter.flag(BlockFlags.RESTART | BlockFlags.OVERRUN)
+
     def _finish(self) -> None:
-        now_ns, utc_ns = self._clock()
         whole = len(self._data) // self._scan.itemsize * self._scan.itemsize
         scans, self._data = np.frombuffer(self._data[:whole], self._scan), self._data[whole:]
         if not len(scans):
             return
-        stamps_ns = self._elements["timestamp"].value(scans["timestamp"])
         counts = np.column_stack([self._elements[axis].value(scans[axis]) for axis in AXES]).astype(np.int32)
+        if self._stamped:
+            self._finish_stamped(counts, self._elements[STAMP].value(scans[STAMP]))
+        else:
+            self._finish_unstamped(counts)
+
+    def _finish_stamped(self, counts: NDArray[np.int32], stamps_ns: NDArray[np.int64]) -> None:
+        now_ns, utc_ns = self._clock()
         lost = iio_scan.missing(stamps_ns, self._last_ns, self._options.rate_hz)
         self._last_ns = int(stamps_ns[-1])
         breaks = [
@@ -128,6 +179,28 @@ class Iio(PollingSensor):
             counts, stamps_ns[newer], np.flatnonzero(newer) + 1, utc_ns - now_ns + int(stamps_ns[newer][-1])
         )
         self._ready.extend(self._cutter.cut(stretch, breaks))
+
+    def _finish_unstamped(self, counts: NDArray[np.int32]) -> None:
+        bursts, self._bursts = np.array(self._bursts, np.int64), []
+        self._unfit = self._unfit + 1 if self._pace.missing else 0
+        if self._unfit:
+            self._dropped["samples", MISSING] += len(counts)
+            self._begin_again()
+            if self._unfit == MOST_MISSING:
+                raise DeviceLost(self._other_rate(bursts))
+            return
+        now_ns, utc_ns = self._clock()
+        stretch = Stretch(counts, bursts[:, 0], bursts[:, 1], utc_ns - now_ns + int(bursts[-1, 0]))
+        self._ready.extend(self._cutter.cut(stretch))
+
+    def _other_rate(self, bursts: NDArray[np.int64]) -> str:
+        """What is told where no block fits the clock."""
+        ns, count = (bursts[-1] - bursts[0]).tolist()
+        return (
+            f"/dev/{self._directory.name}: {count} samples came in {1e-9 * ns:.3g} s, which is not rate_hz "
+            f"{self._options.rate_hz:g} within 10 %; state the rate of the device or its trigger, or use a rate that "
+            "the kernel driver can read without loss"
+        )
 
     def _read(self, file: int) -> bytes:
         try:
@@ -161,32 +234,40 @@ class Iio(PollingSensor):
         wanted |= {here / name: "0" for name in (*OFF, HIGH_PASS) if (here / name).exists()}
         if self._options.trigger is not None:
             wanted[here / "trigger" / "current_trigger"] = self._options.trigger
-        wanted[here / "current_timestamp_clock"] = "monotonic"
+        if (clock := here / "current_timestamp_clock").exists():  # only where there is a time stamp
+            wanted[clock] = "monotonic"
         for path, value in wanted.items():
             _write(path, value)
             found = _text(path)
             if found != value and not _same_number(found, value):
                 raise ConfigurationError(f"{path}: wrote {value}, the kernel driver set {found}")
         self._elements = self._choose(here / "scan_elements")
+        self._stamped = STAMP in self._elements
         self._scan = iio_scan.layout(self._elements)
         bits = self._elements["accel_x"].bits
         self._cutter.lowest, self._cutter.highest = -(2.0 ** (bits - 1)), 2.0 ** (bits - 1) - 1
-        _write(here / "buffer" / "length", str(round(BUFFER_S * self._options.rate_hz)))
+        self._length = 1 << math.ceil(math.log2(max(2.0, BUFFER_S * self._options.rate_hz)))
+        _write(here / "buffer" / "length", str(self._length))
         _write(here / "buffer" / "enable", "1")
         kept = [here / "name", here / "in_accel_scale", here / "in_accel_offset", *wanted]
         return {path.name: _text(path) for path in kept if path.exists()}
 
+    def _together(self) -> int:
+        """The most samples that the kernel driver passes on together, as its files say."""
+        there = [path for name in TOGETHER if (path := self._directory / "buffer" / name).exists()]
+        return round(max([1.0, *(_number(path) for path in there)]))
+
     def _choose(self, directory: Path) -> dict[str, iio_scan.Element]:
-        """Store the acceleration and the time stamp in the buffer and nothing else; returns the stored elements."""
+        """Store the acceleration, and the time stamp if there is one, and nothing else; returns the stored elements."""
         elements = {}
         for path in sorted(directory.glob("in_*_en")):
             name = path.name.removeprefix("in_").removesuffix("_en")
-            chosen = name in (*AXES, "timestamp")
+            chosen = name in (*AXES, STAMP)
             _write(path, "1" if chosen else "0")
             if chosen:
                 index = int(_number(directory / f"in_{name}_index"))
                 elements[name] = iio_scan.Element.parse(index, _text(directory / f"in_{name}_type"))
-        absent = [name for name in (*AXES, "timestamp") if name not in elements]
+        absent = [name for name in AXES if name not in elements]
         if absent:
             raise ConfigurationError(f"{directory}: the device does not have {', '.join(absent)}")
         return elements

@@ -20,11 +20,13 @@ class Pace:
     """Holds the counts of some seconds against one constant rate.
 
     A device that samples at a constant rate f has made floor(f (t - t0)) samples at time t. Where no f and t0 fit all
-    counts, samples were taken out of the FIFO or lost between them.
+    counts, samples were taken out of the FIFO or lost between them. `together`: the samples come so many at a time, so
+    that a count may be behind by as many.
     """
 
-    def __init__(self, rate_hz: float) -> None:
+    def __init__(self, rate_hz: float, together: int = 1) -> None:
         self._rate_hz = rate_hz
+        self._together = together
         self._polls: deque[tuple[int, int, int]] = deque(maxlen=POLLS)  # earliest and latest time in ns, samples so far
         self._count = 0
 
@@ -41,7 +43,7 @@ class Pace:
     @property
     def missing(self) -> bool:
         """Whether no constant rate fits all counts, so that samples are missing."""
-        return self._fit()[0] > 1.0 + MISSING
+        return self._fit()[0] > self._together + MISSING
 
     @property
     def proved(self) -> bool:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import shutil
+import struct
+import termios
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 NODE = "iio:device0"
-SCAN = np.dtype([("x", ">i2"), ("y", ">i2"), ("z", ">i2"), ("_", "V2"), ("timestamp", "<i8")])
+UNSTAMPED = np.dtype([("x", ">i2"), ("y", ">i2"), ("z", ">i2")])
+SCAN = np.dtype([*((axis, ">i2") for axis in "xyz"), ("_", "V2"), ("timestamp", "<i8")])
 FILES = {
     "name": "twin345",
     "in_accel_scale": "0.038300",
@@ -43,7 +47,8 @@ class IioTwin:
     - `stamps_ns(first, n)` returns their stamps.
     - `samples_due(t_s)`: number of samples that exist at `t_s`.
 
-    A full buffer drops the newest samples, like the kernel's.
+    `stamped`: whether it has a time stamp. `together`: how many samples of a FIFO the kernel driver passes on at a
+    time. A full buffer drops the newest samples, like the kernel's.
     """
 
     def __init__(
@@ -52,11 +57,16 @@ class IioTwin:
         source: Callable[[int, int], NDArray[np.int32]],
         stamps_ns: Callable[[int, int], NDArray[np.int64]],
         samples_due: Callable[[float], int],
+        *,
+        stamped: bool = True,
+        together: int = 1,
     ) -> None:
         self.sysfs, self.dev = root / "sys", root / "dev"
         self._source = source
         self._stamps_ns = stamps_ns
         self._samples_due = samples_due
+        self._scan = SCAN if stamped else UNSTAMPED
+        self._together = together
         self.next = 0
         self._pending = b""
         self._pipe: int | None = None
@@ -64,7 +74,8 @@ class IioTwin:
 
     def plug(self) -> None:
         """Bind the kernel driver: files and node exist."""
-        for name, text in FILES.items():
+        files = {name: text for name, text in FILES.items() if self._scan is SCAN or "timestamp" not in name}
+        for name, text in (files | {"buffer/watermark": "1", "buffer/hwfifo_watermark": str(self._together)}).items():
             path = self.sysfs / NODE / name
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text)
@@ -82,20 +93,22 @@ class IioTwin:
 
     def serve(self, t_s: float) -> None:
         """Store the samples made up to `t_s`, and pass on as many as the reader has room for."""
-        due = self._samples_due(t_s)
+        due = self._samples_due(t_s) // self._together * self._together
         first, self.next = self.next, max(self.next, due)
         if self._pipe is None:
             return
         if (self.sysfs / NODE / "buffer" / "enable").read_text() != "1":
             self._pending = b""
             return
-        room = int((self.sysfs / NODE / "buffer" / "length").read_text()) - len(self._pending) // SCAN.itemsize
+        waiting = struct.unpack("I", fcntl.ioctl(self._pipe, termios.FIONREAD, bytes(4)))[0] + len(self._pending)
+        room = int((self.sysfs / NODE / "buffer" / "length").read_text()) - waiting // self._scan.itemsize
         n = min(self.next - first, room)
-        scans = np.zeros(n, SCAN)
+        scans = np.zeros(n, self._scan)
         counts = self._source(first, n)
         for i, axis in enumerate("xyz"):
             scans[axis] = counts[:, i] << 2
-        scans["timestamp"] = self._stamps_ns(first, n)
+        if self._scan is SCAN:
+            scans["timestamp"] = self._stamps_ns(first, n)
         self._pending += scans.tobytes()
         with contextlib.suppress(BlockingIOError):
             self._pending = self._pending[os.write(self._pipe, self._pending) :]

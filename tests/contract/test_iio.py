@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from calib.signal.timing import ClockModel
 from hw import iio
-from hw.block import BlockFlags
+from hw.block import BlockFlags, SampleBlock
 from hw.conformance.sensor import Rig, SensorContract
-from hw.iio import Iio, IioOptions
+from hw.iio import MISSING, Iio, IioOptions
 from hw.iio_scan import Element, layout
 from hw.sensor import ConfigurationError, DeviceLost
 from hw.virtual.iio_twin import IioTwin
@@ -23,9 +24,12 @@ LAP = 8000
 
 
 class IioRig(Rig):
-    def __init__(self, root: Path) -> None:
+    lost = 3  # samples
+    stamped = True
+
+    def __init__(self, root: Path, together: int = 1) -> None:
         self.saturated = range(0)
-        self.twin = IioTwin(root, self.counts, self.stamps_ns, self.due)
+        self.twin = IioTwin(root, self.counts, self.stamps_ns, self.due, stamped=self.stamped, together=together)
         self.sensor = self.build()
 
     def build(self, **changes: object) -> Iio:
@@ -56,7 +60,7 @@ class IioRig(Rig):
         self.saturated = range(first, last + 1)
 
     def lose(self) -> None:
-        self.twin.next += 3
+        self.twin.next += self.lost
 
     def unplug(self) -> None:
         self.twin.unplug()
@@ -69,14 +73,34 @@ class IioRig(Rig):
         self.twin.unplug()
 
 
+class UnstampedRig(IioRig):
+    lost = 40
+    stamped = False
+
+    def blocks(self, seconds: float) -> Iterator[SampleBlock]:
+        """As in the base, but a block among whose samples others are missing is dropped."""
+        samples, dropped = seconds * self.rate_hz, 0
+        while samples > 0:
+            block = self.sensor.read_block()
+            if block is None:
+                dropped += 1
+                assert dropped <= 4, "the device fell silent"
+            else:
+                samples -= block.n
+                yield block
+
+
+def installed(rig: IioRig, monkeypatch: pytest.MonkeyPatch) -> Iterator[IioRig]:
+    monkeypatch.setattr(iio, "SYSFS", rig.twin.sysfs)
+    monkeypatch.setattr(iio, "DEV", rig.twin.dev)
+    yield rig
+    rig.close()
+
+
 class TestIio(SensorContract):
     @pytest.fixture
     def rig(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[IioRig]:
-        rig = IioRig(tmp_path)
-        monkeypatch.setattr(iio, "SYSFS", rig.twin.sysfs)
-        monkeypatch.setattr(iio, "DEV", rig.twin.dev)
-        yield rig
-        rig.close()
+        yield from installed(IioRig(tmp_path), monkeypatch)
 
     def test_polls_do_not_beat_with_the_sample_clock(self, rig: IioRig) -> None:
         """Replaced, because the kernel stamps every sample and no poll can beat with the sample clock."""
@@ -178,6 +202,75 @@ class TestIio(SensorContract):
         assert blocks[-1].first_index + blocks[-1].n - rig.number(blocks[-1].indications)[
             -1
         ] == 1 + before.first_index + (before.n - 1 - rig.number(before.indications)[-1])
+
+
+class TestWithoutStamps(SensorContract):
+    """A kernel driver without a time stamp channel, as adxl372. A loss of fewer samples than two polls are apart is not
+    seen."""
+
+    @pytest.fixture
+    def rig(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[IioRig]:
+        yield from installed(UnstampedRig(tmp_path), monkeypatch)
+
+    def test_says_that_it_has_no_stamps(self, rig: IioRig) -> None:
+        assert "current_timestamp_clock" not in rig.sensor.open().settings
+
+    def test_a_full_buffer_is_told_where_it_dropped(self, rig: IioRig) -> None:
+        rig.open()
+        *_, before = rig.blocks(0.6)
+        rig.sleep(7.0)
+        held, after, *_ = rig.blocks(5.0)
+        numbers = [rig.number(block.indications) for block in (before, held, after)]
+        assert (held.flags, held.n, numbers[1][0]) == (BlockFlags.NONE, 4096, numbers[0][-1] + 1)
+        assert after.flags == BlockFlags.RESTART | BlockFlags.OVERRUN
+        assert numbers[2][0] > numbers[1][-1] + 2000
+
+    def test_a_rate_that_is_another_is_told(self, rig: IioRig) -> None:
+        rig.due = lambda t_s: int(t_s * 1250)  # type: ignore[method-assign]
+        rig.twin._samples_due = rig.due
+        rig.open()
+        with pytest.raises(
+            DeviceLost, match=r"6[0-9][0-9] samples came in 0\.[45].* s, which is not rate_hz 1000 within"
+        ):
+            list(rig.blocks(10.0))
+
+
+class TestTogether:
+    """A kernel driver that passes on 16 samples of the chip's FIFO at a time, without stamps, as adxl345."""
+
+    @pytest.fixture
+    def rig(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[IioRig]:
+        yield from installed(UnstampedRig(tmp_path, together=16), monkeypatch)
+
+    def test_each_lot_is_a_burst_with_its_arrival(self, rig: IioRig) -> None:
+        rig.rate_hz, rig.sensor = 200.0, rig.build(rate_hz=200.0)
+        rig.open()
+        late_s, clock = [], ClockModel(rig.rate_hz)
+        for block in rig.blocks(60.0):
+            numbers = rig.number(block.indications)
+            assert (np.diff(numbers) == 1).all()
+            assert block.flags & ~BlockFlags.RESTART == BlockFlags.NONE
+            ends = numbers[block.burst_count - 1]
+            clock.update(ends, block.burst_t_monotonic_ns * 1e-9)
+            assert (ends % 16 == 15).all()
+            late_s += (block.burst_t_monotonic_ns * 1e-9 - ends / rig.rate_hz).tolist()
+        # Late by less than a poll, and by any part of it: polls do not beat with the interrupts.
+        share, _ = np.histogram(late_s, bins=3, range=(0.0, 0.015))
+        assert share.sum() == len(late_s)
+        assert share[:2].min() >= 0.25 * len(late_s)
+        assert rig.sensor.take_drops() == []
+        samples = np.arange(int(ends[-1]) - 4000, int(ends[-1]) + 1)
+        assert np.abs(clock.result().times_of(int(samples[0]), len(samples)) - samples / rig.rate_hz).max() < 1e-3
+
+    def test_a_fifo_that_the_kernel_read_too_late_is_a_loss(self, rig: IioRig) -> None:
+        rig.open()
+        *_, before = rig.blocks(5.0)
+        rig.twin.next += 64
+        (after, *_) = rig.blocks(1.5)
+        assert after.flags == BlockFlags.RESTART | BlockFlags.OVERRUN
+        assert rig.number(after.indications)[0] > rig.number(before.indications)[-1] + 64
+        (drop,) = rig.sensor.take_drops()
+        assert (drop.unit, drop.reason) == ("samples", MISSING)
 
 
 def test_elements_as_the_kernel_states_them() -> None:
