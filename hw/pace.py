@@ -11,9 +11,8 @@ LEAST_POLLS = 8  # before anything is said
 RATE_WITHIN = 0.1  # relative; oscillators of MEMS are off by a few per cent
 SLOPES, STEPS = 33, 6  # rates that are tried in each step; a step makes the range of rates 16 times smaller
 MISSING = 0.5  # samples; one sample that is missing moves a count by 1
-SURE = (
-    0.5  # samples; a count that lags the clock by less proves that none is missing, for then it would lag by 1 or more
-)
+# Samples. A count that lags the clock by less proves that none is missing, for then it would lag by 1 or more.
+SURE = 0.5
 
 
 class Pace:
