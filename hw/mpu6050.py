@@ -12,7 +12,7 @@ from hw.block import DeviceInfo
 from hw.fifo import Burst, FifoSamples, plain_samples
 from hw.fifo_options import FifoOptions
 from hw.fifo_sensor import FifoSensor, Registers
-from hw.self_test import SelfTest, SelfTestReport
+from hw.self_test import SelfTest
 from hw.sensor import IdentityError
 
 RESET_WAIT_S = 0.1  # register map: 100 ms; Linux uses the same time
@@ -71,16 +71,8 @@ class Mpu6050(FifoSensor):
         options = self._options
         return chip.self_test(self._part, self._device.read(chip.SELF_TEST, 4), options.rate_hz, options.range_g)
 
-    def self_test(self) -> SelfTestReport:
-        """Self-test as in every driver; an MPU-6050 is set to 8 g for it, as its register map requires."""
-        options = self._options
-        if not self._part.accel_config_2 and options.range_g != chip.SELF_TEST_RANGE_G:
-            self._options = options.model_copy(update={"range_g": chip.SELF_TEST_RANGE_G})
-            self.open()
-        try:
-            return super().self_test()
-        finally:
-            self._options = options
+    def _self_test_range_g(self) -> int:
+        return self._options.range_g if self._part.accel_config_2 else chip.SELF_TEST_RANGE_G
 
     def _identify(self) -> dict[str, int]:
         (found,) = self._device.read(chip.WHO_AM_I, 1)

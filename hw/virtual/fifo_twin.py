@@ -51,7 +51,7 @@ class FifoTwin(ABC):
 
     @abstractmethod
     def _reset_registers(self) -> bytearray:
-        """All 256 registers as after a reset."""
+        """All registers as after a reset."""
 
     @property
     @abstractmethod
@@ -69,6 +69,14 @@ class FifoTwin(ABC):
     @abstractmethod
     def _set(self, register: int, value: int) -> None:
         """Write one register."""
+
+    def _selected(self, address: int) -> int:
+        """Register that the first byte of a write message selects."""
+        return address
+
+    def _after(self, register: int) -> int:
+        """Register that is read or written after `register` in one message."""
+        return register & ~0xFF | (register + 1) & 0xFF
 
     def _deflection(self) -> Counts:
         """Change (3,) of the counts by the self-test."""
@@ -110,10 +118,10 @@ class FifoTwin(ABC):
     def write(self, data: bytes) -> None:
         """One I2C write message: register, then values."""
         self._fail()
-        self._pointer = data[0]
+        self._pointer = self._selected(data[0])
         for value in data[1:]:
             self._set(self._pointer, value)
-            self._pointer = (self._pointer + 1) & 0xFF
+            self._pointer = self._after(self._pointer)
 
     def read(self, count: int) -> bytes:
         """One I2C read message; it starts at the register that was written last."""
@@ -127,7 +135,7 @@ class FifoTwin(ABC):
                 out += self._read_fifo(count - len(out))
             else:
                 out.append(self._get(self._pointer))
-                self._pointer = (self._pointer + 1) & 0xFF
+                self._pointer = self._after(self._pointer)
         return bytes(out)
 
     def _break_off(self) -> None:
