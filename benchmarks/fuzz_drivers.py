@@ -21,7 +21,15 @@ import numpy as np
 
 from agent.recording.messages import MessageError, decode
 from agent.recording.raw_block import encode_block
-from hw import adxl355_registers, iio_scan, lsm6dso_registers, miniseed, shake_datagram
+from hw import (
+    adxl355_registers,
+    icm42688_registers,
+    iio_scan,
+    lis3dh_registers,
+    lsm6dso_registers,
+    miniseed,
+    shake_datagram,
+)
 from hw.block import SampleBlock
 from hw.cutting import Cutter
 from hw.fifo import plain_samples
@@ -75,7 +83,9 @@ def parsers() -> dict[str, tuple[bytes, Parse]]:
     return {
         "adxl355": (adxl355_twin.encode(COUNTS), _adxl355),
         "lsm6dso": (lsm6dso_twin.words(2, 0, COUNTS), _lsm6dso),
-        "adxl345, mpu6050": (bytes(60), lambda data, i: plain_samples(_whole(data, 6), "<>"[i % 2])),
+        "adxl345, mpu6050, icm20948": (bytes(60), lambda data, i: plain_samples(_whole(data, 6), "<>"[i % 2])),
+        "icm42688": (b"@" + bytes(7) + b"@" * 16, lambda data, i: icm42688_registers.samples(_whole(data, 8))),  # noqa: ARG005
+        "lis3dh": (bytes(60), lambda data, i: lis3dh_registers.samples(_whole(data, 6))),  # noqa: ARG005
         "witmotion": (wit, _fed(WitStream(Cutter("w", 200.0), 200.0))),
         "serial-binary": (frames, _fed(BinaryStream(Cutter("b", 100.0), binary))),
         "serial-csv": (lines, _fed(LineStream(Cutter("l", 100.0), LINE, longest_gap=1000.0))),

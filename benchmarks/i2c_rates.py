@@ -24,7 +24,10 @@ from hw.sensor import ConfigurationError, load_driver
 from hw.virtual.adxl345_twin import Adxl345Twin
 from hw.virtual.adxl355_twin import Adxl355Twin
 from hw.virtual.fifo_twin import FifoTwin
+from hw.virtual.icm20948_twin import Icm20948Twin
+from hw.virtual.icm42688_twin import Icm42688Twin
 from hw.virtual.kernel import BCM2835, PLAIN, SHORT_MESSAGES, SMBUS_ONLY, WRITE_THEN_READ, Adapter, I2CBus, installed
+from hw.virtual.lis3dh_twin import Lis3dhTwin
 from hw.virtual.lsm6dso_twin import Lsm6dsoTwin
 from hw.virtual.mpu6050_twin import Mpu6050Twin
 
@@ -35,6 +38,9 @@ TWINS: dict[str, type[FifoTwin]] = {
     "adxl345": Adxl345Twin,
     "lsm6dso": Lsm6dsoTwin,
     "mpu6050": Mpu6050Twin,
+    "lis3dh": Lis3dhTwin,
+    "icm20948": Icm20948Twin,
+    "icm42688": Icm42688Twin,
 }
 # Time that an adapter adds to a transfer: interrupts and system calls of a small computer; a USB adapter answers in
 # frames of 1 ms. These are assumptions: the driver measures the adapter that it finds.

@@ -10,23 +10,37 @@ from numpy.typing import NDArray
 
 from calib.model import Array
 from calib.signal.known_filters import filter_of
-from hw import adxl345_registers, adxl355_registers, lsm6dso_registers, mpu6050_registers
+from hw import (
+    adxl345_registers,
+    adxl355_registers,
+    icm20948_registers,
+    icm42688_registers,
+    lis3dh_registers,
+    lsm6dso_registers,
+    mpu6050_registers,
+)
 from hw.adxl345 import Adxl345
 from hw.adxl355 import Adxl355, Adxl357, Adxl359
 from hw.fifo_sensor import FifoSensor
+from hw.icm20948 import Icm20948
+from hw.icm42688 import Icm42688
+from hw.lis3dh import Lis3dh
 from hw.lsm6dso import Lsm6dso
 from hw.mpu6050 import Mpu6050
 from hw.virtual.adxl345_twin import Adxl345Twin
 from hw.virtual.adxl355_twin import Adxl355Twin, Adxl357Twin, Adxl359Twin
 from hw.virtual.fifo_twin import FifoTwin
+from hw.virtual.icm20948_twin import Icm20948Twin
+from hw.virtual.icm42688_twin import Icm42688Twin
 from hw.virtual.kernel import I2CBus, installed
+from hw.virtual.lis3dh_twin import Lis3dhTwin
 from hw.virtual.lsm6dso_twin import Lsm6dsoTwin
 from hw.virtual.mpu6050_twin import Mpu6050Twin
 
 Complex = NDArray[np.complex128]
 SAMPLES = 2000
 CYCLES = np.array([20, 100, 260, 500, 700])  # of each sine in all samples: up to 0.35 of the rate
-COUNTS = 1000.0  # amplitude of each
+COUNTS = 400.0  # amplitude of each; together within 12 bits
 
 
 def passed(driver: type[FifoSensor], twin_class: type[FifoTwin], rate_hz: float) -> tuple[Complex, tuple[str, ...]]:
@@ -75,6 +89,11 @@ def stated(lines: tuple[str, ...], frequency_hz: Array) -> tuple[Complex, Array]
         (Adxl359, Adxl359Twin, 62.5, True),
         (Adxl345, Adxl345Twin, 800.0, False),
         (Adxl345, Adxl345Twin, 100.0, False),
+        (Icm20948, Icm20948Twin, 1125.0, False),
+        (Icm20948, Icm20948Twin, 225.0, False),
+        (Icm42688, Icm42688Twin, 1000.0, True),
+        (Icm42688, Icm42688Twin, 100.0, True),
+        (Lis3dh, Lis3dhTwin, 400.0, False),
         (Lsm6dso, Lsm6dsoTwin, 104.0, False),
         (Mpu6050, Mpu6050Twin, 1000.0, False),
         (Mpu6050, Mpu6050Twin, 100.0, False),
@@ -115,6 +134,9 @@ def test_the_adxl355_states_the_attenuation_and_the_delay_of_its_data_sheet(rate
     [
         (adxl355_registers, adxl355_registers.RATES_HZ),
         (adxl345_registers, tuple(adxl345_registers.RATE_CODES)),
+        (icm20948_registers, icm20948_registers.RATES_HZ),
+        (icm42688_registers, tuple(icm42688_registers.RATES)),
+        (lis3dh_registers, tuple(lis3dh_registers.RATE_CODES)),
         (lsm6dso_registers, lsm6dso_registers.RATES_HZ),
         (mpu6050_registers, mpu6050_registers.RATES_HZ),
     ],

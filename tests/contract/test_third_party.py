@@ -10,13 +10,13 @@ import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-PACKAGE = ROOT / "examples" / "fieldcal-lis3dh"
+PACKAGE = ROOT / "examples" / "fieldcal-mma8451"
 PAGE = ROOT / "docs" / "add-a-sensor.md"
 
 
 def test_its_own_tests_pass(tmp_path: Path) -> None:
     project = tomllib.loads((PACKAGE / "pyproject.toml").read_text("utf-8"))["project"]
-    info = tmp_path / "fieldcal_lis3dh-0.1.0.dist-info"
+    info = tmp_path / "fieldcal_mma8451-0.1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n")
     (name, value), *others = project["entry-points"]["fieldcal.sensors"].items()

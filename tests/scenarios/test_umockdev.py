@@ -24,7 +24,9 @@ from hw.block import BlockFlags, SampleBlock
 from hw.virtual.adxl345_twin import Adxl345Twin
 from hw.virtual.adxl355_twin import Adxl355Twin
 from hw.virtual.fifo_twin import FifoTwin
+from hw.virtual.icm42688_twin import Icm42688Twin
 from hw.virtual.kernel import BCM2835, SMBUS_FUNCTIONS, Adapter, I2CBus
+from hw.virtual.lis3dh_twin import Lis3dhTwin
 from hw.virtual.lsm6dso_twin import Lsm6dsoTwin
 from hw.virtual.mpu6050_twin import Mpu6050Twin
 from hw.virtual.serial_port import PtyDevice, SampleLines
@@ -42,6 +44,8 @@ DEVICES: dict[str, tuple[type[FifoTwin], int, float]] = {
     "adxl345": (Adxl345Twin, 0x53, 50.0),
     "mpu6050": (Mpu6050Twin, 0x68, 100.0),
     "lsm6dso": (Lsm6dsoTwin, 0x6A, 104.0),
+    "lis3dh": (Lis3dhTwin, 0x18, 50.0),
+    "icm42688": (Icm42688Twin, 0x69, 100.0),
 }
 SERIAL_HZ = 100.0
 
@@ -112,10 +116,10 @@ def test_probe_names_who_answers(site: UmockdevSite, bus: I2CBus) -> None:
     (found,) = json.loads(out)["i2c"]
     assert (found["number"], found["fault"]) == (1, "")
     said = {answer["address"]: answer for answer in found["answers"]}
-    assert sorted(said) == [0x1D, 0x53, 0x68, 0x6A]
+    assert sorted(said) == [0x18, 0x1D, 0x53, 0x68, 0x69, 0x6A]
     assert said[0x1D]["identity"].startswith("ADXL355 (REVID 0x01)")
     assert said[0x53]["identity"] == "ADXL345 (DEVID 0xE5)"
-    assert said[0x6A]["drivers"] == ["lsm6dso"]
+    assert [said[address]["drivers"] for address in (0x18, 0x69, 0x6A)] == [["lis3dh"], ["icm42688"], ["lsm6dso"]]
     assert "a kernel driver holds the address" in said[0x68]["note"]
 
 
@@ -155,7 +159,7 @@ def test_who_uses_a_device_is_told(tmp_path: Path, site: UmockdevSite, port: Pty
         out, _ = (process := program(site, "probe", "--json", "-")).communicate(timeout=30)
         assert process.returncode == 0, out
         used = {answer["address"]: answer["used_by"] for answer in json.loads(out)["i2c"][0]["answers"]}
-        assert set(used) == {0x1D, 0x53, 0x68, 0x6A}
+        assert set(used) == {0x18, 0x1D, 0x53, 0x68, 0x69, 0x6A}
         assert all(f"process {running.pid} (" in by for by in used.values())
         process = program(site, "run", config, "--data-dir", tmp_path / "second", "--duration", "2")
         out, _ = process.communicate(timeout=30)

@@ -15,8 +15,11 @@ from smbus2.smbus2 import I2cFunc
 from agent.cli.main import run_cli
 from hw.virtual.adxl345_twin import Adxl345Twin
 from hw.virtual.adxl355_twin import Adxl355Twin
+from hw.virtual.icm20948_twin import Icm20948Twin
+from hw.virtual.icm42688_twin import Icm42688Twin
 from hw.virtual.kernel import SMBUS_FUNCTIONS, Adapter, I2CBus, installed
-from hw.virtual.mpu6050_twin import Mpu6500Twin
+from hw.virtual.lis3dh_twin import Lis3dhTwin
+from hw.virtual.mpu6050_twin import Mpu6050Twin, Mpu6500Twin
 
 
 def noise(first: int, n: int) -> NDArray[np.int32]:
@@ -50,6 +53,35 @@ def test_who_answers(bus: I2CBus, capsys: pytest.CaptureFixture[str]) -> None:
     }
     assert found[0x68]["identity"] == "MPU-6500 (WHO_AM_I 0x70)"
     assert registers == {address: bytes(target.registers) for address, target in bus.targets.items()}  # type: ignore[attr-defined]
+
+
+# 0x68 is an address of three drivers, 0x18 of one; each names its own part, and writes nothing.
+@pytest.mark.parametrize(
+    ("kind", "address", "driver", "identity"),
+    [
+        (Lis3dhTwin, 0x18, "lis3dh", "LIS3DH (WHO_AM_I 0x33)"),
+        (Lis3dhTwin, 0x19, "lis3dh", "LIS3DH (WHO_AM_I 0x33)"),
+        (Icm20948Twin, 0x68, "icm20948", "ICM-20948 (WHO_AM_I 0xEA)"),
+        (Icm20948Twin, 0x69, "icm20948", "ICM-20948 (WHO_AM_I 0xEA)"),
+        (Icm42688Twin, 0x68, "icm42688", "ICM-42688-P (WHO_AM_I 0x47)"),
+        (Icm42688Twin, 0x69, "icm42688", "ICM-42688-P (WHO_AM_I 0x47)"),
+        (Mpu6050Twin, 0x69, "mpu6050", "MPU-6050 (WHO_AM_I 0x68)"),
+    ],
+)
+def test_drivers_that_share_an_address(
+    bus: I2CBus, capsys: pytest.CaptureFixture[str], kind: Any, address: int, driver: str, identity: str
+) -> None:
+    written: list[bytes] = []
+
+    class Watched(kind):  # type: ignore[misc]
+        def _set(self, register: int, value: int) -> None:
+            written.append(bytes([register, value]))
+
+    bus.targets = {address: twin(Watched, 400)}
+    assert {where: (found["drivers"], found["identity"]) for where, found in probed(capsys).items()} == {
+        address: ([driver], identity)
+    }
+    assert written == []
 
 
 def test_a_stranger_and_an_address_of_the_kernel(bus: I2CBus, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,6 +8,9 @@ import pytest
 from hw.virtual.adxl345_twin import Adxl345Twin
 from hw.virtual.adxl355_twin import Adxl355Twin
 from hw.virtual.fifo_twin import Counts, FifoTwin
+from hw.virtual.icm20948_twin import Icm20948Twin
+from hw.virtual.icm42688_twin import Icm42688Twin
+from hw.virtual.lis3dh_twin import Lis3dhTwin
 from hw.virtual.lsm6dso_twin import Lsm6dsoTwin
 from hw.virtual.mpu6050_twin import Mpu6050Twin
 
@@ -22,6 +25,9 @@ def source(first: int, n: int) -> Counts:
     ("twin_class", "register", "wanted"),
     [
         (Adxl345Twin, 0x32, "0900 f7ff 0901"),
+        (Icm20948Twin, 0x2D, "0009 fff7 0109"),
+        (Icm42688Twin, 0x1F, "0009 fff7 0109"),
+        (Lis3dhTwin, 0xA8, "9000 70ff 9010"),
         (Lsm6dsoTwin, 0x28, "0900 f7ff 0901"),
         (Mpu6050Twin, 0x3B, "0009 fff7 0109"),
         (Adxl355Twin, 0x08, "000090 ffff70 001090"),
