@@ -8,7 +8,7 @@ import numpy as np
 
 POLLS = 400  # that are compared: 8 s at 20 ms, in which a device's clock drifts by less than a tenth of a sample
 LEAST_POLLS = 8  # before anything is said
-RATE_WITHIN = 0.1  # relative; oscillators of MEMS are off by a few per cent
+RATE_WITHIN = 0.3  # relative; oscillators of MEMS are off by a few per cent, some by more
 SLOPES, STEPS = 33, 6  # rates that are tried in each step; a step makes the range of rates 16 times smaller
 MISSING = 0.5  # samples; one sample that is missing moves a count by 1
 # Samples. A count that lags the clock by less proves that none is missing, for then it would lag by 1 or more.
