@@ -5,9 +5,15 @@ from __future__ import annotations
 import os
 import sys
 
+from agent.cli.stopping import end_at_once_by_signals
+from agent.delivery.ending import Ending
+
 
 def main() -> None:
     """Run the command line; see `fieldcal --help`."""
+    if sys.argv[1:2] == ["run"]:
+        end_at_once_by_signals()
+    ending = Ending()
     # scipy carries its own OpenBLAS beside numpy's; both read this when they load, and sums over another number of
     # threads differ in the last bit.
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
@@ -22,10 +28,10 @@ def main() -> None:
         guard_standard_streams()
         from agent.cli.main import run_cli
 
-        status = run_cli()
+        ending.status = run_cli()
     except KeyboardInterrupt:  # while modules load
-        status = 130
-    sys.exit(status)
+        ending.status = 130
+    sys.exit(ending.status)
 
 
 if __name__ == "__main__":

@@ -62,12 +62,11 @@ class Service:
         """End the run that has begun; `run` returns within two seconds."""
         self._stop_request.set()
 
-    def run(self, duration_s: float | None) -> bool:
+    def run(self, duration_s: float | None) -> None:
         """Read, calibrate, record and publish until `stop` is called or `duration_s` seconds have passed.
 
         Ends by itself, with the reasons in `refused`, where adapters refuse transfers that every channel needs.
-        Returns whether all threads have ended. Where it returns False, a router or disk that does not respond blocks
-        one of them, and the caller must end the process with `os._exit`.
+        Where a router, a disk or a device does not respond, a thread that waits for it is left behind.
         Raises StoreError or OSError where the data directory cannot be used, OtherGatewayError where it is another
         gateway's, KeyFileError for an unusable signing key, ConfigurationError for a driver that cannot be made.
         """
@@ -127,10 +126,10 @@ class Service:
                 if reader.ident is not None:
                     reader.join(max(0.0, deadline - time.monotonic()))
             recorded = writer.close()
-            ended = self._publisher.close() if self._publisher is not None else True
+            if self._publisher is not None:
+                self._publisher.close()
             if recorded:
                 self._store.close()
-        return ended and recorded
 
     def _publication(self) -> Publisher | None:
         if not self._config.zenoh.enabled:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import shlex
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -130,11 +128,7 @@ def _session(settings: Config, channel: Channel, output: Path, options: dict[str
     if publisher is None:
         return _led(settings, channel, output, options, turn, lambda _: None)
     with publisher:
-        status = _led(settings, channel, output, options, turn, publisher.show)
-    if publisher.blocked:
-        sys.stdout.flush()
-        os._exit(status)
-    return status
+        return _led(settings, channel, output, options, turn, publisher.show)
 
 
 def _publisher(settings: Config) -> GuidePublisher | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ipaddress
-import os
 import socket
 import sqlite3
 import ssl
@@ -121,7 +120,7 @@ def monitor(
             say(f"the fleet page is at http{'s' if https_certificate else ''}://{listen}")
             if users is None and not _is_loopback(host):
                 say("anyone who reaches this address can read the page: it has no login (option --users)", err=True)
-            ended = serve(listening, data_dir, bus, web, settings)
+            serve(listening, data_dir, bus, web, settings)
         except (ConfigError, EndpointError, KeyFileError, UsersError) as error:
             say(f"fieldcal monitor: {error}", err=True)
             return 2
@@ -132,9 +131,6 @@ def monitor(
             where = listen if isinstance(error, OSError) else data_dir / "monitor.sqlite"
             say(f"fieldcal monitor: {where}: {error}", err=True)
             return 1
-    if not ended:  # a router that does not answer blocks a thread; do not wait for it
-        sys.stdout.flush()
-        os._exit(0)
     return 0
 
 

@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import math
 import os
-import signal
 import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from agent.cli.loading import loading
-from agent.cli.stopping import STOP_SIGNALS, StoppedAtStart, stopped_by_signals
+from agent.cli.stopping import TOLD, Run, StoppedAtStart, stopped_by_signals
 from agent.config import Config, ConfigError, load_config, parse_config
 from agent.delivery.history import StoreError
 from agent.terminal.text import say
+
+if TYPE_CHECKING:
+    from agent.acquisition.service import Service
 
 # What a well-known bench states: a second inclination then brings U from 1 % to 0.1 %, and nothing else limits it.
 GUIDED: dict[str, dict[str, float]] = {
@@ -50,50 +52,45 @@ def run(
     with_router: bool,
 ) -> int:
     """Read devices, calibrate, record and publish until Ctrl-C. Without CONFIG the virtual bench is used."""
-    with loading():
-        from agent.supervision.logs import log_as_json, under_journal
-        from agent.terminal.watch import Watch
-
     if duration is not None and not math.isfinite(duration):
         raise click.BadParameter(f"{duration} is not a number of seconds", param_hint="--duration")
-    # Until the service handles these signals, they act as Ctrl-C, so that a router or bench started here is stopped.
-    for number in STOP_SIGNALS:
-        signal.signal(number, signal.default_int_handler)
-    with ExitStack() as stack:
-        if as_json := log == "json" or (log is None and under_journal(os.environ, sys.stderr.fileno())):
-            stack.callback(log_as_json().finish)
-        try:
+    with loading():
+        from agent.acquisition.service import Service
+        from agent.supervision.logs import log_as_json, under_journal
+        from agent.terminal.watch import Watch
+    try:
+        with ExitStack() as stack:
+            if as_json := log == "json" or (log is None and under_journal(os.environ, sys.stderr.fileno())):
+                stack.callback(log_as_json().finish)
             if config is None:
                 settings, truth = stack.enter_context(virtual_bench(preset, seed))
             else:
                 settings, truth = load_config(config), None
-        except ConfigError as error:
-            for fault in error.faults:
-                say(fault, err=True)
-            return 2
-        said = [stack.enter_context(router(LOOPBACK))] if with_router else []
-        title = f"virtual bench, {preset}" if truth else str(config)
-        watch = stack.enter_context(Watch(settings, title, truth, lines=not as_json))
-        for line in said:
-            watch.say(line)
-        return serve(settings, data_dir, watch, duration)
-
-
-def serve(config: Config, data_dir: Path, watch: Any, duration_s: float | None) -> int:
-    """Run the service until a signal or for `duration_s` seconds; returns the exit status."""
-    with loading():
-        from agent.acquisition.service import Service
-        from agent.config.key_file import KeyFileError
-        from agent.recording.owner import OtherGatewayError
-        from hw.sensor import ConfigurationError
-
-    service = Service(config, data_dir, watch)
-    try:
-        with stopped_by_signals(lambda: service.begun, service.stop):
-            ended = service.run(duration_s)
+            stopping = stack.enter_context(stopped_by_signals())  # up to here a signal ends the process at once
+            said = [stack.enter_context(router(LOOPBACK, stopping))] if with_router else []
+            title = f"virtual bench, {preset}" if truth else str(config)
+            watch = stack.enter_context(Watch(settings, title, truth, lines=not as_json))
+            for line in said:
+                watch.say(line)
+            stopping.service = Service(settings, data_dir, watch)
+            return serve(stopping.service, duration)
+    except ConfigError as error:
+        for fault in error.faults:
+            say(fault, err=True)
+        return 2
     except StoppedAtStart:
-        say("stopped before the start was complete", err=True)
+        say(TOLD, err=True)
         return 0
+
+
+def serve(service: Service, duration_s: float | None) -> int:
+    """Run the service until a signal or for `duration_s` seconds; returns the exit status."""
+    from agent.config.key_file import KeyFileError
+    from agent.recording.owner import OtherGatewayError
+    from hw.sensor import ConfigurationError
+
+    try:
+        service.run(duration_s)
     except KeyFileError as error:
         say(f"fieldcal run: recording.signing_key: {error}", err=True)
         return 2
@@ -105,13 +102,7 @@ def serve(config: Config, data_dir: Path, watch: Any, duration_s: float | None) 
         return 1
     for fault in service.refused:
         say(f"fieldcal run: {fault}", err=True)
-    status = 2 if service.refused else 0
-    if not ended:
-        # A router or disk that does not respond blocks a thread. Do not wait for this thread.
-        watch.__exit__()
-        sys.stdout.flush()
-        os._exit(status)
-    return status
+    return 2 if service.refused else 0
 
 
 @contextmanager
@@ -150,8 +141,8 @@ def virtual_bench(preset: str, seed: int) -> Iterator[tuple[Config, Any]]:
 
 
 @contextmanager
-def router(endpoint: str) -> Iterator[str]:
-    """Use the router that runs at `endpoint`, or start one as a process; yields a line for the user."""
+def router(endpoint: str, run: Run) -> Iterator[str]:
+    """Use the router that runs at `endpoint`, or start one as a child of the run; yields a line for the user."""
     from agent.delivery.router import router_running
 
     if router_running(endpoint):
@@ -160,6 +151,7 @@ def router(endpoint: str) -> Iterator[str]:
     command = [sys.executable, "-m", "agent", "router", "--listen", endpoint]
     # In a session of its own, so that Ctrl-C does not stop the router before the agent has published its last results.
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True, env=os.environ)
+    run.children.append(process)
     try:
         yield f"started a Zenoh router at {endpoint}"
     finally:

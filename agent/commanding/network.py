@@ -12,6 +12,7 @@ from agent.commanding.desk import CommandDesk
 
 # Commands that may wait. In a flood the oldest are dropped, so that other messages of the session are not delayed.
 WAITING_MAX = 16
+CLOSE_S = 1.0  # s to wait for the thread at the end; it is longer in a command only where a router does not respond
 _log = logging.getLogger(__name__)
 _Queryable = zenoh.Queryable[zenoh.Handler[zenoh.Query]]
 
@@ -21,8 +22,10 @@ def serve_queries(session: zenoh.Session, gateway: str, desk: CommandDesk, open_
     queryable = session.declare_queryable(
         f"{gateway}/*/command/*", zenoh.handlers.RingChannel(WAITING_MAX), complete=True
     )
+    commands = threading.Thread(target=_answer, args=(queryable, gateway, desk), name="commands", daemon=True)
+    commands.start()
+    open_things.callback(commands.join, CLOSE_S)
     open_things.callback(queryable.undeclare)
-    threading.Thread(target=_answer, args=(queryable, gateway, desk), name="commands", daemon=True).start()
 
 
 def _answer(queryable: _Queryable, gateway: str, desk: CommandDesk) -> None:

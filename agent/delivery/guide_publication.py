@@ -32,8 +32,6 @@ class GuidePublisher:
     """Context in which `show` publishes a guide. It never delays the session, and needs no router.
 
     `site`, `gateway`: names. `connect`: endpoints of routers. `signer`: of the gateway's key, where it has one.
-    `blocked` after the end: a router that does not respond still blocks the thread, so that the process must end with
-    `os._exit`.
     Raises ValueError for an invalid name, EndpointError for an invalid endpoint.
     """
 
@@ -52,7 +50,6 @@ class GuidePublisher:
         self._newest: Guide | None = None
         self._wake, self._stop = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="guide", daemon=True)
-        self.blocked = False
 
     def __enter__(self) -> Self:
         atexit.register(self.close)
@@ -73,7 +70,6 @@ class GuidePublisher:
         self._stop.set()
         self._wake.set()
         self._thread.join(CLOSE_S)
-        self.blocked = self._thread.is_alive()
 
     def _run(self) -> None:
         while not self._stop.is_set():

@@ -147,8 +147,7 @@ class Publisher:
     def close(self, timeout_s: float = CLOSE_S) -> bool:
         """Publish what waits if a router is connected, and close; give up after `timeout_s` s. May be called twice.
 
-        Returns False where a router that does not respond still blocks the thread. The process must then end with
-        `os._exit`: a thread that returns from Zenoh during the interpreter's shutdown aborts it.
+        Returns False where a router that does not respond still blocks the thread.
         """
         atexit.unregister(self.close)
         self._stop.set()
@@ -173,13 +172,15 @@ class Publisher:
             session = open_things.enter_context(zenoh.open(self._config))
             history = open_things.enter_context(History(self._store.path))
             queryable = session.declare_queryable(f"{self._key}/**", zenoh.handlers.FifoChannel(64), complete=True)
-            open_things.callback(queryable.undeclare)
-            threading.Thread(
+            answers = threading.Thread(
                 target=answer_queries,
                 args=(queryable, self._key, self._store.path, lambda: self._told),
                 name="answers",
                 daemon=True,
-            ).start()
+            )
+            answers.start()
+            open_things.callback(answers.join, CLOSE_S)
+            open_things.callback(queryable.undeclare)
             if self._serve_more is not None:
                 self._serve_more(session, open_things)
             token = session.liveliness().declare_token(f"{self._key}/alive")

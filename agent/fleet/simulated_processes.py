@@ -11,6 +11,7 @@ from contextlib import AbstractContextManager, ExitStack, suppress
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+from agent.delivery.ending import Ending
 from agent.delivery.session import session_config
 from agent.fleet.simulated import SimulatedFleet
 from agent.fleet.simulated_sensor import Behaviour
@@ -92,6 +93,7 @@ def _leave(process: ProcessPoolExecutor) -> None:
 
 
 def _begin() -> None:
+    Ending().status = 0
     begin()
     os.nice(NICE)
 

@@ -75,8 +75,7 @@ class Following:
     def close(self, timeout_s: float = CLOSE_S) -> bool:
         """End the threads. May be called twice.
 
-        Returns False where a router that does not answer still blocks a thread after `timeout_s`. The process must then
-        end with `os._exit`: a thread that returns from Zenoh during the interpreter's shutdown aborts it.
+        Returns False where a router that does not answer still blocks a thread after `timeout_s`.
         """
         self._stop.set()
         self._open.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import socket
 import threading
 from collections.abc import Sequence
@@ -61,8 +62,8 @@ class _Server(uvicorn.Server):
         super().handle_exit(sig, frame)
 
 
-def serve(listening: socket.socket, data_dir: Path, bus: Bus, web: Web, settings: MonitorSettings) -> bool:
-    """Serve the page on a socket that listens, until Ctrl-C. Returns what `Following.close` returns.
+def serve(listening: socket.socket, data_dir: Path, bus: Bus, web: Web, settings: MonitorSettings) -> None:
+    """Serve the page on a socket that listens, until Ctrl-C or SIGTERM.
 
     Raises EndpointError, KeyFileError, UsersError, or sqlite3.Error or DatabaseError where the database cannot
     be used.
@@ -89,9 +90,10 @@ def serve(listening: socket.socket, data_dir: Path, bus: Bus, web: Web, settings
             ssl_certfile=web.certificate, ssl_keyfile=web.key,
             proxy_headers=web.behind_proxy, forwarded_allow_ips="127.0.0.1,::1",
         )  # fmt: skip
+        # The server raises the signal again that has ended it; SIGTERM would then end the process before what is below.
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
         with suppress(KeyboardInterrupt):
             _Server(config, stopping).run([listening])
-        return following.close()
 
 
 def _certificates(bus: Bus, web: Web) -> list[Path]:

@@ -29,7 +29,6 @@ from agent.monitor.server import application
 from tests.unit.zenoh_site import Site, wait_for
 
 STARTS_S = 30.0
-COMMAND = "import sys; from agent.cli.main import run_cli; sys.exit(run_cli(sys.argv[1:]))"
 
 
 class Answer:
@@ -112,7 +111,7 @@ class Monitor:
         self.tls = ssl.create_default_context(cafile=ca) if ca is not None else None
         self.url = f"http{'s' if ca is not None else ''}://{self.address}"
         given = ["--connect", endpoint, "--listen", self.address, "--data-dir", str(directory), *options]
-        self._process = subprocess.Popen([sys.executable, "-c", COMMAND, "monitor", *given], stderr=subprocess.PIPE)
+        self._process = subprocess.Popen([sys.executable, "-m", "agent", "monitor", *given], stderr=subprocess.PIPE)
         try:
             wait_for(self._answers, STARTS_S)
         except AssertionError:
@@ -141,8 +140,8 @@ class Monitor:
         self._process.kill()
         self._process.communicate()
 
-    def stop(self) -> None:
-        """Ctrl-C. Fails where the program does not end well."""
-        self._process.send_signal(signal.SIGINT)
+    def stop(self, number: signal.Signals = signal.SIGINT) -> None:
+        """Ctrl-C, or another signal. Fails where the program does not end well."""
+        self._process.send_signal(number)
         said = self._process.communicate(timeout=10)[1].decode()
         assert (self._process.returncode, "Traceback" in said, "FATAL" in said) == (0, False, False), said

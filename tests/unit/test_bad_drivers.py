@@ -54,7 +54,7 @@ def configuration(bugs: Sequence[str]) -> Config:
 
 @dataclass
 class Run:
-    """What a run left. `raised`: what ended the agent; `ended`: it stopped when it was asked to, all threads ended.
+    """What a run left. `raised`: what ended the agent; `ended`: it stopped when it was asked to.
 
     `stopped_s`: seconds from the request to the end. `events`: all that were recorded. `audit`: the status with which
     `fieldcal audit` ends.
@@ -85,7 +85,8 @@ def run(config: Config, data_dir: Path, enough: Callable[[Run], bool], timeout_s
 
         def guarded() -> None:
             try:
-                found.ended = service.run(None)
+                service.run(None)
+                found.ended = True
             except BaseException as error:
                 found.raised.append(error)
 

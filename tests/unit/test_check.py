@@ -15,7 +15,7 @@ from cryptography.hazmat.primitives.asymmetric import ec, ed25519
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
 
 from agent.cli.main import run_cli
-from agent.cli.run import STOP_SIGNALS
+from agent.cli.stopping import STOP_SIGNALS
 
 GOOD = """[gateway]
 site = "bridge"

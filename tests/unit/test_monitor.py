@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
@@ -55,7 +56,7 @@ def test_a_sensor_is_shown_with_why_and_kept_over_a_restart(site: Site, gateway:
         assert len(monitor.get(f"api/history?{asked}calibration")) == 1
         assert "count" in monitor.get(f"sensor.csv?{asked}calibration")
     finally:
-        monitor.stop()
+        monitor.stop(signal.SIGTERM)
 
 
 def test_over_https_a_user_logs_in_with_a_cookie_of_this_host(tmp_path: Path) -> None:

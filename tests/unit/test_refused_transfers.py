@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from agent.acquisition.service import refusals
+from agent.acquisition.service import Service, refusals
 from agent.cli.run import serve
 from agent.config import Config, parse_config
 from agent.core.events import DeviceChange
@@ -157,7 +157,7 @@ def test_adapters_of_the_twins(
     config = parse_config(raw, "test")
     with installed(nodes), Watch(config, "test", None) as watch:
         began_s = time.monotonic()
-        assert serve(config, tmp_path, watch, 4.0 if status == 0 else 60.0) == status
+        assert serve(Service(config, tmp_path, watch), 4.0 if status == 0 else 60.0) == status
         assert status == 0 or time.monotonic() - began_s < 20.0, "it ends at once"
     refusing = [name for name, adapter in zip(names, adapters, strict=True) if adapter is TOO_SHORT]
     said = capsys.readouterr()

@@ -1,0 +1,91 @@
+"""A process ends after its exit handlers and before the interpreter is finalised."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+
+# Gets a message when the interpreter is finalised, in a thread that waits for it in Zenoh. The answer of the C library
+# to that is the abort of the process: the thread cannot leave Zenoh.
+WAITING = """
+import sys, threading, time, types
+import zenoh
+from agent.delivery.session import session_config
+from agent.delivery.ending import Ending
+{ending}
+session = zenoh.open(session_config("peer"))
+subscriber = session.declare_subscriber("key", zenoh.handlers.FifoChannel(4))
+class Finalised:
+    def __del__(self, put=session.put, sleep=time.sleep):
+        put("key", b"")
+        sleep(1)  # so that the thread has time to come back from Zenoh
+sys.modules["finalised"] = types.ModuleType("finalised")
+sys.modules["finalised"].one = Finalised()
+threading.Thread(target=lambda: list(subscriber), daemon=True).start()
+print("done")
+"""
+# Ends in the way that is given, with the tools of an exit: a handler, a thread that is waited for, buffered output.
+ENDS = """
+import atexit, sys, threading, time
+from agent.delivery.ending import Ending
+ending = Ending()
+atexit.register(print, "handler")
+def last():
+    time.sleep(0.2)
+    print("thread")
+threading.Thread(target=last).start()
+{end}
+"""
+
+
+def ended(code: str, **streams: int) -> subprocess.CompletedProcess[str]:
+    """A program with this code, at its end."""
+    given: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | streams
+    buffered = os.environ | {"PYTHONUNBUFFERED": ""}
+    return subprocess.run([sys.executable, "-c", code], text=True, timeout=30, check=False, env=buffered, **given)
+
+
+def test_a_thread_that_waits_in_zenoh_does_not_abort_the_process() -> None:
+    with_ending = ended(WAITING.replace("{ending}", "Ending().status = 0"))
+    assert (with_ending.returncode, with_ending.stdout, with_ending.stderr) == (0, "done\n", "")
+
+
+@pytest.mark.skipif(sys.version_info >= (3, 14), reason="there such a thread is stopped for ever instead")
+def test_without_it_the_process_is_aborted() -> None:
+    without = ended(WAITING.replace("{ending}", ""))
+    assert (without.returncode, without.stdout) == (-6, "done\n")
+    assert "exception not rethrown" in without.stderr
+
+
+@pytest.mark.parametrize(
+    ("end", "status"), [("ending.status = 3; sys.exit(3)", 3), ("ending.status = 0", 0), ("raise ValueError", 1)]
+)
+def test_status_and_all_that_belongs_to_an_exit(end: str, status: int) -> None:
+    told = ended(ENDS.replace("{end}", end))
+    assert (told.returncode, told.stdout) == (status, "thread\nhandler\n")
+    assert ("Traceback" in told.stderr) == (status == 1)
+
+
+def test_output_that_cannot_be_written_is_no_success() -> None:
+    with open("/dev/full", "w") as full:
+        assert ended(ENDS.replace("{end}", "ending.status = 0"), stdout=full.fileno()).returncode == 1
+
+
+def test_the_command_line_ends_so() -> None:
+    code = """
+import os, sys, types
+class Finalised:
+    def __del__(self, write=os.write):
+        write(2, b"finalised")
+sys.modules["finalised"] = types.ModuleType("finalised")
+sys.modules["finalised"].one = Finalised()
+{end}"""
+    assert ended(code.replace("{end}", "")).stderr == "finalised"
+    command = "sys.argv[1:] = ['--version']; from agent.__main__ import main; main()"
+    said = ended(code.replace("{end}", command))
+    assert (said.returncode, said.stderr) == (0, "")
+    assert said.stdout.startswith("fieldcal")
