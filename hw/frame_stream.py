@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +33,7 @@ class Decoded:
 class FrameStream(ABC):
     """Collects bursts with `feed` and decodes all of them in `blocks`.
 
-    Between calls it keeps at most one incomplete frame.
+    Between calls it keeps the bytes that may still become a frame, each with the arrival of its burst.
     """
 
     def __init__(self, cutter: Cutter, layout: Layout) -> None:
@@ -45,6 +46,10 @@ class FrameStream(ABC):
     def _decode(self, found: Found) -> Decoded:
         """Return the samples of these frames."""
 
+    def _find(self, data: bytes) -> Found:
+        """Find the frames in `data`, which begins with the rest of the call before."""
+        return find(data, self._layout)
+
     def begin(self) -> None:
         """Start after a port was opened.
 
@@ -52,8 +57,7 @@ class FrameStream(ABC):
         """
         self._listening = False
         self._slipped = False
-        self._rest = b""
-        self._bursts: list[bytes] = []
+        self._bursts: list[bytes] = []  # what no call has decided yet
         self._arrivals_ns: list[int] = []
         self._utc_ns = 0
         self.size = 0
@@ -68,20 +72,18 @@ class FrameStream(ABC):
 
     def blocks(self) -> list[SampleBlock]:
         """Decode everything fed since the last call and return its blocks."""
-        if not self._bursts:
+        if not self.size:
             return []
-        read = len(self._rest) + np.cumsum([len(burst) for burst in self._bursts])
+        self.size = 0
+        read = np.cumsum([len(burst) for burst in self._bursts])
         arrivals_ns = np.array(self._arrivals_ns, np.int64)
-        found = find(self._rest + b"".join(self._bursts), self._layout)
-        self._bursts, self._arrivals_ns, self.size = [], [], 0
-        self._rest = found.rest
+        found = replace(self._find(b"".join(self._bursts)), slipped_before=self._slipped)
+        self._keep(found, read)
         self._dropped += found.dropped
         if not self._listening:
-            self._dropped -= int(found.end[0]) - self._layout.length if len(found.end) else found.dropped
-            self._listening = bool(len(found.end))
-        slipped = found.slipped
-        slipped[0] |= self._slipped
-        self._slipped = bool(slipped[-1])
+            self._dropped -= int(found.start[0]) if len(found.start) else found.dropped
+            self._listening = bool(len(found.start))
+        self._slipped = bool(found.slipped[-1])
         decoded = self._decode(found)
         ends = found.end[decoded.frame]
         return self._cutter.cut(
@@ -95,6 +97,13 @@ class FrameStream(ABC):
             ),
             decoded.breaks,
         )
+
+    def _keep(self, found: Found, read: NDArray[np.int64]) -> None:
+        """Keep the bytes that are not decided; `read` (B,) are the positions after each burst."""
+        first = int(np.searchsorted(read, found.rest_at, side="right"))
+        edges = [found.rest_at, *read[first:].tolist()]
+        self._bursts = [found.data[begin:end] for begin, end in itertools.pairwise(edges)]
+        self._arrivals_ns = self._arrivals_ns[first:]
 
     def take_drops(self) -> list[Drop]:
         """Bytes since the last call that belong to no frame."""

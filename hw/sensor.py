@@ -68,6 +68,11 @@ class Options(BaseModel):
         return ""
 
     @property
+    def advice(self) -> tuple[str, ...]:
+        """What is not good about these options, each with its remedy. The device works with them all the same."""
+        return ()
+
+    @property
     def known_filters(self) -> tuple[str, ...]:
         """The filters of the device as these options set it, as in DeviceInfo; empty where they are not known."""
         return ()

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import math
 import re
-from typing import Self
+from typing import Self, cast
 
 import numpy as np
 import serial
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 from hw.block import LARGEST, BlockFlags, DeviceInfo
 from hw.cutting import Break, Cutter, follow
 from hw.frame_stream import Decoded, FrameStream
-from hw.frames import CHECKSUMS, WIDTH, ByteOrder, ChecksumName, Found, Layout, NumberType, numbers
+from hw.frames import WIDTH, ByteOrder, ChecksumName, Found, Layout, NumberType, numbers
+from hw.sensor import DeviceLost
 from hw.serial_sensor import LONGEST_GAP_S, Filters, SerialOptions, SerialSensor
+from hw.unchecked_frames import UncheckedFrames
 from hw.units import Unit, asked_of_certificate, nominal_sensitivity, tells_sensitivity
 
+UNDECIDED_S = 5.0  # frames of this time must tell which place in the stream is theirs
 BITS_A_BYTE = 10  # with start and stop bit
 
 
@@ -47,24 +50,28 @@ class SerialBinaryOptions(SerialOptions):
 
     rate_hz: float = Field(gt=0, le=100_000, allow_inf_nan=False, description="nominal rate of the samples")
     start: str = Field(description='first bytes of every frame, hexadecimal, e.g. "aa55"')
-    length: int = Field(ge=3, le=256, description="bytes of a frame, start and checksum included")
+    end: str = Field("", description='last bytes of every frame, after the checksum, hexadecimal, e.g. "0d"')
+    length: int = Field(ge=3, le=256, description="bytes of a frame, from the first of start to the last of end")
     byte_order: ByteOrder = Field("little", description="of all numbers")
     indications: tuple[Number, ...] = Field(description="x, y, z, or a single one: [{at = 4, type = 'i16'}, ...]")
     sequence: Number | None = Field(None, description="a sample counter; without it lost frames are not noticed")
     temperature: Thermometer | None = Field(None, description="temperature of the device")
-    checksum: ChecksumName = Field("none", description="kind of checksum in the last bytes of the frame")
+    checksum: ChecksumName = Field("none", description="kind of checksum, in the last bytes before end")
     checksum_from: int = Field(0, ge=0, description="first byte that the checksum covers")
-    checksum_order: ByteOrder = Field("little", description="byte order of a checksum of two bytes")
+    checksum_order: ByteOrder = Field(
+        "little", description="byte order of a checksum of two bytes, and of the words that sum16 adds"
+    )
     unit: Unit = Field("count", description="of the indications")
     full_scale: float | None = Field(None, gt=0, description="indications of this size or more are saturated")
     serial_number: str = Field("", description="of the device, as on its label")
     filters: Filters = ()
 
-    @field_validator("start")
+    @field_validator("start", "end")
     @classmethod
-    def _is_bytes(cls, value: str) -> str:
-        if not re.fullmatch("([0-9a-fA-F]{2}){1,8}", value):
-            raise ValueError("1 to 8 bytes of two hexadecimal digits each, as in aa55")
+    def _is_bytes(cls, value: str, info: ValidationInfo) -> str:
+        least = 1 if info.field_name == "start" else 0
+        if not re.fullmatch(f"([0-9a-fA-F]{{2}}){{{least},8}}", value):
+            raise ValueError(f"{least} to 8 bytes of two hexadecimal digits each, as in aa55")
         return value
 
     @model_validator(mode="after")
@@ -73,7 +80,14 @@ class SerialBinaryOptions(SerialOptions):
             raise ValueError("temperature.counts_per_degc: 0 counts per degree is not possible")
         if len(self.indications) not in (1, 3):
             raise ValueError(f"indications: 1 or 3 numbers are needed, not {len(self.indications)}")
-        covered = self.length - CHECKSUMS[self.checksum][0]
+        covered = self.layout.body
+        if covered < max(len(self.layout.start), self.checksum_from + 1):
+            raise ValueError(f"length: {self.length} bytes are too few for start, checksum and end")
+        if self.checksum == "sum16" and (covered - self.checksum_from) % 2:
+            raise ValueError(
+                f"checksum: sum16 adds words of two bytes, but bytes {self.checksum_from} to {covered - 1} are an odd "
+                "number of bytes; correct checksum_from or length"
+            )
         for number in (*self.indications, self.sequence, self.temperature):
             if number is not None and number.end > covered:
                 raise ValueError(
@@ -108,8 +122,18 @@ class SerialBinaryOptions(SerialOptions):
     @property
     def layout(self) -> Layout:
         """Layout for `hw.frames.find`."""
-        start = bytes.fromhex(self.start)
-        return Layout(start, self.length, self.checksum, self.checksum_from, self.checksum_order)
+        start, end = bytes.fromhex(self.start), bytes.fromhex(self.end)
+        return Layout(start, self.length, self.checksum, self.checksum_from, self.checksum_order, end)
+
+    @property
+    def advice(self) -> tuple[str, ...]:
+        """One byte does not tell where a frame begins: it may also occur inside the frame."""
+        if self.checksum != "none" or self.end or self.sequence is not None or len(self.layout.start) > 1:
+            return ()
+        return (
+            f"start is the single byte {self.start}, and nothing else tells where a frame begins; state checksum, end "
+            "or sequence, or a start of two bytes (a later release will refuse these options)",
+        )
 
 
 class BinaryStream(FrameStream):
@@ -127,6 +151,26 @@ class BinaryStream(FrameStream):
         """Start after a port was opened."""
         super().begin()
         self._last: int | None = None
+        self._unchecked = UncheckedFrames(self._layout, self._sequence if self._options.sequence else None)
+
+    @property
+    def undecided(self) -> str:
+        """What the frames of UNDECIDED_S did not tell; "" where they told it, or were not that many."""
+        search = self._unchecked
+        if search.places < 2 or search.undecided < UNDECIDED_S * self._options.rate_hz:
+            return ""
+        return (
+            f"{search.places} bytes of each {self._layout.length} may be the start of a frame ({self._options.start}), "
+            f"in {search.undecided} frames one after the other; state checksum, end or sequence"
+        )
+
+    def _find(self, data: bytes) -> Found:
+        return self._unchecked.find(data) if self._layout.checksum == "none" else super()._find(data)
+
+    def _sequence(self, frames: NDArray[np.uint8]) -> NDArray[np.unsignedinteger]:
+        kind = self._options.sequence
+        assert kind is not None
+        return cast(NDArray[np.unsignedinteger], numbers(frames, kind.at, kind.type, self._options.byte_order))
 
     def _decode(self, found: Found) -> Decoded:
         options = self._options
@@ -135,11 +179,12 @@ class BinaryStream(FrameStream):
         with np.errstate(invalid="ignore"):  # the four bytes of an f32 may hold any bits
             values = np.column_stack(columns).astype(np.int32 if counted else np.float64)
         sound = (np.abs(values) <= LARGEST).all(axis=1)
+        samples = found.frames[sound]
         return Decoded(
             np.ascontiguousarray(values[sound]),
             np.flatnonzero(sound),
-            self._unseen(found, sound) if options.sequence is None else self._follow(found.frames[sound]),
-            *self._temperature(found.frames[sound]),
+            self._unseen(found, sound) if options.sequence is None else self._follow(samples, options.sequence),
+            *self._temperature(samples),
         )
 
     def _unseen(self, found: Found, sound: NDArray[np.bool_]) -> list[Break]:
@@ -148,12 +193,11 @@ class BinaryStream(FrameStream):
         broken[1:] |= ~sound[:-1]
         return [Break(at, BlockFlags.RESTART) for at in np.flatnonzero(broken[sound]).tolist()]
 
-    def _follow(self, frames: NDArray[np.uint8]) -> list[Break]:
+    def _follow(self, frames: NDArray[np.uint8], kind: Number) -> list[Break]:
         """Breaks where the sequence number, which wraps around, does not increase by one."""
-        kind = self._options.sequence
-        if kind is None or not len(frames):
+        if not len(frames):
             return []
-        sequence = numbers(frames, kind.at, kind.type, self._options.byte_order).astype(np.int64)
+        sequence = self._sequence(frames).astype(np.int64)
         before = sequence[0] - 1 if self._last is None else self._last
         self._last = int(sequence[-1])
         steps = np.diff(sequence, prepend=before) % 256 ** WIDTH[kind.type]
@@ -172,9 +216,11 @@ class BinaryStream(FrameStream):
 
 
 class SerialBinary(SerialSensor):
-    """Finds frames by their first bytes and their checksum; other bytes are counted and skipped."""
+    """Finds frames by their first and last bytes, their checksum and their sequence; other bytes are counted and
+    skipped."""
 
     options_model = SerialBinaryOptions
+    _stream: BinaryStream
 
     def _build_stream(self, name: str) -> BinaryStream:
         limit = self._options.full_scale or math.inf
@@ -184,10 +230,16 @@ class SerialBinary(SerialSensor):
         options = self._options
         return self._info(
             "serial-binary",
-            {"start": options.start, "length": str(options.length), "checksum": options.checksum},
+            {"start": options.start, "length": str(options.length), "checksum": options.checksum}
+            | ({"end": options.end} if options.end else {}),
             kind="serial-binary",
             serial_number=options.serial_number,
             unit=options.unit,
             nominal_sensitivity=nominal_sensitivity(options.unit),
             axes=len(options.indications),
         )
+
+    def _gather(self, port: serial.Serial) -> None:
+        super()._gather(port)
+        if self._loss is None and (undecided := self._stream.undecided):
+            self._loss = DeviceLost(f"port {port.port}: {undecided}")

@@ -6,6 +6,7 @@ Devices may be unplugged and plugged in again, and their drivers may have bugs. 
 from __future__ import annotations
 
 import json
+import logging
 import queue
 import threading
 import time
@@ -29,6 +30,8 @@ FAULTS_TOLD = 10  # faults of a driver in a row after which the report says what
 SHORTEST_CALL_S = 0.002  # s from one call of read_block to the next
 
 T = TypeVar("T")
+
+_log = logging.getLogger(__name__)
 
 
 class EventQueue:
@@ -252,7 +255,10 @@ def reader_of(device: Device, events: EventQueue) -> Reader:
     """
     factory = load_driver(device.driver)
     try:
-        sensor = factory(device.name, factory.options_model.model_validate(device.options))
+        options = factory.options_model.model_validate(device.options)
+        for advice in options.advice:
+            _log.warning("%s: %s", device.name, advice)
+        sensor = factory(device.name, options)
     except (Exception, SystemExit) as error:
         told = f"{device.name}: {IN_DRIVER} {device.driver!r}: it cannot be made: {told_as(error)}"
         raise ConfigurationError(told) from error

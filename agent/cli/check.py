@@ -74,10 +74,12 @@ def _answers(path: Path, config: Config) -> list[Finding]:
 
 
 def _warnings(path: Path, config: Config) -> Iterator[str]:
-    """What does not keep the agent from running: certificates that end."""
+    """What does not keep the agent from running: certificates that end, options that are not good."""
     now = datetime.now(UTC)
     if config.zenoh.tls and (warning := expiry_warning(config.zenoh.tls.files, now)):
         yield f"{path}: zenoh.tls.{warning}"
+    for i, options in enumerate(loaded_options(config).values()):
+        yield from (f"{path}: devices.{i}.options: {advice}" for advice in options.advice)
     for i, channel in enumerate(config.channels):
         for section, beside in zip(("", "check_reference."), channel.by_reference, strict=False):
             if overdue := beside.certificate.overdue(now):

@@ -67,6 +67,7 @@ def _findings(path: Path | None, data_dir: Path, measure_s: float | None) -> Ite
             yield Finding("configuration", "good", f"{path} has no fault")
             options = device_checks.loaded_options(config)
     yield from machine_checks.clock_findings(data_dir, now)
+    yield from device_checks.option_findings(options)
     yield from device_checks.access_findings(options)
     yield from device_checks.bus_findings(options)
     if config is not None:

@@ -36,6 +36,13 @@ def loaded_options(config: Config) -> dict[str, Options]:
     }
 
 
+def option_findings(options: Mapping[str, Options]) -> Iterator[Finding]:
+    """Which options are not good?"""
+    for name, held in options.items():
+        for advice in held.advice:
+            yield Finding("options", "advice", f"{name}: {advice}")
+
+
 def access_findings(options: Mapping[str, Options]) -> Iterator[Finding]:
     """May this user read and write the devices?"""
     for name, held in options.items():

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from hw.block import BlockFlags, Drop
 from hw.conformance.serial import SerialContract, SerialRig
+from hw.sensor import DeviceLost
 from hw.serial_binary import SerialBinary
 
 LAP = 30_000
@@ -57,6 +58,41 @@ class BinaryRig(SerialRig):
 
 class UncountedRig(BinaryRig):
     known = {key: value for key, value in BinaryRig.known.items() if key != "sequence"}  # noqa: RUF012
+
+
+class UnmarkedRig(BinaryRig):
+    """Frames of 80, x, y, z and 0880: the last byte is 80 too."""
+
+    known = {  # noqa: RUF012
+        "baud_rate": 921600,
+        "start": "80",
+        "length": 9,
+        "byte_order": "big",
+        "indications": [{"at": at, "type": "i16"} for at in (1, 3, 5)],
+    }
+
+    def write(self, first: int, n: int) -> bytes:
+        whole = super().write(first, n)
+        return b"".join(b"\x80" + whole[at + 4 : at + 10] + b"\x08\x80" for at in range(0, len(whole), 14))
+
+
+class EndedRig(BinaryRig):
+    """Frames of 80, sequence, x, y, z, 0880 and 0D."""
+
+    known = {  # noqa: RUF012
+        "baud_rate": 921600,
+        "start": "80",
+        "end": "0d",
+        "length": 12,
+        "byte_order": "big",
+        "sequence": {"at": 1, "type": "u16"},
+        "indications": [{"at": at, "type": "i16"} for at in (3, 5, 7)],
+        "full_scale": 32767,
+    }
+
+    def write(self, first: int, n: int) -> bytes:
+        whole = super().write(first, n)
+        return b"".join(b"\x80" + whole[at + 2 : at + 10] + b"\x08\x80\r" for at in range(0, len(whole), 14))
 
 
 class TestSerialBinary(SerialContract):
@@ -105,3 +141,25 @@ class TestSerialBinary(SerialContract):
             assert after.first_index == before.first_index + before.n
         finally:
             rig.close()
+
+    def test_frames_that_fit_at_two_places_are_a_loss(self, tmp_path: Path) -> None:
+        rig = UnmarkedRig(tmp_path / "other")
+        try:
+            rig.open()
+            told = r"other: 2 bytes of each 9 may be the start of a frame \(80\), in \d{5} frames one after the other"
+            with pytest.raises(DeviceLost, match=told):
+                list(iter(rig.sensor.read_block, "never"))
+        finally:
+            rig.close()
+
+
+class TestWithoutChecksum(SerialContract):
+    """Frames that only their first and last byte and their sequence tell."""
+
+    samples = 100_000  # it shares code with the frames above, of which more are read
+
+    @pytest.fixture
+    def rig(self, tmp_path: Path) -> Iterator[EndedRig]:
+        rig = EndedRig(tmp_path / "port")
+        yield rig
+        rig.close()

@@ -90,6 +90,32 @@ def test_a_certificate_older_than_its_interval_is_told_and_is_no_fault(
     assert shown.out.startswith(f"{path}: good")
 
 
+BINARY = (
+    'driver = "serial-binary"\noptions = { port = "/dev/none", rate_hz = 100, length = 9, start = "80", '
+    "indications = [{ at = 1, type = 'i16' }, { at = 3, type = 'i16' }, { at = 5, type = 'i16' }] }"
+)
+
+
+def test_options_that_are_not_good_are_told_and_are_no_fault(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "gateway.toml"
+    csv = GOOD[GOOD.index("driver") : GOOD.index("[[devices]]", GOOD.index("driver"))]
+    path.write_text(GOOD.replace(csv, BINARY + "\n", 1))
+    advice = "start is the single byte 80, and nothing else tells where a frame begins; state checksum, end or sequence"
+    assert run_cli(["check", str(path)]) == 0
+    shown = capsys.readouterr()
+    assert shown.err.startswith(f"{path}: devices.0.options: {advice}")
+    assert shown.out.startswith(f"{path}: good")
+    run_cli(["doctor", str(path), "--data-dir", str(tmp_path), "--json", "-"])
+    findings = json.loads(capsys.readouterr().out)["findings"]
+    (found,) = [finding for finding in findings if finding["check"] == "options"]
+    assert found["verdict"] == "advice"
+    assert found["says"].startswith(f"imu: {advice}")
+    assert run_cli(["run", str(path), "--data-dir", str(tmp_path / "data"), "--duration", "0.1", "--log", "plain"]) == 0
+    assert f"imu: {advice}" in caplog.text
+
+
 @pytest.mark.parametrize(
     ("said", "instead", "told"),
     [

@@ -25,7 +25,27 @@ LAYOUT = Layout(b"\xaa\x55", 6, "sum8")
     [("sum8", 0xDD), ("xor8", 0x31), ("crc16-ccitt", 0x29B1), ("crc16-modbus", 0x4B37), ("none", 0)],
 )
 def test_checksums(name: ChecksumName, value: int) -> None:
-    assert CHECKSUMS[name][1](b"123456789") == value
+    assert CHECKSUMS[name][1](b"123456789", "little") == value
+
+
+def test_sum_of_words() -> None:
+    # Worked by hand: 8001 + FFFF + 0003 = 18003 hexadecimal; the bytes of each word exchanged: 0180 + FFFF + 0300
+    words = bytes.fromhex("8001 ffff 0003")
+    assert CHECKSUMS["sum16"][1](words, "big") == 0x8003
+    assert CHECKSUMS["sum16"][1](words, "little") == 0x047F
+
+
+@pytest.mark.parametrize(
+    "packet",
+    [
+        "7565 0102 0202 e1c7",  # MIP: set to idle
+        "7565 0102 0201 e0c6",  # MIP: ping
+    ],
+)
+def test_fletcher_of_whole_packets(packet: str) -> None:
+    # Worked by hand for the ping: a = 75 DA DB DD DF E0, b = 75 14F 22A 307 3E6 4C6
+    data = bytes.fromhex(packet)
+    assert CHECKSUMS["fletcher16"][1](data[:-2], "little").to_bytes(2, "little") == data[-2:]
 
 
 @pytest.mark.parametrize(
