@@ -124,6 +124,7 @@ BUILT_IN: Mapping[str, str] = {
     "adxl355": "hw.adxl355:Adxl355",
     "adxl357": "hw.adxl355:Adxl357",
     "adxl359": "hw.adxl355:Adxl359",
+    "epson": "hw.epson:Epson",
     "icm20948": "hw.icm20948:Icm20948",
     "icm42688": "hw.icm42688:Icm42688",
     "iio": "hw.iio:Iio",

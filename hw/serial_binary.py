@@ -239,7 +239,7 @@ class SerialBinary(SerialSensor):
             axes=len(options.indications),
         )
 
-    def _gather(self, port: serial.Serial) -> None:
-        super()._gather(port)
+    def _finish(self) -> None:
+        super()._finish()
         if self._loss is None and (undecided := self._stream.undecided):
-            self._loss = DeviceLost(f"port {port.port}: {undecided}")
+            raise DeviceLost(f"{self._where()}: {undecided}")

@@ -90,17 +90,23 @@ class SerialSensor(PollingSensor):
         return f"port {self._options.port}"
 
     def _start(self) -> DeviceInfo:
+        self._port = self._connect()
+        try:
+            info = self._set_up(self._port)
+        except LOST as error:
+            raise DeviceLost(f"{self._where()}: {reason_of(error)}") from error
+        self._stream.begin()
+        return info
+
+    def _connect(self) -> serial.Serial:
         options = self._options
         try:
-            self._port = serial.Serial(options.port, options.baud_rate, timeout=BLOCK_S, exclusive=True)
-            info = self._set_up(self._port)
+            return serial.Serial(options.port, options.baud_rate, timeout=BLOCK_S, exclusive=True)
         except LOST as error:
             there = f"; {ports_there()}" if getattr(error, "errno", None) == errno.ENOENT else ""
             raise DeviceLost(f"{self._where()}: {reason_of(error)}{there}") from error
         except ValueError as error:
             raise ConfigurationError(f"{self._where()}, baud_rate {options.baud_rate}: {error}") from error
-        self._stream.begin()
-        return info
 
     def _stop(self) -> None:
         port, self._port = self._port, None

@@ -21,8 +21,10 @@ class UncheckedFrames:
     rises evenly, and no other place fits. The place is kept as long as each frame fits.
 
     Nothing proves a single frame. A frame is found only where the frame before it fits too and, without end bytes,
-    where another frame begins behind it. So a byte that is lost or added costs the frames beside it, too. Changed bytes
-    between start and end are not noticed.
+    where another frame begins behind it. So a byte that is lost or added costs the frames beside it, too. A frame whose
+    counter does not count on from the frame before it is left out, too: where bytes were lost, it may consist of halves
+    of two frames. Two such frames, one behind the other, are at a wrong place. Changed bytes between start and end are
+    not noticed.
 
     - `count(frames)`: the unsigned counter (n,) in frames (n, length); None where the frames have none.
     - `places`: number of places that fit all `undecided` frames at the end of the last piece; 0 where none was left
@@ -36,6 +38,8 @@ class UncheckedFrames:
         self._count = count
         self._least = max(2, -(-AGREEMENT_BITS // (8 * len(layout.start + layout.end))))  # frames that must agree
         self._in_step = False  # a frame is expected at the first byte of the next piece
+        self._last = self._step = 0  # the newest count, and by how much it rises
+        self._jumped = False  # whether the newest frame did not count on
         self.places = self.undecided = 0
 
     def find(self, data: bytes) -> Found:
@@ -44,28 +48,42 @@ class UncheckedFrames:
         begins = _matches(data, self._layout.start)
         fits = begins[: max(0, len(data) - length + 1)] & _matches(data, end)[length - len(end) :]
         sound = fits if end else fits[: len(begins[length:])] & begins[length:]
+        counts = self._counts(data)
         starts = [np.empty(0, np.int64)]
         at, self.places, self.undecided = 0, 0, 0
         while True:
             if not self._in_step:
-                at, place = self._place(data, fits, at)
+                at, place = self._place(counts, fits, at)
                 if place is None:
                     break
                 at += place + length
+                if counts is not None:
+                    self._last, self._step = (
+                        int(counts[at - length]),
+                        int((counts[at : at + 1] - counts[at - length])[0]),
+                    )
             run = sound[at::length]
             n = len(run) if run.all() else int(run.argmin())
-            starts.append(at + length * np.arange(n))
+            start = at + length * np.arange(n)
+            if counts is not None and n:
+                on = self._count_on(counts[start])
+                n = len(on)
+                start = start[:n][on]
+            starts.append(start)
             at += n * length
             self._in_step = n == len(run)
             if self._in_step:
                 break
-        start = np.concatenate(starts)
-        return Found(data, start, start + length, at, length)
+        found = np.concatenate(starts)
+        return Found(data, found, found + length, at, length)
 
-    def _place(self, data: bytes, fits: NDArray[np.bool_], at: int) -> tuple[int, int | None]:
+    def _place(
+        self, counts: NDArray[np.unsignedinteger] | None, fits: NDArray[np.bool_], at: int
+    ) -> tuple[int, int | None]:
         """The first position from `at` on from which one place fits alone, and this place; None where more bytes must
         tell."""
-        length, steps = self._layout.length, self._steps(data)
+        length = self._layout.length
+        steps = None if counts is None else counts[length:] - counts[:-length]  # modulo their type
         alive, n = np.ones(length, np.bool_), 0
         while at + (n + 1) * length <= len(fits):
             alive &= fits[at + n * length :][:length]
@@ -81,13 +99,26 @@ class UncheckedFrames:
             self.places, self.undecided = int(alive.sum()), n
         return at, None
 
-    def _steps(self, data: bytes) -> NDArray[np.unsignedinteger] | None:
-        """By how much the counter rises from the frame at each position to the frame behind it."""
-        length = self._layout.length
-        if self._count is None or len(data) < 2 * length:
+    def _counts(self, data: bytes) -> NDArray[np.unsignedinteger] | None:
+        """The counter of a frame at each position, as far as there are whole frames."""
+        if self._count is None:
             return None
-        counts = self._count(sliding_window_view(np.frombuffer(data, np.uint8), length))
-        return counts[length:] - counts[:-length]  # modulo its type
+        padded = np.frombuffer(data.ljust(self._layout.length, b"\0"), np.uint8)
+        return self._count(sliding_window_view(padded, self._layout.length))[
+            : max(0, len(data) - self._layout.length + 1)
+        ]
+
+    def _count_on(self, counts: NDArray[np.unsignedinteger]) -> NDArray[np.bool_]:
+        """Whether frames that lie one behind the other count on from the frame before them, up to the first two that do
+        not."""
+        on = np.asarray(np.diff(counts, prepend=counts.dtype.type(self._last)) == self._step)
+        off = ~np.insert(on, 0, not self._jumped)
+        twice = off[1:] & off[:-1]
+        if twice.any():
+            on = on[: int(twice.argmax())]
+        if len(on):
+            self._last, self._jumped = int(counts[len(on) - 1]), not on[-1]
+        return on
 
 
 def _matches(data: bytes, pattern: bytes) -> NDArray[np.bool_]:

@@ -96,6 +96,30 @@ def test_a_counter_rises_evenly() -> None:
     assert list(map(bytes, found.frames)) == frames[2:89]
 
 
+@pytest.mark.parametrize("changes", [COUNTED, CLOSED | COUNTED])
+def test_two_halves_of_different_frames_are_no_sample(changes: dict[str, object]) -> None:
+    """Bytes were lost until the same byte of a later frame: start and end fit. The counter, which is behind the other
+    numbers, does not."""
+    frames, true = epson(60), axes(60)
+    for cut in range(1, 19):  # from byte 19 on the whole of the numbers is of frame 20
+        data = b"".join([*frames[:20], frames[20][:cut] + frames[25][cut:], *frames[26:]])
+        rows, _, _ = read(data, piece=37, **changes)
+        assert set(rows) <= set(true)
+        assert not {true[k] for k in range(26, 59)} - set(rows)
+
+
+def test_another_place_that_fits_after_a_loss_is_left_again() -> None:
+    """Bytes are lost until the place that was taken is one at which the frames fit, too. Their counter does not."""
+    frames = [bytes([0x80, 3 * k % 256, 0x80, k * k % 251, 7]) for k in range(90)]
+    for piece in (7, 1000):
+        search, rest, found = UncheckedFrames(Layout(b"\x80", 5), lambda f: numbers(f, 1, "u8", "little")), b"", []
+        data = b"".join(frames[:40]) + b"".join(frames[45:])[2:]
+        for at in range(0, len(data), piece):
+            new = search.find(rest + data[at : at + piece])
+            rest, found = new.rest, [*found, *map(bytes, new.frames)]
+        assert found == frames[1:40] + frames[48:89]  # 45 is cut, 46 and 47 are behind it
+
+
 def damaged(frames: list[bytes], k: int, kind: str) -> Iterator[bytes]:
     """The stream with each byte of frame k lost, doubled, or with another byte before it."""
     whole, at = b"".join(frames), sum(map(len, frames[:k]))
