@@ -132,6 +132,7 @@ BUILT_IN: Mapping[str, str] = {
     "lsm6dso": "hw.lsm6dso:Lsm6dso",
     "mcc-usb": "hw.mcc_usb:MccUsb",
     "mcc172": "hw.mcc172:Mcc172",
+    "mip": "hw.mip:Mip",
     "mqtt": "hw.mqtt:Mqtt",
     "mpu6050": "hw.mpu6050:Mpu6050",
     "ni": "hw.ni_daqmx:Ni",
