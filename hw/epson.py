@@ -17,7 +17,7 @@ from hw.cutting import Break, Cutter, follow
 from hw.frame_stream import Decoded, FrameStream
 from hw.frames import Found
 from hw.sensor import ConfigurationError, DeviceLost, IdentityError
-from hw.serial_sensor import LONGEST_GAP_S, LOST, SerialOptions, SerialSensor, reason_of
+from hw.serial_sensor import LONGEST_GAP_S, LOST, AskedSensor, SerialOptions
 from hw.unchecked_frames import UncheckedFrames
 from hw.units import STANDARD_GRAVITY_MPS2, asked_of_certificate, nominal_sensitivity
 
@@ -163,7 +163,7 @@ class EpsonStream(FrameStream):
         return [Break(point.at, BlockFlags.RESTART) for point in breaks] if paused else breaks
 
 
-class Epson(SerialSensor):
+class Epson(AskedSensor):
     """Sets rate, filter and the contents of frames, and reads them back; then the device sends by itself.
 
     User offsets are set to zero, and the limits at which values end to 15 g. Nothing is saved in the device: after a
@@ -173,20 +173,6 @@ class Epson(SerialSensor):
 
     options_model = EpsonOptions
     _stream: EpsonStream
-
-    def identify(self) -> dict[str, Any]:
-        """Options that follow from the device. It stops sending. Raises DeviceError."""
-        try:
-            self._port = self._connect()
-            self._port.timeout = ANSWER_TIMEOUT_S
-            product = self._product(self._port)
-        except LOST as error:
-            raise DeviceLost(f"{self._where()}: {reason_of(error)}") from error
-        finally:
-            self._stop()
-        if product.startswith(epson.VELOCITY.products):
-            return {"unit": "m/s", "rate_hz": epson.VELOCITY_HZ}
-        return {"unit": "g"}
 
     def _stop(self) -> None:
         if self._port is not None:
@@ -199,6 +185,13 @@ class Epson(SerialSensor):
         limits = -output.highest / output.scale, output.highest / output.scale
         return EpsonStream(Cutter(name, self._options.rate_hz, *limits), self._options)
 
+    def _recognise(self, port: serial.Serial) -> dict[str, Any]:
+        port.timeout = ANSWER_TIMEOUT_S
+        product = self._product(port)
+        if product.startswith(epson.VELOCITY.products):
+            return {"unit": "m/s", "rate_hz": epson.VELOCITY_HZ}
+        return {"unit": "g"}
+
     def _set_up(self, port: serial.Serial) -> DeviceInfo:
         options, output = self._options, self._options.output
         timeout, port.timeout = port.timeout, ANSWER_TIMEOUT_S
@@ -209,9 +202,7 @@ class Epson(SerialSensor):
                 f"M-{' or M-'.join(output.products)}"
             )
         if (found := self._read(port, epson.DIAGNOSIS)) & epson.HARDWARE_ERRORS:
-            raise ConfigurationError(
-                f"{self._where()}: M-{product} reports a hardware error (DIAG_STAT 0x{found:04X})"
-            )
+            raise ConfigurationError(f"{self._where()}: M-{product} reports a hardware error (DIAG_STAT 0x{found:04X})")
         read = self._settle(port, epson.settings(output, options.rate_hz, options.used_filter))
         number = epson.text([self._read(port, register) for register in epson.SERIAL_NUMBER])
         version = self._read(port, epson.VERSION)
@@ -251,16 +242,16 @@ class Epson(SerialSensor):
             raise IdentityError(
                 f"{self._where()}: no Epson sensor at {port.baudrate} baud (received: {said}); check baud_rate"
             )
-        self._wait(port, epson.GLOBAL, epson.NOT_READY, READY_S)
+        self._until_clear(port, epson.GLOBAL, epson.NOT_READY, READY_S)
         return epson.text([self._read(port, register) for register in epson.PRODUCT])
 
     def _settle(self, port: serial.Serial, wanted: Mapping[tuple[int, int], int]) -> dict[tuple[int, int], int]:
         """Write the settings and return them as read back. Raises ConfigurationError where one does not hold."""
         for register, value in wanted.items():
             self._write(port, *register, low=value & 0xFF, high=value >> 8 if register != epson.UART else None)
-        self._wait(port, epson.SIGNAL, epson.OUTPUT_BUSY, SETTING_S)
+        self._until_clear(port, epson.SIGNAL, epson.OUTPUT_BUSY, SETTING_S)
         if epson.FILTER in wanted:
-            self._wait(port, epson.FILTER, epson.FILTER_BUSY, SETTING_S)
+            self._until_clear(port, epson.FILTER, epson.FILTER_BUSY, SETTING_S)
         read = {register: self._read(port, register) for register in wanted}
         read[epson.UART] &= 0xFF
         wrong = [
@@ -272,7 +263,7 @@ class Epson(SerialSensor):
             raise ConfigurationError(f"{self._where()}: the sensor does not hold its settings: {', '.join(wrong)}")
         return read
 
-    def _wait(self, port: serial.Serial, register: tuple[int, int], busy: int, longest_s: float) -> None:
+    def _until_clear(self, port: serial.Serial, register: tuple[int, int], busy: int, longest_s: float) -> None:
         """Wait until no bit of `busy` is set."""
         for _ in range(round(longest_s / POLL_S)):
             if not self._read(port, register) & busy:

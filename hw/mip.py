@@ -17,7 +17,7 @@ from hw.cutting import Break, Cutter, follow
 from hw.frame_stream import Decoded, FrameStream
 from hw.frames import Found, Layout
 from hw.sensor import ConfigurationError, DeviceLost, IdentityError
-from hw.serial_sensor import LONGEST_GAP_S, LOST, SerialOptions, SerialSensor, reason_of
+from hw.serial_sensor import LONGEST_GAP_S, LOST, AskedSensor, SerialOptions
 from hw.units import STANDARD_GRAVITY_MPS2, asked_of_certificate, nominal_sensitivity
 
 BITS_A_BYTE = 10  # with start and stop bit
@@ -103,7 +103,7 @@ class MipStream(FrameStream):
         return breaks[: restart + 1]
 
 
-class Mip(SerialSensor):
+class Mip(AskedSensor):
     """Sets rate and contents of the packets, and reads them back; other streams are turned off.
 
     The user's bias of the accelerations and the rotation to the frame of a vehicle are set to nothing, and the low-pass
@@ -112,18 +112,6 @@ class Mip(SerialSensor):
 
     options_model = MipOptions
     _stream: MipStream
-
-    def identify(self) -> dict[str, Any]:
-        """Options that follow from the device. It stops sending. Raises DeviceError."""
-        try:
-            self._port = self._connect()
-            self._port.timeout = ANSWER_TIMEOUT_S
-            self._idle(self._port)
-        except LOST as error:
-            raise DeviceLost(f"{self._where()}: {reason_of(error)}") from error
-        finally:
-            self._stop()
-        return {}
 
     def _stop(self) -> None:
         if self._port is not None:
@@ -135,13 +123,18 @@ class Mip(SerialSensor):
         self._cutter = Cutter(name, self._options.rate_hz)
         return MipStream(self._cutter, self._options.rate_hz)
 
+    def _recognise(self, port: serial.Serial) -> dict[str, Any]:
+        port.timeout = ANSWER_TIMEOUT_S
+        self._idle(port)
+        return {}
+
     def _set_up(self, port: serial.Serial) -> DeviceInfo:
         timeout, port.timeout = port.timeout, ANSWER_TIMEOUT_S
         self._idle(port)
         told = self._ask(port, mip.BASE, mip.DEVICE_INFO, least=82)
         model, _, number, _, options = (mip.text(told[at : at + 16]) for at in range(2, 82, 16))
         known = self._known(port)
-        self._stream.clock = self._clock_field(port, known)
+        self._stream.clock = self._clock_field(known)
         generation = mip.generation(known)
         decimation = self._set_format(port, generation)
         corner_hz = self._set_filter(port, generation) if (mip.SENSOR_COMMANDS, generation.low_pass) in known else None
@@ -225,7 +218,7 @@ class Mip(SerialSensor):
             raise IdentityError(f"{self._where()}: this MIP device has no scaled acceleration")
         return known
 
-    def _clock_field(self, port: serial.Serial, known: set[tuple[int, int]]) -> int:
+    def _clock_field(self, known: set[tuple[int, int]]) -> int:
         """The time that never jumps, where the device has it; else the GPS time, which runs without GPS too."""
         for field in (mip.REFERENCE_TIME, mip.GPS_TIME):
             if (mip.SENSOR_DATA, field) in known:

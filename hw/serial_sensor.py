@@ -147,3 +147,24 @@ class SerialSensor(PollingSensor):
             filters=options.known_filters,
             **known,
         )
+
+
+class AskedSensor(SerialSensor):
+    """A sensor that answers when it is asked who it is."""
+
+    @abstractmethod
+    def _recognise(self, port: serial.Serial) -> dict[str, Any]:
+        """Options that follow from the device. Raises IdentityError where it is none of this driver's."""
+
+    def identify(self) -> dict[str, Any]:
+        """Ask the device at this port and baud rate who it is; it stops sending.
+
+        Returns the options that follow from the device. Raises IdentityError, ConfigurationError or DeviceLost.
+        """
+        try:
+            self._port = self._connect()
+            return self._recognise(self._port)
+        except LOST as error:
+            raise DeviceLost(f"{self._where()}: {reason_of(error)}") from error
+        finally:
+            self._stop()
