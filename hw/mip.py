@@ -35,6 +35,7 @@ class MipOptions(SerialOptions):
     baud_rate: Literal[9600, 19200, 38400, 57600, 115200, 230400, 460800, 921600] = Field(
         115200, description="as set in the device, which is 115200 at the factory"
     )
+    unit: Literal["g"] = Field("g", description="of the indications")
     rate_hz: float = Field(
         100.0, gt=0, le=4000, description="the base rate of the device, which opening tells, or a whole part of it"
     )
@@ -52,7 +53,7 @@ class MipOptions(SerialOptions):
     @property
     def asked_of_certificate(self) -> str:
         """A reference that indicates g has not the sensitivity 1."""
-        return asked_of_certificate("g")
+        return asked_of_certificate(self.unit)
 
 
 class MipStream(FrameStream):
@@ -154,10 +155,10 @@ class Mip(AskedSensor):
             settings,
             kind=model,
             serial_number=number,
-            unit="g",
+            unit=self._options.unit,
             axes=3,
             range_mps2=None if range_g is None else range_g * STANDARD_GRAVITY_MPS2,
-            nominal_sensitivity=nominal_sensitivity("g"),
+            nominal_sensitivity=nominal_sensitivity(self._options.unit),
             filter_settings=tuple({"decimation", "low-pass"} & settings.keys()),
         )
         return info if corner_hz is None else replace(info, filters=(generation.filter_line(corner_hz),))

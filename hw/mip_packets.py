@@ -88,7 +88,7 @@ def find(data: bytes) -> Found:
     """Find all packets in `data`: with the right checksum, and filled by their fields."""
     starts: list[int] = []
     ends: list[int] = []
-    at = 0
+    at = free = 0
     while (at := data.find(SYNC, at)) >= 0 and at + HEADER <= len(data):
         end = at + HEADER + data[at + 3] + CHECKSUM
         if end > len(data):
@@ -96,10 +96,10 @@ def find(data: bytes) -> Found:
         if data[end - CHECKSUM : end] == _checksum(data[at : end - CHECKSUM]) and _is_filled(data[at:end]):
             starts.append(at)
             ends.append(end)
-            at = end
+            at = free = end
         else:
             at += 1
-    rest_at = at if at >= 0 else len(data) - data.endswith(SYNC[:1])
+    rest_at = at if at >= 0 else len(data) - data[free:].endswith(SYNC[:1])
     return Found(data, np.array(starts, np.int64), np.array(ends, np.int64), rest_at)
 
 

@@ -285,7 +285,7 @@ def _axes(device: Chosen) -> int:
         return len(channels)
     driver = load_driver(device.driver.value)
     chip = isinstance(driver, type) and issubclass(driver, FifoSensor)
-    return 3 if chip or device.driver.value in ("iio", "witmotion") else 1
+    return 3 if chip or device.driver.value in ("epson", "iio", "mip", "witmotion") else 1
 
 
 def _sensitivity(asking: Asking, sensor: Chosen, given: float | None) -> Stated[Any]:

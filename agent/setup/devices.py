@@ -13,6 +13,7 @@ from agent.setup.asking import Asking, Stated
 from agent.setup.buses import bus_clock_khz
 from agent.setup.drivers import describe, unit_of
 from agent.setup.listening import Heard, hear
+from agent.setup.recognising import recognised
 from agent.setup.toml import Setting, Table
 from hw.fifo_options import FifoOptions
 from hw.line_columns import IGNORED, Column, columns_of
@@ -70,6 +71,8 @@ def listen(devices: list[Chosen], asking: Asking) -> None:
     heard = hear(ports) if ports else {}
     for device in waiting:
         told = heard[str(device.value("port"))]
+        if isinstance(told, str) and _ask(device):
+            continue
         if isinstance(told, str):
             asking.faults.append(
                 f"{device.role}: port {device.value('port')}: {told}; connect the device, or state its lines with "
@@ -80,6 +83,18 @@ def listen(devices: list[Chosen], asking: Asking) -> None:
             device.state("rate_hz", told.nominal_hz, f"counted on the port: {told.counted_hz:.4g} Hz")
             if columns := _columns(device, told, asking):
                 _state_unit(device, columns, told, asking.faults)
+
+
+def _ask(device: Chosen) -> bool:
+    """Ask the device at a port without lines of text who it is; whether it answered. Its driver is then known."""
+    if device.driver.source.startswith("option"):
+        return False
+    found = recognised(str(device.value("port")), device.value("baud_rate"))
+    if found is not None:
+        device.driver = Stated(found.driver, "the device answered on the port")
+        for name, value in found.options.items():
+            device.state(name, value, "the device answered on the port")
+    return found is not None
 
 
 def _stated_columns(device: Chosen) -> tuple[Column, ...]:

@@ -297,6 +297,14 @@ def test_fields_that_do_not_fill_the_packet_are_no_packet(payload: str) -> None:
     assert len(mip.find(body + bytes([a, b])).start) == 0
 
 
+def test_a_checksum_that_ends_as_a_packet_begins() -> None:
+    last = [packet(0x80, (0x04, bytes([0] * 11 + [i]))) for i in range(256)]
+    (whole,) = [one for one in last if one[-1] == 0x75]
+    found = mip.find(whole)
+    assert (len(found.start), found.dropped, found.rest) == (1, 0, b"")
+    assert mip.find(whole + b"\x75").rest == b"\x75"
+
+
 def read(data: bytes, piece: int = 61) -> list[tuple[float, ...]]:
     stream = MipStream(Cutter("s", 500.0), 500.0)
     stream.clock = mip.REFERENCE_TIME
