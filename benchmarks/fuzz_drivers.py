@@ -32,16 +32,22 @@ from hw import (
 )
 from hw.block import SampleBlock
 from hw.cutting import Cutter
+from hw.epson import EpsonOptions, EpsonStream
 from hw.fifo import plain_samples
 from hw.line_columns import columns_of
 from hw.line_stream import LineStream
+from hw.mip import MipStream
 from hw.mqtt_payload import Json, PayloadError, Sparkplug
 from hw.sensor import ConfigurationError
 from hw.serial_binary import BinaryStream, SerialBinaryOptions
 from hw.serial_sensor import Stream
 from hw.sound_card import read_plate
 from hw.sparkplug_pb2 import Payload
+<<<<<<< HEAD
 from hw.virtual import adxl355_twin, lsm6dso_twin, seedlink_twin, shake_twin, witmotion_twin
+=======
+from hw.virtual import adxl355_twin, epson_twin, lsm6dso_twin, mip_twin, seedlink_twin, witmotion_twin
+>>>>>>> 3e380f7 (Fuzzing of the streams of epson and mip)
 from hw.witmotion import WitStream
 
 STREAMS = 1_000_000
@@ -87,6 +93,12 @@ def parsers() -> dict[str, tuple[bytes, Parse]]:
         "icm42688": (b"@" + bytes(7) + b"@" * 16, lambda data, i: icm42688_registers.samples(_whole(data, 8))),  # noqa: ARG005
         "lis3dh": (bytes(60), lambda data, i: lis3dh_registers.samples(_whole(data, 6))),  # noqa: ARG005
         "witmotion": (wit, _fed(WitStream(Cutter("w", 200.0), 200.0))),
+        "epson": (_epson(b"A352AD10"), _fed(EpsonStream(Cutter("e", 200.0), EpsonOptions(port="p")))),
+        "epson, velocity": (
+            _epson(b"A342VD10"),
+            _fed(EpsonStream(Cutter("v", 3000.0), EpsonOptions(port="p", unit="m/s", rate_hz=3000.0))),
+        ),
+        "mip": (_mip(), _fed(MipStream(Cutter("m", 100.0), 100.0))),
         "serial-binary": (frames, _fed(BinaryStream(Cutter("b", 100.0), binary))),
         "serial-csv": (lines, _fed(LineStream(Cutter("l", 100.0), LINE, longest_gap=1000.0))),
         "seedlink": (seedlink_twin.record("AM.R1.00.ENZ", 0, 100, COUNTS[:, 0]), _miniseed),
@@ -100,6 +112,18 @@ def parsers() -> dict[str, tuple[bytes, Parse]]:
         ),
         "replay": (encode_block(7, block), _replay),
     }
+
+
+def _epson(product: bytes) -> bytes:
+    twin = epson_twin.EpsonTwin(lambda _, n: np.zeros((n, 3), np.int32), lambda _: 0, product=product)
+    twin.registers[1][0x0C:0x0E] = b"\x02\x07" if twin.velocity else b"\x03\xc7"
+    return b"".join(twin.frame(k, [k, -k, 8]) for k in range(6))
+
+
+def _mip() -> bytes:
+    twin = mip_twin.MipTwin(lambda _, n: np.zeros((n, 3)), lambda _: 0, 100.0)
+    twin.format = [(0x12, 10), (0x04, 10)]
+    return b"".join(twin.sample(k, [0.5, -1.0, k / 8]) for k in range(3))
 
 
 def fuzz(streams: int, seed: int) -> list[Row]:
