@@ -43,11 +43,15 @@ from hw.serial_binary import BinaryStream, SerialBinaryOptions
 from hw.serial_sensor import Stream
 from hw.sound_card import read_plate
 from hw.sparkplug_pb2 import Payload
-<<<<<<< HEAD
-from hw.virtual import adxl355_twin, lsm6dso_twin, seedlink_twin, shake_twin, witmotion_twin
-=======
-from hw.virtual import adxl355_twin, epson_twin, lsm6dso_twin, mip_twin, seedlink_twin, witmotion_twin
->>>>>>> 3e380f7 (Fuzzing of the streams of epson and mip)
+from hw.virtual import (
+    adxl355_twin,
+    epson_twin,
+    lsm6dso_twin,
+    mip_twin,
+    seedlink_twin,
+    shake_twin,
+    witmotion_twin,
+)
 from hw.witmotion import WitStream
 
 STREAMS = 1_000_000

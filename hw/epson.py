@@ -87,6 +87,11 @@ class EpsonOptions(SerialOptions):
         return self.filter or epson.USUAL_FILTERS.get(self.rate_hz, "")
 
     @property
+    def quantity(self) -> str:
+        """As the unit says."""
+        return "velocity" if self.unit == "m/s" else "acceleration"
+
+    @property
     def known_filters(self) -> tuple[str, ...]:
         """The delay of the filter. The data sheet draws its response and tells no number; of velocities it is not
         known."""

@@ -51,6 +51,11 @@ class MipOptions(SerialOptions):
         return self
 
     @property
+    def quantity(self) -> str:
+        """It indicates accelerations."""
+        return "acceleration"
+
+    @property
     def asked_of_certificate(self) -> str:
         """A reference that indicates g has not the sensitivity 1."""
         return asked_of_certificate(self.unit)
