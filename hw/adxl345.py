@@ -27,6 +27,7 @@ class Adxl345Options(FifoOptions):
     bytes_a_sample = 11  # one read per sample: address, register, address, INT_SOURCE, DATA_FORMAT, six data bytes
     bytes_a_poll = 4  # address, register, address, FIFO_STATUS
     reads_a_sample, reads_a_poll = 1, 1
+    stated_hz_a_khz = chip.STATED_HZ_A_KHZ
 
     address: Literal[0x53, 0x1D] = Field(0x53, description="83 (0x53), or 29 (0x1D) with ALT ADDRESS high")
     rate_hz: float = Field(800.0, description=f"one of {', '.join(f'{rate:g}' for rate in chip.RATE_CODES)}")

@@ -21,8 +21,8 @@ STANDBY, MEASURE = 0x00, 0x08
 BYPASS, STREAM = 0x00, 0x80
 COUNTS_PER_G = 256  # in full resolution, at any range; the data sheet allows 230 to 282
 RANGE_CODES: Mapping[int, int] = {2: 0, 4: 1, 8: 2, 16: 3}
-# At 3200 and 1600 Hz the lowest bit is lost, and the samples do not fit a 400 kHz bus: the data sheet gives 800 Hz as
-# the highest rate for it.
+STATED_HZ_A_KHZ = 2.0  # data sheet: 800 Hz at 400 kHz, in proportion to the clock
+# At 3200 and 1600 Hz the lowest bit is lost, and the samples do not fit a 400 kHz bus.
 RATE_CODES: Mapping[float, int] = {800.0 / 2.0**step: 0x0D - step for step in range(10)}
 LOWEST_STATED_HZ = 2.0  # of the rates whose filter is stated
 SETTING_NAMES: Mapping[int, str] = {

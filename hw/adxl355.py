@@ -26,6 +26,8 @@ class Adxl355Options(FifoOptions):
     fifo_samples = chip.FIFO_ENTRIES_MAX // 3
     bytes_a_sample = 9
     bytes_a_poll = 12  # address, register, address, STATUS, FIFO_ENTRIES; twice address, register, address; STATUS
+    stated_hz_a_khz = chip.STATED_HZ_A_KHZ
+    must_be_alone = chip.MUST_BE_ALONE
 
     address: Literal[0x1D, 0x53] = Field(0x1D, description="29 (0x1D), or 83 (0x53) with ASEL high")
     rate_hz: float = Field(1000.0, description=f"one of {', '.join(f'{rate:g}' for rate in chip.RATES_HZ)}")
@@ -54,6 +56,12 @@ class Adxl355(FifoSensor):
     part: ClassVar[chip.Part] = chip.ADXL355
     word_bytes, sample_words = 3, 3
     filter_settings = ("FILTER",)
+    _revision = 0
+
+    @property
+    def must_be_alone(self) -> str:
+        """As in FifoSensor."""
+        return "" if self._revision >= chip.FIRST_FREE_REVISION else chip.MUST_BE_ALONE
 
     def _kind(self) -> str:
         return self.part.kind
@@ -76,7 +84,8 @@ class Adxl355(FifoSensor):
         if found[:3] != self.part.identity:
             wanted = self.part.identity.hex(" ")
             raise IdentityError(f"{self._device.name}: expected the IDs {wanted}, found {found[:3].hex(' ')}")
-        return {"REVID": found[chip.REVISION]}
+        self._revision = found[chip.REVISION]
+        return {"REVID": self._revision}
 
     def _trims(self) -> Mapping[int, str]:
         return {chip.SHADOW + i: f"SHADOW_{i + 1}" for i in range(chip.SHADOW_BYTES)}

@@ -34,6 +34,17 @@ SETTING_NAMES = (
     *("INT_MAP", "SYNC", "RANGE", "POWER_CTL", "SELF_TEST"),
 )
 RATES_HZ = tuple(4000.0 / 2.0**code for code in range(11))  # index: the code in FILTER
+# Data sheets of the ADXL355 and ADXL359, "I2C protocol": at most 800 Hz at 400 kHz, in proportion to the clock; else
+# samples may be missing and noise added
+STATED_HZ_A_KHZ = 2.0
+# The same section: a part acknowledges the bytes 0x3A and 0x3B (at 0x53: 0xA6 and 0xA7) in messages to other devices,
+# and pulls SDA down. The sheets, in which REVID is 1, name no revision without this fault. In the ADXL371 and ADXL372 a
+# fault of this kind ended with revision 3 (no-OS, adxl372.c); the same is assumed here.
+FIRST_FREE_REVISION = 3
+MUST_BE_ALONE = (
+    f"a part whose REVID is below {FIRST_FREE_REVISION} answers bytes that are meant for others, so it must be the "
+    "only device on its bus"
+)
 _LATE_S = 0.17e-3  # delay of the path at any rate, besides that of its filters
 COUNTS_MIN, COUNTS_MAX = -(2**19), 2**19 - 1
 _RANGE_RESET_BITS = 0x80  # I2C high-speed bits, set by a reset and kept

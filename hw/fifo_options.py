@@ -32,6 +32,9 @@ class FifoOptions(Options):
     bytes_a_poll: ClassVar[int]  # addresses, registers, status and count
     reads_a_sample: ClassVar[int] = 0  # register reads, where each sample needs its own
     reads_a_poll: ClassVar[int] = 3  # register reads besides: status, data, status
+    # Highest rate that the data sheet states for I2C, Hz for each kHz of the bus; None where it states none
+    stated_hz_a_khz: ClassVar[float | None] = None
+    must_be_alone: ClassVar[str] = ""  # why no other device may be on the bus; "" where others may
 
     bus: int = Field(1, ge=0, description="N of /dev/i2c-N")
     rate_hz: float
@@ -74,6 +77,20 @@ class FifoOptions(Options):
                 f"at most {BUS_SHARE_MAX:.0%} may be used: lower rate_hz or use a faster bus"
             )
         return self
+
+    @property
+    def advice(self) -> tuple[str, ...]:
+        """A rate above what the data sheet states for this bus."""
+        if self.stated_hz_a_khz is None or self.rate_hz <= self.stated_hz_a_khz * self.bus_khz:
+            return ()
+        stated_hz = self.stated_hz_a_khz * self.bus_khz
+        lower = [rate for rate in self.rates_hz if rate <= stated_hz]
+        remedy = f"set rate_hz = {max(lower):g}, or " if lower else ""
+        return (
+            f"rate_hz {self.rate_hz:g} is above {stated_hz:g} Hz, the highest rate that the data sheet states for a "
+            f"bus of {self.bus_khz:g} kHz; samples may be missing and noise added: {remedy}use a bus of at least "
+            f"{self.rate_hz / self.stated_hz_a_khz:g} kHz and state it as bus_khz",
+        )
 
     @property
     def interval_s(self) -> float:

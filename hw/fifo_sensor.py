@@ -182,6 +182,11 @@ class FifoSensor(PollingSensor):
         data_bytes = options.bytes_a_poll + samples * options.bytes_a_sample
         return float(self._device.time_s(transfers, data_bytes) / options.interval_s)
 
+    @property
+    def must_be_alone(self) -> str:
+        """Why no other device may be on the bus of the device that was identified; "" where others may."""
+        return str(self._options.must_be_alone)
+
     def identify(self) -> str:
         """Name the device at the address. Reads only the identity registers, so a device in use is not disturbed.
 

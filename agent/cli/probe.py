@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -26,7 +26,8 @@ class Answer:
     """Answer at an address.
 
     `drivers` are those that recognise the device (several if the part does not tell which of them it is); `note` is
-    what the other drivers, the adapter or the kernel report; `used_by` is the process that has the device open.
+    what the other drivers, the adapter or the kernel report; `used_by` is the process that has the device open;
+    `warning`: why the device must be alone on its bus, where it is not.
     """
 
     address: int
@@ -34,6 +35,7 @@ class Answer:
     identity: str = ""
     note: str = ""
     used_by: str = ""
+    warning: str = ""
     self_test: dict[str, Any] | None = None
 
 
@@ -102,8 +104,11 @@ def on_bus(number: int, drivers: dict[str, type[FifoSensor]], self_test: bool) -
     for name, driver in drivers.items():
         for address in get_args(driver.options_model.model_fields["address"].annotation):
             by_address.setdefault(address, {})[name] = driver
-    answers = [_at(number, address, by_address[address], self_test) for address in sorted(by_address)]
-    return Bus(number, "", [answer for answer in answers if answer is not None])
+    tried = [_at(number, address, by_address[address], self_test) for address in sorted(by_address)]
+    answers = [answer for answer in tried if answer is not None]
+    if len(answers) == 1:
+        answers = [replace(answers[0], warning="")]
+    return Bus(number, "", answers)
 
 
 def _at(bus: int, address: int, drivers: dict[str, type[FifoSensor]], self_test: bool) -> Answer | None:
@@ -123,9 +128,10 @@ def _at(bus: int, address: int, drivers: dict[str, type[FifoSensor]], self_test:
             return None
     if not known:
         return Answer(address, note="; ".join(notes))
-    result = tested(next(iter(known.values()))) if self_test else None
-    used_by = next(iter(known.values())).used_by()
-    return Answer(address, list(known), " or ".join(identities), used_by=used_by, self_test=result)
+    sensor = next(iter(known.values()))
+    result = tested(sensor) if self_test else None
+    told = {"used_by": sensor.used_by(), "warning": sensor.must_be_alone}
+    return Answer(address, list(known), " or ".join(identities), **told, self_test=result)
 
 
 def tested(sensor: FifoSensor) -> dict[str, Any]:
@@ -165,6 +171,8 @@ def _print(buses: list[Bus], ports: list[dict[str, str]]) -> None:
             if answer.drivers:
                 used_by = f", used by {answer.used_by}" if answer.used_by else ""
                 say(f"        driver {' or '.join(answer.drivers)}, one register read a transfer as here{used_by}")
+            if answer.warning:
+                say(f"        warning: other devices answer on this bus; {answer.warning}")
             for line in _self_test_lines(answer.self_test):
                 say(f"        {line}")
     for port in ports:

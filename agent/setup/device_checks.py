@@ -43,6 +43,26 @@ def option_findings(options: Mapping[str, Options]) -> Iterator[Finding]:
             yield Finding("options", "advice", f"{name}: {advice}")
 
 
+def sharing_findings(config: Config, options: Mapping[str, Options]) -> Iterator[Finding]:
+    """Does a device that must be alone on its bus share it? The device's identity is read where the bus is here."""
+    for device in config.devices:
+        held = options[device.name]
+        if not isinstance(held, FifoOptions) or not held.must_be_alone:
+            continue
+        others = [name for name, other in options.items() if isinstance(other, FifoOptions) and other.bus == held.bus]
+        others.remove(device.name)
+        if not others:
+            continue
+        sensor = cast(FifoSensor, load_driver(device.driver)(device.name, held))
+        try:
+            identity = sensor.identify()
+        except DeviceError:
+            identity = "its revision is not known: it was not read"
+        if sensor.must_be_alone:
+            says = f"{device.name} shares /dev/i2c-{held.bus} with {' and '.join(others)}: {held.must_be_alone}"
+            yield Finding("bus", "advice", f"{says} ({identity})", "give it a bus of its own")
+
+
 def access_findings(options: Mapping[str, Options]) -> Iterator[Finding]:
     """May this user read and write the devices?"""
     for name, held in options.items():

@@ -200,7 +200,7 @@ def complete(device: Chosen, asking: Asking) -> None:
 
 
 def _fit_bus(device: Chosen, model: type[FifoOptions]) -> None:
-    """State the clock of the bus as the system tells it, and the highest usual rate that fits it."""
+    """State the clock of the bus as the system tells it, and the highest usual rate that fits it without advice."""
     clock_khz = bus_clock_khz(int(device.value("bus") or 1))
     if clock_khz is not None:
         device.state("bus_khz", clock_khz, "the device tree of this machine")
@@ -210,10 +210,12 @@ def _fit_bus(device: Chosen, model: type[FifoOptions]) -> None:
     stated = {name: held.value for name, held in device.options.items()}
     for rate in sorted((rate for rate in model.rates_hz if rate <= default), reverse=True):
         try:
-            model.model_validate(stated | {"rate_hz": rate})
+            fitting = model.model_validate(stated | {"rate_hz": rate})
         except ValidationError:
             continue
-        source = "default" if rate == default else f"the highest rate that the bus of {clock_khz:g} kHz carries"
+        if fitting.advice:
+            continue
+        source = "default" if rate == default else f"the highest rate for a bus of {fitting.bus_khz:g} kHz"
         device.state("rate_hz", rate, source)
         return
 

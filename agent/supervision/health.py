@@ -24,6 +24,7 @@ from agent.core.events import (
 )
 from agent.supervision.devices import DeviceHealth, DeviceWatch
 from hw.block import SampleBlock
+from hw.sensor import load_driver
 
 # s without samples after which an open device is reported; ten blocks of most devices. By default a sensor's status
 # becomes INVALID after the same time.
@@ -111,7 +112,10 @@ class SensorHealth(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class GatewayStatus(Situation, frozen=True, kw_only=True):
-    """The content of `<gateway>/status`. `reasons`: why `state` is degraded."""
+    """The content of `<gateway>/status`. `reasons`: why `state` is degraded.
+
+    `advice`: what is not good about the options of a device; the device works with them all the same.
+    """
 
     site: str
     gateway: str
@@ -121,6 +125,7 @@ class GatewayStatus(Situation, frozen=True, kw_only=True):
     uptime_s: float
     state: State
     reasons: list[str]
+    advice: list[str]
     devices: dict[str, DeviceHealth]
     sensors: dict[str, SensorHealth]
 
@@ -143,6 +148,8 @@ class Health:
         self._run_id = run_id
         self._origin_ns = origin_ns
         self._devices = {device.name: DeviceWatch() for device in config.devices}
+        options = {d.name: load_driver(d.driver).options_model.model_validate(d.options) for d in config.devices}
+        self._advice = [f"{name}: {advice}" for name, held in options.items() for advice in held.advice]
         nothing = SensorHealth(status="", reason="", windows_used=0, windows_refused=0, calibrations=0)
         self._sensors = {channel.sensor: nothing for channel in config.channels}
 
@@ -187,6 +194,7 @@ class Health:
             uptime_s=(now_ns - self._origin_ns) * 1e-9,
             state=state,
             reasons=reasons,
+            advice=self._advice,
             devices={name: device.health(now_ns) for name, device in self._devices.items()},
             sensors=dict(self._sensors),
             **msgspec.structs.asdict(situation),

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from hw.adxl355_registers import ADXL355
+from hw.adxl355_registers import ADXL355, STATED_HZ_A_KHZ
 from hw.virtual.adxl355_twin import Adxl355Twin, filters
 from hw.virtual.bench import Bench
 from hw.virtual.kernel import BCM2835, I2CBus, installed
@@ -49,6 +49,7 @@ class LiveBench:
             "bus": bus,
             "address": ADDRESS,
             "rate_hz": rate_hz,
+            "bus_khz": max(400.0, rate_hz / STATED_HZ_A_KHZ),
             "range_g": _range_g(parameters.sensor.nominal_sensitivity),
         }
         self._lines = serial_lines(self.bench, "reference", self.time)

@@ -92,17 +92,31 @@ def test_a_certificate_older_than_its_interval_is_told_and_is_no_fault(
 
 BINARY = (
     'driver = "serial-binary"\noptions = { port = "/dev/none", rate_hz = 100, length = 9, start = "80", '
-    "indications = [{ at = 1, type = 'i16' }, { at = 3, type = 'i16' }, { at = 5, type = 'i16' }] }"
+    "indications = [{ at = 1, type = 'i16' }, { at = 3, type = 'i16' }, { at = 5, type = 'i16' }] }\n"
 )
+FAST = 'driver = "adxl355"\noptions = { bus = 250, rate_hz = 1000 }\n'
 
 
+@pytest.mark.parametrize(
+    ("device", "advice"),
+    [
+        (
+            BINARY,
+            "start is the single byte 80, and nothing else tells where a frame begins; state checksum, end or sequence",
+        ),
+        (FAST, "rate_hz 1000 is above 800 Hz, the highest rate that the data sheet states for a bus of 400 kHz"),
+    ],
+)
 def test_options_that_are_not_good_are_told_and_are_no_fault(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+    device: str,
+    advice: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     path = tmp_path / "gateway.toml"
     csv = GOOD[GOOD.index("driver") : GOOD.index("[[devices]]", GOOD.index("driver"))]
-    path.write_text(GOOD.replace(csv, BINARY + "\n", 1))
-    advice = "start is the single byte 80, and nothing else tells where a frame begins; state checksum, end or sequence"
+    path.write_text(GOOD.replace(csv, device, 1))
     assert run_cli(["check", str(path)]) == 0
     shown = capsys.readouterr()
     assert shown.err.startswith(f"{path}: devices.0.options: {advice}")
@@ -114,6 +128,40 @@ def test_options_that_are_not_good_are_told_and_are_no_fault(
     assert found["says"].startswith(f"imu: {advice}")
     assert run_cli(["run", str(path), "--data-dir", str(tmp_path / "data"), "--duration", "0.1", "--log", "plain"]) == 0
     assert f"imu: {advice}" in caplog.text
+
+
+SHARED = """[gateway]
+site = "bridge"
+[[devices]]
+name = "mems"
+driver = "adxl355"
+options = { bus = 250, rate_hz = 500 }
+[[devices]]
+name = "imu"
+driver = "mpu6050"
+options = { bus = 251 }
+[[channels]]
+sensor = "mems"
+reference = "imu"
+rotation = [1, 0, 0, 0, 1, 0, 0, 0, 1]
+[channels.prior]
+sensitivity = 26000
+"""
+
+
+@pytest.mark.parametrize("bus", [250, 251])
+def test_a_part_that_answers_for_others_and_is_not_alone(
+    bus: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "gateway.toml"
+    path.write_text(SHARED.replace("bus = 251", f"bus = {bus}"))
+    assert run_cli(["check", str(path)]) == 0
+    told = capsys.readouterr().err
+    shared = "mems shares /dev/i2c-250 with imu: a part whose REVID is below 3 answers"
+    assert (f"{path}: {shared}" in told) == (bus == 250)
+    run_cli(["doctor", str(path), "--data-dir", str(tmp_path), "--json", "-"])
+    findings = json.loads(capsys.readouterr().out)["findings"]
+    assert any(shared in finding["says"] for finding in findings) == (bus == 250)
 
 
 @pytest.mark.parametrize(

@@ -177,7 +177,7 @@ def test_what_cannot_be_measured_or_is_turned_off_is_no_fault() -> None:
 
 def test_it_is_one_flat_object_of_json_without_nan() -> None:
     told = json.loads(msgspec.json.encode(report(opened(block("mems", 0)), 1.0)))
-    assert {"site", "gateway", "state", "reasons", "devices", "sensors", "queues", "recording", "publication",
+    assert {"site", "gateway", "state", "reasons", "advice", "devices", "sensors", "queues", "recording", "publication",
             "disk_free_bytes", "process", "uptime_s", "run_id", "version", "t_utc_ns"} == set(told)  # fmt: skip
     assert told["devices"]["reference"]["clock"] is None
 
@@ -190,3 +190,11 @@ def test_a_count_that_jumps_at_will_is_no_fault_of_the_supervision() -> None:
         watch.on_block(wild)
         health = watch.health(START_NS + 60 * S)
         assert health.clock is None or np.isfinite([health.clock.rate_hz, health.clock.residual_sd_s]).all()
+
+
+def test_options_that_are_not_good_are_in_the_status() -> None:
+    fast = config().model_dump(mode="json")
+    fast["devices"][0] |= {"driver": "adxl355", "options": {}}
+    (advice,) = report(opened(settings=parse_config(fast, "test")), 1.0).advice
+    assert advice.startswith("mems: rate_hz 1000 is above 800 Hz")
+    assert report(opened(), 1.0).advice == []

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from hw.adxl345 import Adxl345Options
 from hw.adxl355 import Adxl355Options
 from hw.adxl355_registers import ADXL355, ADXL357, ADXL359, settings, temperature, triples, without_empty
 from hw.virtual.adxl355_twin import encode
@@ -125,3 +126,32 @@ def test_rates() -> None:
     assert Adxl355Options(rate_hz=3.906).rate_hz == 3.90625
     assert Adxl355Options(rate_hz=3.90625).interval_s == 0.1
     assert "900 Hz is not a rate of this device; use one of 4000, 2000, 1000" in refusal(rate_hz=900.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "stated_hz", "instead"),
+    [
+        ({"rate_hz": 1000.0}, 800, "500"),
+        ({}, 800, "500"),
+        ({"rate_hz": 500.0}, None, ""),
+        ({"rate_hz": 500.0, "bus_khz": 100.0}, 200, "125"),
+        ({"rate_hz": 4000.0, "bus_khz": 1000.0}, 2000, "2000"),
+        ({"rate_hz": 2000.0, "bus_khz": 1000.0}, None, ""),
+    ],
+)
+def test_a_rate_above_that_of_the_data_sheet_is_advised_against(
+    options: dict[str, float], stated_hz: int | None, instead: str
+) -> None:
+    # Data sheet: 800 Hz at 400 kHz, 200 Hz at 100 kHz, in proportion
+    advice = Adxl355Options.model_validate(options).advice
+    assert len(advice) == (stated_hz is not None)
+    for told in advice:
+        assert f"is above {stated_hz} Hz, the highest rate that the data sheet states" in told
+        assert f"set rate_hz = {instead}, or use a bus of at least" in told
+
+
+def test_the_adxl345_at_its_highest_rate_needs_a_bus_of_400_khz() -> None:
+    assert Adxl345Options().advice == ()
+    (told,) = Adxl345Options(bus_khz=399.0).advice
+    assert "rate_hz 800 is above 798 Hz" in told
+    assert "set rate_hz = 400, or use a bus of at least 400 kHz" in told

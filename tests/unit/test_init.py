@@ -101,7 +101,19 @@ def test_a_slow_bus_lowers_the_rate(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     path = tmp_path / "gateway.toml"
     assert run_cli(["init", str(path), "--no-reference"]) == 0
     options = load_config(path).devices[0].options
-    assert (options["bus_khz"], options["rate_hz"]) == (100, 500)
+    assert (options["bus_khz"], options["rate_hz"]) == (100, 125)
+
+
+@pytest.mark.usefixtures("chip")
+def test_the_rate_is_one_that_the_data_sheet_states_for_the_bus(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "gateway.toml"
+    assert run_cli(["init", str(path), "--no-reference"]) == 0
+    assert load_config(path).devices[0].options["rate_hz"] == 500
+    capsys.readouterr()
+    assert run_cli(["check", str(path)]) == 0
+    assert capsys.readouterr().err == ""
 
 
 @pytest.mark.usefixtures("chip")

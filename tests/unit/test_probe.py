@@ -107,6 +107,26 @@ def test_self_test_of_sound_and_stuck_parts(bus: I2CBus, capsys: pytest.CaptureF
     assert lines[2].strip() == "driver adxl355 or adxl357, one register read a transfer as here"
 
 
+def test_a_part_that_answers_for_others_is_told_where_it_is_not_alone(
+    bus: I2CBus, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = probed(capsys)
+    assert {address: bool(answer["warning"]) for address, answer in found.items()} == {
+        0x1D: True,
+        0x53: False,
+        0x68: False,
+    }
+    assert "REVID is below 3" in found[0x1D]["warning"]
+    assert run_cli(["probe", "--bus", "4"]) == 0
+    assert "warning: other devices answer on this bus" in capsys.readouterr().out
+    bus.targets[0x1D].registers[3] = 3  # type: ignore[attr-defined]
+    assert not probed(capsys)[0x1D]["warning"]
+    bus.targets[0x1D].registers[3] = 2  # type: ignore[attr-defined]
+    assert probed(capsys)[0x1D]["warning"]
+    del bus.targets[0x53], bus.targets[0x68]
+    assert not probed(capsys)[0x1D]["warning"]
+
+
 def test_buses_that_cannot_be_asked(bus: I2CBus, capsys: pytest.CaptureFixture[str]) -> None:
     assert run_cli(["probe", "--bus", "9"]) == 1
     assert capsys.readouterr().out == "/dev/i2c-9: No such file or directory\n"
