@@ -17,6 +17,8 @@ from hw.sensor import DeviceLost, IdentityError, Options
 
 RESET_WAIT_S = 0.01  # twice the data sheet's 5 ms
 RESET_ATTEMPTS = 5  # as the Linux driver does
+LOADING_S, LOADING_POLL_S = 0.1, 0.005  # longest time for loading the trim, as in Zephyr (adxl355.c), and between looks
+TEMPERATURE_READINGS = 4  # at most, until two of them in a row belong together
 
 
 class Adxl355Options(FifoOptions):
@@ -81,6 +83,8 @@ class Adxl355(FifoSensor):
 
     def _identify(self) -> dict[str, int]:
         found = self._device.read(chip.DEVID, 4)
+        if found == chip.LOADING and self._is_loaded():
+            found = self._device.read(chip.DEVID, 4)
         if found[:3] != self.part.identity:
             wanted = self.part.identity.hex(" ")
             raise IdentityError(f"{self._device.name}: expected the IDs {wanted}, found {found[:3].hex(' ')}")
@@ -96,12 +100,15 @@ class Adxl355(FifoSensor):
         return self._info(self.part.kind.lower(), self._options.rate_hz, identity)
 
     def _reset(self) -> None:
-        """Reset until the shadow registers, which hold the factory trim, read the same as before. Raises DeviceLost."""
+        """Reset until the shadow registers, which hold the factory trim, read as before the first reset.
+
+        Raises DeviceLost.
+        """
+        before = self._shadow("start")
         for _ in range(RESET_ATTEMPTS):
-            before = self._device.read(chip.SHADOW, chip.SHADOW_BYTES)
             self._device.write(chip.RESET, chip.RESET_CODE)
             self._sleep(RESET_WAIT_S)
-            after = self._device.read(chip.SHADOW, chip.SHADOW_BYTES)
+            after = self._shadow("reset")
             if after == before:
                 return
         raise DeviceLost(
@@ -109,8 +116,32 @@ class Adxl355(FifoSensor):
             f"not {before.hex(' ')}; check supply and wiring"
         )
 
-    def _temperature(self) -> tuple[int, float]:
-        return chip.temperature(self.part, self._device.read(chip.TEMPERATURE, 2))
+    def _shadow(self, since: str) -> bytes:
+        if not self._is_loaded():
+            raise DeviceLost(
+                f"{self._device.name}: the device has not loaded its factory trim {1e3 * LOADING_S:g} ms after the "
+                f"{since} (NVM_BUSY); check supply and wiring"
+            )
+        return self._device.read(chip.SHADOW, chip.SHADOW_BYTES)
+
+    def _is_loaded(self) -> bool:
+        """Wait until the device has loaded its trim; whether it has."""
+        for _ in range(round(LOADING_S / LOADING_POLL_S)):
+            (status,) = self._device.read(chip.STATUS, 1)
+            if not status & chip.NVM_BUSY:
+                return True
+            self._sleep(LOADING_POLL_S)
+        return False
+
+    def _temperature(self) -> tuple[int | None, float | None]:
+        """Of two readings that belong together: the device may change the value between its two bytes."""
+        before, _ = chip.temperature(self.part, self._device.read(chip.TEMPERATURE, 2))
+        for _ in range(TEMPERATURE_READINGS - 1):
+            raw, degc = chip.temperature(self.part, self._device.read(chip.TEMPERATURE, 2))
+            if abs(raw - before) <= chip.TEMPERATURE_WITHIN:
+                return raw, degc
+            before = raw
+        return None, None
 
     def _poll(self) -> Burst:
         retries = self._device.retries

@@ -24,9 +24,11 @@ from hw.self_test import Axes, SelfTest
 DEVID, REVISION, STATUS, TEMPERATURE, FIFO_DATA = 0x00, 0x03, 0x04, 0x06, 0x11
 FIRST_SETTING, FILTER, RANGE, POWER_CTL, SELF_TEST, RESET, SHADOW = 0x1E, 0x28, 0x2C, 0x2D, 0x2E, 0x2F, 0x50
 SHADOW_BYTES = 5
+LOADING = b"\xff" * 4  # what the first registers read while the device loads its trim; Zephyr (adxl355.c) tells it
 RESET_CODE = 0x52
 MEASURE, _STANDBY = 0x00, 0x01
-OVERRUN = 0x04  # in STATUS
+OVERRUN, NVM_BUSY = 0x04, 0x10  # in STATUS
+TEMPERATURE_WITHIN = 16  # LSB, of two readings that belong together; noise is less, and a torn reading is off by 256
 FIFO_ENTRIES_MAX = 96
 SETTING_NAMES = (
     *("OFFSET_X_H", "OFFSET_X_L", "OFFSET_Y_H", "OFFSET_Y_L", "OFFSET_Z_H", "OFFSET_Z_L"),

@@ -12,8 +12,7 @@ from hw.virtual.response import Response, delay, in_turn, lowpass, taps
 
 IDENTITY = bytes([0xAD, 0x1D, 0xED, 0x01])
 EMPTY_ENTRY = b"\x00\x00\x02"
-RESET_S = 0.005  # for this time after a reset the shadow registers are not loaded and settings are not accepted
-SHADOW = bytes([0x4C, 0x21, 0x9A, 0x05, 0x33])  # factory trim of this twin; any constant will do
+BYTE_S = 9 / 400e3  # time of a byte on a bus of 400 kHz
 STATUS, FIFO_ENTRIES, TEMPERATURE, DATA, FIFO_DATA = 0x04, 0x05, 0x06, 0x08, 0x11
 FIRST_SETTING, LAST_SETTING, FILTER, POWER_CTL, RESET, RESET_CODE, SHADOW_1 = 0x1E, 0x2E, 0x28, 0x2D, 0x2F, 0x52, 0x50
 RESET_VALUES = {0x27: 0x01, 0x29: 0x60, 0x2C: 0x81, POWER_CTL: 0x01}
@@ -40,7 +39,11 @@ def encode(counts: NDArray[np.int32]) -> bytes:
 
 
 class Adxl355Twin(FifoTwin):
-    """See FifoTwin. `identity` are the four ID registers, by default those of the real part."""
+    """See FifoTwin. `identity` are the four ID registers, by default those of the real part.
+
+    For `reset_s` after a reset the trim is not loaded: all registers read 0xFF (NVM_BUSY is a bit of STATUS), and
+    settings are not accepted. The temperature may change between its two bytes.
+    """
 
     own_identity = IDENTITY
     self_test_counts = (76800, 76800, 384000)  # at the lowest range; typical values of the data sheet: 0.3, 0.3, 1.5 g
@@ -50,6 +53,8 @@ class Adxl355Twin(FifoTwin):
     word_bytes = 3
     data_register = FIFO_DATA
     temperature_at_25_degc = 1885
+    reset_s = 0.005
+    shadow = bytes([0x4C, 0x21, 0x9A, 0x05, 0x33])  # factory trim; any constant will do
 
     def __init__(
         self,
@@ -67,7 +72,7 @@ class Adxl355Twin(FifoTwin):
     def power_cycle(self) -> None:
         """Power fails and comes back: registers as after a reset, device in standby."""
         super().power_cycle()
-        self._ready_s = self._clock() + RESET_S
+        self._ready_s = self._clock() + self.reset_s
 
     def _reset_registers(self) -> bytearray:
         registers = bytearray(256)
@@ -94,6 +99,8 @@ class Adxl355Twin(FifoTwin):
         return np.array(self.self_test_counts if self.registers[LAST_SETTING] & 3 == 3 else (0, 0, 0), np.int32)
 
     def _get(self, register: int) -> int:
+        if self._clock() < self._ready_s:
+            return 0xFF
         if register == STATUS:
             entries = len(self._fifo) // 3
             full = entries >= self.registers[0x29]
@@ -102,13 +109,14 @@ class Adxl355Twin(FifoTwin):
             return status
         if register == FIFO_ENTRIES:
             return len(self._fifo) // 3
-        if register in (TEMPERATURE, TEMPERATURE + 1):
-            raw = self._temperature_raw(self._clock()) & 0xFFF
-            return raw >> 8 if register == TEMPERATURE else raw & 0xFF
+        if register == TEMPERATURE:
+            return self._temperature_raw(self._clock()) >> 8 & 0x0F
+        if register == TEMPERATURE + 1:
+            return self._temperature_raw(self._clock() + BYTE_S) & 0xFF
         if DATA <= register < DATA + 9:
             return encode(self._newest()[None])[register - DATA] & (0xFE if register == DATA + 2 else 0xFF)
-        if SHADOW_1 <= register < SHADOW_1 + len(SHADOW):
-            return SHADOW[register - SHADOW_1] if self._clock() >= self._ready_s else 0
+        if SHADOW_1 <= register < SHADOW_1 + len(self.shadow):
+            return self.shadow[register - SHADOW_1]
         return self.registers[register]
 
     def _set(self, register: int, value: int) -> None:

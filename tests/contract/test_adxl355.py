@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
@@ -17,6 +17,19 @@ from hw.virtual.adxl355_twin import Adxl355Twin, Adxl357Twin, Adxl359Twin
 
 class Adxl355Rig(I2cRig):
     driver, twin_class, address, full = Adxl355, Adxl355Twin, 0x1D, 2**19 - 1
+
+
+def timed(rig: Adxl355Rig, temperature_raw: Callable[[float], int]) -> Adxl355Twin:
+    """A twin whose reads take the time of their bytes on a bus of 400 kHz."""
+
+    class Timed(rig.twin_class):  # type: ignore[name-defined,misc]
+        def read(self, count: int) -> bytes:
+            data: bytes = super().read(count)
+            rig.t_s += 9 * count / 400e3
+            return data
+
+    found: Adxl355Twin = Timed(rig.counts, rig.due, lambda: rig.t_s, temperature_raw=temperature_raw)
+    return found
 
 
 class TestAdxl355(I2cContract):
@@ -53,26 +66,68 @@ class TestAdxl355(I2cContract):
         with pytest.raises(IdentityError, match=r"0x1D on /dev/i2c-1: expected the IDs ad 1d ed, found ad 1d e9"):
             rig.sensor.open()
 
-    def test_reset_is_repeated_until_the_trim_is_back(self, rig: Adxl355Rig) -> None:
-        rig.twin.power_cycle()  # the trim, which the driver compares, is not loaded directly after a power cycle
+    def test_it_waits_while_the_device_loads_its_trim(self, rig: Adxl355Rig) -> None:
+        rig.twin.power_cycle()  # reads give 0xFF now
         rig.sensor.open()
         flags, _ = rig.read()
         assert flags == BlockFlags.RESTART
 
-    def test_a_part_that_loses_its_trim_is_not_used(self, rig: Adxl355Rig) -> None:
-        class Worn(rig.twin_class):  # type: ignore[name-defined,misc]
-            wear = 0
+    @pytest.mark.parametrize("busy_s", [0.09, 0.2])
+    def test_the_trim_may_take_100_ms_after_a_reset(self, rig: Adxl355Rig, busy_s: float) -> None:
+        class Slow(rig.twin_class):  # type: ignore[name-defined,misc]
+            reset_s = busy_s
 
-            def read(self, count: int) -> bytes:
-                data = super().read(count)
-                if self._pointer != 0x55:
-                    return data
-                self.wear += 1
-                return data[:4] + bytes([self.wear])
+        rig.put(Slow(rig.counts, rig.due, lambda: rig.t_s))
+        if busy_s < 0.1:
+            rig.sensor.open()
+            return
+        with pytest.raises(DeviceLost, match=r"the device has not loaded its factory trim 100 ms after the reset"):
+            rig.sensor.open()
+
+    def test_a_reset_that_does_not_bring_the_trim_back_is_repeated(self, rig: Adxl355Rig) -> None:
+        class Unsure(rig.twin_class):  # type: ignore[name-defined,misc]
+            resets = 0
+
+            def power_cycle(self) -> None:
+                super().power_cycle()
+                self.resets += 1
+                self.shadow = bytes(5) if self.resets < 5 else Adxl355Twin.shadow
+
+        rig.put(Unsure(rig.counts, rig.due, lambda: rig.t_s))
+        rig.twin.shadow = Adxl355Twin.shadow  # type: ignore[attr-defined]
+        rig.sensor.open()
+        assert rig.twin.resets == 5  # type: ignore[attr-defined]
+
+    def test_a_part_that_loses_its_trim_is_not_used(self, rig: Adxl355Rig) -> None:
+        # The first reset changes the trim for good: the values of before it are those that count.
+        class Worn(rig.twin_class):  # type: ignore[name-defined,misc]
+            def power_cycle(self) -> None:
+                super().power_cycle()
+                self.shadow = bytes.fromhex("4c219a0500")
 
         rig.put(Worn(rig.counts, rig.due, lambda: rig.t_s))
-        with pytest.raises(DeviceLost, match=r"after a reset the shadow registers read .* 0a, not .* 09"):
+        rig.twin.shadow = bytes.fromhex("4c219a0533")  # type: ignore[attr-defined]
+        with pytest.raises(
+            DeviceLost, match=r"after a reset the shadow registers read 4c 21 9a 05 00, not 4c 21 9a 05 33"
+        ):
             rig.sensor.open()
+
+    def test_a_temperature_that_changes_while_it_is_read_is_not_torn(self, rig: Adxl355Rig) -> None:
+        # 0x6FF and 0x700 in turn, every 1.7 ms: 19 of 1200 single readings have the high byte of one and the low byte of
+        # the other, which is 28 K away.
+        rig.put(timed(rig, lambda t_s: 0x6FF + int(t_s / 1.7e-3) % 2))
+        rig.sensor.open()
+        blocks = [rig.sensor.read_block() for _ in range(1200)]
+        raw = [block.temperature_raw for block in blocks if block is not None]
+        assert len(raw) == 1200
+        assert set(raw) == {0x6FF, 0x700}
+
+    def test_a_temperature_that_never_reads_twice_alike_is_none(self, rig: Adxl355Rig) -> None:
+        rig.put(timed(rig, lambda t_s: int(t_s * 1e5) * 17 % 4096))
+        rig.sensor.open()
+        block = rig.sensor.read_block()
+        assert block is not None
+        assert (block.temperature_raw, block.temperature_degc) == (None, None)
 
     def test_out_of_step_at_the_front(self, rig: Adxl355Rig) -> None:
         # The X of the oldest sample is lost: its Y and Z are dropped, and each later poll leaves two entries in the
