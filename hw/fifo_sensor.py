@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Mapping
-from typing import Any, ClassVar
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,10 +93,6 @@ class FifoSensor(PollingSensor):
     @abstractmethod
     def _self_test(self) -> SelfTest:
         """The self-test of the device at its present settings."""
-
-    def _self_test_range_g(self) -> int:
-        """Range at which the self-test is done: another one than that of the options where its limits require it."""
-        return int(self._options.range_g)
 
     @abstractmethod
     def _settings(self) -> Registers:
@@ -207,27 +203,42 @@ class FifoSensor(PollingSensor):
     def self_test(self) -> SelfTestReport:
         """Run the self-test of the open device; takes about 3 s. Open the device again afterwards.
 
-        Raises the same errors as `read_block`.
+        Raises the same errors as `open` and `read_block`.
         """
         options, range_g = self._options, self._self_test_range_g()
         try:
             if range_g != options.range_g:
                 self._options = options.model_copy(update={"range_g": range_g})
                 self.open()
-            test = self._self_test()
-            g = self._counts_per_g()
-            still = self._settled(0.0)
-            for register, value in test.writes:
-                self._device.write(register, value)
-            self._held = dict(self._held) | {r: (self._held[r][0], value) for r, value in test.writes}
-            self._bursts = []
-            self._pace.restart()
-            change = (self._settled(test.settle_s).mean(axis=0) - still.mean(axis=0)) / g
+            return self._tested()
         finally:
             self._options = options
+
+    def _self_test_range_g(self) -> int:
+        """The range for the self-test, g: that of the options, or the first above gravity and the largest change."""
+        ranges_g = get_args(type(self._options).model_fields["range_g"].annotation)
+        above_g = 1.0 + self._self_test().highest_g
+        fitting = (range_g for range_g in ranges_g if range_g >= self._options.range_g and range_g > above_g)
+        return int(min(fitting, default=max(ranges_g)))
+
+    def _tested(self) -> SelfTestReport:
+        test = self._self_test()
+        g = self._counts_per_g()
+        self._switch(test.before)
+        still = self._settled(test.settle_s if test.before else 0.0)
+        self._switch(test.writes)
+        change = (self._settled(test.settle_s).mean(axis=0) - still.mean(axis=0)) / g
         noise = still.std(axis=0) / g
         self.close()
         return SelfTestReport(test, tuple(change.tolist()), tuple(noise.tolist()))
+
+    def _switch(self, writes: Sequence[tuple[int, int]]) -> None:
+        """Write settings of the self-test. The samples from now on do not follow those before."""
+        for register, value in writes:
+            self._device.write(register, value)
+        self._held = dict(self._held) | {r: (self._held[r][0], value) for r, value in writes}
+        self._bursts = []
+        self._pace.restart()
 
     def _settled(self, settle_s: float) -> NDArray[np.generic]:
         """Indications of one block, after the samples of the first `settle_s` and of the block before are discarded."""

@@ -72,7 +72,8 @@ class Mpu6050(FifoSensor):
         return chip.self_test(self._part, self._device.read(chip.SELF_TEST, 4), options.rate_hz, options.range_g)
 
     def _self_test_range_g(self) -> int:
-        return self._options.range_g if self._part.accel_config_2 else chip.SELF_TEST_RANGE_G
+        """An MPU-6050 is set to 8 g, as its register map requires."""
+        return super()._self_test_range_g() if self._part.accel_config_2 else chip.SELF_TEST_RANGE_G
 
     def _identify(self) -> dict[str, int]:
         (found,) = self._device.read(chip.WHO_AM_I, 1)

@@ -12,9 +12,9 @@ Axes = tuple[float, float, float]
 class SelfTest:
     """Definition of a self-test.
 
-    Writing `writes` (register, value) switches the self-test on. After `settle_s` the indications must have changed by
-    `low_g` to `high_g` (by axis, g). `noise_g` is the noise in the data sheet (rms, g) at the present rate and range.
-    `source` names the document of these values.
+    Writing `before` (register, value), if anything, prepares the device; writing `writes` switches the self-test on.
+    `settle_s` after `writes` the indications must have changed by `low_g` to `high_g` (by axis, g). `noise_g` is the
+    noise in the data sheet (rms, g) at the present rate and range. `source` names the document of these values.
     """
 
     writes: Sequence[tuple[int, int]]
@@ -23,6 +23,12 @@ class SelfTest:
     high_g: Axes
     noise_g: Axes
     source: str
+    before: Sequence[tuple[int, int]] = ()
+
+    @property
+    def highest_g(self) -> float:
+        """The largest change that passes on any axis, g."""
+        return max(map(abs, (*self.low_g, *self.high_g)))
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,8 +14,11 @@ IDENTITY = bytes([0xAD, 0x1D, 0xED, 0x01])
 EMPTY_ENTRY = b"\x00\x00\x02"
 BYTE_S = 9 / 400e3  # time of a byte on a bus of 400 kHz
 STATUS, FIFO_ENTRIES, TEMPERATURE, DATA, FIFO_DATA = 0x04, 0x05, 0x06, 0x08, 0x11
-FIRST_SETTING, LAST_SETTING, FILTER, POWER_CTL, RESET, RESET_CODE, SHADOW_1 = 0x1E, 0x2E, 0x28, 0x2D, 0x2F, 0x52, 0x50
-RESET_VALUES = {0x27: 0x01, 0x29: 0x60, 0x2C: 0x81, POWER_CTL: 0x01}
+FIRST_SETTING, FILTER, RANGE, POWER_CTL, SELF_TEST, RESET, RESET_CODE, SHADOW_1 = (
+    *(0x1E, 0x28, 0x2C, 0x2D, 0x2E, 0x2F, 0x52, 0x50),
+)
+LAST_SETTING = SELF_TEST
+RESET_VALUES = {0x27: 0x01, 0x29: 0x60, RANGE: 0x81, POWER_CTL: 0x01}
 
 
 # Data sheet, "Digital filter group delay and profile": a fixed stage decimates to 4 kHz, a variable one to the rate.
@@ -46,7 +49,9 @@ class Adxl355Twin(FifoTwin):
     """
 
     own_identity = IDENTITY
-    self_test_counts = (76800, 76800, 384000)  # at the lowest range; typical values of the data sheet: 0.3, 0.3, 1.5 g
+    # At the lowest range: by ST2, the typical values of the data sheet, 0.3, 0.3 and 1.5 g; by ST1 alone any constants
+    self_test_counts = (76800, 76800, 384000)
+    self_test_mode_counts = (-70000, 60000, 50000)
 
     fifo_bytes = 96 * 3
     sample_bytes = 9
@@ -96,7 +101,9 @@ class Adxl355Twin(FifoTwin):
         return (EMPTY_ENTRY * (count // 3 + 1))[:count]
 
     def _deflection(self) -> Counts:
-        return np.array(self.self_test_counts if self.registers[LAST_SETTING] & 3 == 3 else (0, 0, 0), np.int32)
+        st1, st2 = self.registers[SELF_TEST] & 1, self.registers[SELF_TEST] >> 1 & 1
+        lowest = st1 * (np.array(self.self_test_mode_counts) + st2 * np.array(self.self_test_counts))
+        return np.asarray(lowest >> (self.registers[RANGE] & 3) - 1, np.int32)
 
     def _get(self, register: int) -> int:
         if self._clock() < self._ready_s:
@@ -129,7 +136,7 @@ class Adxl355Twin(FifoTwin):
             self.registers[register] = value
             if self._filling != before:
                 self._empty()
-        elif FIRST_SETTING <= register <= LAST_SETTING and not self._filling:
+        elif register == SELF_TEST or (FIRST_SETTING <= register <= LAST_SETTING and not self._filling):
             self.registers[register] = value
 
 

@@ -64,7 +64,8 @@ class Lsm6dsoTwin(FifoTwin):
         return self._take(whole) + (bytes(self._fifo[:7]) + bytes(7))[: count - whole]
 
     def _deflection(self) -> Counts:
-        return np.array([6000, 7000, 8000] if self.registers[0x14] & 3 == 1 else [0, 0, 0], np.int32)
+        change = np.array([6000, 7000, 8000] if self.registers[0x14] & 3 == 1 else [0, 0, 0], np.int32)
+        return change // (1, 8, 2, 4)[self.registers[CTRL1_XL] >> 2 & 3]  # the same in g at every range
 
     def _get(self, register: int) -> int:
         if register == FIFO_STATUS:

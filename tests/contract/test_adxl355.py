@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from hw.adxl355 import Adxl355, Adxl357, Adxl359
 from hw.block import BlockFlags, Drop
@@ -38,6 +39,7 @@ class TestAdxl355(I2cContract):
     # registers that another user may have written: offsets, high-pass filter, self-test
     trimmed = {0x1E: 0x11, 0x23: 0x11, 0x2E: 0x03}  # noqa: RUF012
     late_s = 0.2
+    self_test_range = 4.0  # 8 g: gravity and 3 g, the largest change that passes, need more than 4 g
     # Data sheet: 1885 at 25 degC, -9.05 LSB per degC: 181 LSB less are 20 degC more.
     temperature = 1704, 45.0
 
@@ -113,8 +115,8 @@ class TestAdxl355(I2cContract):
             rig.sensor.open()
 
     def test_a_temperature_that_changes_while_it_is_read_is_not_torn(self, rig: Adxl355Rig) -> None:
-        # 0x6FF and 0x700 in turn, every 1.7 ms: 19 of 1200 single readings have the high byte of one and the low byte of
-        # the other, which is 28 K away.
+        # 0x6FF and 0x700 in turn, every 1.7 ms: 19 of 1200 single readings have the high byte of one and the low byte
+        # of the other, which is 28 K away.
         rig.put(timed(rig, lambda t_s: 0x6FF + int(t_s / 1.7e-3) % 2))
         rig.sensor.open()
         blocks = [rig.sensor.read_block() for _ in range(1200)]
@@ -128,6 +130,24 @@ class TestAdxl355(I2cContract):
         block = rig.sensor.read_block()
         assert block is not None
         assert (block.temperature_raw, block.temperature_degc) == (None, None)
+
+    def test_a_self_test_that_is_too_strong_fails(self, rig: Adxl355Rig) -> None:
+        # 1 g of gravity and a change of 3.2 g in z: at 2.048 g the indication would change by 1.05 g.
+        class Strong(rig.twin_class):  # type: ignore[name-defined,misc]
+            self_test_counts = (0, 0, round(3.2 * self.counts_per_g))
+
+            def _encode(self, first: int, counts: NDArray[np.int32]) -> bytes:
+                return bytes(super()._encode(first, np.clip(counts, -(2**19), 2**19 - 1)))
+
+        def gravity(first: int, n: int) -> NDArray[np.int32]:
+            z = self.counts_per_g >> (rig.twin.registers[0x2C] & 3) - 1
+            return np.array([0, 0, z], np.int32) + np.arange(first, first + n, dtype=np.int32)[:, None] % 2
+
+        rig.put(Strong(gravity, rig.due, lambda: rig.t_s))
+        rig.sensor.open()
+        report = rig.sensor.self_test()
+        assert report.change_g[2] == pytest.approx(3.2, abs=1e-3)
+        assert "z changes by 3.200 g, the limits are 0.5 to 3 g" in report.faults
 
     def test_out_of_step_at_the_front(self, rig: Adxl355Rig) -> None:
         # The X of the oldest sample is lost: its Y and Z are dropped, and each later poll leaves two entries in the
@@ -221,6 +241,7 @@ class Adxl357Rig(Adxl355Rig):
 
 class TestAdxl357(TestAdxl355):
     kind, counts_per_g = "ADXL357", 51200  # data sheet, at 10 g
+    self_test_range = 1.0
     temperature = 1671, 45.0  # data sheet: 1852 at 25 degC, -9.05 LSB per degC
 
     @pytest.fixture

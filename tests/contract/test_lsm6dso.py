@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from hw.block import BlockFlags, Drop
 from hw.conformance.i2c import I2cContract, I2cRig
@@ -29,6 +30,7 @@ class TestLsm6dso(I2cContract):
     filter_register = 0x17, "CTRL8_XL"
     trimmed = {0x73: 0x11, 0x75: 0xF0, 0x14: 0x01, 0x17: 0xF4}  # noqa: RUF012 - offsets, self-test, high-pass filter
     late_s = 0.9
+    self_test_range = 2.0  # 4 g: gravity and 1.7 g, the largest change that passes, do not fit 2 g
     # Data sheet: 256 LSB per degC, 0 at 25 degC.
     temperature = -2560, 15.0
 
@@ -47,6 +49,30 @@ class TestLsm6dso(I2cContract):
         assert info.settings["CTRL1_XL"] == "0x70"
         assert info.settings["FIFO_CTRL3"] == "0x07"
         assert info.settings["FIFO_CTRL4"] == "0x06"
+
+    def test_a_self_test_that_is_too_strong_fails(self, rig: Lsm6dsoRig) -> None:
+        # 1 g of gravity and a change of 2 g in z: at 2 g the indication would change by 1 g and pass.
+        mg = {0: 0.061, 1: 0.488, 2: 0.122, 3: 0.244}  # data sheet, by the code of the range
+
+        def g() -> int:
+            return round(1000 / mg[rig.twin.registers[0x10] >> 2 & 3])
+
+        class Strong(Slow):
+            def _deflection(self) -> NDArray[np.int32]:
+                return np.array([0, 0, 2 * g() * (self.registers[0x14] & 1)], np.int32)
+
+            def _encode(self, first: int, counts: NDArray[np.int32]) -> bytes:
+                return super()._encode(first, np.clip(counts, -(2**15), 2**15 - 1))
+
+        def gravity(first: int, n: int) -> NDArray[np.int32]:
+            return np.array([0, 0, g()], np.int32) + np.arange(first, first + n, dtype=np.int32)[:, None] % 2
+
+        rig.put(Strong(gravity, rig.due, lambda: rig.t_s))
+        rig.sensor.open()
+        report = rig.sensor.self_test()
+        assert report.change_g[2] == pytest.approx(2.0, abs=1e-3)
+        assert "z changes by 2.000 g, the limits are 0.05 to 1.7 g" in report.faults
+        assert rig.sensor.open().range_mps2 == pytest.approx(2 * 9.80665, rel=1e-3)
 
     @pytest.mark.parametrize("lost", [1, 2, 3])
     def test_lost_words_show_by_the_counter(self, rig: Lsm6dsoRig, lost: int) -> None:
