@@ -16,7 +16,7 @@ from hw.fifo_sensor import FifoSensor, Registers
 from hw.self_test import SelfTest
 from hw.sensor import IdentityError
 
-LOST = "FIFO overrun or interrupted FIFO read"
+LOST = "a full FIFO, which may have lost samples, or an interrupted FIFO read"
 
 
 class Adxl345Options(FifoOptions):
@@ -43,9 +43,9 @@ class Adxl345(FifoSensor):
     """Reads the number of FIFO entries, then the samples, one register read per sample.
 
     Each register read starts at INT_SOURCE, two registers before the data, because reading the data clears the overrun
-    bit in INT_SOURCE, and the adapter may stall between two reads. The samples of this part carry no
-    counter. If samples were lost during a poll, the driver discards all samples of that poll and flags the next block
-    RESTART.
+    bit in INT_SOURCE, and the adapter may stall between two reads. The samples of this part carry no counter, and the
+    overrun bit tells a full FIFO, whether samples were lost or not. If the FIFO was full during a poll, the driver
+    therefore discards all samples of that poll and flags the next block RESTART and OVERRUN.
     """
 
     options_model = Adxl345Options

@@ -1,6 +1,13 @@
 """Registers of the ADXL345 and the meaning of their contents.
 
 Source: data sheet ADXL345. Linux has the same names and bits (drivers/iio/accel/adxl345.h and adxl345_core.c).
+
+OVERRUN: the data sheets of the family (ADXL312, ADXL313, ADXL344; a driver of the ADXL375 quotes the same) say that it
+is set when the FIFO is filled, not when a sample is lost, and cleared when the FIFO is read. FIFO_STATUS counts up to
+the full FIFO only, so nothing tells a full FIFO from one that lost samples.
+
+Sensitivity: 256 LSB/g at a supply of 2.5 V; at 3.3 V, as on most boards, 265 LSB/g in x and y and 256 in z (Klipper,
+pull request 5837; paparazzi, imu_ppzuav.h). The part does not tell its supply.
 """
 
 from __future__ import annotations
@@ -13,13 +20,13 @@ IDENTITY = 0xE5
 DEVID, BW_RATE, POWER_CTL, INT_SOURCE, DATA_FORMAT, DATA, FIFO_CTL, FIFO_STATUS = (
     *(0x00, 0x2C, 0x2D, 0x30, 0x31, 0x32, 0x38, 0x39),
 )
-OVERRUN = 0x01  # in INT_SOURCE; reading the data clears it
+OVERRUN = 0x01  # in INT_SOURCE
 SAMPLE_BYTES = 8  # INT_SOURCE, DATA_FORMAT, three numbers
 ENTRIES_MASK = 0x3F  # in FIFO_STATUS
 FIFO_SAMPLES = 32
 STANDBY, MEASURE = 0x00, 0x08
 BYPASS, STREAM = 0x00, 0x80
-COUNTS_PER_G = 256  # in full resolution, at any range; the data sheet allows 230 to 282
+COUNTS_PER_G = 256  # in full resolution, at any range; the data sheet allows 230 to 282 at 2.5 V
 RANGE_CODES: Mapping[int, int] = {2: 0, 4: 1, 8: 2, 16: 3}
 STATED_HZ_A_KHZ = 2.0  # data sheet: 800 Hz at 400 kHz, in proportion to the clock
 # At 3200 and 1600 Hz the lowest bit is lost, and the samples do not fit a 400 kHz bus.

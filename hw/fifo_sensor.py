@@ -106,6 +106,10 @@ class FifoSensor(PollingSensor):
     def _decode(self, data: bytes) -> FifoSamples:
         """Samples in the words of half a second; `data` begins with the rest of the words before."""
 
+    def _filters(self) -> tuple[str, ...]:
+        """The filters as in DeviceInfo, where the part tells them better than the options do."""
+        return tuple(self._options.known_filters)
+
     def _temperature(self) -> tuple[int | None, float | None]:
         """Raw value and degC; called at the end of each block."""
         return None, None
@@ -365,7 +369,7 @@ class FifoSensor(PollingSensor):
 
     def _info(self, driver: str, rate_hz: float, found: Mapping[str, int]) -> DeviceInfo:
         """Build the result of `open`; `found` are registers that were read but not set, by name."""
-        counts_per_g, filters = self._counts_per_g(), self._options.known_filters
+        counts_per_g, filters = self._counts_per_g(), self._filters()
         registers = dict(found) | dict(self._settings().values())
         return DeviceInfo(
             driver=driver,

@@ -37,7 +37,7 @@ class Mpu6050Options(FifoOptions):
 
     @property
     def known_filters(self) -> tuple[str, ...]:
-        """As the register maps say; nothing is known of a clone."""
+        """Of an MPU-6050: the part is known when the device is open. Nothing may be known of a clone."""
         return () if self.clone else chip.filters(self.rate_hz)
 
 
@@ -66,6 +66,9 @@ class Mpu6050(FifoSensor):
 
     def _counts_per_g(self) -> float:
         return chip.COUNTS_PER_G[self._options.range_g]
+
+    def _filters(self) -> tuple[str, ...]:
+        return chip.filters(self._options.rate_hz, self._part)
 
     def _self_test(self) -> SelfTest:
         options = self._options

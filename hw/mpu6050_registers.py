@@ -3,6 +3,11 @@
 Sources: register maps RM-MPU-6000A, RM-MPU-6500A and RM-MPU-9250A, specification PS-MPU-6000A. Identities, FIFO sizes
 and temperature lines are also in Linux, drivers/iio/imu/inv_mpu6050 (inv_mpu_iio.h, inv_mpu_core.c: offsets 12420 and
 7011 LSB, 2.941176 and 2.995178 mK/LSB). LSB/g, noise and tolerance of the MPU-9250: PS-MPU-9250A-01, table 2.
+
+Bandwidths: of the MPU-6050 as in RM-MPU-6000A; of the MPU-6500 as in pif (EnPifMpu6500ADlpfCfg: 184, 92, 41 Hz). Of
+the MPU-9250, libcaer (davis.h) and the crate mpu9250 (Dlpf) say 218.1, 99, 44.8 Hz; other drivers have the MPU-6500's
+(DLPF_BANDWIDTH_184HZ of MPU9250.cpp), which lie within U. Of the MPU-6886, a driver for M5StickC (MPU6886s.cpp) quotes
+218.1, 99, 44.8 Hz.
 """
 
 from __future__ import annotations
@@ -25,9 +30,12 @@ SELF_TEST_RANGE_G = 8
 LIMITS = -(2**15), 2**15 - 1
 RATES_HZ = tuple(1000.0 / (divider + 1) for divider in (0, 1, 3, 4, 7, 9, 19, 39, 99, 249))
 _ACCEL_INTO_FIFO = 0x08
-# Bandwidth of the digital low-pass filter by its code. Code 0 is not used: with it the MPU-6050 divides 8 kHz, not 1
-# kHz, to make the sample rate.
-_BANDWIDTH_HZ: Mapping[int, float] = {1: 184, 2: 94, 3: 44, 4: 21, 5: 10, 6: 5}
+# Bandwidth of the digital low-pass filter, Hz, by its code from 1 on. Code 0 is not used: with it the MPU-6050 divides
+# 8 kHz, not 1 kHz, to make the sample rate.
+_BANDWIDTHS_6050_HZ = (184.0, 94.0, 44.0, 21.0, 10.0, 5.0)
+_BANDWIDTHS_6500_HZ = (184.0, 92.0, 41.0, 20.0, 10.0, 5.0)
+_BANDWIDTHS_9250_HZ = (218.1, 99.0, 44.8, 21.2, 10.2, 5.05)
+_BANDWIDTHS_6886_HZ = (218.1, 99.0, 44.8, 21.2, 10.2, 5.1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +48,7 @@ class Part:
     accel_config_2: bool
     counts_per_degc: float
     zero_count_degc: float
+    bandwidths_hz: tuple[float, ...]  # empty where they are not known
 
     def temperature(self, data: bytes) -> tuple[int, float]:
         """Raw value and degC from the two bytes of the temperature registers."""
@@ -47,36 +56,41 @@ class Part:
         return raw, raw / self.counts_per_degc + self.zero_count_degc
 
 
-_MPU6050 = Part("MPU-6050", 1024, range(0x06, 0x0C), False, 340.0, 36.53)
-_MPU6500 = Part("MPU-6500", 512, range(0x77, 0x7F), True, 333.87, 21.0)
+_LATER = 512, range(0x77, 0x7F), True, 333.87, 21.0  # the MPU-6500 and later
+_MPU6050 = Part("MPU-6050", 1024, range(0x06, 0x0C), False, 340.0, 36.53, _BANDWIDTHS_6050_HZ)
 PARTS: Mapping[int, Part] = {
     0x68: _MPU6050,
-    0x70: _MPU6500,
-    0x71: Part("MPU-9250", 512, range(0x77, 0x7F), True, 333.87, 21.0),
-    0x73: Part("MPU-9255", 512, range(0x77, 0x7F), True, 333.87, 21.0),
-    0x74: Part("MPU-6515", 512, range(0x77, 0x7F), True, 333.87, 21.0),
+    0x70: Part("MPU-6500", *_LATER, _BANDWIDTHS_6500_HZ),
+    0x71: Part("MPU-9250", *_LATER, _BANDWIDTHS_9250_HZ),
+    0x73: Part("MPU-9255", *_LATER, _BANDWIDTHS_9250_HZ),
+    0x74: Part("MPU-6515", *_LATER, _BANDWIDTHS_6500_HZ),
 }
 """By WHO_AM_I."""
+_CLONES_BANDWIDTHS_HZ = {0x19: _BANDWIDTHS_6886_HZ}
 
 
 def clone(who_am_i: int) -> Part:
     """Properties assumed for a part with another WHO_AM_I; its FIFO size is that of the later parts, the smaller
     one."""
-    return Part(f"MPU clone 0x{who_am_i:02X}", 512, range(0x77, 0x7F), True, 333.87, 21.0)
+    return Part(f"MPU clone 0x{who_am_i:02X}", *_LATER, _CLONES_BANDWIDTHS_HZ.get(who_am_i, ()))
 
 
 def low_pass_code(rate_hz: float) -> int:
     """Code of the widest filter with a bandwidth of at most half the rate, as Linux chooses it."""
-    return min((code for code, hz in _BANDWIDTH_HZ.items() if hz <= rate_hz / 2), default=6)
+    fitting = (code for code, hz in enumerate(_BANDWIDTHS_6050_HZ, 1) if hz <= rate_hz / 2)
+    return min(fitting, default=len(_BANDWIDTHS_6050_HZ))
 
 
-def filters(rate_hz: float) -> tuple[str, ...]:
-    """The filter at a sample rate, as in DeviceInfo.
+def filters(rate_hz: float, part: Part = _MPU6050) -> tuple[str, ...]:
+    """The filter at a sample rate, as in DeviceInfo; empty for a part of which no source tells the bandwidths.
 
-    The register maps tell the bandwidth of each code, which differs by up to 15 % between the parts, and no order: the
-    standard uncertainty is so large that first and second order lie within U.
+    The sources tell the bandwidth of each code and no order: the standard uncertainty is so large that first and second
+    order lie within U. While the part is not known, the MPU-6050 is assumed; the bandwidths of the others, which differ
+    by up to 19 %, lie within U, too.
     """
-    return (f"lowpass order=1 corner_hz={_BANDWIDTH_HZ[low_pass_code(rate_hz)]:g} u_corner_pct=50",)
+    if not part.bandwidths_hz:
+        return ()
+    return (f"lowpass order=1 corner_hz={part.bandwidths_hz[low_pass_code(rate_hz) - 1]:g} u_corner_pct=50",)
 
 
 def settings(part: Part, rate_hz: float, range_g: int) -> dict[int, tuple[str, int]]:
@@ -124,7 +138,7 @@ def self_test(part: Part, codes: bytes, rate_hz: float, range_g: int) -> SelfTes
     """
     spread = 0.5 if part.accel_config_2 else 0.14
     x, y, z = factory_trim_g(part, codes)
-    noise_g = (300e-6 if part.accel_config_2 else 400e-6) * _BANDWIDTH_HZ[low_pass_code(rate_hz)] ** 0.5
+    noise_g = (300e-6 if part.accel_config_2 else 400e-6) * _BANDWIDTHS_6050_HZ[low_pass_code(rate_hz) - 1] ** 0.5
     return SelfTest(
         writes=((ACCEL_CONFIG, 0xE0 | list(COUNTS_PER_G).index(range_g) << 3),),
         settle_s=0.1,

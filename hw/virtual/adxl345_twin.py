@@ -13,6 +13,7 @@ from hw.virtual.response import Response, lowpass
 DEVID, FIRST_SETTING, BW_RATE, POWER_CTL, INT_SOURCE, DATA_FORMAT, DATA, FIFO_CTL, FIFO_STATUS = (
     *(0x00, 0x1D, 0x2C, 0x2D, 0x30, 0x31, 0x32, 0x38, 0x39),
 )
+FIFO_SAMPLES = 32
 READ_ONLY = frozenset((0x2B, INT_SOURCE, *range(DATA, DATA + 6), FIFO_STATUS))
 
 
@@ -22,7 +23,10 @@ def filters(rate_hz: float) -> Response:
 
 
 class Adxl345Twin(FifoTwin):
-    """See FifoTwin. A read that starts at DATA takes one sample from the FIFO and clears the overrun bit."""
+    """See FifoTwin. A read that starts at DATA takes one sample from the FIFO and clears the overrun bit.
+
+    A new sample that fills the FIFO sets the overrun bit, as the data sheets of the family say, though none is lost.
+    """
 
     fifo_bytes = 33 * 6
     sample_bytes = 6
@@ -46,6 +50,11 @@ class Adxl345Twin(FifoTwin):
 
     def _encode(self, first: int, counts: Counts) -> bytes:  # noqa: ARG002 - the samples of this part carry no number
         return counts.astype("<i2").tobytes()
+
+    def _fill(self) -> None:
+        before = self._next
+        super()._fill()
+        self._overrun |= self._next > before and len(self._fifo) >= FIFO_SAMPLES * self.word_bytes
 
     def _read_fifo(self, count: int) -> bytes:
         self._pointer += min(count, self.word_bytes)

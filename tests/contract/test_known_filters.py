@@ -35,7 +35,7 @@ from hw.virtual.icm42688_twin import Icm42688Twin
 from hw.virtual.kernel import I2CBus, installed
 from hw.virtual.lis3dh_twin import Lis3dhTwin
 from hw.virtual.lsm6dso_twin import Lsm6dsoTwin
-from hw.virtual.mpu6050_twin import Mpu6050Twin
+from hw.virtual.mpu6050_twin import Mpu6050Twin, Mpu6500Twin
 
 Complex = NDArray[np.complex128]
 SAMPLES = 2000
@@ -130,6 +130,26 @@ def test_the_adxl355_states_the_attenuation_and_the_delay_of_its_data_sheet(rate
 
 
 @pytest.mark.parametrize(
+    ("order", "at_1500_hz"),
+    [(3, 0.5), (1, 0.7)],  # text of the ADXL359's data sheet: sinc3, 50 % at 1.5 kHz; of the ADXL355's: sinc, 30 % down
+)
+@pytest.mark.parametrize("rate_hz", adxl355_registers.RATES_HZ)
+def test_the_adxl355s_u_contains_the_analog_filter_that_the_text_of_the_sheets_states(
+    rate_hz: float, order: int, at_1500_hz: float
+) -> None:
+    # The table of the same sheets leaves next to nothing for the analog filter (0.02 % at 100 Hz).
+    zero_hz = np.linspace(2000.0, 6000.0, 40001)  # first zero of the sinc
+    text_hz = zero_hz[np.abs(np.sinc(1500.0 / zero_hz) ** order - at_1500_hz).argmin()]
+    f = rate_hz / 4.0 * np.array([0.02, 0.1, 0.5, 1.0])
+    lines = adxl355_registers.filters(rate_hz)
+    _, u = stated(lines, f)
+    differs = np.sinc(f / text_hz) ** order / np.abs(filter_of(lines[0]).at(f)) - 1.0
+    assert (np.abs(differs) <= 2.0 * u).all()
+    if (rate_hz, order) == (4000.0, 3):
+        assert differs[1] == pytest.approx(-0.003, abs=3e-4)  # at 100 Hz
+
+
+@pytest.mark.parametrize(
     ("chip", "rates_hz"),
     [
         (adxl355_registers, adxl355_registers.RATES_HZ),
@@ -147,13 +167,39 @@ def test_what_drivers_state_can_be_read_at_every_rate(chip: Any, rates_hz: tuple
         assert filters or rate_hz < 2.0
 
 
-def test_of_a_clone_nothing_is_known_not_even_which_settings_are_its_filters() -> None:
-    twin = Mpu6050Twin(lambda _, n: np.zeros((n, 3), np.int32), int, lambda: 0.0)
-    found = []
-    for clone in (False, True):
-        options: Any = Mpu6050.options_model.model_validate({"rate_hz": 100.0, "clone": clone})
-        with installed({"/dev/i2c-1": I2CBus({0x68: twin})}):
-            found.append(Mpu6050("sensor", options, sleep=lambda _: None).open())
-    assert found[0].filters == ("lowpass order=1 corner_hz=44 u_corner_pct=50",)
-    assert set(found[0].filter_settings) == {"SMPLRT_DIV", "CONFIG", "ACCEL_CONFIG_2"}
-    assert (found[1].filters, found[1].filter_settings) == ((), ())
+@pytest.mark.parametrize(
+    ("who_am_i", "rate_hz", "corner_hz"),
+    [
+        (0x68, 1000.0, 184),
+        (0x68, 100.0, 44),
+        (0x70, 200.0, 92),
+        (0x71, 1000.0, 218.1),
+        (0x73, 100.0, 44.8),
+        (0x19, 200.0, 99),  # MPU-6886
+        (0x98, 100.0, None),
+    ],
+)
+def test_the_filters_of_an_mpu_are_those_of_its_identity(
+    who_am_i: int, rate_hz: float, corner_hz: float | None
+) -> None:
+    class Part(Mpu6500Twin if who_am_i != 0x68 else Mpu6050Twin):  # type: ignore[misc]
+        identity = who_am_i
+
+    twin = Part(lambda _, n: np.zeros((n, 3), np.int32), int, lambda: 0.0)
+    options: Any = Mpu6050.options_model.model_validate({"rate_hz": rate_hz, "clone": True})
+    with installed({"/dev/i2c-1": I2CBus({0x68: twin})}):
+        info = Mpu6050("sensor", options, sleep=lambda _: None).open()
+    if corner_hz is None:  # no source tells the filters of this part, nor which settings are its filters
+        assert (info.filters, info.filter_settings) == ((), ())
+    else:
+        assert info.filters == (f"lowpass order=1 corner_hz={corner_hz:g} u_corner_pct=50",)
+        assert set(info.filter_settings) == {"SMPLRT_DIV", "CONFIG", "ACCEL_CONFIG_2"}
+
+
+def test_before_the_part_is_known_u_contains_the_filters_of_all() -> None:
+    for rate_hz in mpu6050_registers.RATES_HZ:
+        f = rate_hz * np.array([0.05, 0.2, 0.35])
+        h, u = stated(mpu6050_registers.filters(rate_hz), f)
+        for part in (*mpu6050_registers.PARTS.values(), mpu6050_registers.clone(0x19)):
+            other, _ = stated(mpu6050_registers.filters(rate_hz, part), f)
+            assert (np.abs(np.abs(other / h) - 1.0) <= 2.0 * u).all()
