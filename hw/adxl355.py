@@ -75,6 +75,9 @@ class Adxl355(FifoSensor):
         values = chip.settings(self.part, self._options.rate_hz, self._options.range_g)
         return dict(enumerate(zip(chip.SETTING_NAMES, values, strict=True), chip.FIRST_SETTING))
 
+    def _spoilt_samples(self) -> tuple[int, int]:
+        return chip.spoilt_samples(self._options.rate_hz)
+
     def _counts_per_g(self) -> float:
         return self.part.counts_per_g[self._options.range_g]
 

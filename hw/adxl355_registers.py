@@ -13,6 +13,7 @@ data sheet and in other public drivers, but 1885 in no-OS, which is a difference
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -49,6 +50,7 @@ MUST_BE_ALONE = (
     "only device on its bus"
 )
 _LATE_S = 0.17e-3  # delay of the path at any rate, besides that of its filters
+_FIXED_FILTERS_S, _DRIVE_STOPS_S = 1.4e-3, 0.5e-3
 COUNTS_MIN, COUNTS_MAX = -(2**19), 2**19 - 1
 _RANGE_RESET_BITS = 0x80  # I2C high-speed bits, set by a reset and kept
 _X_MARK, _EMPTY = 0x01, 0x02  # in the last byte of a FIFO entry
@@ -122,6 +124,18 @@ def filters(rate_hz: float) -> tuple[str, ...]:
         *([variable] if decimation > 1 else []),
         f"delay delay_s={_LATE_S + 0.5 / rate_hz:.6g}",
     )
+
+
+def spoilt_samples(rate_hz: float) -> tuple[int, int]:
+    """How many samples before and behind an indication at the end of the range are spoilt, too.
+
+    Data sheets, "Overrange protection": over range the drive of the sensor stops for 0.5 ms and the output floats to
+    zero. The filters spread this over the length of their impulse response: two means over the decimation to the rate,
+    and at most 1.4 ms of the fixed stage and the analog filter (a sinc3 with its first zero at 4.1 kHz, as the text of
+    the ADXL359's sheet has it).
+    """
+    length_s = 2.0 * (1.0 / rate_hz - 1.0 / RATES_HZ[0]) + _FIXED_FILTERS_S
+    return math.ceil(length_s * rate_hz), math.ceil((length_s + _DRIVE_STOPS_S) * rate_hz)
 
 
 def self_test(part: Part, rate_hz: float) -> SelfTest:

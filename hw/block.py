@@ -16,7 +16,7 @@ class BlockFlags(enum.IntFlag):
     """What a reader must know about a block before it uses it."""
 
     NONE = 0
-    SATURATED = 1  # at least one indication is at the end of the range
+    SATURATED = 1  # at least one indication is at the end of the range, or spoilt by a neighbour that is
     OVERRUN = 2  # the device lost an unknown number of samples before this block
     GAP = 4  # samples before this block are missing; first_index tells how many
     RESTART = 8  # the time of this block cannot be counted on from the block before: the clock model starts again

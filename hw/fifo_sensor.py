@@ -63,7 +63,8 @@ class FifoSensor(PollingSensor):
             self._sleep,
             self.read_bytes or self.word_bytes * self.sample_words,
         )
-        self._cutter = Cutter(name, options.rate_hz, *self._limits())
+        before, after = self._spoilt_samples()
+        self._cutter = Cutter(name, options.rate_hz, *self._limits(), before=before, after=after)
         self._pace = Pace(options.rate_hz)
         self._held: Registers = {}  # what must read the same behind each block: settings, and trims as found
         self._bursts: list[Burst] = []
@@ -106,6 +107,10 @@ class FifoSensor(PollingSensor):
     def _decode(self, data: bytes) -> FifoSamples:
         """Samples in the words of half a second; `data` begins with the rest of the words before."""
 
+    def _spoilt_samples(self) -> tuple[int, int]:
+        """How many samples before and behind an indication at the end of the range are spoilt, too."""
+        return 0, 0
+
     def _filters(self) -> tuple[str, ...]:
         """The filters as in DeviceInfo, where the part tells them better than the options do."""
         return tuple(self._options.known_filters)
@@ -137,6 +142,7 @@ class FifoSensor(PollingSensor):
         trims = self._trims()
         self._held = dict(self._settings()) | {r: (trims[r], value) for r, value in self._read_back(trims).items()}
         self._bursts, self._rest = [], b""
+        self._cutter.flush()
         self._pace = Pace(info.nominal_rate_hz)
         self._forget()
         self._cutter.nominal_rate_hz = info.nominal_rate_hz
@@ -277,12 +283,14 @@ class FifoSensor(PollingSensor):
 
     def _begin_again(self) -> None:
         """The samples from now on do not follow those before."""
+        self._ready.extend(self._cutter.flush())
         self._forget()
         self._pace.restart()
         self._cutter.flag(BlockFlags.RESTART | BlockFlags.OVERRUN)
 
     def _finish(self) -> None:
         if self._loss is not None:
+            self._ready.extend(self._cutter.flush())
             self._discard(UNCHECKED)
             return
         for _ in range(PROOF_POLLS):

@@ -146,6 +146,11 @@ class I2cRig(Rig):
         assert block is not None
         return block.flags, self.number(block.indications)
 
+    def read_restart(self) -> tuple[BlockFlags, NDArray[np.int64]]:
+        """The next block that does not follow the one before; at most one block comes before it."""
+        flags, numbers = self.read()
+        return (flags, numbers) if flags & BlockFlags.RESTART else self.read()
+
 
 class I2cContract(SensorContract):
     """What every driver on I2C must do, on every kind of adapter."""
@@ -262,7 +267,7 @@ class I2cContract(SensorContract):
         rig.sensor.open()
         _, before = rig.read()
         rig.twin.break_off(errno.EIO, words)
-        flags, after = rig.read()
+        flags, after = rig.read_restart()
         assert flags == BlockFlags.RESTART | BlockFlags.OVERRUN
         assert after[0] > before[-1] + 1
         assert (np.diff(after) == 1).all()
@@ -271,7 +276,7 @@ class I2cContract(SensorContract):
         rig.sensor.open()
         _, before = rig.read()
         rig.sleep(self.late_s)
-        flags, after = rig.read()
+        flags, after = rig.read_restart()
         assert flags == BlockFlags.RESTART | BlockFlags.OVERRUN
         assert after[0] > before[-1] + 1
 
@@ -302,7 +307,7 @@ class I2cContract(SensorContract):
         rig.sensor.open()
         _, before = rig.read()
         Stalling.stall_s = self.late_s
-        flags, after = rig.read()
+        flags, after = rig.read_restart()
         assert flags == BlockFlags.RESTART | BlockFlags.OVERRUN
         assert after[0] > before[-1] + 1
         assert (np.diff(after) == 1).all()
@@ -313,7 +318,7 @@ class I2cContract(SensorContract):
         rig.twin.power_cycle()
         rig.sleep(0.02)
         with pytest.raises(DeviceLost, match=r"did it lose power, or"):
-            rig.sensor.read_block()
+            list(rig.blocks(2.0))
         rig.sensor.open()
         flags, _ = rig.read()
         assert flags == BlockFlags.RESTART

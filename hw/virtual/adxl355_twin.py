@@ -8,11 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hw.virtual.fifo_twin import Counts, FifoTwin
-from hw.virtual.response import Response, delay, in_turn, lowpass, taps
+from hw.virtual.response import Array, Response, delay, in_turn, lowpass, taps
 
 IDENTITY = bytes([0xAD, 0x1D, 0xED, 0x01])
 EMPTY_ENTRY = b"\x00\x00\x02"
 BYTE_S = 9 / 400e3  # time of a byte on a bus of 400 kHz
+DRIVE_STOPS_S = 0.5e-3
+HIGHEST = 2**19 - 1
 STATUS, FIFO_ENTRIES, TEMPERATURE, DATA, FIFO_DATA = 0x04, 0x05, 0x06, 0x08, 0x11
 FIRST_SETTING, FILTER, RANGE, POWER_CTL, SELF_TEST, RESET, RESET_CODE, SHADOW_1 = (
     *(0x1E, 0x28, 0x2C, 0x2D, 0x2E, 0x2F, 0x52, 0x50),
@@ -32,6 +34,33 @@ def filters(rate_hz: float) -> Response:
     variable = np.convolve(np.ones(decimation), np.ones(decimation))  # two means over the decimation, at 4 kHz
     waiting = delay(0.17e-3 + 0.5 / rate_hz)
     return in_turn(lowpass(1, 4700.0), taps(HALVING, 2.0 * FIXED_HZ), taps(variable, FIXED_HZ), waiting)
+
+
+def shaken(
+    felt_g: Callable[[Array], Array], rate_hz: float, counts_per_g: float, over_g: float = np.inf
+) -> Callable[[int, int], Counts]:
+    """A `source` of the twin in the time domain: the chip feels `felt_g(t_s)`, (n,) -> (n, 3), in g.
+
+    Beyond `over_g` on any axis the drive of the sensor stops for 0.5 ms, and all axes read zero (data sheet, "Overrange
+    protection": 8 g at a range of 2 g). The filters come behind it, and the end of the range behind them.
+    """
+    decimation = round(FIXED_HZ / rate_hz)
+    mean = np.zeros(2 * decimation - 1)
+    mean[::2] = 1.0  # of the samples at 4 kHz, among those at 8 kHz
+    weights = np.convolve(HALVING, np.convolve(mean, mean) if decimation > 1 else [1.0])
+    fine_hz, stopped = 2.0 * FIXED_HZ, round(DRIVE_STOPS_S * 2.0 * FIXED_HZ)
+
+    def source(first: int, n: int) -> Counts:
+        sample = np.arange(first, first + n) * 2 * decimation
+        reach = len(weights) + stopped
+        felt = felt_g(np.arange(sample[0] - reach, sample[-1] + 1) / fine_hz)
+        over = np.max(np.abs(felt), axis=1) > over_g
+        felt[np.convolve(over, np.ones(stopped))[: len(over)] > 0] = 0.0
+        passed = np.column_stack([np.convolve(axis, weights / weights.sum())[: len(axis)] for axis in felt.T])
+        counts = np.rint(passed[sample - sample[0] + reach] * counts_per_g)
+        return np.asarray(np.clip(counts, -HIGHEST - 1, HIGHEST), np.int32)
+
+    return source
 
 
 def encode(counts: NDArray[np.int32]) -> bytes:
