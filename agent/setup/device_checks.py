@@ -53,11 +53,13 @@ def sharing_findings(config: Config, options: Mapping[str, Options]) -> Iterator
         others.remove(device.name)
         if not others:
             continue
-        sensor = cast(FifoSensor, load_driver(device.driver)(device.name, held))
+        sensor = load_driver(device.driver)(device.name, held)
+        if not isinstance(sensor, FifoSensor):
+            continue
         try:
             identity = sensor.identify()
-        except DeviceError:
-            identity = "its revision is not known: it was not read"
+        except DeviceError:  # `answer_findings` tells it
+            identity = "its revision was not read"
         if sensor.must_be_alone:
             says = f"{device.name} shares /dev/i2c-{held.bus} with {' and '.join(others)}: {held.must_be_alone}"
             yield Finding("bus", "advice", f"{says} ({identity})", "give it a bus of its own")
