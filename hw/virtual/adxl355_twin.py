@@ -150,7 +150,8 @@ class Adxl355Twin(FifoTwin):
         if register == TEMPERATURE + 1:
             return self._temperature_raw(self._clock() + BYTE_S) & 0xFF
         if DATA <= register < DATA + 9:
-            return encode(self._newest()[None])[register - DATA] & (0xFE if register == DATA + 2 else 0xFF)
+            newest = self._newest() if self._filling else np.zeros(3, np.int32)  # in standby nothing is measured
+            return encode(newest[None])[register - DATA] & (0xFE if register == DATA + 2 else 0xFF)
         if SHADOW_1 <= register < SHADOW_1 + len(self.shadow):
             return self.shadow[register - SHADOW_1]
         return self.registers[register]

@@ -37,6 +37,7 @@ def test_they_hold_the_sample_made_last(twin_class: type[FifoTwin], register: in
     t_s = 0.0955
     twin = twin_class(source, lambda t: int(t * 100) + 1, lambda: t_s)
     expected = bytes.fromhex(wanted)
+    twin.write(bytes([0x2D, 0x00]))  # the ADXL355 measures
     twin.write(bytes([register]))
     assert twin.read(len(expected)) == expected
     axis = len(expected) // 3  # each axis by itself, as the kernel's adxl345 does
