@@ -59,6 +59,7 @@ class Adxl355(FifoSensor):
     word_bytes, sample_words = 3, 3
     filter_settings = ("FILTER",)
     _revision = 0
+    _lost_trim = b""  # what the shadow registers held before resets that did not bring it back
 
     @property
     def must_be_alone(self) -> str:
@@ -105,18 +106,22 @@ class Adxl355(FifoSensor):
     def _reset(self) -> None:
         """Reset until the shadow registers, which hold the factory trim, read as before the first reset.
 
-        Raises DeviceLost.
+        Rarely a reset spoils the trim, which a power cycle brings back (data sheet ADXL355, rev. C, as quoted in issue
+        5 of plasmapper/adxl355-arduino). What a device holds after such a reset is not taken for its trim at the next
+        `open`. Raises DeviceLost.
         """
-        before = self._shadow("start")
+        before = self._lost_trim or self._shadow("start")
         for _ in range(RESET_ATTEMPTS):
             self._device.write(chip.RESET, chip.RESET_CODE)
             self._sleep(RESET_WAIT_S)
             after = self._shadow("reset")
             if after == before:
+                self._lost_trim = b""
                 return
+        self._lost_trim = before
         raise DeviceLost(
-            f"{self._device.name}: after a reset the shadow registers read {after.hex(' ')}, "
-            f"not {before.hex(' ')}; check supply and wiring"
+            f"{self._device.name}: after a reset the shadow registers read {after.hex(' ')}, not {before.hex(' ')}; "
+            "cut its power for a second; if it is another device than before, start the program again"
         )
 
     def _shadow(self, since: str) -> bytes:
