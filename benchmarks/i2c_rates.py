@@ -1,9 +1,9 @@
-"""What each driver on I2C reads on each kind of adapter: highest rate, bytes on the bus, CPU time.
+"""What each driver on I2C or SPI reads on each kind of adapter: highest rate, bytes on the bus, CPU time.
 
 `python -m benchmarks.i2c_rates [--write]`; with --write the table goes into docs/gateway.md. Time is simulated: a
-transfer takes 9 bits a byte at the clock of the bus, and the time that the adapter adds. The highest rate is the
-highest of the driver's rates that the options accept at this clock, that the driver accepts on this adapter, and that
-it then reads for SECONDS without a loss. CPU is that of the driver, without the twin and without the kernel.
+transfer takes 9 bits a byte (SPI: 8) at the clock of the bus, and the time that the adapter adds. The highest rate is
+the highest of the driver's rates that the options accept at this clock, that the driver accepts on this adapter, and
+that it then reads for SECONDS without a loss. CPU is that of the driver, without the twin and without the kernel.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import argparse
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +31,7 @@ from hw.virtual.kernel import BCM2835, PLAIN, SHORT_MESSAGES, SMBUS_ONLY, WRITE_
 from hw.virtual.lis3dh_twin import Lis3dhTwin
 from hw.virtual.lsm6dso_twin import Lsm6dsoTwin
 from hw.virtual.mpu6050_twin import Mpu6050Twin
+from hw.virtual.spi_bus import SPI, Controller, SpiBus
 
 SECONDS = 20.0
 GATEWAY = Path(__file__).resolve().parents[1] / "docs" / "gateway.md"
@@ -44,8 +46,15 @@ TWINS: dict[str, type[FifoTwin]] = {
 }
 # Time that an adapter adds to a transfer: interrupts and system calls of a small computer; a USB adapter answers in
 # frames of 1 ms. These are assumptions: the driver measures the adapter that it finds.
-ADDED_S = {PLAIN: 1e-4, BCM2835: 1e-4, WRITE_THEN_READ: 2e-3, SHORT_MESSAGES: 1e-4, SMBUS_ONLY: 1e-4}
-CLOCKS_KHZ = (100.0, 400.0)
+ADDED_S: dict[Adapter | Controller, float] = {
+    PLAIN: 1e-4,
+    BCM2835: 1e-4,
+    WRITE_THEN_READ: 2e-3,
+    SHORT_MESSAGES: 1e-4,
+    SMBUS_ONLY: 1e-4,
+    SPI: 1e-4,
+}
+CLOCKS_KHZ, SPI_CLOCKS_KHZ = (100.0, 400.0), (1000.0,)
 
 
 class TimedBus(I2CBus):
@@ -58,6 +67,20 @@ class TimedBus(I2CBus):
         before_s = time.process_time()
         try:
             return super().transfer(messages)
+        finally:
+            self.cpu_s += time.process_time() - before_s
+
+
+class TimedSpiBus(SpiBus):
+    """Counts the CPU time of the simulated bus."""
+
+    cpu_s = 0.0
+
+    def ioctl(self, request: int, argument: Any) -> int:
+        """One request, like every bus."""
+        before_s = time.process_time()
+        try:
+            return super().ioctl(request, argument)
         finally:
             self.cpu_s += time.process_time() - before_s
 
@@ -88,23 +111,25 @@ def counts(first: int, n: int) -> NDArray[np.int32]:
     return np.column_stack([np.arange(first, first + n) % 1000, np.zeros((n, 2))]).astype(np.int32)
 
 
-def run(name: str, adapter: Adapter, clock_khz: float, rate_hz: float) -> Run | None:
+def run(name: str, adapter: Adapter | Controller, clock_khz: float, rate_hz: float) -> Run | None:
     """Read for SECONDS at this rate; None where the options or the driver refuse it, or samples are lost."""
     driver = load_driver(name)
     time_ = Clock()
+    over_spi = isinstance(adapter, Controller)
+    way = {"bus": "spi0.0", "spi_mhz": clock_khz / 1e3} if over_spi else {"bus_khz": clock_khz}
     try:
-        options = driver.options_model.model_validate({"rate_hz": rate_hz, "bus_khz": clock_khz})
+        options = driver.options_model.model_validate({"rate_hz": rate_hz} | way)
     except ValidationError:
         return None
     twin = TWINS[name](counts, lambda t_s: int(t_s * rate_hz), lambda: time_.t_s)
-    bus = TimedBus(
-        {options.address: twin},  # type: ignore[attr-defined]
-        adapter=adapter,
-        spend=time_.spend,
-        transfer_s=ADDED_S[adapter],
-        clock_hz=1e3 * clock_khz,
-    )
-    with installed({"/dev/i2c-1": bus}):
+    added_s = ADDED_S[adapter]
+    bus: TimedBus | TimedSpiBus
+    if isinstance(adapter, Controller):
+        bus = TimedSpiBus(twin, adapter=adapter, spend=time_.spend, message_s=added_s)
+    else:
+        targets = {options.address: twin}  # type: ignore[attr-defined]
+        bus = TimedBus(targets, adapter=adapter, spend=time_.spend, transfer_s=added_s, clock_hz=1e3 * clock_khz)
+    with installed({options.node: bus}):  # type: ignore[attr-defined]
         sensor = driver("imu", options, clock=time_, sleep=time_.spend)
         assert isinstance(sensor, FifoSensor)
         try:
@@ -128,7 +153,9 @@ def table() -> str:
     for name in TWINS:
         rates_hz = sorted(load_driver(name).options_model.rates_hz, reverse=True)  # type: ignore[attr-defined]
         for adapter, added_s in ADDED_S.items():
-            for clock_khz in CLOCKS_KHZ:
+            if isinstance(adapter, Controller) and not TWINS[name].spi_modes:
+                continue
+            for clock_khz in SPI_CLOCKS_KHZ if isinstance(adapter, Controller) else CLOCKS_KHZ:
                 tried = ((rate_hz, run(name, adapter, clock_khz, rate_hz)) for rate_hz in rates_hz)
                 rate_hz, found = next(((rate, run) for rate, run in tried if run is not None), (0.0, Run(0.0, 0.0)))
                 lines.append(

@@ -1,4 +1,4 @@
-"""Driver `adxl345`: the ADXL345 on I2C, read through its FIFO."""
+"""Driver `adxl345`: the ADXL345 on I2C or SPI, read through its FIFO."""
 
 from __future__ import annotations
 
@@ -28,6 +28,7 @@ class Adxl345Options(FifoOptions):
     bytes_a_poll = 4  # address, register, address, FIFO_STATUS
     reads_a_sample, reads_a_poll = 1, 1
     stated_hz_a_khz = chip.STATED_HZ_A_KHZ
+    spi = chip.SPI
 
     address: Literal[0x53, 0x1D] = Field(0x53, description="83 (0x53), or 29 (0x1D) with ALT ADDRESS high")
     rate_hz: float = Field(800.0, description=f"one of {', '.join(f'{rate:g}' for rate in chip.RATE_CODES)}")

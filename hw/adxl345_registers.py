@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from hw.self_test import SelfTest
+from hw.spi import SpiProtocol
 
 IDENTITY = 0xE5
 DEVID, BW_RATE, POWER_CTL, INT_SOURCE, DATA_FORMAT, DATA, FIFO_CTL, FIFO_STATUS = (
@@ -26,6 +27,10 @@ ENTRIES_MASK = 0x3F  # in FIFO_STATUS
 FIFO_SAMPLES = 32
 STANDBY, MEASURE = 0x00, 0x08
 BYPASS, STREAM = 0x00, 0x80
+# Mode 3: data sheet, serial communications. Bits: also Linux, drivers/iio/accel/adxl345_spi.c. The part takes 5 MHz,
+# but needs 5 us between two reads of its FIFO. The same driver of Linux waits for them above 1.5 MHz; up to there they
+# pass while the first byte is sent, so this driver reads no faster.
+SPI = SpiProtocol(mode=3, highest_mhz=1.5, read=0x80, several=0x40)
 COUNTS_PER_G = 256  # in full resolution, at any range; the data sheet allows 230 to 282 at 2.5 V
 RANGE_CODES: Mapping[int, int] = {2: 0, 4: 1, 8: 2, 16: 3}
 STATED_HZ_A_KHZ = 2.0  # data sheet: 800 Hz at 400 kHz, in proportion to the clock

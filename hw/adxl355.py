@@ -1,4 +1,4 @@
-"""Drivers `adxl355`, `adxl357` and `adxl359`: one family of parts on I2C, read through their FIFO."""
+"""Drivers `adxl355`, `adxl357` and `adxl359`: one family of parts on I2C or SPI, read through their FIFO."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ class Adxl355Options(FifoOptions):
     rates_hz = chip.RATES_HZ
     fifo_samples = chip.FIFO_ENTRIES_MAX // 3
     bytes_a_sample = 9
+    spi = chip.SPI
     bytes_a_poll = 12  # address, register, address, STATUS, FIFO_ENTRIES; twice address, register, address; STATUS
     stated_hz_a_khz = chip.STATED_HZ_A_KHZ
     must_be_alone = chip.MUST_BE_ALONE

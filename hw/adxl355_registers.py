@@ -21,6 +21,7 @@ import numpy as np
 
 from hw.fifo import FifoSamples
 from hw.self_test import Axes, SelfTest
+from hw.spi import SpiProtocol
 
 DEVID, REVISION, STATUS, TEMPERATURE, FIFO_DATA = 0x00, 0x03, 0x04, 0x06, 0x11
 FIRST_SETTING, FILTER, RANGE, POWER_CTL, SELF_TEST, RESET, SHADOW = 0x1E, 0x28, 0x2C, 0x2D, 0x2E, 0x2F, 0x50
@@ -37,6 +38,9 @@ SETTING_NAMES = (
     *("ACT_EN", "ACT_THRESH_H", "ACT_THRESH_L", "ACT_COUNT", "FILTER", "FIFO_SAMPLES"),
     *("INT_MAP", "SYNC", "RANGE", "POWER_CTL", "SELF_TEST"),
 )
+# Seven bits of register before the bit of a read: Linux, drivers/iio/accel/adxl355_spi.c. Mode 0: no-OS,
+# eval-adxl355-pmdz. 0.1 to 10 MHz: the data sheet, as a user quotes it (ez.analog.com, thread 100077).
+SPI = SpiProtocol(mode=0, highest_mhz=10.0, read=0x01, shift=1)
 RATES_HZ = tuple(4000.0 / 2.0**code for code in range(11))  # index: the code in FILTER
 # Data sheets of the ADXL355 and ADXL359, "I2C protocol": at most 800 Hz at 400 kHz, in proportion to the clock; else
 # samples may be missing and noise added

@@ -6,8 +6,9 @@ import contextlib
 from collections.abc import Iterator, Sequence
 from typing import ClassVar
 
+from hw.bus_device import Read
 from hw.fifo_sensor import FifoSensor
-from hw.i2c import I2CDevice, Read
+from hw.i2c import I2CDevice
 from hw.sensor import DeviceLost, IdentityError
 
 

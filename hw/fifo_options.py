@@ -1,12 +1,14 @@
-"""Options of all drivers that poll a FIFO over I2C, and the checks of rate, poll interval and bus load."""
+"""Options of all drivers that poll a FIFO over I2C or SPI, and the checks of rate, poll interval and bus load."""
 
 from __future__ import annotations
 
+import re
 from typing import ClassVar, Self
 
 from pydantic import Field, field_validator, model_validator
 
 from hw.sensor import Options
+from hw.spi import SPI_BUS, SpiProtocol, spi_node
 
 POLL_SAMPLES = 16  # default samples per poll; the fixed cost of a read is that of a few samples
 # Default share of the FIFO per poll: at 1 kHz a FIFO of 32 samples then survives a stall of 20 ms, which occurs on
@@ -19,24 +21,37 @@ LONGEST_POLL_S, FEWEST_SAMPLES, SLOWEST_POLL_S = 0.02, 2, 0.1
 FIFO_SHARE_MAX = 7 / 8  # share of the FIFO that may fill between polls; the rest is reserve for a late poll
 # Share of the bus time that may be used; the rest is for clock stretching, retries and other devices
 BUS_SHARE_MAX = 0.7
-BITS_A_BYTE = 9  # with the acknowledge bit
+I2C_BITS, SPI_BITS = 9, 8  # of a byte; on I2C with the acknowledge bit
+ADDRESS_BYTES = 2  # of a register read on I2C, one before the register and one before the data
 RATE_TOLERANCE = 2e-3  # relative; people write 3.906 for 3.90625
 
 
+def foreign_options(bus: int | str) -> tuple[str, ...]:
+    """Names of the options that do not apply to this bus."""
+    return ("address", "bus_khz") if isinstance(bus, str) else ("spi_mhz",)
+
+
 class FifoOptions(Options):
-    """Common options. A subclass states its rates, the samples in its FIFO, and the bytes on the bus."""
+    """Common options. A subclass states its rates, the samples in its FIFO, and the bytes on the bus.
+
+    A subclass whose part can also be read over SPI states how (`spi`).
+    """
 
     rates_hz: ClassVar[tuple[float, ...]]
     fifo_samples: ClassVar[int]
     bytes_a_sample: ClassVar[int]
-    bytes_a_poll: ClassVar[int]  # addresses, registers, status and count
+    bytes_a_poll: ClassVar[int]  # on I2C: addresses, registers, status and count
     reads_a_sample: ClassVar[int] = 0  # register reads, where each sample needs its own
     reads_a_poll: ClassVar[int] = 3  # register reads besides: status, data, status
     # Highest rate that the data sheet states for I2C, Hz for each kHz of the bus; None where it states none
     stated_hz_a_khz: ClassVar[float | None] = None
     must_be_alone: ClassVar[str] = ""  # why no other device may be on the bus; "" where others may
 
-    bus: int = Field(1, ge=0, description="N of /dev/i2c-N")
+    spi: ClassVar[SpiProtocol | None] = None
+
+    bus: int | str = Field(
+        1, description='N of /dev/i2c-N; or "spiB.C" for /dev/spidevB.C, where the driver reads over SPI'
+    )
     rate_hz: float
     poll_interval_s: float | None = Field(
         None,
@@ -46,7 +61,8 @@ class FifoOptions(Options):
     serial_number: str = Field(
         "", description="of the device, as on its label; the chip has none, and a calibration belongs to one device"
     )
-    bus_khz: float = Field(400.0, gt=0, le=3400, description="clock of the bus as set on this machine")
+    bus_khz: float = Field(400.0, gt=0, le=3400, description="clock of the I2C bus as set on this machine")
+    spi_mhz: float = Field(1.0, ge=0.1, description="clock with which the driver reads over SPI; slower for long wires")
 
     @field_validator("rate_hz")
     @classmethod
@@ -56,6 +72,28 @@ class FifoOptions(Options):
                 return rate
         known = ", ".join(f"{rate:g}" for rate in cls.rates_hz)
         raise ValueError(f"{value:g} Hz is not a rate of this device; use one of {known}")
+
+    @field_validator("bus")
+    @classmethod
+    def _known_bus(cls, value: int | str) -> int | str:
+        text = str(value)
+        if text.isdecimal():
+            return int(text)
+        if re.fullmatch(SPI_BUS, text) is None:
+            raise ValueError(f'{text!r} is no bus: N of /dev/i2c-N, as 1, or "spiB.C" of /dev/spidevB.C, as "spi0.0"')
+        if cls.spi is None:
+            raise ValueError(f"{text}: this driver does not read over SPI; use N of /dev/i2c-N")
+        return text
+
+    @model_validator(mode="after")
+    def _of_this_bus(self) -> Self:
+        for name in foreign_options(self.bus):
+            if name in self.model_fields_set:
+                why = "on SPI the chip select in bus names the device" if self.over_spi else "bus names an I2C bus"
+                raise ValueError(f"{name} does not apply to bus {self.bus}, remove it: {why}")
+        if self.over_spi and self.spi and self.spi_mhz > self.spi.highest_mhz:
+            raise ValueError(f"spi_mhz {self.spi_mhz:g} is too fast: at most {self.spi.highest_mhz:g} for this device")
+        return self
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
@@ -67,21 +105,26 @@ class FifoOptions(Options):
                 f"the FIFO holds {self.fifo_samples} and at most {longest:.0f} leave room for a late "
                 f"read; lower poll_interval_s"
             )
-        bits_hz = BITS_A_BYTE * (self.bytes_a_sample * self.rate_hz + self.bytes_a_poll / self.interval_s)
-        share = bits_hz / (1e3 * self.bus_khz)
+        bits, addresses, clock, clock_hz = I2C_BITS, 0, f"bus_khz {self.bus_khz:g}", 1e3 * self.bus_khz
+        if self.over_spi:
+            bits, addresses, clock, clock_hz = SPI_BITS, ADDRESS_BYTES, f"spi_mhz {self.spi_mhz:g}", 1e6 * self.spi_mhz
+        sample_bytes = self.bytes_a_sample - addresses * self.reads_a_sample
+        poll_bytes = self.bytes_a_poll - addresses * self.reads_a_poll
+        bits_hz = bits * (sample_bytes * self.rate_hz + poll_bytes / self.interval_s)
+        share = bits_hz / clock_hz
         if share > BUS_SHARE_MAX:
             raise ValueError(
-                f"bus too slow: {self.rate_hz:g} samples/s of {self.bytes_a_sample} bytes and "
-                f"{1 / self.interval_s:.4g} polls/s of {self.bytes_a_poll} bytes, {BITS_A_BYTE} bits each, are "
-                f"{bits_hz / 1e3:.4g} kbit/s, {share:.0%} of bus_khz {self.bus_khz:g}; "
+                f"bus too slow: {self.rate_hz:g} samples/s of {sample_bytes} bytes and "
+                f"{1 / self.interval_s:.4g} polls/s of {poll_bytes} bytes, {bits} bits each, are "
+                f"{bits_hz / 1e3:.4g} kbit/s, {share:.0%} of {clock}; "
                 f"at most {BUS_SHARE_MAX:.0%} may be used: lower rate_hz or use a faster bus"
             )
         return self
 
     @property
     def advice(self) -> tuple[str, ...]:
-        """A rate above what the data sheet states for this bus."""
-        if self.stated_hz_a_khz is None or self.rate_hz <= self.stated_hz_a_khz * self.bus_khz:
+        """A rate above what the data sheet states for this I2C bus."""
+        if self.over_spi or self.stated_hz_a_khz is None or self.rate_hz <= self.stated_hz_a_khz * self.bus_khz:
             return ()
         stated_hz = self.stated_hz_a_khz * self.bus_khz
         lower = [rate for rate in self.rates_hz if rate <= stated_hz]
@@ -91,6 +134,16 @@ class FifoOptions(Options):
             f"bus of {self.bus_khz:g} kHz; samples may be missing and noise added: {remedy}use a bus of at least "
             f"{self.rate_hz / self.stated_hz_a_khz:g} kHz and state it as bus_khz",
         )
+
+    @property
+    def over_spi(self) -> bool:
+        """Whether `bus` names an SPI bus."""
+        return isinstance(self.bus, str)
+
+    @property
+    def node(self) -> str:
+        """Device node of the bus."""
+        return spi_node(str(self.bus)) if self.over_spi else f"/dev/i2c-{self.bus}"
 
     @property
     def interval_s(self) -> float:

@@ -1,4 +1,4 @@
-"""Common part of all drivers that poll a FIFO over I2C: bursts, settings, self-test.
+"""Common part of all drivers that poll a FIFO over I2C or SPI: bursts, settings, self-test.
 
 A subclass adds the registers of its chip.
 """
@@ -15,14 +15,16 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from hw.block import BlockFlags, DeviceInfo
+from hw.bus_device import READS_MAX, BusDevice
 from hw.cutting import Break, Cutter, Stretch
 from hw.fifo import Burst, FifoSamples
 from hw.fifo_options import BUS_SHARE_MAX
-from hw.i2c import READS_MAX, I2CDevice
+from hw.i2c import I2CDevice
 from hw.pace import Pace
 from hw.polling import PollingSensor
 from hw.self_test import SelfTest, SelfTestReport
 from hw.sensor import ConfigurationError, DeviceError, DeviceLost
+from hw.spi import SpiDevice
 
 STANDARD_GRAVITY_MPS2 = 9.80665
 PROOF_POLLS = 8  # the golden ratio lets every second poll or third prove that no sample is missing
@@ -46,7 +48,7 @@ class FifoSensor(PollingSensor):
     A subclass implements the abstract methods; `options` must be FifoOptions with an `address`.
     """
 
-    device_class: ClassVar[type[I2CDevice]] = I2CDevice
+    device_class: ClassVar[type[I2CDevice]] = I2CDevice  # on I2C
     word_bytes: ClassVar[int]  # bytes that the FIFO stores at a time
     sample_words: ClassVar[int] = 1
     read_bytes: ClassVar[int] = 0  # least bytes of a read; 0: those of a sample
@@ -56,13 +58,7 @@ class FifoSensor(PollingSensor):
 
     def __init__(self, name: str, options: Any, **timing: Any) -> None:
         super().__init__(name, options, **timing)
-        self._device: I2CDevice = self.device_class(
-            self._kind(),
-            options.bus,
-            options.address,
-            self._sleep,
-            self.read_bytes or self.word_bytes * self.sample_words,
-        )
+        self._device: BusDevice = self._bus_device(self.read_bytes or self.word_bytes * self.sample_words)
         before, after = self._spoilt_samples()
         self._cutter = Cutter(name, options.rate_hz, *self._limits(), before=before, after=after)
         self._pace = Pace(options.rate_hz)
@@ -128,6 +124,13 @@ class FifoSensor(PollingSensor):
         self._drop(OUT_OF_STEP, len(self._rest) // self.word_bytes)
         self._rest = b""
 
+    def _bus_device(self, unit: int) -> BusDevice:
+        """The device on the bus of the options."""
+        options = self._options
+        if options.spi and options.over_spi:
+            return SpiDevice(self._kind(), options.bus, options.spi, 1e6 * options.spi_mhz, self._sleep, unit)
+        return self.device_class(self._kind(), options.bus, options.address, self._sleep, unit)
+
     def _where(self) -> str:
         return self._device.name
 
@@ -135,6 +138,7 @@ class FifoSensor(PollingSensor):
         """Identify the device, reset it, write the settings and read them back."""
         self._device.open()
         self._device.lock()
+        self._device.check_free(self.identity_register)
         identity = self._identify()
         self._device.learn(self.identity_register | self.auto_increment, self._longest_read(), self._clock)
         self._check_speed()
@@ -167,7 +171,9 @@ class FifoSensor(PollingSensor):
         possible = []
         for rate_hz in self._options.rates_hz:
             try:
-                slower = type(self._options).model_validate(self._options.model_dump() | {"rate_hz": rate_hz})
+                slower = type(self._options).model_validate(
+                    self._options.model_dump(exclude_unset=True) | {"rate_hz": rate_hz}
+                )
             except ValidationError:
                 continue
             if self._busy(slower) <= BUS_SHARE_MAX:
@@ -200,7 +206,7 @@ class FifoSensor(PollingSensor):
         """
         self._device.open()
         try:
-            self._device.check_free()
+            self._device.check_free(self.identity_register)
             identity = self._identify()
         finally:
             self._device.close()

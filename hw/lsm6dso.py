@@ -1,4 +1,4 @@
-"""Driver `lsm6dso`: LSM6DSO and LSM6DSOX on I2C, the accelerometer read through the tagged FIFO."""
+"""Driver `lsm6dso`: LSM6DSO and LSM6DSOX on I2C or SPI, the accelerometer read through the tagged FIFO."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ class Lsm6dsoOptions(FifoOptions):
     fifo_samples = chip.FIFO_WORDS
     bytes_a_sample = chip.WORD_BYTES
     bytes_a_poll = 13  # address, register, address each for count, data and FIFO_STATUS; 2 + 2 bytes of FIFO_STATUS
+    spi = chip.SPI
 
     address: Literal[0x6A, 0x6B] = Field(0x6A, description="106 (0x6A), or 107 (0x6B) with SA0 high")
     rate_hz: float = Field(833.0, description=f"one of {', '.join(f'{rate:g}' for rate in chip.RATES_HZ)}")

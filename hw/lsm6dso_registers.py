@@ -12,6 +12,7 @@ import numpy as np
 
 from hw.fifo import FifoSamples
 from hw.self_test import SelfTest
+from hw.spi import SpiProtocol
 
 WHO_AM_I, IDENTITY = 0x0F, 0x6C
 FIRST_FIFO_SETTING, FIFO_CTRL3, FIFO_CTRL4, FIFO_STATUS, FIFO_DATA = 0x07, 0x09, 0x0A, 0x3A, 0x78
@@ -21,6 +22,11 @@ SOFTWARE_RESET = 0x01  # in CTRL3_C, clears itself
 BYPASS, CONTINUOUS = 0x00, 0x06  # FIFO_CTRL4
 OVERRUN = 0x48  # in the second byte of FIFO_STATUS: overrun now, and overrun latched until FIFO_STATUS is read
 COUNT_MASK = 0x3FF
+# Bit of a read: Linux, st_lsm6dsx_spi.c; IF_INC in CTRL3_C, set by a reset, counts the register up. Modes 0 and 3: data
+# sheet, as quoted in issue 4 of SparkFun_Qwiic_6DoF_LSM6DSO_Arduino_Library. 10 MHz: SPI slave timing values of ST's
+# LSM9DS1 and LSM6DSK320X; those of the LSM6DSO were not read. I2C stays enabled (I2C_disable in CTRL4_C is 0): the
+# settings, and with them the identity of the device and its calibration, do not depend on the bus.
+SPI = SpiProtocol(mode=0, highest_mhz=10.0, read=0x80)
 FIFO_WORDS = 512
 WORD_BYTES = 7
 LIMITS = -(2**15), 2**15 - 1

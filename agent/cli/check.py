@@ -26,7 +26,7 @@ def check(config: Path, json_to: str | None) -> int:
     """Report every fault in CONFIG, with its line, its setting and what to do. Exit status 2 if there is a fault.
 
     Of a good one, tell which filters of each device are divided out, and who states them, and ask the devices on I2C
-    buses of this machine who they are. A device that does not answer is a warning; an adapter that refuses the
+    and SPI buses of this machine who they are. A device that does not answer is a warning; an adapter that refuses the
     transfers of the driver is a fault.
 
     JSON: `good`, `faults` and `warnings` (lists of texts), and of a good one `devices`, `channels`, `poses` and
@@ -66,7 +66,7 @@ def check(config: Path, json_to: str | None) -> int:
 
 
 def _answers(path: Path, config: Config) -> list[Finding]:
-    """What answers on the I2C buses of this machine. Raises ConfigError where an adapter refuses the transfers."""
+    """What answers on the buses of this machine. Raises ConfigError where an adapter refuses the transfers."""
     answers = list(answer_findings(config, loaded_options(config)))
     if faults := [f"{path}: {answer.says}" for answer in answers if answer.check == "adapter"]:
         raise ConfigError(faults)

@@ -1,8 +1,9 @@
-"""`fieldcal probe`: devices that answer on this machine's I2C buses and serial ports, and their self-tests."""
+"""`fieldcal probe`: devices that answer on this machine's I2C buses, SPI buses and serial ports; their self-tests."""
 
 from __future__ import annotations
 
 import json
+import re
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, replace
@@ -10,13 +11,16 @@ from pathlib import Path
 from typing import Any, get_args
 
 import click
+from pydantic import ValidationError
 
 from agent.terminal.text import say
+from hw.fifo_options import FifoOptions
 from hw.fifo_sensor import FifoSensor
 from hw.i2c import I2CDevice
 from hw.self_test import SelfTestReport
 from hw.sensor import ConfigurationError, DeviceError, DeviceLost, IdentityError, driver_names, load_driver
 from hw.serial_ports import serial_ports
+from hw.spi import SPI_BUS
 
 MICRO = 1e6
 
@@ -48,27 +52,57 @@ class Bus:
     answers: list[Answer]
 
 
+@dataclass(frozen=True, slots=True)
+class Selected:
+    """What one chip select of SPI has: `bus` as in the options of a driver; `note` tells why nothing is known."""
+
+    bus: str
+    driver: str = ""
+    identity: str = ""
+    note: str = ""
+    used_by: str = ""
+    self_test: dict[str, Any] | None = None
+
+
+def bus_name(value: str | int) -> str | int:
+    """N of /dev/i2c-N, or spiB.C of /dev/spidevB.C. Raises click.BadParameter."""
+    text = str(value)
+    if not text.isdecimal() and not re.fullmatch(SPI_BUS, text):
+        raise click.BadParameter(f"{text!r} is neither N of /dev/i2c-N nor spiB.C of /dev/spidevB.C, as spi0.0")
+    return int(text) if text.isdecimal() else text
+
+
 @click.command()
-@click.option("--bus", "buses", type=click.IntRange(0), multiple=True, metavar="N", help="Only /dev/i2c-N.")
+@click.option("--bus", "buses", type=bus_name, multiple=True, metavar="BUS", help="Only /dev/i2c-BUS, or spiB.C.")
+@click.option("--driver", metavar="NAME", help="Ask as this driver does. Only with it is a device on SPI asked.")
 @click.option(
     "--self-test", is_flag=True, help="Run the self-test of each device. It resets the device: stop the agent first."
 )
 @click.option("--json", "json_to", type=click.Choice(["-"]), help="One JSON object on standard output.")
-def probe(buses: tuple[int, ...], self_test: bool, json_to: str | None) -> int:
-    """Probe the I2C buses and serial ports of this machine. Reads only identity registers, unless --self-test is given.
+def probe(buses: tuple[str | int, ...], driver: str | None, self_test: bool, json_to: str | None) -> int:
+    """Probe the buses and serial ports of this machine. Reads only identity registers, unless --self-test is given.
+
+    SPI has no addresses, and what reads from one part may write to another. So a device on SPI is asked only where both
+    --bus and --driver name it, as in --bus spi0.0 --driver adxl355.
 
     Exit status 3 if a self-test failed, 1 if a named bus cannot be probed.
     """
     drivers = i2c_drivers()
-    found = [on_bus(number, drivers, self_test) for number in buses or i2c_buses()]
+    if driver is not None and driver not in drivers:
+        raise click.BadParameter(f"{driver!r} is none of {', '.join(drivers)}", param_hint="--driver")
+    asked = {driver: drivers[driver]} if driver else drivers
+    found = [on_bus(bus, asked, self_test) for bus in buses or i2c_buses() if isinstance(bus, int)]
+    on_select = asked if buses else drivers
+    selected = [on_spi(bus, on_select, self_test) for bus in buses or spi_buses() if isinstance(bus, str)]
     ports = [] if buses else serial_ports()
     if json_to:
-        click.echo(json.dumps({"i2c": [asdict(bus) for bus in found], "serial": ports}))
+        told = {"i2c": [asdict(bus) for bus in found], "spi": [asdict(one) for one in selected], "serial": ports}
+        click.echo(json.dumps(told))
     else:
-        _print(found, ports)
-    if buses and any(bus.fault for bus in found):
+        _print(found, selected, ports, named=bool(buses))
+    if buses and (any(bus.fault for bus in found) or any(not one.identity for one in selected)):
         return 1
-    results = [answer.self_test for bus in found for answer in bus.answers]
+    results = [answer.self_test for bus in found for answer in bus.answers] + [one.self_test for one in selected]
     return 3 if any(result and result["faults"] for result in results) else 0
 
 
@@ -76,6 +110,11 @@ def i2c_buses() -> list[int]:
     """Numbers N of the I2C adapters /dev/i2c-N of this machine."""
     nodes = (path.name.removeprefix("i2c-") for path in Path("/dev").glob("i2c-*"))
     return sorted(int(number) for number in nodes if number.isdigit())
+
+
+def spi_buses() -> list[str]:
+    """Chip selects spiB.C of this machine that have a node /dev/spidevB.C."""
+    return sorted(path.name.replace("spidev", "spi") for path in Path("/dev").glob("spidev*.*"))
 
 
 def i2c_drivers() -> dict[str, type[FifoSensor]]:
@@ -134,6 +173,29 @@ def _at(bus: int, address: int, drivers: dict[str, type[FifoSensor]], self_test:
     return Answer(address, list(known), " or ".join(identities), **told, self_test=result)
 
 
+def on_spi(bus: str, drivers: dict[str, type[FifoSensor]], self_test: bool) -> Selected:
+    """Ask the device on a chip select as the only one of `drivers` does; with several, do not ask."""
+    if len(drivers) > 1:
+        known = " or ".join(name for name, driver in drivers.items() if _over_spi(driver))
+        return Selected(bus, note=f"not asked, since this could write to another part; name its driver: --bus {bus} "
+                        f"--driver {known}")  # fmt: skip
+    ((name, driver),) = drivers.items()
+    try:
+        sensor = driver(name, driver.options_model.model_validate({"bus": bus}))
+        identity = sensor.identify()
+    except ValidationError as error:
+        return Selected(bus, name, note=str(error.errors()[0]["msg"]).removeprefix("Value error, "))
+    except DeviceError as error:
+        return Selected(bus, name, note=str(error))
+    used_by = sensor.used_by()
+    return Selected(bus, name, identity, used_by=used_by, self_test=tested(sensor) if self_test else None)
+
+
+def _over_spi(driver: type[FifoSensor]) -> bool:
+    model = driver.options_model
+    return issubclass(model, FifoOptions) and model.spi is not None
+
+
 def tested(sensor: FifoSensor) -> dict[str, Any]:
     """Result of the self-test, for JSON and for the printed lines."""
     try:
@@ -158,8 +220,8 @@ def as_object(report: SelfTestReport) -> dict[str, Any]:
     }
 
 
-def _print(buses: list[Bus], ports: list[dict[str, str]]) -> None:
-    if not buses:
+def _print(buses: list[Bus], selected: list[Selected], ports: list[dict[str, str]], *, named: bool) -> None:
+    if not buses and not named:
         say("no I2C bus (no /dev/i2c-N): enable the adapter and load the kernel module i2c-dev")
     for bus in buses:
         if bus.fault:
@@ -175,6 +237,11 @@ def _print(buses: list[Bus], ports: list[dict[str, str]]) -> None:
                 say(f"        warning: other devices answer on this bus; {answer.warning}")
             for line in _self_test_lines(answer.self_test):
                 say(f"        {line}")
+    for one in selected:
+        used_by = f", used by {one.used_by}" if one.used_by else ""
+        say(f"{one.bus}: {f'{one.identity}, driver {one.driver}{used_by}' if one.identity else one.note}")
+        for line in _self_test_lines(one.self_test):
+            say(f"        {line}")
     for port in ports:
         known = [text for text in (port["description"], port["serial_number"]) if text not in ("", "n/a")]
         say(f"{port['port']}: serial port, {', '.join(known) or 'of which the system knows nothing more'}")

@@ -47,7 +47,7 @@ def sharing_findings(config: Config, options: Mapping[str, Options]) -> Iterator
     """Does a device that must be alone on its bus share it? The device's identity is read where the bus is here."""
     for device in config.devices:
         held = options[device.name]
-        if not isinstance(held, FifoOptions) or not held.must_be_alone:
+        if not isinstance(held, FifoOptions) or held.over_spi or not held.must_be_alone:
             continue
         others = [name for name, other in options.items() if isinstance(other, FifoOptions) and other.bus == held.bus]
         others.remove(device.name)
@@ -69,7 +69,7 @@ def access_findings(options: Mapping[str, Options]) -> Iterator[Finding]:
     """May this user read and write the devices?"""
     for name, held in options.items():
         if isinstance(held, FifoOptions):
-            node = Path(f"/dev/i2c-{held.bus}")
+            node = Path(held.node)
         elif port := getattr(held, "port", None):
             node = Path(port)
         else:
@@ -85,6 +85,8 @@ def _access(name: str, node: Path) -> Finding:
         remedy = "connect the device; `fieldcal probe` lists what there is"
         if node.name.startswith("i2c-"):
             remedy = "enable the I2C adapter, and load the kernel module: sudo modprobe i2c-dev"
+        elif node.name.startswith("spidev"):
+            remedy = "enable the SPI bus (on a Raspberry Pi dtparam=spi=on in config.txt); no kernel driver may hold it"
         return Finding("device", "fault", f"{name}: {node} does not exist", remedy)
     except (OSError, KeyError) as error:
         return Finding("device", "fault", f"{name}: {node}: {error}", "look at its rights with ls -l")
@@ -97,14 +99,14 @@ def _access(name: str, node: Path) -> Finding:
 
 
 def answer_findings(config: Config, options: Mapping[str, Options]) -> Iterator[Finding]:
-    """Does each device on an I2C bus of this machine answer, to transfers as its driver does them?
+    """Does each device on an I2C or SPI bus of this machine answer, to transfers as its driver does them?
 
     Nothing is said of a bus that is not here, and no register is written. A finding of the check `adapter` is one that
     no other device at the address mends.
     """
     for device in config.devices:
         held = options[device.name]
-        if not isinstance(held, FifoOptions) or not Path(f"/dev/i2c-{held.bus}").exists():
+        if not isinstance(held, FifoOptions) or not Path(held.node).exists():
             continue
         try:
             sensor = load_driver(device.driver)(device.name, held)
@@ -120,14 +122,14 @@ def answer_findings(config: Config, options: Mapping[str, Options]) -> Iterator[
             yield _bad_driver(device, told_as(error))
         else:
             used = f", used by {used_by}" if used_by else ""
-            says = f"{device.name}: {identity} answers on /dev/i2c-{held.bus}, one register read a transfer{used}"
+            says = f"{device.name}: {identity} answers on {held.node}, one register read a transfer{used}"
             yield Finding("device", "good", says)
 
 
 def bus_findings(options: Mapping[str, Options], sysfs: Path = Path("/sys")) -> Iterator[Finding]:
-    """Is each I2C bus as fast as the configuration says, and fast enough for the rate?"""
+    """Is each I2C bus as fast as the configuration says, and fast enough for the rate? (On SPI the driver sets it.)"""
     for name, held in options.items():
-        if not isinstance(held, FifoOptions):
+        if not isinstance(held, FifoOptions) or isinstance(held.bus, str):
             continue
         clock_khz = bus_clock_khz(held.bus, sysfs)
         if clock_khz is None:
@@ -139,7 +141,7 @@ def bus_findings(options: Mapping[str, Options], sysfs: Path = Path("/sys")) -> 
             f"state bus_khz = {clock_khz:g}, so that `fieldcal check` counts with it"
         )
         try:
-            type(held).model_validate(held.model_dump() | {"bus_khz": clock_khz})
+            type(held).model_validate(held.model_dump(exclude_unset=True) | {"bus_khz": clock_khz})
         except ValidationError as error:
             says = f"{name}: /dev/i2c-{held.bus} runs at {clock_khz:g} kHz: {error.errors()[0]['msg']}"
             yield Finding("bus", "fault", says.replace("Value error, ", ""), remedy)

@@ -15,7 +15,7 @@ from agent.setup.drivers import describe, unit_of
 from agent.setup.listening import Heard, hear
 from agent.setup.recognising import recognised
 from agent.setup.toml import Setting, Table
-from hw.fifo_options import FifoOptions
+from hw.fifo_options import FifoOptions, foreign_options
 from hw.line_columns import IGNORED, Column, columns_of
 from hw.sensor import ConfigurationError, load_driver
 from hw.serial_stream import SerialCsvOptions
@@ -188,9 +188,13 @@ def complete(device: Chosen, asking: Asking) -> None:
         asking.faults.append(f"--{device.role}: {error}")
         return
     schema = model.model_json_schema()
+    options = schema.get("properties", {})
     if issubclass(model, FifoOptions):
+        device.state("bus", model.model_fields["bus"].default, "default")
         _fit_bus(device, model)
-    for name, option in schema.get("properties", {}).items():
+        foreign = foreign_options(device.value("bus"))
+        options = {name: option for name, option in options.items() if name not in foreign}
+    for name, option in options.items():
         if name not in device.options and name in schema.get("required", []):
             unit = unit_of(name)
             says = option.get("description", name) + (f", {unit}" if unit else "")
@@ -201,7 +205,8 @@ def complete(device: Chosen, asking: Asking) -> None:
 
 def _fit_bus(device: Chosen, model: type[FifoOptions]) -> None:
     """State the clock of the bus as the system tells it, and the highest usual rate that fits it without advice."""
-    clock_khz = bus_clock_khz(int(device.value("bus") or 1))
+    bus = device.value("bus")
+    clock_khz = None if isinstance(bus, str) else bus_clock_khz(bus)
     if clock_khz is not None:
         device.state("bus_khz", clock_khz, "the device tree of this machine")
     if "rate_hz" in device.options:
@@ -215,7 +220,7 @@ def _fit_bus(device: Chosen, model: type[FifoOptions]) -> None:
             continue
         if fitting.advice:
             continue
-        source = "default" if rate == default else f"the highest rate for a bus of {fitting.bus_khz:g} kHz"
+        source = "default" if rate == default else "the highest rate for this bus"
         device.state("rate_hz", rate, source)
         return
 

@@ -9,7 +9,16 @@ from typing import Any
 from hw.sensor import BUILT_IN, ConfigurationError, DriverFactory, load_driver
 
 # unit by the ending of the option's name
-UNITS = {"_hz": "Hz", "_khz": "kHz", "_s": "s", "_g": "g", "_mps2": "m/s2", "_degc": "degC", "baud_rate": "bit/s"}
+UNITS = {
+    "_hz": "Hz",
+    "_khz": "kHz",
+    "_mhz": "MHz",
+    "_s": "s",
+    "_g": "g",
+    "_mps2": "m/s2",
+    "_degc": "degC",
+    "baud_rate": "bit/s",
+}
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,12 +1,20 @@
-"""Tests that every driver which polls a FIFO over I2C must pass, on a register-level twin under the real smbus2."""
+"""Tests that every driver which polls a FIFO over I2C or SPI must pass, on a register-level twin.
+
+Under it are the real smbus2 and the real `hw.spi`.
+"""
 
 from __future__ import annotations
 
 import errno
 import functools
 import itertools
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, ExitStack
+from dataclasses import replace
+from pathlib import Path
 from typing import Any, ClassVar
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -19,7 +27,9 @@ from hw.fifo_sensor import UNCHECKED, FifoSensor
 from hw.sensor import AdapterError, ConfigurationError, DeviceLost, IdentityError
 from hw.virtual.fifo_twin import FifoTwin
 from hw.virtual.kernel import ADAPTERS, PLAIN, SMBUS_FUNCTIONS, Adapter, I2CBus, installed
+from hw.virtual.spi_bus import CONTROLLERS, SPI, Controller, SpiBus
 
+BUSES: tuple[Adapter | Controller, ...] = (*ADAPTERS, *CONTROLLERS)  # for a driver that reads over SPI, too
 LAP = 1000
 FEWER_SAMPLES = 20_000
 FOREIGN_ACCESSES = 24
@@ -37,7 +47,7 @@ def numbered_counts() -> NDArray[np.int32]:
 
 
 class I2cRig(Rig):
-    """Rig for a driver on I2C.
+    """Rig for a driver on I2C, or on SPI where `adapter` is a controller of it.
 
     A subclass names the driver, the twin, the options and the highest count of the range.
     """
@@ -47,7 +57,7 @@ class I2cRig(Rig):
     address: ClassVar[int]
     full: ClassVar[int]
     options: ClassVar[dict[str, Any]] = {}
-    adapter: ClassVar[Adapter] = PLAIN
+    adapter: ClassVar[Adapter | Controller] = PLAIN
 
     sensor: FifoSensor
 
@@ -60,11 +70,16 @@ class I2cRig(Rig):
         self.saturated = range(0)
         self.temperature_raw: int | None = None
         self.twin = self.build_twin()
-        self.bus = I2CBus({self.address: self.twin}, adapter=self.adapter)
-        self._kernel = installed({"/dev/i2c-1": self.bus})
-        self._kernel.__enter__()
+        self.bus: Any  # I2CBus or SpiBus
+        if isinstance(self.adapter, Controller):
+            self.over_spi, self.name, self.node = True, "on /dev/spidev0.0", "/dev/spidev0.0"
+            self.bus = SpiBus(self.twin, adapter=self.adapter)
+        else:
+            self.over_spi, self.name, self.node = False, f"at 0x{self.address:02X} on /dev/i2c-1", "/dev/i2c-1"
+            self.bus = I2CBus({self.address: self.twin}, adapter=self.adapter)
+        self._held = ExitStack()
+        self._held.enter_context(installed({self.node: self.bus}))
         self.sensor = self.build()
-        self.name = rf"0x{self.address:02X} on /dev/i2c-1"
 
     def build_twin(self) -> FifoTwin:
         return self.twin_class(self.counts, self.due, lambda: self.t_s, temperature_raw=self.temperature)
@@ -73,15 +88,36 @@ class I2cRig(Rig):
         return self.twin_class.temperature_at_25_degc if self.temperature_raw is None else self.temperature_raw
 
     def build(self, **options: Any) -> FifoSensor:
-        given = self.driver.options_model.model_validate(self.options | options)
+        way = {"bus": "spi0.0"} if self.over_spi else {}
+        given = self.driver.options_model.model_validate(way | self.options | options)
         return self.driver("sensor", given, clock=self.clock, sleep=lambda s: self.sleep(s))
 
     def build_elsewhere(self) -> FifoSensor:
-        return self.build(bus=7)
+        return self.build(bus="spi7.0" if self.over_spi else 7)
 
     def put(self, twin: FifoTwin) -> None:
-        """Put another device at the address."""
-        self.twin = self.bus.targets[self.address] = twin
+        """Put another device in the place of the twin."""
+        self.twin = twin
+        if self.over_spi:
+            self.bus.target = twin
+        else:
+            self.bus.targets[self.address] = twin
+
+    def nobody(self, number: int) -> AbstractContextManager[None]:
+        """While this context is active, there is no device; on I2C the adapter then tells the errno `number`."""
+        return installed({self.node: SpiBus(None) if self.over_spi else I2CBus({}, absent_errno=number)})
+
+    def claim(self) -> None:
+        """A kernel driver takes the device."""
+        if not self.over_spi:
+            self.bus.claimed.add(self.address)
+            return
+        sysfs = Path(self._held.enter_context(tempfile.TemporaryDirectory()))
+        (sysfs / "bus/spi/devices/spi0.0").mkdir(parents=True)
+        (sysfs / "bus/spi/drivers/chip").mkdir(parents=True)
+        (sysfs / "bus/spi/devices/spi0.0/driver").symlink_to(sysfs / "bus/spi/drivers/chip")
+        self._held.enter_context(patch("hw.spi.SYSFS", sysfs))
+        self.unplug()
 
     def counts(self, first: int, n: int) -> NDArray[np.int32]:
         counts = numbered_counts()[first : first + n]
@@ -110,7 +146,7 @@ class I2cRig(Rig):
 
     def close(self) -> None:
         self.sensor.close()
-        self._kernel.__exit__(None, None, None)
+        self._held.close()
 
     def write_elsewhere(self, register: int, value: int) -> None:
         """What another program does that writes to one register."""
@@ -152,9 +188,16 @@ class I2cRig(Rig):
         return (flags, numbers) if flags & BlockFlags.RESTART else self.read()
 
 
-class I2cContract(SensorContract):
-    """What every driver on I2C must do, on every kind of adapter."""
+def on_one_adapter(test: Callable[..., None]) -> Callable[..., None]:
+    """Mark a test of the contract that runs on one kind of adapter only."""
+    test.on_one_adapter = True  # type: ignore[attr-defined]
+    return test
 
+
+class I2cContract(SensorContract):
+    """What every driver on I2C or SPI must do, on every kind of adapter."""
+
+    adapters: ClassVar[Sequence[Adapter | Controller]] = ADAPTERS  # BUSES where the driver reads over SPI, too
     filter_register: ClassVar[tuple[int, str]]  # a settings register, and its name in messages
     # Registers (offsets, high-pass filter, self-test) with values that somebody may have left in them
     trimmed: ClassVar[dict[int, int]]
@@ -163,21 +206,21 @@ class I2cContract(SensorContract):
     self_test_range: ClassVar[float] = 1.0  # range during the self-test as a multiple of the range that is set
 
     def pytest_generate_tests(self, metafunc: pytest.Metafunc) -> None:
-        """Every test runs on every kind of adapter, but for those of other programs, which are many."""
-        adapters = ADAPTERS[:1] if "another_program" in metafunc.function.__name__ else ADAPTERS
+        """Every test runs on every kind of adapter, but for those that take long or are many: `on_one_adapter`."""
+        adapters = self.adapters[:1] if hasattr(metafunc.function, "on_one_adapter") else self.adapters
         metafunc.parametrize("adapter", adapters, indirect=True, ids=lambda adapter: adapter.name)
 
     @pytest.fixture(autouse=True)
     def adapter(self, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
         """The most samples are read on the plain adapter."""
         monkeypatch.setattr(I2cRig, "adapter", request.param)
-        if request.param is not PLAIN:
+        if request.param not in (PLAIN, SPI):
             monkeypatch.setattr(self, "samples", min(self.samples, FEWER_SAMPLES))
 
     @pytest.mark.parametrize("number", [errno.ENXIO, errno.EREMOTEIO])
     def test_nobody_at_the_address(self, rig: I2cRig, number: int) -> None:
-        with installed({"/dev/i2c-1": I2CBus({}, absent_errno=number)}):
-            with pytest.raises(DeviceLost, match=rf" at {rig.name}: "):
+        with rig.nobody(number):
+            with pytest.raises(DeviceLost, match=rf" {rig.name}: "):
                 rig.sensor.open()
             rig.sensor.close()
 
@@ -195,20 +238,22 @@ class I2cContract(SensorContract):
         assert bytes(rig.twin.registers) == before
 
     def test_address_of_a_kernel_driver_is_not_forced(self, rig: I2cRig) -> None:
-        rig.bus.claimed.add(rig.address)
+        rig.claim()
         before = bytes(rig.twin.registers)
-        with pytest.raises(ConfigurationError, match=rf"{rig.name}: a kernel driver holds the address"):
+        with pytest.raises(ConfigurationError, match=rf"{rig.node}.* kernel driver .*holds "):
             rig.sensor.open()
         assert bytes(rig.twin.registers) == before
 
-    def test_adapter_that_reads_single_bytes(self, rig: I2cRig) -> None:
+    def test_adapter_that_cannot_do_what_the_driver_needs(self, rig: I2cRig) -> None:
         single = Adapter("bytes", functions=SMBUS_FUNCTIONS & ~I2cFunc.SMBUS_READ_I2C_BLOCK)
-        rig.bus.adapter = single
-        with pytest.raises(AdapterError, match=r"/dev/i2c-1: the adapter can neither do plain I2C transfers nor"):
+        rig.bus.adapter = replace(rig.adapter, modes=()) if isinstance(rig.adapter, Controller) else single
+        why = "the SPI bus refuses mode" if rig.over_spi else "the adapter can neither do plain I2C transfers nor"
+        with pytest.raises(AdapterError, match=f"{rig.node}: {why}"):
             rig.sensor.open()
 
     def test_adapter_whose_messages_are_too_short(self, rig: I2cRig) -> None:
-        rig.bus.adapter = Adapter("short", longest=5)
+        short = Adapter("short", longest=5)
+        rig.bus.adapter = replace(rig.adapter, bufsiz=5) if isinstance(rig.adapter, Controller) else short
         with pytest.raises(AdapterError, match=f"{rig.name}: the adapter "):
             rig.sensor.open()
 
@@ -356,8 +401,8 @@ class I2cContract(SensorContract):
         before = bytes(rig.twin.registers)
         assert rig.build().identify().startswith(info.kind)
         assert bytes(rig.twin.registers) == before
-        rig.bus.claimed.add(rig.address)
-        with pytest.raises(ConfigurationError, match="a kernel driver holds the address"):
+        rig.claim()
+        with pytest.raises(ConfigurationError, match=r"kernel driver .*holds "):
             rig.build().identify()
 
     def test_self_test_passes_on_a_sound_part_and_tells_a_stuck_one(self, rig: I2cRig) -> None:
@@ -388,6 +433,7 @@ class I2cContract(SensorContract):
         assert "x changes by 0.000 g, the limits are" in faults[0]
         assert "may be dead" in faults[1]
 
+    @on_one_adapter
     @pytest.mark.parametrize("seed", range(FOREIGN_ACCESSES))
     def test_what_another_program_writes_is_noticed(self, rig: I2cRig, seed: int) -> None:
         rng = np.random.default_rng(seed)
@@ -409,6 +455,7 @@ class I2cContract(SensorContract):
         rig.sensor.open()
         assert rig.read()[0] == BlockFlags.RESTART
 
+    @on_one_adapter
     @pytest.mark.parametrize("seed", range(FOREIGN_ACCESSES))
     def test_what_another_program_reads_is_noticed(self, rig: I2cRig, seed: int) -> None:
         rng = np.random.default_rng(seed)

@@ -33,6 +33,8 @@ class Adxl345Twin(FifoTwin):
     word_bytes = 6
     data_register = DATA
     identity = 0xE5
+    spi_modes = (3,)
+    spi_highest_hz = 5e6
 
     def _reset_registers(self) -> bytearray:
         registers = bytearray(256)
@@ -55,6 +57,9 @@ class Adxl345Twin(FifoTwin):
         before = self._next
         super()._fill()
         self._overrun |= self._next > before and len(self._fifo) >= FIFO_SAMPLES * self.word_bytes
+
+    def _spi_command(self, first: int) -> tuple[int, bool, bool]:
+        return first % 64, first >= 128, first % 128 >= 64
 
     def _read_fifo(self, count: int) -> bytes:
         self._pointer += min(count, self.word_bytes)

@@ -89,6 +89,8 @@ class Adxl355Twin(FifoTwin):
     temperature_at_25_degc = 1885
     reset_s = 0.005
     shadow = bytes([0x4C, 0x21, 0x9A, 0x05, 0x33])  # factory trim; any constant will do
+    spi_modes = (0,)
+    spi_highest_hz = 10e6
 
     def __init__(
         self,
@@ -125,6 +127,9 @@ class Adxl355Twin(FifoTwin):
 
     def _encode(self, first: int, counts: Counts) -> bytes:  # noqa: ARG002 - these entries carry no number
         return encode(counts)
+
+    def _spi_command(self, first: int) -> tuple[int, bool, bool]:
+        return first // 2, first % 2 == 1, True
 
     def _nothing(self, count: int) -> bytes:
         return (EMPTY_ENTRY * (count // 3 + 1))[:count]

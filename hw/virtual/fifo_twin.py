@@ -16,7 +16,9 @@ Counts = NDArray[np.int32]
 
 
 class FifoTwin(ABC):
-    """A chip on the I2C bus. Motion, noise, time and temperature come from the arguments.
+    """A chip on an I2C bus or, where it has `spi_modes`, on an SPI bus.
+
+    Motion, noise, time and temperature come from the arguments.
 
     - `source(first, n)` returns (n, 3) int32 counts of samples first .. first + n - 1 at the set range.
     - `samples_due(t_s)`: number of samples that exist at `t_s`.
@@ -31,6 +33,8 @@ class FifoTwin(ABC):
     word_bytes: ClassVar[int]
     data_register: ClassVar[int]
     temperature_at_25_degc: ClassVar[int] = 0
+    spi_modes: ClassVar[tuple[int, ...]] = ()
+    spi_highest_hz: ClassVar[float] = 0.0
 
     def __init__(
         self,
@@ -77,6 +81,10 @@ class FifoTwin(ABC):
     def _after(self, register: int) -> int:
         """Register that is read or written after `register` in one message."""
         return register & ~0xFF | (register + 1) & 0xFF
+
+    def _spi_command(self, first: int) -> tuple[int, bool, bool]:
+        """Meaning of the first byte of an SPI frame: register, whether it reads, whether the register counts up."""
+        raise NotImplementedError
 
     def _deflection(self) -> Counts:
         """Change (3,) of the counts by the self-test."""
@@ -137,6 +145,19 @@ class FifoTwin(ABC):
                 out.append(self._get(self._pointer))
                 self._pointer = self._after(self._pointer)
         return bytes(out)
+
+    def exchange(self, sent: bytes) -> bytes:
+        """One SPI frame, from selection to deselection. Its first byte names the register."""
+        register, reads, counts_up = self._spi_command(sent[0])
+        if not reads:
+            for i, value in enumerate(sent[1:]):
+                self.write(bytes([register + (i if counts_up else 0), value]))
+            return bytes(len(sent))
+        self.write(bytes([register]))
+        if counts_up or register == self.data_register:
+            return b"\0" + self.read(len(sent) - 1)
+        received = self.read(1)
+        return b"\0" + received * (len(sent) - 1)
 
     def _break_off(self) -> None:
         if self._broken_off is not None:

@@ -1,4 +1,4 @@
-"""Replaces the kernel's i2c-dev under the real smbus2; only the calls open, close and ioctl are replaced.
+"""Replaces the kernel's i2c-dev and spidev under smbus2 and `hw.spi`; only open, close and ioctl are replaced.
 
 errno values and limits are those of Linux 6.1: at most 42 messages per transfer and 8192 bytes per message (EINVAL);
 ENXIO or EREMOTEIO, depending on the adapter, for an address without a device; EBUSY for an address that a kernel driver
@@ -12,13 +12,16 @@ import ctypes
 import errno
 import os
 import threading
-import weakref
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any, Protocol
 
 import smbus2.smbus2 as s2
+
+import hw.spi
+from hw.virtual.node import Node
+from hw.virtual.spi_bus import SpiBus
 
 MAX_MESSAGES = 42
 MAX_MESSAGE_BYTES = 8192
@@ -58,12 +61,14 @@ class I2CTarget(Protocol):
         """One read message."""
 
 
-class I2CBus:
+class I2CBus(Node):
     """An adapter with its targets by address. A kernel driver holds the addresses in `claimed`.
 
     Where `spend` is given, it is called with the time of each transfer in s: `transfer_s`, and 9 bits at `clock_hz` for
     each address and byte.
     """
+
+    gone_errno = errno.EIO
 
     def __init__(
         self,
@@ -75,28 +80,16 @@ class I2CBus:
         transfer_s: float = 0.0,
         clock_hz: float = 400e3,
     ) -> None:
+        super().__init__("i2c")
         self.targets = dict(targets)
         self.claimed: set[int] = set()
         self.adapter = adapter
-        self.plugged = True
-        self.generation = 0  # increases with each unplug: files opened before are invalid
         self.transfers = 0
         self.bytes = 0  # on the bus, addresses among them
-        self.node = os.memfd_create("i2c")  # a file of its own, as the node of each real adapter is: it can be locked
-        weakref.finalize(self, os.close, self.node)
         self._absent_errno = absent_errno
         self._spend = spend
         self._transfer_s, self._byte_s = transfer_s, 9 / clock_hz
         self._lock = threading.Lock()
-
-    def unplug(self) -> None:
-        """Remove the adapter."""
-        self.plugged = False
-        self.generation += 1
-
-    def replug(self) -> None:
-        """Connect the adapter again."""
-        self.plugged = True
 
     def transfer(self, messages: list[tuple[int, int | bytes]]) -> list[bytes | None]:
         """Do all messages (address, bytes to write or number of bytes to read); return the bytes read, by message."""
@@ -128,14 +121,15 @@ class I2CBus:
 
 
 class Kernel:
-    """Files and ioctls of i2c-dev, on the argument structures of smbus2. All methods raise OSError like the kernel.
+    """Files and ioctls of i2c-dev and spidev, on the argument structures of smbus2 and of `hw.spi`.
 
-    `installed` puts this object under smbus2. Code that forwards the system calls of another process may use it, too.
+    All methods raise OSError like the kernel. `installed` puts this object under smbus2 and `hw.spi`. Code that
+    forwards the system calls of another process may use it, too.
     """
 
-    def __init__(self, nodes: Mapping[str, I2CBus]) -> None:
+    def __init__(self, nodes: Mapping[str, I2CBus | SpiBus]) -> None:
         self._nodes = nodes
-        self._files: dict[int, tuple[I2CBus, int]] = {}
+        self._files: dict[int, tuple[I2CBus | SpiBus, int]] = {}
         self._address: dict[int, int] = {}
 
     def open(self, path: str, flags: int) -> int:
@@ -157,7 +151,9 @@ class Kernel:
         """One request; results are written into `argument`."""
         bus, generation = self._files[file]
         if generation != bus.generation:
-            raise _error(errno.EIO)
+            raise _error(bus.gone_errno)
+        if isinstance(bus, SpiBus):
+            return bus.ioctl(request, argument)
         match request:
             case s2.I2C_FUNCS:
                 argument.value = bus.adapter.functions
@@ -215,14 +211,19 @@ def _error(number: int) -> OSError:
 
 
 @contextlib.contextmanager
-def installed(nodes: Mapping[str, I2CBus]) -> Iterator[None]:
-    """While this context is active, smbus2 finds these adapters (by path, e.g. /dev/i2c-1) and no others."""
+def installed(nodes: Mapping[str, I2CBus | SpiBus]) -> Iterator[None]:
+    """While this context is active, smbus2 and `hw.spi` find these buses and no others.
+
+    Their keys are paths, e.g. /dev/i2c-1 or /dev/spidev0.0.
+    """
     kernel = Kernel(nodes)
-    module = vars(s2)
-    before = module["ioctl"], module["os"]
-    module["ioctl"] = kernel.ioctl
-    module["os"] = SimpleNamespace(open=kernel.open, close=kernel.close, O_RDWR=os.O_RDWR)
+    calls = SimpleNamespace(open=kernel.open, close=kernel.close, O_RDWR=os.O_RDWR, O_CLOEXEC=os.O_CLOEXEC)
+    modules = vars(s2), vars(hw.spi)
+    before = [(module["ioctl"], module["os"]) for module in modules]
+    for module in modules:
+        module["ioctl"], module["os"] = kernel.ioctl, calls
     try:
         yield
     finally:
-        module["ioctl"], module["os"] = before
+        for module, held in zip(modules, before, strict=True):
+            module["ioctl"], module["os"] = held

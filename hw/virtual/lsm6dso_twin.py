@@ -39,6 +39,8 @@ class Lsm6dsoTwin(FifoTwin):
     data_register = FIFO_DATA
     identity = 0x6C
     freq_fine = 0
+    spi_modes = (0, 3)
+    spi_highest_hz = 10e6
 
     def _reset_registers(self) -> bytearray:
         registers = bytearray(256)
@@ -62,6 +64,9 @@ class Lsm6dsoTwin(FifoTwin):
     def _read_fifo(self, count: int) -> bytes:
         whole = count // 7 * 7
         return self._take(whole) + (bytes(self._fifo[:7]) + bytes(7))[: count - whole]
+
+    def _spi_command(self, first: int) -> tuple[int, bool, bool]:
+        return first % 128, first >= 128, self.registers[CTRL3_C] % 8 >= 4
 
     def _deflection(self) -> Counts:
         change = np.array([6000, 7000, 8000] if self.registers[0x14] & 3 == 1 else [0, 0, 0], np.int32)

@@ -11,7 +11,7 @@ import pytest
 from agent.config.knowledge import Prior
 from hw.adxl345 import Adxl345
 from hw.block import BlockFlags, Drop
-from hw.conformance.i2c import I2cContract, I2cRig
+from hw.conformance.i2c import BUSES, I2cContract, I2cRig
 from hw.virtual.adxl345_twin import Adxl345Twin
 
 
@@ -26,6 +26,7 @@ class Adxl345Rig(I2cRig):
 
 
 class TestAdxl345(I2cContract):
+    adapters = BUSES
     filter_register = 0x2C, "BW_RATE"
     trimmed = {0x1E: 0x11, 0x20: 0xF0, 0x2E: 0xFF}  # noqa: RUF012 - offsets, interrupts
     late_s = 0.2

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hw.adxl355 import Adxl355, Adxl357, Adxl359
 from hw.block import BlockFlags, Drop, SampleBlock
-from hw.conformance.i2c import I2cContract, I2cRig
+from hw.conformance.i2c import BUSES, I2cContract, I2cRig, on_one_adapter
 from hw.sensor import DeviceLost, IdentityError
 from hw.virtual.adxl355_twin import Adxl355Twin, Adxl357Twin, Adxl359Twin, shaken
 
@@ -34,6 +34,7 @@ def timed(rig: Adxl355Rig, temperature_raw: Callable[[float], int]) -> Adxl355Tw
 
 
 class TestAdxl355(I2cContract):
+    adapters = BUSES
     kind, counts_per_g = "ADXL355", 256000  # data sheet, at 2 g
     filter_register = 0x28, "FILTER"
     # registers that another user may have written: offsets, high-pass filter, self-test
@@ -65,7 +66,7 @@ class TestAdxl355(I2cContract):
     def test_wrong_identity(self, rig: Adxl355Rig) -> None:
         adxl359 = Adxl355Twin(rig.counts, rig.due, lambda: rig.t_s, identity=b"\xad\x1d\xe9\x01")
         rig.put(adxl359)
-        with pytest.raises(IdentityError, match=r"0x1D on /dev/i2c-1: expected the IDs ad 1d ed, found ad 1d e9"):
+        with pytest.raises(IdentityError, match=f"{rig.name}: expected the IDs ad 1d ed, found ad 1d e9"):
             rig.sensor.open()
 
     def test_it_waits_while_the_device_loads_its_trim(self, rig: Adxl355Rig) -> None:
@@ -118,6 +119,7 @@ class TestAdxl355(I2cContract):
         rig.put(Adxl355Twin(rig.counts, rig.due, lambda: rig.t_s, identity=rig.twin_class.own_identity))
         rig.sensor.open()
 
+    @on_one_adapter
     def test_a_temperature_that_changes_while_it_is_read_is_not_torn(self, rig: Adxl355Rig) -> None:
         # 0x6FF and 0x700 in turn, every 1.7 ms: 19 of 1200 single readings have the high byte of one and the low byte
         # of the other, which is 28 K away.
@@ -273,7 +275,7 @@ class TestAdxl359(TestAdxl357):
 
     def test_wrong_identity(self, rig: Adxl355Rig) -> None:
         rig.put(Adxl357Twin(rig.counts, rig.due, lambda: rig.t_s))
-        with pytest.raises(IdentityError, match=r"0x1D on /dev/i2c-1: expected the IDs ad 1d e9, found ad 1d ed"):
+        with pytest.raises(IdentityError, match=f"{rig.name}: expected the IDs ad 1d e9, found ad 1d ed"):
             rig.sensor.open()
 
 

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from hw.block import BlockFlags, Drop
-from hw.conformance.i2c import I2cContract, I2cRig
+from hw.conformance.i2c import BUSES, I2cContract, I2cRig
 from hw.lsm6dso import Lsm6dso
 from hw.virtual.lsm6dso_twin import Lsm6dsoTwin, words
 
@@ -27,6 +27,7 @@ class Lsm6dsoRig(I2cRig):
 
 
 class TestLsm6dso(I2cContract):
+    adapters = BUSES
     filter_register = 0x17, "CTRL8_XL"
     trimmed = {0x73: 0x11, 0x75: 0xF0, 0x14: 0x01, 0x17: 0xF4}  # noqa: RUF012 - offsets, self-test, high-pass filter
     late_s = 0.9

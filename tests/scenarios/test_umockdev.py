@@ -30,6 +30,7 @@ from hw.virtual.lis3dh_twin import Lis3dhTwin
 from hw.virtual.lsm6dso_twin import Lsm6dsoTwin
 from hw.virtual.mpu6050_twin import Mpu6050Twin
 from hw.virtual.serial_port import PtyDevice, SampleLines
+from hw.virtual.spi_bus import SpiBus
 from tests.numbered import number, numbered, since_now
 from tests.scenarios.processes import ROOT, interrupt, recordings, wait_until
 from tests.scenarios.umockdev_site import UmockdevSite, absence
@@ -223,3 +224,41 @@ def lost(data_dir: Path) -> set[str]:
     """Devices whose last DeviceChange is "lost"."""
     last = {event.device: event.state for event in events(data_dir) if isinstance(event, DeviceChange)}
     return {name for name, state in last.items() if state == "lost"}
+
+
+def test_the_same_chips_over_spi(tmp_path: Path) -> None:
+    chips = {name: (twin, rate_hz) for name, (twin, _, rate_hz) in DEVICES.items() if twin.spi_modes}
+    buses = {
+        f"/dev/spidev0.{select}": SpiBus(twin(numbered, since_now(rate_hz), time.monotonic))
+        for select, (twin, rate_hz) in enumerate(chips.values())
+    }
+    lines = ['[gateway]\nsite = "test"\nname = "gateway"\n[zenoh]\nenabled = false\n[recording]\nflush_s = 0.5\n']
+    for select, (name, (_, rate_hz)) in enumerate(chips.items()):
+        lines += [
+            f'[[devices]]\nname = "{name}"\ndriver = "{name}"\n'
+            f'options = {{ bus = "spi0.{select}", rate_hz = {rate_hz} }}\n'
+            f'[[channels]]\nsensor = "{name}"\nprior = {{}}\n'
+        ]
+    config, data_dir = tmp_path / "gateway.toml", tmp_path / "data"
+    config.write_text("".join(lines))
+    with UmockdevSite(buses) as site:
+        out, _ = (process := program(site, "probe", "--json", "-")).communicate(timeout=30)
+        assert process.returncode == 0, out
+        assert [one["bus"] for one in json.loads(out)["spi"]] == ["spi0.0", "spi0.1", "spi0.2"]
+        assert all(bus.bytes == 0 for bus in buses.values())
+        out, _ = (process := program(site, "check", config)).communicate(timeout=30)
+        assert process.returncode == 0, out
+        assert "  adxl345: ADXL345 (DEVID 0xE5) answers on /dev/spidev0.1, one register read a transfer" in out
+        process = program(site, "doctor", config, "--data-dir", data_dir, "--json", "-")
+        found = json.loads(process.communicate(timeout=60)[0])["findings"]
+        assert all(one["verdict"] == "good" for one in found if one["check"] in ("device", "bus")), found
+        out, _ = (process := program(site, "run", config, "--data-dir", data_dir, "--duration", "6")).communicate(
+            timeout=60
+        )
+        assert process.returncode == 0, out
+    seen = events(data_dir)
+    assert [event for event in seen if isinstance(event, Gap)] == []
+    for name, (_, rate_hz) in chips.items():
+        numbers = np.concatenate([number(block.indications) for block in of(name, seen)])
+        assert (np.diff(numbers) == 1).all(), name
+        assert len(numbers) > 4 * rate_hz, name

@@ -1,4 +1,4 @@
-"""Simulated I2C adapters for another, unmodified process, whose system calls libumockdev's preload library sends here.
+"""Simulated I2C and SPI buses for another, unmodified process, whose system calls libumockdev's preload library sends.
 
 The library sends each ioctl on a device node of its test bed to a socket. The program at the socket can let it read and
 write the memory of the process. A request is three unsigned longs. From the process come 1 (ioctl), 7 (read) and
@@ -23,7 +23,10 @@ from pathlib import Path
 
 import smbus2.smbus2 as s2
 
+import hw.spi
+from hw.spi import Transfer
 from hw.virtual.kernel import READ, I2CBus, Kernel
+from hw.virtual.spi_bus import MAGIC, SpiBus
 
 LIBRARY = "libumockdev-preload.so.0"
 REQUEST = struct.Struct("@LLL")
@@ -41,9 +44,9 @@ def absence() -> str | None:
 
 
 class UmockdevSite:
-    """Context manager. Processes started with `environment` find these adapters under their paths, and no others."""
+    """Context manager. Processes started with `environment` find these buses under their paths, and no others."""
 
-    def __init__(self, nodes: Mapping[str, I2CBus]) -> None:
+    def __init__(self, nodes: Mapping[str, I2CBus | SpiBus]) -> None:
         self._nodes = nodes
         self._kernel = Kernel(nodes)
         # The path of a socket may have 107 characters at most, and pytest's directories have long paths.
@@ -172,8 +175,30 @@ def ioctl(memory: Memory, call: Callable[[object], int], request: int, address: 
             return _smbus(memory, call, address)
         case s2.I2C_RDWR:
             return _transfer(memory, call, address)
+        case hw.spi.RD_MODE32 | hw.spi.WR_MODE32:
+            mode = ctypes.c_uint32.from_buffer_copy(memory.read(address, 4))
+            result = call(mode)
+            memory.write(address, bytes(mode))
+            return result
+        case _ if request >> 8 & 0xFF == MAGIC:
+            return _spi_message(memory, call, request, address)
         case _:
             return call(None)
+
+
+def _spi_message(memory: Memory, call: Callable[[object], int], request: int, address: int) -> int:
+    size = request >> 16 & 0x3FFF
+    transfers = (Transfer * (size // ctypes.sizeof(Transfer))).from_buffer_copy(memory.read(address, size))
+    kept = []
+    for transfer in transfers:
+        sent = ctypes.create_string_buffer(memory.read(transfer.tx_buf, transfer.len))
+        received = ctypes.create_string_buffer(transfer.len)
+        kept.append((transfer.rx_buf, sent, received))
+        transfer.tx_buf, transfer.rx_buf = ctypes.addressof(sent), ctypes.addressof(received)
+    result = call(transfers)
+    for there, _, received in kept:
+        memory.write(there, received.raw)
+    return result
 
 
 def _smbus(memory: Memory, call: Callable[[object], int], address: int) -> int:

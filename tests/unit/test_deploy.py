@@ -66,7 +66,8 @@ def test_it_is_supervised_and_started_again_for_ever() -> None:
 def test_devices_are_let_through_and_no_others() -> None:
     said = directives(UNIT)
     assert said["DevicePolicy"] == ["closed"]
-    assert said["DeviceAllow"] == [f"{device} rw" for device in ("char-i2c", "char-iio", "char-ttyUSB", "char-ttyACM")]
+    devices = ("char-i2c", "char-spi", "char-iio", "char-ttyUSB", "char-ttyACM")
+    assert said["DeviceAllow"] == [f"{device} rw" for device in devices]
     assert "PrivateDevices" not in said, "it would hide them all"
     assert "ProcSubset" not in said, "the name of the boot stands in /proc/sys"
     assert said["ReadWritePaths"] == ["-/sys/devices"], "kernel drivers are set through sysfs"

@@ -116,6 +116,24 @@ def test_the_rate_is_one_that_the_data_sheet_states_for_the_bus(
     assert capsys.readouterr().err == ""
 
 
+def test_a_device_on_spi_that_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "gateway.toml"
+    named = ["--sensor", "adxl355", *stated("sensor", "bus=spi0.0")]
+    assert run_cli(["init", str(path), "--no-reference", *named]) == 0
+    options = load_config(path).devices[0].options
+    assert (options["bus"], options["spi_mhz"]) == ("spi0.0", 1.0)
+    assert not {"address", "bus_khz"} & set(options)
+    assert run_cli(["check", str(path)]) == 0
+    text = path.read_text()
+    path.write_text(text.replace("spi_mhz = 1.0", "spi_mhz = 1.0\naddress = 0x1D"))
+    capsys.readouterr()
+    assert run_cli(["check", str(path)]) == 2
+    assert "address does not apply to bus spi0.0, remove it" in capsys.readouterr().err
+    path.write_text(text.replace('bus = "spi0.0"', "bus = 1"))
+    assert run_cli(["check", str(path)]) == 2
+    assert "spi_mhz does not apply to bus 1, remove it" in capsys.readouterr().err
+
+
 @pytest.mark.usefixtures("chip")
 def test_beside_a_reference_with_three_axes(tmp_path: Path) -> None:
     path = tmp_path / "gateway.toml"

@@ -19,7 +19,9 @@ from hw.virtual.icm20948_twin import Icm20948Twin
 from hw.virtual.icm42688_twin import Icm42688Twin
 from hw.virtual.kernel import SMBUS_FUNCTIONS, Adapter, I2CBus, installed
 from hw.virtual.lis3dh_twin import Lis3dhTwin
+from hw.virtual.lsm6dso_twin import Lsm6dsoTwin
 from hw.virtual.mpu6050_twin import Mpu6050Twin, Mpu6500Twin
+from hw.virtual.spi_bus import SpiBus
 
 
 def noise(first: int, n: int) -> NDArray[np.int32]:
@@ -147,3 +149,61 @@ def test_ports_are_told_with_what_the_system_knows(
         "/dev/ttyS0: serial port, of which the system knows nothing more",
         "a port is not opened here; `fieldcal init --sensor-port PORT` listens to it",
     ]
+
+
+def on_spi(capsys: pytest.CaptureFixture[str], *arguments: str, status: int = 0) -> dict[str, Any]:
+    assert run_cli(["probe", *arguments, "--json", "-"]) == status
+    (found,) = json.loads(capsys.readouterr().out)["spi"]
+    assert isinstance(found, dict)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("driver", "kind", "rate_hz", "says"),
+    [
+        ("adxl355", Adxl355Twin, 1000, "ADXL355 (REVID 0x01)"),
+        ("adxl345", Adxl345Twin, 800, "ADXL345 (DEVID 0xE5)"),
+        ("lsm6dso", Lsm6dsoTwin, 833, "LSM6DSO (WHO_AM_I 0x6C)"),
+    ],
+)
+def test_a_device_on_spi_is_asked_as_the_driver_that_is_named(
+    capsys: pytest.CaptureFixture[str], driver: str, kind: Any, rate_hz: float, says: str
+) -> None:
+    named = ["--bus", "spi0.1", "--driver", driver]
+    chip = twin(kind, rate_hz)
+    before = bytes(chip.registers)
+    with installed({"/dev/spidev0.1": SpiBus(chip)}):
+        found = on_spi(capsys, *named)
+        assert (found["driver"], found["identity"]) == (driver, says)
+        assert bytes(chip.registers) == before
+        assert on_spi(capsys, *named, "--self-test")["self_test"]["faults"] == []
+    with installed({"/dev/spidev0.1": SpiBus(None, idle=0)}):
+        assert "no device answers, all bits read 0; check its supply" in on_spi(capsys, *named, status=1)["note"]
+    with installed({}):
+        assert "/dev/spidev0.1 does not exist; enable the SPI bus" in on_spi(capsys, *named, status=1)["note"]
+
+
+def test_no_byte_is_sent_to_a_device_on_spi_that_nobody_names(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("agent.cli.probe.i2c_buses", list)
+    monkeypatch.setattr("agent.cli.probe.spi_buses", lambda: ["spi0.0"])
+    bus = SpiBus(twin(Adxl355Twin, 1000))
+    with installed({"/dev/spidev0.0": bus}):
+        for given, status in (([], 0), (["--driver", "adxl355"], 0), (["--bus", "spi0.0"], 1)):
+            note = on_spi(capsys, *given, status=status)["note"]
+            assert note.endswith("--bus spi0.0 --driver adxl345 or adxl355 or adxl357 or adxl359 or lsm6dso")
+    assert bus.bytes == 0
+
+
+def test_a_bus_or_driver_that_there_is_not(capsys: pytest.CaptureFixture[str]) -> None:
+    for given, says in (
+        (["--bus", "spidev0.0"], "'spidev0.0' is neither N of /dev/i2c-N nor spiB.C of /dev/spidevB.C, as spi0.0"),
+        (["--bus", "-1"], "'-1' is neither"),
+        (["--driver", "adxl354"], "'adxl354' is none of adxl345, adxl355"),
+    ):
+        assert run_cli(["probe", *given]) == 2
+        assert says in capsys.readouterr().err
+    assert on_spi(capsys, "--bus", "spi0.0", "--driver", "mpu6050", status=1)["note"] == (
+        "spi0.0: this driver does not read over SPI; use N of /dev/i2c-N"
+    )

@@ -25,7 +25,13 @@ def test_json_has_the_schema_that_the_configuration_is_checked_by(capsys: pytest
         assert drivers[name]["description"]
         for option, schema in drivers[name]["options"]["properties"].items():
             assert "default" in schema or option in drivers[name]["options"]["required"]
-    assert drivers["adxl355"]["units"] == {"rate_hz": "Hz", "range_g": "g", "bus_khz": "kHz", "poll_interval_s": "s"}
+    assert drivers["adxl355"]["units"] == {
+        "rate_hz": "Hz",
+        "range_g": "g",
+        "bus_khz": "kHz",
+        "spi_mhz": "MHz",
+        "poll_interval_s": "s",
+    }
 
 
 def test_every_option_says_what_it_is(capsys: pytest.CaptureFixture[str]) -> None:
@@ -41,7 +47,7 @@ def test_every_option_says_what_it_is(capsys: pytest.CaptureFixture[str]) -> Non
 def test_the_table(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_cli(["sensors", "adxl345", "serial-csv"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0] == "adxl345: the ADXL345 on I2C, read through its FIFO."
+    assert lines[0] == "adxl345: the ADXL345 on I2C or SPI, read through its FIFO."
     (range_line,) = [line for line in lines if line.startswith("  range_g")]
     assert range_line.split()[:8] == ["range_g", "g", "16", "2", "4", "8", "16", "range,"]
     (port,) = [line for line in lines if line.startswith("  port ")]
