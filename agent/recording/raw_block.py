@@ -18,8 +18,10 @@ INT32, INT64, FLOAT64 = np.dtype("<i4"), np.dtype("<i8"), np.dtype("<f8")
 
 
 def encode_block(event_sequence: int, block: SampleBlock) -> bytes:
-    """Encode a block, of which `hw.promises.block_fault` says nothing, as protobuf wire bytes."""
+    """Encode a block as protobuf wire bytes. Raises ValueError where its indications are neither int32 nor float64."""
     decimal = block.indications.dtype == np.float64
+    if not decimal and block.indications.dtype != np.int32:
+        raise ValueError(f"indications of {block.device} are {block.indications.dtype}, not int32 or float64")
     columns = np.ascontiguousarray(block.indications.T, "<f8" if decimal else "<i4")
     message = pb.RawBlockBytes(
         event_sequence=event_sequence,

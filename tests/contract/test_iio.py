@@ -226,11 +226,11 @@ class TestWithoutStamps(SensorContract):
         assert numbers[2][0] > numbers[1][-1] + 2000
 
     def test_a_rate_that_is_another_is_told(self, rig: IioRig) -> None:
-        rig.due = lambda t_s: int(t_s * 1250)  # type: ignore[method-assign]
+        rig.due = lambda t_s: int(t_s * 1500)  # type: ignore[method-assign]
         rig.twin._samples_due = rig.due
         rig.open()
         with pytest.raises(
-            DeviceLost, match=r"6[0-9][0-9] samples came in 0\.[45].* s, which is not rate_hz 1000 within"
+            DeviceLost, match=r"7[0-9][0-9] samples came in 0\.[45].* s, which is not rate_hz 1000 within"
         ):
             list(rig.blocks(10.0))
 

@@ -22,7 +22,7 @@ pytest.importorskip("argon2", reason="the extra monitor is not installed")
 from agent.monitor.settings import Plan
 from agent.monitor.users import set_user
 from tests.scenarios.fleet_page import IMAGES, CommandedGateway, page_site
-from tests.unit.monitor_site import COMMAND, Monitor, Served
+from tests.unit.monitor_site import Monitor, Served
 
 pytestmark = needs_chromium
 PASSWORD = "correct horse battery staple"
@@ -201,7 +201,7 @@ def test_a_killed_gateway_is_shown_and_a_restarted_monitor_has_the_whole_history
 ) -> None:
     options = ["simulate", "--fleet", "1", "--sensors", "1", "--every", "0.3", "--connect", site.endpoint]
     monitor = Monitor(site.endpoint, tmp_path / "monitor")
-    gateway = subprocess.Popen([sys.executable, "-c", COMMAND, *options], stdout=subprocess.DEVNULL)
+    gateway = subprocess.Popen([sys.executable, "-m", "agent", *options], stdout=subprocess.DEVNULL)
     asked = "api/history?site=simulated&gateway=gw0000&sensor=s0&what=calibration"
     try:
         watched = Watched(browser, monitor.address)
