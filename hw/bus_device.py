@@ -21,6 +21,7 @@ RETRY_WAIT_S = 0.0005
 TRANSIENT = frozenset((errno.ENXIO, errno.EREMOTEIO, errno.EIO, errno.ETIMEDOUT, errno.EAGAIN))
 # Linux, i2c_check_for_quirks: EOPNOTSUPP; drivers outside of it also return EOVERFLOW (allanbian1017/i2c-ch341-usb 2);
 # spidev: EMSGSIZE
+NOT_ACKNOWLEDGED = (errno.ENXIO, errno.EREMOTEIO)  # by the device at this address
 REFUSED = frozenset((errno.EOPNOTSUPP, errno.EINVAL, errno.EMSGSIZE, errno.EOVERFLOW))
 TIMED_READS = 5  # the shortest of them counts: a read may have waited for another process or master
 
@@ -190,7 +191,9 @@ class BusDevice(ABC):
                         "use another adapter"
                     ) from error
                 if error.errno not in TRANSIENT or attempts > RETRIES:
-                    raise DeviceLost(f"{self.name}: {error.strerror}") from error
+                    silent = error.errno in NOT_ACKNOWLEDGED
+                    reason = f"no device answers ({error.strerror})" if silent else error.strerror
+                    raise DeviceLost(f"{self.name}: {reason}") from error
             attempts += 1
             self.retries += 1
             self._sleep(RETRY_WAIT_S)

@@ -82,7 +82,7 @@ class FifoOptions(Options):
         if re.fullmatch(SPI_BUS, text) is None:
             raise ValueError(f'{text!r} is no bus: N of /dev/i2c-N, as 1, or "spiB.C" of /dev/spidevB.C, as "spi0.0"')
         if cls.spi is None:
-            raise ValueError(f"{text}: this driver does not read over SPI; use N of /dev/i2c-N")
+            raise ValueError(f"this driver does not read over SPI ({text!r}); use N of /dev/i2c-N")
         return text
 
     @model_validator(mode="after")
@@ -105,21 +105,38 @@ class FifoOptions(Options):
                 f"the FIFO holds {self.fifo_samples} and at most {longest:.0f} leave room for a late "
                 f"read; lower poll_interval_s"
             )
-        bits, addresses, clock, clock_hz = I2C_BITS, 0, f"bus_khz {self.bus_khz:g}", 1e3 * self.bus_khz
-        if self.over_spi:
-            bits, addresses, clock, clock_hz = SPI_BITS, ADDRESS_BYTES, f"spi_mhz {self.spi_mhz:g}", 1e6 * self.spi_mhz
-        sample_bytes = self.bytes_a_sample - addresses * self.reads_a_sample
-        poll_bytes = self.bytes_a_poll - addresses * self.reads_a_poll
-        bits_hz = bits * (sample_bytes * self.rate_hz + poll_bytes / self.interval_s)
-        share = bits_hz / clock_hz
-        if share > BUS_SHARE_MAX:
+        sample_bytes, poll_bytes, bits = self._on_the_bus
+        if self._share > BUS_SHARE_MAX:
+            clock = f"spi_mhz {self.spi_mhz:g}" if self.over_spi else f"bus_khz {self.bus_khz:g}"
+            lower = [
+                rate for rate in self.rates_hz if self.model_copy(update={"rate_hz": rate})._share <= BUS_SHARE_MAX
+            ]
+            remedy = f"set rate_hz = {max(lower):g}, or " if lower else ""
             raise ValueError(
                 f"bus too slow: {self.rate_hz:g} samples/s of {sample_bytes} bytes and "
                 f"{1 / self.interval_s:.4g} polls/s of {poll_bytes} bytes, {bits} bits each, are "
-                f"{bits_hz / 1e3:.4g} kbit/s, {share:.0%} of {clock}; "
-                f"at most {BUS_SHARE_MAX:.0%} may be used: lower rate_hz or use a faster bus"
+                f"{self._bits_hz / 1e3:.4g} kbit/s, {self._share:.0%} of {clock}; "
+                f"at most {BUS_SHARE_MAX:.0%} may be used: {remedy}use a faster bus"
             )
         return self
+
+    @property
+    def _on_the_bus(self) -> tuple[int, int, int]:
+        """Bytes of a sample, bytes of a poll, and bits of a byte."""
+        addresses = ADDRESS_BYTES if self.over_spi else 0
+        sample_bytes = self.bytes_a_sample - addresses * self.reads_a_sample
+        poll_bytes = self.bytes_a_poll - addresses * self.reads_a_poll
+        return sample_bytes, poll_bytes, SPI_BITS if self.over_spi else I2C_BITS
+
+    @property
+    def _bits_hz(self) -> float:
+        sample_bytes, poll_bytes, bits = self._on_the_bus
+        return bits * (sample_bytes * self.rate_hz + poll_bytes / self.interval_s)
+
+    @property
+    def _share(self) -> float:
+        """Of the bus time that reading takes."""
+        return self._bits_hz / (1e6 * self.spi_mhz if self.over_spi else 1e3 * self.bus_khz)
 
     @property
     def advice(self) -> tuple[str, ...]:

@@ -38,6 +38,15 @@ class I2CDevice(BusDevice):
         self.close()
         try:
             self._bus = SMBus(self.path)
+        except FileNotFoundError as error:
+            raise DeviceLost(
+                f"{self.path} does not exist; state a bus that is there, or enable this one (on a Raspberry Pi "
+                "dtparam=i2c_arm=on in config.txt, then restart), and load the kernel module: sudo modprobe i2c-dev"
+            ) from error
+        except PermissionError as error:
+            raise DeviceLost(
+                f"{self.path}: {error.strerror}; add the user to the group of the node: sudo usermod -aG i2c USER"
+            ) from error
         except OSError as error:
             raise DeviceLost(f"{self.path}: {error.strerror}") from error
         functions = self._bus.funcs

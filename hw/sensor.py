@@ -179,7 +179,7 @@ def _unknown(name: str) -> str:
     import difflib
 
     names = driver_names()
-    near = difflib.get_close_matches(name, names, n=1)
+    near = difflib.get_close_matches(name.lower(), names, n=1)
     hint = f"did you mean {near[0]!r}? " if near else ""
     return f"no driver {name!r}: {hint}available drivers: {', '.join(names)}"
 

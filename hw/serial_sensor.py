@@ -32,7 +32,11 @@ def reason_of(error: Exception) -> str:
     """Why a port was lost: what the system says, which pyserial repeats in words of its own."""
     number = getattr(error, "errno", None)
     if number == errno.EWOULDBLOCK:
-        return "another program has locked it"
+        return "another program has locked it; end that program, or state another port"
+    if number == errno.EACCES:
+        return f"{os.strerror(number)}; add the user to the group of the port: sudo usermod -aG dialout USER"
+    if isinstance(error.__context__, termios.error) and error.__context__.args[0] == errno.ENOTTY:
+        return "it is no serial port; state one that is"
     return os.strerror(number) if number else str(error)
 
 

@@ -12,7 +12,7 @@ import click
 
 from agent.config import Config, ConfigError, load_config
 from agent.config.tls import expiry_warning
-from agent.setup.device_checks import answer_findings, loaded_options, sharing_findings
+from agent.setup.device_checks import answer_findings, loaded_options, place_findings, sharing_findings
 from agent.setup.finding import Finding
 from agent.setup.known_filters import stated_filters
 from agent.terminal.quantity import counted
@@ -81,7 +81,7 @@ def _warnings(path: Path, config: Config) -> Iterator[str]:
     loaded = loaded_options(config)
     for i, options in enumerate(loaded.values()):
         yield from (f"{path}: devices.{i}.options: {advice}" for advice in options.advice)
-    for finding in sharing_findings(config, loaded):
+    for finding in (*place_findings(config, loaded), *sharing_findings(config, loaded)):
         yield f"{path}: {finding.says}; {finding.remedy}"
     for i, channel in enumerate(config.channels):
         for section, beside in zip(("", "check_reference."), channel.by_reference, strict=False):

@@ -72,6 +72,7 @@ def _findings(path: Path | None, data_dir: Path, measure_s: float | None) -> Ite
     yield from device_checks.bus_findings(options)
     if config is not None:
         yield from device_checks.answer_findings(config, options)
+        yield from device_checks.place_findings(config, options)
         yield from device_checks.sharing_findings(config, options)
         yield from _throughput(config, options, data_dir, measure_s)
     yield from machine_checks.disk_findings(config, options, data_dir)

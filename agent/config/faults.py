@@ -25,6 +25,8 @@ SHOWN_CHARACTERS = 100  # of a value or a path in a fault
 _IN_WORDS = {
     "missing": "is missing; add it",
     "extra_forbidden": "there is no such setting; remove it or correct its name",
+    "tuple_type": 'a list in brackets is needed, as [1, 2] or ["x", "y"]',
+    "list_type": 'a list in brackets is needed, as [1, 2] or ["x", "y"]',
 }
 _PATH = re.compile(r"([a-z_]\w*(?:\.\w+)*): ")  # with which a check of several settings begins
 
@@ -153,7 +155,10 @@ def told(error: ValidationError, raw: Any, *, but_of_the_whole: bool = False) ->
         what = _IN_WORDS.get(fault["type"], what)
         # A whole section as "the offending value" would bury the message.
         whole = isinstance(value, dict | BaseModel | list | tuple) or fault["type"] == "missing"
-        yield path, what if whole else f"{what}, not {_value(value)}"
+        held = repr(value) if isinstance(value, str) else None
+        if held and fault["type"] == "literal_error" and held not in what and _is_number(value):
+            what += " as a number without quotes"
+        yield path, what if whole or (held and held in what) else f"{what}, not {_value(value)}"
 
 
 def _path(location: tuple[str | int, ...], raw: Any) -> Path:
@@ -167,6 +172,14 @@ def _path(location: tuple[str | int, ...], raw: Any) -> Path:
         elif isinstance(raw, Mapping) and k == len(location) - 1:
             path.append(part)  # what is missing
     return tuple(path)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        int(text, 0)
+    except ValueError:
+        return False
+    return True
 
 
 def _value(value: Any) -> str:

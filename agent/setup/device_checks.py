@@ -43,14 +43,42 @@ def option_findings(options: Mapping[str, Options]) -> Iterator[Finding]:
             yield Finding("options", "advice", f"{name}: {advice}")
 
 
+def place_findings(config: Config, options: Mapping[str, Options]) -> Iterator[Finding]:
+    """Is a device stated twice, or a channel's sensor one that cannot be calibrated?"""
+    first: dict[str, str] = {}
+    for name, held in options.items():
+        place = _place(held)
+        if place and place in first:
+            says = f"{first[place]} and {name} are both at {place}: only one of them can be opened"
+            yield Finding("device", "fault", says, "correct the options of one of them, or remove it")
+        first.setdefault(place, name)
+    for channel in config.channels:
+        if getattr(options[channel.sensor], "axes", 3) == 1:
+            says = f"{channel.sensor} has one axis, and the sensor of a channel needs three"
+            yield Finding(
+                "device", "fault", says, "name a sensor with x, y and z; a device with one can be a reference"
+            )
+
+
+def _place(held: Options) -> str:
+    """Where a device is connected that only one can be at; "" where the options do not tell."""
+    if isinstance(held, FifoOptions):
+        return held.node if held.over_spi else f"0x{getattr(held, 'address', 0):02X} on {held.node}"
+    port = getattr(held, "port", None)
+    return os.path.realpath(port) if isinstance(port, str) else ""
+
+
 def sharing_findings(config: Config, options: Mapping[str, Options]) -> Iterator[Finding]:
     """Does a device that must be alone on its bus share it? The device's identity is read where the bus is here."""
     for device in config.devices:
         held = options[device.name]
         if not isinstance(held, FifoOptions) or held.over_spi or not held.must_be_alone:
             continue
-        others = [name for name, other in options.items() if isinstance(other, FifoOptions) and other.bus == held.bus]
-        others.remove(device.name)
+        others = [
+            name
+            for name, other in options.items()
+            if isinstance(other, FifoOptions) and other.bus == held.bus and _place(other) != _place(held)
+        ]
         if not others:
             continue
         sensor = load_driver(device.driver)(device.name, held)
@@ -70,7 +98,7 @@ def access_findings(options: Mapping[str, Options]) -> Iterator[Finding]:
     for name, held in options.items():
         if isinstance(held, FifoOptions):
             node = Path(held.node)
-        elif port := getattr(held, "port", None):
+        elif isinstance(port := getattr(held, "port", None), str):  # of others it is a number in the network
             node = Path(port)
         else:
             continue
@@ -217,9 +245,11 @@ def _read_for(name: str, sensor: Sensor, duration_s: float) -> Finding:
         if first_ns:  # counting begins after the first block
             samples += block.n
         first_ns = first_ns or last_ns
-    if last_ns == first_ns:
-        remedy = "check its power, its cable and its options"
-        return Finding("throughput", "fault", f"{name}: no samples in {duration_s:g} s", remedy)
     lost = [f"{overruns} overruns"] if overruns else []
     lost += [f"{drop.count} {drop.unit}: {drop.reason}" for drop in checked_drops(sensor.take_drops())]
+    if last_ns == first_ns:
+        remedy = "check its power, its cable and its options"
+        return Finding(
+            "throughput", "fault", f"{name}: {'; '.join([f'no samples in {duration_s:g} s', *lost])}", remedy
+        )
     return rate_finding(name, samples / ((last_ns - first_ns) * 1e-9), info.nominal_rate_hz, "; ".join(lost))

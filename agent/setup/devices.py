@@ -76,7 +76,8 @@ def listen(devices: list[Chosen], asking: Asking) -> None:
         if isinstance(told, str):
             asking.faults.append(
                 f"{device.role}: port {device.value('port')}: {told}; connect the device, or state its lines with "
-                f"--{device.role}-option for each of rate_hz, axes, sequence or columns (and baud_rate)"
+                f"--{device.role}-option for each of rate_hz, axes, sequence or columns (and baud_rate), or its driver "
+                f"with --{device.role} if it sends no lines"
             )
             device.state("rate_hz", 1.0, "missing")  # the fault is told once
         else:
@@ -123,6 +124,12 @@ def _columns(device: Chosen, heard: Heard, asking: Asking) -> tuple[Column, ...]
         held = asking.value(option, None, question, kind=_names)
     columns: tuple[Column, ...] = held.value or ()
     if not columns:
+        return ()
+    if device.role == "sensor" and _axes(columns) == 1:
+        asking.faults.append(
+            f"sensor: its lines have one axis, as {heard.example}, and a sensor needs three; a device with one axis "
+            "can be the reference (--reference-port)"
+        )
         return ()
     expected = {"axes": _axes(columns), "sequence": "seq" in columns}
     wrong = [f"{name} = {device.value(name)}" for name in expected if device.value(name) not in (None, expected[name])]

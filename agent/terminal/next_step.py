@@ -166,7 +166,8 @@ def _stated(channel: Channel, seen: Seen) -> str | None:
         return _timed(channel, seen)
     stops = channel.stops
     if not stops:
-        return "state a reference or positions in the configuration: without them no window tells S or Q"
+        lacking = "positions, or rotation," if channel.reference else "a reference or positions"
+        return f"state {lacking} in the configuration: without them no window tells S or Q"
     left = [stop for stop in stops if stop.position not in seen.used] or stops
     used = len(stops) - len(left) if left is not stops else len(stops)
     return f"{_taken(left[0])} and stay {STAY_S} s (positions used: {used} of {len(stops)})"

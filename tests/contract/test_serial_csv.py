@@ -229,6 +229,14 @@ def test_columns_that_make_no_line(options: dict[str, Any], told: str) -> None:
         SerialCsvOptions.model_validate({"port": "p", "rate_hz": 100} | options)
 
 
+def test_a_file_is_no_port(tmp_path: Path) -> None:
+    path = tmp_path / "port"
+    path.write_text("0.1,0.2,9.8\n")
+    sensor = SerialCsv("imu", SerialCsvOptions(port=str(path), rate_hz=100.0))
+    with pytest.raises(DeviceLost, match=f"port {path}: it is no serial port; state one that is"):
+        sensor.open()
+
+
 def test_a_device_with_new_columns_is_another_one_and_the_old_options_make_the_old_identity(tmp_path: Path) -> None:
     rig = CsvRig(tmp_path / "port")
     try:

@@ -128,7 +128,7 @@ def test_probe_names_a_bus_that_is_not_there(site: UmockdevSite) -> None:
     process = program(site, "probe", "--bus", "7")
     out, _ = process.communicate(timeout=30)
     assert process.returncode == 1
-    assert "/dev/i2c-7: No such file or directory" in out
+    assert "/dev/i2c-7 does not exist; state a bus" in out
 
 
 def test_check_and_doctor_ask_the_devices(tmp_path: Path, site: UmockdevSite, bus: I2CBus, port: PtyDevice) -> None:
@@ -139,12 +139,12 @@ def test_check_and_doctor_ask_the_devices(tmp_path: Path, site: UmockdevSite, bu
     del bus.targets[0x6A]
     out, _ = (process := program(site, "check", config)).communicate(timeout=30)
     assert process.returncode == 0, out
-    assert "lsm6dso: LSM6DSO at 0x6A on /dev/i2c-1: Remote I/O error" in out
+    assert "lsm6dso: LSM6DSO at 0x6A on /dev/i2c-1: no device answers (Remote I/O error)" in out
     process = program(site, "doctor", config, "--data-dir", tmp_path / "data", "--json", "-")
     findings = json.loads(process.communicate(timeout=60)[0])["findings"]
     said = {finding["says"]: finding["verdict"] for finding in findings if finding["check"] == "device"}
     assert said["mpu6050: MPU-6050 (WHO_AM_I 0x68) answers on /dev/i2c-1, one register read a transfer"] == "good"
-    assert said["lsm6dso: LSM6DSO at 0x6A on /dev/i2c-1: Remote I/O error"] == "fault"
+    assert said["lsm6dso: LSM6DSO at 0x6A on /dev/i2c-1: no device answers (Remote I/O error)"] == "fault"
     bus.adapter = Adapter("single bytes", functions=SMBUS_FUNCTIONS & ~I2cFunc.SMBUS_READ_I2C_BLOCK)
     out, _ = (process := program(site, "check", config)).communicate(timeout=30)
     assert process.returncode == 2, out

@@ -27,6 +27,13 @@ PUBLIC = 'public_key = "' + "A" * 43 + '="'
 KEY = f'[[commands.keys]]\nid = "anna"\n{PUBLIC}\nverbs = ["hold"]\nsensors = ["imu"]\n'
 
 
+def chip(option: str, driver: str = "adxl355") -> str:
+    """A configuration whose sensor is a chip with this option."""
+    options = f"{{ rate_hz = 500, {option} }}"
+    device = f'[[devices]]\nname = "mems"\ndriver = "{driver}"\noptions = {options}\n'
+    return f'{device}[[channels]]\nsensor = "mems"\nprior = {{}}\n'
+
+
 def faults(text: str) -> list[str]:
     with pytest.raises(ConfigError) as caught:
         parse_config(tomllib.loads(text), "f.toml")
@@ -62,7 +69,12 @@ def faults(text: str) -> list[str]:
         (CHANNEL + KEY.replace('"hold"', '"reboot"'), ["commands.keys.0.verbs.0", "not 'reboot'"]),
         (CHANNEL + KEY.replace('"imu"', '"other"'), ["commands.keys.0.sensors", "'other' has no channel"]),
         (CHANNEL.replace("serial-csv", "serial-cvs"), ["devices.0.driver", "did you mean 'serial-csv'"]),
+        (CHANNEL.replace("serial-csv", "Serial-CSV"), ["devices.0.driver", "did you mean 'serial-csv'"]),
         (CHANNEL.replace("rate_hz = 100", "rate_hz = -1"), ["devices.0.options.rate_hz", "not -1"]),
+        (chip('address = "0x1D"'), ["devices.0.options.address: Input should be 29 or 83 as a number without quotes"]),
+        (chip('address = "up"'), ["devices.0.options.address: Input should be 29 or 83, not 'up'"]),
+        (chip('bus = "spi0.0"', "mpu6050"), ["devices.0.options.bus: this driver does not read over SPI ('spi0.0')"]),
+        (CHANNEL.replace("rate_hz = 100", 'rate_hz = 100, columns = "x,y,z"'), ["options.columns: a list in brackets"]),
         (DEVICES + '[[channels]]\nsensor = "other"\nprior = {}', ["channels.0.sensor", "'other'"]),
         (DEVICES, ["channels"]),
         ("channels = []\n" + DEVICES, ["channels", "at least 1"]),
@@ -81,6 +93,11 @@ def test_an_endpoint_with_a_secret_is_refused_and_not_shown(said: str) -> None:
     assert "zenoh.connect: tcp/h:7447#... contains a key or password" in line
     assert "S3cr3t" not in line
     parse_config(tomllib.loads(CHANNEL + '[zenoh]\nconnect = ["tcp/h:7447#iface=eth0"]'), "")
+
+
+def test_a_value_is_told_once() -> None:
+    (line,) = faults(chip('bus = "i2c-1"'))
+    assert line.count("'i2c-1'") == 1
 
 
 def test_all_faults_come_at_once() -> None:

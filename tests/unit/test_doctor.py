@@ -129,6 +129,34 @@ def test_devices_that_this_user_may_not_use(tmp_path: Path, monkeypatch: pytest.
     assert "usermod -aG" in found.remedy
 
 
+def test_two_devices_at_one_place_and_a_sensor_with_one_axis(tmp_path: Path) -> None:
+    (tmp_path / "by-id").symlink_to("/dev/none")
+    raw = gateway("/dev/none", tmp_path / "by-id")
+    raw["devices"][0]["options"]["axes"] = 1
+    chip = {"driver": "adxl355", "options": {"rate_hz": 500, "address": 0x1D}}
+    raw["devices"] += [
+        {"name": "up", **chip},
+        {"name": "down", **chip, "options": {"rate_hz": 500, "address": 0x53}},
+        {"name": "again", **chip, "driver": "adxl357"},
+        {"name": "shake", "driver": "shake-udp", "options": {"channels": ["ENZ"]}},
+    ]
+    config = parse_config(raw, "test")
+    options = device_checks.loaded_options(config)
+    assert told(device_checks.place_findings(config, options), "device") == [
+        ("fault", "mems and reference are both at /dev/none: only one of them can be opened"),
+        ("fault", "up and again are both at 0x1D on /dev/i2c-1: only one of them can be opened"),
+        ("fault", "mems has one axis, and the sensor of a channel needs three"),
+    ]
+    shared = [says.partition(":")[0] for _, says in told(device_checks.sharing_findings(config, options), "bus")]
+    assert shared == [
+        "up shares /dev/i2c-1 with down",
+        "down shares /dev/i2c-1 with up and again",
+        "again shares /dev/i2c-1 with down",
+    ]
+    # The port of a Shake is a number in the network, and no device node.
+    assert not [says for _, says in told(device_checks.access_findings(options), "device") if "shake" in says]
+
+
 def test_a_router_that_answers_and_one_that_does_not() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]

@@ -152,7 +152,9 @@ def test_any_words_decode(data: bytes, last: int | None) -> None:
 
 def test_what_the_bus_or_the_fifo_cannot_do_is_refused_with_the_arithmetic() -> None:
     # 11 bytes x 9 bit x 800 Hz + 4 bytes x 9 bit x 100 polls/s = 82.8 kbit/s
-    assert "82.8 kbit/s, 83% of bus_khz 100; at most 70%" in refusal(Adxl345Options, bus_khz=100.0)
+    told = refusal(Adxl345Options, bus_khz=100.0)
+    assert "82.8 kbit/s, 83% of bus_khz 100; at most 70% may be used: set rate_hz = 400, or use a faster bus" in told
+    assert Adxl345Options(bus_khz=100.0, rate_hz=400.0).rate_hz == 400.0
     # 6 bytes x 9 bit x 1000 Hz + 12 bytes x 9 bit x 62.5 polls/s = 60.75 kbit/s
     assert Mpu6050Options(bus_khz=100.0).interval_s == 0.016
     assert "bus too slow" in refusal(Lsm6dsoOptions, rate_hz=6667.0)

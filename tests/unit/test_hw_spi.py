@@ -247,7 +247,7 @@ def test_identity_and_settings_are_those_on_i2c() -> None:
         (Adxl355Options, {"bus": 1, "spi_mhz": 1}, "spi_mhz does not apply to bus 1"),
         (Adxl355Options, {"spi_mhz": 10.5}, "spi_mhz 10.5 is too fast: at most 10 for"),
         (Adxl345Options, {"spi_mhz": 2}, "spi_mhz 2 is too fast: at most 1.5 for"),
-        (Mpu6050Options, {}, "spi0.0: this driver does not read over SPI"),
+        (Mpu6050Options, {}, "this driver does not read over SPI ('spi0.0')"),
         (Adxl355Options, {"bus": "spidev0.0"}, "'spidev0.0' is no bus"),
         (Adxl355Options, {"bus": -1}, "'-1' is no bus"),
         # 4000 samples of 9 bytes, 500 polls of a first byte for each of three reads and three more: 39 kB/s of 8 bits

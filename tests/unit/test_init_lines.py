@@ -139,6 +139,14 @@ def test_columns_that_cannot_be_told_apart_are_asked(
     assert not path.exists()
 
 
+def test_a_device_with_one_axis_is_no_sensor(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with writing(lambda k: f"{k},0.0{k % 7}\n") as port:
+        assert init(tmp_path / "gateway.toml", port) == 2
+    (told,) = capsys.readouterr().err.splitlines()
+    assert "sensor: its lines have one axis" in told
+    assert "can be the reference (--reference-port)" in told
+
+
 def test_the_columns_as_an_option(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "gateway.toml"
     columns = 'columns=["x","y","z","temperature"]'

@@ -131,7 +131,7 @@ def test_a_part_that_answers_for_others_is_told_where_it_is_not_alone(
 
 def test_buses_that_cannot_be_asked(bus: I2CBus, capsys: pytest.CaptureFixture[str]) -> None:
     assert run_cli(["probe", "--bus", "9"]) == 1
-    assert capsys.readouterr().out == "/dev/i2c-9: No such file or directory\n"
+    assert capsys.readouterr().out.startswith("/dev/i2c-9 does not exist; state a bus that is there, or enable")
     bus.adapter = Adapter("bytes", functions=SMBUS_FUNCTIONS & ~I2cFunc.SMBUS_READ_I2C_BLOCK)
     assert run_cli(["probe", "--bus", "4"]) == 1
     assert "plain I2C" in capsys.readouterr().out
@@ -205,5 +205,5 @@ def test_a_bus_or_driver_that_there_is_not(capsys: pytest.CaptureFixture[str]) -
         assert run_cli(["probe", *given]) == 2
         assert says in capsys.readouterr().err
     assert on_spi(capsys, "--bus", "spi0.0", "--driver", "mpu6050", status=1)["note"] == (
-        "spi0.0: this driver does not read over SPI; use N of /dev/i2c-N"
+        "this driver does not read over SPI ('spi0.0'); use N of /dev/i2c-N"
     )
