@@ -77,6 +77,28 @@ class ShakeUdpOptions(Options):
         )
 
 
+def receiver(listen: str, port: int, where: str) -> socket.socket:
+    """A socket, which does not block, with the datagrams that come to this UDP port; `where` begins each message.
+
+    Raises ConfigurationError where the port cannot be had, DeviceLost where the address is not one of this computer.
+    """
+    found = socket.socket(socket.AF_INET6 if ":" in listen else socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        found.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
+        found.setblocking(False)
+        found.bind((listen, port))
+    except OSError as error:
+        found.close()
+        if error.errno == errno.EADDRINUSE:
+            raise ConfigurationError(
+                f"{where}: another program receives at this port; end it, or have the Shake send to a port of its own "
+                "for fieldcal"
+            ) from error
+        kind = ConfigurationError if error.errno == errno.EACCES else DeviceLost
+        raise kind(f"{where}: {error.strerror}") from error
+    return found
+
+
 class ShakeUdp(StampedSensor):
     """Counts of one channel or three, at the times that the Shake stamped on its datagrams."""
 
@@ -91,7 +113,7 @@ class ShakeUdp(StampedSensor):
 
     def _connect(self) -> DeviceInfo:
         o = self._options
-        self._socket = self._listen()
+        self._socket = receiver(o.listen, o.port, self._where())
         self._axis = {channel: k for k, channel in enumerate(o.channels)}
         self._source = o.source
         self._seen: set[str] = set()
@@ -111,25 +133,6 @@ class ShakeUdp(StampedSensor):
             nominal_rate_hz=o.rate_hz,
             settings={"port": f"{o.listen}:{o.port}", "channels": ", ".join(o.channels), "quantity": o.quantity},
         )
-
-    def _listen(self) -> socket.socket:
-        """The socket. Raises ConfigurationError where the port cannot be had, DeviceLost where the address is not."""
-        o = self._options
-        found = socket.socket(socket.AF_INET6 if ":" in o.listen else socket.AF_INET, socket.SOCK_DGRAM)
-        try:
-            found.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
-            found.setblocking(False)
-            found.bind((o.listen, o.port))
-        except OSError as error:
-            found.close()
-            if error.errno == errno.EADDRINUSE:
-                raise ConfigurationError(
-                    f"{self._where()}: another program receives at this port; end it, or have the Shake send to a port "
-                    "of its own for fieldcal"
-                ) from error
-            kind = ConfigurationError if error.errno == errno.EACCES else DeviceLost
-            raise kind(f"{self._where()}: {error.strerror}") from error
-        return found
 
     def _stop(self) -> None:
         held, self._socket = self._socket, None

@@ -107,8 +107,9 @@ def init(config: Path, **given: Any) -> int:
     """Write a configuration to CONFIG (default gateway.toml) that `fieldcal check` passes and `fieldcal run` uses.
 
     Devices are those that `fieldcal probe` finds, or those of the options. A serial port is listened to for some
-    seconds: its lines tell axes, sequence numbers and rate. Each value has a comment with unit, default and source. On
-    a terminal, what is not given is asked. An existing file is never overwritten.
+    seconds: its lines tell axes, sequence numbers and rate; so is the UDP port of a Raspberry Shake. Each value has a
+    comment with unit, default and source. On a terminal, what is not given is asked. An existing file is never
+    overwritten.
 
     Exit status 2 if something is missing; each line on standard error names an option.
     """

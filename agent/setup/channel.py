@@ -91,6 +91,8 @@ def _geometry(answers: Answers) -> Iterator[Setting]:
     if mount == "beside":
         says = "a = R a_ref, R row by row; 1 0 0, 0 1 0, 0 0 1: the axes of sensor and reference are parallel"
         yield _setting(Channel, "rotation", answers.rotation, says)
+        if answers.quantity.value != "acceleration":
+            yield _up(answers)
         return
     source = answers.mount.source
     if mount == "clamp":
@@ -114,6 +116,16 @@ def _geometry(answers: Answers) -> Iterator[Setting]:
         "of its sides, in any order, for 20 s or longer: the agent finds position and time from gravity"
     )
     yield Setting("positions", stops, says, source, None, "m/s2")
+
+
+def _up(answers: Answers) -> Setting:
+    """Gravity beside a reference that does not feel it; of a seismometer, the third axis (Z) points up."""
+    up = [answers.gravity_mps2.value * along for along in answers.rotation.value[2::3]]
+    says = (
+        "what an ideal sensor indicates at rest; the reference does not feel gravity. Here its third axis points up; "
+        "where another one does, change this"
+    )
+    return _setting(Channel, "rotation_gravity_mps2", Stated(up, "gravity_mps2 and rotation"), says, "m/s2")
 
 
 def _along(axis: int, value: float) -> list[float]:

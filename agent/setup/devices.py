@@ -11,6 +11,7 @@ from pydantic import ValidationError
 
 from agent.setup.asking import Asking, Stated
 from agent.setup.buses import bus_clock_khz
+from agent.setup.datagrams import hear_shake
 from agent.setup.drivers import describe, unit_of
 from agent.setup.listening import Heard, hear
 from agent.setup.recognising import recognised
@@ -19,10 +20,12 @@ from hw.fifo_options import FifoOptions, foreign_options
 from hw.line_columns import IGNORED, Column, columns_of
 from hw.sensor import ConfigurationError, load_driver
 from hw.serial_stream import SerialCsvOptions
+from hw.shake_udp import ShakeUdpOptions
 from hw.units import STANDARD_GRAVITY_MPS2
 
 Role = Literal["sensor", "reference"]
 TEXT_LINES = "serial-csv"
+SHAKE = "shake-udp"
 BAUD_RATE = 115200  # default of all serial drivers
 # A sensor at rest indicates gravity. m/s2 and g are recognised by this length of the mean.
 GRAVITY_MPS2 = (8.0, 12.0)
@@ -58,9 +61,11 @@ class Chosen:
 
 
 def listen(devices: list[Chosen], asking: Asking) -> None:
-    """Listen to the devices that write lines of text, as far as their options are not all stated."""
+    """Listen to the devices that write lines of text or send datagrams, as far as their options are not all stated."""
     waiting = []
     for device in devices:
+        if device.driver.value == SHAKE and "channels" not in device.options:
+            _hear_shake(device, asking)
         if device.driver.value != TEXT_LINES or not device.value("port"):
             continue
         if columns := _stated_columns(device):
@@ -96,6 +101,28 @@ def _ask(device: Chosen) -> bool:
         for name, value in found.options.items():
             device.state(name, value, "the device answered on the port")
     return found is not None
+
+
+def _hear_shake(device: Chosen, asking: Asking) -> None:
+    """State the channels and the rate of the Raspberry Shake that sends to this computer."""
+    option = f"--{device.role}-option"
+    stated = {name: held.value for name, held in device.options.items()}
+    try:
+        told = hear_shake(ShakeUdpOptions.model_validate(stated | {"channels": ["EHZ"]}))  # any; it is not used
+    except ValidationError as error:
+        told = f"{option} {error.errors()[0]['loc'][0]}: {error.errors()[0]['msg']}"
+    if isinstance(told, str):
+        asking.faults.append(f"{device.role}: {told}")
+        device.state("channels", [], "missing")  # the fault is told once
+        return
+    device.state("rate_hz", told.nominal_hz, f"counted on the port: {told.counted_hz:.4g} Hz")
+    held = Stated(told.channels, "heard on the port")
+    if not held.value:
+        question = (
+            f"{device.role}: one channel, or three for x, y, z, with commas; those that came: {', '.join(told.came)}"
+        )
+        held = asking.value(f"{option} channels=[...]", None, question, kind=_texts)
+    device.state("channels", list(held.value or ()), held.source)
 
 
 def _stated_columns(device: Chosen) -> tuple[Column, ...]:
@@ -157,9 +184,14 @@ def _state_columns(device: Chosen, columns: tuple[Column, ...], source: str) -> 
         device.state("columns", list(columns), source)
 
 
+def _texts(answer: str) -> tuple[str, ...]:
+    """Texts between commas."""
+    return tuple(text.strip() for text in answer.split(","))
+
+
 def _names(answer: str) -> tuple[str, ...]:
     """Names between commas. Raises click.BadParameter."""
-    names = tuple(name.strip() for name in answer.split(","))
+    names = _texts(answer)
     if wrong := [name for name in names if name not in get_args(Column)]:
         raise click.BadParameter(f"{wrong[0]!r} is none of {' '.join(get_args(Column))}")
     return names
@@ -205,7 +237,8 @@ def complete(device: Chosen, asking: Asking) -> None:
         if name not in device.options and name in schema.get("required", []):
             unit = unit_of(name)
             says = option.get("description", name) + (f", {unit}" if unit else "")
-            asked = asking.value(f"--{device.role}-option {name}=VALUE", None, f"{device.role}: {says}")
+            kind = _texts if option.get("items", {}).get("type") == "string" else None
+            asked = asking.value(f"--{device.role}-option {name}=VALUE", None, f"{device.role}: {says}", kind=kind)
             device.options[name] = Stated(asked.value, asked.source)
         device.state(name, option.get("default"), "default")
 

@@ -123,7 +123,7 @@ def _understood(line: _Line, baud_rate: int) -> Heard | str:
         tuple(values.mean(axis=0).tolist()),
         tuple((values % 1 == 0).all(axis=0).tolist()),
         counted_hz,
-        _nominal(counted_hz),
+        nominal_hz(counted_hz),
         _shown(lines[int(decoded.line[-1])]),
     )
 
@@ -164,6 +164,7 @@ def _octets_per_s(arrivals: Sequence[tuple[float, int]]) -> float:
     return float(np.median((octets[half:] - octets[:-half]) / (times_s[half:] - times_s[:-half])))
 
 
-def _nominal(counted_hz: float) -> float:
+def nominal_hz(counted_hz: float) -> float:
+    """The rate that is probably meant where this one was counted, Hz."""
     usual = min(USUAL_HZ, key=lambda rate: abs(rate - counted_hz))
     return float(usual) if abs(usual - counted_hz) <= USUAL_WITHIN * usual else float(f"{counted_hz:.3g}")
