@@ -19,6 +19,7 @@ RESET_WAIT_S = 0.01  # twice the data sheet's 5 ms
 RESET_ATTEMPTS = 5  # as the Linux driver does
 LOADING_S, LOADING_POLL_S = 0.1, 0.005  # longest time for loading the trim, as in Zephyr (adxl355.c), and between looks
 TEMPERATURE_READINGS = 4  # at most, until two of them in a row belong together
+LOST = "FIFO overrun while it was read, or interrupted FIFO read"
 
 
 class Adxl355Options(FifoOptions):
@@ -51,8 +52,10 @@ class Adxl357Options(Adxl355Options):
 class Adxl355(FifoSensor):
     """Reads STATUS and the number of FIFO entries together, then as many entries as make whole samples.
 
-    If a poll comes too late, OVERRUN is set. If a read is interrupted, it may have removed entries from the FIFO.
-    Entries that do not form x, y, z are dropped up to the next entry with the X marker.
+    If a poll comes too late, OVERRUN is set. If a read is interrupted, it may have removed entries from the FIFO. A
+    read of many entries is done in several transfers, so entries may be missing in its midst: if the FIFO overran after
+    the count, or a read of it was interrupted, the driver discards what it read. Entries that do not form x, y, z are
+    dropped up to the next entry with the X marker.
     """
 
     options_model: ClassVar[type[Options]] = Adxl355Options
@@ -153,10 +156,9 @@ class Adxl355(FifoSensor):
         return None, None
 
     def _poll(self) -> Burst:
-        retries = self._device.retries
         arrival_ns, utc_ns, (status, entries) = self._device.read_stamped([(chip.STATUS, 2)], self._clock)
-        # A STATUS read that failed may have cleared the overrun flag.
-        lost = bool(status & chip.OVERRUN) or (self._device.retries > retries and entries >= chip.FIFO_ENTRIES_MAX)
+        # The flag may be gone: a STATUS read that failed has cleared it, or one of another program.
+        lost = bool(status & chip.OVERRUN) or entries >= chip.FIFO_ENTRIES_MAX
         whole = min(entries, chip.FIFO_ENTRIES_MAX) // 3 * 3
         if not whole:
             return Burst(arrival_ns, utc_ns, b"", lost)
@@ -165,7 +167,9 @@ class Adxl355(FifoSensor):
         # count was low.
         data = chip.without_empty(self._device.read(chip.FIFO_DATA, 3 * whole))
         (status,) = self._device.read(chip.STATUS, 1)
-        lost |= bool(status & chip.OVERRUN) or self._device.retries > retries
+        if status & chip.OVERRUN or self._device.retries > retries:
+            self._drop(LOST, whole)
+            return Burst(arrival_ns, utc_ns, b"", True)
         return Burst(arrival_ns, utc_ns, data, lost)
 
     def _decode(self, data: bytes) -> FifoSamples:

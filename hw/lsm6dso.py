@@ -17,6 +17,7 @@ from hw.sensor import DeviceLost, IdentityError
 
 RESET_WAIT_S = 0.01
 RESET_ATTEMPTS = 5
+LOST = "FIFO overrun while it was read, or interrupted FIFO read"
 SETTLE_SAMPLES = 5  # AN5192: discard the first one to four samples after a start
 
 
@@ -42,10 +43,13 @@ class Lsm6dsoOptions(FifoOptions):
 class Lsm6dso(FifoSensor):
     """Reads FIFO_STATUS in one transfer, then the number of words that it states.
 
-    Each word names its sensor and has a counter from 0 to 3, so a lost word is noticed. The nominal rate is the one
-    that the part states of itself (INTERNAL_FREQ_FINE). The part's own time stamps are not stored: they would double
-    the traffic on the bus. Sample times from the arrivals reach about 40 us within a minute; the part's stamps have a
-    step of 25 us.
+    Each word names its sensor and has a counter from 0 to 3, so a lost word is noticed, but not four of them. A read of
+    many words is done in several transfers, between which words may be lost: if the FIFO overran after the count, or a
+    read of it was interrupted, the driver discards what it read.
+
+    The nominal rate is the one that the part states of itself (INTERNAL_FREQ_FINE). The part's own time stamps are not
+    stored: they would double the traffic on the bus. Sample times from the arrivals reach about 40 us within a minute;
+    the part's stamps have a step of 25 us.
     """
 
     options_model = Lsm6dsoOptions
@@ -103,17 +107,20 @@ class Lsm6dso(FifoSensor):
         self._counter = None
 
     def _poll(self) -> Burst:
-        retries = self._device.retries
         arrival_ns, utc_ns, status = self._device.read_stamped([(chip.FIFO_STATUS, 2)], self._clock)
         words = min(int.from_bytes(status, "little") & chip.COUNT_MASK, chip.FIFO_WORDS)
-        lost = bool(status[1] & chip.OVERRUN)
-        data = b""
-        if words:
-            # FIFO_STATUS is read again after the data: the FIFO may have overrun between the count and the data, even
-            # if the count was low.
-            data = self._device.read(chip.FIFO_DATA, chip.WORD_BYTES * words)
-            lost |= bool(self._device.read(chip.FIFO_STATUS, 2)[1] & chip.OVERRUN)
-        return Burst(arrival_ns, utc_ns, data, lost or self._device.retries > retries)
+        # The flag may be gone: a read of FIFO_STATUS that failed has cleared it, or one of another program.
+        lost = bool(status[1] & chip.OVERRUN) or words >= chip.FIFO_WORDS
+        if not words:
+            return Burst(arrival_ns, utc_ns, b"", lost)
+        retries = self._device.retries
+        # FIFO_STATUS is read again after the data: the FIFO may have overrun between the count and the data, even if
+        # the count was low.
+        data = self._device.read(chip.FIFO_DATA, chip.WORD_BYTES * words)
+        if self._device.read(chip.FIFO_STATUS, 2)[1] & chip.OVERRUN or self._device.retries > retries:
+            self._drop(LOST, words)
+            return Burst(arrival_ns, utc_ns, b"", True)
+        return Burst(arrival_ns, utc_ns, data, lost)
 
     def _decode(self, data: bytes) -> FifoSamples:
         samples, self._counter = chip.tagged_samples(data, self._counter)
