@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from hw.block import BlockFlags, SampleBlock
 from hw.sensor import boot_id
 
+MOST_BREAKS = 8  # in the half second of a stretch; more make blocks that are of no use
+
 
 @dataclass(frozen=True, slots=True)
 class Break:

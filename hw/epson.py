@@ -17,11 +17,10 @@ from hw.cutting import Break, Cutter, follow
 from hw.frame_stream import Decoded, FrameStream
 from hw.frames import Found
 from hw.sensor import ConfigurationError, DeviceLost, IdentityError
-from hw.serial_sensor import LONGEST_GAP_S, LOST, AskedSensor, SerialOptions
+from hw.serial_sensor import BITS_A_BYTE, LONGEST_GAP_S, LOST, AskedSensor, SerialOptions
 from hw.unchecked_frames import UncheckedFrames
 from hw.units import STANDARD_GRAVITY_MPS2, asked_of_certificate, nominal_sensitivity
 
-BITS_A_BYTE = 10  # with start and stop bit
 COMMAND_WAIT_S = 0.001  # the data sheet asks for 0.66 ms at 115200 baud
 STOP_WAIT_S = 0.2  # Epson's own code waits this long for the last sample
 STOP_ATTEMPTS = 5
@@ -159,7 +158,8 @@ class EpsonStream(FrameStream):
         if not self._step and len(rises) > 1:
             values, n = np.unique(rises[1:], return_counts=True)
             self._step = int(values[n.argmax()])
-        steps = rises / max(1, self._step)
+        steps, others = np.divmod(rises, max(1, self._step))
+        steps[others > 0] = 0  # no whole number of samples: the counter began anew
         if self._last is None:
             steps[0] = 1
         self._last = int(counts[-1])

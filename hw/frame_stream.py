@@ -10,10 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hw.block import BlockFlags, Drop, SampleBlock
-from hw.cutting import Break, Cutter, Stretch
+from hw.cutting import MOST_BREAKS, Break, Cutter, Stretch
 from hw.frames import Found, Layout, find
 
 NO_FRAME = "no frame"
+NOT_FOLLOWING = (
+    "most samples do not follow the one before, by their counter or time, or by bytes between them that are no frames; "
+    "check what the configuration says of rate and frames, and the cable"
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,13 +37,15 @@ class Decoded:
 class FrameStream(ABC):
     """Collects bursts with `feed` and decodes all of them in `blocks`.
 
-    Between calls it keeps the bytes that may still become a frame, each with the arrival of its burst.
+    Between calls it keeps the bytes that may still become a frame, each with the arrival of its burst. A stretch in
+    which most samples do not follow the one before is dropped with the reason: blocks of one sample are of no use and
+    would fill the queue to the pipeline.
     """
 
     def __init__(self, cutter: Cutter, layout: Layout) -> None:
         self._cutter = cutter
         self._layout = layout
-        self._dropped = 0
+        self._dropped = self._not_following = 0
         self.begin()
 
     @abstractmethod
@@ -85,6 +91,10 @@ class FrameStream(ABC):
             self._listening = bool(len(found.start))
         self._slipped = bool(found.slipped[-1])
         decoded = self._decode(found)
+        if len(decoded.breaks) > max(MOST_BREAKS, len(decoded.frame) // 2):
+            self._not_following += len(decoded.frame)
+            self._cutter.flag(BlockFlags.RESTART)
+            return []
         ends = found.end[decoded.frame]
         return self._cutter.cut(
             Stretch(
@@ -106,6 +116,8 @@ class FrameStream(ABC):
         self._arrivals_ns = self._arrivals_ns[first:]
 
     def take_drops(self) -> list[Drop]:
-        """Bytes since the last call that belong to no frame."""
-        dropped, self._dropped = self._dropped, 0
-        return [Drop(dropped, "bytes", NO_FRAME)] if dropped else []
+        """Bytes that belong to no frame, and samples of dropped stretches, since the last call."""
+        bytes_, samples = self._dropped, self._not_following
+        self._dropped = self._not_following = 0
+        drops = (Drop(bytes_, "bytes", NO_FRAME), Drop(samples, "samples", NOT_FOLLOWING))
+        return [drop for drop in drops if drop.count]

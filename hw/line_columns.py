@@ -61,6 +61,13 @@ class SampleCounter:
         return follow(steps, self._known_gap)
 
 
+def damaged(counts: Values) -> NDArray[np.bool_]:
+    """Which numbers (n,) of a counter are damaged: those beside which let room for one number, and it is another."""
+    found = np.zeros(len(counts), np.bool_)
+    found[1:-1] = (counts[2:] - counts[:-2] == 2) & (counts[1:-1] != counts[:-2] + 1)
+    return found
+
+
 class DeviceTime:
     """Finds missing samples by the device's own time. The time is no clock: only the arrival of the lines is.
 

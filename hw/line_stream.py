@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hw.block import LARGEST, BlockFlags, Drop, SampleBlock
-from hw.cutting import Break, Cutter, Stretch
-from hw.line_columns import AXES, IGNORED, TICKS_HZ, Column, DeviceTime, SampleCounter, kind_of
+from hw.cutting import MOST_BREAKS, Break, Cutter, Stretch
+from hw.line_columns import AXES, IGNORED, TICKS_HZ, Column, DeviceTime, SampleCounter, damaged, kind_of
 from hw.lines import MAX_LINE_BYTES, UNREADABLE, decode, with_newlines
 
 OVERLONG = f"no newline within {MAX_LINE_BYTES} bytes"
 TELL_LOSSES: tuple[Column, ...] = ("seq", "micros", "millis")  # the first one of them that a line has
 NOT_COUNTED = "line whose sample counter (seq) is not a whole number"
-MOST_BREAKS = 8  # in the half second of a call of `blocks`, and one after the other
+NOT_FITTING = "line whose sample counter (seq) fits neither the line before nor the one behind"
 RECENT_NUMBERS = 64  # of the counter or time: enough to tell what they are
 TEMPERATURE_DEGC = -100.0, 200.0  # outside, the thermometer is at fault: no electronics works there
 
@@ -119,14 +119,18 @@ class LineStream:
         return drops
 
     def _sound(self, values: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Whether each line (n,) has possible indications, and a whole number where it has a counter."""
+        """Whether each line (n,) has possible indications, and an undamaged whole number where it has a counter."""
         possible = np.asarray((np.abs(values[:, self._axes]) <= LARGEST).all(axis=1))
         self._drops["lines", UNREADABLE] += int(np.count_nonzero(~possible))
         if self._numbered is None or isinstance(self._numbers, DeviceTime):
             return possible
         whole = values[:, self._numbered] % 1 == 0
         self._drops["lines", NOT_COUNTED] += int(np.count_nonzero(possible & ~whole))
-        return np.asarray(possible & whole)
+        sound = np.asarray(possible & whole)
+        alone = damaged(values[sound, self._numbered])
+        self._drops["lines", NOT_FITTING] += int(np.count_nonzero(alone))
+        sound[sound] = ~alone
+        return sound
 
     def _breaks(self, values: NDArray[np.float64], lost_at: NDArray[np.int64]) -> list[Break]:
         """Breaks by the counter or time; without one, where a line was lost."""

@@ -17,10 +17,9 @@ from hw.cutting import Break, Cutter, follow
 from hw.frame_stream import Decoded, FrameStream
 from hw.frames import Found, Layout
 from hw.sensor import ConfigurationError, DeviceLost, IdentityError
-from hw.serial_sensor import LONGEST_GAP_S, LOST, AskedSensor, SerialOptions
+from hw.serial_sensor import BITS_A_BYTE, LONGEST_GAP_S, LOST, AskedSensor, SerialOptions
 from hw.units import STANDARD_GRAVITY_MPS2, asked_of_certificate, nominal_sensitivity
 
-BITS_A_BYTE = 10  # with start and stop bit
 PACKET_BYTES = mip.HEADER + mip.FIELD_BYTES[mip.ACCELERATION] + mip.FIELD_BYTES[mip.GPS_TIME] + mip.CHECKSUM
 IDLE_ATTEMPTS = 3
 ANSWER_TIMEOUT_S = 0.25

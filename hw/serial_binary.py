@@ -16,12 +16,11 @@ from hw.cutting import Break, Cutter, follow
 from hw.frame_stream import Decoded, FrameStream
 from hw.frames import WIDTH, ByteOrder, ChecksumName, Found, Layout, NumberType, numbers
 from hw.sensor import DeviceLost
-from hw.serial_sensor import LONGEST_GAP_S, Filters, SerialOptions, SerialSensor
+from hw.serial_sensor import BITS_A_BYTE, LONGEST_GAP_S, Filters, SerialOptions, SerialSensor
 from hw.unchecked_frames import UncheckedFrames
 from hw.units import Unit, asked_of_certificate, nominal_sensitivity, tells_sensitivity
 
 UNDECIDED_S = 5.0  # frames of this time must tell which place in the stream is theirs
-BITS_A_BYTE = 10  # with start and stop bit
 
 
 class Number(BaseModel):

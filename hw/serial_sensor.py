@@ -24,6 +24,7 @@ GATHER_SLOW_S = 0.002
 READ_BYTES = 65536  # upper limit of a single read
 BLOCK_BYTES = 262144  # upper limit of the bytes of a block; 0.5 s at 4 Mbaud is 200 kB
 LONGEST_GAP_S = 10.0  # a longer jump of the sequence number means that the counter restarted or the number was damaged
+BITS_A_BYTE = 10  # with start and stop bit
 # Pyserial raises any of these when the port is unplugged; termios.error is not an OSError
 LOST = (serial.SerialException, OSError, termios.error)
 

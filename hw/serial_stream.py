@@ -13,8 +13,10 @@ from hw.cutting import Cutter
 from hw.line_columns import AXES, IGNORED, Column, columns_of
 from hw.line_stream import LineStream
 from hw.lines import MOST_COLUMNS
-from hw.serial_sensor import LONGEST_GAP_S, Filters, SerialOptions, SerialSensor
+from hw.serial_sensor import BITS_A_BYTE, LONGEST_GAP_S, Filters, SerialOptions, SerialSensor
 from hw.units import Unit, asked_of_certificate, nominal_sensitivity, tells_sensitivity
+
+MILLIS_BLIND_HZ = 500.0  # from here on, a missing sample and the resolution change the time by as much
 
 
 class SerialCsvOptions(SerialOptions):
@@ -71,6 +73,23 @@ class SerialCsvOptions(SerialOptions):
     def known_filters(self) -> tuple[str, ...]:
         """As the user states them."""
         return self.filters
+
+    @property
+    def advice(self) -> tuple[str, ...]:
+        """What the time in a line cannot tell, and a port that is too slow for the shortest lines."""
+        told = []
+        if "millis" in self.columns and "seq" not in self.columns and self.rate_hz >= MILLIS_BLIND_HZ:
+            told.append(
+                f"millis does not tell one missing sample at rate_hz {self.rate_hz:g}; let the device send micros or a "
+                "counter (seq)"
+            )
+        bits_hz = BITS_A_BYTE * 2 * len(self.line) * self.rate_hz
+        if bits_hz > self.baud_rate:
+            told.append(
+                f"{self.rate_hz:g} lines/s of {len(self.line)} numbers are at least {bits_hz:g} bit/s, baud_rate is "
+                f"{self.baud_rate}; correct one of them (a device that is USB itself may be faster than it)"
+            )
+        return tuple(told)
 
     @property
     def tells_sensitivity(self) -> bool:

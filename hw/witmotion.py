@@ -14,9 +14,8 @@ from hw.cutting import Break, Cutter, follow
 from hw.frame_stream import Decoded, FrameStream
 from hw.frames import Found, find
 from hw.sensor import ConfigurationError, DeviceLost, IdentityError
-from hw.serial_sensor import LONGEST_GAP_S, SerialOptions, SerialSensor
+from hw.serial_sensor import BITS_A_BYTE, LONGEST_GAP_S, SerialOptions, SerialSensor
 
-BITS_A_BYTE = 10  # with start and stop bit
 FRAMES_A_SAMPLE = 2  # time and acceleration
 STANDARD_GRAVITY_MPS2 = 9.80665
 COMMAND_WAIT_S = 0.02  # WitMotion's own code waits this long between commands
@@ -70,7 +69,8 @@ class WitStream(FrameStream):
         waiting = 0 if self._time_frame is None else 1
         frames = found.frames if self._time_frame is None else np.vstack([self._time_frame, found.frames])
         kind = frames[:, 1]
-        frame = np.flatnonzero((kind[1:] == wit.ACCELERATION) & (kind[:-1] == wit.TIME)) + 1
+        together = ~found.slipped[1 - waiting : len(found.start)]  # else frames may be missing between the two
+        frame = np.flatnonzero((kind[1:] == wit.ACCELERATION) & (kind[:-1] == wit.TIME) & together) + 1
         self._time_frame = frames[-1:] if len(frames) and kind[-1] == wit.TIME else None
         times_ms = wit.milliseconds(frames[frame - 1])
         breaks = self._breaks(times_ms)

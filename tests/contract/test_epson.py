@@ -349,3 +349,13 @@ def test_the_way_is_found_within_two_frames(product: bytes, kind: str) -> None:
             assert rows[-1] == true[-1]
             lost = {k for k in range(20 if kind == "cut" else 1, 40) if true[k] not in rows}
             assert lost <= {20, 21}, (i % length, kind, lost)
+
+
+def test_a_counter_that_jumps_by_no_whole_number_of_samples_is_a_restart() -> None:
+    # At 200 Hz the counter rises by 20 a sample; 3596 are 179.8 samples.
+    stream = EpsonStream(Cutter("s", 200.0), EpsonOptions.model_validate({"port": "p", "rate_hz": 200.0}))
+    for count in (61920, 61940, 0, 20):
+        body = struct.pack(">Hi3iH", 0, 0, 1, 2, 3, count)
+        stream.feed(b"\x80" + body + struct.pack(">H", sum(struct.unpack(">10H", body)) % 65536) + b"\r", 1, 1)
+    found = [(block.first_index, block.n, block.flags) for block in stream.blocks()]
+    assert found == [(0, 2, BlockFlags.RESTART), (2, 2, BlockFlags.RESTART)]

@@ -229,6 +229,26 @@ def test_columns_that_make_no_line(options: dict[str, Any], told: str) -> None:
         SerialCsvOptions.model_validate({"port": "p", "rate_hz": 100} | options)
 
 
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"rate_hz": 100, "columns": ["millis", "x", "y", "z"]}, None),
+        ({"rate_hz": 500, "columns": ["millis", "x", "y", "z"]}, "millis does not tell one missing sample at"),
+        ({"rate_hz": 500, "columns": ["seq", "millis", "x", "y", "z"]}, None),
+        # `1,1,1` and its newline are 6 bytes of 10 bits.
+        ({"rate_hz": 160, "baud_rate": 9600}, None),
+        (
+            {"rate_hz": 161, "baud_rate": 9600},
+            "161 lines/s of 3 numbers are at least 9660 bit/s, baud_rate is 9600",
+        ),
+    ],
+)
+def test_advice(options: dict[str, Any], told: str | None) -> None:
+    advice = SerialCsvOptions.model_validate({"port": "p"} | options).advice
+    assert len(advice) == (told is not None)
+    assert told is None or told in advice[0]
+
+
 def test_a_file_is_no_port(tmp_path: Path) -> None:
     path = tmp_path / "port"
     path.write_text("0.1,0.2,9.8\n")

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from hw.block import BlockFlags, DeviceInfo, Drop
 from hw.conformance.serial import SerialContract, SerialRig
+from hw.cutting import Cutter
 from hw.sensor import ConfigurationError, DeviceLost, IdentityError
 from hw.virtual.witmotion_twin import WitMotionTwin
-from hw.witmotion import WitMotion
+from hw.witmotion import WitMotion, WitStream
 
 LAP = 30_000
 
@@ -138,3 +139,24 @@ class TestWitMotion(SerialContract):
         rig.open()
         (block,) = rig.blocks(0.4)
         assert (block.temperature_raw, block.temperature_degc) == (2503, 25.03)
+
+
+def test_a_time_is_that_of_the_acceleration_right_behind_it() -> None:
+    def frame(kind: int, content: bytes) -> bytes:
+        body = bytes([0x55, kind]) + content
+        return body + bytes([sum(body) % 256])
+
+    def sample(k: int) -> list[bytes]:
+        """Time of day, 10 ms a sample, and acceleration."""
+        return [
+            frame(0x50, bytes([26, 1, 1, 9, 30, 15]) + (10 * k).to_bytes(2, "little")),
+            frame(0x51, k.to_bytes(2, "little") * 3 + bytes(2)),
+        ]
+
+    frames = [part for k in range(8) for part in sample(k)]
+    frames[7] = frames[7][:-1] + b"?"  # the acceleration of sample 3
+    frames[8] = b"?" + frames[8][1:]  # and the time of sample 4
+    stream = WitStream(Cutter("s", 100.0), 100.0)
+    stream.feed(b"".join(frames), 1, 1)
+    found = [(block.first_index, block.indications[:, 0].tolist()) for block in stream.blocks()]
+    assert found == [(0, [0, 1, 2]), (5, [5, 6, 7])]

@@ -62,6 +62,16 @@ def test_sequence(numbers: list[int], expected: list[tuple[int, int, BlockFlags]
         assert [int(value) for block in blocks for value in block.indications[:, 0]] == numbers
 
 
+@pytest.mark.parametrize("damaged", [30, 0, 1029, 1034, 1530, 10301031, -1030])
+def test_a_damaged_counter_between_two_good_ones_is_a_line_lost_and_no_gap_of_another_length(damaged: int) -> None:
+    listening = stream()
+    told = feed(listening, numbered(1028, 1029, damaged, 1031, 1032))
+    assert shape(told) == [(0, 2, RESTART), (3, 2, GAP)]
+    assert listening.take_drops() == [
+        Drop(1, "lines", "line whose sample counter (seq) fits neither the line before nor the one behind")
+    ]
+
+
 @pytest.mark.parametrize("bad", [b"1.5,2\n", b"1e-3,2\n"])
 def test_a_sequence_number_is_a_whole_number(bad: bytes) -> None:
     listening = stream()

@@ -37,7 +37,7 @@ def epson(n: int, *, summed: bool = False) -> list[bytes]:
     """
     frames = []
     for k, indications in enumerate(axes(n)):
-        body = struct.pack(">4iH", 0x0980, *indications, 20 * k % 65536)
+        body = struct.pack(">4iH", 0x0980, *indications, k % 65536)
         if summed:
             body += struct.pack(">H", sum(struct.unpack(">9H", body)) % 65536)
         frames.append(b"\x80" + body + b"\r")
@@ -211,3 +211,25 @@ def test_one_byte_that_tells_nothing_is_advised_against(changes: dict[str, objec
     advice = stream(**changes)._options.advice
     assert bool(advice) == advised
     assert all("start is the single byte 80" in text and "state checksum, end or sequence" in text for text in advice)
+
+
+@pytest.mark.parametrize("sequence", [{"at": 1, "type": "u16"}, {"at": 17, "type": "u8"}])
+def test_frames_that_do_not_follow_each_other_are_told_and_make_no_blocks_of_one_sample(
+    sequence: dict[str, object],
+) -> None:
+    frames = epson(500, summed=True)
+    rows, dropped, made = read(b"".join(frames), piece=100 * len(frames[0]), **SUMMED, sequence=sequence)
+    assert rows == []
+    assert dropped == len(frames)
+    made.feed(b"".join(frames[:100]), 6, 6)
+    made.blocks()
+    (drop,) = made.take_drops()
+    assert (drop.count, drop.unit) == (100, "samples")
+    assert "most samples do not follow the one before" in drop.reason
+
+
+def test_a_stream_with_some_losses_is_read() -> None:
+    frames = epson(500, summed=True)
+    broken = [frame if k % 4 else frame[:-1] for k, frame in enumerate(frames)]
+    rows, _, _ = read(b"".join(broken), piece=100 * len(frames[0]), **SUMMED)
+    assert rows == [indications for k, indications in enumerate(axes(500)) if k % 4]
