@@ -23,11 +23,14 @@ from hw.i2c import I2CDevice
 from hw.pace import Pace
 from hw.polling import PollingSensor
 from hw.self_test import SelfTest, SelfTestReport
-from hw.sensor import ConfigurationError, DeviceError, DeviceLost
+from hw.sensor import GOLDEN, ConfigurationError, DeviceError, DeviceLost
 from hw.spi import SpiDevice
 
 STANDARD_GRAVITY_MPS2 = 9.80665
-PROOF_POLLS = 8  # the golden ratio lets every second poll or third prove that no sample is missing
+# Steps, in parts of a sample period, by which polls come later from one to the next, and polls until they take turns.
+# Of sqrt(3) - 1 and the samples from poll to poll, no driver's defaults make a whole number.
+STEPS, STEP_POLLS = (GOLDEN, 3**0.5 - 1), 8
+PROOF_POLLS = 8  # about every second poll proves that no sample is missing
 OUT_OF_STEP = "incomplete samples in the FIFO"
 UNCHECKED = "samples behind which the settings did not read back as they were set"
 TAKEN = "samples among which others are missing: does another program read the FIFO?"
@@ -66,6 +69,7 @@ class FifoSensor(PollingSensor):
         self._bursts: list[Burst] = []
         self._rest = b""
         self._next_poll_ns = 0
+        self._polls = 0
 
     @abstractmethod
     def _kind(self) -> str:
@@ -102,6 +106,10 @@ class FifoSensor(PollingSensor):
     @abstractmethod
     def _decode(self, data: bytes) -> FifoSamples:
         """Samples in the words of half a second; `data` begins with the rest of the words before."""
+
+    def _number_of_samples(self, data: bytes) -> int:
+        """How many samples the words of one poll are, for the comparison with the clock."""
+        return len(data) // (self.word_bytes * self.sample_words)
 
     def _spoilt_samples(self) -> tuple[int, int]:
         """How many samples before and behind an indication at the end of the range are spoilt, too."""
@@ -274,6 +282,15 @@ class FifoSensor(PollingSensor):
         else:
             self._next_poll_ns = now_ns
 
+    def _next_phase(self) -> float:
+        """As in PollingSensor, but two steps take turns.
+
+        With equal steps there are clocks of devices with which all polls come at the same part of a sample period.
+        """
+        self._polls += 1
+        self._phase = (self._phase + STEPS[self._polls // STEP_POLLS % 2]) % 1.0
+        return self._phase
+
     def _poll_once(self) -> bool:
         burst = self._poll()
         if burst.lost:
@@ -282,8 +299,7 @@ class FifoSensor(PollingSensor):
             self._hand_on()
             self._begin_again()
         else:
-            samples = len(burst.data) // (self.word_bytes * self.sample_words)
-            self._pace.add(burst.arrival_ns, self._device.stamp_half_ns, samples)
+            self._pace.add(burst.arrival_ns, self._device.stamp_half_ns, self._number_of_samples(burst.data))
         self._bursts.append(burst)
         return True
 

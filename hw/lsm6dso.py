@@ -106,6 +106,9 @@ class Lsm6dso(FifoSensor):
         super()._forget()
         self._counter = None
 
+    def _number_of_samples(self, data: bytes) -> int:
+        return sum(tag >> 3 == chip.ACCELEROMETER for tag in data[:: chip.WORD_BYTES])
+
     def _poll(self) -> Burst:
         arrival_ns, utc_ns, status = self._device.read_stamped([(chip.FIFO_STATUS, 2)], self._clock)
         words = min(int.from_bytes(status, "little") & chip.COUNT_MASK, chip.FIFO_WORDS)

@@ -35,7 +35,7 @@ MG_PER_COUNT: Mapping[int, float] = {2: 0.061, 16: 0.488, 4: 0.122, 8: 0.244}
 RATES_HZ = (12.5, 26.0, 52.0, 104.0, 208.0, 416.0, 833.0, 1667.0, 3333.0, 6667.0)  # index + 1 is the code
 _INTERNAL_HZ, _FINE_STEP = 6667.0, 0.0015
 _BLOCK_DATA_UPDATE, _AUTO_INCREMENT, _RESET_CTRL9, _DEVICE_CONF = 0x40, 0x04, 0xE0, 0x02
-_ACCELEROMETER = 2  # tag of the accelerometer
+ACCELEROMETER = 2  # tag of the accelerometer
 
 
 def actual_rate_hz(rate_hz: float, freq_fine: int) -> float:
@@ -108,7 +108,7 @@ def tagged_samples(data: bytes, last_counter: int | None) -> tuple[FifoSamples, 
     """
     words = np.frombuffer(data, np.uint8).reshape(-1, WORD_BYTES)
     tag = words[:, 0]
-    good = (tag >> 3 == _ACCELEROMETER) & (np.bitwise_count(tag) % 2 == 0)
+    good = (tag >> 3 == ACCELEROMETER) & (np.bitwise_count(tag) % 2 == 0)
     last = np.flatnonzero(good)
     counter = (tag[last] >> 1 & 3).astype(np.int64)
     before = counter[:1] - 1 if last_counter is None else last_counter

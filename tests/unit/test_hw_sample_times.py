@@ -20,6 +20,7 @@ from hw.virtual.mpu6050_twin import Mpu6050Twin
 from hw.virtual.timebase import Clock
 
 SECONDS = 120.0
+RESONANT_125_HZ, RESONANT_500_HZ = 2.381966 / (125.0 * 0.02) - 1, 8.381966 / (500.0 * 0.016) - 1
 # Scheduler: 0.2 ms mean, 1 % stalls of 5 to 20 ms, as measured on a loaded gateway. The FIFO is large enough for them.
 MEAN_LATE_S, STALLS, STALL_S = 0.2e-3, 0.01, (5e-3, 20e-3)
 
@@ -43,12 +44,16 @@ class Machine:
 
 
 @pytest.mark.parametrize(
-    ("driver", "twin", "options", "bias_us", "sd_us", "largest_us"),
+    ("driver", "twin", "options", "rate_error", "bias_us", "sd_us", "largest_us"),
     [
-        (Adxl355, Adxl355Twin, {"rate_hz": 1000.0}, 50, 50, 150),
-        (Mpu6050, Mpu6050Twin, {"rate_hz": 1000.0}, 50, 50, 150),
-        (Lsm6dso, Lsm6dsoTwin, {"rate_hz": 833.0}, 50, 50, 150),
-        (Adxl355, Adxl355Twin, {"rate_hz": 125.0}, 100, 120, 350),
+        (Adxl355, Adxl355Twin, {"rate_hz": 1000.0}, 3.3e-3, 50, 50, 150),
+        (Mpu6050, Mpu6050Twin, {"rate_hz": 1000.0}, 3.3e-3, 50, 50, 150),
+        (Lsm6dso, Lsm6dsoTwin, {"rate_hz": 833.0}, 3.3e-3, 50, 50, 150),
+        (Adxl355, Adxl355Twin, {"rate_hz": 125.0}, 3.3e-3, 100, 120, 350),
+        # From poll to poll these clocks make a whole number of samples and 0.382: with 0.618, the golden ratio, polls
+        # that are later by that part from one to the next would all come at the same part of a sample period.
+        (Adxl355, Adxl355Twin, {"rate_hz": 125.0}, RESONANT_125_HZ, 100, 120, 350),
+        (Adxl355, Adxl355Twin, {"rate_hz": 500.0}, RESONANT_500_HZ, 50, 50, 150),
     ],
 )
 @pytest.mark.parametrize("seed", [1, 2])
@@ -56,6 +61,7 @@ def test_sample_times(
     driver: type[FifoSensor],
     twin: type[FifoTwin],
     options: dict[str, Any],
+    rate_error: float,
     bias_us: float,
     sd_us: float,
     largest_us: float,
@@ -63,7 +69,7 @@ def test_sample_times(
 ) -> None:
     machine = Machine(seed)
     rate_hz = options["rate_hz"]
-    truth = Clock(rate_hz, rate_error=3.3e-3, offset_s=0.3e-3, wander=250e-6, wander_period_s=600.0)
+    truth = Clock(rate_hz, rate_error=rate_error, offset_s=0.3e-3, wander=250e-6, wander_period_s=600.0)
     device = twin(
         lambda first, n: np.column_stack([np.arange(first, first + n) % 1000, np.arange(first, first + n) // 1000] * 2)[
             :, :3
