@@ -36,8 +36,8 @@ class SampleCounter:
     """Finds missing samples by a column that rises by one and begins at 0 again after 2^8, 2^16 or 2^32 numbers.
 
     Only the step from the last number to 0 is a wrap, or in a signed counter from the largest number to the smallest
-    one. Any other step back is a RESTART. A counter that wraps within `longest_gap` samples does not tell how many are
-    missing: each jump of it is a RESTART.
+    one. Any other step back is a RESTART, and so is the step behind a damaged number (see `damaged`). A counter that
+    wraps within `longest_gap` samples does not tell how many are missing: each jump of it is a RESTART.
     """
 
     def __init__(self, longest_gap: float) -> None:
@@ -46,13 +46,15 @@ class SampleCounter:
 
     def begin(self) -> None:
         """Forget the counter: the port was opened anew."""
-        self._last: float | None = None
+        self._newest = np.empty(0)  # the last two numbers
         self._known_gap = self._longest_gap
 
     def breaks(self, counts: Values) -> list[Break]:
         """Breaks where the next of n > 0 numbers (n,) does not follow."""
-        steps = np.diff(counts, prepend=counts[0] - 1 if self._last is None else self._last)
-        self._last = float(counts[-1])
+        steps = np.diff(counts, prepend=self._newest[-1] if len(self._newest) else counts[0] - 1)
+        if damaged(np.append(self._newest, counts[0]))[1:-1].any():  # it is handed on, and nothing is known behind it
+            steps[0] = 0
+        self._newest = np.append(self._newest, counts)[-2:]
         for at in np.flatnonzero(steps < 0).tolist():
             size = int(1 - steps[at])
             if size in COUNTER_SIZES and counts[at] in (0, -size // 2):

@@ -72,6 +72,12 @@ def test_a_damaged_counter_between_two_good_ones_is_a_line_lost_and_no_gap_of_an
     ]
 
 
+def test_after_a_damaged_counter_at_the_end_of_a_stretch_nothing_is_counted() -> None:
+    listening = stream()
+    first, second = feed(listening, numbered(1028, 1029, 30)), feed(listening, numbered(1031, 1032))
+    assert shape(first + second) == [(0, 2, RESTART), (2, 1, RESTART), (3, 2, RESTART)]
+
+
 @pytest.mark.parametrize("bad", [b"1.5,2\n", b"1e-3,2\n"])
 def test_a_sequence_number_is_a_whole_number(bad: bytes) -> None:
     listening = stream()
