@@ -14,6 +14,7 @@ from hw.block import BlockFlags, Drop, SampleBlock
 from hw.conformance.i2c import BUSES, I2cContract, I2cRig, on_one_adapter
 from hw.sensor import DeviceLost, IdentityError
 from hw.virtual.adxl355_twin import Adxl355Twin, Adxl357Twin, Adxl359Twin, shaken
+from hw.virtual.kernel import ADAPTERS
 
 
 class Adxl355Rig(I2cRig):
@@ -249,6 +250,7 @@ class Adxl357Rig(Adxl355Rig):
 
 
 class TestAdxl357(TestAdxl355):
+    adapters = ADAPTERS  # over SPI it is the ADXL355's code
     kind, counts_per_g = "ADXL357", 51200  # data sheet, at 10 g
     self_test_range = 1.0
     temperature = 1671, 45.0  # data sheet: 1852 at 25 degC, -9.05 LSB per degC

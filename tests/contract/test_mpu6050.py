@@ -10,6 +10,7 @@ from hw.block import BlockFlags
 from hw.conformance.i2c import I2cContract, I2cRig
 from hw.mpu6050 import Mpu6050
 from hw.sensor import IdentityError
+from hw.virtual.kernel import ADAPTERS
 from hw.virtual.mpu6050_twin import TRIM, Mpu6050Twin, Mpu6500Twin
 
 
@@ -93,6 +94,7 @@ class TestMpu6050(I2cContract):
 
 
 class TestMpu6500(TestMpu6050):
+    adapters = ADAPTERS[:2]  # the same driver as above
     trimmed = {0x1B: 0xE0, 0x6C: 0x3F}  # noqa: RUF012
     # Register map: raw / 333.87 + 21
     temperature = 3339, 31.00093
