@@ -24,6 +24,7 @@ from agent.delivery.history import History, Record, StoreError
 from agent.delivery.publication import Publisher
 from agent.delivery.retention import keep_results
 from agent.delivery.store import Store
+from agent.engine import identity
 from agent.recording.acceleration import encode_acceleration
 from agent.recording.files import final_name
 from agent.recording.fingerprint import fingerprint, versions
@@ -197,6 +198,7 @@ class Service:
             file_sequence=self._recorder.next_file_sequence,
             event_sequence=self._sequence,
             continuation=continuation,
+            engine=identity.name(),
         )
 
     def _loop(

@@ -88,8 +88,19 @@ class LazyGroup(click.Group):
             formatter.write_dl([(name, text) for name, (_, text) in COMMANDS.items()])
 
 
+def _say_version(ctx: click.Context, _: click.Parameter, asked: bool) -> None:
+    if asked:
+        from agent.engine import identity
+
+        click.echo(f"fieldcal, version {__version__}, engine {identity.name()}")
+        ctx.exit()
+
+
 @click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
-@click.version_option(__version__, prog_name="fieldcal")
+@click.option(
+    "--version", is_flag=True, expose_value=False, is_eager=True, callback=_say_version,
+    help="Show the version of the program and the name of its engine.",
+)  # fmt: skip
 def fieldcal() -> None:
     """Recalibrate tri-axial accelerometers in place (Method 3 of D'Emilia et al. 2018)."""
 

@@ -19,7 +19,8 @@ from hw.block import SampleBlock
 class RunStart(msgspec.Struct, frozen=True, kw_only=True):
     """First event of every file, with everything that a replay needs.
 
-    `continuation`: an earlier file has the same run.
+    `continuation`: an earlier file has the same run. `engine`: the name (agent.engine.identity) of the engine that made
+    the results of this file, and `engine_sha256` the digest of the wheel in which it is kept; "" where not known.
     """
 
     run_id: str
@@ -35,6 +36,8 @@ class RunStart(msgspec.Struct, frozen=True, kw_only=True):
     file_sequence: int
     event_sequence: int  # number of this event; the next event has the next number
     continuation: bool = False
+    engine: str = ""
+    engine_sha256: str = ""
 
 
 IN_DRIVER = "fault in the driver"  # so begins the message of a DeviceChange where the driver itself has failed
@@ -108,7 +111,8 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
 
     A new kind of result needs a subclass here and a protobuf message. The message has the name in `what` with a capital
     first letter, and fields of the same names. The result is then recorded, stored, published and shown under this
-    name. `routine` results come by schedule and are not written to the log.
+    name. `routine` results come by schedule and are not written to the log. `engine` names the code that made it
+    (agent.engine.identity); "" in results of older versions.
     """
 
     what: ClassVar[str]
@@ -118,6 +122,7 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
     sequence: int  # counts all results of the gateway
     sensor: str
     t_utc_ns: int
+    engine: str = ""
 
 
 class WindowReport(Result, frozen=True, kw_only=True):

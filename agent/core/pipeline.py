@@ -37,6 +37,7 @@ class Pipeline:
     def __init__(self, config: Config) -> None:
         self._config = config
         self._run_id = ""
+        self._engine = ""
         self._next_sequence = 1
         self._channels = [ChannelState(channel) for channel in config.channels]
 
@@ -86,6 +87,7 @@ class Pipeline:
     def step(self, event: Event) -> list[Output]:
         """Take the next event and give its results, in order. Results get a number, blocks of acceleration get none."""
         if isinstance(event, RunStart):
+            self._engine = event.engine
             return []
         found: list[Output] = []
         for channel in self._channels:
@@ -99,7 +101,7 @@ class Pipeline:
         if isinstance(item, Acceleration):
             return item
         self._next_sequence += 1
-        return msgspec.structs.replace(item, run_id=self._run_id, sequence=self._next_sequence - 1)
+        return msgspec.structs.replace(item, run_id=self._run_id, sequence=self._next_sequence - 1, engine=self._engine)
 
     def memories(self, results: Sequence[Output]) -> list[Memory]:
         """States for later runs, of every sensor whose state has changed by these results of the last step."""

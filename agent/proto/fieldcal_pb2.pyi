@@ -9,7 +9,7 @@ DESCRIPTOR: _descriptor.FileDescriptor
 class Event(_message.Message):
     __slots__ = ("event_sequence", "run_start", "device_change", "gap", "tick", "command", "pruned")
     class RunStart(_message.Message):
-        __slots__ = ("run_id", "site", "gateway", "boot_id", "t_monotonic_ns", "t_utc_ns", "config_json", "versions", "fingerprint", "snapshot", "file_sequence", "continuation")
+        __slots__ = ("run_id", "site", "gateway", "boot_id", "t_monotonic_ns", "t_utc_ns", "config_json", "versions", "fingerprint", "snapshot", "file_sequence", "continuation", "engine", "engine_sha256")
         class VersionsEntry(_message.Message):
             __slots__ = ("key", "value")
             KEY_FIELD_NUMBER: _ClassVar[int]
@@ -36,6 +36,8 @@ class Event(_message.Message):
         SNAPSHOT_FIELD_NUMBER: _ClassVar[int]
         FILE_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
         CONTINUATION_FIELD_NUMBER: _ClassVar[int]
+        ENGINE_FIELD_NUMBER: _ClassVar[int]
+        ENGINE_SHA256_FIELD_NUMBER: _ClassVar[int]
         run_id: str
         site: str
         gateway: str
@@ -48,7 +50,9 @@ class Event(_message.Message):
         snapshot: bytes
         file_sequence: int
         continuation: bool
-        def __init__(self, run_id: _Optional[str] = ..., site: _Optional[str] = ..., gateway: _Optional[str] = ..., boot_id: _Optional[str] = ..., t_monotonic_ns: _Optional[int] = ..., t_utc_ns: _Optional[int] = ..., config_json: _Optional[str] = ..., versions: _Optional[_Mapping[str, str]] = ..., fingerprint: _Optional[_Mapping[str, str]] = ..., snapshot: _Optional[bytes] = ..., file_sequence: _Optional[int] = ..., continuation: _Optional[bool] = ...) -> None: ...
+        engine: str
+        engine_sha256: str
+        def __init__(self, run_id: _Optional[str] = ..., site: _Optional[str] = ..., gateway: _Optional[str] = ..., boot_id: _Optional[str] = ..., t_monotonic_ns: _Optional[int] = ..., t_utc_ns: _Optional[int] = ..., config_json: _Optional[str] = ..., versions: _Optional[_Mapping[str, str]] = ..., fingerprint: _Optional[_Mapping[str, str]] = ..., snapshot: _Optional[bytes] = ..., file_sequence: _Optional[int] = ..., continuation: _Optional[bool] = ..., engine: _Optional[str] = ..., engine_sha256: _Optional[str] = ...) -> None: ...
     class DeviceChange(_message.Message):
         __slots__ = ("device", "state", "t_monotonic_ns", "t_utc_ns", "message", "info_json", "attempt")
         DEVICE_FIELD_NUMBER: _ClassVar[int]
@@ -223,7 +227,7 @@ class RawBlockBytes(_message.Message):
     def __init__(self, event_sequence: _Optional[int] = ..., device: _Optional[str] = ..., boot_id: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., first_index: _Optional[int] = ..., nominal_rate_hz: _Optional[float] = ..., flags: _Optional[int] = ..., temperature_raw: _Optional[int] = ..., temperature_degc: _Optional[float] = ..., axes: _Optional[int] = ..., decimal: _Optional[bool] = ..., burst_t_monotonic_ns: _Optional[bytes] = ..., burst_count: _Optional[bytes] = ..., x_counts: _Optional[bytes] = ..., y_counts: _Optional[bytes] = ..., z_counts: _Optional[bytes] = ..., x: _Optional[bytes] = ..., y: _Optional[bytes] = ..., z: _Optional[bytes] = ...) -> None: ...
 
 class Window(_message.Message):
-    __slots__ = ("event_sequence", "run_id", "sequence", "sensor", "t_utc_ns", "start_s", "stop_s", "position", "used", "reason", "points", "left_out", "numbers", "fault", "signature")
+    __slots__ = ("event_sequence", "run_id", "sequence", "sensor", "t_utc_ns", "start_s", "stop_s", "position", "used", "reason", "points", "left_out", "numbers", "fault", "engine", "signature")
     class NumbersEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -245,6 +249,7 @@ class Window(_message.Message):
     LEFT_OUT_FIELD_NUMBER: _ClassVar[int]
     NUMBERS_FIELD_NUMBER: _ClassVar[int]
     FAULT_FIELD_NUMBER: _ClassVar[int]
+    ENGINE_FIELD_NUMBER: _ClassVar[int]
     SIGNATURE_FIELD_NUMBER: _ClassVar[int]
     event_sequence: int
     run_id: str
@@ -260,11 +265,12 @@ class Window(_message.Message):
     left_out: int
     numbers: _containers.ScalarMap[str, float]
     fault: str
+    engine: str
     signature: bytes
-    def __init__(self, event_sequence: _Optional[int] = ..., run_id: _Optional[str] = ..., sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., start_s: _Optional[float] = ..., stop_s: _Optional[float] = ..., position: _Optional[str] = ..., used: _Optional[bool] = ..., reason: _Optional[str] = ..., points: _Optional[int] = ..., left_out: _Optional[int] = ..., numbers: _Optional[_Mapping[str, float]] = ..., fault: _Optional[str] = ..., signature: _Optional[bytes] = ...) -> None: ...
+    def __init__(self, event_sequence: _Optional[int] = ..., run_id: _Optional[str] = ..., sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., start_s: _Optional[float] = ..., stop_s: _Optional[float] = ..., position: _Optional[str] = ..., used: _Optional[bool] = ..., reason: _Optional[str] = ..., points: _Optional[int] = ..., left_out: _Optional[int] = ..., numbers: _Optional[_Mapping[str, float]] = ..., fault: _Optional[str] = ..., engine: _Optional[str] = ..., signature: _Optional[bytes] = ...) -> None: ...
 
 class Calibration(_message.Message):
-    __slots__ = ("event_sequence", "run_id", "sequence", "sensor", "t_utc_ns", "sxx", "sxy", "sxz", "syx", "syy", "syz", "szx", "szy", "szz", "qx", "qy", "qz", "u_sxx", "u_sxy", "u_sxz", "u_syx", "u_syy", "u_syz", "u_szx", "u_szy", "u_szz", "u_qx", "u_qy", "u_qz", "coverage_factor", "residual_sd_x", "residual_sd_y", "residual_sd_z", "windows", "method", "uncertainty_kind", "output_unit", "identity", "determined", "covariance", "reference_temperature_degc", "temperature_low_degc", "temperature_high_degc", "offset_temperature", "u_offset_temperature", "sensitivity_temperature", "u_sensitivity_temperature", "offset_rate", "u_offset_rate", "made_run_id", "made_sequence", "made_utc_ns", "references", "reference_frequency_hz", "valid_band_hz", "sensitivity_at_0hz", "response", "shared_errors", "signature")
+    __slots__ = ("event_sequence", "run_id", "sequence", "sensor", "t_utc_ns", "sxx", "sxy", "sxz", "syx", "syy", "syz", "szx", "szy", "szz", "qx", "qy", "qz", "u_sxx", "u_sxy", "u_sxz", "u_syx", "u_syy", "u_syz", "u_szx", "u_szy", "u_szz", "u_qx", "u_qy", "u_qz", "coverage_factor", "residual_sd_x", "residual_sd_y", "residual_sd_z", "windows", "method", "uncertainty_kind", "output_unit", "identity", "determined", "covariance", "reference_temperature_degc", "temperature_low_degc", "temperature_high_degc", "offset_temperature", "u_offset_temperature", "sensitivity_temperature", "u_sensitivity_temperature", "offset_rate", "u_offset_rate", "made_run_id", "made_sequence", "made_utc_ns", "references", "reference_frequency_hz", "valid_band_hz", "sensitivity_at_0hz", "response", "shared_errors", "engine", "signature")
     class Steady(_message.Message):
         __slots__ = ("sensitivity", "standard_uncertainty")
         SENSITIVITY_FIELD_NUMBER: _ClassVar[int]
@@ -368,6 +374,7 @@ class Calibration(_message.Message):
     SENSITIVITY_AT_0HZ_FIELD_NUMBER: _ClassVar[int]
     RESPONSE_FIELD_NUMBER: _ClassVar[int]
     SHARED_ERRORS_FIELD_NUMBER: _ClassVar[int]
+    ENGINE_FIELD_NUMBER: _ClassVar[int]
     SIGNATURE_FIELD_NUMBER: _ClassVar[int]
     event_sequence: int
     run_id: str
@@ -427,11 +434,12 @@ class Calibration(_message.Message):
     sensitivity_at_0hz: Calibration.Steady
     response: _containers.RepeatedCompositeFieldContainer[Calibration.Band]
     shared_errors: _containers.RepeatedCompositeFieldContainer[Calibration.SharedError]
+    engine: str
     signature: bytes
-    def __init__(self, event_sequence: _Optional[int] = ..., run_id: _Optional[str] = ..., sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., sxx: _Optional[float] = ..., sxy: _Optional[float] = ..., sxz: _Optional[float] = ..., syx: _Optional[float] = ..., syy: _Optional[float] = ..., syz: _Optional[float] = ..., szx: _Optional[float] = ..., szy: _Optional[float] = ..., szz: _Optional[float] = ..., qx: _Optional[float] = ..., qy: _Optional[float] = ..., qz: _Optional[float] = ..., u_sxx: _Optional[float] = ..., u_sxy: _Optional[float] = ..., u_sxz: _Optional[float] = ..., u_syx: _Optional[float] = ..., u_syy: _Optional[float] = ..., u_syz: _Optional[float] = ..., u_szx: _Optional[float] = ..., u_szy: _Optional[float] = ..., u_szz: _Optional[float] = ..., u_qx: _Optional[float] = ..., u_qy: _Optional[float] = ..., u_qz: _Optional[float] = ..., coverage_factor: _Optional[float] = ..., residual_sd_x: _Optional[float] = ..., residual_sd_y: _Optional[float] = ..., residual_sd_z: _Optional[float] = ..., windows: _Optional[int] = ..., method: _Optional[str] = ..., uncertainty_kind: _Optional[str] = ..., output_unit: _Optional[str] = ..., identity: _Optional[str] = ..., determined: _Optional[_Iterable[bool]] = ..., covariance: _Optional[_Iterable[float]] = ..., reference_temperature_degc: _Optional[float] = ..., temperature_low_degc: _Optional[float] = ..., temperature_high_degc: _Optional[float] = ..., offset_temperature: _Optional[_Iterable[float]] = ..., u_offset_temperature: _Optional[_Iterable[float]] = ..., sensitivity_temperature: _Optional[_Iterable[float]] = ..., u_sensitivity_temperature: _Optional[_Iterable[float]] = ..., offset_rate: _Optional[_Iterable[float]] = ..., u_offset_rate: _Optional[_Iterable[float]] = ..., made_run_id: _Optional[str] = ..., made_sequence: _Optional[int] = ..., made_utc_ns: _Optional[int] = ..., references: _Optional[_Iterable[str]] = ..., reference_frequency_hz: _Optional[float] = ..., valid_band_hz: _Optional[_Iterable[float]] = ..., sensitivity_at_0hz: _Optional[_Union[Calibration.Steady, _Mapping]] = ..., response: _Optional[_Iterable[_Union[Calibration.Band, _Mapping]]] = ..., shared_errors: _Optional[_Iterable[_Union[Calibration.SharedError, _Mapping]]] = ..., signature: _Optional[bytes] = ...) -> None: ...
+    def __init__(self, event_sequence: _Optional[int] = ..., run_id: _Optional[str] = ..., sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., sxx: _Optional[float] = ..., sxy: _Optional[float] = ..., sxz: _Optional[float] = ..., syx: _Optional[float] = ..., syy: _Optional[float] = ..., syz: _Optional[float] = ..., szx: _Optional[float] = ..., szy: _Optional[float] = ..., szz: _Optional[float] = ..., qx: _Optional[float] = ..., qy: _Optional[float] = ..., qz: _Optional[float] = ..., u_sxx: _Optional[float] = ..., u_sxy: _Optional[float] = ..., u_sxz: _Optional[float] = ..., u_syx: _Optional[float] = ..., u_syy: _Optional[float] = ..., u_syz: _Optional[float] = ..., u_szx: _Optional[float] = ..., u_szy: _Optional[float] = ..., u_szz: _Optional[float] = ..., u_qx: _Optional[float] = ..., u_qy: _Optional[float] = ..., u_qz: _Optional[float] = ..., coverage_factor: _Optional[float] = ..., residual_sd_x: _Optional[float] = ..., residual_sd_y: _Optional[float] = ..., residual_sd_z: _Optional[float] = ..., windows: _Optional[int] = ..., method: _Optional[str] = ..., uncertainty_kind: _Optional[str] = ..., output_unit: _Optional[str] = ..., identity: _Optional[str] = ..., determined: _Optional[_Iterable[bool]] = ..., covariance: _Optional[_Iterable[float]] = ..., reference_temperature_degc: _Optional[float] = ..., temperature_low_degc: _Optional[float] = ..., temperature_high_degc: _Optional[float] = ..., offset_temperature: _Optional[_Iterable[float]] = ..., u_offset_temperature: _Optional[_Iterable[float]] = ..., sensitivity_temperature: _Optional[_Iterable[float]] = ..., u_sensitivity_temperature: _Optional[_Iterable[float]] = ..., offset_rate: _Optional[_Iterable[float]] = ..., u_offset_rate: _Optional[_Iterable[float]] = ..., made_run_id: _Optional[str] = ..., made_sequence: _Optional[int] = ..., made_utc_ns: _Optional[int] = ..., references: _Optional[_Iterable[str]] = ..., reference_frequency_hz: _Optional[float] = ..., valid_band_hz: _Optional[_Iterable[float]] = ..., sensitivity_at_0hz: _Optional[_Union[Calibration.Steady, _Mapping]] = ..., response: _Optional[_Iterable[_Union[Calibration.Band, _Mapping]]] = ..., shared_errors: _Optional[_Iterable[_Union[Calibration.SharedError, _Mapping]]] = ..., engine: _Optional[str] = ..., signature: _Optional[bytes] = ...) -> None: ...
 
 class Status(_message.Message):
-    __slots__ = ("event_sequence", "run_id", "sequence", "sensor", "t_utc_ns", "status", "before", "reason", "signature")
+    __slots__ = ("event_sequence", "run_id", "sequence", "sensor", "t_utc_ns", "status", "before", "reason", "engine", "signature")
     EVENT_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     RUN_ID_FIELD_NUMBER: _ClassVar[int]
     SEQUENCE_FIELD_NUMBER: _ClassVar[int]
@@ -440,6 +448,7 @@ class Status(_message.Message):
     STATUS_FIELD_NUMBER: _ClassVar[int]
     BEFORE_FIELD_NUMBER: _ClassVar[int]
     REASON_FIELD_NUMBER: _ClassVar[int]
+    ENGINE_FIELD_NUMBER: _ClassVar[int]
     SIGNATURE_FIELD_NUMBER: _ClassVar[int]
     event_sequence: int
     run_id: str
@@ -449,11 +458,12 @@ class Status(_message.Message):
     status: str
     before: str
     reason: str
+    engine: str
     signature: bytes
-    def __init__(self, event_sequence: _Optional[int] = ..., run_id: _Optional[str] = ..., sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., status: _Optional[str] = ..., before: _Optional[str] = ..., reason: _Optional[str] = ..., signature: _Optional[bytes] = ...) -> None: ...
+    def __init__(self, event_sequence: _Optional[int] = ..., run_id: _Optional[str] = ..., sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., status: _Optional[str] = ..., before: _Optional[str] = ..., reason: _Optional[str] = ..., engine: _Optional[str] = ..., signature: _Optional[bytes] = ...) -> None: ...
 
 class Estimate(_message.Message):
-    __slots__ = ("event_sequence", "run_id", "sequence", "sensor", "t_utc_ns", "reason", "calibration", "signature")
+    __slots__ = ("event_sequence", "run_id", "sequence", "sensor", "t_utc_ns", "reason", "calibration", "engine", "signature")
     EVENT_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     RUN_ID_FIELD_NUMBER: _ClassVar[int]
     SEQUENCE_FIELD_NUMBER: _ClassVar[int]
@@ -461,6 +471,7 @@ class Estimate(_message.Message):
     T_UTC_NS_FIELD_NUMBER: _ClassVar[int]
     REASON_FIELD_NUMBER: _ClassVar[int]
     CALIBRATION_FIELD_NUMBER: _ClassVar[int]
+    ENGINE_FIELD_NUMBER: _ClassVar[int]
     SIGNATURE_FIELD_NUMBER: _ClassVar[int]
     event_sequence: int
     run_id: str
@@ -469,11 +480,12 @@ class Estimate(_message.Message):
     t_utc_ns: int
     reason: str
     calibration: bytes
+    engine: str
     signature: bytes
-    def __init__(self, event_sequence: _Optional[int] = ..., run_id: _Optional[str] = ..., sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., reason: _Optional[str] = ..., calibration: _Optional[bytes] = ..., signature: _Optional[bytes] = ...) -> None: ...
+    def __init__(self, event_sequence: _Optional[int] = ..., run_id: _Optional[str] = ..., sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., reason: _Optional[str] = ..., calibration: _Optional[bytes] = ..., engine: _Optional[str] = ..., signature: _Optional[bytes] = ...) -> None: ...
 
 class Drift(_message.Message):
-    __slots__ = ("event_sequence", "run_id", "sequence", "sensor", "t_utc_ns", "parameter", "verdict", "change", "u_change", "rate", "u_rate", "onset_utc_ns", "statistic", "threshold", "false_alarms_a_year", "reason", "signature")
+    __slots__ = ("event_sequence", "run_id", "sequence", "sensor", "t_utc_ns", "parameter", "verdict", "change", "u_change", "rate", "u_rate", "onset_utc_ns", "statistic", "threshold", "false_alarms_a_year", "reason", "engine", "signature")
     EVENT_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     RUN_ID_FIELD_NUMBER: _ClassVar[int]
     SEQUENCE_FIELD_NUMBER: _ClassVar[int]
@@ -490,6 +502,7 @@ class Drift(_message.Message):
     THRESHOLD_FIELD_NUMBER: _ClassVar[int]
     FALSE_ALARMS_A_YEAR_FIELD_NUMBER: _ClassVar[int]
     REASON_FIELD_NUMBER: _ClassVar[int]
+    ENGINE_FIELD_NUMBER: _ClassVar[int]
     SIGNATURE_FIELD_NUMBER: _ClassVar[int]
     event_sequence: int
     run_id: str
@@ -507,11 +520,12 @@ class Drift(_message.Message):
     threshold: float
     false_alarms_a_year: float
     reason: str
+    engine: str
     signature: bytes
-    def __init__(self, event_sequence: _Optional[int] = ..., run_id: _Optional[str] = ..., sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., parameter: _Optional[str] = ..., verdict: _Optional[str] = ..., change: _Optional[float] = ..., u_change: _Optional[float] = ..., rate: _Optional[float] = ..., u_rate: _Optional[float] = ..., onset_utc_ns: _Optional[int] = ..., statistic: _Optional[float] = ..., threshold: _Optional[float] = ..., false_alarms_a_year: _Optional[float] = ..., reason: _Optional[str] = ..., signature: _Optional[bytes] = ...) -> None: ...
+    def __init__(self, event_sequence: _Optional[int] = ..., run_id: _Optional[str] = ..., sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., parameter: _Optional[str] = ..., verdict: _Optional[str] = ..., change: _Optional[float] = ..., u_change: _Optional[float] = ..., rate: _Optional[float] = ..., u_rate: _Optional[float] = ..., onset_utc_ns: _Optional[int] = ..., statistic: _Optional[float] = ..., threshold: _Optional[float] = ..., false_alarms_a_year: _Optional[float] = ..., reason: _Optional[str] = ..., engine: _Optional[str] = ..., signature: _Optional[bytes] = ...) -> None: ...
 
 class Clock(_message.Message):
-    __slots__ = ("event_sequence", "run_id", "sequence", "sensor", "t_utc_ns", "device", "role", "nominal_rate_hz", "rate_hz", "u_rate_hz", "offset_s", "u_offset_s", "jitter_s", "lag_s", "u_lag_s", "arrivals", "signature")
+    __slots__ = ("event_sequence", "run_id", "sequence", "sensor", "t_utc_ns", "device", "role", "nominal_rate_hz", "rate_hz", "u_rate_hz", "offset_s", "u_offset_s", "jitter_s", "lag_s", "u_lag_s", "arrivals", "engine", "signature")
     EVENT_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     RUN_ID_FIELD_NUMBER: _ClassVar[int]
     SEQUENCE_FIELD_NUMBER: _ClassVar[int]
@@ -528,6 +542,7 @@ class Clock(_message.Message):
     LAG_S_FIELD_NUMBER: _ClassVar[int]
     U_LAG_S_FIELD_NUMBER: _ClassVar[int]
     ARRIVALS_FIELD_NUMBER: _ClassVar[int]
+    ENGINE_FIELD_NUMBER: _ClassVar[int]
     SIGNATURE_FIELD_NUMBER: _ClassVar[int]
     event_sequence: int
     run_id: str
@@ -545,8 +560,9 @@ class Clock(_message.Message):
     lag_s: float
     u_lag_s: float
     arrivals: int
+    engine: str
     signature: bytes
-    def __init__(self, event_sequence: _Optional[int] = ..., run_id: _Optional[str] = ..., sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., device: _Optional[str] = ..., role: _Optional[str] = ..., nominal_rate_hz: _Optional[float] = ..., rate_hz: _Optional[float] = ..., u_rate_hz: _Optional[float] = ..., offset_s: _Optional[float] = ..., u_offset_s: _Optional[float] = ..., jitter_s: _Optional[float] = ..., lag_s: _Optional[float] = ..., u_lag_s: _Optional[float] = ..., arrivals: _Optional[int] = ..., signature: _Optional[bytes] = ...) -> None: ...
+    def __init__(self, event_sequence: _Optional[int] = ..., run_id: _Optional[str] = ..., sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., device: _Optional[str] = ..., role: _Optional[str] = ..., nominal_rate_hz: _Optional[float] = ..., rate_hz: _Optional[float] = ..., u_rate_hz: _Optional[float] = ..., offset_s: _Optional[float] = ..., u_offset_s: _Optional[float] = ..., jitter_s: _Optional[float] = ..., lag_s: _Optional[float] = ..., u_lag_s: _Optional[float] = ..., arrivals: _Optional[int] = ..., engine: _Optional[str] = ..., signature: _Optional[bytes] = ...) -> None: ...
 
 class Acceleration(_message.Message):
     __slots__ = ("event_sequence", "sensor", "t_utc_ns", "first_index", "rate_hz", "x", "y", "z", "covariance", "noise", "determined", "calibration_run_id", "calibration_sequence", "dynamic_only")
