@@ -26,6 +26,7 @@ from pyarrow import csv, parquet
 from agent.config import Config
 from agent.core.events import DeviceChange, RunStart
 from agent.core.pipeline import Pipeline
+from agent.engine import identity
 from agent.recording.writer import Recorder
 from benchmarks.agent_cost import peak_mb
 from benchmarks.page import machine, write_part
@@ -122,6 +123,7 @@ def write_recording(directory: Path, count: int, axes: int) -> tuple[Path, Path]
         run_id="r", site="s", gateway="g", boot_id="b", t_monotonic_ns=0, t_utc_ns=0,
         config_json=config.model_dump_json(), versions={}, fingerprint={},
         snapshot=Pipeline.begin(config, "r", 0, 0, {}).snapshot(), file_sequence=1, event_sequence=0,
+        engine=identity.name(),
     )  # fmt: skip
     opened = DeviceChange(device="reference", state="open", t_monotonic_ns=0, t_utc_ns=0, info_json='{"unit": "m/s2"}')
     recorder.record(0, start, [])

@@ -15,6 +15,7 @@ import zstandard
 from agent.config import Config
 from agent.core.events import Event, RunStart, WindowReport
 from agent.core.pipeline import Pipeline
+from agent.engine import identity
 from agent.recording.integrity import check_integrity
 from agent.recording.reading import RecordingReader
 from agent.recording.records import walk
@@ -36,9 +37,9 @@ def record(directory: Path, config: Config, events: list[Event]) -> Path:
     start = RunStart(
         run_id="r", site="s", gateway="g", boot_id="b", t_monotonic_ns=0, t_utc_ns=EPOCH_NS,
         config_json=config.model_dump_json(), versions={}, fingerprint={}, snapshot=pipeline.snapshot(),
-        file_sequence=1, event_sequence=0,
+        file_sequence=1, event_sequence=0, engine=identity.name(),
     )  # fmt: skip
-    recorder.record(0, start, [])
+    recorder.record(0, start, pipeline.step(start))
     flush_each = int(3 * FLUSH_S / BLOCK_S)  # two blocks and a tick
     for number, event in enumerate(events, start=1):
         recorder.record(number, event, pipeline.step(event))

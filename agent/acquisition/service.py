@@ -111,7 +111,7 @@ class Service:
             self._supervisor.remember(plant.outbox.drifts(channel.sensor))
         self.begun = True
         try:
-            writer.put(0, self._run_start(continuation=False), [])
+            self._begin_file(writer, continuation=False)
             with few_objects():
                 for reader in readers:
                     reader.start()
@@ -182,6 +182,10 @@ class Service:
             _log.warning("the calibrations in force cannot be restored, and the run begins without them: %s", error)
         return kept
 
+    def _begin_file(self, writer: RecordingThread, *, continuation: bool) -> None:
+        start = self._run_start(continuation=continuation)
+        writer.put(self._sequence, start, self._pipeline.step(start))
+
     def _run_start(self, *, continuation: bool) -> RunStart:
         gateway = self._config.gateway
         return RunStart(
@@ -226,7 +230,7 @@ class Service:
                 self._step(pruned, writer)
             if writer.wants_rotation:
                 self._sequence += 1
-                writer.put(self._sequence, self._run_start(continuation=True), [])
+                self._begin_file(writer, continuation=True)
 
     def _step(self, event: Event, writer: RecordingThread) -> None:
         self._sequence += 1

@@ -5,28 +5,35 @@ from __future__ import annotations
 import time
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 import msgspec
 
+from agent.audit.auditing import AuditedFile, audit_file, conclude
+from agent.audit.comparison import OTHER_CPU
+from agent.audit.engines import Engines
+from agent.audit.parallel import for_each
+from agent.audit.replaying import Replayer
+from agent.audit.replaying import link as link_replays
+from agent.cli.engine_options import ENGINES, JOBS, TRUST_ENGINE, engines_for
 from agent.cli.given import Given, add_witnessed, read_head, recordings_of
 from agent.cli.kernels import compute_as_in
 from agent.delivery.history import StoreError
-from agent.recording.auditing import AuditedFile, audit_file
 from agent.recording.chain import Link, chain_faults, missing_after
-from agent.recording.comparison import OTHER_CPU
 from agent.recording.end_check import check_end
 from agent.recording.head import HEAD_NAME
 from agent.recording.pruned_ranges import Ranges, merged
 from agent.recording.reading import open_recording
-from agent.recording.replaying import Replay, Restore
 from agent.recording.set_aside import deleted as statements
 from agent.terminal.text import say
 
 if TYPE_CHECKING:
     from agent.config.known_keys import KnownKeys
+
+NO_ENGINE = "which engine made these results: without signatures anybody can write the name of another one"
 
 
 @click.command()
@@ -46,7 +53,13 @@ if TYPE_CHECKING:
     "--witness", metavar="DIR", type=click.Path(path_type=Path),
     help="The directory of `fieldcal witness`, with the heads that it kept of this gateway.",
 )  # fmt: skip
-@click.option("--strict", is_flag=True, help="Fail also for repaired files, and for files of another CPU or version.")
+@ENGINES
+@TRUST_ENGINE
+@JOBS
+@click.option(
+    "--strict", is_flag=True,
+    help="Fail also for repaired files and files of another CPU; let results pass by their own engine alone.",
+)  # fmt: skip
 @click.option("--json", "json_to", type=click.Choice(["-"]), help="Print one JSON object on standard output.")
 def audit(
     files: tuple[Path, ...],
@@ -54,13 +67,17 @@ def audit(
     known_keys: Path | None,
     heads: tuple[Path, ...],
     witness: Path | None,
+    engines: tuple[Path, ...],
+    trusted: tuple[str, ...],
+    jobs: int,
     strict: bool,
     json_to: str | None,
 ) -> int:
-    """Check recordings, given in order: every byte, whether results follow from the data, whether a file is missing.
+    """Check recordings: every byte, whether results follow from the data, whether a file is missing.
 
     Give a data directory instead of files to check all its recordings; then no recording may be missing. Exit status: 0
-    all passed, 3 a check failed, 2 a file cannot be read. The end of the output says what cannot be proven.
+    all passed, 3 a check failed, 4 not decided here because another engine made the results, 2 a file cannot be read.
+    The end of the output says what cannot be proven.
     """
     from agent.config.key_file import KeyFileError
     from agent.core.pipeline import Pipeline
@@ -85,7 +102,8 @@ def audit(
         return 2
     if given.paths:
         compute_as_in(given.paths[0])
-    return run_audit(given, Pipeline.restore, as_json=json_to is not None, strict=strict, keys=keys)
+    chosen = engines_for(Pipeline.restore, files, engines, trusted)
+    return run_audit(given, chosen, as_json=json_to is not None, strict=strict, keys=keys, jobs=jobs)
 
 
 def _known(public_key: Path | None, known_keys: Path | None) -> KnownKeys | None:
@@ -101,11 +119,17 @@ def _known(public_key: Path | None, known_keys: Path | None) -> KnownKeys | None
 
 
 def run_audit(
-    given: Given, restore: Restore, *, as_json: bool, strict: bool = False, keys: KnownKeys | None = None
+    given: Given,
+    engines: Engines,
+    *,
+    as_json: bool,
+    strict: bool = False,
+    keys: KnownKeys | None = None,
+    jobs: int = 1,
 ) -> int:
     """Audit, print, and return the exit status. With `keys`, files must be signed by a key of their gateway."""
     try:
-        audited, links, deleted = _audited(given, restore, strict=strict, keys=keys)
+        audited, links, deleted = _audited(given, engines, strict=strict, keys=keys, jobs=jobs)
         end = check_end(given.heads, links, deleted, keys, time.time_ns())
         end.reasons += given.faults
     except OSError as error:
@@ -113,13 +137,18 @@ def run_audit(
         return 2
     if strict and keys is not None and not given.heads and links[-1:] and links[-1].signed_results is not None:
         end.reasons.append(f"there is no {HEAD_NAME} beside signed recordings, and none was given (--head, --witness)")
+    if keys is None and audited:
+        end.unproven.append(NO_ENGINE)
     lost = missing_after(links, given.up_to or 0, deleted)
-    ok = not lost and not end.reasons and all(file.ok for file in audited)
+    failed = bool(lost or end.reasons or any(file.reasons for file in audited))
+    undecided = sum(bool(file.undecided) for file in audited)
     if as_json:
-        undecidable = sum(file.replay.undecidable for file in audited)
-        unsealed = sum(file.repaired for file in audited)
-        counted = {"undecidable": undecidable, "unsealed": unsealed}
-        verdict = {"ok": ok, **counted, "missing": lost, "end": end, "files": audited}
+        counted = {
+            "undecidable": sum(file.replay.undecidable for file in audited),
+            "undecided": undecided,
+            "unsealed": sum(file.repaired for file in audited),
+        }
+        verdict = {"ok": not failed and not undecided, **counted, "missing": lost, "end": end, "files": audited}
         click.echo(msgspec.json.encode(verdict).decode())
     else:
         for file in audited:
@@ -129,42 +158,40 @@ def run_audit(
             say(f"FAILED: {lost}")
         for line in end.describe():
             say(line)
-    return 0 if ok else 3
+    return 3 if failed else 4 if undecided else 0
 
 
 def audit_files(
-    given: Given, restore: Restore, *, strict: bool = False, keys: KnownKeys | None = None
+    given: Given, engines: Engines, *, strict: bool = False, keys: KnownKeys | None = None
 ) -> list[AuditedFile]:
     """The verdict on each file. Each file is also compared with the one before it. Raises OSError."""
-    return _audited(given, restore, strict=strict, keys=keys)[0]
+    return _audited(given, engines, strict=strict, keys=keys, jobs=1)[0]
 
 
 def _audited(
-    given: Given, restore: Restore, *, strict: bool, keys: KnownKeys | None
+    given: Given, engines: Engines, *, strict: bool, keys: KnownKeys | None, jobs: int
 ) -> tuple[list[AuditedFile], list[Link], Ranges]:
     """(the verdicts, the links of the chain, the file numbers that retention deleted)."""
     from agent.recording.fingerprint import fingerprint
 
-    replayed = Replay(restore, fingerprint(), elsewhere=OTHER_CPU)
-    audited: list[AuditedFile] = []
-    links: list[Link] = []
-    said: list[tuple[int, int]] = []  # recordings that retention deleted
+    replayer = Replayer(engines, fingerprint(), OTHER_CPU)
+    work = partial(audit_file, replayer=replayer, trusted=engines.trusts, strict=strict, keys=keys)
     with ExitStack() as held:  # kept open to the end, so that retention deletes none meanwhile
-        files = [held.enter_context(open_recording(path)) for path in given.paths]
-        for path, file in zip(given.paths, files, strict=True):
-            checked = audit_file(path, file, replayed, strict=strict, keys=keys)
-            audited.append(checked.verdict)
-            links.append(checked.link)
-            said += checked.deleted
+        for path in given.paths:
+            held.enter_context(open_recording(path))
+        checked = list(for_each(work, given.paths, jobs))
+    audited, links = [one.verdict for one in checked], [one.link for one in checked]
+    faults = link_replays([one.replayed for one in checked])
+    said = [deleted for one in checked for deleted in one.deleted]  # recordings that retention deleted
     pruned = [event for verdict in audited for event in verdict.replay.pruned]
     if given.directory is not None:
         gateway = next((link.gateway for link in links if link.gateway), "")
         said += statements(given.directory, gateway, keys)[0]
     gone = merged([*said, *((event.first_file, event.last_file) for event in pruned)])
-    for index, fault in chain_faults(links, pruned, gone, from_first=given.up_to is not None):
+    for index, fault in [*faults, *chain_faults(links, pruned, gone, from_first=given.up_to is not None)]:
         audited[index].reasons.append(fault)
     for verdict in audited:
-        verdict.ok = not verdict.reasons
+        conclude(verdict, strict=strict)
     return audited, links, gone
 
 
@@ -172,9 +199,12 @@ def describe(file: AuditedFile) -> list[str]:
     """The verdict as text: one line, and one more line for each reason and note."""
     replay = file.replay
     how = f"equal within {replay.tolerance:g}" if replay.tolerance else "equal bit for bit"
-    verdict = f"passed, {replay.results} results {how}" if file.ok else "FAILED"
+    how = how if replay.by_own_engine else "nearly equal"
+    passed = f"passed, {replay.results} results {how}"
+    needed = f"not decided: needs engine {replay.engine or '(not named)'}"
+    verdict = passed if file.ok else "FAILED" if file.reasons else needed
     lines = [f"{file.path}: {verdict}; {file.size} bytes, {file.chunks} chunks, {replay.events} events replayed"]
     lines[0] += f", {file.signed_results} results signed" if file.signed_results else ""
-    lines += [f"  {reason}" for reason in file.reasons]
+    lines += [f"  {reason}" for reason in (*file.reasons, *file.undecided)]
     lines += [f"  note: {note}" for note in file.notes if note not in file.reasons]
     return lines

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import click
 import msgspec
 
+from agent.audit.engines import Engines
+from agent.audit.parallel import for_each
+from agent.audit.replaying import Replayed, ReplayedFile, Replayer, link
+from agent.cli.engine_options import ENGINES, JOBS, TRUST_ENGINE, engines_for
 from agent.cli.kernels import compute_as_in
 from agent.core.events import CalibrationUpdate
-from agent.recording.replaying import Replay, ReplayedFile, Restore
 from agent.terminal.text import say
 
 SHOWN = 12  # calibrations shown in the table; `--json` gives all
@@ -20,32 +24,39 @@ SHOWN = 12  # calibrations shown in the table; `--json` gives all
 
 @click.command()
 @click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="FILE.mcap...")
+@ENGINES
+@TRUST_ENGINE
+@JOBS
 @click.option("--json", "json_to", type=click.Choice(["-"]), help="Print one JSON object on standard output.")
-def replay(files: tuple[Path, ...], json_to: str | None) -> int:
+def replay(
+    files: tuple[Path, ...], engines: tuple[Path, ...], trusted: tuple[str, ...], jobs: int, json_to: str | None
+) -> int:
     """Run recordings through the pipeline, in the order given, and print the calibrations.
 
-    Exit status: 0 the computed results equal the recorded ones bit for bit, 3 they do not, 2 a file cannot be read.
+    Exit status: 0 the computed results equal the recorded ones bit for bit, 3 they do not, 4 another engine made the
+    recorded ones and they differ, 2 a file cannot be read.
     """
     from agent.core.pipeline import Pipeline
 
     compute_as_in(files[0])
-    return run_replay(files, Pipeline.restore, as_json=json_to is not None)
+    chosen = engines_for(Pipeline.restore, files, engines, trusted)
+    return run_replay(files, chosen, as_json=json_to is not None, jobs=jobs)
 
 
-def run_replay(files: Sequence[Path], restore: Restore, *, as_json: bool) -> int:
+def run_replay(files: Sequence[Path], engines: Engines, *, as_json: bool, jobs: int = 1) -> int:
     """Replay the files, print the calibrations, and return the exit status."""
     from agent.recording.fingerprint import fingerprint
 
-    replayed = Replay(restore, fingerprint(), elsewhere=0.0)
-    unreadable = []
-    for path in files:
-        try:
-            file = replayed.run(path)
-        except OSError as error:
-            unreadable.append(f"{path}: {error.strerror or error}")
-            continue
-        if not file.events:
-            unreadable.append(f"{path}: {file.fault or 'not a recording made by fieldcal'}")
+    replayer = Replayer(engines, fingerprint(), elsewhere=0.0)
+    replayed, unreadable = [], []
+    for path, one in zip(files, for_each(partial(_replayed, replayer), files, jobs), strict=True):
+        if isinstance(one, str):
+            unreadable.append(one)
+        elif not one.file.events:
+            unreadable.append(f"{path}: {one.file.fault or 'not a recording made by fieldcal'}")
+        if isinstance(one, Replayed):
+            replayed.append(one)
+    link(replayed)
     if as_json:
         click.echo(msgspec.json.encode(as_object(replayed)).decode())
     elif not unreadable:
@@ -54,27 +65,37 @@ def run_replay(files: Sequence[Path], restore: Restore, *, as_json: bool) -> int
         say(line, err=True)
     if unreadable:
         return 2
-    corrupt = any(file.fault and file.fault.kind == "corrupt" for file in replayed.files)
-    return 0 if all(file.equal for file in replayed.files) and not corrupt else 3
+    found = [one.file for one in replayed]
+    if any((file.by_own_engine and not file.equal) or (file.fault and file.fault.kind == "corrupt") for file in found):
+        return 3
+    return 0 if all(file.equal for file in found) else 4
 
 
-def as_object(replayed: Replay) -> dict[str, Any]:
+def _replayed(replayer: Replayer, path: Path) -> Replayed | str:
+    """The replay of a file; why it cannot be read."""
+    try:
+        return replayer.run(path)
+    except OSError as error:
+        return f"{path}: {error.strerror or error}"
+
+
+def as_object(replayed: Sequence[Replayed]) -> dict[str, Any]:
     """The object that `--json -` prints."""
-    files = replayed.files
+    files = [one.file for one in replayed]
     return {
         "files": files,
         "runs": list(dict.fromkeys(file.run_id for file in files)),
-        "calibrations": replayed.calibrations,
-        "windows": replayed.windows,
+        "calibrations": [update for one in replayed for update in one.calibrations],
+        "windows": [window for one in replayed for window in one.windows],
         "equal": bool(files) and all(file.equal for file in files),
-        "first_difference": replayed.first_difference,
+        "first_difference": next((file.first_difference for file in files if file.first_difference), None),
         "events": sum(file.events for file in files),
         "results": sum(file.results for file in files),
         "torn": [file.path for file in files if file.fault],
     }
 
 
-def _print(replayed: Replay) -> None:
+def _print(replayed: Sequence[Replayed]) -> None:
     from rich import box
     from rich.table import Table
 
@@ -84,13 +105,14 @@ def _print(replayed: Replay) -> None:
     table = Table(box=box.SIMPLE, title="Calibrations, with expanded uncertainty")
     for name in ("sensor", "result", "windows", "Sxx", "Syy", "Szz", "Qx", "Qy", "Qz", "unit"):
         table.add_column(name, overflow="fold")
-    for update in replayed.calibrations[-SHOWN:]:
+    calibrations = [update for one in replayed for update in one.calibrations]
+    for update in calibrations[-SHOWN:]:
         table.add_row(update.sensor, str(update.sequence), str(update.windows), *_cells(update), update.output_unit)
     console.print(table)
-    if len(replayed.calibrations) > SHOWN:
-        console.print(f"only the last {SHOWN} of {len(replayed.calibrations)} calibrations are shown; --json - has all")
-    for file in replayed.files:
-        for line in describe(file):
+    if len(calibrations) > SHOWN:
+        console.print(f"only the last {SHOWN} of {len(calibrations)} calibrations are shown; --json - has all")
+    for one in replayed:
+        for line in describe(one.file):
             say(line)
 
 
@@ -102,6 +124,9 @@ def describe(file: ReplayedFile) -> list[str]:
         lines.append(f"  cannot be replayed: {file.refused}")
     elif file.first_difference:
         lines.append(f"  results differ after {file.different} events, first {file.first_difference}")
+    elif file.departure is not None:
+        made = f"engine {file.engine}" if file.engine else "a version that does not name its engine"
+        lines.append(f"  made by {made}; by engine {file.replayed_by} {file.departure}")
     elif not file.results:
         lines.append("  no results were recorded, and none were computed")
     elif file.tolerance:

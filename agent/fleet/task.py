@@ -10,15 +10,16 @@ from typing import Any
 import msgspec
 
 from agent import __version__
+from agent.audit.auditing import AuditedFile, audit_file, conclude
+from agent.audit.comparison import OTHER_CPU
+from agent.audit.engines import Engines, as_if_own
+from agent.audit.replaying import PipelineLike, Replayed, ReplayedFile, Replayer
 from agent.core.events import CalibrationUpdate, WindowReport
 from agent.export.samples import ExportError
 from agent.fleet.exporting import Exported, exported
 from agent.fleet.settings import Setting, SettingError, changed_config
 from agent.fleet.sources import SourceError, local
-from agent.recording.auditing import AuditedFile, audit_file
-from agent.recording.comparison import OTHER_CPU
 from agent.recording.reading import open_recording
-from agent.recording.replaying import PipelineLike, Replay, ReplayedFile
 
 UNCHANGED = b""  # in place of a result: the one that is known still holds
 
@@ -81,16 +82,17 @@ def _result(task: Task) -> FileResult | None:
                 return result
             settings = [Setting.of(text) for text in task.settings]
             if task.audit:
-                file.seek(0)
-                replayed = Replay(_recorded, here, elsewhere=OTHER_CPU)
-                verdict = audit_file(path, file, replayed).verdict
-                verdict.ok, verdict.path = not verdict.reasons, task.place
-                result.audited, result.reasons = verdict, list(verdict.reasons)
+                engines = Engines(_recorded)
+                audited = audit_file(path, replayer=Replayer(engines, here, OTHER_CPU), trusted=engines.trusts)
+                verdict, replayed = audited.verdict, audited.replayed
+                conclude(verdict, strict=False)
+                verdict.path = task.place
+                result.audited, result.reasons = verdict, [*verdict.reasons, *verdict.undecided]
             if settings:
                 replayed = _recomputed(path, settings, here, result)
             elif not task.audit:
-                replayed = Replay(_recorded, here, elsewhere=OTHER_CPU)
-                result.reasons += _reasons(replayed.run(path))
+                replayed = Replayer(Engines(_recorded), here, OTHER_CPU).run(path)
+                result.reasons += _reasons(replayed.file)
     except (SourceError, SettingError) as error:
         result.reasons.append(str(error).removeprefix(f"{task.place}: "))
         return result
@@ -100,7 +102,7 @@ def _result(task: Task) -> FileResult | None:
     except OSError as error:
         result.reasons.append(f"cannot be read: {error.strerror or error}")
         return result
-    result.replayed = replayed.files[-1]
+    result.replayed = replayed.file
     result.replayed.path = task.place
     if result.replayed.first_difference is not None:
         result.replayed.first_difference = msgspec.structs.replace(result.replayed.first_difference, file=task.place)
@@ -108,7 +110,7 @@ def _result(task: Task) -> FileResult | None:
     return result
 
 
-def _recomputed(path: Path, settings: Sequence[Setting], here: dict[str, str], result: FileResult) -> Replay:
+def _recomputed(path: Path, settings: Sequence[Setting], here: dict[str, str], result: FileResult) -> Replayed:
     """The replay under changed settings: other results than the recorded ones are what was asked for."""
     from agent.core.anew import anew
     from agent.core.pipeline import Pipeline
@@ -123,8 +125,8 @@ def _recomputed(path: Path, settings: Sequence[Setting], here: dict[str, str], r
             raise
         return Pipeline.restore(config.model_dump_json(), anew(config, snapshot))
 
-    replayed = Replay(restore, here, elsewhere=0.0)
-    file = replayed.run(path)
+    replayed = Replayer(as_if_own(restore), here, elsewhere=0.0).run(path)
+    file = replayed.file
     if refused:
         raise refused[0]
     file.different, file.first_difference = 0, None
@@ -143,6 +145,8 @@ def _reasons(file: ReplayedFile) -> list[str]:
     if not file.events:
         return [str(file.fault or "not a recording made by fieldcal")]
     reasons = [f"cannot be replayed: {file.refused}"] if file.refused else []
+    if file.departure is not None and not file.departure.near:
+        reasons.append(f"made by engine {file.engine or '(not named)'}; by engine {file.replayed_by} {file.departure}")
     if file.first_difference is not None:
         reasons.append(f"results differ after {file.different} events, first {file.first_difference}")
     if file.fault is not None and file.fault.kind == "corrupt":

@@ -28,11 +28,14 @@ from agent.recording.records import ChunkMessage, Fault, Record, RecordError, co
 class Step:
     """An event and the results recorded for it.
 
-    `complete`: something was recorded after them, or the file was closed; otherwise results may be missing.
+    `schema`, `data`: name of the event's message and its bytes. `complete`: something was recorded after the results,
+    or the file was closed; otherwise results may be missing.
     """
 
     event_sequence: int
     event: Event
+    schema: str
+    data: bytes
     results: list[Output] = field(default_factory=list)
     complete: bool = False
 
@@ -55,7 +58,7 @@ class RecordingReader:
         step: Step | None = None
         try:
             with open_recording(self.path) as file:
-                for record, number, item in self._items(file):
+                for record, number, item, schema, data in self._items(file):
                     if isinstance(item, Output):
                         if step is None or number != step.event_sequence:
                             raise refusal(record, f"a result of event {number} does not follow that event")
@@ -67,7 +70,7 @@ class RecordingReader:
                     if step is not None:
                         step.complete = True
                         yield step
-                    step = Step(number, item)
+                    step = Step(number, item, schema, data)
         except RecordError as error:
             self.fault = error.fault
         if step is not None:
@@ -83,8 +86,8 @@ class RecordingReader:
             expected = before.event_sequence + 1
             raise refusal(record, f"event {number} follows event {before.event_sequence}; expected event {expected}")
 
-    def _items(self, file: BinaryIO) -> Iterator[tuple[Record, int, Event | Output]]:
-        """Yield (chunk record, event sequence, event or result) for every message."""
+    def _items(self, file: BinaryIO) -> Iterator[tuple[Record, int, Event | Output, str, bytes]]:
+        """Yield (chunk record, event sequence, event or result, schema name, message) for every message."""
         budget = Budget()
         for record in walk(file, os.fstat(file.fileno()).st_size):
             if record.opcode == Opcode.CHUNK:
@@ -99,7 +102,7 @@ class RecordingReader:
                 raise refusal(record, "a message outside a chunk; a recording has messages only in chunks")
             self.good_bytes = record.end
 
-    def _item(self, record: Record, message: ChunkMessage) -> tuple[int, Event | Output]:
+    def _item(self, record: Record, message: ChunkMessage) -> tuple[int, Event | Output, str, bytes]:
         channel = self._channels.get(message.channel_id)
         schema = self._schemas.get(channel.schema_id) if channel else None
         if channel is None or schema is None:
@@ -110,7 +113,7 @@ class RecordingReader:
             raise refusal(record, f"{channel.topic}: {error}") from None
         if topic_of(item) != channel.topic or number & 0xFFFFFFFF != message.sequence:
             raise refusal(record, f"{channel.topic}: the message says topic {topic_of(item)} and event {number}")
-        return number, item
+        return number, item, schema.name, message.data
 
 
 def open_recording(path: Path) -> BufferedReader:

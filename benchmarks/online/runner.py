@@ -12,6 +12,7 @@ from agent import __version__
 from agent.config import Config
 from agent.core.events import Acceleration, DeviceChange, Event, Result, RunStart, Tick
 from agent.core.pipeline import Pipeline
+from agent.engine import identity
 from agent.recording.fingerprint import fingerprint, versions
 from agent.recording.writer import Recorder
 from hw.block import DeviceInfo, SampleBlock
@@ -46,9 +47,9 @@ class Run:
                 run_id="run-1", site=config.gateway.site, gateway=config.gateway.name, boot_id="boot",
                 t_monotonic_ns=0, t_utc_ns=EPOCH_NS, config_json=config.model_dump_json(),
                 versions={"fieldcal": __version__, **versions()}, fingerprint=fingerprint(),
-                snapshot=self.pipeline.snapshot(), file_sequence=1, event_sequence=0,
+                snapshot=self.pipeline.snapshot(), file_sequence=1, event_sequence=0, engine=identity.name(),
             )  # fmt: skip
-            self._record(start, [])
+            self._record(start, self.pipeline.step(start))
 
     @property
     def now_s(self) -> float:

@@ -13,13 +13,13 @@ from typing import Any
 
 import pytest
 
+from agent.audit.replaying import ReplayedFile
 from agent.cli import probe
 from agent.cli.audit import describe as describe_audit
 from agent.cli.main import run_cli
 from agent.core.events import StatusChange
 from agent.delivery.history import Record
 from agent.delivery.store import Store
-from agent.recording.replaying import ReplayedFile
 from agent.terminal.console import TextConsole
 from agent.terminal.screen import Picture
 from agent.terminal.state import DeviceState, ViewState

@@ -11,6 +11,8 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from agent.audit.engines import Engines
+from agent.audit.replaying import Replayer
 from agent.core.events import CalibrationUpdate
 from agent.core.pipeline import Pipeline
 from agent.delivery.consumer import Received
@@ -18,7 +20,6 @@ from agent.delivery.history import FILE_NAME, History, Record, StoreError
 from agent.delivery.store import Store
 from agent.recording.fingerprint import fingerprint
 from agent.recording.reading import RecordingReader
-from agent.recording.replaying import Replay
 from tests.faults.rig import OFFSET, SENSITIVITY
 from tests.scenarios.processes import recordings
 
@@ -137,8 +138,7 @@ class Ledger:
                 continue
             self._replayed[name] = size
             found.recordings += 1
-            replay = Replay(Pipeline.restore, fingerprint(), elsewhere=0.0)
-            file = replay.run(path)
+            file = Replayer(Engines(Pipeline.restore), fingerprint(), elsewhere=0.0).run(path).file
             expected = {
                 r.sequence: r for r in self.records if r.recorded and r.recording.removesuffix(".active") == name
             }

@@ -19,12 +19,13 @@ import msgspec
 
 os.environ["OPENBLAS_NUM_THREADS"] = "1"  # as in every entry point of the product; must be set before numpy is loaded
 
+from agent.audit.engines import Engines
+from agent.audit.replaying import Replayer
 from agent.core.events import DeviceChange, Event
 from agent.core.pipeline import Pipeline
 from agent.core.snapshot import VERSION
 from agent.recording.fingerprint import fingerprint
 from agent.recording.reading import RecordingReader
-from agent.recording.replaying import Replay
 from benchmarks.online.clamp import blocks
 from benchmarks.online.runner import ticked
 from hw.block import SampleBlock
@@ -41,8 +42,8 @@ DURATION_S, SEED = 27.0, 1
 
 def results_of(path: Path) -> list[dict[str, Any]]:
     """All results of a replay, in order, as they are after JSON encoding and decoding."""
-    replay = Replay(Pipeline.restore, fingerprint(), elsewhere=0.0)
-    file = replay.run(path)
+    replay = Replayer(Engines(Pipeline.restore), fingerprint(), elsewhere=0.0).run(path)
+    file = replay.file
     assert not file.refused, file.refused
     assert file.fault is None
     found = sorted([*replay.windows, *replay.calibrations], key=lambda result: result.sequence)

@@ -21,6 +21,8 @@ from agent.core.events import (
     Tick,
     WindowReport,
 )
+from agent.core.memory import Memory
+from agent.engine import identity
 from agent.recording.fingerprint import fingerprint
 from agent.recording.writer import Recorder
 from hw.block import BlockFlags, SampleBlock
@@ -55,6 +57,9 @@ class StandIn:
     def snapshot(self) -> bytes:
         names = ("run_id", "sequence", "blocks", "windows")
         return msgspec.msgpack.encode({name: vars(self)[name] for name in names} | {"sums": self.sums.tobytes()})
+
+    def all_memories(self) -> list[Memory]:
+        return []
 
     def step(self, event: Event) -> list[Result]:
         if isinstance(event, RunStart):
@@ -165,6 +170,7 @@ def run_start(pipeline: StandIn, event_sequence: int, file_sequence: int, now_ns
         file_sequence=file_sequence,
         event_sequence=event_sequence,
         continuation=event_sequence > 0,
+        engine=identity.name(),
     )
 
 

@@ -11,6 +11,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
 
+from agent.audit.engines import Engines
 from agent.cli.audit import audit, audit_files, recordings_of, run_audit
 from agent.config.key_file import KeyFileError
 from agent.config.known_keys import KnownKeys
@@ -73,7 +74,7 @@ def said(directory: Path, **options: object) -> tuple[int, str]:
 def said_of(paths: list[Path], **options: object) -> tuple[int, str]:
     runner = CliRunner()
     with runner.isolation() as (out, _, _):
-        status = run_audit(recordings_of(paths), StandIn.restore, as_json=False, **options)  # type: ignore[arg-type]
+        status = run_audit(recordings_of(paths), Engines(StandIn.restore), as_json=False, **options)  # type: ignore[arg-type]
         return status, out.getvalue().decode()
 
 
@@ -123,7 +124,7 @@ def test_what_was_taken_is_missed(tmp_path: Path, limit: KeepFiles) -> None:
 def test_a_file_in_the_place_of_the_last_deleted_is_seen(tmp_path: Path, limit: KeepFiles) -> None:
     record(tmp_path, keep=limit)
     files = [path for _, path in recordings(tmp_path)]
-    (file,) = audit_files(recordings_of(files[-1:]), StandIn.restore)
+    (file,) = audit_files(recordings_of(files[-1:]), Engines(StandIn.restore))
     pruned = file.replay.pruned[-1]
     assert pruned.last_file + 1 == names(tmp_path)[0]
     first = files[0]
@@ -166,7 +167,7 @@ def test_a_file_closed_after_a_crash_passes_and_is_counted(tmp_path: Path) -> No
     assert said(tmp_path, strict=True)[0] == 3
     runner = CliRunner()
     with runner.isolation() as (out, _, _):
-        assert run_audit(recordings_of([tmp_path]), StandIn.restore, as_json=True) == 0
+        assert run_audit(recordings_of([tmp_path]), Engines(StandIn.restore), as_json=True) == 0
         assert json.loads(out.getvalue())["unsealed"] == 1
 
 

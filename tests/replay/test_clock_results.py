@@ -7,10 +7,10 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from agent.audit.engines import Engines
 from agent.cli.audit import Given, run_audit
 from agent.core.events import ClockReport, Result, RunStart, Tick
 from agent.core.pipeline import Pipeline
-from agent.core.snapshot import pack, unpack
 from agent.delivery.history import FILE_NAME, History
 from agent.recording.files import recordings
 from agent.recording.reading import RecordingReader
@@ -34,7 +34,7 @@ def entries(run: Path) -> list[Recorded]:
 
 
 def audit(path: Path) -> int:
-    return run_audit(Given([path]), Pipeline.restore, as_json=False)
+    return run_audit(Given([path]), Engines(Pipeline.restore), as_json=False)
 
 
 def test_clock_results_are_recorded_stored_and_follow_from_the_data(
@@ -64,24 +64,6 @@ def test_a_clock_result_that_does_not_follow_from_the_data_is_found(
 
 def _halved(result: Result) -> Result:
     return msgspec.structs.replace(result, jitter_s=result.jitter_s / 2) if isinstance(result, ClockReport) else result
-
-
-def test_a_recording_of_a_version_without_clock_results_is_sound(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """A recording as the version before clock results wrote it: neither its snapshot nor its results have any."""
-
-    def before(entry: Recorded) -> Recorded:
-        number, event, results = entry
-        if isinstance(event, RunStart):
-            state = unpack(event.snapshot)
-            for channel in state["channels"].values():
-                del channel["clock_due_s"]
-            event = msgspec.structs.replace(event, snapshot=pack(state))
-        return number, event, [result for result in results if not isinstance(result, ClockReport)]
-
-    path = record_again(tmp_path / "older", entries(run), before)
-    assert audit(path) == 0, capsys.readouterr().out
 
 
 @pytest.mark.parametrize("directory", [f for f in FORMATS if f.name == "format-1"], ids=lambda path: path.name)

@@ -11,15 +11,15 @@ import msgspec
 import numpy as np
 import pytest
 
-from agent import __version__
+from agent.audit.comparison import OTHER_CPU
+from agent.audit.engines import Engines
+from agent.audit.replaying import Replayed, ReplayedFile, Replayer, link
 from agent.cli.replay import run_replay
 from agent.core.events import CalibrationUpdate, Event, Result, RunStart, StatusChange, WindowReport
-from agent.recording.comparison import OTHER_CPU
 from agent.recording.files import recordings
 from agent.recording.fingerprint import fingerprint
 from agent.recording.messages import encode
 from agent.recording.records import walk
-from agent.recording.replaying import Replay, ReplayedFile
 from agent.recording.writer import Recorder
 from tests.replay.stand_in import CONFIG, SECOND, Recorded, StandIn, happenings, record_run, run_start
 
@@ -31,11 +31,11 @@ def files_of(directory: Path) -> list[Path]:
     return [path for _, path in recordings(directory)]
 
 
-def replayed(files: list[Path], restore: Callable[[str, bytes], StandIn] = StandIn.restore) -> Replay:
-    replay = Replay(restore, fingerprint(), elsewhere=0.0)
-    for path in files:
-        replay.run(path)
-    return replay
+def replayed(files: list[Path], restore: Callable[[str, bytes], StandIn] = StandIn.restore) -> list[Replayed]:
+    replayer = Replayer(Engines(restore), fingerprint(), elsewhere=0.0)
+    found = [replayer.run(path) for path in files]
+    link(found)
+    return found
 
 
 def record_again(path: Path, recorded: list[Recorded], alter: Callable[[Recorded], Recorded]) -> Path:
@@ -50,9 +50,9 @@ def record_again(path: Path, recorded: list[Recorded], alter: Callable[[Recorded
 
 def test_a_run_replays_to_the_same_results(tmp_path: Path) -> None:
     recorded = record_run(tmp_path, blocks=BLOCKS)
-    replay = replayed(files_of(tmp_path))
-    assert replay.first_difference is None
-    (file,) = replay.files
+    (replay,) = replayed(files_of(tmp_path))
+    file = replay.file
+    assert file.first_difference is None
     results = [result for _, _, results in recorded for result in results]
     assert (file.events, file.results, file.equal) == (len(recorded), len(results), True)
     windows = [result for result in results if isinstance(result, WindowReport)]
@@ -66,13 +66,13 @@ def test_each_file_alone_and_all_in_chain(tmp_path: Path) -> None:
     recorded = record_run(tmp_path, blocks=BLOCKS, rotate_at=ROTATIONS)
     files = files_of(tmp_path)
     assert len(files) == 1 + len(ROTATIONS)
-    chain = replayed(files)
-    assert [file.in_chain for file in chain.files] == [False, True, True, True]
-    assert all(file.equal for file in chain.files)
-    assert not any(file.notes for file in chain.files)
-    alone = [replayed([path]).files[0] for path in files]
+    chain = [one.file for one in replayed(files)]
+    assert [file.in_chain for file in chain] == [False, True, True, True]
+    assert all(file.equal for file in chain)
+    assert not any(file.notes for file in chain)
+    alone = [replayed([path])[0].file for path in files]
     assert all(file.equal for file in alone)
-    for counted in (chain.files, alone):
+    for counted in (chain, alone):
         assert sum(file.events for file in counted) == len(recorded)
         assert sum(file.results for file in counted) == sum(len(results) for _, _, results in recorded)
 
@@ -84,16 +84,16 @@ def test_restoring_equals_going_on_at_every_event(tmp_path: Path) -> None:
         directory.mkdir()
         record_run(directory, blocks=8, rotate_at=(at,))
         _, second = files_of(directory)
-        assert replayed([second]).files[0].equal
+        assert replayed([second])[0].file.equal
 
 
 def test_a_missing_file_is_told_and_the_next_starts_from_its_own_snapshot(tmp_path: Path) -> None:
     record_run(tmp_path, blocks=BLOCKS, rotate_at=ROTATIONS)
     first, _, third, _ = files_of(tmp_path)
-    replay = replayed([first, third])
-    assert not replay.files[1].in_chain
-    assert replay.files[1].equal
-    assert replay.files[1].notes == ["events 9 to 19 are in none of these files"]
+    second = replayed([first, third])[1].file
+    assert not second.in_chain
+    assert second.equal
+    assert second.notes == ["events 9 to 19 are in none of these files"]
 
 
 def test_a_state_that_does_not_go_on_is_a_difference(tmp_path: Path) -> None:
@@ -104,10 +104,10 @@ def test_a_state_that_does_not_go_on_is_a_difference(tmp_path: Path) -> None:
     pipeline.sums[0, 0] = np.nextafter(0.0, 1.0)  # the state changes between the files without an event
     recorder.record(1, run_start(pipeline, 1, 2), [])
     recorder.close()
-    replay = replayed(files_of(tmp_path))
-    assert [file.equal for file in replay.files] == [True, False]
-    assert replay.first_difference is not None
-    assert replay.first_difference.what == "snapshot"
+    first, second = (one.file for one in replayed(files_of(tmp_path)))
+    assert (first.equal, second.equal) == (True, False)
+    assert second.first_difference is not None
+    assert second.first_difference.what == "snapshot"
 
 
 def test_a_file_cut_anywhere_replays_up_to_its_last_good_record(tmp_path: Path) -> None:
@@ -118,7 +118,7 @@ def test_a_file_cut_anywhere_replays_up_to_its_last_good_record(tmp_path: Path) 
     seen = set()
     for size in range(0, len(data), 101):
         cut.write_bytes(data[:size])
-        (file,) = replayed([cut]).files
+        file = replayed([cut])[0].file
         assert file.fault is not None
         assert file.fault.kind == "torn"
         assert file.good_bytes <= size
@@ -136,8 +136,8 @@ def test_results_lost_with_the_tail_are_no_difference(tmp_path: Path) -> None:
     torn, whole = tmp_path / "torn.mcap", tmp_path / "whole.mcap"
     torn.write_bytes(data[:-60])
     whole.write_bytes(data)
-    assert replayed([torn]).files[0].equal
-    assert not replayed([whole]).files[0].equal
+    assert replayed([torn])[0].file.equal
+    assert not replayed([whole])[0].file.equal
 
 
 def alter_number(entry: Recorded) -> Recorded:
@@ -177,15 +177,15 @@ def test_altered_recordings_with_sound_sums_do_not_pass(
 ) -> None:
     recorded = record_run(tmp_path, blocks=BLOCKS)
     path = record_again(tmp_path / "again", recorded, alter)
-    assert run_replay([path], StandIn.restore, as_json=False) == 3
+    assert run_replay([path], Engines(StandIn.restore), as_json=False) == 3
     assert "results differ after" in capsys.readouterr().out
 
 
 def test_a_file_after_one_that_differs_is_judged_by_itself(tmp_path: Path) -> None:
     recorded = record_run(tmp_path, blocks=BLOCKS, rotate_at=(9,))
     record_again(tmp_path / "again", recorded, alter_data)
-    replay = replayed(files_of(tmp_path / "again"))
-    assert [(file.equal, file.in_chain) for file in replay.files] == [(False, False), (True, False)]
+    found = replayed(files_of(tmp_path / "again"))
+    assert [(one.file.equal, one.file.in_chain) for one in found] == [(False, False), (True, False)]
 
 
 def test_a_recording_from_elsewhere_is_compared_within_the_tolerance(tmp_path: Path) -> None:
@@ -199,23 +199,9 @@ def test_a_recording_from_elsewhere_is_compared_within_the_tolerance(tmp_path: P
 
     path = record_again(tmp_path / "again", recorded, elsewhere)
     for tolerance, equal in ((OTHER_CPU, True), (0.0, False)):
-        replay = Replay(StandIn.restore, fingerprint(), elsewhere=tolerance)
-        assert replay.run(path).equal == equal
-        assert "another blas_kernel" in replay.files[0].notes[0]
-
-
-@pytest.mark.parametrize(("version", "equal"), [("0.0.9", True), (__version__, False)])
-def test_reasons_that_another_version_worded_are_not_compared(tmp_path: Path, version: str, equal: bool) -> None:
-    def older(entry: Recorded) -> Recorded:
-        number, event, results = entry
-        if isinstance(event, RunStart):
-            event = msgspec.structs.replace(event, versions={"fieldcal": version})
-        said = [r for r in results if isinstance(r, WindowReport)]
-        return number, event, [msgspec.structs.replace(r, reason="so") if r in said else r for r in results]
-
-    path = record_again(tmp_path / "again", record_run(tmp_path, blocks=BLOCKS), older)
-    [file] = replayed([path]).files
-    assert (file.equal, len(file.notes)) == (equal, int(equal))
+        file = Replayer(Engines(StandIn.restore), fingerprint(), elsewhere=tolerance).run(path).file
+        assert file.equal == equal
+        assert "another blas_kernel" in file.notes[0]
 
 
 def test_after_an_undecidable_decision_the_next_snapshot_leads_back(tmp_path: Path) -> None:
@@ -235,8 +221,8 @@ def test_after_an_undecidable_decision_the_next_snapshot_leads_back(tmp_path: Pa
             results = [refused_by_a_hair(r) if isinstance(r, WindowReport) else r for r in results]
         recorder.record(number, event, results)
     recorder.close()
-    replay = Replay(OnTheEdge.restore, fingerprint(), elsewhere=OTHER_CPU)
-    first, second = (replay.run(path) for path in files_of(directory))
+    replayer = Replayer(Engines(OnTheEdge.restore), fingerprint(), elsewhere=OTHER_CPU)
+    first, second = (replayer.run(path).file for path in files_of(directory))
     assert (first.undecidable, first.different, first.equal) == (1, 0, True)
     assert any("undecidable on this machine" in note for note in first.notes)
     assert (second.undecidable, second.different, second.equal) == (0, 0, True)
@@ -284,7 +270,7 @@ class WithNumpy(StandIn):
 
 def test_numpy_scalars_in_results_are_no_difference(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     record_run(tmp_path, blocks=BLOCKS)
-    assert run_replay(files_of(tmp_path), WithNumpy.restore, as_json=True) == 0
+    assert run_replay(files_of(tmp_path), Engines(WithNumpy.restore), as_json=True) == 0
     assert json.loads(capsys.readouterr().out)["equal"]
 
 
@@ -301,13 +287,13 @@ def test_a_run_start_that_does_not_restore_is_refused_with_its_reason(
         return number, event, results
 
     path = record_again(tmp_path / "again", recorded, spoil)
-    assert run_replay([path], StandIn.restore, as_json=False) == 3
+    assert run_replay([path], Engines(StandIn.restore), as_json=False) == 3
     assert "cannot be replayed: no pipeline can be made from its configuration and snapshot" in capsys.readouterr().out
 
 
 def test_json_says_all_and_is_all_of_the_output(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     recorded = record_run(tmp_path, blocks=BLOCKS, rotate_at=(9,))
-    assert run_replay(files_of(tmp_path), StandIn.restore, as_json=True) == 0
+    assert run_replay(files_of(tmp_path), Engines(StandIn.restore), as_json=True) == 0
     said = json.loads(capsys.readouterr().out)
     assert (said["equal"], said["first_difference"], said["runs"], said["torn"]) == (True, None, ["run-1"], [])
     assert said["events"] == len(recorded)
@@ -325,11 +311,11 @@ def test_what_is_no_recording_is_bad_input(
     path = tmp_path / "x.mcap"
     if content is not None:
         path.write_bytes(content)
-    assert run_replay([path], StandIn.restore, as_json=False) == 2
+    assert run_replay([path], Engines(StandIn.restore), as_json=False) == 2
     said = capsys.readouterr()
     assert said.err.count("\n") == 1
     assert str(path) in said.err
-    assert run_replay([tmp_path], StandIn.restore, as_json=True) == 2
+    assert run_replay([tmp_path], Engines(StandIn.restore), as_json=True) == 2
 
 
 def test_damage_inside_is_a_refusal_and_a_torn_tail_is_not(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -337,10 +323,10 @@ def test_damage_inside_is_a_refusal_and_a_torn_tail_is_not(tmp_path: Path, capsy
     (path,) = files_of(tmp_path)
     data = bytearray(path.read_bytes())
     path.write_bytes(data[:-2000])
-    assert run_replay([path], StandIn.restore, as_json=False) == 0
+    assert run_replay([path], Engines(StandIn.restore), as_json=False) == 0
     assert "ends early at byte" in capsys.readouterr().out
     chunk = [record for record in walk(io.BytesIO(data), len(data)) if record.name == "Chunk"][2]
     data[chunk.end - 20] ^= 1
     path.write_bytes(data)
-    assert run_replay([path], StandIn.restore, as_json=False) == 3
+    assert run_replay([path], Engines(StandIn.restore), as_json=False) == 3
     assert f"damaged at byte {chunk.offset} (Chunk)" in capsys.readouterr().out

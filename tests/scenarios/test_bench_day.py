@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from agent.audit.engines import Engines
+from agent.audit.replaying import Replayer
 from agent.core.events import WindowReport
 from agent.core.pipeline import Pipeline
 from agent.recording.fingerprint import fingerprint
-from agent.recording.replaying import Replay
 from benchmarks.online import bench
 from benchmarks.online.clamp import bench_events
 from benchmarks.online.runner import Run
@@ -110,8 +111,7 @@ def test_its_recording_replays_bit_for_bit(positions: str, tmp_path: Path) -> No
     run.close()
     assert sum(isinstance(r, WindowReport) for r in results) >= 2
     (path,) = tmp_path.glob("*.mcap")
-    replay = Replay(Pipeline.restore, fingerprint(), elsewhere=0.0)
-    found = replay.run(path)
-    assert replay.first_difference is None
+    found = Replayer(Engines(Pipeline.restore), fingerprint(), elsewhere=0.0).run(path).file
+    assert found.first_difference is None
     assert found.equal
     assert found.results == len(results)

@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from agent.audit.engines import Engines
+from agent.audit.replaying import Replayer
 from agent.config import Config
 from agent.core.events import Event, Result, RunStart
 from agent.core.pipeline import Pipeline
 from agent.recording.fingerprint import fingerprint
 from agent.recording.reading import RecordingReader
-from agent.recording.replaying import Replay
 from benchmarks.online import harm, year
 from benchmarks.online.node import Timing, node
 from benchmarks.online.runner import Run, visits
@@ -43,9 +44,8 @@ def test_a_recording_replays_bit_for_bit(name: str, tmp_path: Path) -> None:
     building, config = WORLDS[name]
     recorded = played(Run(config, tmp_path), visits(building, range(TIMING.windows)))
     (path,) = tmp_path.glob("*.mcap")
-    replay = Replay(Pipeline.restore, fingerprint(), elsewhere=0.0)
-    found = replay.run(path)
-    assert replay.first_difference is None
+    found = Replayer(Engines(Pipeline.restore), fingerprint(), elsewhere=0.0).run(path).file
+    assert found.first_difference is None
     assert found.equal
     assert found.results == len(recorded) > TIMING.windows  # window reports and status changes
 

@@ -16,6 +16,7 @@ from agent.core.events import DeviceChange, Event, Result, RunStart, Tick
 from agent.core.pipeline import Pipeline
 from agent.delivery.history import Record
 from agent.delivery.store import Store
+from agent.engine import identity
 from agent.recording.fingerprint import fingerprint, versions
 from agent.recording.writer import Recorder
 from hw.block import DeviceInfo, SampleBlock
@@ -44,8 +45,9 @@ def record_events(data_dir: Path, config: Config, events: Iterable[Event], run_i
         run_id=run_id, site=config.gateway.site, gateway=config.gateway.name, boot_id="boot", t_monotonic_ns=0,
         t_utc_ns=EPOCH_NS, config_json=config.model_dump_json(), versions={"fieldcal": __version__, **versions()},
         fingerprint=fingerprint(), snapshot=pipeline.snapshot(), file_sequence=1, event_sequence=0,
+        engine=identity.name(),
     )  # fmt: skip
-    recorder.record(0, start, [])
+    recorder.record(0, start, pipeline.step(start))
     assert recorder.path is not None
     name = recorder.path.name.removesuffix(".active")
     for number, event in enumerate(events, start=1):

@@ -15,6 +15,7 @@ import pytest
 
 from agent.acquisition import reader
 from agent.acquisition.service import Service
+from agent.audit.engines import Engines
 from agent.cli.audit import run_audit
 from agent.cli.given import recordings_of
 from agent.cli.main import run_cli
@@ -100,7 +101,7 @@ def run(config: Config, data_dir: Path, enough: Callable[[Run], bool], timeout_s
             runner.join(10)
             found.stopped_s = time.monotonic() - asked_s
     assert not runner.is_alive()
-    found.audit = run_audit(recordings_of([data_dir]), Pipeline.restore, as_json=False)
+    found.audit = run_audit(recordings_of([data_dir]), Engines(Pipeline.restore), as_json=False)
     return found.look()
 
 

@@ -8,8 +8,8 @@ import msgspec
 import numpy as np
 import pytest
 
+from agent.audit.comparison import OTHER_CPU, compare, differences
 from agent.core.events import CalibrationUpdate, Result, StatusChange, WindowReport
-from agent.recording.comparison import OTHER_CPU, compare, differences
 from tests.replay.stand_in import CONFIG, StandIn, block
 
 NAN = float("nan")
@@ -57,29 +57,6 @@ def test_one_bit_is_a_difference_and_its_place_is_told(results: list[Result]) ->
     assert (found.event_sequence, found.what, found.field) == (7, "/bridge-1/calibration", "sensitivity[1][2]")
     assert not found.undecidable
     assert compare("f", 7, results, changed(results, 1, sensitivity=rows), OTHER_CPU) is None
-
-
-def test_only_the_text_of_a_reason_is_left_out_of_the_comparison(results: list[Result]) -> None:
-    recorded = changed(results, 0, reason="the same in other words")
-    assert compare("f", 1, recorded, results, 0.0) is not None
-    assert compare("f", 1, recorded, results, 0.0, same_version=False) is None
-    assert compare("f", 1, recorded, changed(results, 0, used=False), 0.0, same_version=False) is not None
-
-
-def test_a_field_that_an_older_version_did_not_have_is_left_out_of_the_comparison(results: list[Result]) -> None:
-    now = changed(results, 1, references=["KB12 0042"])
-    assert compare("f", 1, results, now, 0.0) is not None
-    assert compare("f", 1, results, now, 0.0, same_version=False) is None
-    assert compare("f", 1, now, changed(now, 1, references=["KB12 0043"]), 0.0, same_version=False) is not None
-
-
-def test_a_number_of_a_window_that_an_older_version_did_not_have_is_left_out(results: list[Result]) -> None:
-    window = results[0]
-    assert isinstance(window, WindowReport)
-    now = changed(results, 0, numbers=window.numbers | {"step_mps2": 0.1})
-    assert compare("f", 1, results, now, 0.0) is not None
-    assert compare("f", 1, results, now, 0.0, same_version=False) is None
-    assert compare("f", 1, now, results, 0.0, same_version=False) is not None
 
 
 @pytest.mark.parametrize(

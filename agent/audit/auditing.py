@@ -6,20 +6,22 @@ How recordings continue each other is not looked at here; `fieldcal audit` does 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass
-from io import BufferedReader
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import msgspec
 
+from agent.audit.departure import Departure
+from agent.audit.replaying import Replayed, ReplayedFile, Replayer
+from agent.audit.result_check import check_results
 from agent.recording.chain import Link
 from agent.recording.integrity import Integrity, check_integrity
 from agent.recording.pruned_ranges import PRUNED_METADATA, Ranges, from_metadata
+from agent.recording.reading import open_recording
 from agent.recording.records import Fault
 from agent.recording.repair import REPAIR_METADATA
-from agent.recording.replaying import Replay, ReplayedFile
-from agent.recording.result_check import check_results
 from agent.recording.results_chain import EPOCH, FILE_METADATA, PREVIOUS_RESULTS
 from agent.recording.signing import SIGNATURE_METADATA, Statement, signed_results, verify_file
 
@@ -27,14 +29,22 @@ if TYPE_CHECKING:
     from agent.config.known_keys import KnownKeys
 
 
+Trusted = Callable[[str], bool]
+
+
 class AuditedFile(msgspec.Struct, kw_only=True):
-    """The verdict on one file. `reasons` why it failed, empty where it passed; `notes`: what could not be decided."""
+    """The verdict on one file.
+
+    `reasons`: why it failed, empty where it passed. `undecided`: why this program cannot say whether its results follow
+    from its data. `notes`: what else could not be decided.
+    """
 
     path: str
     ok: bool
     incomplete: bool
     repaired: bool  # a crash left it open, and a later start closed it
     reasons: list[str]
+    undecided: list[str]
     notes: list[str]
     size: int
     sha256: str
@@ -49,44 +59,62 @@ class AuditedFile(msgspec.Struct, kw_only=True):
 
 @dataclass(frozen=True, slots=True)
 class Audited:
-    """The verdict on one file, without `ok`; its link in the chain; the file numbers that retention deleted."""
+    """The verdict on one file, not concluded; its replay; its link in the chain; the numbers that retention deleted."""
 
     verdict: AuditedFile
+    replayed: Replayed
     link: Link
     deleted: Ranges
 
 
 def audit_file(
-    path: Path, file: BufferedReader, replayed: Replay, *, strict: bool = False, keys: KnownKeys | None = None
+    path: Path,
+    replayer: Replayer,
+    *,
+    trusted: Trusted,
+    strict: bool = False,
+    keys: KnownKeys | None = None,
 ) -> Audited:
-    """Audit the recording at `path`, open as `file`, which is read from its beginning.
+    """Audit one recording.
 
-    `replayed`: runs it too. With `keys`, the file must be signed by a key of its gateway. `strict`: what could not be
-    decided is a reason to fail. Raises OSError.
+    `trusted`: says of the name of an engine that is not here whether the auditor trusts it: then results that nearly
+    agree with those of the present engine pass, unless the audit is `strict`. With `keys`, the file must be signed by a
+    key of its gateway. Raises OSError.
     """
-    sha256 = hashlib.file_digest(file, "sha256").hexdigest()
-    size = file.tell()
-    file.seek(0)
-    integrity = check_integrity(file, size)
-    verdict = _verdict(path, sha256, size, integrity, replayed.run(path))
-    fault = ""
-    if keys is not None:
-        signature = integrity.metadata.get(SIGNATURE_METADATA)
-        fault = verify_file(file, size, signature, keys, _statement(verdict, integrity))
-        verdict.reasons += [fault] if fault else []
+    with open_recording(path) as file:
+        sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+        size = file.tell()
+        file.seek(0)
+        integrity = check_integrity(file, size)
+        replayed = replayer.run(path)
+        verdict = _verdict(path, sha256, size, integrity, replayed.file)
+        fault = ""
+        if keys is not None:
+            signature = integrity.metadata.get(SIGNATURE_METADATA)
+            fault = verify_file(file, size, signature, keys, _statement(verdict, integrity))
+            verdict.reasons += [fault] if fault else []
+    if replayed.file.departure is not None:
+        near_passes = not strict and not verdict.reasons and trusted(replayed.file.engine)
+        _judge_departure(verdict, replayed.file.departure, near_passes=near_passes)
     results = check_results(path, verdict.replay.gateway, None if fault else keys)
     verdict.signed_results = results.signed
     if results.fault:
         verdict.reasons.append(f"{results.faults} results without a valid signature; the first: {results.fault}")
+    deleted = from_metadata(integrity.metadata.get(PRUNED_METADATA))
+    return Audited(verdict, replayed, _link(verdict, integrity), deleted)
+
+
+def conclude(verdict: AuditedFile, *, strict: bool) -> None:
+    """Decide whether a file passes, after it was also compared with its neighbours."""
+    verdict.notes = [*verdict.replay.notes, *verdict.notes]
     if strict:
         verdict.reasons += verdict.notes
-    deleted = from_metadata(integrity.metadata.get(PRUNED_METADATA))
-    return Audited(verdict, _link(verdict, integrity), deleted)
+    verdict.ok = not verdict.reasons and not verdict.undecided
 
 
 def _verdict(path: Path, sha256: str, size: int, integrity: Integrity, replay: ReplayedFile) -> AuditedFile:
     repair = integrity.metadata.get(REPAIR_METADATA)
-    notes = list(replay.notes)
+    notes = []
     if repair is not None:
         torn = repair.get("torn_bytes")
         notes.append(f"unsealed: left open by a crash, closed later; the last {torn} bytes, incomplete, were set aside")
@@ -96,6 +124,7 @@ def _verdict(path: Path, sha256: str, size: int, integrity: Integrity, replay: R
         incomplete=not integrity.finished and all(fault.kind == "torn" for fault in integrity.faults),
         repaired=repair is not None,
         reasons=_reasons(integrity, replay) + _metadata_reasons(integrity, replay),
+        undecided=[],
         notes=notes,
         size=size,
         sha256=sha256,
@@ -106,6 +135,18 @@ def _verdict(path: Path, sha256: str, size: int, integrity: Integrity, replay: R
         messages=integrity.messages,
         replay=replay,
     )
+
+
+def _judge_departure(verdict: AuditedFile, departure: Departure, *, near_passes: bool) -> None:
+    """Say what follows where another engine than the present one made the file, and that engine did not run."""
+    replay = verdict.replay
+    made = f"made by engine {replay.engine}" if replay.engine else "made by a version that does not name its engine"
+    made += f", which is not here ({replay.engine_missing})" if replay.engine_missing else ""
+    if replay.refused:
+        verdict.undecided.append(f"{made}; engine {replay.replayed_by} cannot replay it: {replay.refused}")
+        return
+    text = f"{made}; by engine {replay.replayed_by} {departure}"
+    (verdict.notes if near_passes and departure.near else verdict.undecided).append(text)
 
 
 def _statement(verdict: AuditedFile, integrity: Integrity) -> Statement:
@@ -138,7 +179,7 @@ def _reasons(integrity: Integrity, replay: ReplayedFile) -> list[str]:
         reasons.append(f"{integrity.fault_count - len(integrity.faults)} more faults")
     if replay.fault is not None and not integrity.faults:
         reasons.append(str(replay.fault))
-    if replay.refused:
+    if replay.refused and replay.by_own_engine:
         reasons.append(f"cannot be replayed: {replay.refused}")
     if replay.first_difference is not None:
         reasons.append(f"the results do not follow from the data: {replay.first_difference}")

@@ -48,15 +48,11 @@ def compare(
     tolerance: float,
     *,
     complete: bool = True,
-    same_version: bool = True,
 ) -> Difference | None:
     """The first difference between the results of one event, or None.
 
     `tolerance` 0 compares floats by their bits, so that NaN equals NaN and 0.0 differs from -0.0; above it is relative
-    to the largest of a list. Where `complete` is false the recording may end before the last results. Where
-    `same_version` is false another version of the program recorded: the text in `reason` is not compared, because that
-    version may word it in another way, and neither is a field that the recorded result leaves empty or a number of a
-    window that it does not have, because that version may not have it.
+    to the largest of a list. Where `complete` is false the recording may end before the last results.
     """
 
     def difference(what: str, field: str, before: Any, now: Any, *, decision: bool) -> Difference:
@@ -73,15 +69,7 @@ def compare(
     for before, now in zip(recorded, computed, strict=False):
         if type(before) is not type(now) or topic_of(before) != topic_of(now):
             return difference(topic_of(before), "kind", topic_of(before), topic_of(now), decision=True)
-        pair = (_plain(before), _plain(now))
-        if not same_version:
-            left_out = {"reason", *_empty(before)}
-            for side in pair:
-                for name in left_out & side.keys():
-                    del side[name]
-            if isinstance(before, WindowReport):
-                pair[1]["numbers"] = {n: v for n, v in pair[1]["numbers"].items() if n in before.numbers}
-        for field, a, b in differences(*pair, tolerance):
+        for field, a, b in differences(plain(before), plain(now), tolerance):
             return difference(topic_of(before), field, a, b, decision=not isinstance(a, float))
     if len(recorded) > len(computed) or (complete and len(recorded) < len(computed)):
         kinds = ([topic_of(result) for result in results] for results in (recorded, computed))
@@ -144,14 +132,15 @@ def _agree(recorded: Mapping[str, float], computed: Mapping[str, float], names: 
     return all(name in recorded and _same(recorded[name], computed[name], OTHER_CPU, 0.0) for name in names)
 
 
-def _empty(item: Output) -> set[str]:
-    """Fields of a result that have their default values."""
+def empty_fields(item: Output) -> set[str]:
+    """Names of the fields of a result that have their default values."""
     fields = msgspec.structs.fields(item) if isinstance(item, msgspec.Struct) else ()
     defaults = {f.name: f.default if f.default_factory is msgspec.NODEFAULT else f.default_factory() for f in fields}
     return {name for name, default in defaults.items() if getattr(item, name) == default}
 
 
-def _plain(item: Output) -> Any:
+def plain(item: Output) -> Any:
+    """A result as a dict of builtin values."""
     if isinstance(item, Acceleration):
         fields = {f.name: getattr(item, f.name) for f in dataclasses.fields(item)}
         return {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in fields.items()}

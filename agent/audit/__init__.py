@@ -1,0 +1,1 @@
+"""The audit: are recordings what the gateway wrote, and do their results follow from their data?"""

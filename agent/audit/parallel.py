@@ -1,0 +1,31 @@
+"""Does the same work for many files on several cores, and gives what comes out in the order of the files."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+T = TypeVar("T")
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def for_each(work: Callable[[Path], T], paths: Sequence[Path], jobs: int) -> Iterator[T]:
+    """Yield work(path) of each file. With more than one of `jobs`, `work` and what it gives must be picklable.
+
+    An exception of `work` is raised here. Memory: what came out of files waits until those before them are done.
+    """
+    jobs = min(jobs, len(paths))
+    if jobs < 2:
+        yield from map(work, paths)
+        return
+    from concurrent.futures import ProcessPoolExecutor
+    from multiprocessing import get_context
+
+    with ProcessPoolExecutor(jobs, mp_context=get_context("fork")) as pool:
+        yield from pool.map(work, paths)
