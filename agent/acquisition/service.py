@@ -25,6 +25,7 @@ from agent.delivery.publication import Publisher
 from agent.delivery.retention import keep_results
 from agent.delivery.store import Store
 from agent.engine import identity
+from agent.engine.keeping import keep_engine
 from agent.recording.acceleration import encode_acceleration
 from agent.recording.files import final_name
 from agent.recording.fingerprint import fingerprint, versions
@@ -161,6 +162,7 @@ class Service:
         )
 
     def _begin(self) -> None:
+        self._engine_sha256 = keep_engine(self._data_dir)[1]
         self._origin_ns = time.monotonic_ns()
         self._run_id = uuid.uuid4().hex
         self._pipeline = Pipeline.begin(
@@ -203,6 +205,7 @@ class Service:
             event_sequence=self._sequence,
             continuation=continuation,
             engine=identity.name(),
+            engine_sha256=self._engine_sha256,
         )
 
     def _loop(

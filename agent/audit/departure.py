@@ -14,7 +14,7 @@ from typing import Any
 
 import msgspec
 
-from agent.audit.comparison import differences, empty_fields, plain
+from agent.audit.comparison import THRESHOLD, differences, empty_fields, plain
 from agent.core.events import CalibrationUpdate, Output
 from agent.recording.messages import topic_of
 
@@ -70,7 +70,7 @@ class Departure(msgspec.Struct, kw_only=True):
     def _weigh(self, place: str, path: list[str], pair: tuple[Any, Any], results: tuple[Any, Any]) -> None:
         """Count two values at the same `path` of two results that differ."""
         x, y = pair
-        if path[-1] in _WORDS or (path[0] == "numbers" and None in pair):
+        if path[-1] in _WORDS or (path[0] == "numbers" and (None in pair or path[-1].endswith(THRESHOLD))):
             return
         if _DECISIONS & set(path):
             self._differ("decision", place)

@@ -44,7 +44,7 @@ class Engines:
                     yield Candidate(partial(_process, wheel), own=True)
                 else:
                     missing = wheel
-        yield Candidate(partial(nullcontext, here), own=own, missing=missing)
+        yield Candidate(lambda: nullcontext(here), own=own, missing=missing)
 
     def trusts(self, engine: str) -> bool:
         """Whether an engine with this name is a release: then its results pass where those of this program are near."""
@@ -62,7 +62,7 @@ class Engines:
 def as_if_own(restore: Restore) -> Choose:
     """Choose the engine of this program, and hold it to the recorded results whatever engine a file names."""
     engine = EngineHere(restore, identity.name())
-    return lambda _: [Candidate(partial(nullcontext, engine), own=True)]
+    return lambda _: [Candidate(lambda: nullcontext(engine), own=True)]
 
 
 class _EngineOfWheel:
