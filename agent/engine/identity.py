@@ -10,9 +10,11 @@ from __future__ import annotations
 import ast
 import hashlib
 import io
+import json
 import tokenize
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 # Raise this number when results change: when the same events give another S, Q, U or decision than before. The test of
 # the golden recordings fails otherwise.
@@ -20,6 +22,7 @@ NUMBER = 11
 ROOT = Path(__file__).resolve().parents[2]  # of the packages agent, calib and hw
 # The modules that an engine's process calls, and one that another module imports by a name that it computes.
 BEGIN = ("agent.core.pipeline", "agent.recording.messages", "agent.config.recorded")
+BUILT = "built.json"  # beside this file, in an installation that is not editable
 DIGITS = 16  # of the SHA-256 that are the id
 _PACKAGES = ("agent", "calib", "hw")
 
@@ -32,20 +35,44 @@ def name() -> str:
 @cache
 def engine_id() -> str:
     """The first DIGITS hexadecimal digits of the SHA-256 over names and sources of all modules of the engine."""
-    return digest({member: path.read_bytes() for member, path in source_files()})
+    return _built()[0] or computed()["id"]
+
+
+def computed() -> dict[str, Any]:
+    """The id, and the SHA-256 of each source with its comments, as the file BUILT holds them."""
+    sources = {member: path.read_bytes() for member, path in _closure()}
+    return {"id": digest(sources), "sources": {member: _sha256(source) for member, source in sources.items()}}
+
+
+@cache
+def source_files() -> list[tuple[str, Path]]:
+    """(name in an archive, path) of each module that the engine imports anywhere, and of their packages, by name."""
+    return _built()[1] or _closure()
+
+
+@cache
+def _built() -> tuple[str, list[tuple[str, Path]]]:
+    """Id and sources as they were when this installation was built; empty where there is no such file, or a source has
+    changed since."""
+    path = Path(__file__).with_name(BUILT)
+    if not path.is_file():
+        return "", []
+    built = json.loads(path.read_text())
+    files = [(member, ROOT / member) for member in built["sources"]]
+    same = all(file.is_file() and _sha256(file.read_bytes()) == built["sources"][member] for member, file in files)
+    return (built["id"], files) if same else ("", [])
 
 
 def digest(sources: dict[str, bytes]) -> str:
     """The id of an engine with these sources, by their names in the archive. Raises SyntaxError, UnicodeDecodeError."""
     total = hashlib.sha256()
     for member, source in sorted(sources.items()):
-        total.update(f"{member}\n{hashlib.sha256(bare(source).encode()).hexdigest()}\n".encode())
+        total.update(f"{member}\n{_sha256(bare(source).encode())}\n".encode())
     return total.hexdigest()[:DIGITS]
 
 
 @cache
-def source_files() -> list[tuple[str, Path]]:
-    """(name in an archive, path) of each module that the engine imports anywhere, and of their packages, by name."""
+def _closure() -> list[tuple[str, Path]]:
     found: dict[str, Path] = {}
     waiting = list(BEGIN)
     while waiting:
@@ -59,6 +86,10 @@ def source_files() -> list[tuple[str, Path]]:
             ast.parse(path.read_bytes()), module if path.stem == "__init__" else module.rpartition(".")[0]
         )
     return sorted(found.items())
+
+
+def _sha256(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
 
 
 def bare(source: bytes) -> str:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from agent.engine.identity import ROOT, bare, digest, name, source_files
+from agent.engine.identity import BUILT, ROOT, bare, computed, digest, name, source_files
+from agent.engine.identity import __file__ as IDENTITY
 
 GOLDEN = ROOT / "tests/replay/golden/format-3/fieldcal-000001.mcap"
 REPLAY = """
@@ -104,3 +106,21 @@ def test_bare_source_means_the_same_as_the_source() -> None:
 def test_an_engine_has_one_name_wherever_its_sources_lie() -> None:
     assert name().rpartition("-")[2] == digest(sources())
     assert digest(dict(reversed(list(sources().items())))) == digest(sources())
+
+
+def test_a_built_installation_knows_its_id_until_a_source_changes(tmp_path: Path) -> None:
+    files = {**sources(), "agent/engine/__init__.py": b"", "agent/engine/identity.py": Path(IDENTITY).read_bytes()}
+    for member, data in files.items():
+        (tmp_path / member).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / member).write_bytes(data)
+    built = computed() | {"id": "0123456789abcdef"}  # another one than is computed, so that its use is seen
+    (tmp_path / "agent/engine" / BUILT).write_text(json.dumps(built))
+
+    def said() -> str:
+        script = f"import sys; sys.path.insert(0, {str(tmp_path)!r})\nfrom agent.engine import identity\n"
+        script += "print(identity.engine_id(), len(identity.source_files()))"
+        return subprocess.run([sys.executable, "-I", "-c", script], capture_output=True, text=True, check=True).stdout
+
+    assert said() == f"0123456789abcdef {len(sources())}\n"
+    (tmp_path / "hw/block.py").write_bytes(sources()["hw/block.py"] + b"\nX = 1\n")
+    assert said().split()[0] not in ("0123456789abcdef", name().rpartition("-")[2])
