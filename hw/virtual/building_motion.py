@@ -65,7 +65,8 @@ class BuildingMotion:
         )
         lines *= level_mps2 * points / np.sqrt(2 * np.sum(np.abs(lines) ** 2, axis=0))
         if response is not None:
-            lines *= response(frequency_hz)[:, None]
+            moves = lines.any(axis=1)  # the band alone, which is a sixteenth of the lines
+            lines[moves] *= response(frequency_hz[moves])[:, None]
         if np.iscomplexobj(shape):
             lines, shape = np.hstack([lines, 1j * lines]), np.vstack([shape.real, shape.imag])
         self._shape = np.asarray(shape, dtype=np.float64)
