@@ -3,6 +3,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 PRESET ?= plain
+# Images for containers set it. Then each program that a test starts would compile its sources again.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: run fleet test nightly lint bench faults faults-short soak lock deb container site clean
 

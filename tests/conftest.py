@@ -12,9 +12,17 @@ os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
 import pytest
 from hypothesis import settings
+from xdist.scheduler import LoadScopeScheduling
+from xdist.workermanage import WorkerController
 
 if TYPE_CHECKING:
+    from xdist.remote import Producer
+
     from tests.unit.zenoh_site import Site
+
+SCENARIOS = "tests/scenarios/"
+PROCESSES_PER_CORE = 2  # half of them for scenarios, which mostly wait
+NICE = 5  # of the other half
 
 # A shell starts a command in the background with SIGINT ignored, and every child of the tests would ignore Ctrl-C too.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -23,6 +31,45 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 # Examples follow from the test's own code, so that a failure comes again; time limits fail on a machine under load.
 settings.register_profile("fieldcal", deadline=None, derandomize=True)
 settings.load_profile("fieldcal")
+
+
+class ScenariosBesideTheRest(LoadScopeScheduling):
+    """Gives the scenarios to every second process, and the other tests to the others, until one kind has run out.
+
+    A scenario waits most of its time for a program that runs against the clock; meanwhile the other tests compute.
+    Scenarios of files with few tests come first: one that takes a minute is nearly alone in its file.
+    """
+
+    def _assign_work_unit(self, node: WorkerController) -> None:
+        for_scenarios = takes_scenarios(node)
+        scopes = reversed(self.workqueue) if for_scenarios else iter(self.workqueue)
+        wanted = next((scope for scope in scopes if scope.startswith(SCENARIOS) == for_scenarios), None)
+        if wanted is not None:
+            self.workqueue.move_to_end(wanted, last=False)
+        super()._assign_work_unit(node)
+
+
+def takes_scenarios(node: WorkerController) -> bool:
+    """Whether this process of xdist (gw0, gw1, ...) takes scenarios first."""
+    return int(node.gateway.id.removeprefix("gw")) % 2 == 0
+
+
+def pytest_xdist_auto_num_workers() -> int:
+    return PROCESSES_PER_CORE * len(os.sched_getaffinity(0))
+
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> LoadScopeScheduling | None:
+    return ScenariosBesideTheRest(config, log) if config.getvalue("dist") == "loadscope" else None
+
+
+def pytest_configure_node(node: WorkerController) -> None:
+    by_scope = node.config.getvalue("dist") == "loadscope"
+    node.workerinput["nice"] = NICE if by_scope and not takes_scenarios(node) else 0
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """What computes leaves the processor to what must keep pace with the clock."""
+    os.nice(getattr(session.config, "workerinput", {"nice": 0})["nice"])
 
 
 @pytest.fixture
