@@ -32,11 +32,14 @@ fleet: $(VENV)/development  ## router, fleet page and a simulated fleet of 40 se
 # Tests of running programs against the clock can fail where other work delays them. What failed runs once more, alone.
 once_more = { test $$? = 1 && $(BIN)/python -m pytest --last-failed --last-failed-no-failures none $(1); }
 
+# Two for each processor: one of them takes scenarios, which mostly wait for programs that they start (tests/conftest.py).
+PROCESSES = $$((2 * $$(nproc)))
+
 # The drivers' contract reads 200,000 samples here, which a counter of 16 bits does three times; `pytest tests/contract`
 # reads a million.
 test: export FIELDCAL_CONTRACT_SAMPLES = 200000
 test: $(VENV)/development
-	$(BIN)/python -m pytest -n auto --dist loadscope -m "not faults" || \
+	$(BIN)/python -m pytest -n $(PROCESSES) --dist loadscope -m "not faults" || \
 		$(call once_more,-m "not faults")
 
 nightly: $(VENV)/development  ## the twins under Debian's kernel in QEMU; needs qemu-system-x86, busybox-static and Debian's apt

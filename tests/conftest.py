@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     from tests.unit.zenoh_site import Site
 
 SCENARIOS = "tests/scenarios/"
-PROCESSES_PER_CORE = 2  # half of them for scenarios, which mostly wait
-NICE = 5  # of the other half
+NICE = 5  # of processes that take other tests
 
 # A shell starts a command in the background with SIGINT ignored, and every child of the tests would ignore Ctrl-C too.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -52,10 +51,6 @@ class ScenariosBesideTheRest(LoadScopeScheduling):
 def takes_scenarios(node: WorkerController) -> bool:
     """Whether this process of xdist (gw0, gw1, ...) takes scenarios first."""
     return int(node.gateway.id.removeprefix("gw")) % 2 == 0
-
-
-def pytest_xdist_auto_num_workers() -> int:
-    return PROCESSES_PER_CORE * len(os.sched_getaffinity(0))
 
 
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> LoadScopeScheduling | None:
