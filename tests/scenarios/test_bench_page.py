@@ -56,8 +56,11 @@ def test_the_page_shows_what_the_terminal_says(site: Site, tmp_path: Path, brows
             for found in re.findall(r"^stop \d: .*|it tells most of .*|U will be [^;\n]*(?=;|$)", told, re.MULTILINE):
                 assert found.lower() in shown.lower()
             if "does not look like" in told:
-                warning = next(line.strip() for line in told.splitlines() if "does not look like" in line)
-                assert page.locator("#bench-warnings li").all_inner_texts() == [f"Stop 2: {warning}"]
+                # A busy machine delays samples; now and then one is left out as a knock, and both say so.
+                warned = re.findall(r"^  (knocks: .*|.* does not look like .*)$", "".join(asked), re.MULTILINE)
+                texts = page.locator("#bench-warnings li").all_inner_texts()
+                assert [re.sub(r"^Stop [12]: ", "", text) for text in texts] == warned
+                assert texts[-1].startswith("Stop 2: ")
                 assert serious_faults(page) == []
             if (taken := re.search(r"stop 1, (.*): U is now", told)) is not None:  # the page told U in each second
                 stay = re.compile(rf"At {taken[1]}[2-9] s of 4 to 60 s; U will be \d")
