@@ -67,8 +67,8 @@ def answer_to(call: Callable[..., list[bytes]], arguments: list[bytes]) -> list[
         return [b"fault", f"{type(error).__name__}: {error}"[:LONGEST_FAULT].encode(errors="replace")]
 
 
-def main() -> None:
-    """Serve the frames on standard input until it ends."""
+def main(make: Callable[[], Engine] = Engine) -> None:
+    """Serve the frames on standard input until it ends. `make` makes the engine, where its modules have other names."""
     # What the engine itself prints goes to standard error, and never between the frames.
     source, target = os.fdopen(0, "rb", buffering=0), os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
@@ -79,7 +79,7 @@ def main() -> None:
         if name == b"engine":
             answer = [b"engine", frames.VERSION, about["id"].encode()]
         else:
-            engine = engine or Engine()
+            engine = engine or make()
             answer = answer_to(getattr(engine, name.decode()), arguments)
         target.write(frames.packed(answer))
         target.flush()

@@ -40,14 +40,14 @@ def engine_id() -> str:
 
 def computed() -> dict[str, Any]:
     """The id, and the SHA-256 of each source with its comments, as the file BUILT holds them."""
-    sources = {member: path.read_bytes() for member, path in _closure()}
+    sources = {member: path.read_bytes() for member, path in closure()}
     return {"id": digest(sources), "sources": {member: _sha256(source) for member, source in sources.items()}}
 
 
 @cache
 def source_files() -> list[tuple[str, Path]]:
-    """(name in an archive, path) of each module that the engine imports anywhere, and of their packages, by name."""
-    return _built()[1] or _closure()
+    """`closure` of the engine of this program."""
+    return _built()[1] or closure()
 
 
 @cache
@@ -71,14 +71,17 @@ def digest(sources: dict[str, bytes]) -> str:
     return total.hexdigest()[:DIGITS]
 
 
-@cache
-def _closure() -> list[tuple[str, Path]]:
+def closure(root: Path = ROOT, begin: tuple[str, ...] = BEGIN) -> list[tuple[str, Path]]:
+    """(name in an archive, path) of each module that an engine imports anywhere, and of their packages, by name.
+
+    `root`, `begin`: as ROOT and BEGIN, of the engine of another revision.
+    """
     found: dict[str, Path] = {}
-    waiting = list(BEGIN)
+    waiting = list(begin)
     while waiting:
         module = waiting.pop()
-        path = _path(module)
-        if path is None or (member := path.relative_to(ROOT).as_posix()) in found:
+        path = _path(root, module)
+        if path is None or (member := path.relative_to(root).as_posix()) in found:
             continue
         found[member] = path
         waiting += module.rpartition(".")[:1]
@@ -140,10 +143,10 @@ def _imported(tree: ast.Module, package: str) -> list[str]:
     return names
 
 
-def _path(module: str) -> Path | None:
+def _path(root: Path, module: str) -> Path | None:
     """The file of a module of this program; None for any other name."""
     parts = module.split(".")
     if parts[0] not in _PACKAGES:
         return None
-    place = ROOT.joinpath(*parts)
+    place = root.joinpath(*parts)
     return next((path for path in (place / "__init__.py", place.with_suffix(".py")) if path.is_file()), None)

@@ -99,10 +99,14 @@ def _trusted(path: Path, data: bytes, engine: str, trusted: Collection[str]) -> 
 
 def add_release(revision: str) -> None:
     """Add the running engine to the list, unless it is there. `revision`: of the program's sources."""
-    present = KnownEngine(NUMBER, engine_id(), hashlib.sha256(build()).hexdigest(), __version__, revision)
-    if present.sha256 not in known_digests(present.id):
-        listed = [known._asdict() for known in (*known_engines(), present)]
-        _LIST.write_text(json.dumps(listed, indent=1) + "\n", "utf-8")
+    add([KnownEngine(NUMBER, engine_id(), hashlib.sha256(build()).hexdigest(), __version__, revision)])
+
+
+def add(engines: Sequence[KnownEngine]) -> None:
+    """Add engines to the list, by their numbers, unless they are there."""
+    new = [engine for engine in engines if engine.sha256 not in known_digests(engine.id)]
+    listed = sorted([*known_engines(), *new], key=lambda engine: engine.number)
+    _LIST.write_text(json.dumps([engine._asdict() for engine in listed], indent=1) + "\n", "utf-8")
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ MOST_MEMBERS = 1000
 # What an engine imports, as in pyproject.toml.
 REQUIREMENTS = ("msgspec>=0.20,<1", "numpy>=2.0,<2.5", "protobuf>=7.35.1,<8", "pydantic>=2.11,<3", "scipy>=1.15,<1.18")
 ABOUT = "agent/engine/engine.json"  # the member that names the engine
-_OWN = ("agent/engine/__init__.py", "agent/engine/entry.py", "agent/engine/frames.py")  # no result depends on these
+PROCESS = ("agent/engine/__init__.py", "agent/engine/entry.py", "agent/engine/frames.py")  # no result depends on these
 _MEMBER = re.compile(r"(agent|calib|hw)(/[a-z_][a-z0-9_]*)+\.(py|json)|fieldcal_engine-\d+\.dist-info/\w+")
 _ID = re.compile(r"[0-9a-f]{16,64}")
 
@@ -60,7 +60,7 @@ class EngineWheel:
 def build() -> bytes:
     """The wheel of the running engine. Raises OSError, and RuntimeError where this Python has no bz2."""
     sources = {name: path.read_bytes() for name, path in source_files()}
-    sources |= {name: (ROOT / name).read_bytes() for name in _OWN}
+    sources |= {name: (ROOT / name).read_bytes() for name in PROCESS}
     return wheel_of(NUMBER, engine_id(), sources)
 
 

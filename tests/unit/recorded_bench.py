@@ -18,6 +18,7 @@ from agent.delivery.history import Record
 from agent.delivery.store import Store
 from agent.engine import identity
 from agent.recording.fingerprint import fingerprint, versions
+from agent.recording.signing import Signer
 from agent.recording.writer import Recorder
 from hw.block import DeviceInfo, SampleBlock
 from hw.virtual.bench import Bench, Truth
@@ -35,12 +36,15 @@ def record(data_dir: Path, duration_s: float, seed: int = 7, run_id: str = "run-
     return bench.truth
 
 
-def record_events(data_dir: Path, config: Config, events: Iterable[Event], run_id: str) -> None:
+def record_events(
+    data_dir: Path, config: Config, events: Iterable[Event], run_id: str, signer: Signer | None = None
+) -> None:
     """Feed a new pipeline with the events; write recording and store into a data directory."""
     data_dir.mkdir(parents=True, exist_ok=True)
     pipeline = Pipeline.begin(config, run_id, 0, 0, {})
     devices, sensors = [d.name for d in config.devices], [c.sensor for c in config.channels]
-    recorder, store = Recorder(data_dir, devices, sensors), Store(data_dir, 0)
+    store = Store(data_dir, 0)
+    recorder = Recorder(data_dir, devices, sensors, signer=signer, epoch=store.epoch)
     start = RunStart(
         run_id=run_id, site=config.gateway.site, gateway=config.gateway.name, boot_id="boot", t_monotonic_ns=0,
         t_utc_ns=EPOCH_NS, config_json=config.model_dump_json(), versions={"fieldcal": __version__, **versions()},

@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 from agent.engine.identity import BUILT, ROOT, bare, computed, digest, name, source_files
-from agent.engine.identity import __file__ as IDENTITY
 
 GOLDEN = ROOT / "tests/replay/golden/format-3/fieldcal-000001.mcap"
 REPLAY = """
@@ -109,7 +108,8 @@ def test_an_engine_has_one_name_wherever_its_sources_lie() -> None:
 
 
 def test_a_built_installation_knows_its_id_until_a_source_changes(tmp_path: Path) -> None:
-    files = {**sources(), "agent/engine/__init__.py": b"", "agent/engine/identity.py": Path(IDENTITY).read_bytes()}
+    identity = "agent/engine/identity.py"
+    files = {**sources(), "agent/engine/__init__.py": b"", identity: (ROOT / identity).read_bytes()}
     for member, data in files.items():
         (tmp_path / member).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / member).write_bytes(data)
