@@ -12,10 +12,11 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from agent.recording.comparison import differences
-from agent.recording.replaying import Replay
 from mcap.reader import NonSeekingReader
 
+from agent.audit.comparison import differences
+from agent.audit.engines import as_if_own
+from agent.audit.replaying import Replayer
 from agent.config import recorded_config
 from agent.core.events import CalibrationUpdate, DeviceChange, WindowReport
 from agent.core.pipeline import Pipeline
@@ -43,8 +44,8 @@ RESULTS_CHANGED = (
 
 def test_results_of_the_present_engine_change_with_its_number_alone() -> None:
     assert PRESENT.exists(), f"{PRESENT} is missing: `python -m tests.replay.golden_files` makes it"
-    replay = Replay(Pipeline.restore, fingerprint(), ELSEWHERE)
-    file = replay.run(PRESENT / RECORDING)
+    replay = Replayer(as_if_own(Pipeline.restore), fingerprint(), ELSEWHERE).run(PRESENT / RECORDING)
+    file = replay.file
     assert (file.fault, file.undecidable) == (None, 0)
     assert file.equal, RESULTS_CHANGED.format(file.refused or file.first_difference)
     assert len(replay.calibrations) >= 1
