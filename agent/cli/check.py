@@ -14,6 +14,7 @@ from agent.config import Config, ConfigError, load_config
 from agent.config.tls import expiry_warning
 from agent.setup.device_checks import answer_findings, loaded_options, place_findings, sharing_findings
 from agent.setup.finding import Finding
+from agent.setup.key_checks import signing_key_warnings
 from agent.setup.known_filters import stated_filters
 from agent.terminal.quantity import counted
 from agent.terminal.text import say
@@ -74,10 +75,11 @@ def _answers(path: Path, config: Config) -> list[Finding]:
 
 
 def _warnings(path: Path, config: Config) -> Iterator[str]:
-    """What does not keep the agent from running: certificates that end, options that are not good."""
+    """What does not keep the agent from running: certificates that end, a misplaced key, options that are not good."""
     now = datetime.now(UTC)
     if config.zenoh.tls and (warning := expiry_warning(config.zenoh.tls.files, now)):
         yield f"{path}: zenoh.tls.{warning}"
+    yield from (f"{path}: {warning}" for warning in signing_key_warnings(config))
     loaded = loaded_options(config)
     for i, options in enumerate(loaded.values()):
         yield from (f"{path}: devices.{i}.options: {advice}" for advice in options.advice)

@@ -14,7 +14,7 @@ import click
 
 from agent.config import Config, ConfigError, load_config
 from agent.delivery.history import FILE_NAME, History, StoreError
-from agent.setup import device_checks, machine_checks
+from agent.setup import device_checks, key_checks, machine_checks
 from agent.setup.finding import Finding
 from agent.setup.running import agent_runs
 from agent.terminal.quantity import counted
@@ -33,7 +33,7 @@ WORDS = {"good": "good  ", "advice": "advice", "fault": "FAULT "}
               help="Read the devices for S seconds, and compare with their rates. Stop the agent first.")  # fmt: skip
 @click.option("--json", "json_to", type=click.Choice(["-"]), help="One JSON object on standard output.")
 def doctor(config: Path | None, data_dir: Path, measure_s: float | None, json_to: str | None) -> int:
-    """Check this gateway: clock, devices, bus clocks, rates, disk, certificates, router, optional parts.
+    """Check this gateway: clock, devices, bus clocks, rates, disk, certificates, signing key, router, optional parts.
 
     Each line is good, advice (it works, with a disadvantage) or FAULT (it does not work, or soon will not), with a
     remedy. Without CONFIG only the machine is checked. Run it as the agent's user: rights are those of the caller.
@@ -78,6 +78,7 @@ def _findings(path: Path | None, data_dir: Path, measure_s: float | None) -> Ite
     yield from machine_checks.disk_findings(config, options, data_dir)
     if config is not None:
         yield from machine_checks.certificate_findings(config, now)
+        yield from key_checks.signing_key_findings(config, data_dir)
         yield from machine_checks.router_findings(config)
     yield from machine_checks.extra_findings()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, get_args
@@ -13,9 +14,11 @@ from agent.cli.probe import i2c_buses, i2c_drivers, on_bus
 from agent.config import ConfigError
 from agent.config.channel import Channel
 from agent.config.devices import Gateway
+from agent.config.key_file import KeyFileError
 from agent.config.knowledge import Certificate, Prior
 from agent.config.reading import parse_config
-from agent.config.sinks import Zenoh
+from agent.config.sinks import Recording, Zenoh
+from agent.keys.files import KeyPair, gateway_key
 from agent.setup import channel as tables
 from agent.setup.asking import Asking, Stated, driver_options
 from agent.setup.devices import TEXT_LINES, Chosen, Found, Role, complete, listen, tables_of
@@ -103,6 +106,10 @@ def nine_numbers(value: str | tuple[float, ...]) -> tuple[float, ...]:
     help="Local gravity, m/s2.",
 )
 @click.option("--connect", multiple=True, metavar="ENDPOINT", help="Zenoh router, as tcp/192.0.2.1:7447.")
+@click.option("--signing-key", type=click.Path(path_type=Path), metavar="FILE.key",
+              help="Private key that signs recordings, made where it is missing; default: "
+              "keys/SITE.GATEWAY.signing.key beside CONFIG.")  # fmt: skip
+@click.option("--no-signing-key", is_flag=True, help="Sign nothing: nobody can prove who made the recordings.")
 def init(config: Path, **given: Any) -> int:
     """Write a configuration to CONFIG (default gateway.toml) that `fieldcal check` passes and `fieldcal run` uses.
 
@@ -110,6 +117,10 @@ def init(config: Path, **given: Any) -> int:
     seconds: its lines tell axes, sequence numbers and rate; so is the UDP port of a Raspberry Shake. Each value has a
     comment with unit, default and source. On a terminal, what is not given is asked. An existing file is never
     overwritten.
+
+    Recordings are signed: an Ed25519 key is made, which only its owner may read, and its public key beside it, for
+    the auditor. An existing key is used. Where root runs this, a new key belongs to the user of the service, if there
+    is one.
 
     Exit status 2 if something is missing; each line on standard error names an option.
     """
@@ -126,9 +137,21 @@ def init(config: Path, **given: Any) -> int:
         for fault in asking.faults:
             say(f"fieldcal init: {fault}", err=True)
         return 2
+    key = None if given["no_signing_key"] else _signing_key(config, answers, given["signing_key"])
+    return _write(config, answers, devices, key)
+
+
+def _signing_key(config: Path, answers: tables.Answers, given: Path | None) -> Path:
+    """The file of the key, absolute: the agent may be started in another directory."""
+    name = f"{answers.site.value}.{answers.gateway.value}.signing.key"
+    return (given or config.parent / "keys" / name).absolute()
+
+
+def _text(path: Path, answers: tables.Answers, devices: list[Chosen]) -> str:
+    """The configuration."""
     today = f"{datetime.now(UTC):%Y-%m-%d}"
-    text = written(
-        f"Written by `fieldcal init` on {today}. `fieldcal check {config}` names every fault at once.",
+    return written(
+        f"Written by `fieldcal init` on {today}. `fieldcal check {path}` names every fault at once.",
         [
             tables.gateway_table(answers),
             *(table for device in devices for table in tables_of(device)),
@@ -136,29 +159,45 @@ def init(config: Path, **given: Any) -> int:
             *tables.sink_tables(answers),
         ],
     )
-    return _write(config, text)
 
 
-def _write(path: Path, text: str) -> int:
-    """Check the text as `fieldcal check` does, and write it to a new file."""
+def _write(path: Path, answers: tables.Answers, devices: list[Chosen], key: Path | None) -> int:
+    """Check the configuration as `fieldcal check` does, and write it to a new file; make the key, unless it is None."""
+    text = _text(path, answers, devices)
     try:
         made = parse_config(tomllib.loads(text), "what init would write", text)
     except ConfigError as error:
         for fault in error.faults:
             say(f"fieldcal init: {fault}", err=True)
         return 2
+    pair: KeyPair | None = None
     try:
         with path.open("x", encoding="utf-8") as file:
+            if key is not None:
+                pair = gateway_key(key)
+                text = _text(path, replace(answers, signing_key=Stated(str(key), "init")), devices)
             file.write(text)
     except OSError as error:
         say(f"fieldcal init: {path}: {error.strerror}", err=True)
         return 2
+    except KeyFileError as error:
+        path.unlink()
+        say(f"fieldcal init: {error}; --signing-key FILE.key states another file, --no-signing-key none", err=True)
+        return 2
     for one in stated_filters(made):
         say(one.told)
+    if pair is not None:
+        _tell_key(pair)
     say(f"{path}: written; read it, then:")
     say(f"  fieldcal check {path}")
     say(f"  fieldcal run {path} --data-dir data")
     return 0
+
+
+def _tell_key(pair: KeyPair) -> None:
+    done = "made; it" if pair.made else "this key exists, and"
+    say(f"{pair.private}: {done} signs what this gateway records. Never copy it: who has it can sign as this gateway")
+    say(f"{pair.public}: give this public key to the auditor: fieldcal audit DATA --public-key {pair.public.name}")
 
 
 def _devices(asking: Asking, given: dict[str, Any]) -> list[Chosen]:
@@ -260,6 +299,7 @@ def _answers(asking: Asking, devices: list[Chosen], given: dict[str, Any]) -> ta
         reference_serial=of(Certificate, "serial_number", "reference_serial"),
         calibrated=of(Certificate, "calibrated", "calibrated"),
         connect=of(Zenoh, "connect", "connect"),
+        signing_key=_default(Recording, "signing_key"),
     )
 
 

@@ -16,7 +16,9 @@ import click
 from agent.cli.loading import loading
 from agent.cli.stopping import TOLD, Run, StoppedAtStart, stopped_by_signals
 from agent.config import Config, ConfigError, load_config, parse_config
+from agent.config.key_file import KeyFileError
 from agent.delivery.history import StoreError
+from agent.setup.key_checks import signing_key_warnings
 from agent.terminal.text import say
 
 if TYPE_CHECKING:
@@ -39,6 +41,9 @@ LOOPBACK = "tcp/127.0.0.1:7447"
               help="The kind of virtual bench, without CONFIG.")  # fmt: skip
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=1, show_default=True,
               help="Seed of the virtual bench's random numbers.")  # fmt: skip
+@click.option("--signing-key", type=click.Path(path_type=Path), metavar="FILE.key",
+              help="Private key that signs the recordings of the virtual bench, made where it is missing; with CONFIG, "
+              "recording.signing_key states the key.")  # fmt: skip
 @click.option("--log", type=click.Choice(["plain", "json"]),
               help="Form of the log on standard error; json, one object a line, by default under systemd.")  # fmt: skip
 @click.option("--with-router", is_flag=True, help=f"Start a Zenoh router at {LOOPBACK} unless one runs there.")
@@ -48,12 +53,15 @@ def run(
     duration: float | None,
     preset: str,
     seed: int,
+    signing_key: Path | None,
     log: str | None,
     with_router: bool,
 ) -> int:
     """Read devices, calibrate, record and publish until Ctrl-C. Without CONFIG the virtual bench is used."""
     if duration is not None and not math.isfinite(duration):
         raise click.BadParameter(f"{duration} is not a number of seconds", param_hint="--duration")
+    if signing_key is not None and config is not None:
+        raise click.UsageError("--signing-key is for the virtual bench; state recording.signing_key in CONFIG")
     with loading():
         from agent.acquisition.service import Service
         from agent.supervision.logs import log_as_json, under_journal
@@ -63,20 +71,23 @@ def run(
             if as_json := log == "json" or (log is None and under_journal(os.environ, sys.stderr.fileno())):
                 stack.callback(log_as_json().finish)
             if config is None:
-                settings, truth = stack.enter_context(virtual_bench(preset, seed))
+                settings, truth = stack.enter_context(virtual_bench(preset, seed, signing_key))
             else:
                 settings, truth = load_config(config), None
             stopping = stack.enter_context(stopped_by_signals())  # up to here a signal ends the process at once
             said = [stack.enter_context(router(LOOPBACK, stopping))] if with_router else []
             title = f"virtual bench, {preset}" if truth else str(config)
             watch = stack.enter_context(Watch(settings, title, truth, lines=not as_json))
-            for line in said:
+            for line in (*said, *signing_key_warnings(settings, data_dir)):
                 watch.say(line)
             stopping.service = Service(settings, data_dir, watch)
             return serve(stopping.service, duration)
     except ConfigError as error:
         for fault in error.faults:
             say(fault, err=True)
+        return 2
+    except KeyFileError as error:
+        say(f"fieldcal run: {error}", err=True)
         return 2
     except StoppedAtStart:
         say(TOLD, err=True)
@@ -85,7 +96,6 @@ def run(
 
 def serve(service: Service, duration_s: float | None) -> int:
     """Run the service until a signal or for `duration_s` seconds; returns the exit status."""
-    from agent.config.key_file import KeyFileError
     from agent.recording.owner import OtherGatewayError
     from hw.sensor import ConfigurationError
 
@@ -106,8 +116,12 @@ def serve(service: Service, duration_s: float | None) -> int:
 
 
 @contextmanager
-def virtual_bench(preset: str, seed: int) -> Iterator[tuple[Config, Any]]:
-    """Run the paper's bench as virtual devices under the real drivers; yields (configuration, true values)."""
+def virtual_bench(preset: str, seed: int, signing_key: Path | None = None) -> Iterator[tuple[Config, Any]]:
+    """Run the paper's bench as virtual devices under the real drivers; yields (configuration, true values).
+
+    `signing_key`: signs the recordings; a missing one is made. Raises KeyFileError.
+    """
+    from agent.keys.files import gateway_key
     from hw.virtual import presets
     from hw.virtual.live import LiveBench
 
@@ -136,6 +150,7 @@ def virtual_bench(preset: str, seed: int) -> Iterator[tuple[Config, Any]]:
                     "poses_repeat_s": parameters.schedule.period_s,
                 }
             ],
+            "recording": {"signing_key": str(gateway_key(signing_key).private)} if signing_key else {},
         }
         yield parse_config(raw, "virtual bench"), live.bench.truth
 

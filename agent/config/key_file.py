@@ -11,6 +11,7 @@ if TYPE_CHECKING:  # only who reads keys pays for it
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 LARGEST_KEY_FILE = 1 << 16  # bytes; a key has 120
+SERVICE_USER = "fieldcal"  # as deploy/fieldcal.sysusers makes it
 
 
 class KeyFileError(Exception):
@@ -62,5 +63,16 @@ def read_key_file(path: Path) -> bytes:
         raise _unread(path, error) from None
 
 
+def service_uid() -> int | None:
+    """The user of the service on this machine; None where it is not installed."""
+    import pwd  # Windows has none
+
+    try:
+        return pwd.getpwnam(SERVICE_USER).pw_uid
+    except KeyError:
+        return None
+
+
 def _unread(path: Path, error: OSError) -> KeyFileError:
-    return KeyFileError(f"{path}: cannot be read: {error.strerror}")
+    remedy = "; make it the file of the user that runs this (chown)" if isinstance(error, PermissionError) else ""
+    return KeyFileError(f"{path}: cannot be read: {error.strerror}{remedy}")

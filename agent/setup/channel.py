@@ -41,6 +41,7 @@ class Answers:
     reference_serial: Stated[str]
     calibrated: Stated[str]
     connect: Stated[tuple[str, ...]]
+    signing_key: Stated[str | None]
 
 
 def gateway_table(answers: Answers) -> Table:
@@ -80,6 +81,7 @@ def sink_tables(answers: Answers) -> Iterator[Table]:
         [
             _setting(Recording, "rotate_s", _default(Recording, "rotate_s"), "a new file after this time", "s"),
             _setting(Recording, "keep_days", _default(Recording, "keep_days"), says, "days"),
+            _setting(Recording, "signing_key", answers.signing_key, "private key that signs recordings and results"),
         ],
     )
     says = "Zenoh routers to which results go; without a router they wait in the store"
