@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from agent.config import ConfigError, load_config
-from agent.setup.backup import BackupError, back_up, key_files
+from agent.setup.backup import BackupError, back_up, key_files, left_out
 from agent.terminal.quantity import size
 from agent.terminal.text import say
 
@@ -23,7 +23,8 @@ def backup(target: Path, data_dir: Path, config_path: Path | None, with_keys: bo
     """Copy a data directory to the new directory TARGET: results, states, recordings. The agent may go on meanwhile.
 
     TARGET/data can be used as a data directory; `sha256sum -c SHA256SUMS` checks the copy. Keys are copied only with
-    --with-keys.
+    --with-keys, wherever they lie. The counters of commands are not copied: an agent that begins with the copy takes
+    only commands that are signed after its start. Files that the agent did not make are not copied, and are told.
 
     Exit status 2 if TARGET exists or there is nothing to copy, 1 if the disk fails.
     """
@@ -40,4 +41,6 @@ def backup(target: Path, data_dir: Path, config_path: Path | None, with_keys: bo
         say(f"fieldcal backup: {error}", err=True)
         return 2
     say(f"{target}: {len(copied)} files, {size(sum(path.stat().st_size for path in copied))}")
+    if strange := left_out(data_dir):
+        say(f"not copied, since the agent did not make it: {', '.join(strange)}")
     return 0

@@ -4,21 +4,27 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import shutil
 import sqlite3
 import stat
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
 
 from agent.config import Config
 from agent.delivery.history import FILE_NAME, connect_read_only
-from agent.delivery.opening import LOCK_NAME
 from agent.delivery.schema import write_mark
 from agent.recording.files import ACTIVE_SUFFIX, recordings
+from agent.recording.head import HEAD_NAME
 from agent.recording.reading import open_recording
 
 DATA, KEYS, SUMS = "data", "keys", "SHA256SUMS"
+ENGINES = "engines"  # directory of the wheels, `<id>.whl`, of the engines that wrote the recordings
+# The head; statements about recordings that retention deleted; pins that keep a recording. Nothing else is copied, so
+# no key that lies there, and not the counters of commands: with older counters a command could be repeated.
+_SMALL = re.compile(rf"{HEAD_NAME}|fieldcal-\d{{6,18}}\.(deleted|mcap\.lock)")
+_OWN = (HEAD_NAME, ENGINES, "fieldcal-", "state.", "command")  # with which the names of the agent's files begin
 
 
 class BackupError(Exception):
@@ -45,12 +51,15 @@ def back_up(data_dir: Path, target: Path, config_path: Path | None, keys: Iterab
         raise BackupError(f"{partial}: an earlier backup did not end; remove this directory") from None
     data = partial / DATA
     data.mkdir()
-    for path in _small_files(data_dir):
+    for path in _regular(path for path in data_dir.iterdir() if _SMALL.fullmatch(path.name)):
         _copy(path, data / path.name)
     if (data_dir / FILE_NAME).exists():
         _copy_store(data_dir / FILE_NAME, data / FILE_NAME)
     for _, path in recordings(data_dir):
         _copy_recording(path, data)
+    for path in _regular((data_dir / ENGINES).glob("*.whl")):  # last, so that none of a recording is missing
+        (data / ENGINES).mkdir(exist_ok=True)
+        _copy(path, data / ENGINES / path.name)
     if config_path is not None:
         _copy(config_path, partial / config_path.name)
     for key in keys:
@@ -71,13 +80,14 @@ def key_files(config: Config) -> list[Path]:
     return named + ([Path(tls.ca), Path(tls.certificate), Path(tls.key)] if tls else [])
 
 
-def _small_files(data_dir: Path) -> Iterator[Path]:
-    """Files of the data directory besides store, lock and recordings, such as the counters of commands."""
-    left_out = {path.name for _, path in recordings(data_dir)} | {LOCK_NAME}
-    for path in sorted(data_dir.iterdir()):
-        regular = stat.S_ISREG(path.lstat().st_mode)  # no socket, no link
-        if regular and path.name not in left_out and not path.name.startswith(FILE_NAME):
-            yield path
+def left_out(data_dir: Path) -> list[str]:
+    """Names in a data directory that the agent did not make, and that are not copied. Raises OSError."""
+    return sorted(path.name for path in data_dir.iterdir() if not path.name.startswith(_OWN))
+
+
+def _regular(paths: Iterable[Path]) -> list[Path]:
+    """The regular files among them, in order: no link, and nothing in a linked directory."""
+    return sorted(path for path in paths if stat.S_ISREG(path.lstat().st_mode) and not path.parent.is_symlink())
 
 
 def _copy_store(source: Path, target: Path) -> None:

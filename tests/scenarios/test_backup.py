@@ -2,36 +2,68 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import stat
 import subprocess
+from base64 import b64encode
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from agent.cli.main import run_cli
+from agent.commanding.local import LocalAgent
 from agent.delivery.store import UNKEPT_MAX, Store
 from hw.virtual.serial_port import PtyDevice
 from tests.replay.test_audit_chain import write_keys
 from tests.scenarios.processes import interrupt, recordings, results, started, wait_until
 from tests.scenarios.resting_sensor import config_text, port
+from tests.unit.command_desk import ANNA, sealed
 
 __all__ = ["port"]  # a fixture
+
+COMMANDS = f"""[commands]
+enabled = true
+[[commands.keys]]
+id = "anna"
+public_key = "{b64encode(ANNA.public_key().public_bytes_raw()).decode()}"
+verbs = ["hold"]
+sensors = ["*"]
+"""
+
+
+def release() -> bytes:
+    """A command of anna that ends a hold, and changes nothing here."""
+    return sealed({"release": True}, gateway="site/gateway", sensor="imu", valid_s=600)
+
+
+def answer(data_dir: Path, command: bytes) -> dict[str, Any]:
+    with LocalAgent(data_dir) as agent:
+        return dict(json.loads(agent.send("imu/command/hold", command)))
 
 
 def test_a_restored_directory_goes_on(tmp_path: Path, port: PtyDevice) -> None:
     private, public = write_keys(tmp_path)
     config, data_dir, copy = tmp_path / "gateway.toml", tmp_path / "data", tmp_path / "copy"
-    config.write_text(config_text(port, private))
+    config.write_text(config_text(port, private) + COMMANDS)
     with started("run", config, "--data-dir", data_dir, output=tmp_path / "output") as process:
         wait_until(lambda: len(recordings(data_dir)) >= 4 and results(data_dir, "window"), 30, "recordings")
+        old = [release()]
+        assert answer(data_dir, old[0])["taken"]
+        engine = data_dir / "engines" / "1-abc.whl"
+        engine.parent.mkdir(exist_ok=True)
+        engine.write_bytes(b"wheel")
         arguments = ["--data-dir", str(data_dir), "--config", str(config), "--with-keys"]
         assert run_cli(["backup", str(copy), *arguments]) == 0
+        old.append(release())
+        assert answer(data_dir, old[1])["taken"], "after the backup"
         interrupt(process)
     names = [path.name for path in recordings(copy / "data")]
     assert len(names) >= 4
     assert names[-1].endswith(".active"), "also the file that is being written"
     assert (copy / "data" / "head.json").exists()
+    assert (copy / "data" / "engines" / engine.name).read_bytes() == b"wheel"
     assert (copy / "gateway.toml").read_text() == config.read_text()
     key = copy / "keys" / private.name
     assert key.read_bytes() == private.read_bytes()
@@ -44,6 +76,10 @@ def test_a_restored_directory_goes_on(tmp_path: Path, port: PtyDevice) -> None:
     shutil.copytree(copy / "data", data_dir)
     with started("run", config, "--data-dir", data_dir, output=tmp_path / "output") as process:
         wait_until(lambda: len(results(data_dir, "window")) > len(stored) + 1, 30, "new windows")
+        for command in old:
+            assert not (said := answer(data_dir, command))["taken"]
+            assert "is not above" in said["reason"]
+        assert answer(data_dir, release())["taken"]
         interrupt(process)
     assert process.returncode == 0, (tmp_path / "output").read_text()
     after = results(data_dir, "window")
@@ -64,11 +100,20 @@ def test_a_copy_never_uses_the_numbers_that_the_original_used_meanwhile(tmp_path
 def test_keys_are_copied_only_if_that_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data_dir = tmp_path / "data"
     data_dir.mkdir()
-    (data_dir / "command-counters.json").write_text("{}")
-    (data_dir / "link").symlink_to("/etc/passwd")
+    write_keys(data_dir)
+    names = ["command-counters.json", "fieldcal-000001.key", "fieldcal-000001.deleted", "fieldcal-000002.mcap.lock"]
+    for name in [*names, "head.json", "notes.txt", "engines.whl"]:
+        (data_dir / name).write_text("{}")
+    (data_dir / "engines").mkdir()
+    (data_dir / "engines" / "a.key").write_text("{}")
+    for link in ("link", "engines/link.whl", "fieldcal-000003.deleted"):
+        (data_dir / link).symlink_to("/etc/passwd")
     assert run_cli(["backup", str(tmp_path / "copy"), "--data-dir", str(data_dir)]) == 0
     found = {str(path.relative_to(tmp_path / "copy")) for path in (tmp_path / "copy").rglob("*") if path.is_file()}
-    assert found == {"data/command-counters.json", "SHA256SUMS"}
+    kept = {f"data/{name}" for name in (*names[2:], "head.json")}
+    assert found == {*kept, "SHA256SUMS"}
+    told = capsys.readouterr().out.splitlines()[-1]
+    assert told == "not copied, since the agent did not make it: gateway.key, gateway.pub, link, notes.txt"
     assert stat.S_IMODE((tmp_path / "copy").stat().st_mode) == 0o700
     capsys.readouterr()
     assert run_cli(["backup", str(tmp_path / "copy"), "--data-dir", str(data_dir)]) == 2

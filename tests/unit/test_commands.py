@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from agent.commanding.counters import FILE_NAME
+from agent.commanding.counters import FILE_NAME, Counters
 from agent.commanding.desk import RECORDED_REFUSALS, TAKEN
 from agent.commanding.envelope import LARGEST
 from agent.recording.messages import decode, encode
@@ -159,6 +159,30 @@ def test_a_lost_file_of_counters_opens_no_way_for_an_old_command(site: DeskSite,
     aside = restarted.desk.counters.set_aside
     assert (aside is None) == (content is None)
     assert aside is None or aside.read_bytes() == content
+
+
+def test_a_lost_file_is_lost_for_every_key_also_after_the_next_start(tmp_path: Path) -> None:
+    old = time.time_ns()
+    Counters(tmp_path).take("anna", time.time_ns())
+    again = Counters(tmp_path)
+    assert again.last("bob") > old, "bob signed nothing since the file was lost, but perhaps before"
+    again.take("bob", time.time_ns())
+    assert Counters(tmp_path).last("carol") > old
+
+
+def test_a_clock_that_was_behind_at_the_start_lets_no_old_command_pass(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A gateway without a battery begins with the time of its last stop, and is set by NTP a little later."""
+    utc_ns, behind_ns = time.time_ns, 300_000_000_000
+    old = utc_ns()
+    monkeypatch.setattr(time, "time_ns", lambda: utc_ns() - behind_ns)
+    counters = Counters(tmp_path)
+    assert counters.last("anna") < old
+    monkeypatch.setattr(time, "time_ns", utc_ns)
+    assert old < counters.last("anna") <= utc_ns()
+    monkeypatch.setattr(time, "time_ns", lambda: utc_ns() - behind_ns)
+    assert counters.last("anna") > old, "a clock that is set back takes nothing back"
 
 
 @pytest.mark.skipif(os.geteuid() == 0 and not Path("/dev/full").exists(), reason="no way to make writing fail")
