@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import math
 import signal
 import threading
@@ -31,7 +32,8 @@ INBOX = 1000  # heads that may wait; the oldest are dropped, and each gateway pu
 CONNECT_MS = 10_000
 CLOSE_S = 2.0  # s to wait at the end until a head that has arrived is kept
 LOOK_S = 1.0  # s between two looks whether the router still hears
-TOLD_S = 10.0  # s between two heads that are said to be refused, since strangers may publish them without end
+TOLD_S = 10.0  # s between two lines about heads that are not kept, since strangers may publish them without end
+FULL = (errno.ENOSPC, errno.EDQUOT)
 HEADS = f"{PREFIX}/*/*/head"
 
 
@@ -61,7 +63,10 @@ def witness(
     """Keep the heads that gateways publish, with the time of this machine, signed with a key of this machine.
 
     `fieldcal audit DATA --witness DIR` then notices recordings that are missing at the end. Run it on a machine that
-    those who can write on the gateway cannot write on. Exit status: 1 no router or a fault of the disk, 2 bad input.
+    those who can write on the gateway cannot write on. While the disk is full it says so, and keeps nothing. Without
+    --public-key and --keys it keeps heads of 100 gateways at most.
+
+    Exit status: 1 no router or a fault of the disk, 2 bad input.
     """
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -112,12 +117,14 @@ def _follow(session: zenoh.Session, key: str, kept: Witness, stop: threading.Eve
             try:
                 taken, said = kept.take(address.source if address else "", sample.payload.to_bytes())
             except OSError as error:
-                faults.append(error)
-                stop.set()
-                return
+                if error.errno not in FULL:
+                    faults.append(error)
+                    stop.set()
+                    return
+                taken, said = False, f"{address.source if address else ''}: not kept, the disk is full"
             if said and not taken:
                 refused += 1
-                said = f"{said} ({refused} refused so far)" if time.monotonic() > silent_until_s else ""
+                said = f"{said} ({refused} not kept so far)" if time.monotonic() > silent_until_s else ""
                 silent_until_s = time.monotonic() + TOLD_S if said else silent_until_s
             if said:
                 say(said)
