@@ -20,7 +20,8 @@ from agent.config import Channel, Config
 from agent.core.events import Acceleration, DeviceChange, Event, Result, RunStart, Tick
 from agent.core.memory import Memory
 from agent.core.pipeline import Pipeline
-from agent.delivery.history import History, Record, StoreError
+from agent.delivery.gateway_key import GatewayKey
+from agent.delivery.history import Record, StoreError
 from agent.delivery.publication import Publisher
 from agent.delivery.retention import keep_results
 from agent.delivery.store import Store
@@ -75,10 +76,12 @@ class Service:
         one_arena()
         self._data_dir.mkdir(parents=True, exist_ok=True)
         config = self._config
-        check_owner(self._data_dir, f"{config.gateway.site}/{config.gateway.name}")
+        name = f"{config.gateway.site}/{config.gateway.name}"
+        check_owner(self._data_dir, name)
         signer = Signer.load(config.recording.signing_key) if config.recording.signing_key else None
         recall = partial(memories_of, restore=Pipeline.restore)
-        self._store = Store(self._data_dir, keep=keep_results(config.results), recall=recall)
+        key = GatewayKey(name, signer) if signer is not None else None
+        self._store = Store(self._data_dir, keep=keep_results(config.results), recall=recall, key=key)
         if self._store.set_aside:
             _log.warning(
                 "the state file was corrupt and is kept as %s; a new one is made from the recordings",
@@ -87,6 +90,8 @@ class Service:
         if (found := self._store.recovered).results or found.memories:
             lacked = "%d results and the states of %d devices that the state file lacked were found in the recordings"
             _log.warning(lacked, found.results, found.memories)
+        for fault in found.faults:
+            _log.warning("%s", fault)
         self._recorder = Recorder(
             self._data_dir,
             [device.name for device in config.devices],
@@ -131,7 +136,13 @@ class Service:
             if self._publisher is not None:
                 self._publisher.close()
             if recorded:
-                self._store.close()
+                self._end_store(writer.whole)
+
+    def _end_store(self, whole: bool) -> None:
+        """Close the store; with the states after the last event, if the recordings hold all events (`whole`)."""
+        if whole:
+            self._store.end([channel.sensor for channel in self._config.channels], self._pipeline.all_memories())
+        self._store.close()
 
     def _publication(self) -> Publisher | None:
         if not self._config.zenoh.enabled:
@@ -170,18 +181,10 @@ class Service:
         )
 
     def _kept(self) -> dict[str, dict[str, bytes]]:
-        """The states of the estimation that earlier runs left, by sensor and by identity of the device.
-
-        Where the store cannot be read a warning is logged, and there are none.
-        """
+        """The states of the estimation that earlier runs left, by sensor and by identity of the device."""
         kept: dict[str, dict[str, bytes]] = {}
-        try:
-            with History(self._store.path) as history:
-                for channel in self._config.channels:
-                    memories = history.memories(channel.sensor)
-                    kept[channel.sensor] = {identity: memory.state for identity, memory in memories.items()}
-        except StoreError as error:
-            _log.warning("the calibrations in force cannot be restored, and the run begins without them: %s", error)
+        for memory in self._store.states:
+            kept.setdefault(memory.sensor, {})[memory.identity] = memory.state
         return kept
 
     def _begin_file(self, writer: RecordingThread, *, continuation: bool) -> None:

@@ -283,9 +283,12 @@ class ChannelState:
     # --- state
 
     @property
-    def known(self) -> bool:
-        """Whether there is a device with a state to keep."""
-        return self._estimation is not None
+    def taught(self) -> bool:
+        """Whether the state of the device that is connected now holds more than its configuration states."""
+        if self._estimation is None:
+            return False
+        taken = self._estimation.recursion.windows or self._in_force is not None
+        return bool(taken or self._estimation.gate.on_hold)
 
     def memory(self) -> bytes:
         """State of the device that is connected now, for later runs."""
@@ -295,8 +298,7 @@ class ChannelState:
 
     def memories(self) -> dict[str, bytes]:
         """`memory` by identity: of the device that is connected now and of those that were connected before."""
-        taught = self._estimation is not None and (self._estimation.recursion.windows or self._in_force is not None)
-        return self._kept | ({self.identity: self.memory()} if taught else {})
+        return shelved(self._kept, self.identity, self.memory()) if self.taught else dict(self._kept)
 
     def _remember(self, memory: bytes) -> tuple[list[Result], str]:
         kept = take_up(memory, self._filters, self._nominal)

@@ -117,6 +117,11 @@ class Gate:
         return "COLLECTING" if self._taken else "UNCALIBRATED"
 
     @property
+    def on_hold(self) -> bool:
+        """Whether an operator put the calibration on hold."""
+        return bool(self._hold)
+
+    @property
     def held(self) -> int:
         """Number of held windows. A command or the loss of the sensor dismisses them."""
         return self._held

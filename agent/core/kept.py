@@ -87,6 +87,11 @@ def keep(
     )
 
 
+def of_calibration(update: CalibrationUpdate) -> bytes:
+    """The state for `take_up` where nothing but the calibration in force is left of it."""
+    return pack({"in_force": plain(update), "device": "", "day": 0.0, "t_utc_ns": update.t_utc_ns})
+
+
 def take_up(kept: bytes, filters: DriverFilters, nominal: float | None) -> Kept:
     """The estimation from the bytes of `keep`, as far as it is still valid. Raises ValueError as Estimation does.
 
@@ -99,6 +104,8 @@ def take_up(kept: bytes, filters: DriverFilters, nominal: float | None) -> Kept:
     except MALFORMED as error:
         reason = f"begun again from the prior: the stored state cannot be read: {_said(error)}"
         return Kept(Estimation(filters.channel, nominal), None, 0.0, 0, reason)
+    if "estimation" not in state:
+        return _from_in_force(state, in_force, filters.channel, nominal, day, t_utc_ns, "nothing else was left")
     try:
         were = DriverFilters(_as_before(state["basis"], configured))
         were.load(state["filters"])
@@ -117,7 +124,8 @@ def take_up(kept: bytes, filters: DriverFilters, nominal: float | None) -> Kept:
         gravity = _gravity(changed, state["basis"], configured)
         moved = fresh.restate(gravity, remounted=bool(MOUNT & changed), size=size)
     except MALFORMED as error:
-        return _from_in_force(state, in_force, filters.channel, nominal, day, t_utc_ns, _said(error))
+        why = f"the stored state cannot be read: {_said(error)}"
+        return _from_in_force(state, in_force, filters.channel, nominal, day, t_utc_ns, why)
     reason = "restored from the previous run"
     if changed:
         reason += f"; these settings have changed and were exchanged in the state: {', '.join(sorted(changed))}"
@@ -135,8 +143,7 @@ def _from_in_force(
     t_utc_ns: int,
     why: str,
 ) -> Kept:
-    """The estimation begun from the calibration in force, because the rest of the state cannot be read."""
-    why = f"the stored state cannot be read: {why}"
+    """The estimation begun from the calibration in force, because the rest of the state is lost or cannot be read."""
     fresh = Estimation(channel, nominal)
     if in_force is None:
         return Kept(fresh, None, day, t_utc_ns, f"begun again from the prior: {why}")

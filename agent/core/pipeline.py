@@ -108,7 +108,7 @@ class Pipeline:
         found = []
         for channel in self._channels:
             own = [r for r in results if r.sensor == channel.sensor and isinstance(r, Result) and changes_state(r)]
-            if own and channel.known:
+            if own and channel.taught:
                 found.append(Memory(channel.sensor, channel.identity, own[-1].sequence, channel.memory()))
         return found
 

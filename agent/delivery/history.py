@@ -2,108 +2,34 @@
 
 from __future__ import annotations
 
-import math
 import os
 import sqlite3
 from collections.abc import Collection
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 from urllib.parse import quote
 
-import msgspec
-
-from agent.core.events import RESULTS, CalibrationUpdate, Result
 from agent.core.memory import Memory
+from agent.delivery.record import JOINED, Record
 from agent.delivery.schema import (
-    RESULT_COLUMNS,
     SCHEMA_VERSION,
     DamagedRow,
     StoreError,
     checked,
     damage,
     known_version,
-    row_crc,
     version_of,
 )
+
+if TYPE_CHECKING:
+    from agent.config.known_keys import KnownKeys
 
 __all__ = ["FILE_NAME", "History", "Record", "Removed", "StoreError", "connect_read_only"]
 
 FILE_NAME = "state.sqlite"
-
-
-@dataclass(frozen=True, slots=True)
-class Record:
-    """A result as it is stored and published.
-
-    `payload`: its JSON with two added fields: `recorded`, which is false where the result and its raw data are in no
-    recording, and `epoch`, which names the numbering that `sequence` belongs to. `sensor`: empty for a result of the
-    gateway itself. `sequence`: rises over all runs of a gateway, with gaps. `signed`: the result as its gateway signed
-    it (agent.recording.result_signing), without `recorded`; empty where the gateway has no key.
-    """
-
-    sequence: int
-    run_id: str
-    sensor: str
-    what: str
-    payload: bytes
-    t_utc_ns: int
-    recorded: bool
-    recording: str  # name of the recording's file; "" where the result is in none
-    identity: str = ""  # for a calibration, the identity of the device
-    signed: bytes = b""
-
-    @staticmethod
-    def of(result: Result, *, recorded: bool, recording: str, epoch: str = "", signed: bytes = b"") -> Record:
-        """Make the record of a result."""
-        identity = result.identity if isinstance(result, CalibrationUpdate) else ""
-        return Record(
-            result.sequence,
-            result.run_id,
-            result.sensor,
-            result.what,
-            payload_of(result, recorded=recorded, epoch=epoch),
-            result.t_utc_ns,
-            recorded,
-            recording,
-            identity,
-            signed,
-        )
-
-    @staticmethod
-    def of_row(row: tuple[Any, ...], signed: bytes = b"") -> Record:
-        """Make the record from a row: RESULT_COLUMNS and their CRC. Raises DamagedRow."""
-        sequence, run_id, sensor, what, payload, t_utc_ns, recorded, recording, identity = checked(row)
-        return Record(sequence, run_id, sensor, what, payload, t_utc_ns, bool(recorded), recording, identity, signed)
-
-    @property
-    def row(self) -> tuple[Any, ...]:
-        """The columns of RESULT_COLUMNS and their CRC."""
-        columns: tuple[Any, ...] = (self.sequence, self.run_id, self.sensor, self.what, self.payload, self.t_utc_ns)
-        columns += (int(self.recorded), self.recording, self.identity)
-        return (*columns, row_crc(*columns))
-
-    @property
-    def is_withdrawal(self) -> bool:
-        """Whether this status (UNCALIBRATED) ends the time in force of the sensor's calibration."""
-        return self.what == "status" and self.fields.get("status") == "UNCALIBRATED"
-
-    @property
-    def fields(self) -> dict[str, Any]:
-        """The payload, decoded from JSON. Raises StoreError where it is not JSON."""
-        try:
-            return msgspec.json.decode(self.payload, type=dict[str, Any])
-        except (msgspec.DecodeError, UnicodeDecodeError) as error:
-            raise StoreError(f"result {self.sequence} cannot be read: {error}") from None
-
-    @property
-    def result(self) -> Result:
-        """The result, decoded; null becomes NaN. Raises StoreError where this version cannot decode the payload."""
-        try:
-            return msgspec.convert(_null_to_nan(self.fields), RESULTS[self.what])
-        except (KeyError, msgspec.ValidationError) as error:
-            raise StoreError(f"result {self.sequence}, a {self.what}, cannot be read: {error}") from None
+_EPOCH_OF = "ifnull(iif(json_valid(CAST(payload AS TEXT)), json_extract(CAST(payload AS TEXT), '$.epoch'), NULL), '')"
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,10 +46,16 @@ class History:
     """Reads the store through a connection of its own, also while the agent writes.
 
     Only the thread that made it may use it. Every method raises StoreError where the store is missing or damaged.
+
+    What is signed is given as it was signed, whatever its row says. With `keys` (those of the gateway), a result that
+    none of them signed is left out; without, one whose signature is not valid. `refused`: why, by sequence number, also
+    of rows that said something else than was signed. Results without any signature are given: `Record.signed` is empty.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, keys: KnownKeys | None = None) -> None:
         self._path = path
+        self._keys = keys
+        self.refused: dict[int, str] = {}
         if not path.is_file():
             raise StoreError(f"{path}: there is no such file; `fieldcal run` makes it in its data directory")
         self._connection = connect_read_only(path)
@@ -160,15 +92,19 @@ class History:
 
         Only of `channels` (sensor, what) and of one `epoch` ("" for results of older versions) where these are given.
         """
-        where, values = "sequence > ?", [sequence]
+        where = "sequence > ?"
         if channels is not None:
-            rows = ", ".join(["(?, ?)"] * len(channels)) or "(NULL, NULL)"
-            where += f" AND (sensor, what) IN (VALUES {rows})"
+            places = ", ".join(["(?, ?)"] * len(channels)) or "(NULL, NULL)"
+            where += f" AND (sensor, what) IN (VALUES {places})"
         names = [name for channel in channels or () for name in channel]
         if epoch is not None:
-            where += " AND ifnull(json_extract(CAST(payload AS TEXT), '$.epoch'), '') = ?"
+            where += f" AND {_EPOCH_OF} = ?"
             names.append(epoch)
-        return self._records(f"WHERE {where} ORDER BY sequence LIMIT ?", *values, *names, limit)
+        while rows := self._joined(f"WHERE {where} ORDER BY sequence LIMIT ?", sequence, *names, limit):
+            if records := self._proven(rows):
+                return records
+            sequence = rows[-1][0]  # all of them are refused
+        return []
 
     def count_after(self, sequence: int) -> int:
         """The number of results after `sequence`. For the last published number this is the size of the outbox."""
@@ -182,10 +118,8 @@ class History:
 
     def latest(self) -> list[Record]:
         """The newest result of every channel, in order of sequence; a calibration only while it is in force."""
-        return sorted(
-            (self._record(sequence) for _, _, sequence, withdrawn in self._latest() if not withdrawn),
-            key=lambda record: record.sequence,
-        )
+        numbers = sorted(sequence for _, _, sequence, withdrawn in self._latest() if not withdrawn)
+        return [record for sequence in numbers for record in self._one(sequence)]
 
     def in_force(self, sensor: str) -> Record | None:
         """The calibration in force of a sensor; None if it has none, or if a later status was UNCALIBRATED."""
@@ -196,8 +130,7 @@ class History:
         rows = self._rows(
             "SELECT max(sequence) FROM results WHERE sensor = ? AND what = 'calibration' GROUP BY identity", sensor
         )
-        records = [self._record(sequence) for (sequence,) in rows]
-        return {record.identity: record for record in records}
+        return {record.identity: record for (sequence,) in rows for record in self._one(sequence)}
 
     def memories(self, sensor: str) -> dict[str, Memory]:
         """The newest state of the estimation of each of this sensor's last devices, by identity, oldest first."""
@@ -218,7 +151,7 @@ class History:
         """The newest `limit` results of one channel, of one run if it is named, newest first."""
         of_run, named = (" AND run_id = ?", [run_id]) if run_id else ("", [])
         where = f"WHERE sensor = ? AND what = ?{of_run} ORDER BY sequence DESC LIMIT ?"
-        return self._records(where, sensor, what, *named, limit)
+        return self._proven(self._joined(where, sensor, what, *named, limit))
 
     def removed(self) -> list[Removed]:
         """What retention deleted, by channel."""
@@ -238,19 +171,42 @@ class History:
     def _latest(self) -> list[tuple[Any, ...]]:
         return self._checked("SELECT sensor, what, sequence, withdrawn, crc FROM latest")
 
-    def _record(self, sequence: int) -> Record:
-        found = self._records("WHERE sequence = ?", sequence)
-        if not found:
+    def _one(self, sequence: int) -> list[Record]:
+        """The result with this number; none where it is refused."""
+        rows = self._joined("WHERE sequence = ?", sequence)
+        if not rows:
             raise StoreError(f"{self._path}: damaged: result {sequence} is missing")
-        return found[0]
+        return self._proven(rows, unsigned=not self._must_be_signed())
 
-    def _records(self, clause: str, *values: object) -> list[Record]:
-        columns = f"{RESULT_COLUMNS}, crc, data, signed_crc"
-        rows = self._rows(f"SELECT {columns} FROM results LEFT JOIN signed USING (sequence) {clause}", *values)
+    def _must_be_signed(self) -> bool:
+        """Whether the gateway has a key and has used it: then a result without a signature is not put forward."""
+        return self._keys is not None and bool(self._rows("SELECT 1 FROM signed LIMIT 1"))
+
+    def _joined(self, clause: str, *values: object) -> list[tuple[Any, ...]]:
+        return self._rows(f"{JOINED} {clause}", *values)
+
+    def _proven(self, rows: list[tuple[Any, ...]], *, unsigned: bool = True) -> list[Record]:
+        """The results in rows of `_joined`, as they were signed; without those that are refused."""
         try:
-            return [Record.of_row(row[:-2], _signed(row)) for row in rows]
+            stored = [Record.of_joined(row) for row in rows]
         except DamagedRow as error:
             raise StoreError(f"{self._path}: {error}") from None
+        found = []
+        for record in stored:
+            if not record.signed:
+                found += [record] if unsigned else []
+                self.refused |= {} if unsigned else {record.sequence: "it is not signed"}
+                continue
+            from agent.delivery.proof import UnprovenError, proven
+
+            try:
+                true, differs = proven(record, self._keys)
+                found.append(true)
+            except UnprovenError as error:
+                differs = str(error)
+            if differs:
+                self.refused[record.sequence] = differs
+        return found
 
     def _checked(self, sql: str) -> list[tuple[Any, ...]]:
         try:
@@ -265,31 +221,6 @@ class History:
                 return cursor.fetchall()
         except (sqlite3.Error, UnicodeDecodeError) as error:
             raise StoreError(f"{self._path}: {error}") from None
-
-
-def payload_of(result: Result, *, recorded: bool, epoch: str) -> bytes:
-    """The JSON of a result, as it is stored and published. A number that is not finite becomes null."""
-    fields = {**msgspec.structs.asdict(result), "recorded": recorded} | ({"epoch": epoch} if epoch else {})
-    return msgspec.json.encode(fields)
-
-
-def _signed(row: tuple[Any, ...]) -> bytes:
-    """The signed result at the end of a row; empty where it has none. Raises DamagedRow."""
-    data = row[-2]
-    return bytes(checked((row[0], *row[-2:]))[1]) if data is not None else b""
-
-
-def result_of(what: str, fields: dict[str, Any]) -> Result | None:
-    """The result whose fields these are; None where this version knows no such kind. Raises msgspec.ValidationError."""
-    return msgspec.convert(_null_to_nan(fields), RESULTS[what]) if what in RESULTS else None
-
-
-def _null_to_nan(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _null_to_nan(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_null_to_nan(item) for item in value]
-    return math.nan if value is None else value
 
 
 def connect_read_only(path: Path) -> sqlite3.Connection:

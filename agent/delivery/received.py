@@ -9,8 +9,8 @@ from typing import Any
 import msgspec
 
 from agent.core.events import CalibrationUpdate, Estimate
-from agent.delivery.history import result_of
 from agent.delivery.keys import Address, parse_key
+from agent.delivery.record import result_of
 from agent.delivery.verifying import Verifier, differing, signer_of
 
 LARGEST_RESULT = 256 << 10  # bytes; the largest result, a calibration, has 5 kB

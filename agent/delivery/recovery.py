@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import logging
 import sqlite3
-import time
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from agent.core.memory import Memory
-from agent.delivery.history import Record
+from agent.delivery.proof import UnprovenError, proven
+from agent.delivery.record import Record
 from agent.delivery.schema import (
     RESULT_COLUMNS,
     checked,
@@ -18,7 +18,6 @@ from agent.delivery.schema import (
     insert_signed,
     withdraw,
     write_latest,
-    write_memory,
 )
 from agent.recording.files import final_name, recordings
 from agent.recording.reading import first_event
@@ -26,16 +25,16 @@ from agent.recording.result_signing import PUBLIC_KEY, recorded_result
 from agent.recording.results_chain import EPOCH, FILE_METADATA
 from agent.recording.scan import ScannedFile, scan
 
-_log = logging.getLogger(__name__)
+if TYPE_CHECKING:
+    from agent.config.known_keys import KnownKeys
 
-Recall = Callable[[Path], Sequence[Memory]]  # gives the states of the estimation at the end of a recording
-# s; after this time no further recording is replayed at a start. One replay takes seconds for an hour of recording.
-LONGEST_S = 60.0
+_log = logging.getLogger(__name__)
 
 
 @dataclass(slots=True)
 class Recovered:
     """What was restored: `results` from `files` recordings, states (`memories`) of so many devices.
+    `faults`: what in the store was not as the gateway signed it, and what is done instead.
 
     `file_sequence`, `published`: number of the newest recording, and the last published result when it began.
     """
@@ -45,13 +44,15 @@ class Recovered:
     files: int = 0
     file_sequence: int = 0
     published: int = 0
+    faults: list[str] = field(default_factory=list)
 
 
-def recover(connection: sqlite3.Connection, directory: Path, *, everything: bool) -> Recovered:
+def recover(connection: sqlite3.Connection, directory: Path, keys: KnownKeys | None, *, everything: bool) -> Recovered:
     """Add the recorded results that the store lacks, within the caller's transaction.
 
     Reads the recordings from the newest one back to the first of which no result is missing; all of them with
-    `everything`. A file that cannot be read is skipped, with a warning in the log. Raises sqlite3.Error, DamagedRow.
+    `everything`. With `keys`, one of them must have signed a result that names a key. A file that cannot be read is
+    skipped, with a warning in the log. Raises sqlite3.Error, DamagedRow.
     """
     recovered = Recovered()
     rows = connection.execute("SELECT sensor, what, count, up_to, crc FROM removed")
@@ -67,10 +68,10 @@ def recover(connection: sqlite3.Connection, directory: Path, *, everything: bool
         if not recovered.file_sequence and first_event(path) is not None:  # without it the number is used again
             recovered.file_sequence = number
             recovered.published = _published(found.metadata.get(FILE_METADATA, {}))
-        records = _records(path, found)
-        missing = [r for r in _missing(connection, records) if r.sequence > removed.get((r.sensor, r.what), 0)]
+        missing = _missing(connection, records_of(path, found))
+        missing = [r for r in missing if r.sequence > removed.get((r.sensor, r.what), 0) and _counts(path, r, keys)]
         insert_results(connection, [record.row for record in missing])
-        insert_signed(connection, _signed(path, found, {record.sequence for record in missing}))
+        insert_signed(connection, [(record.sequence, record.signed) for record in missing if record.signed])
         recovered.results += len(missing)
         recovered.files += bool(missing)
         if found.results and not missing and not everything:
@@ -80,59 +81,31 @@ def recover(connection: sqlite3.Connection, directory: Path, *, everything: bool
     return recovered
 
 
-def _records(path: Path, found: ScannedFile) -> list[Record]:
-    epoch = found.metadata.get(FILE_METADATA, {}).get(EPOCH, "")
-    return [Record.of(r, recorded=True, recording=final_name(path), epoch=epoch) for r in found.results]
-
-
-def _signed(path: Path, found: ScannedFile, sequences: set[int]) -> list[tuple[int, bytes]]:
-    """(sequence, signed result) of these results of a recording. Signatures are not verified: consumers do that."""
+def records_of(path: Path, found: ScannedFile) -> list[Record]:
+    """The results of a scanned recording, with their signatures, which are not verified."""
     origin = found.metadata.get(FILE_METADATA, {})
-    start = first_event(path) if sequences and PUBLIC_KEY in origin else None
-    if start is None:
-        return []
-    each = zip(found.results, found.messages, strict=True)
-    signed = [recorded_result(*one, f"{start.site}/{start.gateway}", origin) for one in each]
-    return [(one.sequence, one.data) for one in signed if one and one.sequence in sequences and one.is_written]
+    start = first_event(path) if PUBLIC_KEY in origin else None
+    gateway = f"{start.site}/{start.gateway}" if start is not None else ""
+    records = []
+    for result, message in zip(found.results, found.messages, strict=True):
+        signed = recorded_result(result, message, gateway, origin) if start is not None else None
+        data = signed.data if signed is not None and signed.is_written else b""
+        records.append(
+            Record.of(result, recorded=True, recording=final_name(path), epoch=origin.get(EPOCH, ""), signed=data)
+        )
+    return records
 
 
-def recover_memories(connection: sqlite3.Connection, directory: Path, recall: Recall) -> int:
-    """Update the states of the estimation from the recordings, within the caller's transaction.
-
-    The newest recording gives the states of all devices of its run and those kept from before. Then follow, newest
-    first, the recordings with a calibration that is newer than the state known of its device.
-    Returns the number of devices whose state was replaced.
-    """
-    rows = connection.execute("SELECT sensor, identity, sequence, state, crc FROM memory")
-    known: dict[tuple[str, str], int] = {(row[0], row[1]): row[2] for row in map(checked, rows)}
-    files = {final_name(path): path for _, path in recordings(directory)}
-    end = time.monotonic() + LONGEST_S
-    found: set[tuple[str, str]] = set()
-
-    def take(name: str) -> None:
-        path = files.pop(name, None)
-        for memory in recall(path) if path is not None and time.monotonic() < end else ():
-            device = (memory.sensor, memory.identity)
-            if memory.sequence > known.get(device, 0):
-                write_memory(connection, (*device, memory.sequence, memory.state))
-                known[device] = memory.sequence
-                found.add(device)
-
-    take(next(reversed(files), ""))
-    for sensor, identity, name, sequence in connection.execute(_CALIBRATED).fetchall():
-        if known.get((sensor, identity), 0) < sequence:
-            take(name)
-    return len(found)
-
-
-_CALIBRATED = """
-SELECT sensor, identity, recording, max(sequence) AS newest FROM results
-WHERE what = 'calibration' AND recorded = 1 GROUP BY sensor, identity, recording ORDER BY newest DESC"""
-
-
-def no_memories(_: Path) -> Sequence[Memory]:
-    """A Recall that replays nothing and gives no states."""
-    return ()
+def _counts(path: Path, record: Record, keys: KnownKeys | None) -> bool:
+    """Whether a result of a recording may be in the store."""
+    if keys is None or not record.signed:
+        return True
+    try:
+        proven(record, keys)
+    except UnprovenError as error:
+        _log.warning("%s: result %d is not restored to the store: %s", path, record.sequence, error)
+        return False
+    return True
 
 
 def name_latest(connection: sqlite3.Connection) -> None:

@@ -13,9 +13,9 @@ from typing import Any
 
 import msgspec
 
-from agent.core.memory import MOST_MEMORIES
+from agent.core.memory import MOST_MEMORIES, Memory
 
-SCHEMA_VERSION = 4
+SCHEMA_VERSION = 5
 # `epoch` names the numbering of the results. Version 2 had the same tables without this mark; a start adds it.
 EPOCH = "epoch"
 MARKS = frozenset({"floor", "published", "clean", "file", EPOCH})
@@ -39,11 +39,14 @@ _REMOVED = """CREATE TABLE removed (
 _MEMORY = """CREATE TABLE memory (
     sensor TEXT NOT NULL, identity TEXT NOT NULL, sequence INTEGER NOT NULL, state BLOB NOT NULL, crc INTEGER NOT NULL,
     PRIMARY KEY (sensor, identity)) STRICT"""
+# The signed list of the rows of `memory` (agent.delivery.signed_states); empty where the gateway has no key.
+_STATES = """CREATE TABLE states (
+    one INTEGER PRIMARY KEY CHECK (one = 1), signed BLOB NOT NULL, crc INTEGER NOT NULL) STRICT"""
 _INDEXES = (
     "CREATE INDEX results_of_channel ON results (sensor, what, sequence)",
     "CREATE INDEX calibrations_of_device ON results (sensor, identity, sequence) WHERE what = 'calibration'",
 )
-_STATEMENTS = (_RESULTS, _LATEST, _MARKS, _REMOVED, _MEMORY, _SIGNED, *_INDEXES)
+_STATEMENTS = (_RESULTS, _LATEST, _MARKS, _REMOVED, _MEMORY, _SIGNED, _STATES, *_INDEXES)
 
 
 class StoreError(Exception):
@@ -114,19 +117,39 @@ def insert_signed(connection: sqlite3.Connection, rows: Iterable[tuple[int, byte
     connection.executemany("INSERT INTO signed (sequence, data, signed_crc) VALUES (?, ?, ?)", with_crc)
 
 
-def write_memory(connection: sqlite3.Connection, row: tuple[str, str, int, bytes]) -> None:
-    """Write the state of the estimation of a device: `row` is (sensor, identity, sequence, state).
+def write_memory(connection: sqlite3.Connection, memory: Memory) -> None:
+    """Write the state of the estimation of a device.
 
     It replaces the device's previous state. For each sensor, only the MOST_MEMORIES newest devices are kept.
     """
+    row = (memory.sensor, memory.identity, memory.sequence, memory.state)
     connection.execute(
         "INSERT OR REPLACE INTO memory (sensor, identity, sequence, state, crc) VALUES (?, ?, ?, ?, ?)",
         (*row, row_crc(*row)),
     )
-    newest = "SELECT identity FROM memory WHERE sensor = ? ORDER BY sequence DESC LIMIT ?"
+    newest = "SELECT identity FROM memory WHERE sensor = ? ORDER BY sequence DESC, rowid DESC LIMIT ?"
     connection.execute(
-        f"DELETE FROM memory WHERE sensor = ? AND identity NOT IN ({newest})", (row[0], row[0], MOST_MEMORIES)
+        f"DELETE FROM memory WHERE sensor = ? AND identity NOT IN ({newest})",
+        (memory.sensor, memory.sensor, MOST_MEMORIES),
     )
+
+
+def read_memories(connection: sqlite3.Connection) -> list[Memory]:
+    """All states of the estimation, those of a sensor oldest first. Raises DamagedRow, sqlite3.Error."""
+    sql = "SELECT sensor, identity, sequence, state, crc FROM memory ORDER BY sensor, sequence, rowid"
+    return [Memory(*checked(row)) for row in connection.execute(sql).fetchall()]
+
+
+def write_states(connection: sqlite3.Connection, signed: bytes) -> None:
+    """Replace the signed list of the states."""
+    row = (1, signed)
+    connection.execute("INSERT OR REPLACE INTO states (one, signed, crc) VALUES (?, ?, ?)", (*row, row_crc(*row)))
+
+
+def read_states(connection: sqlite3.Connection) -> bytes:
+    """The signed list of the states; empty where there is none. Raises DamagedRow, sqlite3.Error."""
+    rows = connection.execute("SELECT one, signed, crc FROM states").fetchall()
+    return bytes(checked(rows[0])[1]) if rows else b""
 
 
 def create_tables(connection: sqlite3.Connection, marks: dict[str, int]) -> None:
@@ -183,6 +206,7 @@ _MIGRATIONS: dict[int, Callable[[sqlite3.Connection], object]] = {
     1: _add_crcs,
     2: lambda _: None,
     3: lambda connection: connection.execute(_SIGNED),
+    4: lambda connection: connection.execute(_STATES),
 }
 
 
@@ -202,7 +226,8 @@ def damage(connection: sqlite3.Connection) -> str:
         _check_all(connection.execute(f"SELECT {RESULT_COLUMNS}, crc FROM results"))
         _check_all(connection.execute("SELECT sequence, data, signed_crc FROM signed"))
         _check_all(connection.execute("SELECT sensor, what, count, up_to, crc FROM removed"))
-        _check_all(connection.execute("SELECT sensor, identity, sequence, state, crc FROM memory"))
+        read_memories(connection)
+        read_states(connection)
         named = {checked(row)[:3] for row in connection.execute("SELECT * FROM latest")}
     except DamagedRow as error:
         return str(error)

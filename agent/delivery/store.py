@@ -7,13 +7,15 @@ import secrets
 import sqlite3
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
 
 from agent.core.memory import Memory
-from agent.delivery.history import FILE_NAME, Record
+from agent.delivery.gateway_key import GatewayKey
+from agent.delivery.history import FILE_NAME, History
 from agent.delivery.opening import lock, open_or_set_aside
-from agent.delivery.recovery import Recall, Recovered, no_memories, recover, recover_memories
+from agent.delivery.record import Record
+from agent.delivery.recovery import Recovered, recover
 from agent.delivery.retention import FOR_EVER, KeepResults, Sweep
 from agent.delivery.schema import (
     EPOCH,
@@ -28,7 +30,10 @@ from agent.delivery.schema import (
     write_latest,
     write_mark,
     write_memory,
+    write_states,
 )
+from agent.delivery.signed_states import Digests, StateList, digest_of
+from agent.delivery.states import Recall, no_memories, states_at_start
 
 # After a crash, results may have been published with sequence numbers that no commit has kept. The next run therefore
 # skips so many numbers: more than a week of one result a second that the disk refused.
@@ -51,6 +56,8 @@ class Store:
     default the UTC in milliseconds (small enough for JavaScript's numbers), and after all numbers in the recordings.
     `keep`: limits beyond which old results are deleted.
     `recall`: gives the states of the estimation at the end of a recording, to restore them with the results.
+    `key`: of the gateway. With it, what the store holds counts only as far as this key signed it, and the store keeps a
+    signed list of its states. `states`: the states of the estimation with which the run begins.
     Raises StoreError where the directory cannot be written or another process uses the store.
     """
 
@@ -60,12 +67,16 @@ class Store:
         count_from: int | None = None,
         keep: KeepResults = FOR_EVER,
         recall: Recall = no_memories,
+        key: GatewayKey | None = None,
     ) -> None:
         first = time.time_ns() // 1_000_000 if count_from is None else count_from
         self.path = data_dir / FILE_NAME
         self._mutex = threading.Lock()
         self._waiting: list[Record] = []
         self._memories: dict[tuple[str, str], Memory] = {}
+        self._key = key
+        self._digests: Digests = {}
+        self.states: list[Memory] = []
         self._last = self._published = self._file_sequence = 0
         self._sweep = Sweep(keep)
         self._lock = lock(data_dir)
@@ -103,6 +114,10 @@ class Store:
             self._waiting.clear()
             self._memories.clear()
 
+    def history(self) -> History:
+        """Open a reader that gives only what the gateway's key signed. Use it in one thread. Raises StoreError."""
+        return History(self.path, self._key.known if self._key is not None else None)
+
     def published(self) -> int:
         """The last published result. The results after it are the outbox: they still wait for a router."""
         return self._published
@@ -132,6 +147,25 @@ class Store:
             except sqlite3.Error as error:
                 raise StoreError(f"{self.path}: {error}") from None
             return str(row[0]) if row else ""
+
+    def end(self, sensors: Collection[str], memories: Iterable[Memory]) -> None:
+        """Replace the states of these sensors by those after the last event, all of which is recorded.
+
+        Raises StoreError.
+        """
+        with self._mutex:
+            try:
+                with self._connection:
+                    self._connection.execute("BEGIN IMMEDIATE")
+                    self._write(self._waiting)
+                    for sensor in sensors:
+                        self._connection.execute("DELETE FROM memory WHERE sensor = ?", (sensor,))
+                    self._write_memories(memories)
+                    self._sign_states(self._last)
+            except (sqlite3.Error, DamagedRow) as error:
+                raise StoreError(f"{self.path}: {error}") from None
+            self._waiting.clear()
+            self._memories.clear()
 
     def close(self) -> None:
         """Write what still waits and close the file. May be called twice. Raises StoreError."""
@@ -164,10 +198,29 @@ class Store:
             write_latest(self._connection, record.sensor, record.what, record.sequence, withdrawn=False)
             if record.is_withdrawal:
                 withdraw(self._connection, record.sensor)
-        for memory in self._memories.values():
-            write_memory(self._connection, (memory.sensor, memory.identity, memory.sequence, memory.state))
+        if self._memories:
+            self._write_memories(self._memories.values())
+            self._sign_states(self._last)
         write_mark(self._connection, "published", self._published)
         write_mark(self._connection, "file", self._file_sequence)
+
+    def _recover(self, *, everything: bool) -> Recovered:
+        keys = self._key.known if self._key is not None else None
+        return recover(self._connection, self.path.parent, keys, everything=everything)
+
+    def _write_memories(self, memories: Iterable[Memory]) -> None:
+        for memory in memories:
+            write_memory(self._connection, memory)
+            self._digests[memory.sensor, memory.identity] = digest_of(memory)
+
+    def _sign_states(self, sequence: int) -> None:
+        """Sign which states there are after the result with the number `sequence`."""
+        if self._key is None:
+            return
+        there = set(self._connection.execute("SELECT sensor, identity FROM memory"))
+        self._digests = {device: digest for device, digest in self._digests.items() if device in there}
+        listed = StateList(self._key.gateway, self.epoch, self._file_sequence, sequence, self._digests)
+        write_states(self._connection, self._key.signer.sign(listed.text).json)
 
     def _begin_run(self, first: int, recall: Recall) -> Recovered:
         """Read the marks, make the tables where the file is new, and restore missing results from the recordings."""
@@ -181,18 +234,23 @@ class Store:
             epoch = marks.get(EPOCH, secrets.randbits(63))
             self.epoch = f"{epoch:016x}"
             directory = self.path.parent
-            recovered = Recovered() if marks["clean"] else recover(self._connection, directory, everything=new)
-            if new or recovered.results:
-                recovered.memories = recover_memories(self._connection, directory, recall)
+            recovered = Recovered() if marks["clean"] else self._recover(everything=new)
+            behind = not marks["clean"] or bool(recovered.results)
+            found = states_at_start(self._connection, directory, recall, self._key, self.epoch, behind=behind, lost=new)
+            recovered.memories, recovered.faults = found.replayed, found.faults
             (kept,) = self._connection.execute("SELECT coalesce(max(sequence), 0) FROM results").fetchone()
-            self._last = max(kept, marks["floor"])
+            self._last = max(kept, marks["floor"], found.sequence)
             if not marks["clean"] and not new:
                 self._last += UNKEPT_MAX
             self._published = marks["published"]
             if new and recovered.results:
-                self._last = max(first, kept + UNKEPT_MAX)
+                self._last = max(first, found.sequence, kept + UNKEPT_MAX)
                 self._published = recovered.published
-            self._file_sequence = max(marks["file"], recovered.file_sequence)
+            self._file_sequence = max(marks["file"], recovered.file_sequence, found.recording)
+            self._connection.execute("DELETE FROM memory")
+            self._write_memories(found.memories)
+            self._sign_states(found.sequence)
+            self.states = found.memories
             write_mark(self._connection, "floor", self._last)
             write_mark(self._connection, "published", self._published)
             write_mark(self._connection, "file", self._file_sequence)

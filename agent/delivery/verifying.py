@@ -9,8 +9,8 @@ import msgspec
 
 from agent.config.key_file import KeyFileError
 from agent.config.known_keys import KnownKeys, WatchedKeys, add_key, identifier
-from agent.delivery.history import payload_of
 from agent.delivery.keys import Address
+from agent.delivery.record import payload_of
 from agent.delivery.seldom import Seldom
 from agent.recording.messages import MessageError
 from agent.recording.result_signing import SignedResult

@@ -1,16 +1,38 @@
-"""Gets the states of the estimation at the end of a recording, by replaying the recording."""
+"""Gets the states of the estimation at the end of a recording, by replaying the recording.
+
+Where the gateway has a key, a recording counts as far as the key covers it. A recording that was closed is covered by
+its signature. One that a crash left open is covered by the head beside it, or, where it just began, by the recording
+before it, which must end with the same states. What follows in it is not sealed yet: each result must have its
+signature and follow from the data.
+"""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol, cast
 
 from agent.core.events import Event, Output, RunStart
 from agent.core.memory import Memory
-from agent.recording.messages import recorded_ones
-from agent.recording.reading import RecordingReader
+from agent.recording.comparison import OTHER_CPU, compare
+from agent.recording.continuation import continues
+from agent.recording.files import file_number, recordings
+from agent.recording.fingerprint import fingerprint
+from agent.recording.head import HEAD_NAME, Head
+from agent.recording.integrity import Integrity, check_integrity
+from agent.recording.messages import decode, encode, recorded_ones, schema_of, topic_of
+from agent.recording.reading import RecordingReader, first_event, open_recording
+from agent.recording.repair import REPAIR_METADATA
+from agent.recording.result_check import check_results
+from agent.recording.results_chain import EPOCH, FILE_METADATA
+from agent.recording.signed_text import SignedText, SignedTextError
+from agent.recording.signing import SIGNATURE_METADATA, Statement, prefix_sha256, verify_file
+
+if TYPE_CHECKING:
+    from agent.config.known_keys import KnownKeys
+
+LONGEST_CHAIN = 20  # recordings in a row that crashes left open; each was a start that ended at once
 
 _log = logging.getLogger(__name__)
 
@@ -22,23 +44,119 @@ class Remembering(Protocol):
     def all_memories(self) -> list[Memory]: ...
 
 
-def memories_of(path: Path, restore: Callable[[str, bytes], Remembering]) -> list[Memory]:
+Restore = Callable[[str, bytes], Remembering]
+
+
+class UncoveredError(Exception):
+    """A recording is not covered by the gateway's key. The message says why."""
+
+
+def memories_of(path: Path, keys: KnownKeys | None, *, restore: Restore) -> list[Memory] | None:
     """The states of the estimation where a recording ends, or where a power cut tore it.
 
     `restore(config_json, snapshot)` makes the pipeline. The states include those of earlier runs in its snapshot.
-    A recording that cannot be replayed gives no states; a warning in the log says why.
+    With `keys`, only what they cover counts. None where the recording cannot be replayed or is not covered; a warning
+    in the log says why.
     """
-    pipeline: Remembering | None = None
     try:
-        for step in RecordingReader(path).steps():
-            if isinstance(step.event, RunStart):
-                pipeline = restore(step.event.config_json, step.event.snapshot)
-            assert pipeline is not None  # the reader ensures that the first event is a RunStart
-            before = [] if step.complete else pipeline.all_memories()
-            outputs = recorded_ones(pipeline.step(step.event))
-            if not step.complete and len(outputs) > len(step.results):
-                return before  # results of this event are not in the file, so they were never published: leave it out
+        return _memories(path, restore, keys, LONGEST_CHAIN)
+    except UncoveredError as error:
+        _log.warning("%s: the states of the estimation are not taken from it: %s", path, error)
     except Exception as error:  # a damaged or forged snapshot may raise any exception
         _log.warning("%s: does not replay; the states of the estimation in it are not restored: %s", path, error)
-        return []
+    return None
+
+
+def _memories(path: Path, restore: Restore, keys: KnownKeys | None, further: int) -> list[Memory]:
+    if keys is None or _is_sealed(path, keys):
+        return _replayed(path, restore, unsealed=False)
+    start = first_event(path)
+    if start is None:
+        raise UncoveredError("it has no first event")
+    if not _head_covers(path, start, keys):
+        _compare_with_before(path, start, restore, keys, further)
+    checked = check_results(path, f"{start.site}/{start.gateway}", keys)
+    if checked.fault:
+        raise UncoveredError(f"{checked.faults} results without a valid signature; the first: {checked.fault}")
+    return _replayed(path, restore, unsealed=True)
+
+
+def _is_sealed(path: Path, keys: KnownKeys) -> bool:
+    """Whether a recording was closed by its run, and not after a crash. Raises UncoveredError where it was changed."""
+    with open_recording(path) as file:
+        size = file.seek(0, 2)
+        file.seek(0)
+        integrity = check_integrity(file, size)
+        if not integrity.finished or REPAIR_METADATA in integrity.metadata:
+            return False
+        start = first_event(path)
+        if start is None or start.file_sequence != file_number(path.name):
+            raise UncoveredError("its first event does not name it")
+        said = _statement(start, integrity)
+        if fault := verify_file(file, size, integrity.metadata.get(SIGNATURE_METADATA), keys, said):
+            raise UncoveredError(fault)
+    return True
+
+
+def _statement(start: RunStart, integrity: Integrity) -> Statement:
+    origin = integrity.metadata.get(FILE_METADATA, {})
+    epoch, before = origin.get(EPOCH, ""), origin.get("previous_sha256", "")
+    return Statement(f"{start.site}/{start.gateway}", epoch, start.file_sequence, before, integrity.results.text, 0, "")
+
+
+def _head_covers(path: Path, start: RunStart, keys: KnownKeys) -> bool:
+    """Whether the head beside a recording is of it, and its bytes up to there, its snapshot among them, are the same.
+
+    Raises UncoveredError where they are others.
+    """
+    try:
+        signed = SignedText.read(path.with_name(HEAD_NAME).read_bytes())
+        head = Head.of(signed)
+    except (OSError, SignedTextError):
+        return False
+    of_it = (f"{start.site}/{start.gateway}", file_number(path.name)) == (head.statement.gateway, head.place[0])
+    if not of_it or signed.fault_by(keys, head.statement.gateway):
+        return False
+    with open_recording(path) as file:
+        if prefix_sha256(file, head.statement.length).hex() != head.statement.sha256:
+            raise UncoveredError(f"its first {head.statement.length} bytes are not those that the gateway signed")
+    return True
+
+
+def _compare_with_before(path: Path, start: RunStart, restore: Restore, keys: KnownKeys, further: int) -> None:
+    """The states in a snapshot must be those with which the recording before ends. Raises UncoveredError."""
+    pipeline = restore(start.config_json, start.snapshot)
+    number = file_number(path.name) or 0
+    before = next((one for at, one in recordings(path.parent) if at == number - 1), None)
+    if (before is None and number > 1) or not further:
+        raise UncoveredError("no head beside it names it, and the recording before it is not there")
+    left = _memories(before, restore, keys, further - 1) if before is not None else []
+    kept = pipeline.all_memories()
+    if fault := continues(left, kept, {memory.sensor for memory in [*left, *kept]}):
+        raise UncoveredError(fault)
+
+
+def _replayed(path: Path, restore: Restore, *, unsealed: bool) -> list[Memory]:
+    """The states at the end. What is `unsealed` counts as far as its results follow from its data."""
+    pipeline: Remembering | None = None
+    tolerance = 0.0
+    for step in RecordingReader(path).steps():
+        if isinstance(step.event, RunStart):
+            pipeline = restore(step.event.config_json, step.event.snapshot)
+            tolerance = 0.0 if step.event.fingerprint == fingerprint() else OTHER_CPU
+        assert pipeline is not None  # the reader ensures that the first event is a RunStart
+        before = [] if step.complete else pipeline.all_memories()
+        outputs = recorded_ones(pipeline.step(step.event))
+        if not step.complete and len(outputs) > len(step.results):
+            return before  # results of this event are not in the file, so they were never published: leave it out
+        if unsealed and (outputs or step.results):
+            computed = [_as_recorded(step.event_sequence, output) for output in outputs]
+            found = compare(str(path), step.event_sequence, step.results, computed, tolerance, complete=step.complete)
+            if found is not None:
+                raise UncoveredError(f"its results do not follow from its data: {found}")
     return [] if pipeline is None else pipeline.all_memories()
+
+
+def _as_recorded(event_sequence: int, output: Output) -> Output:
+    _, read = decode(schema_of(topic_of(output)), encode(event_sequence, output))
+    return cast(Output, read)

@@ -52,6 +52,7 @@ class RecordingThread:
         self._queue: queue.Queue[Entry | None] = queue.Queue(CAPACITY)
         self._starts_sent = self._starts_done = 0
         self._pruning_sent = False
+        self._whole = True
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._run, name="recording", daemon=True)
         self._thread.start()
@@ -69,6 +70,11 @@ class RecordingThread:
     def waiting(self) -> int:
         """Number of events that wait for the disk; at CAPACITY, `put` blocks."""
         return self._queue.qsize()
+
+    @property
+    def whole(self) -> bool:
+        """Whether the last event is in a recording, which has no fault. Asked after `close`."""
+        return self._whole and not self._recorder.fault
 
     def put(
         self, event_sequence: int, event: Event, outputs: Sequence[Output], memories: Sequence[Memory] = ()
@@ -144,7 +150,7 @@ class RecordingThread:
                 self._give_up(entry)
                 return
             event_sequence, event, outputs, memories = entry
-            recorded = self._recorder.record(event_sequence, event, outputs)
+            recorded = self._whole = self._recorder.record(event_sequence, event, outputs)
             results = [item for item in outputs if isinstance(item, Result)]
             self._starts_done += isinstance(event, RunStart)
             if isinstance(event, Pruned):
@@ -154,7 +160,7 @@ class RecordingThread:
 
     def _give_up(self, entry: Entry) -> None:
         """Deliver the results of `entry` and of all waiting events in one call, since each call waits for the disk."""
-        waiting = [entry]
+        self._whole, waiting = False, [entry]
         with suppress(queue.Empty):
             while (following := self._queue.get_nowait()) is not None:
                 waiting.append(following)

@@ -148,7 +148,7 @@ def test_wherever_a_recording_is_torn_the_state_is_that_of_the_last_result_in_it
         path.write_bytes(whole[:size])
         held = [result for step in RecordingReader(path).steps() for result in step.results]
         updates = [r for r in held if isinstance(r, CalibrationUpdate)]
-        states = [unpack(memory.state)["in_force"] for memory in RECALL(path)]
+        states = [unpack(memory.state)["in_force"] for memory in RECALL(path, None) or ()]
         known = [state["sequence"] for state in states if state is not None]
         assert known == [r.sequence for r in updates][-1:]
         seen.add(known[0] if known else None)
@@ -169,7 +169,7 @@ def test_an_event_whose_results_were_torn_off_changes_nothing(tmp_path: Path) ->
     recorder.record(last, steps[last].event, [])
     recorder.sync()
     ((_, torn),) = recordings(tmp_path / "torn")
-    (memory,) = RECALL(torn)
+    (memory,) = RECALL(torn, None) or ()
     recorder.close()
     assert (memory.sequence, unpack(memory.state)["in_force"]) == (before[-1], None)
 
@@ -195,7 +195,8 @@ def test_devices_that_the_newest_file_does_not_know_are_looked_for_where_they_la
              "fieldcal-000002.mcap": [],  # does not replay
              "fieldcal-000001.mcap": [Memory("bridge-1", "ADXL355 0123", 10**6, b"oldest")]}  # fmt: skip
 
-    def recall(path: Path) -> Sequence[Memory]:
+    def recall(path: Path, keys: object) -> Sequence[Memory]:
+        assert keys is None
         asked.append(path.name)
         return known[path.name]
 

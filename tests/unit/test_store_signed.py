@@ -64,6 +64,7 @@ def test_a_store_of_version_3_takes_signed_results_after_its_migration(tmp_path:
     fill(tmp_path, 2)
     with closing(sqlite3.connect(tmp_path / FILE_NAME)) as connection, connection:
         connection.execute("DROP TABLE signed")
+        connection.execute("DROP TABLE states")
         connection.execute("PRAGMA user_version = 3")
     with pytest.raises(StoreError, match="`fieldcal run` brings it up to date"):
         History(tmp_path / FILE_NAME)

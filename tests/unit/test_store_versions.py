@@ -95,5 +95,5 @@ def test_a_migration_that_is_interrupted_leaves_the_old_version(
 
 
 def test_a_reader_says_who_brings_it_up_to_date(path: Path) -> None:
-    with pytest.raises(StoreError, match=r"version 1, .* version 4; `fieldcal run` brings it up to date"):
+    with pytest.raises(StoreError, match=r"version 1, .* version 5; `fieldcal run` brings it up to date"):
         History(path)

@@ -1,0 +1,220 @@
+"""The states of the estimation with which a run begins: from the store, from the recordings, or from a calibration.
+
+The states in the store count where they are those that the gateway signed, and where no recording goes on after them.
+Otherwise the newest recording is replayed. What neither gives begins again from the newest calibration that is signed.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+import time
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from agent.core.events import CalibrationUpdate
+from agent.core.memory import Memory
+from agent.delivery.gateway_key import GatewayKey
+from agent.delivery.proof import UnprovenError, proven
+from agent.delivery.record import JOINED, Record
+from agent.delivery.schema import read_memories, read_states
+from agent.delivery.signed_states import StateList
+from agent.recording.files import file_number, final_name, recordings
+from agent.recording.head import HEAD_NAME
+from agent.recording.result_signing import PUBLIC_KEY
+from agent.recording.results_chain import FILE_METADATA, ResultsChain
+from agent.recording.scan import metadata_of, scan
+from agent.recording.signed_text import SignedText, SignedTextError
+from agent.recording.signing import SIGNATURE_METADATA, signed_results
+
+if TYPE_CHECKING:
+    from agent.config.known_keys import KnownKeys
+
+# s; after this time no further recording is replayed at a start. One replay takes seconds for an hour of recording.
+LONGEST_S = 60.0
+
+
+# Gives the states of the estimation at the end of a recording, as far as the keys cover it; without keys, all of it.
+# None where it cannot be replayed or is not covered.
+Recall = Callable[[Path, "KnownKeys | None"], Sequence[Memory] | None]
+
+
+def no_memories(_: Path, __: KnownKeys | None) -> Sequence[Memory] | None:
+    """A Recall that replays nothing."""
+    return None
+
+
+@dataclass(slots=True)
+class States:
+    """The states at a start, those of a sensor oldest first.
+
+    `recording`, `sequence`: the highest numbers of a recording and of a result that they follow. `replayed`: how many
+    come from recordings. `faults`: what was not as the gateway signed it, and what is done instead.
+    """
+
+    memories: list[Memory] = field(default_factory=list)
+    recording: int = 0
+    sequence: int = 0
+    replayed: int = 0
+    faults: list[str] = field(default_factory=list)
+
+    def take(self, found: Sequence[Memory]) -> None:
+        """Take the states where a recording ends; those in the store that are newer stay."""
+        sensors, end = {memory.sensor for memory in found}, max((memory.sequence for memory in found), default=0)
+        stored = {(memory.sensor, memory.identity): memory for memory in self.memories}
+        newer = {device: memory for device, memory in stored.items() if memory.sequence > end}
+        others = [memory for memory in self.memories if memory.sensor not in sensors]
+        taken = [newer.pop((memory.sensor, memory.identity), memory) for memory in found]
+        self.replayed += sum(memory not in self.memories for memory in taken)
+        self.memories = [*others, *taken, *(memory for memory in newer.values() if memory.sensor in sensors)]
+        self.sequence = max(self.sequence, end)
+
+    def add(self, memory: Memory) -> None:
+        """Take the state of one more device, or a newer one; the oldest come first."""
+        device = (memory.sensor, memory.identity)
+        others = [known for known in self.memories if (known.sensor, known.identity) != device]
+        self.memories = sorted([*others, memory], key=lambda known: known.sequence)
+
+    def known(self, sensor: str, identity: str) -> int:
+        """The result that the state of a device follows; 0 where there is none."""
+        return next((m.sequence for m in self.memories if (m.sensor, m.identity) == (sensor, identity)), 0)
+
+
+def states_at_start(
+    connection: sqlite3.Connection,
+    directory: Path,
+    recall: Recall,
+    key: GatewayKey | None,
+    epoch: str,
+    *,
+    behind: bool,
+    lost: bool,
+) -> States:
+    """The states with which the next run begins. `behind`: a crash may have kept some from the store. `lost`: the store
+    is new. `epoch`: of the store. Raises sqlite3.Error, DamagedRow, OSError.
+    """
+    states = States() if lost else _stored(connection, key, epoch)
+    lost = lost or bool(states.faults)
+    files = {final_name(path): path for _, path in recordings(directory)}
+    keys, end_s = key.known if key is not None else None, time.monotonic() + LONGEST_S
+    if key is not None and _is_new(connection, directory, files.values()):
+        states.faults.append(f"nothing in {directory} is signed: this start takes over once what the recordings say")
+        keys = None
+    path = next(reversed(files.values()), None)
+    if path is not None:
+        number, last = _reached(path, key)
+        late = states.recording < number or states.sequence < last
+        if late and not (lost or behind):
+            states.faults.append("the states of the estimation in the store are older than the newest recording")
+        if behind or lost or late:
+            found = recall(path, keys)
+            if found is not None:
+                states.take(found)
+            elif key is not None:
+                states.faults.append(f"{path.name} does not give the states of the estimation where it ends")
+            lost = lost or found is None
+        states.recording, states.sequence = max(states.recording, number), max(states.sequence, last)
+    if lost:
+        _take_calibrated(connection, files, recall, keys, states, end_s)
+        if key is not None:
+            _begin_from_calibrations(connection, key, states)
+    return states
+
+
+def _stored(connection: sqlite3.Connection, key: GatewayKey | None, epoch: str) -> States:
+    """The states in the store; with a key only if they are those that it signed."""
+    memories = read_memories(connection)
+    if key is None:
+        return States(memories, sequence=max((memory.sequence for memory in memories), default=0))
+    data = read_states(connection)
+    try:
+        if not data and not memories:
+            return States()
+        if not data:
+            raise SignedTextError("the store has no signed list of them")
+        listed = StateList.read(data, key.gateway, key.known)
+        if listed.epoch != epoch:
+            raise SignedTextError(f"they are of the epoch {listed.epoch!r:.40}, the store is of {epoch}")
+        if fault := listed.fault(memories):
+            raise SignedTextError(fault)
+    except SignedTextError as error:
+        return States(faults=[f"the states of the estimation in the store are refused: {error}"])
+    return States(memories, listed.recording, listed.sequence)
+
+
+def _reached(path: Path, key: GatewayKey | None) -> tuple[int, int]:
+    """(number of a recording, number of the last result in it or before it); both 0 without a key."""
+    if key is None:
+        return 0, 0
+    number = file_number(path.name) or 0
+    signature = metadata_of(path).get(SIGNATURE_METADATA, {})
+    try:
+        signed = SignedText(signature["text"], signature["public_key"], signature["signature"])
+    except KeyError:
+        signed = None
+    chain = signed_results(signature)
+    if signed is not None and chain is not None and f"\nrecording {number}\n" in signed.text:
+        after = ResultsChain.of_text(chain).before
+        return number, after if not signed.fault_by(key.known, key.gateway) else _last_found(path)
+    return number, _last_found(path)
+
+
+def _last_found(path: Path) -> int:
+    return max((result.sequence for result in scan(path).results), default=0)
+
+
+def _is_new(connection: sqlite3.Connection, directory: Path, paths: Iterable[Path]) -> bool:
+    """Whether nothing in a data directory with recordings was ever signed."""
+    if not (paths := list(paths)) or (directory / HEAD_NAME).exists() or read_states(connection):
+        return False
+    if connection.execute("SELECT 1 FROM signed LIMIT 1").fetchone() is not None:
+        return False
+    newest = metadata_of(paths[-1])
+    return PUBLIC_KEY not in newest.get(FILE_METADATA, {}) and SIGNATURE_METADATA not in newest
+
+
+_CALIBRATED = """
+SELECT sensor, identity, recording, max(sequence) AS newest FROM results
+WHERE what = 'calibration' AND recorded = 1 GROUP BY sensor, identity, recording ORDER BY newest DESC"""
+
+
+def _take_calibrated(
+    connection: sqlite3.Connection,
+    files: dict[str, Path],
+    recall: Recall,
+    keys: KnownKeys | None,
+    states: States,
+    end_s: float,
+) -> None:
+    """Replay, newest first, the recordings with a calibration that is newer than the state known of its device."""
+    replayed = {next(reversed(files), "")}
+    for sensor, identity, name, sequence in connection.execute(_CALIBRATED).fetchall():
+        if states.known(sensor, identity) >= sequence or name in replayed or name not in files:
+            continue
+        if time.monotonic() >= end_s:
+            return
+        replayed.add(name)
+        for memory in recall(files[name], keys) or ():
+            if memory.sequence > states.known(memory.sensor, memory.identity):
+                states.add(memory)
+                states.replayed += 1
+
+
+def _begin_from_calibrations(connection: sqlite3.Connection, key: GatewayKey, states: States) -> None:
+    """What nothing else is known of begins again from the newest calibration of the device that is signed."""
+    from agent.core.kept import of_calibration
+
+    done: set[tuple[str, str]] = set()
+    for row in connection.execute(f"{JOINED} WHERE what = 'calibration' ORDER BY sequence DESC"):
+        record = Record.of_joined(row)
+        device = (record.sensor, record.identity)
+        if device in done or states.known(*device) >= record.sequence or not record.signed:
+            continue
+        with suppress(UnprovenError):
+            update = proven(record, key.known)[0].result
+            if isinstance(update, CalibrationUpdate) and update.identity == record.identity:
+                states.add(Memory(*device, record.sequence, of_calibration(update)))
+                states.faults.append(f"{device[0]} begins again from calibration {record.sequence}, which is signed")
+                done.add(device)
