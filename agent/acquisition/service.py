@@ -90,8 +90,6 @@ class Service:
         if (found := self._store.recovered).results or found.memories:
             lacked = "%d results and the states of %d devices that the state file lacked were found in the recordings"
             _log.warning(lacked, found.results, found.memories)
-        for fault in found.faults:
-            _log.warning("%s", fault)
         self._recorder = Recorder(
             self._data_dir,
             [device.name for device in config.devices],
@@ -169,7 +167,7 @@ class Service:
         if not self._config.commands.enabled:
             return None
         return Reception(
-            self._config, self._data_dir, self._store.path, lambda command: events.put(command.sensor, command)
+            self._config, self._data_dir, self._store.find, lambda command: events.put(command.sensor, command)
         )
 
     def _begin(self) -> None:

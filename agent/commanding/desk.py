@@ -21,8 +21,9 @@ from agent.config.commands import CommandKey, Commands
 from agent.config.key_file import KeyFileError
 from agent.config.known_keys import WatchedKeys
 from agent.core.events import Command
-from agent.delivery.history import History, StoreError
 from agent.delivery.keys import CHUNK
+from agent.delivery.record import Record
+from agent.delivery.schema import StoreError
 
 # s by which a gateway's clock may be off: with NTP it is right within a second, but not soon after a start.
 CLOCK_TOLERANCE_S = 30.0
@@ -33,6 +34,8 @@ RECORDED_REFUSALS = (20, 0.1)
 # Commands that are accepted: 20 at once, then 1 per second. A faulty script with a valid key cannot fill the disk.
 TAKEN = (20, 1.0)
 LONGEST_REASON = 300  # characters
+
+Find = Callable[[str, str, int], Record | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,8 +54,9 @@ class Answer:
 class CommandDesk:
     """Accepts or refuses commands for the gateway `gateway` (`<site>/<gateway>`) and its `sensors`.
 
-    `settings`: the keys and their rights. `data_dir`: where the counters are kept. `store`: path of the store, in which
-    accept and rollback find what they name. `put`: called with each accepted command and with each recorded refusal.
+    `settings`: the keys and their rights. `data_dir`: where the counters are kept. `find(sensor, what, sequence)` gives
+    the result that accept or rollback names, as the store does (agent.delivery.store). `put`: called with each accepted
+    command and with each recorded refusal.
     All methods may be called from any thread.
     """
 
@@ -62,7 +66,7 @@ class CommandDesk:
         sensors: list[str],
         settings: Commands,
         data_dir: Path,
-        store: Path,
+        find: Find,
         put: Callable[[Command], None],
     ) -> None:
         self._gateway = gateway
@@ -70,7 +74,7 @@ class CommandDesk:
         self._rights = {key.id: key for key in settings.keys}
         self._keys = {key.id: Ed25519PublicKey.from_public_bytes(key.public_bytes) for key in settings.keys}
         self._revoked = WatchedKeys(settings.revoked_keys) if settings.revoked_keys is not None else None
-        self._store = store
+        self._find = find
         self._put = put
         self.counters = Counters(data_dir)
         self._mutex = threading.Lock()
@@ -172,13 +176,12 @@ class CommandDesk:
             return ""
         what = "calibration" if isinstance(arguments, Rollback) else "estimate"
         try:
-            with History(self._store) as history:
-                found = history.after(arguments.sequence - 1, [(sensor, what)], limit=1)
+            found = self._find(sensor, what, arguments.sequence)
         except StoreError as error:
             raise Refused("not kept", str(error)) from None
-        if not found or found[0].sequence != arguments.sequence:
+        if found is None:
             raise Refused("out of limits", f"{sensor} has no {what} with the sequence number {arguments.sequence}")
-        return found[0].payload.decode() if what == "calibration" else ""
+        return found.payload.decode() if what == "calibration" else ""
 
     def _refuse(self, address: str, data: bytes, refused: Refused) -> None:
         self._counts[refused.kind] += 1

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import zenoh
 
-from agent.commanding.desk import CommandDesk
+from agent.commanding.desk import CommandDesk, Find
 from agent.commanding.local import LocalDoor
 from agent.commanding.network import serve_queries
 from agent.config import Config
@@ -25,12 +25,12 @@ class Reception:
     Where the local socket cannot be opened a warning is logged, and commands come over Zenoh only.
     """
 
-    def __init__(self, config: Config, data_dir: Path, store: Path, put: Callable[[Command], None]) -> None:
+    def __init__(self, config: Config, data_dir: Path, find: Find, put: Callable[[Command], None]) -> None:
         gateway = config.gateway
         name = f"{gateway.site}/{gateway.name}"
         self._key = gateway_key(gateway.site, gateway.name)
         sensors = [channel.sensor for channel in config.channels]
-        self.desk = CommandDesk(name, sensors, config.commands, data_dir, store, put)
+        self.desk = CommandDesk(name, sensors, config.commands, data_dir, find, put)
         if self.desk.counters.set_aside:
             _log.warning(
                 "the file of command counters was unreadable and is kept as %s; commands signed before now are refused",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from pathlib import Path
 
 import zenoh
 
@@ -19,11 +18,13 @@ _log = logging.getLogger(__name__)
 _Queryable = zenoh.Queryable[zenoh.Handler[zenoh.Query]]
 
 
-def answer_queries(queryable: _Queryable, gateway: str, store: Path, told: Callable[[], Mapping[str, bytes]]) -> None:
+def answer_queries(
+    queryable: _Queryable, gateway: str, open_store: Callable[[], History], told: Callable[[], Mapping[str, bytes]]
+) -> None:
     """Answer queries until the queryable is undeclared or its session closes. Runs in a thread of its own.
 
-    `gateway`: Zenoh key of the gateway. `store`: path of its store. `told`: gives what the gateway says of itself, JSON
-    by the end of its key: `status`, `head`.
+    `gateway`: Zenoh key of the gateway. `open_store`: opens its store to read it. `told`: gives what the gateway says
+    of itself, JSON by the end of its key: `status`, `head`.
     A query for `<keys>` gets the newest result of each channel that matches, a calibration only while it is in force,
     and the gateway's status and head where their keys match.
     A query for `<keys>?after=<sequence>` gets the first REPLIES_MAX results after that number, in order. Several of
@@ -36,7 +37,7 @@ def answer_queries(queryable: _Queryable, gateway: str, store: Path, told: Calla
     for query in queryable:
         with query:  # without closing the query, the sender waits until its timeout
             try:
-                records, removed = _answers(query, gateway, store)
+                records, removed = _answers(query, gateway, open_store)
                 replied = _reply_told(query, gateway, told())
                 if removed:
                     query.reply_err(f"{REMOVED}{removed}")
@@ -68,10 +69,10 @@ def _reply_told(query: zenoh.Query, gateway: str, told: Mapping[str, bytes]) -> 
     return bool(matching)
 
 
-def _answers(query: zenoh.Query, gateway: str, store: Path) -> tuple[list[Record], int]:
+def _answers(query: zenoh.Query, gateway: str, open_store: Callable[[], History]) -> tuple[list[Record], int]:
     """(the records asked for, the number up to which some of them have been deleted, or 0)."""
     after = query.parameters.get("after")
-    with History(store) as history:
+    with open_store() as history:
         wanted = [
             (sensor, what)
             for sensor, what in history.channels()

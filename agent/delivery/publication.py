@@ -170,11 +170,11 @@ class Publisher:
             if self._tls and (warning := expiry_warning(self._tls, datetime.now(UTC))):
                 _log.warning("zenoh.tls.%s", warning)
             session = open_things.enter_context(zenoh.open(self._config))
-            history = open_things.enter_context(History(self._store.path))
+            history = open_things.enter_context(self._store.history())
             queryable = session.declare_queryable(f"{self._key}/**", zenoh.handlers.FifoChannel(64), complete=True)
             answers = threading.Thread(
                 target=answer_queries,
-                args=(queryable, self._key, self._store.path, lambda: self._told),
+                args=(queryable, self._key, self._store.history, lambda: self._told),
                 name="answers",
                 daemon=True,
             )

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import logging
 import sqlite3
+import time
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from agent.delivery.gateway_key import GatewayKey
 from agent.delivery.proof import UnprovenError, proven
-from agent.delivery.record import Record
+from agent.delivery.record import JOINED, Record
 from agent.delivery.schema import (
     RESULT_COLUMNS,
     checked,
@@ -19,6 +21,7 @@ from agent.delivery.schema import (
     withdraw,
     write_latest,
 )
+from agent.recording.covered import digest_is_signed
 from agent.recording.files import final_name, recordings
 from agent.recording.reading import first_event
 from agent.recording.result_signing import PUBLIC_KEY, recorded_result
@@ -28,13 +31,14 @@ from agent.recording.scan import ScannedFile, scan
 if TYPE_CHECKING:
     from agent.config.known_keys import KnownKeys
 
+LOOK_S = 3.0  # s that a result is looked for in the recordings; who sent a command waits 5 s for the answer
+
 _log = logging.getLogger(__name__)
 
 
 @dataclass(slots=True)
 class Recovered:
     """What was restored: `results` from `files` recordings, states (`memories`) of so many devices.
-    `faults`: what in the store was not as the gateway signed it, and what is done instead.
 
     `file_sequence`, `published`: number of the newest recording, and the last published result when it began.
     """
@@ -44,7 +48,6 @@ class Recovered:
     files: int = 0
     file_sequence: int = 0
     published: int = 0
-    faults: list[str] = field(default_factory=list)
 
 
 def recover(connection: sqlite3.Connection, directory: Path, keys: KnownKeys | None, *, everything: bool) -> Recovered:
@@ -76,8 +79,6 @@ def recover(connection: sqlite3.Connection, directory: Path, keys: KnownKeys | N
         recovered.files += bool(missing)
         if found.results and not missing and not everything:
             break
-    if recovered.results:
-        name_latest(connection)
     return recovered
 
 
@@ -96,6 +97,66 @@ def records_of(path: Path, found: ScannedFile) -> list[Record]:
     return records
 
 
+def find_recorded(directory: Path, name: str, sequence: int, key: GatewayKey) -> Record | None:
+    """A result in the recordings, first looked for in the one with this name; None where there is none within LOOK_S.
+
+    The key must have signed it, or a recording that names the SHA-256 of its recording. Raises OSError.
+    """
+    end_s = time.monotonic() + LOOK_S
+    for path in sorted(
+        (path for _, path in reversed(recordings(directory))), key=lambda path: final_name(path) != name
+    ):
+        if time.monotonic() > end_s:
+            return None
+        for record in records_of(path, scan(path)):
+            if record.sequence != sequence:
+                continue
+            if record.signed and _counts(path, record, key.known):
+                return record
+            if not record.signed and digest_is_signed(path, key.gateway, key.known):
+                return record
+    return None
+
+
+def check_newest(connection: sqlite3.Connection, directory: Path, key: GatewayKey) -> list[str]:
+    """Check the newest result of each channel, as `check_row`; returns what is told.
+
+    Raises sqlite3.Error, DamagedRow, OSError.
+    """
+    (first,) = connection.execute("SELECT coalesce(min(sequence), 0) FROM signed").fetchone()
+    newest = connection.execute("SELECT sequence FROM latest WHERE sequence > ?", (first,)).fetchall()
+    told = [check_row(connection, directory, sequence, key) for (sequence,) in newest] if first else []
+    return [fault for fault in told if fault]
+
+
+def check_row(connection: sqlite3.Connection, directory: Path, sequence: int, key: GatewayKey) -> str:
+    """Make the row of a result anew where it is not what the key signed, within the caller's transaction.
+
+    Returns what is told of it; "" where the row is right, or is unsigned and the same as in the recordings. Raises
+    sqlite3.Error, DamagedRow, OSError.
+    """
+    record = Record.of_joined(connection.execute(f"{JOINED} WHERE sequence = ?", (sequence,)).fetchone())
+    right, reason = None, "it is not signed"
+    if record.signed:
+        try:
+            right, reason = proven(record, key.known)
+        except UnprovenError as error:
+            reason = str(error)
+    if not reason:
+        return ""
+    right = right or find_recorded(directory, record.recording, sequence, key)
+    if right is not None and right.payload == record.payload and not (right.signed or record.signed):
+        return ""
+    told = f"{record.what} {sequence} in the store is not what this gateway signed: {reason}"
+    if right is None:
+        return f"{told}; no recording has it"
+    for table in ("results", "signed"):
+        connection.execute(f"DELETE FROM {table} WHERE sequence = ?", (sequence,))
+    insert_results(connection, [right.row])
+    insert_signed(connection, [(sequence, right.signed)] if right.signed else [])
+    return f"{told}; it was made anew from what is signed: send a command that names it again"
+
+
 def _counts(path: Path, record: Record, keys: KnownKeys | None) -> bool:
     """Whether a result of a recording may be in the store."""
     if keys is None or not record.signed:
@@ -110,6 +171,9 @@ def _counts(path: Path, record: Record, keys: KnownKeys | None) -> bool:
 
 def name_latest(connection: sqlite3.Connection) -> None:
     """Write the table `latest` anew: the newest result of every channel; mark calibrations no longer in force."""
+    # Retention may have deleted the status by which a calibration was withdrawn.
+    withdrawn = connection.execute("SELECT sensor, sequence FROM latest WHERE withdrawn = 1").fetchall()
+    connection.execute("DELETE FROM latest")
     newest = "SELECT sensor, what, max(sequence) FROM results GROUP BY sensor, what"
     calibrations: dict[str, int] = {}
     for sensor, what, sequence in connection.execute(newest).fetchall():
@@ -119,7 +183,7 @@ def name_latest(connection: sqlite3.Connection) -> None:
     since = f"SELECT {RESULT_COLUMNS}, crc FROM results WHERE sensor = ? AND what = 'status' AND sequence > ?"
     for sensor, sequence in calibrations.items():
         statuses = map(Record.of_row, connection.execute(since, (sensor, sequence)))
-        if any(status.is_withdrawal for status in statuses):
+        if (sensor, sequence) in withdrawn or any(status.is_withdrawal for status in statuses):
             withdraw(connection, sensor)
 
 

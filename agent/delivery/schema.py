@@ -19,6 +19,7 @@ SCHEMA_VERSION = 5
 # `epoch` names the numbering of the results. Version 2 had the same tables without this mark; a start adds it.
 EPOCH = "epoch"
 MARKS = frozenset({"floor", "published", "clean", "file", EPOCH})
+LARGEST_MARK = 2**53  # above it, JavaScript's numbers are not exact
 RESULT_COLUMNS = "sequence, run_id, sensor, what, payload, t_utc_ns, recorded, recording, identity"
 _RESULTS = """CREATE TABLE results (
     sequence INTEGER PRIMARY KEY, run_id TEXT NOT NULL, sensor TEXT NOT NULL, what TEXT NOT NULL,
@@ -86,6 +87,8 @@ def read_marks(connection: sqlite3.Connection) -> dict[str, int]:
     marks = {str(name): value for name, value in map(checked, rows) if isinstance(value, int)}
     if marks.keys() | {EPOCH} != MARKS:
         raise DamagedRow(f"the table marks has {', '.join(sorted(marks))} instead of {', '.join(sorted(MARKS))}")
+    if beyond := sorted(name for name, value in marks.items() if name != EPOCH and not 0 <= value <= LARGEST_MARK):
+        raise DamagedRow(f"the table marks has a number for {beyond[0]} that is not from 0 to {LARGEST_MARK}")
     return marks
 
 
@@ -177,7 +180,7 @@ def known_version(version: int) -> bool:
 
 def _add_crcs(connection: sqlite3.Connection) -> None:
     """Version 1 to 2 adds CRCs, the column `withdrawn`, and the marks of retention and of file numbers."""
-    withdrawn = {sensor for (sensor,) in connection.execute(_WITHDRAWN_IN_1)}
+    withdrawn = {sensor for (sensor,) in connection.execute(_WITHDRAWN)}
     newest = connection.execute("SELECT sensor, what, sequence FROM latest").fetchall()
     marks = dict(connection.execute("SELECT name, value FROM marks").fetchall())
     connection.create_function("row_crc", 9, row_crc, deterministic=True)
@@ -198,7 +201,7 @@ def _add_crcs(connection: sqlite3.Connection) -> None:
         write_mark(connection, name, value)
 
 
-_WITHDRAWN_IN_1 = """
+_WITHDRAWN = """
 SELECT DISTINCT status.sensor FROM results AS status JOIN latest ON latest.sensor = status.sensor
 WHERE latest.what = 'calibration' AND status.what = 'status' AND status.sequence > latest.sequence
 AND json_extract(CAST(status.payload AS TEXT), '$.status') = 'UNCALIBRATED'"""
@@ -228,11 +231,14 @@ def damage(connection: sqlite3.Connection) -> str:
         _check_all(connection.execute("SELECT sensor, what, count, up_to, crc FROM removed"))
         read_memories(connection)
         read_states(connection)
-        named = {checked(row)[:3] for row in connection.execute("SELECT * FROM latest")}
+        latest = [checked(row) for row in connection.execute("SELECT * FROM latest")]
     except DamagedRow as error:
         return str(error)
-    if named != set(connection.execute(newest)):
+    if {row[:3] for row in latest} != set(connection.execute(newest)):
         return "the table latest does not name the newest results"
+    in_force = {row[0] for row in latest if row[1] == "calibration" and not row[3]}
+    if not in_force.isdisjoint(sensor for (sensor,) in connection.execute(_WITHDRAWN)):
+        return "the table latest names a calibration that is no longer in force"
     return ""
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import secrets
 import sqlite3
@@ -15,7 +16,7 @@ from agent.delivery.gateway_key import GatewayKey
 from agent.delivery.history import FILE_NAME, History
 from agent.delivery.opening import lock, open_or_set_aside
 from agent.delivery.record import Record
-from agent.delivery.recovery import Recovered, recover
+from agent.delivery.recovery import Recovered, check_newest, check_row, name_latest, recover
 from agent.delivery.retention import FOR_EVER, KeepResults, Sweep
 from agent.delivery.schema import (
     EPOCH,
@@ -40,6 +41,9 @@ from agent.delivery.states import Recall, no_memories, states_at_start
 UNKEPT_MAX = 1_000_000
 # Results that a failing disk refused wait in memory for the next commit; beyond this number the oldest are dropped.
 WAITING_MAX = 1000
+FAULTS_MAX = 20  # of a run that the status of the gateway names
+
+_log = logging.getLogger(__name__)
 
 
 class Store:
@@ -57,7 +61,8 @@ class Store:
     `keep`: limits beyond which old results are deleted.
     `recall`: gives the states of the estimation at the end of a recording, to restore them with the results.
     `key`: of the gateway. With it, what the store holds counts only as far as this key signed it, and the store keeps a
-    signed list of its states. `states`: the states of the estimation with which the run begins.
+    signed list of its states. `states`: the states of the estimation with which the run begins. `faults`: what in the
+    store was not what the key signed, and what was done.
     Raises StoreError where the directory cannot be written or another process uses the store.
     """
 
@@ -77,6 +82,7 @@ class Store:
         self._key = key
         self._digests: Digests = {}
         self.states: list[Memory] = []
+        self.faults: list[str] = []
         self._last = self._published = self._file_sequence = 0
         self._sweep = Sweep(keep)
         self._lock = lock(data_dir)
@@ -117,6 +123,35 @@ class Store:
     def history(self) -> History:
         """Open a reader that gives only what the gateway's key signed. Use it in one thread. Raises StoreError."""
         return History(self.path, self._key.known if self._key is not None else None)
+
+    def find(self, sensor: str, what: str, sequence: int) -> Record | None:
+        """A result that is to come into force, as the gateway's key signed it; None where there is none.
+
+        Raises StoreError where it is not what the key signed, or cannot be read. If the recordings have it, its row is
+        made anew from them, and the next call gives it.
+        """
+        with self.history() as history:
+            found = history.after(sequence - 1, [(sensor, what)], limit=1)
+            reason = history.refused.get(sequence, "")
+        record = found[0] if found and found[0].sequence == sequence else None
+        if self._key is None or (record is None and not reason) or (record and record.signed and not reason):
+            return record
+        try:
+            with self._mutex, self._connection:
+                self._connection.execute("BEGIN IMMEDIATE")
+                fault = check_row(self._connection, self.path.parent, sequence, self._key)
+        except (sqlite3.Error, DamagedRow, OSError) as error:
+            raise StoreError(f"{self.path}: {error}") from None
+        if not fault:
+            return record
+        raise StoreError(self._tell(fault))
+
+    def _tell(self, fault: str) -> str:
+        """Log a fault, and keep it for the status of the gateway."""
+        _log.warning("%s", fault)
+        if fault not in self.faults and len(self.faults) < FAULTS_MAX:
+            self.faults.append(fault)
+        return fault
 
     def published(self) -> int:
         """The last published result. The results after it are the outbox: they still wait for a router."""
@@ -237,7 +272,12 @@ class Store:
             recovered = Recovered() if marks["clean"] else self._recover(everything=new)
             behind = not marks["clean"] or bool(recovered.results)
             found = states_at_start(self._connection, directory, recall, self._key, self.epoch, behind=behind, lost=new)
-            recovered.memories, recovered.faults = found.replayed, found.faults
+            recovered.memories = found.replayed
+            name_latest(self._connection)
+            if self._key is not None:
+                found.faults += check_newest(self._connection, directory, self._key)
+            for fault in found.faults:
+                self._tell(fault)
             (kept,) = self._connection.execute("SELECT coalesce(max(sequence), 0) FROM results").fetchone()
             self._last = max(kept, marks["floor"], found.sequence)
             if not marks["clean"] and not new:
@@ -246,6 +286,7 @@ class Store:
             if new and recovered.results:
                 self._last = max(first, found.sequence, kept + UNKEPT_MAX)
                 self._published = recovered.published
+            self._published = min(self._published, self._last)
             self._file_sequence = max(marks["file"], recovered.file_sequence, found.recording)
             self._connection.execute("DELETE FROM memory")
             self._write_memories(found.memories)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Protocol
 
 from agent.core.events import DriftReport
-from agent.delivery.history import History, StoreError
+from agent.delivery.history import StoreError
 from agent.delivery.publication import Publisher
 from agent.delivery.store import Store
 from agent.recording.thread import CAPACITY, RecordingThread
@@ -51,10 +51,15 @@ class Outbox:
             self._asked, self._count = now, self._read(*now)
         return self._count
 
+    @property
+    def faults(self) -> list[str]:
+        """What in the store was not what the gateway's key signed."""
+        return self._store.faults
+
     def drifts(self, sensor: str) -> list[DriftReport]:
         """The newest stored verdicts of the drift test on a sensor, oldest first; none if the store is not readable."""
         try:
-            with History(self._store.path) as history:
+            with self._store.history() as history:
                 found = [record.result for record in history.newest(sensor, "drift", limit=MOST_DRIFTS)]
         except (StoreError, sqlite3.Error):
             return []
@@ -64,7 +69,7 @@ class Outbox:
         if published >= last:
             return 0
         try:
-            with History(self._store.path) as history:
+            with self._store.history() as history:
                 return history.count_after(published)
         except (StoreError, sqlite3.Error):
             return None

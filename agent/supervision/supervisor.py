@@ -68,7 +68,9 @@ class Supervisor:
         self._notifier.close()
 
     def _look(self, tick: Tick) -> None:
-        state, reasons = self._health.state(tick.t_monotonic_ns, self._plant.situation(), self._faults)
+        state, reasons = self._health.state(
+            tick.t_monotonic_ns, self._plant.situation(), [*self._faults, *self._plant.outbox.faults]
+        )
         if (state, reasons) != self._told or tick.t_monotonic_ns >= self._report_at_ns:
             self._report(state, reasons, tick.t_monotonic_ns, tick.t_utc_ns)
 

@@ -8,7 +8,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -34,23 +33,23 @@ from tests.unit.test_pipeline import EPOCH_NS, OFFSET, POSE_S, SECOND, SENSITIVI
 
 GATEWAY = "site/gateway"
 CONFIG = pipeline(False, 100.0)._config
+CHANNEL = CONFIG.channels[0].model_copy(update={"poses_repeat_s": 4 * POSE_S})
+CONFIG = CONFIG.model_copy(update={"channels": (CHANNEL,)})
 RATE_HZ, BLOCK = 100.0, 50
 G_MPS2 = np.array([[0, 0, 9.8], [9.8, 0, 0], [0, 9.8, 0], [0, -9.8, 0]])
-MAIN = ("estimation", "recursion", "state", "mean")
 
 
-def rests(seed: int = 1, serial_number: str = "A", begin_s: float = 0.0) -> Iterator[Event]:
-    """A sensor is opened and turned through four rests, the first event at `begin_s`."""
+def rests(seed: int = 1, serial_number: str = "A", begin_s: float = 0.0, count: int = 6) -> Iterator[Event]:
+    """A sensor is opened and turned through so many rests, the first event at `begin_s`."""
     noise = np.random.default_rng(seed)
     shift_ns = round(begin_s * SECOND)
     yield opened("s", begin_s, serial_number=serial_number)
-    for first in range(0, round((4 * POSE_S + 3.0) * RATE_HZ), BLOCK):
-        pose = np.minimum((first + np.arange(BLOCK)) / RATE_HZ // POSE_S, 3).astype(int)
+    for first in range(0, round((count * POSE_S + 1.0) * RATE_HZ), BLOCK):
+        pose = ((first + np.arange(BLOCK)) / RATE_HZ // POSE_S).astype(int) % 4
         values = G_MPS2[pose] @ SENSITIVITY.T + OFFSET + noise.normal(0, 1e-3, (BLOCK, 3))
         made = block("s", first, values, nominal_hz=RATE_HZ, true_hz=RATE_HZ)
-        yield replace(
-            made, t_utc_ns=made.t_utc_ns + shift_ns, burst_t_monotonic_ns=made.burst_t_monotonic_ns + shift_ns
-        )
+        arrivals_ns = made.burst_t_monotonic_ns + shift_ns
+        yield replace(made, t_utc_ns=made.t_utc_ns + shift_ns, burst_t_monotonic_ns=arrivals_ns)
 
 
 class Run:
@@ -63,7 +62,7 @@ class Run:
         signer = Signer(key) if key is not None else None
         held = GatewayKey(gateway, signer) if signer is not None else None
         self.store = Store(directory, 0, recall=partial(memories_of, restore=Pipeline.restore), key=held)
-        self.faults = self.store.recovered.faults
+        self.faults = self.store.faults
         self.recorder = Recorder(directory, ["s"], ["s"], ledger=self.store, signer=signer, epoch=self.store.epoch)
         self.recorder.close_torn()
         kept: dict[str, dict[str, bytes]] = {"s": {}}
@@ -135,11 +134,6 @@ class Run:
         return [result for result in self.results if isinstance(result, CalibrationUpdate)][-1]
 
 
-def half(seed: int) -> list[Event]:
-    """Events of which some windows are used; the device stays connected."""
-    return list(islice(rests(seed), 30))
-
-
 def states(memories: Iterable[Memory]) -> dict[tuple[str, str], bytes]:
     """The states by device."""
     return {(memory.sensor, memory.identity): memory.state for memory in memories}
@@ -172,6 +166,22 @@ def forge_result(directory: Path, sequence: int, **changes: Any) -> None:
         connection.execute(
             "UPDATE results SET payload = ?, crc = ? WHERE sequence = ?", (payload, row_crc(*row), sequence)
         )
+
+
+def rows(directory: Path, sql: str) -> list[Any]:
+    """Read from the store."""
+    with closing(sqlite3.connect(directory / FILE_NAME)) as connection:
+        return connection.execute(sql).fetchall()
+
+
+def put_back(directory: Path, store: Path, *tables: str) -> None:
+    """Replace tables of the store by those of another one; the states and their list, where none is named."""
+    with closing(sqlite3.connect(directory / FILE_NAME)) as connection:
+        connection.execute("ATTACH DATABASE ? AS other", (str(store),))
+        with connection:
+            for table in tables or ("memory", "states"):
+                connection.execute(f"DELETE FROM main.{table}")
+                connection.execute(f"INSERT INTO main.{table} SELECT * FROM other.{table}")
 
 
 def change(directory: Path, sql: str, *values: Any) -> None:

@@ -15,7 +15,7 @@ from agent.commanding.desk import Answer, CommandDesk
 from agent.commanding.envelope import Order, seal
 from agent.config import Commands
 from agent.core.events import Command
-from agent.delivery.history import FILE_NAME
+from agent.delivery.history import FILE_NAME, History, Record
 from agent.delivery.store import Store
 from tests.unit.zenoh_site import record
 
@@ -44,7 +44,13 @@ class DeskSite:
             made = Store(directory, count_from=100)
             made.commit([record(101, "calibration"), record(102, "window")])
             made.close()
-        self.desk = CommandDesk(GATEWAY, ["mems", "spare"], settings(**more), directory, store, self.events.append)
+
+        def find(sensor: str, what: str, sequence: int) -> Record | None:
+            with History(store) as history:
+                found = history.after(sequence - 1, [(sensor, what)], limit=1)
+            return found[0] if found and found[0].sequence == sequence else None
+
+        self.desk = CommandDesk(GATEWAY, ["mems", "spare"], settings(**more), directory, find, self.events.append)
 
     def send(self, data: bytes, sensor: str = "mems", verb: str = "hold") -> Answer:
         """The answer to bytes on the address of a sensor and a verb."""

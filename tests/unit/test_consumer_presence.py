@@ -28,7 +28,7 @@ def silent_gateway(site: Site, store: Store) -> Iterator[None]:
     """It has a token and answers queries from its store, but all of its messages are lost."""
     with site.client() as session:
         queryable = session.declare_queryable(f"{KEY}/**", zenoh.handlers.FifoChannel(64), complete=True)
-        told = (queryable, KEY, store.path, dict)
+        told = (queryable, KEY, store.history, dict)
         threading.Thread(target=answer_queries, args=told, daemon=True).start()
         token = session.liveliness().declare_token(f"{KEY}/alive")
         yield
