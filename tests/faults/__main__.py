@@ -13,7 +13,7 @@ from pathlib import Path
 os.environ["OPENBLAS_NUM_THREADS"] = "1"  # as every entry point of the product, before numpy loads
 
 from benchmarks.page import machine, write_part
-from tests.faults import clock, disk, flips, kill, needs, remembering, routing, unplug
+from tests.faults import clock, disk, flips, kill, needs, remembering, routing, states, unplug
 from tests.faults.outcome import HEAD, Outcome, row
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "reliability.md"
@@ -21,6 +21,7 @@ PART = "faults"
 LINES: dict[str, Callable[[Path], Outcome]] = {
     "kill": partial(kill.at_random_moments, kills=200),
     "write": kill.at_every_write,
+    "states": partial(states.killed, kills=20),
     "ext4": partial(disk.power_cut, kind="ext4", cuts=50),
     "xfs": partial(disk.power_cut, kind="xfs", cuts=50),
     "full": disk.full,
