@@ -18,7 +18,7 @@ from agent.audit.replaying import Replayed, ReplayedFile, Replayer
 from agent.audit.result_check import check_results
 from agent.recording.chain import Link
 from agent.recording.integrity import Integrity, check_integrity
-from agent.recording.pruned_ranges import PRUNED_METADATA, Ranges, from_metadata
+from agent.recording.pruned_ranges import LIST, PRUNED_METADATA, Deleted, from_metadata
 from agent.recording.reading import open_recording
 from agent.recording.records import Fault
 from agent.recording.repair import REPAIR_METADATA
@@ -59,12 +59,11 @@ class AuditedFile(msgspec.Struct, kw_only=True):
 
 @dataclass(frozen=True, slots=True)
 class Audited:
-    """The verdict on one file, not concluded; its replay; its link in the chain; the numbers that retention deleted."""
+    """The verdict on one file, not concluded; its replay; its link in the chain."""
 
     verdict: AuditedFile
     replayed: Replayed
     link: Link
-    deleted: Ranges
 
 
 def audit_file(
@@ -100,8 +99,7 @@ def audit_file(
     verdict.signed_results = results.signed
     if results.fault:
         verdict.reasons.append(f"{results.faults} results without a valid signature; the first: {results.fault}")
-    deleted = from_metadata(integrity.metadata.get(PRUNED_METADATA))
-    return Audited(verdict, replayed, _link(verdict, integrity), deleted)
+    return Audited(verdict, replayed, _link(verdict, integrity))
 
 
 def conclude(verdict: AuditedFile, *, strict: bool) -> None:
@@ -157,9 +155,11 @@ def _statement(verdict: AuditedFile, integrity: Integrity) -> Statement:
 
 
 def _link(verdict: AuditedFile, integrity: Integrity) -> Link:
+    pruned = integrity.metadata.get(PRUNED_METADATA)
     return Link(
         path=verdict.path,
         gateway=verdict.replay.gateway,
+        epoch=integrity.metadata.get(FILE_METADATA, {}).get(EPOCH, ""),
         file_sequence=verdict.replay.file_sequence,
         sha256=verdict.sha256,
         incomplete=verdict.incomplete,
@@ -167,6 +167,8 @@ def _link(verdict: AuditedFile, integrity: Integrity) -> Link:
         previous_sha256=integrity.metadata.get(FILE_METADATA, {}).get("previous_sha256", ""),
         previous_results=integrity.metadata.get(FILE_METADATA, {}).get(PREVIOUS_RESULTS, ""),
         signed_results=signed_results(integrity.metadata.get(SIGNATURE_METADATA)),
+        deleted=(*from_metadata(pruned), *map(Deleted.of, verdict.replay.pruned)),
+        listed=(pruned or {}).get(LIST, ""),
     )
 
 

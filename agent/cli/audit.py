@@ -22,12 +22,11 @@ from agent.cli.engine_options import ENGINES, JOBS, TRUST_ENGINE, engines_for
 from agent.cli.given import Given, add_witnessed, read_head, recordings_of
 from agent.cli.kernels import compute_as_in
 from agent.delivery.history import StoreError
-from agent.recording.chain import Link, chain_faults, missing_after
+from agent.recording.chain import Link, chain_faults, missing_after, unproven
 from agent.recording.end_check import check_end
+from agent.recording.gone import Gone, find_gone
 from agent.recording.head import HEAD_NAME
-from agent.recording.pruned_ranges import Ranges, merged
 from agent.recording.reading import open_recording
-from agent.recording.set_aside import deleted as statements
 from agent.terminal.text import say
 
 if TYPE_CHECKING:
@@ -129,9 +128,10 @@ def run_audit(
 ) -> int:
     """Audit, print, and return the exit status. With `keys`, files must be signed by a key of their gateway."""
     try:
-        audited, links, deleted = _audited(given, engines, strict=strict, keys=keys, jobs=jobs)
-        end = check_end(given.heads, links, deleted, keys, time.time_ns())
-        end.reasons += given.faults
+        audited, links, gone = _audited(given, engines, strict=strict, keys=keys, jobs=jobs)
+        end = check_end(given.heads, links, gone, keys, time.time_ns())
+        end.reasons += [*given.faults, *gone.faults]
+        end.unproven += [*unproven(links, gone.statements, whole=gone.whole), *gone.unproven]
     except OSError as error:
         say(f"{error.filename}: {error.strerror}", err=True)
         return 2
@@ -139,7 +139,7 @@ def run_audit(
         end.reasons.append(f"there is no {HEAD_NAME} beside signed recordings, and none was given (--head, --witness)")
     if keys is None and audited:
         end.unproven.append(NO_ENGINE)
-    lost = missing_after(links, given.up_to or 0, deleted)
+    lost = missing_after(links, given.up_to or 0)
     failed = bool(lost or end.reasons or any(file.reasons for file in audited))
     undecided = sum(bool(file.undecided) for file in audited)
     if as_json:
@@ -170,8 +170,8 @@ def audit_files(
 
 def _audited(
     given: Given, engines: Engines, *, strict: bool, keys: KnownKeys | None, jobs: int
-) -> tuple[list[AuditedFile], list[Link], Ranges]:
-    """(the verdicts, the links of the chain, the file numbers that retention deleted)."""
+) -> tuple[list[AuditedFile], list[Link], Gone]:
+    """(the verdicts, the links of the chain, what is known of recordings that are not there)."""
     from agent.recording.fingerprint import fingerprint
 
     replayer = Replayer(engines, fingerprint(), OTHER_CPU)
@@ -182,13 +182,8 @@ def _audited(
         checked = list(for_each(work, given.paths, jobs))
     audited, links = [one.verdict for one in checked], [one.link for one in checked]
     faults = link_replays([one.replayed for one in checked])
-    said = [deleted for one in checked for deleted in one.deleted]  # recordings that retention deleted
-    pruned = [event for verdict in audited for event in verdict.replay.pruned]
-    if given.directory is not None:
-        gateway = next((link.gateway for link in links if link.gateway), "")
-        said += statements(given.directory, gateway, keys)[0]
-    gone = merged([*said, *((event.first_file, event.last_file) for event in pruned)])
-    for index, fault in [*faults, *chain_faults(links, pruned, gone, from_first=given.up_to is not None)]:
+    gone = find_gone(given.directory, links, [head.number for head in given.heads], keys)
+    for index, fault in [*faults, *chain_faults(links, gone.statements, whole=gone.whole)]:
         audited[index].reasons.append(fault)
     for verdict in audited:
         conclude(verdict, strict=strict)

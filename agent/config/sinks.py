@@ -29,8 +29,13 @@ class Recording(Section):
     ] = None
     # A full disk stops more than the recording. This leaves space for two files of `rotate_bytes`.
     least_free_bytes: Annotated[
-        ByteSize, Field(ge=0, description="free disk space to keep; the oldest recordings are deleted for it")
+        ByteSize,
+        Field(ge=0, description="free disk space to keep; the oldest recordings are deleted for it; 0: none is"),
     ] = ByteSize(512 * 1024 * 1024)
+    # A week is enough to notice the status of a gateway whose disk somebody else has filled, and to come there.
+    keep_at_least_days: Annotated[
+        float, Field(ge=0, description="younger recordings are not deleted for `least_free_bytes`")
+    ] = 7.0
     signing_key: Annotated[
         Path | None, Field(description="file of an Ed25519 private key (PEM), which signs each closed file")
     ] = None

@@ -93,7 +93,10 @@ class Command(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Pruned(msgspec.Struct, frozen=True, kw_only=True):
-    """The agent deleted its oldest recordings, to stay within the configured limits: all numbers from first to last."""
+    """The agent deleted its oldest recording, to stay within the configured limits.
+
+    Events of older versions name all numbers from first to last, and neither `epoch` nor `previous_sha256`.
+    """
 
     t_monotonic_ns: int
     t_utc_ns: int
@@ -101,6 +104,8 @@ class Pruned(msgspec.Struct, frozen=True, kw_only=True):
     last_file: int
     last_sha256: str  # of the last deleted file, hexadecimal; the next file holds the same value
     bytes: int
+    epoch: str = ""  # of the store when the deleted file began
+    previous_sha256: str = ""  # that the first deleted file names as the one of the file before it
 
 
 Event = RunStart | SampleBlock | DeviceChange | Gap | Command | Pruned | Tick

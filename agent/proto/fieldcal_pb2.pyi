@@ -112,20 +112,24 @@ class Event(_message.Message):
         refused: str
         def __init__(self, sensor: _Optional[str] = ..., verb: _Optional[str] = ..., t_monotonic_ns: _Optional[int] = ..., t_utc_ns: _Optional[int] = ..., arguments_json: _Optional[str] = ..., calibration_json: _Optional[str] = ..., key_id: _Optional[str] = ..., counter: _Optional[int] = ..., refused: _Optional[str] = ...) -> None: ...
     class Pruned(_message.Message):
-        __slots__ = ("t_monotonic_ns", "t_utc_ns", "first_file", "last_file", "last_sha256", "bytes")
+        __slots__ = ("t_monotonic_ns", "t_utc_ns", "first_file", "last_file", "last_sha256", "bytes", "epoch", "previous_sha256")
         T_MONOTONIC_NS_FIELD_NUMBER: _ClassVar[int]
         T_UTC_NS_FIELD_NUMBER: _ClassVar[int]
         FIRST_FILE_FIELD_NUMBER: _ClassVar[int]
         LAST_FILE_FIELD_NUMBER: _ClassVar[int]
         LAST_SHA256_FIELD_NUMBER: _ClassVar[int]
         BYTES_FIELD_NUMBER: _ClassVar[int]
+        EPOCH_FIELD_NUMBER: _ClassVar[int]
+        PREVIOUS_SHA256_FIELD_NUMBER: _ClassVar[int]
         t_monotonic_ns: int
         t_utc_ns: int
         first_file: int
         last_file: int
         last_sha256: str
         bytes: int
-        def __init__(self, t_monotonic_ns: _Optional[int] = ..., t_utc_ns: _Optional[int] = ..., first_file: _Optional[int] = ..., last_file: _Optional[int] = ..., last_sha256: _Optional[str] = ..., bytes: _Optional[int] = ...) -> None: ...
+        epoch: str
+        previous_sha256: str
+        def __init__(self, t_monotonic_ns: _Optional[int] = ..., t_utc_ns: _Optional[int] = ..., first_file: _Optional[int] = ..., last_file: _Optional[int] = ..., last_sha256: _Optional[str] = ..., bytes: _Optional[int] = ..., epoch: _Optional[str] = ..., previous_sha256: _Optional[str] = ...) -> None: ...
     EVENT_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     RUN_START_FIELD_NUMBER: _ClassVar[int]
     DEVICE_CHANGE_FIELD_NUMBER: _ClassVar[int]

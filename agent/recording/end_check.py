@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from agent.recording.chain import Link, span
+from agent.recording.gone import Gone
 from agent.recording.head import Head
-from agent.recording.pruned_ranges import Ranges, first_outside
 from agent.recording.reading import open_recording
 from agent.recording.signed_text import SignedText, SignedTextError
 from agent.recording.signing import prefix_sha256
@@ -38,6 +38,14 @@ class GivenHead:
     source: str
     data: bytes
     elsewhere: bool
+
+    @property
+    def number(self) -> int:
+        """The number of the recording that it names; 0 where it is no head."""
+        try:
+            return Head.of(SignedText.read(self.data)).statement.file_sequence
+        except SignedTextError:
+            return 0
 
 
 class End(msgspec.Struct, kw_only=True):
@@ -71,9 +79,9 @@ class End(msgspec.Struct, kw_only=True):
 
 
 def check_end(
-    heads: Sequence[GivenHead], links: Sequence[Link], deleted: Ranges, keys: KnownKeys | None, now_ns: int
+    heads: Sequence[GivenHead], links: Sequence[Link], gone: Gone, keys: KnownKeys | None, now_ns: int
 ) -> End:
-    """Compare recordings with all given heads. `deleted`: numbers that retention deleted. `now_ns`: UTC.
+    """Compare recordings with all given heads. `gone`: what is known of deleted recordings. `now_ns`: UTC.
 
     With `keys` each head must be signed by a key of the gateway that it names. Raises OSError.
     """
@@ -81,6 +89,7 @@ def check_end(
     newest: tuple[Head, GivenHead] | None = None
     by_number = {link.file_sequence: link for link in links if link.gateway}
     gateway = next((link.gateway for link in links if link.gateway), "")
+    undecided: dict[str, list[int]] = {}
     for given in heads:
         try:
             signed = SignedText.read(given.data)
@@ -95,7 +104,7 @@ def check_end(
         if gateway and head.statement.gateway != gateway:
             fault = f"it is a head of {head.statement.gateway!r:.130}, the recordings are of {gateway!r:.130}"
         else:
-            fault = _fault(head, by_number, deleted)
+            fault = _fault(head, by_number, gone, undecided)
         if fault:
             end.reasons.append(f"{given.source}: {fault}")
         if newest is None or (head.place, given.elsewhere) > (newest[0].place, newest[1].elsewhere):
@@ -108,6 +117,8 @@ def check_end(
         end.unproven.append(BESIDE)
     else:
         end.unproven.append(f"whether more was recorded after {when(end.utc_ns)}")
+    for what, numbers in undecided.items():
+        end.unproven.append(f"{what} (recording {min(numbers)}{f' and {n} more' if (n := len(numbers) - 1) else ''})")
     if keys is None:
         end.unproven.append(NO_KEY)
     return end
@@ -122,14 +133,21 @@ def _name(end: End, head: Head, given: GivenHead, now_ns: int) -> None:
     end.age_s = (now_ns - head.utc_ns) * 1e-9
 
 
-def _fault(head: Head, by_number: Mapping[int, Link], deleted: Ranges) -> str:
-    """Why recordings do not reach as far as a head, with the content that it names; "" where they do."""
+def _fault(head: Head, by_number: Mapping[int, Link], gone: Gone, undecided: dict[str, list[int]]) -> str:
+    """Why recordings do not reach as far as a head, with the content that it names; "" where they do.
+
+    `undecided` gets what cannot be shown of a recording that is not there.
+    """
     number, length = head.place
-    missing = first_outside(deleted, max(by_number, default=0) + 1, number)
-    if missing is not None:
-        return f"{span(*missing)} missing at the end: this head of {when(head.utc_ns)} names recording {number}"
+    last = max(by_number, default=0)
+    if number > last:
+        missing = span(last + 1, number)
+        return f"{missing} missing at the end: this head of {when(head.utc_ns)} names recording {number}"
     if number not in by_number:
-        return ""  # deleted by retention; or a gap, which the chain names
+        fault, what = gone.compare(head)
+        if what:
+            undecided.setdefault(what, []).append(number)
+        return fault
     path = by_number[number].path
     with open_recording(Path(path)) as file:
         if file.seek(0, 2) < length:

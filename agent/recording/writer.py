@@ -14,16 +14,25 @@ from pathlib import Path
 from typing import Protocol
 
 from agent.core.events import RESULTS, Event, Output, Pruned, RunStart
-from agent.recording.files import RecordingFile, newest, recordings, sync_directory
+from agent.recording.deleted_list import DeletedList
+from agent.recording.files import RecordingFile, file_number, newest, recordings, sync_directory
 from agent.recording.head import HeadKeeper, Tell
 from agent.recording.messages import EVENTS_TOPIC, topic_of
-from agent.recording.pruned_ranges import PRUNED_METADATA, Ranges, from_metadata, merged, to_metadata
+from agent.recording.pruned_ranges import (
+    LIST,
+    PRUNED_METADATA,
+    Deleted,
+    first_outside,
+    from_metadata,
+    merged,
+    to_metadata,
+)
 from agent.recording.repair import close_torn
 from agent.recording.result_signing import PUBLIC_KEY, ResultSigner
 from agent.recording.results_chain import EPOCH, PREVIOUS_RESULTS
-from agent.recording.retention import FOR_EVER, KeepFiles, delete, due, free_bytes
+from agent.recording.retention import FOR_EVER, KeepFiles, Moment, Retention, delete, free_bytes
 from agent.recording.scan import metadata_of
-from agent.recording.set_aside import deleted, finish, highest_number, remove_statements, set_aside
+from agent.recording.set_aside import finish, highest_number, remove_statements, set_aside, statements
 from agent.recording.signing import SIGNATURE_METADATA, Signer, signed_results
 
 log = logging.getLogger(__name__)
@@ -82,7 +91,7 @@ class Recorder:
         self._max_bytes = max_bytes
         self._max_age_ns = int(max_age_s * 1e9)
         self._retry_ns = int(retry_s * 1e9)
-        self._keep = keep
+        self._retention = Retention(directory, keep)
         self._ledger = ledger
         self._signer = signer
         self._head = HeadKeeper(directory, signer, tell_head) if signer is not None else None
@@ -93,9 +102,12 @@ class Recorder:
         self._utc_minus_monotonic_ns = 0
         self._now_ns = self._since_ns = 0  # event time of the last event; event time when the file began or failed
         self._numbered = ledger.file_sequence() if ledger is not None else 0
-        self._pruned = _pruned_before(directory)
-        self._due: Pruned | None = None  # files that may be deleted
-        self._unsaid = False  # the files of `_due` were deleted, but the event is in no recording yet
+        self._pruned, named = _pruned_before(directory)
+        self._of_this_version = bool(named)  # whether a version that keeps the list wrote the newest recording
+        self._list = DeletedList(directory, named)
+        self.pruning: Pruned | None = None  # the event to record next; its file is due to be deleted
+        self._timed = False  # whether an event with both clocks has come
+        self._quota = False  # whether the last failure was that the user's quota is used up
         # For its age, one file is deleted for each file that begins. Where the clock jumps ahead by years, only as many
         # recordings are lost as begin before the clock is corrected.
         self._may_age = True
@@ -133,12 +145,9 @@ class Recorder:
         return age_ns >= self._max_age_ns or file.size >= self._max_bytes or file.full
 
     @property
-    def pruning(self) -> Pruned | None:
-        """The Pruned event to record next, or None. Its files are due to be deleted.
-
-        Where nothing was recorded at the time, its files are deleted already, and the event must still be recorded.
-        """
-        return self._due if self.recording or not self._unsaid else None
+    def space(self) -> str:
+        """What the lack of free space means for older recordings; "" where none lacks."""
+        return self._retention.notice
 
     def close_torn(self) -> None:
         """Close the files that a crash left open. Call it before `next_file_sequence` is first used. Raises OSError."""
@@ -146,20 +155,21 @@ class Recorder:
         close_torn(self._directory, self._signer)
 
     def look_for_pruning(self) -> None:
-        """Check whether files are due to be deleted; `pruning` then tells which. Fast, but it accesses the disk."""
-        if self._due is not None:
+        """Check whether a file is due to be deleted; `pruning` then tells which. It may read this file."""
+        if self.pruning is not None or not self._timed:
             return
         try:
             waiting = self._ledger.first_waiting_recording() if self._ledger is not None else ""
-            self._due = due(self._directory, self._keep, self.path, waiting, by_age=self._may_age)
+            at = Moment(self._now_ns, self._utc_ns, self.path, waiting, self._may_age, self._quota)
+            self.pruning = self._retention.due(at)
         except Exception as error:  # the next write to the failing disk or store reports the failure
             log.info("cannot determine which recordings to delete: %s", error)
 
     def record(self, event_sequence: int, event: Event, results: Sequence[Output]) -> bool:
         """Write an event and its results. With results, and for a RunStart or a Pruned, wait until they are on disk.
 
-        A RunStart finishes the current file and begins the next one. The files that a Pruned names are deleted after
-        the event is on disk.
+        A RunStart finishes the current file and begins the next one. The file that a Pruned names is deleted after the
+        event is on disk; while nothing is recorded, a statement takes its place.
         Returns whether the event is in a file. If so, and if there are results, the event, its results and all events
         before it survive a power cut.
         """
@@ -168,13 +178,13 @@ class Recorder:
             messages = [(topic_of(item), self.results.encode(event_sequence, item)) for item in (event, *results)]
             if isinstance(event, RunStart):
                 self._begin(event)
-            if isinstance(event, Pruned):
-                self._pruned = merged([*self._pruned, (event.first_file, event.last_file)])
+            if isinstance(event, Pruned) and self._file is not None:
+                self._repeat([Deleted.of(event)])
             if self._file is not None:
                 for topic, data in messages:
                     self._file.append(topic, data, log_time, publish_time, event_sequence)
-                if isinstance(event, RunStart | Pruned) and self._pruned:
-                    self._file.note(PRUNED_METADATA, to_metadata(self._pruned))
+                if isinstance(event, RunStart | Pruned):
+                    self._file.note(PRUNED_METADATA, to_metadata(self._pruned, self._list.text))
                 if results or isinstance(event, RunStart | Pruned):
                     self._file.sync()
             if isinstance(event, RunStart):
@@ -186,6 +196,7 @@ class Recorder:
             if isinstance(event, RunStart) and self._file is not None:
                 self._file.discard()
                 self._file = None
+            self._quota = error.errno == errno.EDQUOT
             self._fail(f"{error.strerror or error} ({where})")
         except (ValueError, TypeError) as error:
             # The event cannot be encoded. The file ends before it; the next file begins with a snapshot taken after it.
@@ -206,6 +217,7 @@ class Recorder:
                     self.close()
                     self._fail(f"{os.strerror(errno.ENOSPC)} ({self._directory})")
         except OSError as error:
+            self._quota = error.errno == errno.EDQUOT
             self._fail(f"{error.strerror or error} ({self.path})")
 
     def close(self) -> None:
@@ -228,30 +240,45 @@ class Recorder:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self._directory))
         if self._failures:
             close_torn(self._directory, self._signer)  # the failed file, so that the next one can name its SHA-256
+        self._repeat(self._set_aside())
         name, digest = newest(self._directory)
+        if self._pruned and self._pruned[-1].last > (file_number(name) or 0):  # the newest one was deleted
+            name, digest = f"fieldcal-{self._pruned[-1].last:06d}.mcap", self._pruned[-1].sha256
         origin = {"previous_file": name, "previous_sha256": digest} | ({EPOCH: self._epoch} if self._epoch else {})
         if self._ledger is not None:
             origin["published"] = str(self._ledger.published())
         if self._signer is not None:
             origin[PUBLIC_KEY] = self._signer.public_base64
             origin |= {PREVIOUS_RESULTS: _signed_results(self._directory / name)} if name else {}
-        self._pruned = merged([*self._pruned, *self._set_aside()])
         self._since_ns = self._now_ns
         self._file = RecordingFile(self._directory, start, self._topics, origin, self._signer)
         sync_directory(self._directory)
-        self.fault = ""
+        self.fault, self._quota = "", False
 
-    def _set_aside(self) -> Ranges:
-        """The recordings that were deleted while nothing could be recorded."""
-        ranges, faults = deleted(self._directory, self.results.gateway, self._signer.known if self._signer else None)
-        for fault in faults:
+    def _set_aside(self) -> Sequence[Deleted]:
+        """The recordings that were deleted while nothing could be recorded.
+
+        Statements of version 1 count only where an older version wrote the newest recording: nobody else makes them.
+        """
+        keys = self._signer.known if self._signer else None
+        found = statements(self._directory, self.results.gateway, keys, self._pruned)
+        for fault in found.faults:
             log.warning("%s", fault)
-        return ranges
+        return [*found.deleted, *(() if self._of_this_version else found.of_version_1)]
+
+    def _repeat(self, deleted: Sequence[Deleted]) -> None:
+        """From now on every recording says that these were deleted."""
+        deleted = [one for one in deleted if first_outside(self._pruned, one.first, one.last) is not None]
+        self._pruned = merged([*self._pruned, *deleted])
+        try:
+            self._list.add(deleted)
+        except OSError as error:
+            log.warning("deleted recordings cannot be added to %s: %s", error.filename, error.strerror)
 
     def _begun(self, start: RunStart) -> None:
         """The RunStart is on the disk. A crash before that leaves no file, and its number is used again."""
         self._number(start.file_sequence)
-        self._may_age = True
+        self._may_age = self._of_this_version = True
         try:
             remove_statements(self._directory, self._pruned)
         except OSError as error:  # they stay until the next file begins
@@ -275,23 +302,18 @@ class Recorder:
                 )
 
     def _prune(self, pruned: Pruned) -> None:
-        """Delete the files; check whether more are due.
-
-        Where nothing is recorded, statements say that the files were deleted, and the event is recorded again in the
-        next file.
-        """
+        """Delete the file, or replace it by a statement where nothing is recorded; check whether more are due."""
         try:
-            if self._file is None:
-                set_aside(self._directory, pruned.first_file, pruned.last_file, self.results.gateway, self._signer)
-            else:
+            if self._file is not None:
                 delete(self._directory, pruned)
+            else:
+                set_aside(self._directory, Deleted.of(pruned), self.results.gateway, self._signer)
+                self._failures, self._since_ns = 1, self._now_ns - self._retry_ns  # there may be space now
         except OSError as error:
-            log.warning("recordings %d to %d cannot be deleted: %s", pruned.first_file, pruned.last_file, error)
-        if self._file is None:
-            self._unsaid = True
-            self._failures, self._since_ns = 1, self._now_ns - self._retry_ns
+            log.warning("recording %d cannot be deleted: %s", pruned.last_file, error)
+            self.pruning = None
         else:
-            self._unsaid, self._due, self._may_age = False, None, False
+            self.pruning, self._may_age = None, False
             self.look_for_pruning()
 
     def _fail(self, fault: str) -> None:
@@ -316,7 +338,7 @@ class Recorder:
             utc_ns = monotonic_ns + self._utc_minus_monotonic_ns
         else:
             self._utc_minus_monotonic_ns = utc_ns - monotonic_ns
-            self._now_ns = monotonic_ns
+            self._now_ns, self._timed = monotonic_ns, True
         return max(utc_ns, 0), max(monotonic_ns, 0)
 
 
@@ -325,12 +347,15 @@ def _signed_results(path: Path) -> str:
     return signed_results(metadata_of(path).get(SIGNATURE_METADATA)) or "" if path.exists() else ""
 
 
-def _pruned_before(directory: Path) -> Ranges:
-    """The recordings that retention deleted before this run, as the newest readable recording says."""
+def _pruned_before(directory: Path) -> tuple[tuple[Deleted, ...], str]:
+    """The recordings that were deleted before this run, and the bytes and SHA-256 of the list of all of them, as the
+    newest readable recording says; "" where an older version wrote it.
+    """
     try:
         for _, path in reversed(recordings(directory)):
             if metadata := metadata_of(path):
-                return from_metadata(metadata.get(PRUNED_METADATA))
+                pruned = metadata.get(PRUNED_METADATA, {})
+                return from_metadata(pruned), pruned.get(LIST, "")
     except OSError as error:  # the next write to the failing disk reports the failure
         log.info("cannot read which recordings were deleted before this run: %s", error)
-    return ()
+    return (), ""

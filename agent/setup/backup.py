@@ -15,6 +15,7 @@ from pathlib import Path
 from agent.config import Config
 from agent.delivery.history import FILE_NAME, connect_read_only
 from agent.delivery.schema import write_mark
+from agent.recording.deleted_list import LIST_NAME
 from agent.recording.files import ACTIVE_SUFFIX, recordings
 from agent.recording.head import HEAD_NAME
 from agent.recording.reading import open_recording
@@ -24,7 +25,14 @@ ENGINES = "engines"  # directory of the wheels, `<id>.whl`, of the engines that 
 # The head; statements about recordings that retention deleted; pins that keep a recording. Nothing else is copied, so
 # no key that lies there, and not the counters of commands: with older counters a command could be repeated.
 _SMALL = re.compile(rf"{HEAD_NAME}|fieldcal-\d{{6,18}}\.(deleted|mcap\.lock)")
-_OWN = (HEAD_NAME, ENGINES, "fieldcal-", "state.", "command")  # with which the names of the agent's files begin
+_OWN = (
+    HEAD_NAME,
+    ENGINES,
+    LIST_NAME,
+    "fieldcal-",
+    "state.",
+    "command",
+)  # with which the names of the agent's files begin
 
 
 class BackupError(Exception):
@@ -36,7 +44,8 @@ def back_up(data_dir: Path, target: Path, config_path: Path | None, keys: Iterab
 
     The order makes the copy like a gateway after a power cut, which a start repairs: first the small files, such as the
     head of the recordings, then the store, at one moment (SQLite's backup), then the recordings, which reach at least
-    as far as both. The file that is being written is copied as far as it is written.
+    as far as both, then the list of deleted recordings, which has all that they name. The file that is being written is
+    copied as far as it is written.
 
     Raises BackupError or OSError. What was begun is then left beside `target`, with the ending .partial.
     """
@@ -60,6 +69,8 @@ def back_up(data_dir: Path, target: Path, config_path: Path | None, keys: Iterab
     for path in _regular((data_dir / ENGINES).glob("*.whl")):  # last, so that none of a recording is missing
         (data / ENGINES).mkdir(exist_ok=True)
         _copy(path, data / ENGINES / path.name)
+    if (data_dir / LIST_NAME).exists():
+        _copy(data_dir / LIST_NAME, data / LIST_NAME)
     if config_path is not None:
         _copy(config_path, partial / config_path.name)
     for key in keys:

@@ -42,12 +42,13 @@ class Queue(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class RecordingHealth(msgspec.Struct, frozen=True, kw_only=True):
-    """The file being written."""
+    """The file being written. `space`: what the lack of free space means for older recordings; "" where none lacks."""
 
     active: bool
     file: str
     size_bytes: int
     fault: str
+    space: str = ""
 
 
 class PublicationHealth(msgspec.Struct, frozen=True, kw_only=True):
@@ -220,6 +221,7 @@ class Health:
         behind = [name for name, queue in now.queues.items() if queue.waiting > BEHIND * queue.capacity]
         told = {
             f"not recording: {now.recording.fault}": not now.recording.active and now.recording.fault,
+            f"recordings: {now.recording.space}": now.recording.space,
             f"less than {least / 1e6:g} MB free on the disk of the data": (now.disk_free_bytes or least) < least,
             "the store cannot be read": publication.unpublished is None,
             "no Zenoh router, results wait in the store": publication.enabled and not publication.connected,

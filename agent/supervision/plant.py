@@ -99,6 +99,7 @@ class Plant:
                 file=path.name if path else "",
                 size_bytes=self.recorder.size_bytes,
                 fault=self.recorder.fault,
+                space=self.recorder.space,
             ),
             publication=self._publication(),
             disk_free_bytes=_disk_free_bytes(self.data_dir),

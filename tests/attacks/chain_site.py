@@ -15,9 +15,11 @@ from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 from agent.cli.audit import run_audit
 from agent.cli.given import recordings_of
 from agent.config.known_keys import KnownKeys
+from agent.core.events import Event
 from agent.delivery.store import Store
 from agent.recording.end_check import GivenHead
 from agent.recording.files import recordings
+from agent.recording.retention import FOR_EVER, KeepFiles
 from agent.recording.signing import Signer
 from agent.recording.writer import Recorder
 from tests.replay.stand_in import CONFIG, StandIn, happenings, run_start
@@ -34,25 +36,35 @@ def record(
     blocks: int = 14,
     key: Ed25519PrivateKey = KEY,
     heads: list[bytes] | None = None,
+    keep: KeepFiles = FOR_EVER,
 ) -> list[Path]:
     """Record one run of `gateway` into `directory`, signed with `key`; returns its recordings.
 
-    All heads that the gateway publishes are added to `heads`.
+    All heads that the gateway publishes are added to `heads`. `keep`: the limits of the recordings.
     """
     directory.mkdir(exist_ok=True)
     store = Store(directory, 0)
     told = [] if heads is None else heads
     names = (["acc", "ref"], ["bridge-1"])
-    recorder = Recorder(directory, *names, ledger=store, signer=Signer(key), tell_head=told.append, epoch=store.epoch)
+    recorder = Recorder(
+        directory, *names, ledger=store, signer=Signer(key), tell_head=told.append, epoch=store.epoch, keep=keep
+    )
     recorder.close_torn()
     pipeline = StandIn(CONFIG)
+    at = 0
+
+    def take(event: Event) -> None:
+        nonlocal at
+        assert recorder.record(at, event, pipeline.step(event)), recorder.fault
+        at += 1
+
     for number, event in enumerate(happenings(blocks, seed)):
-        at = number + number // ROTATE_EACH
         if number % ROTATE_EACH == 0:
             start = run_start(pipeline, at, recorder.next_file_sequence, event.t_monotonic_ns)
-            start = msgspec.structs.replace(start, gateway=gateway, run_id=f"run-{seed}")
-            assert recorder.record(at, start, pipeline.step(start)), recorder.fault
-        assert recorder.record(at + 1, event, pipeline.step(event)), recorder.fault
+            take(msgspec.structs.replace(start, gateway=gateway, run_id=f"run-{seed}"))
+            while recorder.pruning is not None:
+                take(recorder.pruning)
+        take(event)
     recorder.close()
     store.close()
     return [path for _, path in recordings(directory)]

@@ -1,0 +1,96 @@
+"""What is known of recordings that are not there, to compare it with heads that name them.
+
+A recording that retention deleted is known from later recordings, from the list of deleted recordings whose SHA-256
+these name, and, until the next recording begins, from statements in the directory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from agent.recording.chain import Link
+from agent.recording.deleted_list import listed
+from agent.recording.head import Head
+from agent.recording.pruned_ranges import Deleted, first_outside
+from agent.recording.set_aside import statements
+
+if TYPE_CHECKING:
+    from agent.config.known_keys import KnownKeys
+
+NOT_GIVEN = "that recordings which heads name were as these say: they are not given"
+OLDER = "that deleted recordings which heads name were those: their SHA-256 is not in the list of deleted recordings"
+OPEN = "that deleted recordings began with the bytes which heads name: these heads were signed before they were closed"
+
+
+@dataclass(frozen=True, slots=True)
+class Gone:
+    """What the links and the directory say of recordings that are not there.
+
+    `statements`: those that count. `listed`: of recordings that heads name. `whole`: the recordings of a directory were
+    given. `faults`: a list of deleted recordings that is not the one that was signed. `unproven`: statements that prove
+    nothing.
+    """
+
+    links: Sequence[Link]
+    statements: tuple[Deleted, ...] = ()
+    listed: tuple[Deleted, ...] = ()
+    whole: bool = False
+    faults: tuple[str, ...] = ()
+    unproven: tuple[str, ...] = ()
+
+    def compare(self, head: Head) -> tuple[str, str]:
+        """(why the recording that a head names and that is not there should be there or was another one, what cannot be
+        shown of it); "" for none. Only later recordings count: a statement alone can come from a copy of the directory.
+        """
+        said, number = head.statement, head.statement.file_sequence
+        entries = {entry for link in self.links if link.file_sequence > number for entry in link.deleted}
+        if first_outside(entries, number, number) is not None:
+            stated = first_outside(self.statements, number, number) is None
+            only = f"recording {number}, which this head names, is not there: only a statement says that it was deleted"
+            remedy = "the next recording of the gateway will repeat that"
+            return (f"{only}, no later recording; {remedy}" if stated else ""), ("" if self.whole else NOT_GIVEN)
+        epochs = {entry.epoch for entry in entries if entry.first <= number <= entry.last and entry.epoch}
+        if said.epoch and epochs and said.epoch not in epochs:
+            return f"recording {number} of the epoch {said.epoch}, which this head names, is not there", ""
+        own = [entry for entry in self.listed if entry.first == number and entry.epoch == said.epoch]
+        if head.closed:
+            digests = self._digests(entries, number) | {entry.sha256 for entry in own}
+            named, unknown = said.sha256, OLDER
+        else:
+            digests = self._digests(entries, number - 1) | {entry.previous_sha256 for entry in own}
+            named, unknown = said.previous_sha256, OPEN
+        if named and digests - {"", named}:
+            return f"the deleted recording {number} was not the one that this head names: its SHA-256 differs", ""
+        return "", ("" if head.closed and named in digests else unknown)
+
+    def _digests(self, entries: Iterable[Deleted], number: int) -> set[str]:
+        """All SHA-256 that are said of a recording by its neighbours and by what is said of them."""
+        there = {link.sha256 for link in self.links if link.file_sequence == number and not link.incomplete}
+        named = {link.previous_sha256 for link in self.links if link.file_sequence == number + 1}
+        ends = {entry.sha256 for entry in entries if entry.last == number}
+        begins = {entry.previous_sha256 for entry in entries if entry.first == number + 1}
+        return (there | named | ends | begins) - {""}
+
+
+def find_gone(directory: Path | None, links: Sequence[Link], heads: Iterable[int], keys: KnownKeys | None) -> Gone:
+    """Read what a data directory says of recordings that are not there; nothing without a `directory`. Raises OSError.
+
+    `heads`: numbers of the recordings that heads name. With `keys` statements must be signed by one of the gateway's,
+    and those of version 1 do not count: they do not say which recording is meant.
+    """
+    if directory is None:
+        return Gone(links)
+    gateway = next((link.gateway for link in links if link.gateway), "")
+    there = {link.file_sequence for link in links}
+    found = statements(directory, gateway, keys, [entry for link in links for entry in link.deleted])
+    newest = max((link for link in links if link.listed), key=lambda link: link.file_sequence, default=None)
+    entries, fault = listed(directory, newest.listed if newest is not None else "", set(heads) - there)
+    old = [
+        f"that retention deleted recording {one.last}: a statement of version 1 says so, which does not say its SHA-256"
+        for one in found.of_version_1
+    ]
+    counted = (*found.deleted, *(found.of_version_1 if keys is None else ()))
+    return Gone(links, counted, tuple(entries), True, (fault,) if fault else (), (*old, *found.faults))
