@@ -12,6 +12,7 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
+from agent.config.files import open_file
 from agent.recording.pruned_ranges import Deleted
 
 LIST_NAME = "deleted.list"
@@ -75,9 +76,9 @@ def listed(directory: Path, named: str, wanted: Iterable[int]) -> tuple[list[Del
     found, digest = list[Deleted](), hashlib.sha256()
     if not left:
         return [], ""
-    if not path.is_file():
+    if not path.exists():
         return [], f"{path} is missing; the newest recording names its first {left} bytes"
-    with open(path, "rb") as file:
+    with open_file(path) as file:
         while left and (line := file.readline(min(left, _LONGEST))):
             left -= len(line)
             digest.update(line)

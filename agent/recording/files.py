@@ -19,7 +19,8 @@ from agent.recording.signing import SIGNATURE_METADATA, Signer, Statement
 
 LARGE = UNPACKED_LIMIT // 2  # bytes; the chunk of a larger message is not compressed, since a reader would refuse it
 ACTIVE_SUFFIX = ".active"
-_NAME = re.compile(r"fieldcal-(\d{6,18})\.mcap(\.active)?")
+_NAME = re.compile(r"fieldcal-(\d{1,18})\.mcap(\.active)?")
+_LIKE = re.compile(r"\.mcap(\.active)?$", re.IGNORECASE)
 
 
 class _HashedFile:
@@ -78,7 +79,7 @@ class RecordingFile:
         self._epoch = origin.get(EPOCH, "")
         self._previous_sha256 = origin.get("previous_sha256", "")
         self._results = ResultsChain.of_text(origin.get(PREVIOUS_RESULTS, ""))
-        self.final_path = directory / f"fieldcal-{start.file_sequence:06d}.mcap"
+        self.final_path = directory / recording_name(start.file_sequence)
         self.path = self.final_path.with_name(self.final_path.name + ACTIVE_SUFFIX)
         self._stream = _HashedFile(self.path)
         self._unsynced = False
@@ -185,8 +186,22 @@ class RecordingFile:
 
 def recordings(directory: Path) -> list[tuple[int, Path]]:
     """(file sequence, path) of every recording in a directory, finished or not, sorted by file sequence."""
-    found = [(_NAME.fullmatch(path.name), path) for path in directory.iterdir()]
-    return sorted((int(match[1]), path) for match, path in found if match)
+    found = ((file_number(path.name), path) for path in directory.iterdir())
+    return sorted((number, path) for number, path in found if number is not None)
+
+
+def misnamed(directory: Path) -> list[tuple[int, Path]]:
+    """(number, path) of files whose name is like that of a recording, but not the one that a recording has.
+
+    `fieldcal-0000001.mcap` names 1, as `fieldcal-000001.mcap` does; a file `.mcap` that names no number has 0.
+    """
+    found = [path for path in directory.iterdir() if _LIKE.search(path.name) and file_number(path.name) is None]
+    return sorted((int(match[1]) if (match := _NAME.fullmatch(path.name)) else 0, path) for path in found)
+
+
+def recording_name(number: int) -> str:
+    """The name of the closed recording with this number."""
+    return f"fieldcal-{number:06d}.mcap"
 
 
 def final_name(path: Path) -> str:
@@ -197,7 +212,8 @@ def final_name(path: Path) -> str:
 def file_number(name: str) -> int | None:
     """The number in the file name of a recording, finished or not; None where it is not such a name."""
     match = _NAME.fullmatch(name)
-    return int(match[1]) if match else None
+    number = int(match[1]) if match else 0
+    return number if match and name == recording_name(number) + (match[2] or "") else None
 
 
 def newest(directory: Path) -> tuple[str, str]:

@@ -6,13 +6,14 @@ these name, and, until the next recording begins, from statements in the directo
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from agent.recording.chain import Link
 from agent.recording.deleted_list import listed
+from agent.recording.files import misnamed
 from agent.recording.head import Head
 from agent.recording.pruned_ranges import Deleted, first_outside
 from agent.recording.set_aside import statements
@@ -30,8 +31,8 @@ class Gone:
     """What the links and the directory say of recordings that are not there.
 
     `statements`: those that count. `listed`: of recordings that heads name. `whole`: the recordings of a directory were
-    given. `faults`: a list of deleted recordings that is not the one that was signed. `unproven`: statements that prove
-    nothing.
+    given. `faults`: a list of deleted recordings that is not the one that was signed, a second file of one number.
+    `unproven`: statements that prove nothing, files that are no recordings.
     """
 
     links: Sequence[Link]
@@ -92,5 +93,23 @@ def find_gone(directory: Path | None, links: Sequence[Link], heads: Iterable[int
         f"that retention deleted recording {one.last}: a statement of version 1 says so, which does not say its SHA-256"
         for one in found.of_version_1
     ]
-    counted = (*found.deleted, *(found.of_version_1 if keys is None else ()))
-    return Gone(links, counted, tuple(entries), True, (fault,) if fault else (), (*old, *found.faults))
+    doubles, others = _misnamed(directory, {link.number for link in links})
+    return Gone(
+        links,
+        statements=(*found.deleted, *(found.of_version_1 if keys is None else ())),
+        listed=tuple(entries),
+        whole=True,
+        faults=(*doubles, *filter(None, [fault])),
+        unproven=(*old, *found.faults, *others),
+    )
+
+
+def _misnamed(directory: Path, numbers: Container[int]) -> tuple[list[str], list[str]]:
+    """(faults of files that claim a number which is there, sentences about other files that were not looked at)."""
+    doubles, others = list[str](), list[str]()
+    for number, path in misnamed(directory):
+        if number and number in numbers:
+            doubles.append(f"{path}: this is not the name of a recording, and recording {number} is there already")
+        else:
+            others.append(f"what {path} holds: it was not looked at, because this is not the name of a recording")
+    return doubles, others

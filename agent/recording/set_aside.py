@@ -17,7 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from agent.recording.files import recordings, sync_directory
+from agent.config.files import open_file
+from agent.recording.files import recording_name, recordings, sync_directory
 from agent.recording.pruned_ranges import Deleted, first_outside
 from agent.recording.records import MAGIC
 from agent.recording.retention import is_kept
@@ -60,7 +61,7 @@ def set_aside(directory: Path, deleted: Deleted, gateway: str, signer: Signer | 
             }
             text = written(_PURPOSE, values)
             statement = (signer.sign(text) if signer is not None else SignedText(text, "", "")).json + b"\n"
-            path = path.rename(path.with_name(f"fieldcal-{number:06d}.deleted"))
+            path = path.rename(_statement_path(directory, number))
             sync_directory(directory)
             with open(path, "r+b", buffering=0) as file:
                 file.write(statement)
@@ -80,7 +81,7 @@ def finish(directory: Path) -> None:
             if not begin.startswith(MAGIC):
                 file.truncate(len(begin.partition(b"\n")[0]) + 1)
                 continue
-        path.rename(directory / f"fieldcal-{number:06d}.mcap")
+        path.rename(directory / recording_name(number))
 
 
 def statements(directory: Path, gateway: str, keys: KnownKeys | None, repeated: Sequence[Deleted]) -> Statements:
@@ -94,7 +95,7 @@ def statements(directory: Path, gateway: str, keys: KnownKeys | None, repeated: 
     for number, path in _files(directory):
         if first_outside(repeated, number, number) is None:
             continue
-        with open(path, "rb") as file:
+        with open_file(path) as file:
             data = file.read(LARGEST).partition(b"\n")[0]
         try:
             statement = SignedText.read(data)
@@ -144,5 +145,10 @@ def _about(number: int, gateway: str, of: str, about: str) -> None:
 
 def _files(directory: Path) -> Iterator[tuple[int, Path]]:
     for path in sorted(directory.iterdir()):
-        if match := _NAME.fullmatch(path.name):
+        match = _NAME.fullmatch(path.name)
+        if match and path == _statement_path(directory, int(match[1])):
             yield int(match[1]), path
+
+
+def _statement_path(directory: Path, number: int) -> Path:
+    return (directory / recording_name(number)).with_suffix(".deleted")

@@ -15,7 +15,7 @@ from typing import Protocol
 
 from agent.core.events import RESULTS, Event, Output, Pruned, RunStart
 from agent.recording.deleted_list import DeletedList
-from agent.recording.files import RecordingFile, file_number, newest, recordings, sync_directory
+from agent.recording.files import RecordingFile, file_number, newest, recording_name, recordings, sync_directory
 from agent.recording.head import HeadKeeper, Tell
 from agent.recording.messages import EVENTS_TOPIC, topic_of
 from agent.recording.pruned_ranges import (
@@ -243,7 +243,7 @@ class Recorder:
         self._repeat(self._set_aside())
         name, digest = newest(self._directory)
         if self._pruned and self._pruned[-1].last > (file_number(name) or 0):  # the newest one was deleted
-            name, digest = f"fieldcal-{self._pruned[-1].last:06d}.mcap", self._pruned[-1].sha256
+            name, digest = recording_name(self._pruned[-1].last), self._pruned[-1].sha256
         origin = {"previous_file": name, "previous_sha256": digest} | ({EPOCH: self._epoch} if self._epoch else {})
         if self._ledger is not None:
             origin["published"] = str(self._ledger.published())
