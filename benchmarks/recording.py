@@ -1,24 +1,38 @@
-"""Cost of recording and replaying: CPU time per block; replay compared with decompression and CRC of the file."""
+"""Recordings: bytes a number, part by part, and CPU time of writing, reading and replay, with packed and plain blocks.
+
+`python -m benchmarks recording` measures half an hour of `benchmarks.online day` and writes the page.
+`python -m benchmarks.recording FILE...` prints the bytes of recordings, as they are and with plain blocks.
+Plain blocks are those of versions before the packed ones: an array of 32 bits a count or 64 bits a decimal.
+"""
 
 from __future__ import annotations
 
+import io
+import sys
 import tempfile
 import time
 import zlib
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 import zstandard
 
 from agent.config import Config
 from agent.core.events import Event, RunStart, WindowReport
 from agent.core.pipeline import Pipeline
 from agent.engine import identity
+from agent.proto import fieldcal_pb2 as pb
+from agent.recording.files import RecordingFile
 from agent.recording.integrity import check_integrity
+from agent.recording.limits import Budget
+from agent.recording.messages import decode, schema_of
+from agent.recording.raw_block import encode_block
 from agent.recording.reading import RecordingReader
-from agent.recording.records import walk
+from agent.recording.records import ChunkMessage, content, unpack, walk
 from agent.recording.writer import Recorder
 from benchmarks.online import day
 from benchmarks.online.runner import EPOCH_NS
@@ -28,6 +42,9 @@ from hw.block import SampleBlock
 BLOCK_S = 0.5
 DURATION_S = 1800.0
 FLUSH_S = 2.0
+ROUNDS = 7
+Encode = Callable[[int, SampleBlock], bytes]
+Item = tuple[str, ChunkMessage, SampleBlock | None]  # topic, message, and the block where it is one
 
 
 def record(directory: Path, config: Config, events: list[Event]) -> Path:
@@ -47,6 +64,102 @@ def record(directory: Path, config: Config, events: list[Event]) -> Path:
             recorder.sync()
     recorder.close()
     return directory / "fieldcal-000001.mcap"
+
+
+def plain_block(event_sequence: int, block: SampleBlock) -> bytes:
+    """A block as versions before the packed blocks encoded it."""
+    decimal = block.indications.dtype == np.float64
+    names = ("x", "y", "z") if decimal else ("x_counts", "y_counts", "z_counts")
+    columns = np.ascontiguousarray(block.indications.T)
+    message = pb.RawBlockBytes(
+        event_sequence=event_sequence, device=block.device, boot_id=block.boot_id, t_utc_ns=block.t_utc_ns,
+        first_index=block.first_index, nominal_rate_hz=block.nominal_rate_hz, flags=int(block.flags),
+        temperature_raw=block.temperature_raw, temperature_degc=block.temperature_degc, axes=len(columns),
+        decimal=decimal, burst_t_monotonic_ns=block.burst_t_monotonic_ns.tobytes(),
+        burst_count=block.burst_count.tobytes(),
+    )  # fmt: skip
+    for name, column in zip(names, columns, strict=False):
+        setattr(message, name, column.tobytes())
+    return message.SerializeToString(deterministic=True)
+
+
+def chunks(path: Path) -> list[list[Item]]:
+    """All messages of a recording, chunk by chunk."""
+    found: list[list[Item]] = []
+    topics: dict[int, str] = {}
+    with open(path, "rb") as file:
+        for record in walk(file, path.stat().st_size):
+            if record.name == "Chunk":
+                found.append([])
+                for part in content(record, unpack(record, Budget()), Budget()):
+                    if isinstance(part, ChunkMessage):
+                        topic = topics[part.channel_id]
+                        _, item = decode(schema_of(topic), part.data)
+                        found[-1].append((topic, part, item if isinstance(item, SampleBlock) else None))
+                    elif hasattr(part, "topic"):
+                        topics[part.id] = part.topic
+    return found
+
+
+def write(found: Sequence[Sequence[Item]], encode: Encode, directory: Path) -> Path:
+    """Write a recording of these messages, with the same chunks, as the agent does; blocks are encoded by `encode`."""
+    _, start = decode(schema_of("/events"), found[0][0][1].data)
+    assert isinstance(start, RunStart)
+    file = RecordingFile(directory, start, [], {})
+    for chunk in found:
+        for topic, message, block in chunk:
+            data = message.data if block is None else encode(message.sequence, block)
+            file.append(topic, data, message.log_time, message.publish_time, message.sequence)
+        file.sync()
+    file.finish()
+    return file.final_path
+
+
+def parts(path: Path) -> dict[str, int]:
+    """Bytes of each part of a recording. What is in chunks is told as it is before compression, in brackets."""
+    outside: Counter[str] = Counter()
+    inside: Counter[str] = Counter()
+    with open(path, "rb") as file:
+        for record in walk(file, path.stat().st_size):
+            size = record.end - record.offset
+            if record.name == "Chunk":
+                chunk = unpack(record, Budget())
+                outside["compressed content of chunks"] += chunk.compressed_size
+                outside["heads of chunks"] += size - chunk.compressed_size
+            elif record.name == "MessageIndex":
+                outside["message indexes"] += size
+            else:
+                outside["all else: summary, metadata"] += size
+    for chunk_messages in chunks(path):
+        for topic, message, _ in chunk_messages:
+            kind = "raw blocks" if topic.endswith("/raw") else "events" if topic == "/events" else "results"
+            inside[f"({kind})"] += len(message.data)
+            inside["(heads of messages)"] += 31
+    outside["magic"] = 16
+    return {**outside, **inside}
+
+
+def numbers(found: Sequence[Sequence[Item]]) -> int:
+    """Numbers of all blocks: samples times axes."""
+    return sum(block.indications.size for chunk in found for _, _, block in chunk if block is not None)
+
+
+def steim2_bytes(found: Sequence[Sequence[Item]]) -> int:
+    """Bytes of the same samples as MiniSEED with Steim2, without arrivals; decimals as the whole numbers of the blocks."""
+    from obspy import Stream, Trace
+
+    columns: dict[tuple[str, int], list[Any]] = {}
+    for chunk in found:
+        for _, _, block in chunk:
+            if block is not None:
+                message = pb.RawBlockBytes.FromString(encode_block(0, block))
+                whole = np.rint(block.indications * 10.0**message.decimal_places).astype(np.int32)
+                for axis, column in enumerate(whole.T):
+                    columns.setdefault((block.device, axis), []).append(column)
+    file = io.BytesIO()
+    traces = [Trace(np.concatenate(column)) for column in columns.values()]
+    Stream(traces).write(file, format="MSEED", encoding="STEIM2")
+    return len(file.getvalue())
 
 
 def decompress_and_check(path: Path) -> None:
@@ -88,52 +201,91 @@ def check(path: Path) -> None:
         assert not check_integrity(file, path.stat().st_size).faults
 
 
-def cpu_s(work: Callable[[Path], object], path: Path) -> float:
-    """Smallest CPU time of three runs, s."""
-    times = []
-    for _ in range(3):
-        start = time.process_time()
-        work(path)
-        times.append(time.process_time() - start)
-    return min(times)
+def write_anew(found: Sequence[Sequence[Item]], encode: Encode) -> None:
+    """Write the recording into a directory that is deleted."""
+    with tempfile.TemporaryDirectory() as directory:
+        write(found, encode, Path(directory))
+
+
+def pair_s(plain: Callable[[], object], packed: Callable[[], object], rounds: int) -> tuple[float, float]:
+    """Smallest CPU time of each in s; the two take turns, so that what else the machine does disturbs both."""
+    least = [float("inf")] * 2
+    for _ in range(rounds):
+        for place, work in enumerate((plain, packed)):
+            start = time.process_time()
+            work()
+            least[place] = min(least[place], time.process_time() - start)
+    return least[0], least[1]
+
+
+def bytes_table(found: Sequence[Sequence[Item]], plain: Path, packed: Path) -> str:
+    """Bytes a number of each part of a recording, with plain blocks and with packed ones."""
+    n, sizes = numbers(found), [parts(path) for path in (plain, packed)]
+    sizes = [{"the whole file": path.stat().st_size, **size} for path, size in zip((plain, packed), sizes, strict=True)]
+    lines = [f"| {part} | {size / n:.3f} | {sizes[1][part] / n:.3f} |" for part, size in sizes[0].items()]
+    lines.append(f"| MiniSEED, Steim2, of the same samples without arrivals | | {steim2_bytes(found) / n:.3f} |")
+    return "\n".join(["| bytes a number | plain blocks | packed blocks |", "| --- | --- | --- |", *lines])
 
 
 def main() -> None:
-    """Measure and write the table."""
+    """Measure and write the tables."""
     bench = day.bench()
-    events = list(day.events(bench, DURATION_S, BLOCK_S))
     with tempfile.TemporaryDirectory() as directory:
-        start = time.process_time()
-        path = record(Path(directory), day.config(bench), events)
-        writing_s = time.process_time() - start
-        size = path.stat().st_size
-        plain_s = cpu_s(decompress_and_check, path)
-        rows = [(name, cpu_s(work, path)) for name, work in WORK]
-    blocks = [event for event in events if isinstance(event, SampleBlock)]
-    samples = sum(block.indications.size for block in blocks)
-    rows = [("decompressing and CRC alone", plain_s), *rows]
-    lines = [f"| {name} | {DURATION_S / s:,.0f} | {s / plain_s:.1f} |" for name, s in rows]
-    writing_us = writing_s / len(blocks) * 1e6
+        path = record(Path(directory), day.config(bench), list(day.events(bench, DURATION_S, BLOCK_S)))
+        found = chunks(path)
+        plain, packed = both(found, Path(directory))
+        written = pair_s(lambda: write_anew(found, plain_block), lambda: write_anew(found, encode_block), ROUNDS)
+        pairs = [("writing: blocks encoded, compressed, hashed, synced", written)]
+        for name, work, rounds in WORK:
+            pairs.append((name, pair_s(lambda work=work: work(plain), lambda work=work: work(packed), rounds)))  # type: ignore[misc]
+        sizes = bytes_table(found, plain, packed)
+    blocks = sum(block is not None for chunk in found for _, _, block in chunk)
+    lines = [
+        f"| {name} | {a / blocks * 1e6:.0f} | {b / blocks * 1e6:.0f} | {b / a - 1:+.0%} |" for name, (a, b) in pairs
+    ]
     write_part(
         "recording",
         f"""
 `python -m benchmarks recording` on {machine()}: half an hour of the bench of `benchmarks.online day`,
 a window a minute: a sensor (1 kHz x 3) and a reference (1 kHz), blocks of 0.5 s, flushed and synced each {FLUSH_S:g} s.
-To make the results and write them takes {writing_us:.0f} us of CPU for each block, and {size / samples:.2f} bytes for
-each number.
+The reference gives decimals with all their 53 bits here, which no text of a few digits has; those are not packed.
+Plain blocks are those of versions before the packed ones, written in the same run.
 
-| work | speed, in multiples of real time | CPU time, divided by that of decompressing and CRC alone |
-| --- | --- | --- |
+{sizes}
+
+CPU time, us a block, the smallest of {ROUNDS} turns (replay: 2):
+
+| work | plain blocks | packed blocks | |
+| --- | --- | --- | --- |
 """
         + "\n".join(lines),
     )
 
 
+def both(found: Sequence[Sequence[Item]], directory: Path) -> list[Path]:
+    """The recording with plain blocks and with packed ones."""
+    files = []
+    for name, encode in (("plain", plain_block), ("packed", encode_block)):
+        (there := directory / name).mkdir()
+        files.append(write(found, encode, there))
+    return files
+
+
+def tell(path: Path) -> None:
+    """Print the bytes of one recording, with plain blocks and with packed ones."""
+    found = chunks(path)
+    with tempfile.TemporaryDirectory() as directory:
+        print(f"{path}: {path.stat().st_size / numbers(found):.3f} bytes a number as it is\n")
+        print(bytes_table(found, *both(found, Path(directory))))
+
+
 WORK = (
-    ("reading: all events and results checked and decoded", read),
-    ("replay: reading, the pipeline, results compared", replay),
-    ("integrity: the audit's pass over every byte", check),
+    ("decompressing and CRC alone", decompress_and_check, ROUNDS),
+    ("reading: all events and results checked and decoded", read, ROUNDS),
+    ("replay: reading, the pipeline, results compared", replay, 2),
+    ("integrity: the audit's pass over every byte", check, ROUNDS),
 )
 
 if __name__ == "__main__":
-    main()
+    for argument in sys.argv[1:]:
+        tell(Path(argument))

@@ -30,7 +30,6 @@ from agent.core.events import (
 from agent.proto import fieldcal_pb2 as pb
 from agent.recording.messages import MessageError, decode, encode, schema_data, schema_of, topic_of
 from hw.block import BlockFlags, SampleBlock
-from tests.replay.stand_in import block
 
 REPOSITORY = Path(__file__).parents[2]
 STRUCTS = [
@@ -185,17 +184,6 @@ def test_blocks_come_back_as_they_were(
     assert bits(received.temperature_degc) == bits(temperature)
 
 
-@pytest.mark.parametrize("device", ["acc", "ref"])
-def test_a_block_on_the_wire_is_a_plain_packed_message(device: str) -> None:
-    sent = block(device, 3, np.random.default_rng(1))
-    data = encode(7, sent)
-    message = pb.RawBlock.FromString(data)
-    assert message.SerializeToString(deterministic=True) == data
-    first = message.x_counts if device == "acc" else message.x
-    assert list(first) == sent.indications[:, 0].tolist()
-    assert list(message.z_counts) == (sent.indications[:, 2].tolist() if device == "acc" else [])
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_a_schema_alone_decodes_its_messages(name: str) -> None:
     pool = descriptor_pool.DescriptorPool()
@@ -219,11 +207,6 @@ def test_any_bytes_decode_or_are_refused(name: str, data: bytes) -> None:
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("RawBlock", pb.RawBlock(axes=3, x_counts=[1], y_counts=[1], z_counts=[1, 2], burst_count=[1])),
-        ("RawBlock", pb.RawBlock(axes=2, x_counts=[1], burst_count=[1], burst_t_monotonic_ns=[1])),
-        ("RawBlock", pb.RawBlock(axes=1, x_counts=[1, 2], burst_count=[1], burst_t_monotonic_ns=[1])),
-        ("RawBlock", pb.RawBlock(axes=1)),
-        ("RawBlock", pb.RawBlockBytes(axes=1, x_counts=b"123", burst_count=b"1234")),
         ("Event", pb.Event(event_sequence=1)),
         ("Event", pb.Event(device_change=pb.Event.DeviceChange(state="asleep"))),
         ("Status", pb.Status(status="GOOD")),

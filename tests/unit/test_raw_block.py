@@ -1,0 +1,193 @@
+"""Sample blocks on the wire: every bit comes back, in few bytes; bytes of a hostile file cost no more than an error."""
+
+from __future__ import annotations
+
+import tracemalloc
+import zlib
+from decimal import Decimal
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from agent.proto import fieldcal_pb2 as pb
+from agent.recording.messages import MessageError, decode
+from agent.recording.raw_block import decode_block, encode_block
+from hw.block import SampleBlock
+
+EXTREMES = [-(2**31), -(2**31) + 1, -1, 0, 1, 127, 128, 32767, 32768, 2**31 - 1]
+
+
+def made(indications: Any, arrivals: Any = None, counts: Any = None) -> SampleBlock:
+    n = len(indications)
+    arrivals = np.arange(1, 3, dtype=np.int64) * 5_000_000 if arrivals is None else arrivals
+    return SampleBlock(
+        "acc", "boot", 7, 0, 1000.0, np.asarray(arrivals, np.int64),
+        np.asarray([n // 2, n] if counts is None else counts, np.int32), np.asarray(indications),
+    )  # fmt: skip
+
+
+def wire(block: SampleBlock) -> pb.RawBlock:
+    """The fields that are on the wire, after a check that all bits come back."""
+    data = encode_block(3, block)
+    number, back = decode_block(data)
+    assert number == 3
+    for name in ("indications", "burst_t_monotonic_ns", "burst_count"):
+        sent, received = getattr(block, name), getattr(back, name)
+        assert (sent.dtype, sent.shape, sent.tobytes()) == (received.dtype, received.shape, received.tobytes()), name
+    return pb.RawBlock.FromString(data)
+
+
+@given(
+    axes=st.sampled_from([1, 3]),
+    rows=st.lists(st.tuples(*3 * [st.integers(-(2**31), 2**31 - 1) | st.sampled_from(EXTREMES)]), min_size=1),
+)
+def test_counts_whose_differences_wrap_around_come_back(axes: int, rows: list[tuple[int, int, int]]) -> None:
+    assert wire(made(np.array(rows, np.int32)[:, :axes])).order in (1, 2)
+
+
+@given(places=st.integers(0, 9), whole=st.lists(st.integers(-(10**9), 10**9), min_size=1, max_size=60))
+def test_decimals_of_a_text_are_whole_numbers_with_decimal_places(places: int, whole: list[int]) -> None:
+    texts = [f"{Decimal(number).scaleb(-places):.{places}f}" for number in whole]
+    message = wire(made(np.array([[float(text)] for text in texts])))
+    assert (message.order > 0, len(message.x)) == (True, 0)
+    assert message.decimal_places <= places
+
+
+def test_a_negative_zero_stays_one() -> None:
+    texts = ["-0.00", "0.00", "-0.01", "-0.00", "1.25", "-0.0", "0.5", "3", "-0.0"]
+    message = wire(made(np.array([float(text) for text in texts]).reshape(3, 3)))
+    assert (list(message.negative_zeros), message.decimal_places) == ([0, 3, 5, 8], 2)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [[np.nan], [np.inf, 1.0], [1e300], [5e-324], [2.0**31], [1 / 3], [0.1 + 0.2], [float(np.float32(0.1))], [1e-10]],
+)
+def test_other_decimals_keep_their_64_bits(values: list[float]) -> None:
+    message = wire(made(np.array(values)[:, np.newaxis]))
+    assert (message.order, message.differences, len(message.x)) == (0, b"", len(values))
+
+
+@pytest.mark.parametrize(
+    ("arrivals", "plain"),
+    [
+        ([-(2**63), -(2**63) + 2**31 - 1], False),
+        ([0, 2**31], True),
+        ([2**63 - 1, -(2**63)], False),  # the interval wraps around to 1
+        ([5, 5 - 2**31], False),
+        ([0, 2**40], True),
+    ],
+)
+def test_arrivals_come_back_whatever_their_intervals(arrivals: list[int], plain: bool) -> None:
+    assert bool(wire(made(np.zeros((4, 1), np.int32), arrivals)).burst_t_monotonic_ns) == plain
+
+
+@pytest.mark.parametrize(("counts", "plain"), [([1, 2, 257], False), ([255, 510, 510], True), ([1, 257, 300], True)])
+def test_bursts_of_more_than_255_samples_come_back(counts: list[int], plain: bool) -> None:
+    message = wire(made(np.zeros((counts[-1], 1), np.int32), [1, 2, 3], counts))
+    assert bool(message.burst_count) == plain
+
+
+def test_slow_motion_takes_second_differences_and_noise_first_ones() -> None:
+    noise = np.random.default_rng(1).integers(-100, 100, (500, 1)).astype(np.int32)
+    motion = np.rint(1e5 * np.sin(np.arange(500) / 50))[:, np.newaxis].astype(np.int32)
+    assert (wire(made(noise)).order, wire(made(noise + motion)).order) == (1, 2)
+
+
+def test_no_samples_are_no_bytes() -> None:
+    message = wire(made(np.empty((0, 3), np.int32)))
+    assert (message.order, message.differences) == (0, b"")
+
+
+@pytest.mark.parametrize("decimal", [False, True])
+def test_blocks_of_older_files_are_read_as_before(decimal: bool) -> None:
+    values = np.random.default_rng(2).integers(-(2**31), 2**31, (5, 3)) / (7.0 if decimal else 1)
+    block = made(values if decimal else values.astype(np.int32))
+    names = ("x", "y", "z") if decimal else ("x_counts", "y_counts", "z_counts")
+    old = pb.RawBlock(
+        event_sequence=3, device="acc", boot_id="boot", t_utc_ns=7, nominal_rate_hz=1000.0, axes=3, decimal=decimal,
+        burst_t_monotonic_ns=block.burst_t_monotonic_ns.tolist(), burst_count=block.burst_count.tolist(),
+        **dict(zip(names, block.indications.T.tolist(), strict=True)),
+    )  # fmt: skip
+    _, back = decode_block(old.SerializeToString())
+    assert back.indications.tobytes() == block.indications.tobytes()
+    assert back.indications.flags.c_contiguous
+    assert back.burst_count.tolist() == [2, 5]
+    assert back.burst_t_monotonic_ns.tolist() == [5_000_000, 10_000_000]
+
+
+def test_the_message_with_byte_strings_has_the_bytes_of_the_schema() -> None:
+    for values in (np.arange(12, dtype=np.int32), np.arange(12) / 8, -np.zeros(12), np.full(12, np.pi)):
+        data = encode_block(7, made(values.reshape(4, 3)))
+        assert pb.RawBlock.FromString(data).SerializeToString(deterministic=True) == data
+
+
+def hostile(**changes: Any) -> bytes:
+    """A block of four samples of one axis, with some fields changed."""
+    fields = {
+        "axes": 1, "nominal_rate_hz": 1.0, "burst_sizes": b"\4", "order": 1, "first_values": [5], "differences": b"abc",
+    }  # fmt: skip
+    return pb.RawBlock(**(fields | changes)).SerializeToString()
+
+
+def test_the_hostile_blocks_are_good_before_they_are_changed() -> None:
+    assert decode_block(hostile())[1].indications[:, 0].tolist() == [5, 102, 200, 299]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"axes": 0}, {"axes": 2}, {"axes": 2**32 - 1}, {"order": 3}, {"order": 2}, {"order": 2**32 - 1}, {"order": 0},
+        {"differences": b""}, {"differences": b"ab"}, {"differences": b"abcd"}, {"differences": bytes(9)},
+        {"differences": bytes(24)}, {"first_values": []}, {"first_values": [5, 6]}, {"axes": 3},
+        {"burst_sizes": b""}, {"burst_sizes": b"\3"}, {"burst_sizes": b"\xff"}, {"burst_sizes": b"\0"},
+        {"burst_sizes": b"", "burst_count": [4, -4]}, {"burst_sizes": b"", "burst_count": [2**31 - 1]},
+        {"burst_sizes": b"\1\1\2"}, {"burst_intervals_ns": [1]}, {"x_counts": [5]}, {"z": [5.0]},
+        {"burst_t_monotonic_ns": [1, 2]}, {"burst_t_monotonic_ns": [0], "burst_intervals_ns": [1]},
+        {"burst_count": [4]}, {"burst_t_monotonic_ns": [1], "first_burst_t_monotonic_ns": 1},
+        {"burst_count": [4], "order": 0, "x_counts": [1, 2, 3, 4]}, {"decimal": True, "decimal_places": 10},
+        {"decimal": True, "negative_zeros": [0]}, {"decimal": True, "negative_zeros": [4]},
+        {"decimal": True, "negative_zeros": [-1]}, {"nominal_rate_hz": float("nan")},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_a_hostile_block_is_refused_with_one_line(changes: dict[str, Any]) -> None:
+    with pytest.raises(MessageError) as told:
+        decode("fieldcal.v1.RawBlock", hostile(**changes))
+    assert len(str(told.value)) < 200
+    assert "\n" not in str(told.value)
+
+
+def test_what_a_block_announces_takes_no_memory() -> None:
+    sizes = pb.RawBlock(axes=3, nominal_rate_hz=1.0, burst_sizes=b"\xff" * 4_000_000, order=1, first_values=[0] * 3)
+    long = hostile(differences=bytes(4_000_000), burst_sizes=b"", burst_count=[4_000_001])
+    for data in (sizes.SerializeToString(), long):
+        tracemalloc.start()
+        with pytest.raises(ValueError, match=r"\d"):
+            decode_block(data)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak < 6 * len(data)
+
+
+def test_bytes_of_a_block_that_are_changed_give_a_block_or_an_error() -> None:
+    values = np.random.default_rng(3).integers(-9, 9, (40, 3))
+    data = encode_block(1, made(values.astype(np.int32)))
+    refused = 0
+    for at in range(len(data)):
+        for value in (0, 1, 0x7F, 0x80, 0xFF, data[at] ^ 1):
+            try:
+                decode("fieldcal.v1.RawBlock", data[:at] + bytes([value]) + data[at + 1 :])
+            except MessageError:
+                refused += 1
+    assert refused > 100
+
+
+def test_a_block_of_a_real_sensor_takes_few_bytes() -> None:
+    """Noise of 100 counts in the first differences has log2(100 sqrt(2 pi e)) = 8.7 bits; four bytes are 32."""
+    noise = np.random.default_rng(4).normal(0.0, 100.0, (5000, 3)).cumsum(axis=0)
+    data = encode_block(1, made(np.rint(noise).astype(np.int32)))
+    assert len(zlib.compress(data, 6)) < 1.4 * noise.size
