@@ -48,6 +48,7 @@ COMMANDS = {
     ),
     "doctor": ("agent.cli.doctor", "Check this gateway: clock, devices, disk, certificates; with remedies."),
     "install-service": ("agent.cli.install_service", "Install the systemd unit, its user and rules; or remove them."),
+    "engines": ("agent.cli.engines", "List engines, or make an archive for audits in ten years."),
     "backup": ("agent.cli.backup", "Copy a data directory, also while the agent runs."),
     "extras": ("agent.cli.extras", "List the optional parts, and install them, also without network."),
     "check": ("agent.cli.check", "List all faults of a configuration."),

@@ -83,6 +83,17 @@ def find_engine(engine: str, directories: Sequence[Path], trusted: Collection[st
     return f"{file_name(engine)} is in none of: {', '.join(map(str, directories))}" if directories else "no directory"
 
 
+def told_of(path: Path) -> dict[str, str]:
+    """What can be said of a file without trust in it: its path and SHA-256, and which release it is; or a fault."""
+    try:
+        sha256 = hashlib.sha256(read_file(path, LARGEST)).hexdigest()
+    except OSError as error:
+        return {"path": str(path), "fault": error.strerror or str(error)}
+    release = next((known for known in known_engines() if known.sha256 == sha256), None)
+    name = {"engine": f"{release.number}-{release.id}", "version": release.version} if release else {}
+    return {"path": str(path), "sha256": sha256, **name}
+
+
 def _trusted(path: Path, data: bytes, engine: str, trusted: Collection[str]) -> EngineWheel | str:
     sha256 = hashlib.sha256(data).hexdigest()
     if sha256 not in known_digests(engine) and not any(sha256.startswith(digits) for digits in trusted):

@@ -39,6 +39,7 @@ class EngineWheel:
     """The wheel of an engine, read once and checked: nothing of it has been run. `source`: where it was found."""
 
     source: str
+    data: bytes
     sha256: str
     number: int
     engine_id: str
@@ -108,7 +109,7 @@ def read_wheel(source: str, data: bytes) -> EngineWheel:
         raise WheelError(f"it is no wheel of an engine: {type(error).__name__}: {error}") from None
     if not isinstance(number, int) or not isinstance(engine, str) or not is_id(engine):
         raise WheelError(f"{ABOUT} does not name the engine")
-    return EngineWheel(source, hashlib.sha256(data).hexdigest(), number, engine, members)
+    return EngineWheel(source, data, hashlib.sha256(data).hexdigest(), number, engine, members)
 
 
 def is_id(text: str) -> bool:

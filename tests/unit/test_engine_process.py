@@ -175,7 +175,7 @@ def test_engine_that_answers_the_first_frame_wrongly_is_told(before: bytes, afte
     entry = engine_that("").members["agent/engine/entry.py"]
     assert before in entry
     members = engine_that("").members | {"agent/engine/entry.py": entry.replace(before, after)}
-    with pytest.raises(EngineError, match=told), EngineProcess(EngineWheel("", "", 1, "0" * 16, members)):
+    with pytest.raises(EngineError, match=told), EngineProcess(EngineWheel("", b"", "", 1, "0" * 16, members)):
         pass
 
 
