@@ -145,7 +145,7 @@ def numbers(found: Sequence[Sequence[Item]]) -> int:
 
 
 def steim2_bytes(found: Sequence[Sequence[Item]]) -> int:
-    """Bytes of the same samples as MiniSEED with Steim2, without arrivals; decimals as the whole numbers of the blocks."""
+    """Bytes of the same samples as MiniSEED with Steim2, without arrivals; decimals as whole numbers."""
     from obspy import Stream, Trace
 
     columns: dict[tuple[str, int], list[Any]] = {}

@@ -14,8 +14,8 @@ from typing import Any
 
 import msgspec
 
-from agent.audit.comparison import THRESHOLD, differences, empty_fields, plain
 from agent.core.events import CalibrationUpdate, Output
+from agent.recording.comparison import THRESHOLD, differences, empty_fields, plain
 from agent.recording.messages import topic_of
 
 NEAR = 0.1  # of U: the largest departure that still is the same result

@@ -16,11 +16,11 @@ from typing import Protocol, cast
 
 import msgspec
 
-from agent.audit.comparison import Difference, compare
 from agent.audit.departure import Departure
 from agent.core.events import CalibrationUpdate, Event, Output, Pruned, RunStart, WindowReport
 from agent.core.memory import Memory
 from agent.engine.process import EngineError
+from agent.recording.comparison import Difference, compare
 from agent.recording.messages import decode, encode, recorded_ones, schema_of, topic_of
 from agent.recording.reading import RecordingReader, Step
 from agent.recording.records import Fault

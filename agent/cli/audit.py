@@ -13,7 +13,6 @@ import click
 import msgspec
 
 from agent.audit.auditing import AuditedFile, audit_file, conclude
-from agent.audit.comparison import OTHER_CPU
 from agent.audit.engines import Engines
 from agent.audit.parallel import for_each
 from agent.audit.replaying import Replayer
@@ -23,6 +22,7 @@ from agent.cli.given import Given, add_witnessed, read_head, recordings_of
 from agent.cli.kernels import compute_as_in
 from agent.delivery.history import StoreError
 from agent.recording.chain import Link, chain_faults, missing_after, unproven
+from agent.recording.comparison import OTHER_CPU
 from agent.recording.end_check import check_end
 from agent.recording.gone import Gone, find_gone
 from agent.recording.head import HEAD_NAME

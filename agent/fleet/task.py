@@ -11,7 +11,6 @@ import msgspec
 
 from agent import __version__
 from agent.audit.auditing import AuditedFile, audit_file, conclude
-from agent.audit.comparison import OTHER_CPU
 from agent.audit.engines import Engines, as_if_own
 from agent.audit.replaying import PipelineLike, Replayed, ReplayedFile, Replayer
 from agent.core.events import CalibrationUpdate, WindowReport
@@ -19,6 +18,7 @@ from agent.export.samples import ExportError
 from agent.fleet.exporting import Exported, exported
 from agent.fleet.settings import Setting, SettingError, changed_config
 from agent.fleet.sources import SourceError, local
+from agent.recording.comparison import OTHER_CPU
 from agent.recording.reading import open_recording
 
 UNCHANGED = b""  # in place of a result: the one that is known still holds

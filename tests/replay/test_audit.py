@@ -14,10 +14,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from agent.audit.comparison import OTHER_CPU
 from agent.audit.engines import Engines
 from agent.cli.audit import Given, audit_files, recordings_of, run_audit
 from agent.core.events import RunStart
+from agent.recording.comparison import OTHER_CPU
 from agent.recording.files import recordings
 from agent.recording.fingerprint import environment_for, fingerprint
 from tests.replay.forgery import with_sums

@@ -14,7 +14,6 @@ import msgspec
 import pytest
 from mcap.reader import NonSeekingReader
 
-from agent.audit.comparison import differences
 from agent.audit.engines import as_if_own
 from agent.audit.replaying import Replayer
 from agent.config import recorded_config
@@ -25,6 +24,7 @@ from agent.delivery.store import Store
 from agent.engine.known import known_engines
 from agent.engine.process import EngineProcess, EngineResults
 from agent.engine.wheel import read_wheel
+from agent.recording.comparison import differences
 from agent.recording.fingerprint import fingerprint
 from agent.recording.messages import decode
 from agent.recording.reading import RecordingReader

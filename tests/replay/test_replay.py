@@ -11,11 +11,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from agent.audit.comparison import OTHER_CPU
 from agent.audit.engines import Engines
 from agent.audit.replaying import Replayed, ReplayedFile, Replayer, link
 from agent.cli.replay import run_replay
 from agent.core.events import CalibrationUpdate, Event, Result, RunStart, StatusChange, WindowReport
+from agent.recording.comparison import OTHER_CPU
 from agent.recording.files import recordings
 from agent.recording.fingerprint import fingerprint
 from agent.recording.messages import encode

@@ -138,7 +138,9 @@ WRONG = {
         [link(1), link(2), link(3), link(7, NEW, "b", (gone(1, 6, NEW, "b"),))], (), "another epoch than a/",
     ),
     "the same, of the same epoch": (
-    "a deletion of what comes later": ([link(1, deleted=(gone(1, 2),))], (), "does not come before it"),
+        [link(1), link(2), link(3), link(7, OLD, "b", (gone(3, 6, OLD, "b"),))],
+        (),
+        "gives recording 2 another SHA-256",
     ),
     "a gap between two directories": (
         [link(1), link(7, NEW, "b", (Deleted(2, 6, NEW, "", sha256(6, "b")),))], (), "of another epoch",

@@ -8,8 +8,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from agent.audit.comparison import OTHER_CPU, compare, differences
 from agent.core.events import CalibrationUpdate, Result, StatusChange, WindowReport
+from agent.recording.comparison import OTHER_CPU, compare, differences
 from tests.replay.stand_in import CONFIG, StandIn, block
 
 NAN = float("nan")
