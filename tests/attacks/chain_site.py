@@ -12,6 +12,7 @@ from click.testing import CliRunner
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
+from agent.audit.engines import Engines
 from agent.cli.audit import run_audit
 from agent.cli.given import recordings_of
 from agent.config.known_keys import KnownKeys
@@ -85,7 +86,7 @@ def _run(directory: Path, *, heads: Sequence[GivenHead] = (), **options: Any) ->
     with runner.isolation() as (out, _, _):
         given = recordings_of([directory])
         given.heads.extend(heads)
-        status = run_audit(given, StandIn.restore, **{"strict": True, "keys": known(KEY)} | options)
+        status = run_audit(given, Engines(StandIn.restore), **{"strict": True, "keys": known(KEY)} | options)
         return status, out.getvalue().decode()
 
 
