@@ -18,9 +18,8 @@ from agent.audit.replaying import Replayed, ReplayedFile, Replayer
 from agent.recording.chain import Link
 from agent.recording.integrity import Integrity, check_integrity
 from agent.recording.pruned_ranges import LIST, PRUNED_METADATA, Deleted, from_metadata
-from agent.recording.reading import open_recording
+from agent.recording.reading import REPAIR_METADATA, open_recording
 from agent.recording.records import Fault
-from agent.recording.repair import REPAIR_METADATA
 from agent.recording.result_check import check_results
 from agent.recording.results_chain import EPOCH, FILE_METADATA, PREVIOUS_RESULTS
 from agent.recording.signing import SIGNATURE_METADATA, Statement, signed_results, verify_file

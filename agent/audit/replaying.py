@@ -21,10 +21,12 @@ from agent.core.events import CalibrationUpdate, Event, Output, Pruned, RunStart
 from agent.core.memory import Memory
 from agent.engine.process import EngineError
 from agent.recording.comparison import Difference, compare
+from agent.recording.continuation import continues, left
 from agent.recording.messages import decode, encode, recorded_ones, schema_of, topic_of
 from agent.recording.reading import RecordingReader, Step
 from agent.recording.records import Fault
 
+OTHER = "another engine made it, or it cannot be replayed here"
 LONGEST_REASON = 1000  # characters; a hostile configuration has a hundred thousand faults
 
 
@@ -210,6 +212,7 @@ class _One:
         self._file = ReplayedFile(path=str(path), replayed_by=engine.name)
         self._file.departure = None if own else Departure()
         self._found = Replayed(self._file)
+        self._left: list[Memory] | None = None  # before an event whose results a crash kept from the file
 
     def run(self) -> Replayed:
         file, reader = self._file, RecordingReader(self._path)
@@ -223,9 +226,10 @@ class _One:
                 self._step(step)
             self._found.next_event = step.event_sequence + 1
         file.fault, file.good_bytes = reader.fault, reader.good_bytes
-        if file.equal and not file.fault and not file.undecidable and not file.tolerance and file.by_own_engine:
+        corrupt = file.fault is not None and file.fault.kind != "torn"
+        if file.equal and not corrupt and not file.undecidable and not file.tolerance and file.by_own_engine:
             self._found.left_sha256 = hashlib.sha256(self._engine.snapshot()).hexdigest()
-            self._found.left = self._engine.memories()
+            self._found.left = self._left if self._left is not None else self._engine.memories()
         return self._found
 
     def _describe(self, start: RunStart) -> None:
@@ -242,6 +246,7 @@ class _One:
     def _step(self, step: Step) -> None:
         file, begins = self._file, isinstance(step.event, RunStart)
         try:
+            before = [] if step.complete or begins else self._engine.memories()
             computed = self._engine.begin(step) if begins else self._engine.step(step)
             if begins and not cast(RunStart, step.event).continuation:
                 self._found.kept = self._engine.memories()
@@ -252,6 +257,8 @@ class _One:
             place = "" if begins else f"the pipeline fails at event {step.event_sequence}: "
             file.refused = f"{place}{kind}{_short(error)}"
             return
+        if not step.complete and len(computed) > len(step.results):
+            self._left = before
         file.results += len(computed)
         self._found.calibrations += [result for result in computed if isinstance(result, CalibrationUpdate)]
         self._found.windows += [result for result in computed if isinstance(result, WindowReport)]
@@ -277,24 +284,65 @@ def differ(file: ReplayedFile, difference: Difference) -> None:
     file.first_difference = file.first_difference or difference
 
 
-def link(replayed: Sequence[Replayed]) -> list[tuple[int, str]]:
-    """Compare what each file begins with to what the file before it leaves, where it continues the same run.
+def link(replayed: Sequence[Replayed]) -> tuple[list[tuple[int, str]], list[str]]:
+    """Compare what each file begins with to what the file before it leaves, by the numbers of the files.
 
-    Returns (index, fault) of each file that begins with another state; the difference is also counted in its replay.
+    Returns (index, fault) of each file that begins with another state, and what cannot be shown. A difference within a
+    run is also counted in the replay of the file.
     """
-    faults = []
+    faults, unproven = list[tuple[int, str]](), list[str]()
+    known = _Left(from_first=bool(replayed) and replayed[0].file.file_sequence == 1)
     for index, (before, after) in enumerate(pairwise(replayed), start=1):
         start, file = after.start, after.file
-        if start is None or before.start is None or before.start.run_id != start.run_id or not start.continuation:
+        if start is None or before.start is None:
             continue
-        if start.event_sequence > before.next_event:
+        known.take(before, before.start)
+        if before.start.run_id != start.run_id or not start.continuation:
+            if before.file.gateway == file.gateway and before.file.file_sequence + 1 == file.file_sequence:
+                if not (before.left_sha256 and file.by_own_engine and file.engine == before.file.engine):
+                    unproven.append(f"that {file.path} begins with the states that {before.file.path} left: {OTHER}")
+                elif fault := known.fault(after, start):
+                    faults.append((index, f"this run does not go on from {before.file.path}: {fault}"))
+        elif start.event_sequence > before.next_event:
             file.notes.append(f"events {before.next_event} to {start.event_sequence - 1} are in none of these files")
         elif start.event_sequence == before.next_event and before.left_sha256 and file.by_own_engine:
             file.in_chain = hashlib.sha256(start.snapshot).hexdigest() == before.left_sha256
             if not file.in_chain:
                 differ(file, difference := _snapshot_difference(file, start))
                 faults.append((index, f"the results do not follow from the data: {difference}"))
-    return faults
+    return faults, unproven
+
+
+class _Left:
+    """The states that recordings leave for the next run, as far as the replays tell.
+
+    `from_first`: the first recording is number 1, so there are no states of earlier ones.
+    """
+
+    def __init__(self, *, from_first: bool) -> None:
+        self._memories: list[Memory] = []
+        self._sensors: set[str] = set()  # of which the states are known
+        self._all = from_first
+
+    def take(self, replayed: Replayed, start: RunStart) -> None:
+        """Take the next recording."""
+        sensors, known = _sensors(start), bool(replayed.left_sha256)
+        self._memories = left(self._memories, replayed.left, sensors)
+        self._sensors = self._sensors | sensors if known else self._sensors - sensors
+        self._all = self._all and known
+
+    def fault(self, after: Replayed, start: RunStart) -> str:
+        """Why the run that begins does not begin with these states; "" where it does."""
+        sensors = _sensors(start) if self._all else _sensors(start) & self._sensors
+        return continues(self._memories, [one for one in after.kept if one.sensor in sensors], sensors)
+
+
+def _sensors(start: RunStart) -> set[str]:
+    """The sensors in the configuration of a run; none where this is not one."""
+    try:
+        return {str(channel["sensor"]) for channel in msgspec.json.decode(start.config_json)["channels"]}
+    except (msgspec.DecodeError, KeyError, TypeError):
+        return set()
 
 
 def _short(error: Exception) -> str:

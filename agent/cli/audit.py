@@ -179,15 +179,15 @@ def _audited(
     with ExitStack() as held:  # kept open to the end, so that retention deletes none meanwhile
         for path in given.paths:
             held.enter_context(open_recording(path))
-        checked = list(for_each(work, given.paths, jobs))
+        checked = sorted(for_each(work, given.paths, jobs), key=lambda one: one.link.number)
     audited, links = [one.verdict for one in checked], [one.link for one in checked]
-    faults = link_replays([one.replayed for one in checked])
+    faults, not_linked = link_replays([one.replayed for one in checked])
     gone = find_gone(given.directory, links, [head.number for head in given.heads], keys)
     for index, fault in [*faults, *chain_faults(links, gone.statements, whole=gone.whole)]:
         audited[index].reasons.append(fault)
     for verdict in audited:
         conclude(verdict, strict=strict)
-    return audited, links, gone
+    return audited, links, replace(gone, unproven=(*gone.unproven, *not_linked))
 
 
 def describe(file: AuditedFile) -> list[str]:

@@ -12,16 +12,18 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from io import BufferedReader
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, cast
 
 from mcap.opcode import Opcode
-from mcap.records import Channel, Schema
+from mcap.records import Channel, Metadata, Schema
 
 from agent.config.files import open_file
 from agent.core.events import Event, Output, RunStart
 from agent.recording.limits import MOST_RESULTS, Budget
 from agent.recording.messages import MessageError, decode, topic_of
-from agent.recording.records import ChunkMessage, Fault, Record, RecordError, content, refusal, unpack, walk
+from agent.recording.records import ChunkMessage, Fault, Record, RecordError, content, parse, refusal, unpack, walk
+
+REPAIR_METADATA = "fieldcal.repair"  # the metadata record of a file that a crash left open and a later start closed
 
 
 @dataclass(slots=True)
@@ -43,13 +45,15 @@ class Step:
 class RecordingReader:
     """One pass over a recording. `fault` says afterwards why the pass ended early (None: it reached the footer).
 
-    `good_bytes`: offset of the end of the last record that was read and understood.
+    `good_bytes`: offset of the end of the last record that was read and understood. `repaired`: a crash left the file
+    open, so that its last results may be missing.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.fault: Fault | None = None
         self.good_bytes = 0
+        self.repaired = False
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
 
@@ -74,7 +78,7 @@ class RecordingReader:
         except RecordError as error:
             self.fault = error.fault
         if step is not None:
-            step.complete = self.fault is None
+            step.complete = self.fault is None and not self.repaired
             yield step
 
     @staticmethod
@@ -98,6 +102,8 @@ class RecordingReader:
                         self._schemas[part.id] = part
                     else:
                         self._channels[part.id] = part
+            elif record.opcode == Opcode.METADATA:
+                self.repaired |= cast(Metadata, parse(record)).name == REPAIR_METADATA
             elif record.opcode == Opcode.MESSAGE:
                 raise refusal(record, "a message outside a chunk; a recording has messages only in chunks")
             self.good_bytes = record.end

@@ -22,8 +22,7 @@ from agent.recording.fingerprint import fingerprint
 from agent.recording.head import HEAD_NAME, Head
 from agent.recording.integrity import Integrity, check_integrity
 from agent.recording.messages import decode, encode, recorded_ones, schema_of, topic_of
-from agent.recording.reading import RecordingReader, first_event, open_recording
-from agent.recording.repair import REPAIR_METADATA
+from agent.recording.reading import REPAIR_METADATA, RecordingReader, first_event, open_recording
 from agent.recording.result_check import check_results
 from agent.recording.results_chain import EPOCH, FILE_METADATA
 from agent.recording.signed_text import SignedText, SignedTextError

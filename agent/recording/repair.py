@@ -23,14 +23,13 @@ from mcap.records import Attachment, DataEnd, Footer, Metadata, SummaryOffset
 from agent.recording.files import ACTIVE_SUFFIX, recordings, sync_directory
 from agent.recording.integrity import check_integrity
 from agent.recording.limits import Budget
-from agent.recording.reading import first_event
+from agent.recording.reading import REPAIR_METADATA, first_event
 from agent.recording.records import MAGIC, Record, RecordError, parse, unpack, walk
 from agent.recording.results_chain import EPOCH, FILE_METADATA
 from agent.recording.scan import metadata_of
 from agent.recording.signing import SIGNATURE_METADATA, Signer, Statement
 from agent.recording.summary import KINDS, DerivedSummary
 
-REPAIR_METADATA = "fieldcal.repair"
 TAIL_ATTACHMENT = "torn"
 # Bytes. A crash damages only what was written after the last flush: one or two chunks. Where more data other than zeros
 # follow a broken record, the damage has another cause. Such a file is not closed, since data after the damage may be
