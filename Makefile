@@ -59,7 +59,7 @@ faults: $(VENV)/development  ## breaks the agent on purpose, for an hour; needs 
 
 # The slow disk is tested alone, because a busy machine makes a disk look slower than it is. What failed runs once more.
 faults-short: $(VENV)/development  ## the same in a few minutes; skips what this machine cannot do
-	$(BIN)/python -m pytest -n auto -m faults tests/faults -k "not slow" || \
+	$(BIN)/python -m pytest -n auto --dist worksteal -m faults tests/faults -k "not slow" || \
 		$(call once_more,-m faults tests/faults)
 	$(BIN)/python -m pytest -m faults tests/faults -k slow || \
 		$(call once_more,-m faults tests/faults)
