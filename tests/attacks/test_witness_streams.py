@@ -87,7 +87,7 @@ def test_the_clock_of_a_gateway_does_not_count(machine: Machine, step_ns: int) -
 
 @pytest.mark.parametrize("step_ns", [-2 * YEAR_NS, 2 * YEAR_NS])
 def test_the_clock_of_the_witness_is_set(machine: Machine, step_ns: int) -> None:
-    """Each head of the hour after it is kept as before, and a stranger gains a day's allowance at most once."""
+    """The hour after it is kept as the hour before, and a gateway gains what is allowed at once, and no more."""
     for minute in range(61):
         machine.take(head(1, 1000 + minute), after_s=60)
     machine.now_ns += step_ns
@@ -98,6 +98,7 @@ def test_the_clock_of_the_witness_is_set(machine: Machine, step_ns: int) -> None
     for n in range(2, 100):
         machine.take(head(n, 1, closed=True), after_s=0.001)
     assert machine.bytes_of() < AT_ONCE_BYTES + 14 * LINE
+    assert machine.take(head(100, 1), after_s=3600)[0], "the allowance grows by the new clock"
 
 
 @pytest.mark.parametrize(("listed", "closed"), [(False, False), (True, True)])
