@@ -118,7 +118,7 @@ def _file_faults(raw: Mapping[str, Any]) -> Iterator[Told]:
         try:
             load_private_key(FilePath(key))
         except KeyFileError as error:
-            yield ("recording", "signing_key"), f"{error}; `openssl genpkey -algorithm ed25519` makes one"
+            yield ("recording", "signing_key"), str(error)
     commands = raw.get("commands")
     revoked = commands.get("revoked_keys") if isinstance(commands, Mapping) else None
     if isinstance(revoked, str):
