@@ -15,6 +15,7 @@ from agent import __version__
 from agent.acquisition.arena import one_arena
 from agent.acquisition.reader import EventQueue, Reader, reader_of
 from agent.acquisition.stalls import few_objects
+from agent.audit.recalling import memories_of
 from agent.commanding.reception import Reception
 from agent.config import Channel, Config
 from agent.core.events import Acceleration, DeviceChange, Event, Result, RunStart, Tick
@@ -31,7 +32,6 @@ from agent.recording.acceleration import encode_acceleration
 from agent.recording.files import final_name
 from agent.recording.fingerprint import fingerprint, versions
 from agent.recording.owner import check_owner
-from agent.recording.recalling import memories_of
 from agent.recording.retention import keep_files
 from agent.recording.signing import Signer
 from agent.recording.thread import RecordingThread

@@ -23,6 +23,7 @@ from agent.delivery.schema import read_memories, read_states
 from agent.delivery.signed_states import StateList
 from agent.recording.files import file_number, final_name, recordings
 from agent.recording.head import HEAD_NAME
+from agent.recording.reading import first_event
 from agent.recording.result_signing import PUBLIC_KEY
 from agent.recording.results_chain import FILE_METADATA, ResultsChain
 from agent.recording.scan import metadata_of, scan
@@ -102,14 +103,14 @@ def states_at_start(
     if key is not None and _is_new(connection, directory, files.values()):
         states.faults.append(f"nothing in {directory} is signed: this start takes over once what the recordings say")
         keys = None
-    path = next(reversed(files.values()), None)
+    path = next((path for path in reversed(files.values()) if first_event(path) is not None), None)
     if path is not None:
         number, last = _reached(path, key)
         late = states.recording < number or states.sequence < last
         if late and not (lost or behind):
             states.faults.append("the states of the estimation in the store are older than the newest recording")
         if behind or lost or late:
-            found = recall(path, keys)
+            found = recall(files.pop(final_name(path)), keys)
             if found is not None:
                 states.take(found)
             elif key is not None:
@@ -189,14 +190,12 @@ def _take_calibrated(
     end_s: float,
 ) -> None:
     """Replay, newest first, the recordings with a calibration that is newer than the state known of its device."""
-    replayed = {next(reversed(files), "")}
     for sensor, identity, name, sequence in connection.execute(_CALIBRATED).fetchall():
-        if states.known(sensor, identity) >= sequence or name in replayed or name not in files:
+        if states.known(sensor, identity) >= sequence or name not in files:
             continue
         if time.monotonic() >= end_s:
             return
-        replayed.add(name)
-        for memory in recall(files[name], keys) or ():
+        for memory in recall(files.pop(name), keys) or ():
             if memory.sequence > states.known(memory.sensor, memory.identity):
                 states.add(memory)
                 states.replayed += 1

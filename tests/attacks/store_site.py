@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
+from agent.audit.recalling import memories_of
 from agent.core.events import CalibrationUpdate, Event, Result, RunStart
 from agent.core.memory import Memory
 from agent.core.pipeline import Pipeline
@@ -25,7 +26,6 @@ from agent.delivery.schema import row_crc
 from agent.delivery.store import Store
 from agent.recording.files import final_name
 from agent.recording.fingerprint import fingerprint
-from agent.recording.recalling import memories_of
 from agent.recording.signing import Signer
 from agent.recording.writer import Recorder
 from tests.attacks.chain_site import KEY

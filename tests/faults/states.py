@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from random import Random
 
+from agent.audit.recalling import memories_of
 from agent.config import recorded_config
 from agent.core.memory import Memory
 from agent.core.pipeline import Pipeline
@@ -17,7 +18,6 @@ from agent.delivery.store import Store
 from agent.recording.continuation import continues, left
 from agent.recording.files import recordings
 from agent.recording.reading import RecordingReader, first_event
-from agent.recording.recalling import memories_of
 from agent.recording.signing import Signer
 from tests.attacks.store_site import forge_memory, states
 from tests.faults.invariants import Ledger

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from agent.audit.recalling import memories_of
 from agent.core.events import CalibrationUpdate, Event, Result, RunStart
 from agent.core.memory import Memory
 from agent.core.pipeline import Pipeline
@@ -18,7 +19,6 @@ from agent.delivery.history import History, Record
 from agent.delivery.store import Store
 from agent.recording.files import recordings
 from agent.recording.reading import RecordingReader
-from agent.recording.recalling import memories_of
 from agent.recording.writer import Recorder
 from tests.replay.stand_in import record_run
 from tests.unit.test_pipeline import EPOCH_NS, OFFSET, POSE_S, SENSITIVITY, block, opened, pipeline

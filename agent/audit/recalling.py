@@ -9,22 +9,24 @@ signature and follow from the data.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, cast
+from typing import TYPE_CHECKING
 
-from agent.core.events import Event, Output, RunStart
+from agent.audit.replaying import EngineHere, Restore
+from agent.core.events import RunStart
 from agent.core.memory import Memory
+from agent.engine import identity
 from agent.recording.comparison import OTHER_CPU, compare
 from agent.recording.continuation import continues
 from agent.recording.files import file_number, recordings
 from agent.recording.fingerprint import fingerprint
 from agent.recording.head import HEAD_NAME, Head
 from agent.recording.integrity import Integrity, check_integrity
-from agent.recording.messages import decode, encode, recorded_ones, schema_of, topic_of
 from agent.recording.reading import REPAIR_METADATA, RecordingReader, first_event, open_recording
 from agent.recording.result_check import check_results
+from agent.recording.result_signing import PUBLIC_KEY
 from agent.recording.results_chain import EPOCH, FILE_METADATA
+from agent.recording.scan import metadata_of
 from agent.recording.signed_text import SignedText, SignedTextError
 from agent.recording.signing import SIGNATURE_METADATA, Statement, prefix_sha256, verify_file
 
@@ -34,16 +36,6 @@ if TYPE_CHECKING:
 LONGEST_CHAIN = 20  # recordings in a row that crashes left open; each was a start that ended at once
 
 _log = logging.getLogger(__name__)
-
-
-class Remembering(Protocol):
-    """The methods needed of the pipeline that is replayed; agent.core.pipeline.Pipeline has them."""
-
-    def step(self, event: Event) -> list[Output]: ...
-    def all_memories(self) -> list[Memory]: ...
-
-
-Restore = Callable[[str, bytes], Remembering]
 
 
 class UncoveredError(Exception):
@@ -74,6 +66,8 @@ def _memories(path: Path, restore: Restore, keys: KnownKeys | None, further: int
         raise UncoveredError("it has no first event")
     if not _head_covers(path, start, keys):
         _compare_with_before(path, start, restore, keys, further)
+    if PUBLIC_KEY not in metadata_of(path).get(FILE_METADATA, {}):
+        raise UncoveredError("its results are not signed")
     checked = check_results(path, f"{start.site}/{start.gateway}", keys)
     if checked.fault:
         raise UncoveredError(f"{checked.faults} results without a valid signature; the first: {checked.fault}")
@@ -137,25 +131,19 @@ def _compare_with_before(path: Path, start: RunStart, restore: Restore, keys: Kn
 
 def _replayed(path: Path, restore: Restore, *, unsealed: bool) -> list[Memory]:
     """The states at the end. What is `unsealed` counts as far as its results follow from its data."""
-    pipeline: Remembering | None = None
-    tolerance = 0.0
+    engine, tolerance = EngineHere(restore, identity.name()), 0.0
     for step in RecordingReader(path).steps():
+        before: list[Memory] = []
         if isinstance(step.event, RunStart):
-            pipeline = restore(step.event.config_json, step.event.snapshot)
             tolerance = 0.0 if step.event.fingerprint == fingerprint() else OTHER_CPU
-        assert pipeline is not None  # the reader ensures that the first event is a RunStart
-        before = [] if step.complete else pipeline.all_memories()
-        outputs = recorded_ones(pipeline.step(step.event))
-        if not step.complete and len(outputs) > len(step.results):
+            computed = engine.begin(step)
+        else:
+            before = [] if step.complete else engine.memories()
+            computed = engine.step(step)
+        if not step.complete and len(computed) > len(step.results):
             return before  # results of this event are not in the file, so they were never published: leave it out
-        if unsealed and (outputs or step.results):
-            computed = [_as_recorded(step.event_sequence, output) for output in outputs]
+        if unsealed and (computed or step.results):
             found = compare(str(path), step.event_sequence, step.results, computed, tolerance, complete=step.complete)
             if found is not None:
                 raise UncoveredError(f"its results do not follow from its data: {found}")
-    return [] if pipeline is None else pipeline.all_memories()
-
-
-def _as_recorded(event_sequence: int, output: Output) -> Output:
-    _, read = decode(schema_of(topic_of(output)), encode(event_sequence, output))
-    return cast(Output, read)
+    return engine.memories()
