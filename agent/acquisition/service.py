@@ -78,7 +78,8 @@ class Service:
         config = self._config
         name = f"{config.gateway.site}/{config.gateway.name}"
         check_owner(self._data_dir, name)
-        signer = Signer.load(config.recording.signing_key) if config.recording.signing_key else None
+        recording = config.recording
+        signer = Signer.load(recording.signing_key, recording.earlier_keys) if recording.signing_key else None
         recall = partial(memories_of, restore=Pipeline.restore)
         key = GatewayKey(name, signer) if signer is not None else None
         self._store = Store(self._data_dir, keep=keep_results(config.results), recall=recall, key=key)

@@ -28,23 +28,29 @@ HISTORY_SHOWN = 10  # newest calibrations and windows of a sensor
 @click.option("--data-dir", type=click.Path(path_type=Path), default=Path("data"), show_default=True, metavar="D",
               help="Where the agent keeps recordings and state.")  # fmt: skip
 @click.option("--json", "json_to", type=click.Choice(["-"]), help="One JSON object on standard output.")
+@click.option("--public-key", metavar="K", type=click.Path(path_type=Path),
+              help="Show only results that this key (PEM) signed.")  # fmt: skip
 @click.option("--limit", type=click.IntRange(1), default=HISTORY_SHOWN, show_default=True, metavar="N",
               help="Show the newest N calibrations and windows of each sensor.")  # fmt: skip
-def show(data_dir: Path, json_to: str | None, limit: int) -> int:
+def show(data_dir: Path, json_to: str | None, public_key: Path | None, limit: int) -> int:
     """Show calibration in force, status, history and recordings of a data directory.
 
-    Exit status 2 if there is no store, or if it cannot be read.
+    A result that the gateway signed is shown as it was signed. One whose signature is not valid is not shown.
+
+    Exit status 2 if there is no store, or if it cannot be read; 3 if a result is refused, with the reasons.
     """
+    from agent.config.key_file import KeyFileError
+
     try:
-        overview = read_overview(data_dir, limit)
+        overview = read_overview(data_dir, limit, public_key)
         if json_to:
             click.echo(msgspec.json.encode(as_object(overview)).decode())
         else:
             _print(overview)
-    except StoreError as error:
+    except (StoreError, KeyFileError) as error:
         say(f"fieldcal show: {error}", err=True)
         return 2
-    return 0
+    return 3 if overview.refused else 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,21 +64,40 @@ class SensorHistory:
     drift: list[Record]  # verdicts of the drift test
     routine: dict[str, list[Record]]  # results that come by schedule; key: their kind
 
+    @property
+    def records(self) -> list[Record]:
+        """All of them."""
+        single = [record for record in (self.status, self.calibration) if record is not None]
+        listed = [*self.calibrations, *self.windows, *self.drift]
+        return [*single, *listed, *(record for records in self.routine.values() for record in records)]
+
 
 @dataclass(frozen=True, slots=True)
 class Overview:
-    """Content of a data directory: sensors by name, and (name, size in bytes) of each recording in order."""
+    """Content of a data directory: sensors by name, and (name, size in bytes) of each recording in order.
+
+    `evidence`: sentences on what is signed; `refused`: whether a result was refused.
+    """
 
     data_dir: Path
     sensors: dict[str, SensorHistory]
     recordings: list[tuple[str, int]]
+    evidence: list[str]
+    refused: bool
 
 
-def read_overview(data_dir: Path, limit: int) -> Overview:
-    """Read a data directory, with the newest `limit` results of each kind. Raises StoreError."""
+def read_overview(data_dir: Path, limit: int, public_key: Path | None = None) -> Overview:
+    """Read a data directory, with the newest `limit` results of each kind. Raises StoreError, KeyFileError.
+
+    `public_key`: only results that it signed.
+    """
+    from agent.config.known_keys import KnownKeys
+    from agent.delivery.evidence import evidence
     from agent.recording.files import recordings
+    from agent.recording.signing import load_public_key
 
-    with History(data_dir / FILE_NAME) as history:
+    keys = KnownKeys(anywhere=(load_public_key(public_key).public_bytes_raw(),)) if public_key is not None else None
+    with History(data_dir / FILE_NAME, keys, signed_only=keys is not None) as history:
         history.check()
         in_force = {record.sensor: record for record in history.latest() if record.what == "calibration"}
         sensors = {
@@ -86,11 +111,13 @@ def read_overview(data_dir: Path, limit: int) -> Overview:
             )
             for sensor in sorted({sensor for sensor, _ in history.channels() if sensor})
         }
+        shown = [record for held in sensors.values() for record in held.records]
+        said = evidence(history, shown, data_dir, checked=keys is not None)
     sizes = []
     for _, path in recordings(data_dir):
         with contextlib.suppress(FileNotFoundError):  # the agent renames a file when it closes it
             sizes.append((path.name, path.stat().st_size))
-    return Overview(data_dir, sensors, sizes)
+    return Overview(data_dir, sensors, sizes, said, bool(history.refused))
 
 
 def as_object(overview: Overview) -> dict[str, Any]:
@@ -113,6 +140,7 @@ def as_object(overview: Overview) -> dict[str, Any]:
             {"file": name, "size_bytes": octets, "finished": name.endswith(".mcap")}
             for name, octets in overview.recordings
         ],
+        "evidence": overview.evidence,
     }
 
 
@@ -128,6 +156,8 @@ def _print(overview: Overview) -> None:
     span = f": {' to '.join(dict.fromkeys((names[0], names[-1])))}" if names else ""
     total = size(sum(octets for _, octets in overview.recordings))
     console.print_line(f"{counted(len(names), 'recordings')} in {overview.data_dir}, {total}{span}")
+    for sentence in overview.evidence:
+        console.print_line(sentence)
 
 
 def _print_sensor(console: TextConsole, sensor: str, held: SensorHistory) -> None:

@@ -39,6 +39,10 @@ class Recording(Section):
     signing_key: Annotated[
         Path | None, Field(description="file of an Ed25519 private key (PEM), which signs each closed file")
     ] = None
+    earlier_keys: Annotated[
+        tuple[Path, ...],
+        Field(description="files of public keys (PEM) that signed before; what they signed in the data still counts"),
+    ] = ()
 
 
 class Results(Section):

@@ -49,11 +49,13 @@ class History:
 
     What is signed is given as it was signed, whatever its row says. With `keys` (those of the gateway), a result that
     none of them signed is left out; without, one whose signature is not valid. `refused`: why, by sequence number, also
-    of rows that said something else than was signed. Results without any signature are given: `Record.signed` is empty.
+    of rows that said something else than was signed. Results without any signature are given, unless `signed_only`:
+    `Record.signed` is empty.
     """
 
-    def __init__(self, path: Path, keys: KnownKeys | None = None) -> None:
+    def __init__(self, path: Path, keys: KnownKeys | None = None, *, signed_only: bool = False) -> None:
         self._path = path
+        self._signed_only = signed_only
         self._keys = keys
         self.refused: dict[int, str] = {}
         if not path.is_file():
@@ -176,7 +178,7 @@ class History:
         rows = self._joined("WHERE sequence = ?", sequence)
         if not rows:
             raise StoreError(f"{self._path}: damaged: result {sequence} is missing")
-        return self._proven(rows, unsigned=not self._must_be_signed())
+        return self._proven(rows, put_forward=True)
 
     def _must_be_signed(self) -> bool:
         """Whether the gateway has a key and has used it: then a result without a signature is not put forward."""
@@ -185,28 +187,31 @@ class History:
     def _joined(self, clause: str, *values: object) -> list[tuple[Any, ...]]:
         return self._rows(f"{JOINED} {clause}", *values)
 
-    def _proven(self, rows: list[tuple[Any, ...]], *, unsigned: bool = True) -> list[Record]:
+    def _proven(self, rows: list[tuple[Any, ...]], *, put_forward: bool = False) -> list[Record]:
         """The results in rows of `_joined`, as they were signed; without those that are refused."""
         try:
             stored = [Record.of_joined(row) for row in rows]
         except DamagedRow as error:
             raise StoreError(f"{self._path}: {error}") from None
+        must_be = self._signed_only or (put_forward and self._must_be_signed())
+        unsigned = "it is not signed" if must_be else ""
         found = []
         for record in stored:
-            if not record.signed:
-                found += [record] if unsigned else []
-                self.refused |= {} if unsigned else {record.sequence: "it is not signed"}
-                continue
-            from agent.delivery.proof import UnprovenError, proven
-
-            try:
-                true, differs = proven(record, self._keys)
+            true, refused = self._as_signed(record) if record.signed else (record, unsigned)
+            if refused:
+                self.refused[record.sequence] = refused
+            if true is not None and (record.signed or not refused):
                 found.append(true)
-            except UnprovenError as error:
-                differs = str(error)
-            if differs:
-                self.refused[record.sequence] = differs
         return found
+
+    def _as_signed(self, record: Record) -> tuple[Record | None, str]:
+        """The result as it was signed, or None; and why its row is refused."""
+        from agent.delivery.proof import UnprovenError, proven
+
+        try:
+            return proven(record, self._keys)
+        except UnprovenError as error:
+            return None, str(error)
 
     def _checked(self, sql: str) -> list[tuple[Any, ...]]:
         try:

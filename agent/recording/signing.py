@@ -10,6 +10,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
@@ -75,18 +76,21 @@ class Statement:
 
 
 class Signer:
-    """Signs with a gateway's private key."""
+    """Signs with a gateway's private key. `earlier`: public keys (32 bytes each) with which it signed before."""
 
-    def __init__(self, key: Ed25519PrivateKey) -> None:
+    def __init__(self, key: Ed25519PrivateKey, earlier: Sequence[bytes] = ()) -> None:
         self._key = key
         self.public_key = key.public_key()
-        self.known = KnownKeys(anywhere=(self.public_key.public_bytes_raw(),))  # a list of this key alone
+        self.known = KnownKeys(anywhere=(self.public_key.public_bytes_raw(), *earlier))  # what this gateway believes
         self.public_base64 = base64.b64encode(self.public_key.public_bytes_raw()).decode()
 
     @staticmethod
-    def load(path: Path) -> Signer:
-        """Make a Signer with the key in a PEM file (PKCS #8, not encrypted). Raises KeyFileError."""
-        return Signer(load_private_key(path))
+    def load(path: Path, earlier: Sequence[Path] = ()) -> Signer:
+        """Make a Signer with the key in a PEM file (PKCS #8, not encrypted), and earlier public keys in PEM files.
+
+        Raises KeyFileError.
+        """
+        return Signer(load_private_key(path), [load_public_key(one).public_bytes_raw() for one in earlier])
 
     def sign(self, text: str) -> SignedText:
         """Sign a text of `signed_text.written`."""

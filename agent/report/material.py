@@ -13,6 +13,7 @@ from agent.calibrate.origin import SourceFile, source_file
 from agent.config.files import read_file
 from agent.core.events import CalibrationUpdate, StatusChange, WindowReport
 from agent.delivery.calibrations import calibrations, made
+from agent.delivery.evidence import evidence
 from agent.delivery.history import FILE_NAME, History, Record, StoreError
 from agent.recording.files import recordings
 from agent.report.recorded import Recorded, RecordingError, read_recordings, sensors_of
@@ -123,6 +124,8 @@ def _from_directory(directory: Path, sensor: str | None) -> Material:
         kept = calibrations(history, chosen, limit=MOST_HISTORY)[::-1]
         seen = history.newest(chosen, "window", limit=MOST_HISTORY, run_id=_run_of(history, chosen, in_force))[::-1]
         status = next(iter(history.newest(chosen, "status", limit=1)), None)
+        shown = [*kept, *seen, *(record for record in (in_force, status) if record is not None)]
+        said = evidence(history, shown, directory, checked=False)
     windows = [_verdict(w.result) for w in seen if isinstance(w.result, WindowReport)]
     wanted = list(dict.fromkeys(w.recording for w in seen if w.fields.get("used")))
     paths, lost = _present(directory, wanted[-MOST_RECORDINGS:])
@@ -133,6 +136,7 @@ def _from_directory(directory: Path, sensor: str | None) -> Material:
     material = _of(recorded, windows, newest)
     material.history = updates
     material.files = [source_file(path) for path in paths]
+    material.notices += said
     material.notices += [
         f"the recording {name} does not exist any more, so its windows are not shown point by point" for name in lost
     ]
