@@ -236,7 +236,8 @@ def test_every_signed_byte_counts_though_the_sums_fit(tmp_path: Path) -> None:
 def test_a_file_that_is_no_key_is_one_clear_line(tmp_path: Path, content: str) -> None:
     path = tmp_path / "key"
     path.write_text(content)
-    with pytest.raises(KeyFileError, match=f"^{path}: not a private key in PEM without a password$"):
+    makes = "`openssl genpkey -algorithm ed25519` makes one"
+    with pytest.raises(KeyFileError, match=f"^{path}: not a private key in PEM without a password; {makes}$"):
         Signer.load(path)
     with pytest.raises(KeyFileError, match=f"^{path}: not a public key in PEM$"):
         load_public_key(path)
