@@ -14,7 +14,9 @@ import pytest
 
 from agent.cli.main import run_cli
 from agent.config import load_config
+from agent.delivery.store import Store
 from agent.recording.signing import Signer, load_public_key
+from tests.scenarios.processes import fieldcal
 
 STATED = ["--sensor", "adxl355", "--no-reference", "--site", "workshop", "--gateway", "gateway-1"]
 
@@ -153,3 +155,13 @@ def test_a_configuration_states_its_key_itself(place: Path, capsys: pytest.Captu
     assert run_cli(["run", "examples/gateway.toml", "--signing-key", str(key)]) == 2
     assert "state recording.signing_key in CONFIG" in capsys.readouterr().err
     assert not key.exists()
+
+
+def test_a_run_tells_where_its_key_is_misplaced(place: Path) -> None:
+    config, data = place / "gateway.toml", place / "data"
+    assert run_cli(["init", str(config), *STATED, "--signing-key", str(data / "a.key")]) == 0
+    store = Store(data, 0)  # holds the lock, as an agent does, so that the run ends at once
+    done = fieldcal("run", config, "--data-dir", data)
+    store.close()
+    assert done.returncode == 1
+    assert f"{data / 'a.key'} is in the data directory {data}" in " ".join(done.stdout.split())
