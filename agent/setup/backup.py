@@ -15,13 +15,13 @@ from pathlib import Path
 from agent.config import Config
 from agent.delivery.history import FILE_NAME, connect_read_only
 from agent.delivery.schema import write_mark
+from agent.engine.wheel import ENGINES
 from agent.recording.deleted_list import LIST_NAME
 from agent.recording.files import ACTIVE_SUFFIX, recordings
 from agent.recording.head import HEAD_NAME
 from agent.recording.reading import open_recording
 
 DATA, KEYS, SUMS = "data", "keys", "SHA256SUMS"
-ENGINES = "engines"  # directory of the wheels, `<id>.whl`, of the engines that wrote the recordings
 # The head; statements about recordings that retention deleted; pins that keep a recording. Nothing else is copied, so
 # no key that lies there, and not the counters of commands: with older counters a command could be repeated.
 _SMALL = re.compile(rf"{HEAD_NAME}|fieldcal-\d{{6,18}}\.(deleted|mcap\.lock)")
