@@ -46,10 +46,11 @@ _RESOLVED = re.compile(r"^\t(?:\S+ => )?(/\S+) \(0x", re.MULTILINE)  # a line of
 AUDIT = """#!/bin/sh
 # Audits recordings with what is in this archive: ./audit DATA-DIRECTORY; ./audit --help
 here=$(cd "${0%/*}" && pwd) || exit 1
+[ -w /dev/shm ] || set -- --jobs 1 "$@"  # where several processes cannot share memory
 for machine in x86_64 aarch64; do
   python=$here/$machine/bin/python3
-  if [ -f "$python" ] && "$python" -I -S -c "" 2>/dev/null; then
-    exec "$python" -I -B -m agent audit "$@"
+  if [ -f "$python" ] && "$python" -I -S -c "" 2>&-; then
+    exec "$python" -I -B -m agent audit --engines "$here/engines" "$@"
   fi
 done
 echo "audit: no interpreter in $here runs on this machine; README.md says which there are" >&2
@@ -114,34 +115,43 @@ def _fill(target: Path, parts: Parts) -> list[str]:
         (target / directory).mkdir()
     for engine in parts.engines:
         (target / "engines" / file_name(engine.engine_id)).write_bytes(engine.data)
-    shutil.copy(parts.program, target / "program")
+    program = Path(shutil.copy(parts.program, target / "program"))
     lock = Path(shutil.copy(parts.lock, target / "requirements.lock"))
-    missing = []
+    runnable = [machine for machine in ARCHITECTURES if _interpreter(target / machine, parts)]
+    for machine in runnable:
+        _install(program, target / machine / _PACKAGES)
     for machine in ARCHITECTURES:
-        wheels = target / "wheels" / machine
-        _fetch(machine, lock, parts.wheelhouse, wheels)
-        if machine not in parts.interpreters and machine != platform.machine():
-            missing.append(f"an interpreter for {machine}; --interpreter {machine}=FILE.tar.gz adds one")
-            continue
-        _make_runnable(target, machine, parts, [*(target / "program").iterdir(), *sorted(wheels.iterdir())])
+        _fetch(machine, lock, parts.wheelhouse, target / "wheels" / machine)
+        if machine in runnable:
+            _make_runnable(target, machine, parts)
     _write_script(target / "audit", AUDIT)
     engines = "\n".join(f"- engine {engine.name}, SHA-256 {engine.sha256}" for engine in parts.engines)
+    missing = [
+        f"an interpreter for {machine}; --interpreter {machine}=FILE.tar.gz adds one"
+        for machine in ARCHITECTURES
+        if machine not in runnable
+    ]
     absent = "".join(f"\nNot in this archive: {what}.\n" for what in missing)
     (target / "README.md").write_text(f"{README}{engines}\n{absent}")
     (target / INDEX).write_text(_index(target))
     return missing
 
 
-def _make_runnable(target: Path, machine: str, parts: Parts, wheels: Sequence[Path]) -> None:
-    """The directory of an architecture: interpreter, packages and, where the interpreter is ours, its libraries."""
-    place, given = target / machine, parts.interpreters.get(machine)
-    if given is not None:
+def _interpreter(place: Path, parts: Parts) -> bool:
+    """Put the interpreter of an architecture into its directory; False where there is none."""
+    if (given := parts.interpreters.get(place.name)) is not None:
         _unpack_interpreter(given, place)
-    else:
+    elif place.name == platform.machine():
         _copy_interpreter(place)
-    for wheel in wheels:
+    return place.exists()
+
+
+def _make_runnable(target: Path, machine: str, parts: Parts) -> None:
+    """Add the packages to an interpreter and, where the interpreter is the running one, the libraries of the system."""
+    place = target / machine
+    for wheel in sorted((target / "wheels" / machine).iterdir()):
         _install(wheel, place / _PACKAGES)
-    if given is None:
+    if machine not in parts.interpreters:
         _copy_libraries(place)
     compileall.compile_dir(  # without the paths of this machine, and so that nothing is written at an audit
         place / "lib", quiet=2, stripdir=str(target), rx=_TESTS, invalidation_mode=PycInvalidationMode.UNCHECKED_HASH
@@ -198,11 +208,9 @@ def _unpack_interpreter(file: Path, place: Path) -> None:
         with tarfile.open(file) as archive:
             archive.extractall(beside, filter="data")
         found = next((path.parents[2] for path in beside.rglob(f"lib/{_PYTHON}/os.py")), None)
-        if found is None or not (found.parent / "bin/python3").exists():
-            raise ArchiveError(
-                f"{file}: it has no bin/python3 with lib/{_PYTHON}; the version must be that of this Python"
-            )
-        found.parent.rename(place)
+        if found is None or not (found / "bin/python3").exists():
+            raise ArchiveError(f"{file}: it has no bin/python3 with lib/{_PYTHON}, the version of this Python")
+        found.rename(place)
     except tarfile.TarError as error:
         raise ArchiveError(f"{file}: no tar file of an interpreter: {error}") from None
     finally:

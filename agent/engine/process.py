@@ -66,8 +66,7 @@ class EngineProcess:
         if sys.platform != "linux":
             raise EngineError(f"the engine {self._wheel.name} is not run: its sandbox needs Linux")
         with contextlib.ExitStack() as held:
-            directory = held.enter_context(tempfile.TemporaryDirectory(prefix="fieldcal-engine-"))
-            self._wheel.unpack(Path(directory))
+            directory = self._unpacked(held)
             self._process = self._start(directory)
             held.callback(self._stop)
             self._unpacker = frames.Unpacker()
@@ -112,6 +111,16 @@ class EngineProcess:
             )
         if engine != self._wheel.engine_id.encode():
             raise self._broken(f"it calls itself {_text(engine)}")
+
+    def _unpacked(self, held: contextlib.ExitStack) -> str:
+        try:
+            directory = held.enter_context(tempfile.TemporaryDirectory(prefix="fieldcal-engine-"))
+            self._wheel.unpack(Path(directory))
+        except OSError as error:
+            raise EngineError(
+                f"the engine {self._wheel.name} cannot be unpacked: {error.strerror}; TMPDIR names another place for it"
+            ) from None
+        return directory
 
     def _start(self, directory: str) -> subprocess.Popen[bytes]:
         # Not sys.path as it is: that of an editable installation has the sources of this program.

@@ -211,17 +211,62 @@ def test_filter_has_the_numbers_of_the_kernel() -> None:
             assert calls[name][column] == (int(numbers[name]) if name in numbers else None), name
 
 
-def test_filter_for_arm_is_a_program_that_the_kernel_takes() -> None:
-    """Jumps stay inside and every way ends in a decision, for both architectures."""
-    for machine in ("x86_64", "aarch64"):
-        program = list(struct.iter_unpack("<HBBI", sandbox.filter_program(machine, 4711)))
-        for index, (code, where_true, where_false, _) in enumerate(program):
-            assert code == 0x06 or index + 1 + max(where_true, where_false) < len(program)
-        assert program[-1][0] == 0x06
+ALLOW, END, EPERM, ENOSYS = "allowed", "ended", "refused", "no such call"
+DECISIONS = {0x7FFF0000: ALLOW, 0x80000000: END, 0x50001: EPERM, 0x50026: ENOSYS}
+AUDIT = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
 
 
-def test_results_with_a_block_go_through_pipes_of_any_size() -> None:
-    """Frames that arrive byte by byte are the frames that were sent."""
+def decided(machine: str, number: int, *arguments: int, audit: int | None = None) -> str:
+    """What the kernel would do with a call: the filter, run here (linux/filter.h, struct seccomp_data)."""
+    program = list(struct.iter_unpack("<HBBI", sandbox.filter_program(machine, process=4711)))
+    values = (*arguments, *(0,) * (6 - len(arguments)))
+    data = struct.pack("<IIQ6Q", number, AUDIT[machine] if audit is None else audit, 0, *values)
+    place, loaded = 0, 0
+    while True:
+        code, where_true, where_false, constant = program[place]
+        place += 1
+        if code == 0x06:
+            return DECISIONS[constant]
+        if code == 0x20:
+            (loaded,) = struct.unpack_from("<I", data, constant)
+        else:
+            true = {0x15: loaded == constant, 0x35: loaded >= constant, 0x45: bool(loaded & constant)}[code]
+            place += where_true if true else where_false
+
+
+@pytest.mark.parametrize("machine", ["x86_64", "aarch64"])
+def test_decisions_of_the_filter_on_both_architectures(machine: str) -> None:
+    arm = machine == "aarch64"
+    openat, clone, fcntl = (56, 220, 25) if arm else (257, 56, 72)
+    prlimit64, kill, tgkill, getpid = (261, 129, 131, 172) if arm else (302, 62, 234, 39)
+    socket, getrandom, unlinkat = (198, 278, 35) if arm else (41, 318, 263)
+    thread = 0x3D0F00  # as pthread_create calls clone
+    calls = {
+        (getpid,): ALLOW, (getrandom,): ALLOW, (socket,): END, (unlinkat,): EPERM, (9999,): ENOSYS,
+        (getpid + 0x40000000,): END,  # x32
+        (437,): ENOSYS, (435,): ENOSYS,  # openat2, clone3
+        (openat, 0, 0, 0o2000000): ALLOW, (openat, 0, 0, 1): EPERM, (openat, 0, 0, 2): EPERM,
+        (openat, 0, 0, 0o100): EPERM, (openat, 0, 0, 0o1000): EPERM, (openat, 0, 0, 0o20200000 | 2): EPERM,
+        (openat, 0, 0, 1 << 32): ALLOW,  # the kernel takes 32 bits
+        (clone, thread): ALLOW, (clone, 17): END, (clone, thread & ~0x10000): END, (clone, thread | 0x10000000): END,
+        (clone, thread | 0x20000): END,  # a user namespace, a mount namespace
+        (prlimit64, 0, 9, 0, 1): ALLOW, (prlimit64, 0, 9, 1, 0): EPERM, (prlimit64, 0, 9, 1 << 32, 0): EPERM,
+        (kill, 4711, 6): ALLOW, (kill, 1, 9): END, (kill, 0xFFFFFFFF, 9): END, (tgkill, 4711, 4711, 6): ALLOW,
+        (tgkill, 1, 1, 9): END, (fcntl, 1, 4): ALLOW, (fcntl, 1, 8): EPERM,  # F_SETFL, F_SETOWN
+    }  # fmt: skip
+    assert {call: decided(machine, *call) for call in calls} == calls
+    for audit in {*AUDIT.values(), 0x40000003, 0x40000028} - {AUDIT[machine]}:  # of 32-bit programs too
+        assert decided(machine, getpid, audit=audit) == END
+
+
+def test_directory_for_engines_that_is_full_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    wheel = engine_that("")
+    monkeypatch.setattr("tempfile.tempdir", "/proc")
+    with pytest.raises(EngineError, match=r"cannot be unpacked: .*; TMPDIR names another place"), EngineProcess(wheel):
+        pass
+
+
+def test_frames_that_arrive_byte_by_byte_are_those_that_were_sent() -> None:
     sent = [[b"step", b"x" * 70_000, b""], [b"snapshot"]]
     unpacker = frames.Unpacker()
     got = []
