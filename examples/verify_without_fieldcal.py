@@ -20,6 +20,7 @@ from pathlib import Path
 
 import zstandard
 from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from cryptography.hazmat.primitives.serialization import load_pem_public_key
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.data_stream import ReadDataStream
@@ -139,7 +140,8 @@ def verify_file(path, key, wanted):
                 if item.sequence == wanted:
                     say(f"{name}: {item}")
             last, before = name, last
-        need((before, last) == ("fieldcal.signature", "DataEnd"), "it does not end with a signature")
+        need(signature, "it is not signed: it was made without a signing key, or its signature was taken out")
+        need((before, last) == ("fieldcal.signature", "DataEnd"), "it does not end with its signature")
         with memoryview(data) as whole, whole[:length] as signed:
             content, sha256 = hashlib.sha256(signed).hexdigest(), hashlib.sha256(whole).hexdigest()
     lines = {
@@ -175,6 +177,24 @@ def verify_head(path, key, files, gateways):
     return f"recording {number}, {length} bytes, closed: {said['closed']}, {said['utc_ns']} ns UTC"
 
 
+def public_key(path):
+    """The public key in a PEM file."""
+    with open(path, "rb") as file:
+        try:
+            key = load_pem_public_key(file.read(HEAD))
+        except Exception:  # of many kinds, for other files
+            key = None
+    need(isinstance(key, Ed25519PublicKey), "it is no Ed25519 public key in PEM format")
+    return key
+
+
+def reason(error):
+    """Why a file was refused, in one line."""
+    if isinstance(error, OSError):
+        return error.strerror or str(error)
+    return str(error) if type(error) is ValueError else f"its bytes cannot be understood: {error!r:.200}"
+
+
 def say(text):
     """Print; characters that a terminal obeys are written out."""
     print("".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text))
@@ -182,12 +202,19 @@ def say(text):
 
 def main(arguments):
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("public_key", type=Path, help="of the gateway, PEM")
-    parser.add_argument("recordings", type=Path, help="a directory, or one closed recording")
+    parser.add_argument("public_key", type=Path, nargs="?", help="of the gateway, PEM")
+    parser.add_argument("recordings", type=Path, nargs="?", help="a directory, or one closed recording")
     parser.add_argument("--head", type=Path, action="append", default=[], help="a head that was kept elsewhere")
     parser.add_argument("--result", type=int, metavar="SEQUENCE", help="print this result")
     given = parser.parse_args(arguments)
-    key = load_pem_public_key(given.public_key.read_bytes())
+    if given.recordings is None:
+        print("give two things: the gateway's public key (PEM), then its recordings; see --help", file=sys.stderr)
+        return 2
+    try:
+        key = public_key(given.public_key)
+    except (OSError, ValueError) as error:
+        print(f"{given.public_key}: not the gateway's public key: {reason(error)}", file=sys.stderr)
+        return 2
     paths, beside = [given.recordings], []
     if given.recordings.is_dir():
         paths, beside = sorted(given.recordings.glob("*.mcap*")), sorted(given.recordings.glob("head.json"))
@@ -205,7 +232,9 @@ def main(arguments):
             say(f"{path}: verified: {told}")
         except Exception as error:  # a hostile file can make the libraries raise anything
             failed += 1
-            say(f"{path}: FAILED: {error if type(error) is ValueError else repr(error)}")
+            say(f"{path}: FAILED: {reason(error)}")
+    if not good and not failed:
+        say(f"{given.recordings}: FAILED: no closed recording, fieldcal-<number>.mcap, is there")
     if good and not (beside or given.head):
         say("not proven: that nothing is missing at the end, because there is no head")
     return 3 if failed or not good else 0

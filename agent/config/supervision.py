@@ -25,7 +25,7 @@ class Supervision(Section):
     status_s: Annotated[
         float, Field(ge=1, le=3600, description="seconds between two reports; a change is reported at once")
     ] = 10.0
-    # A tri-axial sensor and a reference at 1 kHz record 33 MB an hour (docs/performance.md): seven hours are left.
+    # A tri-axial sensor and a reference at 1 kHz record 27 MB an hour (docs/performance.md): nine hours are left.
     least_disk_free: Annotated[ByteSize, Field(description="with less free disk space the status is degraded")] = (
         ByteSize(250_000_000)
     )

@@ -168,9 +168,8 @@ def _whole_indications(m: pb.RawBlockBytes, n: int) -> NDArray[Any]:
     width, rest = divmod(len(differences), axes * (n - order)) if n > order else (1, len(differences))
     if width not in WIDTHS or rest:
         raise ValueError(f"{n} samples of {axes} axes do not have {len(differences)} bytes of differences")
-    rows = np.empty((axes, n), INT32)
-    rows[:, :order] = np.frombuffer(m.first_values, INT32).reshape(axes, order)
-    rows[:, order:] = _numbers(differences, width).reshape(axes, n - order)
+    first_values = np.frombuffer(m.first_values, INT32).reshape(axes, order)
+    rows = np.concatenate((first_values, _numbers(differences, width).reshape(axes, n - order)), axis=1)
     if order == 2:
         np.add.accumulate(rows[:, 1:], axis=1, out=rows[:, 1:])
     np.add.accumulate(rows, axis=1, out=rows)

@@ -24,9 +24,9 @@ from hw.sensor import Options
 TIMEX_BYTES, STATUS_AT, MAXERROR_AT = 208, 40, 24
 UNSYNCHRONISED = 0x0040  # STA_UNSYNC
 DAY_S = 86_400.0
-# Measured on `fieldcal run` with two devices `serial-csv` at 1 kHz, three axes and one: 1,070,420 bytes in 66 s. Chips
-# and devices with little noise need less.
-BYTES_A_VALUE = 4.1
+# Measured on `fieldcal run` (an ADXL355 and a `serial-csv` of one axis, both at 1 kHz): docs/performance.md. Devices
+# with little noise need less, decimals of which a block has no short text up to eight bytes.
+BYTES_A_VALUE = 1.9
 SOON_FULL_DAYS = 7.0
 CONNECT_S = 2.0
 

@@ -17,8 +17,9 @@ from pathlib import Path
 import msgspec
 import pytest
 import verify_without_fieldcal as outsider
+from cryptography.hazmat.primitives.asymmetric.ec import SECP256R1, generate_private_key
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
 
 from agent.delivery.consumer import Consumer, Received
 from tests.attacks.chain_site import KEY, public_pem, record
@@ -28,6 +29,7 @@ from tests.scenarios.processes import ROOT, fieldcal
 from tests.unit.zenoh_site import Site
 
 SCRIPT = ROOT / "examples" / "verify_without_fieldcal.py"
+UNSIGNED = ROOT / "tests" / "replay" / "golden" / "format-3" / "fieldcal-000001.mcap"
 PAGE = (ROOT / "docs" / "audit.md").read_text("utf-8")
 # A second for each position, so that each second gives a result; the virtual bench has no port.
 CONFIG = """
@@ -229,6 +231,57 @@ def test_a_hostile_file_takes_no_memory_and_no_control_of_the_terminal(
     assert verify(site, capsys)[1][0].endswith("the record at byte 8 reaches beyond the end")
     outsider.say("\x1b[2J\u202e")
     assert capsys.readouterr().out == "\\x1b[2J\\u202e\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "told"),
+    [
+        ("", 2, "give two things"),
+        ("unsigned", 2, "give two things: the gateway's public key"),
+        ("no.pub unsigned", 2, "no.pub: not the gateway's public key: No such file or directory"),
+        ("unsigned unsigned", 2, "unsigned: not the gateway's public key: Is a directory"),
+        ("text unsigned", 2, "text: not the gateway's public key: it is no Ed25519 public key in PEM format"),
+        ("private.key unsigned", 2, "it is no Ed25519 public key"),
+        ("ec.pub unsigned", 2, "it is no Ed25519 public key"),
+        ("gateway.pub unsigned", 3, "000001.mcap: FAILED: it is not signed: it was made without a signing key"),
+        ("gateway.pub unsigned/fieldcal-000001.mcap", 3, "FAILED: it is not signed"),
+        ("gateway.pub nowhere", 3, "nowhere: FAILED: no closed recording"),
+        ("gateway.pub nowhere.mcap", 3, "nowhere.mcap: FAILED: No such file or directory"),
+        ("gateway.pub empty", 3, "empty: FAILED: no closed recording"),
+        ("gateway.pub open", 3, "open: FAILED: no closed recording"),
+        ("gateway.pub text.mcap", 3, "text.mcap: FAILED: it does not begin and end as an MCAP file"),
+        ("gateway.pub other.mcap", 3, "other.mcap: FAILED: its bytes cannot be understood"),
+        ("gateway.pub unsigned --head text", 3, "text: FAILED: its bytes cannot be understood: JSONDecodeError"),
+        ("gateway.pub unsigned --head no.json", 3, "no.json: FAILED: No such file or directory"),
+    ],
+)
+def test_each_line_about_what_cannot_be_verified_is_clear(
+    arguments: str,
+    status: int,
+    told: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("unsigned", "empty", "open"):
+        Path(name).mkdir()
+    shutil.copy(UNSIGNED, "unsigned")
+    shutil.copy(UNSIGNED, "open/fieldcal-000002.mcap.active")
+    Path("gateway.pub").write_bytes(public_pem())
+    Path("private.key").write_bytes(KEY.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))
+    other = generate_private_key(SECP256R1()).public_key()
+    Path("ec.pub").write_bytes(other.public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo))
+    for name in ("text", "text.mcap"):
+        Path(name).write_text("not what it should be")
+    Path("other.mcap").write_bytes(
+        outsider.MAGIC + struct.pack("<BQ", 4, 0) + struct.pack("<BQ", 12, 3) + b"abc" + outsider.MAGIC
+    )
+    assert outsider.main(arguments.split()) == status
+    output = capsys.readouterr()
+    lines = (output.out + output.err).splitlines()
+    assert len(lines) == (2 if "--head" in arguments else 1)
+    assert told in lines[-1]
 
 
 def commands(title: str) -> str:
