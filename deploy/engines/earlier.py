@@ -72,7 +72,8 @@ class NoHistoryError(NoEngineError):
 @contextmanager
 def checkout(commit: str, *paths: str) -> Iterator[Path]:
     """The files of a revision under these paths, in a directory that is removed afterwards. Raises NoHistoryError."""
-    command = ["git", "archive", "--format=zip", "-0", commit, *paths]
+    # Where a user's settings ask for CRLF, `git archive` writes it (git-for-windows/git, issue 2425).
+    command = ["git", "-c", "core.autocrlf=false", "-c", "core.eol=lf", "archive", "--format=zip", "-0", commit, *paths]
     try:
         archive = subprocess.run(command, cwd=ROOT, capture_output=True, check=True).stdout
     except OSError as error:

@@ -92,14 +92,14 @@ def row(revision: Revision, directory: Path) -> str:
     """The line of the table."""
     without, told = audit(revision, directory)
     status, passed = audit(revision, directory, "--engines", str(directory / "engines"))
-    departure = told["replay"]["departure"]
-    unreadable = told["replay"]["refused"]
-    largest = "cannot be replayed" if unreadable else f"{departure['largest_in_u']:.2g} U"
-    decision = "" if unreadable else departure["decision"].partition(":")[0] or "none"
-    how = f"{passed['replay']['replayed_by']}, {passed['replay']['results']} results"
-    how += ", bit for bit" if not passed["replay"]["tolerance"] else ""
+    departure, replay = told["replay"]["departure"], passed["replay"]
+    differs, decision = f"{departure['largest_in_u']:.2g} U", departure["decision"].partition(":")[0] or "none"
+    if told["replay"]["refused"]:
+        differs, decision = "cannot be replayed", ""
+    exact = "bit for bit" if replay["tolerance"] == 0.0 else f"within {replay['tolerance']:g}"
+    by = f"{replay['replayed_by']}: {replay['results']} results {exact}" if status == 0 else ""
     signed = "yes" if is_signed(revision, directory) else "no"
-    return f"| {revision.commit} | {signed} | {without} | {largest} | {decision} | {status} | {how} |"
+    return f"| {revision.commit} | {signed} | {without} | {differs} | {decision} | {status} | {by} |"
 
 
 def main() -> None:
@@ -119,7 +119,7 @@ def main() -> None:
         keep(revision, directory / "engines")
     with ThreadPoolExecutor(given.jobs) as pool:
         list(pool.map(lambda revision: record(revision, directory, given.seconds), REVISIONS))
-    print("| revision | signed | exit without engines | S and Q differ by | decision that differs | exit with | by |")
+    print("| revision | signed | exit without | values differ by at most | another decision | exit with | by engine |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
     for revision in REVISIONS:
         print(row(revision, directory), flush=True)

@@ -32,7 +32,11 @@ def test_an_engine_has_the_known_bytes_wherever_and_however_often_it_is_built(
 ) -> None:
     known = known_engines()[0]
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    monkeypatch.setenv("TZ", "Asia/Tokyo")
+    settings = {"core.autocrlf": "true", "tar.umask": "077"}
+    monkeypatch.setenv("GIT_CONFIG_COUNT", str(len(settings)))
+    for number, (key, value) in enumerate(settings.items()):
+        monkeypatch.setenv(f"GIT_CONFIG_KEY_{number}", key)
+        monkeypatch.setenv(f"GIT_CONFIG_VALUE_{number}", value)
     wheel = keep(REVISIONS[0], tmp_path / "engines")
     assert (wheel.name, wheel.sha256) == (f"1-{known.id}", known.sha256)
     assert read_wheel("", (tmp_path / "engines" / f"{known.id}.whl").read_bytes()).sha256 == known.sha256
