@@ -32,8 +32,9 @@ DAY_NS = 86_400_000_000_000
 OWN_ROOM_BYTES = 64 << 20
 SHORT_S = 300.0  # s of event time that a lack of free space must last, longer than most programs hold a temporary file
 SAID_S = 30.0  # s of event time from the saying to the first loss; the status is published several times meanwhile
-# s of event time between two deletions for free space. Some file systems show the space of a deleted file only after
-# their next commit (ext4: 5 s, btrfs: 30 s).
+# s of event time between two deletions for free space. A file system may show the space of a deleted file only after
+# its next commit, by default each 5 s (Linux, Documentation/admin-guide/ext4.rst) or 30 s (Linux,
+# Documentation/filesystems/btrfs.txt). Where it does not show it after 10 s, the next deletion waits SHORT_S.
 PACE_S = 10.0
 
 _log = logging.getLogger(__name__)

@@ -27,6 +27,7 @@ from agent.recording.pruned_ranges import (
     merged,
     to_metadata,
 )
+from agent.recording.reading import first_event
 from agent.recording.repair import close_torn
 from agent.recording.result_signing import PUBLIC_KEY, ResultSigner
 from agent.recording.results_chain import EPOCH, PREVIOUS_RESULTS
@@ -183,7 +184,7 @@ class Recorder:
             if self._file is not None:
                 for topic, data in messages:
                     self._file.append(topic, data, log_time, publish_time, event_sequence)
-                if isinstance(event, RunStart | Pruned):
+                if isinstance(event, Pruned):
                     self._file.note(PRUNED_METADATA, to_metadata(self._pruned, self._list.text))
                 if results or isinstance(event, RunStart | Pruned):
                     self._file.sync()
@@ -252,6 +253,8 @@ class Recorder:
             origin |= {PREVIOUS_RESULTS: _signed_results(self._directory / name)} if name else {}
         self._since_ns = self._now_ns
         self._file = RecordingFile(self._directory, start, self._topics, origin, self._signer)
+        # Before the RunStart: whatever a crash leaves of a recording that is not removed, it says what was deleted.
+        self._file.note(PRUNED_METADATA, to_metadata(self._pruned, self._list.text))
         sync_directory(self._directory)
         self.fault, self._quota = "", False
 
@@ -353,7 +356,8 @@ def _pruned_before(directory: Path) -> tuple[tuple[Deleted, ...], str]:
     """
     try:
         for _, path in reversed(recordings(directory)):
-            if metadata := metadata_of(path):
+            metadata = metadata_of(path)
+            if PRUNED_METADATA in metadata or first_event(path) is not None:  # otherwise a crash left it, to be removed
                 pruned = metadata.get(PRUNED_METADATA, {})
                 return from_metadata(pruned), pruned.get(LIST, "")
     except OSError as error:  # the next write to the failing disk reports the failure

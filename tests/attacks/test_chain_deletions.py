@@ -15,7 +15,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from agent.recording.deleted_list import LIST_NAME
 from agent.recording.end_check import GivenHead
 from agent.recording.files import recordings
-from agent.recording.head import Head
+from agent.recording.head import HEAD_NAME, Head
 from agent.recording.pruned_ranges import Deleted
 from agent.recording.retention import KeepFiles
 from agent.recording.scan import metadata_of
@@ -24,6 +24,7 @@ from agent.recording.signed_text import SignedText, written
 from agent.recording.signing import Signer
 from agent.recording.writer import Recorder
 from tests.attacks.chain_site import KEY, audited, record
+from tests.replay.forgery import records
 from tests.replay.stand_in import CONFIG, StandIn, run_start
 
 
@@ -124,6 +125,30 @@ def test_the_newest_recording_may_go_and_the_chain_goes_on(tmp_path: Path, monke
     assert metadata_of(path)["fieldcal.file"]["previous_sha256"] == last
     status, text = audited(directory)
     assert status == 0, text
+
+
+def test_a_kill_while_a_recording_begins_loses_no_deletion(tmp_path: Path) -> None:
+    """Killed behind each record up to the first event, and within it: the file is removed, its number used again."""
+    size = record(tmp_path / "size")[0].stat().st_size
+    record(tmp_path / "a", keep=KeepFiles(bytes=3 * size))
+    record(tmp_path / "a", blocks=2, seed=2)
+    newest = recordings(tmp_path / "a")[-1][1]
+    data = newest.read_bytes()
+    first = next(one for one in records(data) if one.name == "Chunk")
+    cuts = [one.end for one in records(data) if one.end <= first.offset] + [first.offset + 20, first.end]
+    assert len(cuts) == 5
+    for cut in cuts:
+        b = copied(tmp_path / "a", "b")
+        (b / newest.name).unlink()
+        (b / f"{newest.name}.active").write_bytes(data[:cut])
+        (b / HEAD_NAME).unlink()
+        recorder = recorder_on(b, KeepFiles())
+        assert start(recorder)
+        recorder.close()
+        (b / "state.sqlite").unlink()
+        status, text = audited(b, strict=False)
+        assert status == 0, (cut, text)
+        shutil.rmtree(b)
 
 
 def test_a_kill_between_the_steps_of_a_deletion_loses_nothing(tmp_path: Path) -> None:
