@@ -217,8 +217,7 @@ def _deleted_ones(
     order: Sequence[tuple[int, Link]], by_recordings: Sequence[Deleted], statements: Sequence[Deleted]
 ) -> Iterator[str]:
     numbers = [0, *(link.number for _, link in order)]
-    gaps = [(before + 1, after - 1) for before, after in pairwise(numbers) if before + 1 < after]
-    repeated, all_of_them = (_count(gaps, each) for each in (by_recordings, _union([*by_recordings, *statements])))
+    repeated, all_of_them = (_missing(numbers, each) for each in (by_recordings, _union([*by_recordings, *statements])))
     if all_of_them:
         said = f"as later recordings say of {repeated} and only statements in the directory of {all_of_them - repeated}"
         yield f"what {all_of_them} recordings held: retention deleted them, {said}"
@@ -231,11 +230,13 @@ def _unnamed(entries: Sequence[Deleted], statements: Sequence[Deleted]) -> Itera
     ends = {entry.last for entry in entries if entry.sha256}
     unnamed = _union([one for one in (*entries, *statements) if not one.sha256 and one.last not in ends])
     if unnamed:
-        which = ", ".join(f"{entry.first} to {entry.last}" for entry in unnamed[:5])
+        which = ", ".join(
+            f"{one.first} to {one.last}" if one.first < one.last else f"{one.first}" for one in unnamed[:5]
+        )
         yield f"which recordings {which} were: an older version deleted them, and did not say their SHA-256"
 
 
-def _count(gaps: Sequence[tuple[int, int]], entries: Sequence[Deleted]) -> int:
-    """How many numbers in the gaps are in the entries, which do not overlap."""
-    both = ((max(first, one.first), min(last, one.last)) for first, last in gaps for one in entries)
-    return sum(last - first + 1 for first, last in both if first <= last)
+def _missing(numbers: Sequence[int], entries: Sequence[Deleted]) -> int:
+    """How many numbers up to the last of `numbers`, which rise, are in the entries, which do not overlap, only."""
+    named = sum(max(0, min(entry.last, numbers[-1]) - entry.first + 1) for entry in entries)
+    return named - sum(bisect_right(numbers, entry.last) - bisect_left(numbers, entry.first) for entry in entries)

@@ -30,12 +30,14 @@ OPEN = "that deleted recordings began with the bytes which heads name: these hea
 class Gone:
     """What the links and the directory say of recordings that are not there.
 
-    `statements`: those that count. `listed`: of recordings that heads name. `whole`: the recordings of a directory were
-    given. `faults`: a list of deleted recordings that is not the one that was signed, a second file of one number.
-    `unproven`: statements that prove nothing, files that are no recordings.
+    `deleted`: what recordings say was deleted. `statements`: those that count. `listed`: what the list of deleted
+    recordings says of those that heads name. `whole`: the recordings of a directory were given. `faults`: a list that
+    is not the one that was signed, a second file of one number. `unproven`: statements that prove nothing, files that
+    are no recordings.
     """
 
     links: Sequence[Link]
+    deleted: Sequence[Deleted] = ()
     statements: tuple[Deleted, ...] = ()
     listed: tuple[Deleted, ...] = ()
     whole: bool = False
@@ -47,7 +49,7 @@ class Gone:
         shown of it); "" for none. Only later recordings count: a statement alone can come from a copy of the directory.
         """
         said, number = head.statement, head.statement.file_sequence
-        entries = {entry for link in self.links if link.file_sequence > number for entry in link.deleted}
+        entries = [entry for entry in self.deleted if entry.first - 1 <= number <= entry.last + 1]
         if first_outside(entries, number, number) is not None:
             stated = first_outside(self.statements, number, number) is None
             only = f"recording {number}, which this head names, is not there: only a statement says that it was deleted"
@@ -82,11 +84,12 @@ def find_gone(directory: Path | None, links: Sequence[Link], heads: Iterable[int
     `heads`: numbers of the recordings that heads name. With `keys` statements must be signed by one of the gateway's,
     and those of version 1 do not count: they do not say which recording is meant.
     """
+    deleted = sorted({entry for link in links for entry in link.deleted})
     if directory is None:
-        return Gone(links)
+        return Gone(links, deleted)
     gateway = next((link.gateway for link in links if link.gateway), "")
     there = {link.file_sequence for link in links}
-    found = statements(directory, gateway, keys, [entry for link in links for entry in link.deleted])
+    found = statements(directory, gateway, keys, deleted)
     newest = max((link for link in links if link.listed), key=lambda link: link.file_sequence, default=None)
     entries, fault = listed(directory, newest.listed if newest is not None else "", set(heads) - there)
     old = [
@@ -96,6 +99,7 @@ def find_gone(directory: Path | None, links: Sequence[Link], heads: Iterable[int
     doubles, others = _misnamed(directory, {link.number for link in links})
     return Gone(
         links,
+        deleted,
         statements=(*found.deleted, *(found.of_version_1 if keys is None else ())),
         listed=tuple(entries),
         whole=True,

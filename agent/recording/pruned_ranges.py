@@ -79,8 +79,9 @@ def from_metadata(metadata: dict[str, str] | None) -> tuple[Deleted, ...]:
 
 def first_outside(entries: Iterable[Deleted], first: int, last: int) -> tuple[int, int] | None:
     """The first run of numbers within `first` to `last` that is in none of the entries; None where all numbers are."""
-    for entry in sorted(entries):
+    for entry in sorted(entries) if first <= last else ():
         if entry.first > first:
-            return (first, min(last, entry.first - 1)) if first <= last else None
+            last = min(last, entry.first - 1)
+            break
         first = max(first, entry.last + 1)
     return (first, last) if first <= last else None

@@ -82,7 +82,7 @@ def disk_findings(config: Config | None, options: dict[str, Options], data_dir: 
     if free < kept:
         yield Finding(
             "disk", "fault", f"{free_text}, less than recording.least_free_bytes ({kept / 1e9:.3g} GB)",
-            "free some space, or set recording.keep_days; the agent deletes its oldest recordings meanwhile",
+            "free some space, or set recording.keep_days; if this lasts, the agent deletes its oldest recordings",
         )  # fmt: skip
         return
     if not a_day:

@@ -14,7 +14,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from agent.recording.deleted_list import LIST_NAME
 from agent.recording.end_check import GivenHead
-from agent.recording.files import recordings
+from agent.recording.files import RecordingFile, recordings
 from agent.recording.head import HEAD_NAME, Head
 from agent.recording.pruned_ranges import Deleted
 from agent.recording.retention import KeepFiles
@@ -268,6 +268,52 @@ def test_a_statement_about_a_recording_that_is_there(tmp_path: Path, *, same: bo
     assert status == (0 if same else 3), text
     told = "that recording 2 was deleted: a statement says so, but it is there"
     assert (told if same else "gives recording 2 another SHA-256") in text
+
+
+@pytest.mark.parametrize("older", [True, False], ids=["an older version recorded", "this version recorded"])
+def test_a_statement_of_version_1_proves_nothing_and_accuses_nobody(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, older: bool
+) -> None:
+    """An update of the program while the disk was full leaves one. A thief may put one there at any time."""
+    directory = tmp_path / "a"
+    with monkeypatch.context() as before:
+        if older:
+            before.setattr(RecordingFile, "note", lambda *_: None)  # older versions named no list
+        first = record(directory)[0]
+    values = {"gateway": "site/gateway", "recording": "1"}
+    statement = Signer(KEY).sign(written("fieldcal deletion, version 1", values)).json
+    first.unlink()
+    first.with_suffix(".deleted").write_bytes(statement + b"\n")
+    told = "that retention deleted recording 1: a statement of version 1 says so, which does not say its SHA-256"
+    for options, expected in (({"keys": None, "strict": False}, 0), ({"strict": False}, 3), ({}, 3)):
+        status, text = audited(directory, **options)
+        assert status == expected, text
+        assert f"not proven: {told}" in text
+        assert "forged" not in text
+    record(directory, seed=2)
+    status, text = audited(directory)
+    if older:
+        assert status == 0, text
+        assert "not proven: which recordings 1 were: an older version deleted them" in text
+    else:
+        assert status == 3
+        assert "recording 1 is missing before it" in text
+
+
+@pytest.mark.parametrize(
+    "name", ["fieldcal-0000001.mcap", "fieldcal-0000009.mcap", "copy.mcap", "fieldcal-000001.mcap.active"]
+)
+def test_a_file_that_is_like_a_recording_is_named(tmp_path: Path, name: str) -> None:
+    files = record(tmp_path / "a")
+    shutil.copy(files[0], tmp_path / "a" / name)
+    status, text = audited(tmp_path / "a")
+    assert status == (3 if "1.mcap" in name else 0)
+    words = {
+        "fieldcal-0000001.mcap": "FAILED: {}: this is not the name of a recording, and recording 1 is there already",
+        "fieldcal-000001.mcap.active": "it has the number 1, and so has",
+    }
+    other = "not proven: what {} holds: it was not looked at, because this is not the name of a recording"
+    assert words.get(name, other).format(tmp_path / "a" / name) in text
 
 
 @pytest.fixture
