@@ -152,8 +152,8 @@ def test_an_open_device_that_says_nothing_is_silent() -> None:
     [
         ({"recording": RecordingHealth(active=False, file="", size_bytes=0, fault="No space left")},
          "not recording: No space left"),
-        ({"recording": RecordingHealth(active=True, file="x", size_bytes=1, fault="", space="less than 64 MB are free")},
-         "recordings: less than 64 MB are free"),
+        ({"recording": RecordingHealth(active=True, file="x", size_bytes=1, fault="", space="less than 64 MB free")},
+         "recordings: less than 64 MB free"),
         ({"disk_free_bytes": 10**8}, "less than 250 MB free on the disk of the data"),
         ({"publication": PublicationHealth(enabled=True, connected=False, unpublished=7, fault="")},
          "no Zenoh router, results wait in the store"),
