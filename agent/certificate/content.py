@@ -144,7 +144,7 @@ def as_object(certificate: Certificate) -> dict[str, Any]:
             "expanded_uncertainty_pct": v.expanded_uncertainty_pct, "limit_pct": v.limit_pct, "conforms": v.conforms,
         } for v in c.verdicts]),
         "made_from": [msgspec.structs.asdict(file) for file in c.files],
-        "made_by": {"fieldcal": __version__, "calibrated_with": told.get("version")},
+        "made_by": {"fieldcal": __version__, "calibrated_with": told.get("version"), "engine": told.get("engine")},
         "provenance": graph(c, measured),
     }  # fmt: skip
 

@@ -76,11 +76,13 @@ def after_results(c: Certificate) -> Iterator[Section]:
                           f"{'conforms' if v.conforms else 'does not conform'}")
             for v in c.verdicts
         ]])  # fmt: skip
+    engine = c.result.fields.get("engine")
     yield Section("Origin", [
         *[("made from", _file(file)) for file in c.files[:MOST_FILES]],
         *([("and", f"{len(c.files) - MOST_FILES} more files, see certificate.json")] if len(c.files) > MOST_FILES
           else []),
         *[("remark", remark) for remark in c.stated.remarks],
+        *([("engine", f"{engine}: the code that made the result")] if engine else []),
         ("program", f"fieldcal {__version__}; certificate.json and certificate.xml have all digits and the covariance"),
     ])  # fmt: skip
 

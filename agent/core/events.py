@@ -241,6 +241,7 @@ class CalibrationUpdate(Result, frozen=True, kw_only=True):
     made_run_id: str = ""
     made_sequence: int = 0
     made_utc_ns: int = 0
+    made_engine: str = ""
 
     @property
     def made(self) -> tuple[str, int]:
@@ -249,6 +250,11 @@ class CalibrationUpdate(Result, frozen=True, kw_only=True):
         This identifies the calibration and never changes.
         """
         return (self.made_run_id, self.made_sequence) if self.made_sequence else (self.run_id, self.sequence)
+
+    @property
+    def by_engine(self) -> str:
+        """Name of the engine that made it; "" in results of older versions."""
+        return self.made_engine if self.made_sequence else self.engine
 
     @property
     def date_utc_ns(self) -> int:

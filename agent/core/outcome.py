@@ -114,6 +114,7 @@ def again(update: CalibrationUpdate, before: CalibrationUpdate) -> CalibrationUp
     run_id, sequence = before.made
     return msgspec.structs.replace(
         update, made_run_id=run_id, made_sequence=sequence, made_utc_ns=before.date_utc_ns,
+        made_engine=before.by_engine,
         shared_errors=before.shared_errors,
     )  # fmt: skip
 

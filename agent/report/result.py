@@ -175,6 +175,7 @@ def from_update(
         "windows": [asdict(window) for window in windows],
         "statistics": {},
         "version": versions.get("fieldcal", ""),
+        "engine": update.by_engine,
         "method": update.method,
         "uncertainty_kind": update.uncertainty_kind,
         "output_unit": update.output_unit,
