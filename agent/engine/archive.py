@@ -203,6 +203,8 @@ def _install(wheel: Path, packages: Path) -> None:
 
 
 def _unpack_interpreter(file: Path, place: Path) -> None:
+    if not hasattr(tarfile, "data_filter"):
+        raise ArchiveError(f"{file}: this Python cannot unpack a tar file safely; Python 3.11.4 and later can")
     beside = place.with_suffix(".unpacked")
     try:
         with tarfile.open(file) as archive:

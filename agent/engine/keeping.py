@@ -43,14 +43,18 @@ def keep_engine(directory: Path) -> tuple[str, str]:
 
 
 def _write(path: Path, data: bytes) -> None:
-    """Write a file that is whole or not there, whenever the power fails. What an earlier try left is replaced."""
+    """Write a file that is whole or not there, whenever the power fails. A full disk is left as it was."""
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.with_suffix(".new")
-    with open(beside, "wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(beside, path)
+    try:
+        with open(beside, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(beside, path)
+    except OSError:
+        beside.unlink(missing_ok=True)
+        raise
     descriptor = os.open(path.parent, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
+import resource
 from pathlib import Path
 
 import pytest
@@ -61,6 +62,17 @@ def test_directory_that_cannot_be_written_is_told_and_stops_nothing(
     monkeypatch.setattr(keeping, "build", without_bz2)
     assert keep_engine(tmp_path) == (engine_id(), "")
     assert "its wheel cannot be made: Compression requires" in caplog.messages[-1]
+
+
+def test_disk_that_is_full_is_left_as_it_was(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
+    try:
+        assert keep_engine(tmp_path) == (engine_id(), hashlib.sha256(build()).hexdigest())
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert "is not kept" in caplog.text
+    assert os.listdir(tmp_path / ENGINES) == []
 
 
 def test_release_is_added_to_the_list_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
