@@ -126,7 +126,8 @@ def main() -> int:
     parser.add_argument("--write", action="store_true", help="add the engines of the table to agent/engine/known.json")
     parser.add_argument("revisions", metavar="REVISION", nargs="*", help="default: those of the table")
     given = parser.parse_args()
-    asked = [Revision(0, commit, "") for commit in given.revisions] or REVISIONS
+    table = {revision.commit: revision for revision in REVISIONS}
+    asked = [table.get(commit[:12], Revision(0, commit, "")) for commit in given.revisions] or REVISIONS
     found = []
     for revision in asked:
         try:
