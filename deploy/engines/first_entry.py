@@ -1,6 +1,6 @@
-"""The process of an engine of 21 November 2026.
+"""The process of an engine of before 22 November 2026, 12:00, whose modules have other places.
 
-Its modules have other places, every output of its pipeline is a result, and no state outlives its run.
+At first every output of its pipeline is a result (until 21 November, 05:06), and no state outlives its run (until 05:42).
 
 In the wheel of such an engine this file is agent/engine/entry.py, and the entry of today is agent/engine/serving.py.
 """
@@ -20,15 +20,15 @@ except ImportError:
 
 
 class Engine(serving.Engine):
-    """Answers by the modules in their places of that day."""
+    """Answers by the modules in their places of that time."""
 
     def __init__(self) -> None:
         self._restore, self._pipeline = Pipeline.restore, None
-        self._messages = SimpleNamespace(**vars(messages), recorded_ones=list)
+        self._messages = SimpleNamespace(**{"recorded_ones": list} | vars(messages))
 
     def memories(self) -> list[bytes]:
-        """None: a run began with the last calibration alone."""
-        return [b"memories"]
+        """What a later run of a gateway would begin with: at first the last calibration alone, which is no state."""
+        return super().memories() if hasattr(Pipeline, "all_memories") else [b"memories"]
 
 
 def main() -> None:
