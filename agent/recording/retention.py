@@ -12,7 +12,7 @@ import errno
 import hashlib
 import logging
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -108,29 +108,29 @@ class Retention:
         if self._keep == FOR_EVER:
             return None
         files = [_File(n, path, (s := path.stat()).st_size, s.st_mtime_ns) for n, path in recordings(self._directory)]
-        deletable = _deletable(files, at)
-        chosen = self._over_limit(files, deletable, at) or self._for_space(deletable, at)
+        candidates = _candidates(files, at)
+        chosen = self._over_limit(files, candidates, at) or self._for_space(candidates, at)
         return None if chosen is None else _event(chosen, at)
 
-    def _over_limit(self, files: Sequence[_File], deletable: Sequence[_File], at: Moment) -> _File | None:
-        keep, oldest = self._keep, deletable[0] if deletable else None
-        if oldest is None:
-            return None
+    def _over_limit(self, files: Sequence[_File], candidates: Sequence[_File], at: Moment) -> _File | None:
+        keep = self._keep
         if keep.bytes is not None and sum(file.size for file in files) > keep.bytes:
-            return oldest
-        old = keep.days is not None and at.by_age and _age_days(oldest, at) > keep.days
-        return oldest if old else None
+            return next(_free(candidates), None)
+        if keep.days is not None and at.by_age:
+            return next(_free(file for file in candidates if _age_days(file, at) > keep.days), None)
+        return None
 
-    def _for_space(self, deletable: Sequence[_File], at: Moment) -> _File | None:
+    def _for_space(self, candidates: Sequence[_File], at: Moment) -> _File | None:
         keep, free = self._keep, free_bytes(self._directory)
         urgent = bool(keep.least_free_bytes) and (at.quota or free < min(OWN_ROOM_BYTES, keep.least_free_bytes))
         short = urgent or free < keep.least_free_bytes
         self._short_ns = _since(self._short_ns, at.now_ns) if short else None
         self._urgent_ns = _since(self._urgent_ns, at.now_ns) if urgent else None
+        deletable = list(_free(candidates)) if short else []
         old = [file for file in deletable if _age_days(file, at) > keep.at_least_days]
         helps = free + sum(file.size for file in old) >= keep.least_free_bytes
         self._say(self._words(urgent=urgent, helps=helps, quota=at.quota) if short else "", at.now_ns)
-        choice = deletable if urgent else old if short and helps else []
+        choice = deletable if urgent else old if helps else []
         if not choice or at.now_ns < self._earliest_ns(free):
             return None
         chosen = choice[0]
@@ -202,17 +202,22 @@ def is_kept(path: Path) -> bool:
     return False
 
 
-def _deletable(files: Sequence[_File], at: Moment) -> list[_File]:
-    """The files that may be deleted, oldest first."""
+def _candidates(files: Sequence[_File], at: Moment) -> list[_File]:
+    """The files that may be deleted, oldest first, where nobody keeps them."""
     limit = file_number(at.waiting)
     found = []
     for file in files:
         if file.path == at.active or (limit is not None and file.number >= limit):
             break
         unfinished = at.active is None and file.path.name.endswith(ACTIVE_SUFFIX)  # the next start closes it
-        if not unfinished and not is_kept(file.path):
+        if not unfinished:
             found.append(file)
     return found
+
+
+def _free(files: Iterable[_File]) -> Iterator[_File]:
+    """Those of the files that nobody keeps. To find out, each is opened; so this is lazy."""
+    return (file for file in files if not is_kept(file.path))
 
 
 def _age_days(file: _File, at: Moment) -> float:
