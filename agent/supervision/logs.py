@@ -165,7 +165,7 @@ def log_event(event: Event, results: Sequence[Result]) -> None:
         refused = f"refused: {event.refused}" if event.refused else "taken"
         tell("command", f"{event.sensor}: command {event.verb} {refused}", bool(event.refused), **_fields(event))
     elif isinstance(event, Pruned):
-        message = f"recording {event.last_file} was deleted to keep to the limits"
+        message = f"recording {event.last_file} is deleted to keep to the limits"
         tell("pruned", message, first_file=event.first_file, last_file=event.last_file, bytes=event.bytes)
     for result in results:
         if not result.routine:
