@@ -119,9 +119,16 @@ class History:
         return sorted((sensor, what) for sensor, what, _, _ in self._latest())
 
     def latest(self) -> list[Record]:
-        """The newest result of every channel, in order of sequence; a calibration only while it is in force."""
-        numbers = sorted(sequence for _, _, sequence, withdrawn in self._latest() if not withdrawn)
-        return [record for sequence in numbers for record in self._one(sequence)]
+        """The newest result of every channel, in order of sequence; a calibration only while it is in force.
+
+        With `keys`, the newest one that they signed, once the gateway has signed any.
+        """
+        found = [
+            self._one(sequence) or self._signed_before(sensor, what, sequence)
+            for sensor, what, sequence, withdrawn in self._latest()
+            if not withdrawn
+        ]
+        return sorted((record for records in found for record in records), key=lambda record: record.sequence)
 
     def in_force(self, sensor: str) -> Record | None:
         """The calibration in force of a sensor; None if it has none, or if a later status was UNCALIBRATED."""
@@ -179,6 +186,15 @@ class History:
         if not rows:
             raise StoreError(f"{self._path}: damaged: result {sequence} is missing")
         return self._proven(rows, put_forward=True)
+
+    def _signed_before(self, sensor: str, what: str, sequence: int) -> list[Record]:
+        """The newest result of a channel before one that is refused, which may be put forward; none where none may."""
+        clause = "WHERE sensor = ? AND what = ? AND sequence < ? ORDER BY sequence DESC LIMIT 1"
+        while rows := self._joined(clause, sensor, what, sequence):
+            if records := self._proven(rows, put_forward=True):
+                return records
+            sequence = rows[0][0]
+        return []
 
     def _must_be_signed(self) -> bool:
         """Whether the gateway has a key and has used it: then a result without a signature is not put forward."""

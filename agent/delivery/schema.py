@@ -224,6 +224,9 @@ def damage(connection: sqlite3.Connection) -> str:
     if not _is_ours(connection):
         return "its tables are not those of this version"
     newest = "SELECT sensor, what, max(sequence) FROM results GROUP BY sensor, what"
+    beyond = "SELECT 1 FROM results WHERE sequence > ? LIMIT 1"
+    if connection.execute(beyond, (LARGEST_MARK,)).fetchone() is not None:
+        return f"a result has a number above {LARGEST_MARK}"
     try:
         read_marks(connection)
         _check_all(connection.execute(f"SELECT {RESULT_COLUMNS}, crc FROM results"))

@@ -56,10 +56,16 @@ class Run:
     """One run of the gateway on a data directory: begun as `fieldcal run` does it, then `stop`ped or `kill`ed."""
 
     def __init__(
-        self, directory: Path, number: int = 1, *, key: Ed25519PrivateKey | None = KEY, gateway: str = GATEWAY
+        self,
+        directory: Path,
+        number: int = 1,
+        *,
+        key: Ed25519PrivateKey | None = KEY,
+        gateway: str = GATEWAY,
+        earlier: Sequence[bytes] = (),
     ) -> None:
         directory.mkdir(exist_ok=True)
-        signer = Signer(key) if key is not None else None
+        signer = Signer(key, earlier) if key is not None else None
         held = GatewayKey(gateway, signer) if signer is not None else None
         self.store = Store(directory, 0, recall=partial(memories_of, restore=Pipeline.restore), key=held)
         self.faults = self.store.faults

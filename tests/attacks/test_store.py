@@ -10,10 +10,14 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from agent.cli.show import show
 from agent.core.events import CalibrationUpdate, Result
 from agent.delivery.history import FILE_NAME, History, Record
 from agent.delivery.schema import StoreError, row_crc
+from tests.attacks.chain_site import KEY, public_pem
+from tests.attacks.signed_site import OTHER
 from tests.attacks.store_site import Run, change, forge_memory, forge_result, put_back, rests, rows, states
 
 
@@ -246,3 +250,82 @@ def test_a_calibration_that_was_withdrawn_is_not_shown_as_in_force(begin: Begin,
         history.check()
     begin().stop()
     assert in_force(data) is None
+
+
+def insert(data: Path, sequence: int, like: int) -> None:
+    """Add a copy of a result, with another number and without a signature."""
+    columns = "run_id, sensor, what, payload, t_utc_ns, recorded, recording, identity"
+    ((*held,),) = rows(data, f"SELECT {columns} FROM results WHERE sequence = {like}")
+    held[3] = msgspec.json.encode(msgspec.json.decode(held[3]) | {"sequence": sequence, "sensitivity": [[3.0] * 3] * 3})
+    row = (sequence, *held)
+    change(data, "INSERT INTO results VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", *row, row_crc(*row))
+    latest = (held[1], held[2], sequence, 0)
+    change(data, "INSERT OR REPLACE INTO latest VALUES (?, ?, ?, ?, ?)", *latest, row_crc(*latest))
+
+
+@pytest.mark.parametrize("sequence", [2000, 2**62])
+def test_a_result_that_somebody_adds_hides_none_and_comes_nowhere(
+    sequence: int, ended: tuple[Path, Run], data: Path, begin: Begin
+) -> None:
+    insert(data, sequence, ended[1].calibration.sequence)
+    again = begin()
+    with again.store.history() as history:
+        (shown,) = [record for record in history.latest() if record.what == "calibration"]
+    assert said(shown.result) == said(ended[1].calibration)
+    assert again.store.last_sequence() < 2**53
+    if sequence == 2000:
+        with pytest.raises(StoreError, match="it is not signed; no recording has it"):
+            again.store.find("s", "calibration", sequence)
+
+
+def test_what_an_earlier_key_signed_counts_only_where_the_configuration_names_it(
+    ended: tuple[Path, Run], data: Path, begin: Begin, tmp_path: Path
+) -> None:
+    copy = Path(shutil.copytree(data, tmp_path / "copy"))
+    refused = begin(key=OTHER)
+    assert (refused.begun_with, "signed with the key" in str(refused.faults)) == ([], True)
+    again = begin(copy, key=OTHER, earlier=[KEY.public_key().public_bytes_raw()])
+    assert (again.faults, states(again.begun_with)) == ([], states(ended[1].pipeline.all_memories()))
+    again.feed(rests(2)).stop()
+    third = begin(copy, key=OTHER)
+    assert (third.faults, bool(third.begun_with)) == ([], True), "the new key has signed the states"
+
+
+def test_an_older_file_beside_the_newer_log_of_sqlite_is_set_aside_or_refused(
+    data: Path, begin: Begin, tmp_path: Path
+) -> None:
+    older = Path(shutil.copy(data / FILE_NAME, tmp_path / "older"))
+    second = begin().feed(rests(2))
+    log = (data / f"{FILE_NAME}-wal").read_bytes()
+    second.stop()
+    shutil.copy(older, data / FILE_NAME)
+    (data / f"{FILE_NAME}-wal").write_bytes(log)
+    assert states(begin().begun_with) == states(second.pipeline.all_memories())
+
+
+def test_show_tells_what_is_refused_what_is_unsigned_and_whose_key_it_is(
+    ended: tuple[Path, Run], data: Path, tmp_path: Path
+) -> None:
+    def shown(*options: str) -> tuple[int, str]:
+        found = CliRunner().invoke(show, ["--data-dir", str(data), *options], standalone_mode=False)
+        return found.return_value, found.stdout
+
+    for name, key in (("right.pub", KEY), ("other.pub", OTHER)):
+        (tmp_path / name).write_bytes(public_pem(key))
+    status, text = shown()
+    assert (status, "signed with the key 56475aa75463474c; `fieldcal show --public-key` checks" in text) == (0, True)
+    assert "signed" not in shown("--public-key", str(tmp_path / "right.pub"))[1]
+    status, text = shown("--public-key", str(tmp_path / "other.pub"))
+    assert (status, "no calibration in force" in text, "is refused: signed with the key" in text) == (3, True, True)
+    sequence = ended[1].calibration.sequence
+    forge_result(data, sequence, sensitivity=[[3.0] * 3] * 3)
+    status, text = shown("--json", "-")
+    told = msgspec.json.decode(text)
+    assert (status, told["sensors"]["s"]["calibration"]["sensitivity"]) == (3, ended[1].calibration.sensitivity)
+    refused = f"result {sequence} is refused: its row says something else than what was signed: sensitivity"
+    assert refused in told["evidence"]
+    change(data, "DELETE FROM signed WHERE sequence = ?", sequence)
+    status, text = shown()
+    assert "results shown are not signed, though this gateway has a key" in text
+    status, text = shown("--public-key", str(tmp_path / "right.pub"))
+    assert (status, f"result {sequence} is refused: it is not signed" in text) == (3, True)
