@@ -51,21 +51,27 @@ def no_memories(_: Path, __: KnownKeys | None) -> Sequence[Memory] | None:
 class States:
     """The states at a start, those of a sensor oldest first.
 
-    `recording`, `sequence`: the highest numbers of a recording and of a result that they follow. `replayed`: how many
-    come from recordings. `faults`: what was not as the gateway signed it, and what is done instead.
+    `recording`, `sequence`: the highest numbers of a recording and of a result that they follow. `late`: the recordings
+    go on after those in the store. `replayed`: how many come from recordings. `faults`: what was not as the gateway
+    signed it, and what is done instead.
     """
 
     memories: list[Memory] = field(default_factory=list)
     recording: int = 0
     sequence: int = 0
+    late: bool = False
     replayed: int = 0
     faults: list[str] = field(default_factory=list)
 
-    def take(self, found: Sequence[Memory]) -> None:
-        """Take the states where a recording ends; those in the store that are newer stay."""
+    def take(self, found: Sequence[Memory], number: int) -> None:
+        """Take the states where the recording `number` ends; those in the store that are newer stay.
+
+        None is newer where the recording began after the states were signed, whatever the numbers of results are.
+        """
         sensors, end = {memory.sensor for memory in found}, max((memory.sequence for memory in found), default=0)
         stored = {(memory.sensor, memory.identity): memory for memory in self.memories}
-        newer = {device: memory for device, memory in stored.items() if memory.sequence > end}
+        began_after = self.recording < number
+        newer = {device: m for device, m in stored.items() if m.sequence > end and not began_after}
         others = [memory for memory in self.memories if memory.sensor not in sensors]
         taken = [newer.pop((memory.sensor, memory.identity), memory) for memory in found]
         self.replayed += sum(memory not in self.memories for memory in taken)
@@ -101,18 +107,19 @@ def states_at_start(
     files = {final_name(path): path for _, path in recordings(directory)}
     keys, end_s = key.known if key is not None else None, time.monotonic() + LONGEST_S
     if key is not None and _is_new(connection, directory, files.values()):
-        states.faults.append(f"nothing in {directory} is signed: this start takes over once what the recordings say")
+        states.faults.append(f"nothing in {directory} is signed: this start takes over once what is not signed")
         keys = None
     path = next((path for path in reversed(files.values()) if first_event(path) is not None), None)
     if path is not None:
         number, last = _reached(path, key)
-        late = states.recording < number or states.sequence < last
-        if late and not (lost or behind):
+        states.late = states.recording < number or states.sequence < last
+        if states.late and not (lost or behind):
             states.faults.append("the states of the estimation in the store are older than the newest recording")
-        if behind or lost or late:
+        if behind or lost or states.late:
             found = recall(files.pop(final_name(path)), keys)
             if found is not None:
-                states.take(found)
+                states.take(found, number)
+                states.faults[:] = [f"{fault}; {path.name} gives them instead" for fault in states.faults]
             elif key is not None:
                 states.faults.append(f"{path.name} does not give the states of the estimation where it ends")
             lost = lost or found is None
@@ -134,7 +141,7 @@ def _stored(connection: sqlite3.Connection, key: GatewayKey | None, epoch: str) 
         if not data and not memories:
             return States()
         if not data:
-            raise SignedTextError("the store has no signed list of them")
+            raise SignedTextError("no signed list names them, as in a store of an earlier version")
         listed = StateList.read(data, key.gateway, key.known)
         if listed.epoch != epoch:
             raise SignedTextError(f"they are of the epoch {listed.epoch!r:.40}, the store is of {epoch}")

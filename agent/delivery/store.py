@@ -272,6 +272,8 @@ class Store:
             recovered = Recovered() if marks["clean"] else self._recover(everything=new)
             behind = not marks["clean"] or bool(recovered.results)
             found = states_at_start(self._connection, directory, recall, self._key, self.epoch, behind=behind, lost=new)
+            if found.late and marks["clean"]:
+                recovered = self._recover(everything=False)
             recovered.memories = found.replayed
             name_latest(self._connection)
             if self._key is not None:

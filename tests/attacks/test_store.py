@@ -329,3 +329,19 @@ def test_show_tells_what_is_refused_what_is_unsigned_and_whose_key_it_is(
     assert "results shown are not signed, though this gateway has a key" in text
     status, text = shown("--public-key", str(tmp_path / "right.pub"))
     assert (status, f"result {sequence} is refused: it is not signed" in text) == (3, True)
+
+
+def test_the_store_of_an_earlier_epoch_is_older_whatever_its_numbers_are(
+    data: Path, begin: Begin, tmp_path: Path
+) -> None:
+    """A clock that was ahead gave it higher numbers than the present store has."""
+    earlier = begin(tmp_path / "earlier")
+    earlier.store._last, earlier.pipeline._next_sequence = 10**12, 10**12 + 1
+    earlier.feed(rests(5)).stop()
+    second = begin().feed(rests(2)).stop()
+    shutil.copy(tmp_path / "earlier" / FILE_NAME, data)
+    again = begin()
+    there = {sequence for (sequence,) in rows(data, "SELECT sequence FROM results")}
+    assert there >= {result.sequence for result in second.results}, "results that it lacks come from the recordings"
+    assert "older than the newest recording" in again.faults[0]
+    assert states(again.begun_with) == states(second.pipeline.all_memories())

@@ -1,4 +1,4 @@
-"""kill -9, a few times; `make faults` does it 200 times and at every write."""
+"""kill -9, a few times; `make faults` does it 200 times, at every write, and 20 times with a key."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.faults import kill
+from tests.faults import kill, states
 from tests.faults.invariants import read_store
 from tests.faults.needs import require
 from tests.faults.rig import rig, stop
@@ -40,3 +40,8 @@ def test_a_calibration_of_another_device_is_not_taken(tmp_path: Path) -> None:
         of_the_other = read_store(r.data_dir)[len(before) :]
     assert of_the_other[0].what == "status"
     assert of_the_other[0].fields["status"] == "UNCALIBRATED"
+
+
+def test_states_go_on_bit_for_bit_and_forged_ones_are_refused(tmp_path: Path) -> None:
+    outcome = states.killed(tmp_path, 2)
+    assert outcome.good, outcome
