@@ -147,7 +147,7 @@ class Event(_message.Message):
     def __init__(self, event_sequence: _Optional[int] = ..., run_start: _Optional[_Union[Event.RunStart, _Mapping]] = ..., device_change: _Optional[_Union[Event.DeviceChange, _Mapping]] = ..., gap: _Optional[_Union[Event.Gap, _Mapping]] = ..., tick: _Optional[_Union[Event.Tick, _Mapping]] = ..., command: _Optional[_Union[Event.Command, _Mapping]] = ..., pruned: _Optional[_Union[Event.Pruned, _Mapping]] = ...) -> None: ...
 
 class RawBlock(_message.Message):
-    __slots__ = ("event_sequence", "device", "boot_id", "t_utc_ns", "first_index", "nominal_rate_hz", "flags", "temperature_raw", "temperature_degc", "axes", "decimal", "burst_t_monotonic_ns", "burst_count", "x_counts", "y_counts", "z_counts", "x", "y", "z", "first_burst_t_monotonic_ns", "burst_intervals_ns", "burst_sizes", "order", "first_values", "differences", "decimal_places", "negative_zeros")
+    __slots__ = ("event_sequence", "device", "boot_id", "t_utc_ns", "first_index", "nominal_rate_hz", "flags", "temperature_raw", "temperature_degc", "axes", "decimal", "burst_t_monotonic_ns", "burst_count", "x_counts", "y_counts", "z_counts", "x", "y", "z", "first_burst_t_monotonic_ns", "burst_sizes", "order", "first_values", "differences", "decimal_places", "negative_zeros", "burst_intervals_ns")
     EVENT_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     DEVICE_FIELD_NUMBER: _ClassVar[int]
     BOOT_ID_FIELD_NUMBER: _ClassVar[int]
@@ -168,13 +168,13 @@ class RawBlock(_message.Message):
     Y_FIELD_NUMBER: _ClassVar[int]
     Z_FIELD_NUMBER: _ClassVar[int]
     FIRST_BURST_T_MONOTONIC_NS_FIELD_NUMBER: _ClassVar[int]
-    BURST_INTERVALS_NS_FIELD_NUMBER: _ClassVar[int]
     BURST_SIZES_FIELD_NUMBER: _ClassVar[int]
     ORDER_FIELD_NUMBER: _ClassVar[int]
     FIRST_VALUES_FIELD_NUMBER: _ClassVar[int]
     DIFFERENCES_FIELD_NUMBER: _ClassVar[int]
     DECIMAL_PLACES_FIELD_NUMBER: _ClassVar[int]
     NEGATIVE_ZEROS_FIELD_NUMBER: _ClassVar[int]
+    BURST_INTERVALS_NS_FIELD_NUMBER: _ClassVar[int]
     event_sequence: int
     device: str
     boot_id: str
@@ -195,17 +195,17 @@ class RawBlock(_message.Message):
     y: _containers.RepeatedScalarFieldContainer[float]
     z: _containers.RepeatedScalarFieldContainer[float]
     first_burst_t_monotonic_ns: int
-    burst_intervals_ns: _containers.RepeatedScalarFieldContainer[int]
     burst_sizes: bytes
     order: int
     first_values: _containers.RepeatedScalarFieldContainer[int]
     differences: bytes
     decimal_places: int
     negative_zeros: _containers.RepeatedScalarFieldContainer[int]
-    def __init__(self, event_sequence: _Optional[int] = ..., device: _Optional[str] = ..., boot_id: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., first_index: _Optional[int] = ..., nominal_rate_hz: _Optional[float] = ..., flags: _Optional[int] = ..., temperature_raw: _Optional[int] = ..., temperature_degc: _Optional[float] = ..., axes: _Optional[int] = ..., decimal: _Optional[bool] = ..., burst_t_monotonic_ns: _Optional[_Iterable[int]] = ..., burst_count: _Optional[_Iterable[int]] = ..., x_counts: _Optional[_Iterable[int]] = ..., y_counts: _Optional[_Iterable[int]] = ..., z_counts: _Optional[_Iterable[int]] = ..., x: _Optional[_Iterable[float]] = ..., y: _Optional[_Iterable[float]] = ..., z: _Optional[_Iterable[float]] = ..., first_burst_t_monotonic_ns: _Optional[int] = ..., burst_intervals_ns: _Optional[_Iterable[int]] = ..., burst_sizes: _Optional[bytes] = ..., order: _Optional[int] = ..., first_values: _Optional[_Iterable[int]] = ..., differences: _Optional[bytes] = ..., decimal_places: _Optional[int] = ..., negative_zeros: _Optional[_Iterable[int]] = ...) -> None: ...
+    burst_intervals_ns: bytes
+    def __init__(self, event_sequence: _Optional[int] = ..., device: _Optional[str] = ..., boot_id: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., first_index: _Optional[int] = ..., nominal_rate_hz: _Optional[float] = ..., flags: _Optional[int] = ..., temperature_raw: _Optional[int] = ..., temperature_degc: _Optional[float] = ..., axes: _Optional[int] = ..., decimal: _Optional[bool] = ..., burst_t_monotonic_ns: _Optional[_Iterable[int]] = ..., burst_count: _Optional[_Iterable[int]] = ..., x_counts: _Optional[_Iterable[int]] = ..., y_counts: _Optional[_Iterable[int]] = ..., z_counts: _Optional[_Iterable[int]] = ..., x: _Optional[_Iterable[float]] = ..., y: _Optional[_Iterable[float]] = ..., z: _Optional[_Iterable[float]] = ..., first_burst_t_monotonic_ns: _Optional[int] = ..., burst_sizes: _Optional[bytes] = ..., order: _Optional[int] = ..., first_values: _Optional[_Iterable[int]] = ..., differences: _Optional[bytes] = ..., decimal_places: _Optional[int] = ..., negative_zeros: _Optional[_Iterable[int]] = ..., burst_intervals_ns: _Optional[bytes] = ...) -> None: ...
 
 class RawBlockBytes(_message.Message):
-    __slots__ = ("event_sequence", "device", "boot_id", "t_utc_ns", "first_index", "nominal_rate_hz", "flags", "temperature_raw", "temperature_degc", "axes", "decimal", "burst_t_monotonic_ns", "burst_count", "x_counts", "y_counts", "z_counts", "x", "y", "z", "first_burst_t_monotonic_ns", "burst_intervals_ns", "burst_sizes", "order", "first_values", "differences", "decimal_places", "negative_zeros")
+    __slots__ = ("event_sequence", "device", "boot_id", "t_utc_ns", "first_index", "nominal_rate_hz", "flags", "temperature_raw", "temperature_degc", "axes", "decimal", "burst_t_monotonic_ns", "burst_count", "x_counts", "y_counts", "z_counts", "x", "y", "z", "first_burst_t_monotonic_ns", "burst_sizes", "order", "first_values", "differences", "decimal_places", "negative_zeros", "burst_intervals_ns")
     EVENT_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     DEVICE_FIELD_NUMBER: _ClassVar[int]
     BOOT_ID_FIELD_NUMBER: _ClassVar[int]
@@ -226,13 +226,13 @@ class RawBlockBytes(_message.Message):
     Y_FIELD_NUMBER: _ClassVar[int]
     Z_FIELD_NUMBER: _ClassVar[int]
     FIRST_BURST_T_MONOTONIC_NS_FIELD_NUMBER: _ClassVar[int]
-    BURST_INTERVALS_NS_FIELD_NUMBER: _ClassVar[int]
     BURST_SIZES_FIELD_NUMBER: _ClassVar[int]
     ORDER_FIELD_NUMBER: _ClassVar[int]
     FIRST_VALUES_FIELD_NUMBER: _ClassVar[int]
     DIFFERENCES_FIELD_NUMBER: _ClassVar[int]
     DECIMAL_PLACES_FIELD_NUMBER: _ClassVar[int]
     NEGATIVE_ZEROS_FIELD_NUMBER: _ClassVar[int]
+    BURST_INTERVALS_NS_FIELD_NUMBER: _ClassVar[int]
     event_sequence: int
     device: str
     boot_id: str
@@ -253,14 +253,14 @@ class RawBlockBytes(_message.Message):
     y: bytes
     z: bytes
     first_burst_t_monotonic_ns: int
-    burst_intervals_ns: bytes
     burst_sizes: bytes
     order: int
     first_values: bytes
     differences: bytes
     decimal_places: int
     negative_zeros: bytes
-    def __init__(self, event_sequence: _Optional[int] = ..., device: _Optional[str] = ..., boot_id: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., first_index: _Optional[int] = ..., nominal_rate_hz: _Optional[float] = ..., flags: _Optional[int] = ..., temperature_raw: _Optional[int] = ..., temperature_degc: _Optional[float] = ..., axes: _Optional[int] = ..., decimal: _Optional[bool] = ..., burst_t_monotonic_ns: _Optional[bytes] = ..., burst_count: _Optional[bytes] = ..., x_counts: _Optional[bytes] = ..., y_counts: _Optional[bytes] = ..., z_counts: _Optional[bytes] = ..., x: _Optional[bytes] = ..., y: _Optional[bytes] = ..., z: _Optional[bytes] = ..., first_burst_t_monotonic_ns: _Optional[int] = ..., burst_intervals_ns: _Optional[bytes] = ..., burst_sizes: _Optional[bytes] = ..., order: _Optional[int] = ..., first_values: _Optional[bytes] = ..., differences: _Optional[bytes] = ..., decimal_places: _Optional[int] = ..., negative_zeros: _Optional[bytes] = ...) -> None: ...
+    burst_intervals_ns: bytes
+    def __init__(self, event_sequence: _Optional[int] = ..., device: _Optional[str] = ..., boot_id: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., first_index: _Optional[int] = ..., nominal_rate_hz: _Optional[float] = ..., flags: _Optional[int] = ..., temperature_raw: _Optional[int] = ..., temperature_degc: _Optional[float] = ..., axes: _Optional[int] = ..., decimal: _Optional[bool] = ..., burst_t_monotonic_ns: _Optional[bytes] = ..., burst_count: _Optional[bytes] = ..., x_counts: _Optional[bytes] = ..., y_counts: _Optional[bytes] = ..., z_counts: _Optional[bytes] = ..., x: _Optional[bytes] = ..., y: _Optional[bytes] = ..., z: _Optional[bytes] = ..., first_burst_t_monotonic_ns: _Optional[int] = ..., burst_sizes: _Optional[bytes] = ..., order: _Optional[int] = ..., first_values: _Optional[bytes] = ..., differences: _Optional[bytes] = ..., decimal_places: _Optional[int] = ..., negative_zeros: _Optional[bytes] = ..., burst_intervals_ns: _Optional[bytes] = ...) -> None: ...
 
 class Window(_message.Message):
     __slots__ = ("event_sequence", "run_id", "sequence", "sensor", "t_utc_ns", "start_s", "stop_s", "position", "used", "reason", "points", "left_out", "numbers", "fault", "engine", "signature")

@@ -92,7 +92,7 @@ def _put_bursts(message: pb.RawBlockBytes, arrival: NDArray[np.int64], count: ND
     """Set the fields of the bursts; their arrivals and their sizes each in the shorter form where it can hold them."""
     intervals = arrival[1:] - arrival[:-1]
     if len(arrival) and (intervals == (small := intervals.astype(INT32))).all():
-        message.first_burst_t_monotonic_ns, message.burst_intervals_ns = arrival[0], small.tobytes()
+        message.first_burst_t_monotonic_ns, message.burst_intervals_ns = arrival[0], _transposed(small, 4)
     else:
         message.burst_t_monotonic_ns = arrival.astype(INT64, copy=False).tobytes()
     sizes = np.concatenate((count[:1], count[1:] - count[:-1]))
@@ -123,8 +123,10 @@ def _transposed(numbers: NDArray[np.int32], width: int) -> bytes:
 
 
 def _numbers(transposed: bytes, width: int) -> NDArray[Any]:
-    """The whole numbers of `width` bytes that `_transposed` gave."""
-    n = len(transposed) // width
+    """The whole numbers of `width` bytes that `_transposed` gave. Raises ValueError."""
+    n, rest = divmod(len(transposed), width)
+    if rest:
+        raise ValueError(f"{len(transposed)} bytes are no whole numbers of {width} bytes")
     data = bytearray(n * width)
     for place in range(width):
         data[place::width] = transposed[place * n : (place + 1) * n]
@@ -141,10 +143,10 @@ def _has_two(m: pb.RawBlockBytes) -> bool:
 
 
 def _arrivals(m: pb.RawBlockBytes) -> NDArray[np.int64]:
-    """The arrivals of the bursts."""
+    """The arrivals of the bursts. Raises ValueError."""
     if plain := m.burst_t_monotonic_ns:
         return np.frombuffer(plain, INT64)
-    intervals = np.frombuffer(m.burst_intervals_ns, INT32)
+    intervals = _numbers(m.burst_intervals_ns, 4)
     arrivals = np.empty(len(intervals) + 1, INT64)
     arrivals[0], arrivals[1:] = m.first_burst_t_monotonic_ns, intervals
     return np.add.accumulate(arrivals, out=arrivals)
