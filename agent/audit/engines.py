@@ -53,9 +53,9 @@ class Engines:
     def _wheels(self, start: RunStart) -> Sequence[EngineWheel | str]:
         """The trusted wheels that may have made a file; or why its own one is not run."""
         if start.engine:
-            found = find_engine(start.engine.rpartition("-")[2], self.directories, self.trusted)
+            own = find_engine(start.engine.rpartition("-")[2], self.directories, self.trusted)
             named = f"; the recording names the SHA-256 {start.engine_sha256}" if start.engine_sha256 else ""
-            return [f"{found}{named}" if isinstance(found, str) else found]
+            return [f"{own}{named}" if isinstance(own, str) else own]
         names = sorted({path.stem for directory in self.offered for path in directory.glob("*.whl")})
         found = [find_engine(name, self.offered, self.trusted) for name in names[:MOST_TRIED]]
         return [wheel for wheel in found if isinstance(wheel, EngineWheel)]
