@@ -210,7 +210,7 @@ def test_deleting_that_cannot_reach_the_limit_deletes_nothing(
     disk = Disk(directory, KeepFiles(least_free_bytes=LEAST), monkeypatch)
     assert disk.passes(60) == []
     disk.free = 400 << 20
-    assert disk.passes(3600) == []
+    assert disk.passes(1000) == []
     assert "nothing is deleted before less than 67.1 MB are free" in disk.retention.notice
     assert [record.getMessage() for record in caplog.records] == [disk.retention.notice]
     disk.free = LEAST
@@ -241,12 +241,12 @@ def test_young_recordings_go_only_where_the_agent_itself_needs_the_space(
     sizes = [path.stat().st_size for _, path in recordings(directory)]
     disk = Disk(directory, KeepFiles(least_free_bytes=LEAST, at_least_days=3.5), monkeypatch)
     disk.free = LEAST - sum(sizes[:2]) - 1  # files 1 and 2 are older than 3.5 days
-    assert disk.passes(3600) == []
-    disk.free += 1
-    assert [number for _, number in disk.passes(3600)] == [1, 2]
+    assert disk.passes(1000) == []
+    disk.free, began_s = disk.free + 1, disk.now_s  # now deleting helps, and this is said first
+    assert disk.passes(1000) == [(began_s + 31, 1), (began_s + 41, 2)]
     assert "younger" not in caplog.text
     disk.free, began_s = (64 << 20) - 1, disk.now_s
-    assert disk.passes(3600) == [(began_s + 31, 3)]
+    assert disk.passes(1000) == [(began_s + 31, 3)]
     assert "fieldcal-000003.mcap is deleted though it is younger than recording.keep_at_least_days (3.5)" in caplog.text
 
 
@@ -278,7 +278,7 @@ def test_a_quota_that_is_used_up_is_no_free_space(directory: Path, monkeypatch: 
 def test_without_a_limit_for_free_space_nothing_goes_for_it(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     disk = Disk(directory, KeepFiles(days=365.0), monkeypatch)
     disk.free = 0
-    assert disk.passes(3600) == []
+    assert disk.passes(1000) == []
 
 
 def test_where_nothing_can_be_recorded_room_is_made_and_the_next_recording_says_it(
