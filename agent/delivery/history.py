@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 from urllib.parse import quote
 
-from agent.core.memory import Memory
 from agent.delivery.record import JOINED, Record
 from agent.delivery.schema import (
     SCHEMA_VERSION,
@@ -140,16 +139,6 @@ class History:
             "SELECT max(sequence) FROM results WHERE sensor = ? AND what = 'calibration' GROUP BY identity", sensor
         )
         return {record.identity: record for (sequence,) in rows for record in self._one(sequence)}
-
-    def memories(self, sensor: str) -> dict[str, Memory]:
-        """The newest state of the estimation of each of this sensor's last devices, by identity, oldest first."""
-        rows = self._rows(
-            "SELECT sensor, identity, sequence, state, crc FROM memory WHERE sensor = ? ORDER BY sequence", sensor
-        )
-        try:
-            return {row[1]: Memory(*checked(row)) for row in rows}
-        except DamagedRow as error:
-            raise StoreError(f"{self._path}: {error}") from None
 
     def file_sequence(self) -> int:
         """The highest file number of all recordings, deleted ones included."""

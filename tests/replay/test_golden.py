@@ -108,8 +108,8 @@ def test_a_state_of_a_released_format_is_brought_up_to_date(directory: Path, tmp
     config = recorded_config(config_of(directory / RECORDING))
     (sensor,) = [channel.sensor for channel in config.channels]
     with History(store.path) as history:
-        kept = {identity: memory.state for identity, memory in history.memories(sensor).items()}
         in_force = history.in_force(sensor)
+    kept = {memory.identity: memory.state for memory in store.states if memory.sensor == sensor}
     store.close()
     assert in_force is not None
     pipeline = Pipeline.begin(config, "later", 0, store.last_sequence(), {sensor: kept})

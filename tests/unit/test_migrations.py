@@ -16,7 +16,6 @@ from agent.core.events import CalibrationUpdate, DeviceChange
 from agent.core.kept import take_up
 from agent.core.pipeline import Pipeline
 from agent.core.snapshot import VERSION, pack, unpack
-from agent.delivery.history import History
 from agent.delivery.store import Store
 from agent.recording.reading import RecordingReader
 from benchmarks.online.node import Node, Timing, node
@@ -32,8 +31,7 @@ def kept(tmp_path: Path) -> bytes:
     """What the released version 1 kept of the golden recording's sensor."""
     (tmp_path / STATE).write_bytes((FORMAT_1 / STATE).read_bytes())
     store = Store(tmp_path, 0)
-    with History(store.path) as history:
-        (memory,) = history.memories("mems").values()
+    (memory,) = (memory for memory in store.states if memory.sensor == "mems")
     store.close()
     return memory.state
 

@@ -82,8 +82,7 @@ def behind(directory: Path, results: Sequence[Result], memory: Memory) -> None:
 
 
 def kept(store: Store) -> dict[str, Memory]:
-    with History(store.path) as history:
-        return history.memories("s")
+    return {memory.identity: memory for memory in store.states if memory.sensor == "s"}
 
 
 def begun_with(state: bytes) -> list[Result]:
@@ -203,8 +202,7 @@ def test_devices_that_the_newest_file_does_not_know_are_looked_for_where_they_la
     store = Store(tmp_path, 0, recall=recall)
     with History(store.path) as history:
         calibrated = {record.recording for record in history.newest("bridge-1", "calibration", limit=9)}
-        assert [m.state for m in history.memories("bridge-1").values()] == [b"oldest"]
-        assert [m.state for m in history.memories("other").values()] == [b"newest"]
+    assert {m.sensor: m.state for m in store.states} == {"bridge-1": b"oldest", "other": b"newest"}
     store.close()
     assert calibrated == known.keys()
     assert asked == sorted(known, reverse=True)
