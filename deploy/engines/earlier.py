@@ -56,8 +56,10 @@ REVISIONS = (
     Revision(8, "7183c8541ce7", "0.2.0"),
     # Drivers state filters. The last before U contains what no band tells.
     Revision(9, "cab5d9b86642", "0.2.0"),
-    # The same results as engine 11 has without its name in them.
+    # The last before corners that drivers state are undone.
     Revision(10, "b98989ace301", "0.2.0"),
+    # The last without a name. Engine 11 gives the same results, and its name in them.
+    Revision(11, "46e5f60074dd", "0.2.0"),
 )
 
 

@@ -1,6 +1,6 @@
 """The process of an engine of before 22 November 2026, 12:00, whose modules have other places.
 
-At first every output of its pipeline is a result (until 21 November, 05:06), and no state outlives its run (until 05:42).
+At first every output of its pipeline is a result (until 21 November, 05:06), and no state outlives its run (05:42).
 
 In the wheel of such an engine this file is agent/engine/entry.py, and the entry of today is agent/engine/serving.py.
 """
