@@ -62,7 +62,7 @@ class Ran:
 
     def fault(self, use: Use, empty: Ran, recording: bool) -> str:
         """What must not be, "" where nothing is wrong."""
-        if self.status not in (0, 2, 3):
+        if self.status not in (0, 2, 3, 4):
             return f"status {self.status}"
         if b"Traceback" in self.output or b"internal fault" in self.output:
             return "a traceback"

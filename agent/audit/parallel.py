@@ -5,7 +5,10 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
+
+if TYPE_CHECKING:
+    from concurrent.futures import ProcessPoolExecutor
 
 T = TypeVar("T")
 
@@ -20,12 +23,22 @@ def for_each(work: Callable[[Path], T], paths: Sequence[Path], jobs: int) -> Ite
 
     An exception of `work` is raised here. Memory: what came out of files waits until those before them are done.
     """
-    jobs = min(jobs, len(paths))
-    if jobs < 2:
+    pool = _pool(min(jobs, len(paths)))
+    if pool is None:
         yield from map(work, paths)
         return
+    with pool:
+        yield from pool.map(work, paths)
+
+
+def _pool(jobs: int) -> ProcessPoolExecutor | None:
+    """So many processes; None where one is enough, or where the system has no semaphores (no /dev/shm)."""
+    if jobs < 2:
+        return None
     from concurrent.futures import ProcessPoolExecutor
     from multiprocessing import get_context
 
-    with ProcessPoolExecutor(jobs, mp_context=get_context("fork")) as pool:
-        yield from pool.map(work, paths)
+    try:
+        return ProcessPoolExecutor(jobs, mp_context=get_context("fork"))
+    except (OSError, ImportError, ValueError):
+        return None

@@ -17,15 +17,16 @@ from typing import Protocol, cast
 import msgspec
 
 from agent.audit.departure import Departure
-from agent.core.events import CalibrationUpdate, Event, Output, Pruned, RunStart, WindowReport
+from agent.core.events import CalibrationUpdate, Event, Output, Pruned, Result, RunStart, WindowReport
 from agent.core.memory import Memory
 from agent.engine.process import EngineError
 from agent.recording.comparison import Difference, compare
-from agent.recording.continuation import continues, left
+from agent.recording.continuation import UNKEPT_MAX, continues, left
 from agent.recording.messages import decode, encode, recorded_ones, schema_of, topic_of
 from agent.recording.reading import RecordingReader, Step
 from agent.recording.records import Fault
 
+UNRECORDED = "the results between them are in no recording, as where a disk was full"
 OTHER = "another engine made it, or it cannot be replayed here"
 LONGEST_REASON = 1000  # characters; a hostile configuration has a hundred thousand faults
 
@@ -154,15 +155,17 @@ class ReplayedFile(msgspec.Struct, kw_only=True):
 class Replayed:
     """The replay of one file, and what its neighbours are compared with.
 
-    `start`: its RunStart. `kept`: states with which it begins, where it begins a run. `next_event`, `left_sha256`,
-    `left`: number of the event after its end, SHA-256 of the state and the states for a next run there; "" and empty
-    where they are not known.
+    `start`: its RunStart. `first_result`, `last_result`: numbers of its results; 0 without any. `kept`: states with
+    which it begins, where it begins a run. `next_event`, `left_sha256`, `left`: number of the event after its end,
+    SHA-256 of the state and the states for a next run there; "" and empty where they are not known.
     """
 
     file: ReplayedFile
     calibrations: list[CalibrationUpdate] = field(default_factory=list)
     windows: list[WindowReport] = field(default_factory=list)
     start: RunStart | None = None
+    first_result: int = 0
+    last_result: int = 0
     kept: list[Memory] = field(default_factory=list)
     next_event: int = 0
     left_sha256: str = ""
@@ -260,6 +263,9 @@ class _One:
         if not step.complete and len(computed) > len(step.results):
             self._left = before
         file.results += len(computed)
+        numbers = [result.sequence for result in step.results if isinstance(result, Result)]
+        self._found.first_result = self._found.first_result or next(iter(numbers), 0)
+        self._found.last_result = max([self._found.last_result, *numbers])
         self._found.calibrations += [result for result in computed if isinstance(result, CalibrationUpdate)]
         self._found.windows += [result for result in computed if isinstance(result, WindowReport)]
         if not computed and not step.results:
@@ -298,11 +304,13 @@ def link(replayed: Sequence[Replayed]) -> tuple[list[tuple[int, str]], list[str]
             continue
         known.take(before, before.start)
         if before.start.run_id != start.run_id or not start.continuation:
-            if before.file.gateway == file.gateway and before.file.file_sequence + 1 == file.file_sequence:
-                if not (before.left_sha256 and file.by_own_engine and file.engine == before.file.engine):
-                    unproven.append(f"that {file.path} begins with the states that {before.file.path} left: {OTHER}")
-                elif fault := known.fault(after, start):
-                    faults.append((index, f"this run does not go on from {before.file.path}: {fault}"))
+            fault, open_question = known.compare(before, after, start)
+            if open_question:
+                unproven.append(
+                    f"that {file.path} begins with the states that {before.file.path} left: {open_question}"
+                )
+            elif fault:
+                faults.append((index, f"this run does not go on from {before.file.path}: {fault}"))
         elif start.event_sequence > before.next_event:
             file.notes.append(f"events {before.next_event} to {start.event_sequence - 1} are in none of these files")
         elif start.event_sequence == before.next_event and before.left_sha256 and file.by_own_engine:
@@ -323,6 +331,7 @@ class _Left:
         self._memories: list[Memory] = []
         self._sensors: set[str] = set()  # of which the states are known
         self._all = from_first
+        self._last_result = 0
 
     def take(self, replayed: Replayed, start: RunStart) -> None:
         """Take the next recording."""
@@ -330,11 +339,19 @@ class _Left:
         self._memories = left(self._memories, replayed.left, sensors)
         self._sensors = self._sensors | sensors if known else self._sensors - sensors
         self._all = self._all and known
+        self._last_result = max(self._last_result, replayed.last_result)
 
-    def fault(self, after: Replayed, start: RunStart) -> str:
-        """Why the run that begins does not begin with these states; "" where it does."""
+    def compare(self, before: Replayed, after: Replayed, start: RunStart) -> tuple[str, str]:
+        """(why the run that begins after these recordings does not begin with these states, why it cannot be said)."""
+        if before.file.gateway != after.file.gateway or before.file.file_sequence + 1 != after.file.file_sequence:
+            return "", ""  # what is between them is told by the chain
+        if not (before.left_sha256 and after.file.by_own_engine and after.file.engine == before.file.engine):
+            return "", OTHER
         sensors = _sensors(start) if self._all else _sensors(start) & self._sensors
-        return continues(self._memories, [one for one in after.kept if one.sensor in sensors], sensors)
+        fault = continues(self._memories, [one for one in after.kept if one.sensor in sensors], sensors)
+        between = after.first_result - self._last_result - 1
+        unrecorded = self._last_result and between > 0 and between != UNKEPT_MAX
+        return fault, UNRECORDED if fault and unrecorded else ""
 
 
 def _sensors(start: RunStart) -> set[str]:

@@ -35,10 +35,8 @@ from agent.delivery.schema import (
 )
 from agent.delivery.signed_states import Digests, StateList, digest_of
 from agent.delivery.states import Recall, no_memories, states_at_start
+from agent.recording.continuation import UNKEPT_MAX
 
-# After a crash, results may have been published with sequence numbers that no commit has kept. The next run therefore
-# skips so many numbers: more than a week of one result a second that the disk refused.
-UNKEPT_MAX = 1_000_000
 # Results that a failing disk refused wait in memory for the next commit; beyond this number the oldest are dropped.
 WAITING_MAX = 1000
 FAULTS_MAX = 20  # of a run that the status of the gateway names

@@ -6,6 +6,10 @@ from collections.abc import Collection, Iterable
 
 from agent.core.memory import Memory
 
+# After a crash, results may have been published with sequence numbers that no commit has kept. The next run therefore
+# skips so many numbers: more than a week of one result a second that the disk refused.
+UNKEPT_MAX = 1_000_000
+
 
 def continues(before: Iterable[Memory], kept: Iterable[Memory], sensors: Collection[str]) -> str:
     """Why a run does not begin with the states that were left for it; "" where it does.

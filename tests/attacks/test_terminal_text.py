@@ -108,7 +108,8 @@ def test_a_verdict_cannot_be_forged_by_a_line_break() -> None:
 
     replayed = ReplayedFile(path="f", notes=[HOSTILE], refused=HOSTILE)
     verdict = AuditedFile(
-        path="f", ok=False, incomplete=False, repaired=False, reasons=[HOSTILE], notes=[HOSTILE], size=1, sha256="",
+        path="f", ok=False, incomplete=False, repaired=False, reasons=[HOSTILE],
+        undecided=[HOSTILE], notes=[HOSTILE], size=1, sha256="",
         good_bytes=0, faults=[], fault_count=0, chunks=0, messages=0, replay=replayed,
     )  # fmt: skip
     for line in describe_audit(verdict):

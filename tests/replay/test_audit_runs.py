@@ -13,7 +13,7 @@ from click.testing import CliRunner
 
 from agent.cli.audit import audit
 from agent.config import recorded_config
-from agent.core.events import DeviceChange, Event, RunStart
+from agent.core.events import DeviceChange, Event, Result, RunStart
 from agent.core.pipeline import Pipeline
 from agent.core.snapshot import pack, unpack
 from agent.engine import identity
@@ -31,23 +31,29 @@ def audited(*arguments: object) -> tuple[int, dict[str, Any]]:
     return ran.return_value, json.loads(ran.stdout)
 
 
-def two_runs(directory: Path, change: Callable[[Kept], Kept], engine: str = "") -> list[Path]:
-    """Record the golden events, and a second run that begins with the states of the first one, changed."""
+def two_runs(directory: Path, change: Callable[[Kept], Kept], engine: str = "", unrecorded: int = 0) -> list[Path]:
+    """Record the golden events, and a second run that begins with the states of the first one, changed.
+
+    `unrecorded`: results between them that are in no recording.
+    """
     directory.mkdir()
     golden = start_of(PRESENT / RECORDING)
     config = recorded_config(golden.config_json)
     events = [step.event for step in RecordingReader(PRESENT / RECORDING).steps()][1:]
     recorder = Recorder(directory, [golden_site.SENSOR, golden_site.REFERENCE], [golden_site.SENSOR])
-    number = 0
+    number = last = 0
 
     def record(event: Event) -> None:
         nonlocal number
-        assert recorder.record(number, event, pipeline.step(event)), recorder.fault
+        nonlocal last
+        results = pipeline.step(event)
+        assert recorder.record(number, event, results), recorder.fault
         number += 1
+        last = max([last, *(result.sequence for result in results if isinstance(result, Result))])
 
     kept: Kept = {}
     for run, of_run in enumerate((events, [e for e in events if isinstance(e, DeviceChange)]), start=1):
-        pipeline = Pipeline.begin(config, f"run-{run}", 0, 100 * run, kept)
+        pipeline = Pipeline.begin(config, f"run-{run}", 0, last + (unrecorded if kept else 0), kept)
         number = 0
         start = msgspec.structs.replace(
             golden, run_id=f"run-{run}", snapshot=pipeline.snapshot(), file_sequence=run,
@@ -108,6 +114,13 @@ def test_states_that_another_engine_left_are_not_proven(tmp_path: Path) -> None:
     status, said = audited(*two_runs(tmp_path / "runs", scaled, engine="12-00000000deadbeef"))
     assert status == 4
     assert any("begins with the states" in line for line in said["end"]["unproven"])
+
+
+def test_results_that_no_recording_has_are_no_fault_and_are_told(tmp_path: Path) -> None:
+    """A disk was full at the end of the first run: its states are newer than its recording."""
+    status, said = audited(*two_runs(tmp_path / "runs", scaled, unrecorded=3))
+    assert status == 0
+    assert any("are in no recording" in line for line in said["end"]["unproven"])
 
 
 def test_files_on_several_cores_give_the_same(tmp_path: Path) -> None:
