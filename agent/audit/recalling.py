@@ -20,15 +20,14 @@ from agent.recording.comparison import OTHER_CPU, compare
 from agent.recording.continuation import continues
 from agent.recording.files import file_number, recordings
 from agent.recording.fingerprint import fingerprint
-from agent.recording.head import HEAD_NAME, Head
+from agent.recording.head import begins_as_signed, head_beside
 from agent.recording.integrity import Integrity, check_integrity
 from agent.recording.reading import REPAIR_METADATA, RecordingReader, first_event, open_recording
 from agent.recording.result_check import check_results
 from agent.recording.result_signing import PUBLIC_KEY
 from agent.recording.results_chain import EPOCH, FILE_METADATA
 from agent.recording.scan import metadata_of
-from agent.recording.signed_text import SignedText, SignedTextError
-from agent.recording.signing import SIGNATURE_METADATA, Statement, prefix_sha256, verify_file
+from agent.recording.signing import SIGNATURE_METADATA, Statement, verify_file
 
 if TYPE_CHECKING:
     from agent.config.known_keys import KnownKeys
@@ -102,18 +101,10 @@ def _head_covers(path: Path, start: RunStart, keys: KnownKeys) -> bool:
 
     Raises UncoveredError where they are others.
     """
-    try:
-        signed = SignedText.read(path.with_name(HEAD_NAME).read_bytes())
-        head = Head.of(signed)
-    except (OSError, SignedTextError):
-        return False
-    of_it = (f"{start.site}/{start.gateway}", file_number(path.name)) == (head.statement.gateway, head.place[0])
-    if not of_it or signed.fault_by(keys, head.statement.gateway):
-        return False
-    with open_recording(path) as file:
-        if prefix_sha256(file, head.statement.length).hex() != head.statement.sha256:
-            raise UncoveredError(f"its first {head.statement.length} bytes are not those that the gateway signed")
-    return True
+    head = head_beside(path, f"{start.site}/{start.gateway}", keys)
+    if head is not None and not begins_as_signed(path, head):
+        raise UncoveredError(f"its first {head.statement.length} bytes are not those that the gateway signed")
+    return head is not None
 
 
 def _compare_with_before(path: Path, start: RunStart, restore: Restore, keys: KnownKeys, further: int) -> None:

@@ -13,10 +13,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from agent.recording.files import file_number
+from agent.recording.reading import open_recording
 from agent.recording.signed_text import SignedText, SignedTextError, count, values_of, written
-from agent.recording.signing import Signer, Statement
+from agent.recording.signing import Signer, Statement, prefix_sha256
 
 if TYPE_CHECKING:
+    from agent.config.known_keys import KnownKeys
     from agent.recording.files import RecordingFile
 
 Tell = Callable[[bytes], None]
@@ -66,6 +69,23 @@ class Head:
         if head.text != signed.text:
             raise SignedTextError("its lines are not as this program writes them")
         return head
+
+
+def head_beside(path: Path, gateway: str, keys: KnownKeys) -> Head | None:
+    """The head in the directory of a recording that names it, signed by one of the gateway's keys; None without one."""
+    try:
+        signed = SignedText.read(path.with_name(HEAD_NAME).read_bytes())
+        head = Head.of(signed)
+    except (OSError, SignedTextError):
+        return None
+    named = (head.statement.gateway, head.place[0]) == (gateway, file_number(path.name))
+    return head if named and not signed.fault_by(keys, gateway) else None
+
+
+def begins_as_signed(path: Path, head: Head) -> bool:
+    """Whether the bytes of a recording up to its head are those that were signed. Raises OSError."""
+    with open_recording(path) as file:
+        return prefix_sha256(file, head.statement.length).hex() == head.statement.sha256
 
 
 class HeadKeeper:

@@ -20,10 +20,12 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import Attachment, DataEnd, Footer, Metadata, SummaryOffset
 
+from agent.core.events import RunStart
 from agent.recording.files import ACTIVE_SUFFIX, recordings, sync_directory
+from agent.recording.head import begins_as_signed, head_beside
 from agent.recording.integrity import check_integrity
 from agent.recording.limits import Budget
-from agent.recording.reading import REPAIR_METADATA, first_event
+from agent.recording.reading import REPAIR_METADATA, RecordingReader, first_event
 from agent.recording.records import MAGIC, Record, RecordError, parse, unpack, walk
 from agent.recording.results_chain import EPOCH, FILE_METADATA
 from agent.recording.scan import metadata_of
@@ -39,24 +41,26 @@ TAIL_MAX = 8 << 20
 _log = logging.getLogger(__name__)
 
 
-def close_torn(directory: Path, signer: Signer | None = None) -> None:
+def close_torn(directory: Path, signer: Signer | None = None, *, own: bool = False) -> None:
     """Close every `.active` file in `directory`. No process may be writing to one of them.
 
-    A file that cannot be closed stays as it is; a warning in the log names it. Raises OSError where the directory
-    cannot be read.
+    With a `signer` they are signed as far as the gateway's head shows that the gateway began them; all of them where
+    they are this process's `own`. A file that cannot be closed stays as it is; a warning in the log names it. Raises
+    OSError where the directory cannot be read.
     """
     for _, path in recordings(directory):
         if path.name.endswith(ACTIVE_SUFFIX):
             try:
-                _log.warning("%s", close_file(path, signer))
+                _log.warning("%s", close_file(path, signer, own=own))
             except (OSError, RecordError) as error:
                 _log.warning("%s was left unfinished and cannot be closed: %s", path, error)
 
 
-def close_file(path: Path, signer: Signer | None = None) -> str:
+def close_file(path: Path, signer: Signer | None = None, *, own: bool = False) -> str:
     """Close one file; return what was done, as a sentence. Raises OSError, or RecordError where data would be lost."""
     final = path.with_name(path.name.removesuffix(ACTIVE_SUFFIX))
-    sign = _signing(path, signer) if signer is not None else None
+    unsigned = uncovered(path, signer) if signer is not None and not own else ""
+    sign = _signing(path, signer) if signer is not None and not unsigned else None
     if final.exists():
         raise FileExistsError(f"{final.name} exists already")
     with open(path, "r+b") as file:
@@ -74,7 +78,24 @@ def close_file(path: Path, signer: Signer | None = None) -> str:
             _append(file, sound, size, sign)
     path.rename(final)
     sync_directory(path.parent)
-    return f"{final} was left unfinished and is closed now; the last {torn} bytes were incomplete"
+    said = f"{final} was left unfinished and is closed now; the last {torn} bytes were incomplete"
+    return f"{said}; it is not signed, and an audit with the key refuses it: {unsigned}" if unsigned else said
+
+
+def uncovered(path: Path, signer: Signer) -> str:
+    """Why nothing shows that the gateway began an open recording; "" where its signed head does. Raises OSError.
+
+    The gateway signs a head before it writes the second event, so a recording of one event needs none.
+    """
+    reader = RecordingReader(path)
+    first, second = (next(steps := reader.steps(), None), next(steps, None))
+    start = first.event if first is not None else None
+    if not isinstance(start, RunStart):
+        return "its first event cannot be read"
+    head = head_beside(path, f"{start.site}/{start.gateway}", signer.known)
+    if head is None:
+        return "no head beside it names it, so anybody may have written it" if second is not None else ""
+    return "" if begins_as_signed(path, head) else "its beginning is not the one that the gateway signed"
 
 
 @dataclass(slots=True)

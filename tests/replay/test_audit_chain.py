@@ -37,10 +37,13 @@ def write_keys(directory: Path) -> tuple[Path, Path]:
     return private, public
 
 
-def record(directory: Path, *, keep: KeepFiles | None = None, signer: Signer | None = None) -> None:
-    """Record a run of five files, with a store in the same directory and the retention limits `keep`."""
-    store = Store(directory, 0)
-    recorder = Recorder(directory, ["acc", "ref"], ["bridge-1"], keep=keep or KeepFiles(), ledger=store, signer=signer)
+def record(directory: Path, *, keep: KeepFiles | None = None, signer: Signer | None = None) -> list[bytes]:
+    """Record a run of five files, with a store beside them and the retention limits `keep`; give its heads."""
+    store, heads = Store(directory, 0), list[bytes]()
+    recorder = Recorder(
+        directory, ["acc", "ref"], ["bridge-1"], keep=keep or KeepFiles(), ledger=store, signer=signer,
+        tell_head=heads.append,
+    )  # fmt: skip
     pipeline = StandIn(CONFIG)
     number = 0
     for event in happenings(4 * FILES, seed=1):
@@ -56,6 +59,7 @@ def record(directory: Path, *, keep: KeepFiles | None = None, signer: Signer | N
         number += 1
     recorder.close()
     store.close()
+    return heads
 
 
 def names(directory: Path) -> list[int]:
@@ -189,19 +193,55 @@ def test_signatures_are_required_with_a_key(tmp_path: Path) -> None:
     assert (status, text.count("no signature in this file")) == (3, len(names(unsigned)))
 
 
+def torn(data: Path, lost: int = 3000) -> Path:
+    """The newest recording as a crash leaves it."""
+    path = recordings(data)[-1][1]
+    left = path.with_name(path.name + ".active")
+    left.write_bytes(path.read_bytes()[:-lost])
+    path.unlink()
+    return left
+
+
 def test_a_file_closed_after_a_crash_is_signed_then(tmp_path: Path) -> None:
     private, public = write_keys(tmp_path)
     data = tmp_path / "data"
     data.mkdir()
-    record(data, signer=Signer.load(private))
-    path = recordings(data)[-1][1]
-    path.with_name(path.name + ".active").write_bytes(path.read_bytes()[:-3000])
-    path.unlink()
-    (data / "head.json").unlink()  # a head is written only after the bytes that it names
+    heads = record(data, signer=Signer.load(private))
+    torn(data)
+    (data / "head.json").write_bytes(heads[-2])  # of its beginning; the last one is of the closed file
     Recorder(data, [], [], signer=Signer.load(private)).close_torn()
     status, text = said(data, keys=listed(public))
     assert status == 0, text
     assert text.count("unsealed") == 1
+
+
+def test_an_open_file_that_the_gateway_did_not_begin_is_not_signed(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Whoever writes in the directory while the agent is stopped would have its key under whatever he likes."""
+    private, public = write_keys(tmp_path)
+    data, other = tmp_path / "data", tmp_path / "other"
+    data.mkdir()
+    other.mkdir()
+    heads = record(data, signer=Signer.load(private))
+    record(other)
+    last = names(data)[-1]
+    genuine = torn(data).read_bytes()
+    forged = torn(other).read_bytes()
+    for content, head, reason in (
+        (forged, heads[-2], "its beginning is not the one that the gateway signed"),
+        (forged, heads[0], "no head beside it names it"),
+        (genuine, b"", "no head beside it names it"),
+    ):
+        (data / f"fieldcal-{last:06d}.mcap.active").write_bytes(content)
+        (data / "head.json").write_bytes(head)
+        Recorder(data, [], [], signer=Signer.load(private)).close_torn()
+        assert reason in caplog.text
+        status, text = said(data, keys=listed(public))
+        assert status == 3
+        assert "no signature in this file" in text or "unsigned data follow its signature" in text, text
+        caplog.clear()
+        (data / f"fieldcal-{last:06d}.mcap").unlink()
 
 
 def test_every_signed_byte_counts_though_the_sums_fit(tmp_path: Path) -> None:
