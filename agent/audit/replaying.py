@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Protocol, cast
@@ -155,15 +155,18 @@ class ReplayedFile(msgspec.Struct, kw_only=True):
 class Replayed:
     """The replay of one file, and what its neighbours are compared with.
 
-    `start`: its RunStart. `first_result`, `last_result`: numbers of its results; 0 without any. `kept`: states with
-    which it begins, where it begins a run. `next_event`, `left_sha256`, `left`: number of the event after its end,
-    SHA-256 of the state and the states for a next run there; "" and empty where they are not known.
+    `start`: its RunStart without the snapshot, of which `began_sha256` is the SHA-256. `first_result`, `last_result`:
+    numbers of its results; 0 without any. `kept`: states with which it begins, where it begins a run. `next_event`,
+    `left_sha256`, `left`: number of the event after its end, SHA-256 of the state and the states for a next run there;
+    "" and empty where they are not known. Of each state in `kept` and `left` only the SHA-256 is here: a state has 0.1
+    MB, and a year has thousands of files.
     """
 
     file: ReplayedFile
     calibrations: list[CalibrationUpdate] = field(default_factory=list)
     windows: list[WindowReport] = field(default_factory=list)
     start: RunStart | None = None
+    began_sha256: str = ""
     first_result: int = 0
     last_result: int = 0
     kept: list[Memory] = field(default_factory=list)
@@ -232,12 +235,17 @@ class _One:
         corrupt = file.fault is not None and file.fault.kind != "torn"
         if file.equal and not corrupt and not file.undecidable and not file.tolerance and file.by_own_engine:
             self._found.left_sha256 = hashlib.sha256(self._engine.snapshot()).hexdigest()
-            self._found.left = self._left if self._left is not None else self._engine.memories()
+            self._found.left = self._left if self._left is not None else self._digests()
         return self._found
+
+    def _digests(self) -> list[Memory]:
+        """The states with which a next run would begin, each as its SHA-256."""
+        return [replace(one, state=hashlib.sha256(one.state).digest()) for one in self._engine.memories()]
 
     def _describe(self, start: RunStart) -> None:
         file = self._file
-        self._found.start = start
+        self._found.start = msgspec.structs.replace(start, snapshot=b"")
+        self._found.began_sha256 = hashlib.sha256(start.snapshot).hexdigest()
         file.run_id, file.file_sequence, file.engine = start.run_id, start.file_sequence, start.engine
         file.gateway = f"{start.site}/{start.gateway}"
         here = self._how.here
@@ -249,10 +257,10 @@ class _One:
     def _step(self, step: Step) -> None:
         file, begins = self._file, isinstance(step.event, RunStart)
         try:
-            before = [] if step.complete or begins else self._engine.memories()
+            before = [] if step.complete or begins else self._digests()
             computed = self._engine.begin(step) if begins else self._engine.step(step)
             if begins and not cast(RunStart, step.event).continuation:
-                self._found.kept = self._engine.memories()
+                self._found.kept = self._digests()
         except EngineError:
             raise
         except Exception as error:  # a damaged or forged recording may raise any exception
@@ -314,7 +322,7 @@ def link(replayed: Sequence[Replayed]) -> tuple[list[tuple[int, str]], list[str]
         elif start.event_sequence > before.next_event:
             file.notes.append(f"events {before.next_event} to {start.event_sequence - 1} are in none of these files")
         elif start.event_sequence == before.next_event and before.left_sha256 and file.by_own_engine:
-            file.in_chain = hashlib.sha256(start.snapshot).hexdigest() == before.left_sha256
+            file.in_chain = after.began_sha256 == before.left_sha256
             if not file.in_chain:
                 differ(file, difference := _snapshot_difference(file, start))
                 faults.append((index, f"the results do not follow from the data: {difference}"))
@@ -379,6 +387,6 @@ def _snapshot_difference(file: ReplayedFile, start: RunStart) -> Difference:
         event_sequence=start.event_sequence,
         what="snapshot",
         field="state at the end of the previous file",
-        recorded=f"{len(start.snapshot)} bytes",
-        computed="other bytes",
+        recorded="its snapshot",
+        computed="another state",
     )

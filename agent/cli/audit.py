@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -32,6 +32,7 @@ from agent.terminal.text import say
 if TYPE_CHECKING:
     from agent.config.known_keys import KnownKeys
 
+FILES_NEEDED = 100  # open files of the audit itself, with its libraries
 NO_ENGINE = "which engine made these results: without signatures anybody can write the name of another one"
 
 
@@ -176,8 +177,8 @@ def _audited(
 
     replayer = Replayer(engines, fingerprint(), OTHER_CPU)
     work = partial(audit_file, replayer=replayer, trusted=engines.trusts, strict=strict, keys=keys)
-    with ExitStack() as held:  # kept open to the end, so that retention deletes none meanwhile
-        for path in given.paths:
+    with ExitStack() as held:  # kept open to the end, so that retention, which begins with the oldest, deletes none
+        for path in given.paths[: _most_open()]:
             held.enter_context(open_recording(path))
         checked = sorted(for_each(work, given.paths, jobs), key=lambda one: one.link.number)
     audited, links = [one.verdict for one in checked], [one.link for one in checked]
@@ -188,6 +189,19 @@ def _audited(
     for verdict in audited:
         conclude(verdict, strict=strict)
     return audited, links, replace(gone, unproven=(*gone.unproven, *not_linked))
+
+
+def _most_open() -> int:
+    """How many files this process can hold open, besides those that it needs."""
+    try:
+        import resource
+    except ImportError:  # no Unix
+        return 0
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with suppress(OSError, ValueError):
+        resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+        soft = hard
+    return max(0, min(soft, 1 << 20) - FILES_NEEDED)
 
 
 def describe(file: AuditedFile) -> list[str]:
