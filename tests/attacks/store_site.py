@@ -63,23 +63,34 @@ class Run:
         key: Ed25519PrivateKey | None = KEY,
         gateway: str = GATEWAY,
         earlier: Sequence[bytes] = (),
+        engine: str = "",
+        **options: Any,
     ) -> None:
+        """`options` are those of the recorder."""
         directory.mkdir(exist_ok=True)
         signer = Signer(key, earlier) if key is not None else None
         held = GatewayKey(gateway, signer) if signer is not None else None
         self.store = Store(directory, 0, recall=partial(memories_of, restore=Pipeline.restore), key=held)
         self.faults = self.store.faults
-        self.recorder = Recorder(directory, ["s"], ["s"], ledger=self.store, signer=signer, epoch=self.store.epoch)
+        self.recorder = Recorder(
+            directory, ["s"], ["s"], ledger=self.store, signer=signer, epoch=self.store.epoch, **options
+        )
         self.recorder.close_torn()
         kept: dict[str, dict[str, bytes]] = {"s": {}}
         for memory in self.store.states:
             kept.setdefault(memory.sensor, {})[memory.identity] = memory.state
-        self.run_id, self._gateway, self._event = f"run-{number}", gateway, 0
+        self.run_id, self._gateway, self._engine, self._event = f"run-{number}", gateway, engine, 0
         self.pipeline = Pipeline.begin(CONFIG, self.run_id, 0, self.store.last_sequence(), kept)
         self.begun_with = self.pipeline.all_memories()
         self.results: list[Result] = []
         self.alive = True
-        self._record(self._start(0), [])
+        self._begin_file(0)
+
+    def _begin_file(self, t_monotonic_ns: int) -> None:
+        start = self._start(t_monotonic_ns)
+        self._record(start, self.pipeline.step(start))
+        while self.recorder.pruning is not None:
+            self._record(self.recorder.pruning, self.pipeline.step(self.recorder.pruning))
 
     def _start(self, t_monotonic_ns: int) -> RunStart:
         site, _, gateway = self._gateway.partition("/")
@@ -88,6 +99,7 @@ class Run:
             t_utc_ns=EPOCH_NS + t_monotonic_ns, config_json=CONFIG.model_dump_json(), versions={},
             fingerprint=fingerprint(), snapshot=self.pipeline.snapshot(),
             file_sequence=self.recorder.next_file_sequence, event_sequence=self._event, continuation=self._event > 0,
+            engine=self._engine,
         )  # fmt: skip
 
     def _record(self, event: Event, outputs: Sequence[Any]) -> None:
@@ -113,7 +125,7 @@ class Run:
 
     def rotate(self) -> Run:
         """Begin a new file."""
-        self._record(self._start(self._event * SECOND), [])
+        self._begin_file(self._event * SECOND)
         return self
 
     def stop(self) -> Run:
