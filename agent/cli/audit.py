@@ -34,6 +34,10 @@ if TYPE_CHECKING:
 
 FILES_NEEDED = 100  # open files of the audit itself, with its libraries
 NO_ENGINE = "which engine made these results: without signatures anybody can write the name of another one"
+OPEN_AFTER_CRASH = (
+    "that the samples of {} recordings that a crash left open are as measured: until the next start only their results "
+    "and what a head names were signed"
+)
 
 
 @click.command()
@@ -140,6 +144,8 @@ def run_audit(
         end.reasons.append(f"there is no {HEAD_NAME} beside signed recordings, and none was given (--head, --witness)")
     if keys is None and audited:
         end.unproven.append(NO_ENGINE)
+    if keys is not None and (left_open := sum(file.repaired for file in audited)):
+        end.unproven.append(OPEN_AFTER_CRASH.format(left_open))
     lost = missing_after(links, given.up_to or 0)
     failed = bool(lost or end.reasons or any(file.reasons for file in audited))
     undecided = sum(bool(file.undecided) for file in audited)

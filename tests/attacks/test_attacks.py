@@ -1,8 +1,8 @@
-"""Some attacks of benchmarks/attacks.py, at one place each: the audit ends with the status that belongs to them."""
+"""Some attacks of benchmarks/attacks, at one place each: the audit ends with the status that belongs to them."""
 
 from __future__ import annotations
 
-from benchmarks.attacks import run
+from benchmarks.attacks.__main__ import run
 
 FORGED = (
     "recording renamed",

@@ -21,7 +21,7 @@ from agent.recording.head import HEAD_NAME
 from agent.recording.retention import KeepFiles
 from agent.recording.signing import Signer
 from agent.recording.writer import Recorder
-from benchmarks.attack_site import OTHER
+from benchmarks.attacks.site import OTHER
 from tests.attacks import chain_site
 from tests.attacks.chain_site import KEY, audited, known
 from tests.replay.stand_in import CONFIG, EPOCH_NS, SECOND, StandIn, happenings, run_start
@@ -244,3 +244,12 @@ def test_an_honest_directory_passes(case: str, tmp_path: Path) -> None:
     kept = [GivenHead("kept", head, elsewhere=True) for head in heads]
     status, text = audited(tmp_path / "data", heads=kept, keys=known(KEY, OTHER), strict=False)
     assert status == 0, text
+
+
+def test_what_a_recording_that_a_crash_left_open_does_not_prove_is_said(tmp_path: Path) -> None:
+    """Between a crash and the next start, who can write the directory can change samples on which no result depends."""
+    killed_while_writing(tmp_path / "killed", [])
+    two_runs(tmp_path / "ended", [])
+    said = "not proven: that the samples of 1 recordings that a crash left open are as measured"
+    assert said in audited(tmp_path / "killed", strict=False)[1]
+    assert said not in audited(tmp_path / "ended", strict=False)[1]

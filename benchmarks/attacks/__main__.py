@@ -1,11 +1,11 @@
 """Directed attacks on a signed data directory of the real pipeline: what does the audit say to each?
 
-    python -m benchmarks.attacks [--kinds WORD] [--places 10] [--seconds S] [--show] [--json -]
+    python -m benchmarks.attacks [--kinds WORD] [--places 10] [--show] [--json -]
 
-Each kind of attack is tried at ten places or in ten variants (benchmarks/attack_kinds.py). Each audit is a process of
-its own with 2 GiB of address space, with the key of the gateway and a head that was kept elsewhere; forgeries without
-signatures are audited with neither. The table gives how many audits ended with each exit status, the longest time and
-the largest memory. A kind fails where one ends with 0, with a traceback, after SECONDS or above MEMORY.
+Each kind of attack is tried at ten places or in ten variants (`kinds.py`). Each audit is a process of its own with
+2 GiB of address space, with the key of the gateway and a head that was kept elsewhere; forgeries without signatures are
+audited with neither. The table gives how many audits ended with each exit status, the longest time and the largest
+memory. An attack counts as a fault where its audit ends with 0 or a traceback, after SECONDS or above MEMORY.
 """
 
 from __future__ import annotations
@@ -24,8 +24,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from benchmarks.attack_kinds import KINDS, Kind
-from benchmarks.attack_site import Site
+os.environ["OPENBLAS_NUM_THREADS"] = "1"  # as in every entry point of the product; before numpy is loaded
+
+from benchmarks.attacks.kinds import KINDS, Kind
+from benchmarks.attacks.site import Site
 from tests.attacks.chain_site import public_pem
 
 PLACES = 10
@@ -70,7 +72,7 @@ def attack(kind: Kind, place: int, site: Site, directory: Path, kept: list[str])
     data, output = directory / "data", directory / "output"
     shutil.copytree(site.true, data)
     kind.attack(data, site, place)
-    outcome = audit([str(data), "--jobs", "1", *(kept if kind.keyed else []), *kind.options], output)
+    outcome = audit([str(data), "--jobs", "1", *(kept if kind.keyed else [])], output)
     shutil.rmtree(data)
     return *outcome, output.read_text(errors="replace")
 

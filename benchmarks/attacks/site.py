@@ -7,6 +7,7 @@ deleted the two oldest recordings by its limit; seven are left. A head was kept 
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -82,3 +83,17 @@ def record(run: Run, seed: int, begin_s: float, files: int) -> None:
         if first:
             run.rotate()
         run.feed(events[first : first + each])
+
+
+Attack = Callable[[Path, Site, int], object]  # on a copy of `true`, with a place
+
+
+def files(data: Path) -> list[Path]:
+    """The recordings of a directory."""
+    return [path for _, path in recordings(data)]
+
+
+def at(data: Path, place: int) -> Path:
+    """The recording for a place."""
+    found = files(data)
+    return found[place % len(found)]
