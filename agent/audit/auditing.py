@@ -20,6 +20,7 @@ from agent.recording.integrity import Integrity, check_integrity
 from agent.recording.pruned_ranges import LIST, PRUNED_METADATA, Deleted, from_metadata
 from agent.recording.reading import REPAIR_METADATA, open_recording
 from agent.recording.records import Fault
+from agent.recording.repair import UNSIGNED
 from agent.recording.result_check import check_results
 from agent.recording.results_chain import EPOCH, FILE_METADATA, PREVIOUS_RESULTS
 from agent.recording.signing import SIGNATURE_METADATA, Statement, signed_results, verify_file
@@ -115,6 +116,8 @@ def _verdict(path: Path, sha256: str, size: int, integrity: Integrity, replay: R
     if repair is not None:
         torn = repair.get("torn_bytes")
         notes.append(f"unsealed: left open by a crash, closed later; the last {torn} bytes, incomplete, were set aside")
+        if unsigned := repair.get(UNSIGNED):
+            notes.append(f"the gateway did not sign it then: {unsigned:.200}")
     return AuditedFile(
         path=str(path),
         ok=False,

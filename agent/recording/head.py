@@ -128,4 +128,7 @@ class HeadKeeper:
                 os.fsync(file.fileno())
             new.replace(self._path)
         except OSError as error:  # the disk may be full; the head is published nevertheless
-            _log.info("%s cannot be written: %s", self._path, error.strerror)
+            _log.warning(
+                "%s cannot be written (%s): a crash now would leave a recording that cannot be signed later",
+                self._path, error.strerror,
+            )  # fmt: skip

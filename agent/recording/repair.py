@@ -33,6 +33,7 @@ from agent.recording.signing import SIGNATURE_METADATA, Signer, Statement
 from agent.recording.summary import KINDS, DerivedSummary
 
 TAIL_ATTACHMENT = "torn"
+UNSIGNED = "unsigned"  # in the metadata of the repair: why the gateway did not sign the file then
 # Bytes. A crash damages only what was written after the last flush: one or two chunks. Where more data other than zeros
 # follow a broken record, the damage has another cause. Such a file is not closed, since data after the damage may be
 # readable.
@@ -75,7 +76,7 @@ def close_file(path: Path, signer: Signer | None = None, *, own: bool = False) -
         if check_integrity(file, size).finished:
             torn = 0  # the file is complete; only its final name is missing
         else:
-            _append(file, sound, size, sign)
+            _append(file, sound, size, sign, unsigned)
     path.rename(final)
     sync_directory(path.parent)
     said = f"{final} was left unfinished and is closed now; the last {torn} bytes were incomplete"
@@ -196,12 +197,12 @@ def _signing(path: Path, signer: Signer) -> Sign | None:
     return sign
 
 
-def _append(file: BinaryIO, sound: _Sound, size: int, sign: Sign | None) -> None:
+def _append(file: BinaryIO, sound: _Sound, size: int, sign: Sign | None, unsigned: str) -> None:
     """Write the end of the file. Where the disk has no space for it, restore the file as it was and raise OSError."""
     length = sound.length
     file.seek(length)
     tail = file.read(TAIL_MAX)
-    end = _end(sound, tail, size, sign)
+    end = _end(sound, tail, size, sign, unsigned)
     try:
         file.seek(length)
         file.write(end)
@@ -215,8 +216,8 @@ def _append(file: BinaryIO, sound: _Sound, size: int, sign: Sign | None) -> None
         raise
 
 
-def _end(sound: _Sound, tail: bytes, size: int, sign: Sign | None) -> bytes:
-    """The bytes that close the file, to be written after its intact part."""
+def _end(sound: _Sound, tail: bytes, size: int, sign: Sign | None, unsigned: str) -> bytes:
+    """The bytes that close the file, to be written after its intact part. `unsigned`: why it is not signed."""
     parts: list[bytes] = []
 
     def add(record: Any) -> None:
@@ -239,7 +240,7 @@ def _end(sound: _Sound, tail: bytes, size: int, sign: Sign | None) -> bytes:
             )
         )
     note = {"found_bytes": str(size), "kept_bytes": str(kept), "torn_bytes": str(size - kept)}
-    add(Metadata(name=REPAIR_METADATA, metadata=note))
+    add(Metadata(name=REPAIR_METADATA, metadata=note | ({UNSIGNED: unsigned} if unsigned else {})))
     if sign is not None:
         add(Metadata(name=SIGNATURE_METADATA, metadata=sign(sound)))
     return b"".join(parts) + _summary(sound)

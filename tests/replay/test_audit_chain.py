@@ -240,6 +240,7 @@ def test_an_open_file_that_the_gateway_did_not_begin_is_not_signed(
         status, text = said(data, keys=listed(public))
         assert status == 3
         assert "no signature in this file" in text or "unsigned data follow its signature" in text, text
+        assert f"the gateway did not sign it then: {reason}" in text
         caplog.clear()
         (data / f"fieldcal-{last:06d}.mcap").unlink()
 
