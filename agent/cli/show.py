@@ -92,7 +92,7 @@ def read_overview(data_dir: Path, limit: int, public_key: Path | None = None) ->
     `public_key`: only results that it signed.
     """
     from agent.config.known_keys import KnownKeys
-    from agent.delivery.evidence import evidence
+    from agent.delivery.evidence import evidence, signed_with
     from agent.recording.files import recordings
     from agent.recording.signing import load_public_key
 
@@ -112,7 +112,9 @@ def read_overview(data_dir: Path, limit: int, public_key: Path | None = None) ->
             for sensor in sorted({sensor for sensor, _ in history.channels() if sensor})
         }
         shown = [record for held in sensors.values() for record in held.records]
-        said = evidence(history, shown, data_dir, checked=keys is not None)
+        said = evidence(history, shown, data_dir)
+        if keys is None and (signers := signed_with(shown)):
+            said.append(signers)
     sizes = []
     for _, path in recordings(data_dir):
         with contextlib.suppress(FileNotFoundError):  # the agent renames a file when it closes it

@@ -69,6 +69,7 @@ class Pipeline:
         pipeline = cls(recorded_config(config_json))
         state = unpack(snapshot)
         pipeline._run_id = state["run_id"]
+        pipeline._engine = state.get("engine", "")  # earlier states have none; the next RunStart names it
         pipeline._next_sequence = state["next_sequence"]
         for channel in pipeline._channels:
             channel.load(state["channels"][channel.sensor])
@@ -79,6 +80,7 @@ class Pipeline:
         return pack(
             {
                 "run_id": self._run_id,
+                "engine": self._engine,
                 "next_sequence": self._next_sequence,
                 "channels": {channel.sensor: channel.snapshot() for channel in self._channels},
             }

@@ -14,22 +14,24 @@ from agent.recording.results_chain import FILE_METADATA
 from agent.recording.scan import metadata_of
 
 
-def evidence(history: History, shown: Iterable[Record], directory: Path, *, checked: bool) -> list[str]:
+def evidence(history: History, shown: Iterable[Record], directory: Path) -> list[str]:
     """Sentences on the results in `shown`, which `history` gave, and on those that it refused.
 
-    `directory`: the data directory. `checked`: the reader gave the gateway's key. Of a gateway that signs nothing,
-    there is nothing to say. Raises OSError.
+    `directory`: the data directory. Of a gateway that signs nothing, there is nothing to say. Raises OSError.
     """
     records = {record.sequence: record for record in shown}
-    keys = {SignedResult.read(record.signed).public_key for record in records.values() if record.signed}
     unsigned = sum(not record.signed for record in records.values())
     said = [f"result {sequence} is refused: {reason}" for sequence, reason in sorted(history.refused.items())]
-    if unsigned and (keys or _signs(directory)):
+    if unsigned and (unsigned < len(records) or _signs(directory)):
         said.append(f"{unsigned} of the {len(records)} results shown are not signed, though this gateway has a key")
-    if keys and not checked:
-        names = " and ".join(sorted(map(identifier, keys)))
-        said.append(f"signed with the key {names}; `fieldcal show --public-key` checks whether it is the gateway's")
     return said
+
+
+def signed_with(shown: Iterable[Record]) -> str:
+    """The sentence on the keys that signed results which nobody checked with the gateway's key; "" for none."""
+    keys = {SignedResult.read(record.signed).public_key for record in shown if record.signed}
+    names = " and ".join(sorted(map(identifier, keys)))
+    return f"signed with the key {names}; `--public-key` checks whether it is the gateway's" if names else ""
 
 
 def _signs(directory: Path) -> bool:

@@ -15,11 +15,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 from agent.core.memory import Memory
-from agent.engine import frames, sandbox
+from agent.engine import frames
 from agent.engine.wheel import EngineWheel
 
 # What of the environment decides with which kernels numpy computes (agent/recording/fingerprint.py).
 _PASSED_ON = ("OPENBLAS_CORETYPE", "OPENBLAS_L2_SIZE", "NPY_DISABLE_CPU_FEATURES")
+SANDBOX = str(Path(__file__).with_name("sandbox.py"))  # a program of its own, which imports what other systems lack
+NO_SANDBOX = 71  # its exit status where it cannot be made, as the program says
 _MOST_SAID = 4000  # bytes of standard error that are kept
 _END_S = 2.0  # s; a process that closes its output is about to end
 _LONGEST = 300  # characters of a text by the engine
@@ -134,7 +136,7 @@ class EngineProcess:
             "PYDANTIC_DISABLE_PLUGINS": "__all__",
             "LC_ALL": "C.UTF-8",
         }
-        command = [sys.executable, "-I", "-S", "-B", sandbox.__file__, *limits, directory, *packages]
+        command = [sys.executable, "-I", "-S", "-B", SANDBOX, *limits, directory, *packages]
         try:
             process = subprocess.Popen(
                 command, env=passed_on | own, cwd=directory, start_new_session=True,
@@ -220,7 +222,7 @@ class EngineProcess:
             while data := os.read(self._process.stderr.fileno(), 1 << 16):  # type: ignore[union-attr] # a pipe
                 self._said += data[: _MOST_SAID - len(self._said)]
         last = _text(self._said.strip().rpartition(b"\n")[2])
-        if status == sandbox.NO_SANDBOX:
+        if status == NO_SANDBOX:
             return EngineError(f"the engine {self._wheel.name} is not run, for it can have no sandbox here: {last}")
         if status == -signal.SIGSYS:
             return self._broken("it was ended when it tried to open a connection, to start a process, or the like")

@@ -125,7 +125,7 @@ def _from_directory(directory: Path, sensor: str | None) -> Material:
         seen = history.newest(chosen, "window", limit=MOST_HISTORY, run_id=_run_of(history, chosen, in_force))[::-1]
         status = next(iter(history.newest(chosen, "status", limit=1)), None)
         shown = [*kept, *seen, *(record for record in (in_force, status) if record is not None)]
-        said = evidence(history, shown, directory, checked=False)
+        said = evidence(history, shown, directory)
     windows = [_verdict(w.result) for w in seen if isinstance(w.result, WindowReport)]
     wanted = list(dict.fromkeys(w.recording for w in seen if w.fields.get("used")))
     paths, lost = _present(directory, wanted[-MOST_RECORDINGS:])

@@ -89,11 +89,11 @@ def test_how_long_the_disk_lasts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         monkeypatch.setattr(os, "statvfs", lambda _: space)
         return told(machine_checks.disk_findings(config or config_of(), options, tmp_path), "disk")
 
-    # Two devices with three axes at 200 Hz: 1200 values a second, 0.425 GB a day; 0.54 GB stay free (least_free_bytes).
-    ((verdict, says),) = disk(KEPT + 10 * 0.425e9)
+    # Two devices with three axes at 200 Hz: 1200 values a second, 0.197 GB a day; 0.54 GB stay free (least_free_bytes).
+    ((verdict, says),) = disk(KEPT + 10 * 0.197e9)
     assert verdict == "good"
     assert "fill it in 10 days" in says
-    assert disk(KEPT + 2 * 0.425e9)[0][0] == "advice"
+    assert disk(KEPT + 2 * 0.197e9)[0][0] == "advice"
     assert disk(0.5e9)[0][0] == "fault"
     for k in range(4):  # what was really recorded counts: 1 MB in 100 s, 0.864 GB a day
         path = tmp_path / f"fieldcal-{k + 1:06d}.mcap"

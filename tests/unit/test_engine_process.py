@@ -185,7 +185,7 @@ def test_engine_is_not_run_where_no_filter_can_be_installed(monkeypatch: pytest.
     broken.write_text(
         Path(sandbox.__file__).read_text().replace("_FILTER_MODE = 38, 22, 2", "_FILTER_MODE = 38, 22, 9")
     )
-    monkeypatch.setattr(sandbox, "__file__", str(broken))
+    monkeypatch.setattr("agent.engine.process.SANDBOX", str(broken))
     told = "is not run, for it can have no sandbox here: this kernel or container installs no filter"
     with pytest.raises(EngineError, match=told), EngineProcess(engine_that("")):
         pass

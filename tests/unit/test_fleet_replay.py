@@ -85,7 +85,7 @@ def test_one_bad_file_is_told_and_the_others_have_the_same_bits_with_one_and_two
     assert status == 3
     bad, *good = one["files"]
     assert bad["place"].endswith("damaged.mcap")
-    assert re.search(r"byte \d+ \(Chunk\): decompression error", bad["reasons"][0])
+    assert re.search(r"byte \d+ \(Chunk\): (decompression error|its CRC does not fit)", bad["reasons"][0])
     assert [Path(file["place"]).name for file in good] == [f"gateway-{seed}.mcap" for seed in (1, 2, 3)]
     assert all(file["results"] and not file["reasons"] for file in good)
     assert fleet_replay(recordings, "--audit", "--workers", 2, "-o", tmp_path / "two") == (status, one)

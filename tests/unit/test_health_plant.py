@@ -27,7 +27,7 @@ def store(tmp_path: Path) -> Iterator[Store]:
 
 
 def plant(data_dir: Path, store: Store, **parts: Any) -> Plant:
-    recorder = SimpleNamespace(path=data_dir / "fieldcal-000001.mcap.active", size_bytes=7, fault="")
+    recorder = SimpleNamespace(path=data_dir / "fieldcal-000001.mcap.active", size_bytes=7, fault="", space="")
     publisher = SimpleNamespace(state=lambda: SimpleNamespace(connected=True, fault="", reopened=0))
     found: dict[str, Any] = {
         "events": EventQueue(2), "writer": SimpleNamespace(waiting=3), "recorder": recorder, "publisher": publisher,
@@ -95,7 +95,7 @@ def test_without_a_file_to_be_had_it_goes_on(tmp_path: Path, store: Store) -> No
 
 
 def test_a_run_without_network_or_recording_is_told_so(tmp_path: Path, store: Store) -> None:
-    recorder = SimpleNamespace(path=None, size_bytes=0, fault="No space left on device")
+    recorder = SimpleNamespace(path=None, size_bytes=0, fault="No space left on device", space="")
     situation = plant(tmp_path, store, recorder=recorder, publisher=None).situation()
     assert (situation.recording.active, situation.recording.fault) == (False, "No space left on device")
     assert not situation.publication.enabled

@@ -103,7 +103,7 @@ def test_the_clocks_of_both_devices_are_published_as_json_and_a_late_get_brings_
     assert [(fields["device"], fields["lag_s"]) for fields in told] == [("reference", None), ("mems", 2.5e-3)]
     assert set(told[0]) == {
         "run_id", "sequence", "sensor", "t_utc_ns", "device", "role", "nominal_rate_hz", "rate_hz", "u_rate_hz",
-        "offset_s", "u_offset_s", "jitter_s", "lag_s", "u_lag_s", "arrivals", "recorded",
+        "offset_s", "u_offset_s", "jitter_s", "lag_s", "u_lag_s", "arrivals", "recorded", "engine",
     }  # fmt: skip
 
 
