@@ -15,6 +15,7 @@ import msgspec
 
 from agent.audit.departure import Departure
 from agent.audit.replaying import Replayed, ReplayedFile, Replayer
+from agent.engine import identity
 from agent.recording.chain import Link
 from agent.recording.integrity import Integrity, check_integrity
 from agent.recording.pruned_ranges import LIST, PRUNED_METADATA, Deleted, from_metadata
@@ -92,7 +93,9 @@ def audit_file(
             signature = integrity.metadata.get(SIGNATURE_METADATA)
             fault = verify_file(file, size, signature, keys, _statement(verdict, integrity))
             verdict.reasons += [fault] if fault else []
-    if replayed.file.departure is not None:
+    if _unread(replayed.file):
+        verdict.undecided.append(f"{_made_by(replayed.file)}; this program cannot read it: {replayed.file.fault}")
+    elif replayed.file.departure is not None:
         near_passes = not strict and not verdict.reasons and trusted(replayed.file.engine)
         _judge_departure(verdict, replayed.file.departure, near_passes=near_passes)
     results = check_results(path, verdict.replay.gateway, None if fault else keys)
@@ -139,14 +142,22 @@ def _verdict(path: Path, sha256: str, size: int, integrity: Integrity, replay: R
 
 def _judge_departure(verdict: AuditedFile, departure: Departure, *, near_passes: bool) -> None:
     """Say what follows where another engine than the present one made the file, and that engine did not run."""
-    replay = verdict.replay
-    made = f"made by engine {replay.engine}" if replay.engine else "made by a version that does not name its engine"
-    made += f", which is not here ({replay.engine_missing})" if replay.engine_missing else ""
+    replay, made = verdict.replay, _made_by(verdict.replay)
     if replay.refused:
         verdict.undecided.append(f"{made}; engine {replay.replayed_by} cannot replay it: {replay.refused}")
         return
     text = f"{made}; by engine {replay.replayed_by} {departure}"
     (verdict.notes if near_passes and departure.near else verdict.undecided).append(text)
+
+
+def _made_by(replay: ReplayedFile) -> str:
+    made = f"made by engine {replay.engine}" if replay.engine else "made by a version that does not name its engine"
+    return made + (f", which is not here ({replay.engine_missing})" if replay.engine_missing else "")
+
+
+def _unread(replay: ReplayedFile) -> bool:
+    """Whether another engine wrote messages that this program cannot decode: no check of its bytes has failed then."""
+    return replay.undecoded and replay.engine != identity.name()
 
 
 def _statement(verdict: AuditedFile, integrity: Integrity) -> Statement:
@@ -181,7 +192,7 @@ def _reasons(integrity: Integrity, replay: ReplayedFile) -> list[str]:
         reasons.append(f"{incomplete}{fault}")
     if integrity.fault_count > len(integrity.faults):
         reasons.append(f"{integrity.fault_count - len(integrity.faults)} more faults")
-    if replay.fault is not None and not integrity.faults:
+    if replay.fault is not None and not integrity.faults and not _unread(replay):
         reasons.append(str(replay.fault))
     if replay.refused and replay.by_own_engine:
         reasons.append(f"cannot be replayed: {replay.refused}")

@@ -126,6 +126,7 @@ class ReplayedFile(msgspec.Struct, kw_only=True):
     events: int = 0
     results: int = 0  # computed
     fault: Fault | None = None
+    undecoded: bool = False  # the fault is a message that this program cannot decode
     good_bytes: int = 0
     refused: str = ""  # why the file cannot be replayed
     different: int = 0  # events after which computed and recorded results differ
@@ -231,7 +232,7 @@ class _One:
             if not file.refused and not file.undecidable:
                 self._step(step)
             self._found.next_event = step.event_sequence + 1
-        file.fault, file.good_bytes = reader.fault, reader.good_bytes
+        file.fault, file.undecoded, file.good_bytes = reader.fault, reader.undecoded, reader.good_bytes
         corrupt = file.fault is not None and file.fault.kind != "torn"
         if file.equal and not corrupt and not file.undecidable and not file.tolerance and file.by_own_engine:
             self._found.left_sha256 = hashlib.sha256(self._engine.snapshot()).hexdigest()

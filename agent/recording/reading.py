@@ -46,7 +46,8 @@ class RecordingReader:
     """One pass over a recording. `fault` says afterwards why the pass ended early (None: it reached the footer).
 
     `good_bytes`: offset of the end of the last record that was read and understood. `repaired`: a crash left the file
-    open, so that its last results may be missing.
+    open, so that its last results may be missing. `undecoded`: the fault is a message that this program cannot decode,
+    as another version may have written it.
     """
 
     def __init__(self, path: Path) -> None:
@@ -54,6 +55,7 @@ class RecordingReader:
         self.fault: Fault | None = None
         self.good_bytes = 0
         self.repaired = False
+        self.undecoded = False
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
 
@@ -116,6 +118,7 @@ class RecordingReader:
         try:
             number, item = decode(schema.name, message.data)
         except MessageError as error:
+            self.undecoded = True
             raise refusal(record, f"{channel.topic}: {error}") from None
         if topic_of(item) != channel.topic or number & 0xFFFFFFFF != message.sequence:
             raise refusal(record, f"{channel.topic}: the message says topic {topic_of(item)} and event {number}")

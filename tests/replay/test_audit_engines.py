@@ -153,6 +153,16 @@ def test_no_forgery_passes_under_the_name_of_another_engine(engine: str, tmp_pat
     assert passed == []
 
 
+def test_what_only_another_engine_can_read_is_not_decided(tmp_path: Path) -> None:
+    """A status that this version does not have; of this version's own engine it would be a fault."""
+    newer = changed(StatusChange, status="RESTING")
+    status, said = audited(forged(tmp_path / "newer", UNKNOWN, newer))
+    assert (status, said["files"][0]["reasons"]) == (4, [])
+    assert f"made by engine {UNKNOWN}" in said["files"][0]["undecided"][0]
+    assert "this program cannot read it" in said["files"][0]["undecided"][0]
+    assert audited(forged(tmp_path / "own", identity.name(), newer))[0] == 3
+
+
 def test_near_results_pass_by_the_name_of_a_release_alone_and_are_told(tmp_path: Path) -> None:
     near = scaled(s=1 + 1e-6)
     status, said = audited(forged(tmp_path / "release", RELEASE, near))
