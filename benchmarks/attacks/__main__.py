@@ -3,9 +3,10 @@
     python -m benchmarks.attacks [--kinds WORD] [--places 10] [--show] [--json -]
 
 Each kind of attack is tried at ten places or in ten variants (`kinds.py`). Each audit is a process of its own with
-2 GiB of address space, with the key of the gateway and a head that was kept elsewhere; forgeries without signatures are
-audited with neither. The table gives how many audits ended with each exit status, the longest time and the largest
-memory. An attack counts as a fault where its audit ends with 0 or a traceback, after SECONDS or above MEMORY.
+2 GiB of address space more than it begins with, with the key of the gateway and a head that was kept elsewhere;
+forgeries without signatures are audited with neither. The table gives how many audits ended with each exit status, the
+longest time and the largest memory. An attack counts as a fault where its audit ends with 0 or a traceback, after
+SECONDS or above MEMORY.
 """
 
 from __future__ import annotations
@@ -50,12 +51,15 @@ def audit(arguments: list[str], output: Path) -> tuple[str, float, int]:
     from agent.cli.main import run_cli
 
     begin = time.monotonic()
+    space, resident = (
+        int(pages) * resource.getpagesize() for pages in Path("/proc/self/statm").read_text().split()[:2]
+    )
     if not (child := os.fork()):
         with open(output, "w") as file:
             os.dup2(file.fileno(), 1)
             os.dup2(file.fileno(), 2)
         signal.alarm(int(SECONDS))
-        resource.setrlimit(resource.RLIMIT_AS, (2 << 30, 2 << 30))
+        resource.setrlimit(resource.RLIMIT_AS, (space + (2 << 30), space + (2 << 30)))
         status = 70
         try:
             status = run_cli(["audit", *arguments])
@@ -64,7 +68,7 @@ def audit(arguments: list[str], output: Path) -> tuple[str, float, int]:
             os._exit(status)
     _, ended, used = os.wait4(child, 0)
     how = str(os.waitstatus_to_exitcode(ended)) if os.WIFEXITED(ended) else signal.Signals(os.WTERMSIG(ended)).name
-    return how, time.monotonic() - begin, used.ru_maxrss << 10
+    return how, time.monotonic() - begin, max(0, (used.ru_maxrss << 10) - resident)
 
 
 def attack(kind: Kind, place: int, site: Site, directory: Path, kept: list[str]) -> tuple[str, float, int, str]:

@@ -313,7 +313,7 @@ def test_show_tells_what_is_refused_what_is_unsigned_and_whose_key_it_is(
     for name, key in (("right.pub", KEY), ("other.pub", OTHER)):
         (tmp_path / name).write_bytes(public_pem(key))
     status, text = shown()
-    assert (status, "signed with the key 56475aa75463474c; `fieldcal show --public-key` checks" in text) == (0, True)
+    assert (status, "signed with the key 56475aa75463474c; `--public-key` checks" in text) == (0, True)
     assert "signed" not in shown("--public-key", str(tmp_path / "right.pub"))[1]
     status, text = shown("--public-key", str(tmp_path / "other.pub"))
     assert (status, "no calibration in force" in text, "is refused: signed with the key" in text) == (3, True, True)
