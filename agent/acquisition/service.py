@@ -172,7 +172,7 @@ class Service:
         )
 
     def _begin(self) -> None:
-        self._engine_sha256 = keep_engine(self._data_dir)[1]
+        self._engine_sha256 = keep_engine(self._data_dir)
         self._origin_ns = time.monotonic_ns()
         self._run_id = uuid.uuid4().hex
         self._pipeline = Pipeline.begin(

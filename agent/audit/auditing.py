@@ -24,11 +24,10 @@ from agent.recording.records import Fault
 from agent.recording.repair import UNSIGNED
 from agent.recording.result_check import check_results
 from agent.recording.results_chain import EPOCH, FILE_METADATA, PREVIOUS_RESULTS
-from agent.recording.signing import SIGNATURE_METADATA, Statement, signed_results, verify_file
+from agent.recording.signing import SIGNATURE_METADATA, signed_results, verify_file
 
 if TYPE_CHECKING:
     from agent.config.known_keys import KnownKeys
-
 
 Trusted = Callable[[str], bool]
 
@@ -91,7 +90,8 @@ def audit_file(
         fault = ""
         if keys is not None:
             signature = integrity.metadata.get(SIGNATURE_METADATA)
-            fault = verify_file(file, size, signature, keys, _statement(verdict, integrity))
+            said = integrity.statement(verdict.replay.gateway, verdict.replay.file_sequence)
+            fault = verify_file(file, size, signature, keys, said)
             verdict.reasons += [fault] if fault else []
     if _unread(replayed.file):
         verdict.undecided.append(f"{_made_by(replayed.file)}; this program cannot read it: {replayed.file.fault}")
@@ -151,20 +151,12 @@ def _judge_departure(verdict: AuditedFile, departure: Departure, *, near_passes:
 
 
 def _made_by(replay: ReplayedFile) -> str:
-    made = f"made by engine {replay.engine}" if replay.engine else "made by a version that does not name its engine"
-    return made + (f", which is not here ({replay.engine_missing})" if replay.engine_missing else "")
+    return replay.made_by + (f", which is not here ({replay.engine_missing})" if replay.engine_missing else "")
 
 
 def _unread(replay: ReplayedFile) -> bool:
     """Whether another engine wrote messages that this program cannot decode: no check of its bytes has failed then."""
     return replay.undecoded and replay.engine != identity.name()
-
-
-def _statement(verdict: AuditedFile, integrity: Integrity) -> Statement:
-    """What the signature of a file must say of it; its content is hashed when the signature is checked."""
-    origin, replay = integrity.metadata.get(FILE_METADATA, {}), verdict.replay
-    epoch, previous_sha256 = origin.get(EPOCH, ""), origin.get("previous_sha256", "")
-    return Statement(replay.gateway, epoch, replay.file_sequence, previous_sha256, integrity.results.text, 0, "")
 
 
 def _link(verdict: AuditedFile, integrity: Integrity) -> Link:
@@ -176,7 +168,6 @@ def _link(verdict: AuditedFile, integrity: Integrity) -> Link:
         file_sequence=verdict.replay.file_sequence,
         sha256=verdict.sha256,
         incomplete=verdict.incomplete,
-        repaired=verdict.repaired,
         previous_sha256=integrity.metadata.get(FILE_METADATA, {}).get("previous_sha256", ""),
         previous_results=integrity.metadata.get(FILE_METADATA, {}).get(PREVIOUS_RESULTS, ""),
         signed_results=signed_results(integrity.metadata.get(SIGNATURE_METADATA)),

@@ -46,7 +46,7 @@ class Departure(msgspec.Struct, kw_only=True):
         return self.largest_in_u <= NEAR and not self.decision and not self.other
 
     def __str__(self) -> str:
-        largest = f"S and Q differ by at most {self.largest_in_u:.2g} U"
+        largest = f"its values differ by at most {self.largest_in_u:.2g} U"
         largest += f" ({self.where})" if self.largest_in_u > NEAR else ""
         decision = f"a decision differs ({self.decision})" if self.decision else "no decision differs"
         return f"{largest}, {decision}" + (f", and another value ({self.other})" if self.other else "")

@@ -21,13 +21,13 @@ from agent.recording.continuation import continues
 from agent.recording.files import file_number, recordings
 from agent.recording.fingerprint import fingerprint
 from agent.recording.head import begins_as_signed, head_beside
-from agent.recording.integrity import Integrity, check_integrity
+from agent.recording.integrity import check_integrity
 from agent.recording.reading import REPAIR_METADATA, RecordingReader, first_event, open_recording
 from agent.recording.result_check import check_results
 from agent.recording.result_signing import PUBLIC_KEY
-from agent.recording.results_chain import EPOCH, FILE_METADATA
+from agent.recording.results_chain import FILE_METADATA
 from agent.recording.scan import metadata_of
-from agent.recording.signing import SIGNATURE_METADATA, Statement, verify_file
+from agent.recording.signing import SIGNATURE_METADATA, verify_file
 
 if TYPE_CHECKING:
     from agent.config.known_keys import KnownKeys
@@ -84,16 +84,10 @@ def _is_sealed(path: Path, keys: KnownKeys) -> bool:
         start = first_event(path)
         if start is None or start.file_sequence != file_number(path.name):
             raise UncoveredError("its first event does not name it")
-        said = _statement(start, integrity)
+        said = integrity.statement(f"{start.site}/{start.gateway}", start.file_sequence)
         if fault := verify_file(file, size, integrity.metadata.get(SIGNATURE_METADATA), keys, said):
             raise UncoveredError(fault)
     return True
-
-
-def _statement(start: RunStart, integrity: Integrity) -> Statement:
-    origin = integrity.metadata.get(FILE_METADATA, {})
-    epoch, before = origin.get(EPOCH, ""), origin.get("previous_sha256", "")
-    return Statement(f"{start.site}/{start.gateway}", epoch, start.file_sequence, before, integrity.results.text, 0, "")
 
 
 def _head_covers(path: Path, start: RunStart, keys: KnownKeys) -> bool:

@@ -151,6 +151,11 @@ class ReplayedFile(msgspec.Struct, kw_only=True):
         """Whether the engine that ran may be the one that made the file."""
         return self.departure is None
 
+    @property
+    def made_by(self) -> str:
+        """The sentence that names the engine which made the file."""
+        return f"made by engine {self.engine}" if self.engine else "made by a version that does not name its engine"
+
 
 @dataclass(slots=True)
 class Replayed:

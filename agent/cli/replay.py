@@ -125,8 +125,7 @@ def describe(file: ReplayedFile) -> list[str]:
     elif file.first_difference:
         lines.append(f"  results differ after {file.different} events, first {file.first_difference}")
     elif file.departure is not None:
-        made = f"engine {file.engine}" if file.engine else "a version that does not name its engine"
-        lines.append(f"  made by {made}; by engine {file.replayed_by} {file.departure}")
+        lines.append(f"  {file.made_by}; by engine {file.replayed_by} {file.departure}")
     elif not file.results:
         lines.append("  no results were recorded, and none were computed")
     elif file.tolerance:

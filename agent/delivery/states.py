@@ -27,8 +27,8 @@ from agent.recording.reading import first_event
 from agent.recording.result_signing import PUBLIC_KEY
 from agent.recording.results_chain import FILE_METADATA, ResultsChain
 from agent.recording.scan import metadata_of, scan
-from agent.recording.signed_text import SignedText, SignedTextError
-from agent.recording.signing import SIGNATURE_METADATA, signed_results
+from agent.recording.signed_text import SignedTextError
+from agent.recording.signing import SIGNATURE_METADATA, signed_results, signed_text
 
 if TYPE_CHECKING:
     from agent.config.known_keys import KnownKeys
@@ -158,12 +158,8 @@ def _reached(path: Path, key: GatewayKey | None) -> tuple[int, int]:
         return 0, 0
     number = file_number(path.name) or 0
     signature = metadata_of(path).get(SIGNATURE_METADATA, {})
-    try:
-        signed = SignedText(signature["text"], signature["public_key"], signature["signature"])
-    except KeyError:
-        signed = None
-    chain = signed_results(signature)
-    if signed is not None and chain is not None and f"\nrecording {number}\n" in signed.text:
+    signed, chain = signed_text(signature), signed_results(signature)
+    if chain is not None and f"\nrecording {number}\n" in signed.text:
         after = ResultsChain.of_text(chain).before
         return number, after if not signed.fault_by(key.known, key.gateway) else _last_found(path)
     return number, _last_found(path)

@@ -12,12 +12,13 @@ from agent.config.files import read_file
 from agent.engine.identity import engine_id
 from agent.engine.known import known_digests
 from agent.engine.wheel import ENGINES, LARGEST, build, file_name
+from agent.recording.files import sync_directory
 
 _log = logging.getLogger(__name__)
 
 
-def keep_engine(directory: Path) -> tuple[str, str]:
-    """Put the wheel of the running engine into a data directory, unless it is there; gives its id and its SHA-256.
+def keep_engine(directory: Path) -> str:
+    """Put the wheel of the running engine into a data directory, unless it is there; gives its SHA-256.
 
     A wheel of a release with the same id stays: it differs by comments alone. Where the wheel cannot be written, the
     log says so, and the agent goes on. The SHA-256 is "" where this Python cannot make the wheel (it has no bz2).
@@ -28,18 +29,18 @@ def keep_engine(directory: Path) -> tuple[str, str]:
         kept = read_file(path, LARGEST)
     sha256 = hashlib.sha256(kept).hexdigest()
     if sha256 in known_digests(engine_id()):
-        return engine_id(), sha256
+        return sha256
     try:
         built = build()
     except (OSError, RuntimeError) as error:
         _log.warning("the engine of this run is not kept in %s: its wheel cannot be made: %s", path.parent, error)
-        return engine_id(), ""
+        return ""
     if built != kept:
         try:
             _write(path, built)
         except OSError as error:
             _log.warning("the engine of this run is not kept: %s: %s", path, error.strerror or error)
-    return engine_id(), hashlib.sha256(built).hexdigest()
+    return hashlib.sha256(built).hexdigest()
 
 
 def _write(path: Path, data: bytes) -> None:
@@ -55,8 +56,4 @@ def _write(path: Path, data: bytes) -> None:
     except OSError:
         beside.unlink(missing_ok=True)
         raise
-    descriptor = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    sync_directory(path.parent)

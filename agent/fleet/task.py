@@ -146,7 +146,7 @@ def _reasons(file: ReplayedFile) -> list[str]:
         return [str(file.fault or "not a recording made by fieldcal")]
     reasons = [f"cannot be replayed: {file.refused}"] if file.refused else []
     if file.departure is not None and not file.departure.near:
-        reasons.append(f"made by engine {file.engine or '(not named)'}; by engine {file.replayed_by} {file.departure}")
+        reasons.append(f"{file.made_by}; by engine {file.replayed_by} {file.departure}")
     if file.first_difference is not None:
         reasons.append(f"results differ after {file.different} events, first {file.first_difference}")
     if file.fault is not None and file.fault.kind == "corrupt":

@@ -26,7 +26,6 @@ class Link:
     file_sequence: int
     sha256: str
     incomplete: bool
-    repaired: bool
     previous_sha256: str
     previous_results: str  # the chain of results at its beginning; "" in a file of an older version
     signed_results: str | None  # the chain at its end, as its signature says; None without such a signature

@@ -10,8 +10,7 @@ from agent.recording.files import file_number, recordings
 from agent.recording.reading import open_recording
 from agent.recording.results_chain import FILE_METADATA
 from agent.recording.scan import metadata_of
-from agent.recording.signed_text import SignedText
-from agent.recording.signing import SIGNATURE_METADATA
+from agent.recording.signing import SIGNATURE_METADATA, signed_text
 
 if TYPE_CHECKING:
     from agent.config.known_keys import KnownKeys
@@ -28,9 +27,7 @@ def digest_is_signed(path: Path, gateway: str, keys: KnownKeys) -> bool:
             sha256 = hashlib.file_digest(file, "sha256").hexdigest()
         metadata, number = metadata_of(following), number + 1
         if (signature := metadata.get(SIGNATURE_METADATA)) is not None:
-            signed = SignedText(
-                signature.get("text", ""), signature.get("public_key", ""), signature.get("signature", "")
-            )
+            signed = signed_text(signature)
             names_both = f"\nrecording {number}\nprevious {sha256}\n" in signed.text
             return names_both and not signed.fault_by(keys, gateway)
         if metadata.get(FILE_METADATA, {}).get("previous_sha256") != sha256:

@@ -15,7 +15,8 @@ from mcap.records import Attachment, DataEnd, Footer, MessageIndex, Metadata
 
 from agent.recording.crc_location import changed_byte
 from agent.recording.records import MAGIC, Fault, Record, RecordError, parse, record_name, refusal, walk
-from agent.recording.results_chain import ResultsChain
+from agent.recording.results_chain import EPOCH, FILE_METADATA, ResultsChain
+from agent.recording.signing import Statement
 from agent.recording.summary import KINDS, DerivedSummary
 
 FAULTS_KEPT = 20  # faults kept for one file; the others are only counted
@@ -33,6 +34,12 @@ class Integrity:
     messages: int = 0
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)  # by name; of one name, the last record
     results: ResultsChain = field(default_factory=ResultsChain)  # at the end of the file
+
+    def statement(self, gateway: str, file_sequence: int) -> Statement:
+        """What the signature of this file must say; its content is hashed when the signature is checked."""
+        origin = self.metadata.get(FILE_METADATA, {})
+        epoch, previous_sha256 = origin.get(EPOCH, ""), origin.get("previous_sha256", "")
+        return Statement(gateway, epoch, file_sequence, previous_sha256, self.results.text, 0, "")
 
     def add(self, fault: Fault) -> None:
         """Count a fault; keep it if it is among the first."""

@@ -125,6 +125,11 @@ def load_public_key(path: Path) -> Ed25519PublicKey:
     return key
 
 
+def signed_text(metadata: dict[str, str]) -> SignedText:
+    """The text, key and signature in the record of a signature; "" where the record lacks one."""
+    return SignedText(*(metadata.get(name, "") for name in ("text", "public_key", "signature")))
+
+
 def signed_results(metadata: dict[str, str] | None) -> str | None:
     """The chain of results at the end of a file, as its signature names it; None where it names none."""
     try:
@@ -185,7 +190,7 @@ def _fault_1(metadata: dict[str, str], sha256: bytes, keys: KnownKeys, gateway: 
 
 
 def _fault_2(metadata: dict[str, str], found: Statement, said: list[str], keys: KnownKeys) -> str:
-    signed = SignedText(metadata["text"], metadata.get("public_key", ""), metadata.get("signature", ""))
+    signed = signed_text(metadata)
     if fault := signed.key_fault(keys, found.gateway):
         return fault
     values = found.values

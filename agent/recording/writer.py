@@ -240,9 +240,8 @@ class Recorder:
         if free_bytes(self._directory) < 2 * LEAST_ROOM:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self._directory))
         if self._failures:
-            close_torn(
-                self._directory, self._signer, own=True
-            )  # the failed file, so that the next one can name its SHA-256
+            # The failed file is closed, so that the next one can name its SHA-256.
+            close_torn(self._directory, self._signer, own=True)
         self._repeat(self._set_aside())
         name, digest = newest(self._directory)
         if self._pruned and self._pruned[-1].last > (file_number(name) or 0):  # the newest one was deleted

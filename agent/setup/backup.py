@@ -25,14 +25,8 @@ DATA, KEYS, SUMS = "data", "keys", "SHA256SUMS"
 # The head; statements about recordings that retention deleted; pins that keep a recording. Nothing else is copied, so
 # no key that lies there, and not the counters of commands: with older counters a command could be repeated.
 _SMALL = re.compile(rf"{HEAD_NAME}|fieldcal-\d{{6,18}}\.(deleted|mcap\.lock)")
-_OWN = (
-    HEAD_NAME,
-    ENGINES,
-    LIST_NAME,
-    "fieldcal-",
-    "state.",
-    "command",
-)  # with which the names of the agent's files begin
+# With these the names of the agent's files begin.
+_OWN = (HEAD_NAME, ENGINES, LIST_NAME, "fieldcal-", "state.", "command")
 
 
 class BackupError(Exception):

@@ -38,7 +38,7 @@ MEMORY = 1 << 30  # bytes that an audit may need
 
 @dataclass
 class Outcome:
-    """What came of the audits of one kind. `passed`: the places where an audit ended with 0."""
+    """What came of the audits of one kind. `faults`: the places where an audit passed, was late or needed too much."""
 
     statuses: Counter[str] = field(default_factory=Counter)
     faults: list[str] = field(default_factory=list)

@@ -31,6 +31,9 @@ from tests.replay.forgery import Unpacked
 from tests.replay.golden_files import FORMATS, RECORDING
 from tests.unit.certificates import uneven
 
+# Exit statuses. An earlier engine made the golden recording, so `replay` cannot say whether its results are right.
+REFUSED = {"report": 2, "export": 2, "fleet replay": 3, "replay": 4}
+
 
 def changed(path: Path, change: Callable[[str, Any], None]) -> Path:
     """The golden recording, in which `change` was done to each event and block. All CRCs are right."""
@@ -176,13 +179,14 @@ def test_a_pose_that_lasts_for_ever_takes_no_time(start_s: float, stop_s: float)
         '{"channels": [{"process": {"reference_pct": "a"}, "certificate": {"calibrated": 5}}]}',
     ],
 )
-@pytest.mark.parametrize("command", ["report", "export", "fleet replay", "replay"])
+@pytest.mark.parametrize("command", REFUSED)
 def test_a_recording_whose_configuration_is_none_is_refused_in_one_line(
     command: str, text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = str(changed(tmp_path / "a.mcap", configuration(text)))
     out = {"report": "-o out", "export": "--to out.csv", "fleet replay": "--export csv -o out"}.get(command, "")
-    assert run_cli([*command.split(), path, *out.replace("out", str(tmp_path / "out")).split()]) in (2, 3, 4)
+    status = run_cli([*command.split(), path, *out.replace("out", str(tmp_path / "out")).split()])
+    assert status == REFUSED[command]
     told = capsys.readouterr()
     lines = [line for line in (told.out + told.err).splitlines() if "onfiguration" in line]
     assert len(lines) == 1
@@ -201,7 +205,7 @@ def with_a_broken_clock(snapshot: bytes) -> bytes:
 
 
 @pytest.mark.parametrize("damage", [lambda held: held + b"\0", without_channels, with_a_broken_clock])
-@pytest.mark.parametrize("command", ["report", "export", "fleet replay", "replay"])
+@pytest.mark.parametrize("command", REFUSED)
 def test_a_recording_whose_snapshot_is_damaged_is_refused_in_one_line(
     command: str, damage: Callable[[bytes], bytes], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -216,7 +220,7 @@ def test_a_recording_whose_snapshot_is_damaged_is_refused_in_one_line(
     if out.endswith(("csv", "csv -o out")) and damage is without_channels:
         assert status == 0, "an export of the file's own samples needs nothing from before the file"
         return
-    assert status in (2, 3, 4)
+    assert status == REFUSED[command]
     lines = [line for line in (told.out + told.err).splitlines() if "snapshot: " in line]
     assert len(lines) == 1
     assert re.search("snapshot: (KeyError|ValueError): ", lines[0])

@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
+import pytest
 
 os.environ["OPENBLAS_NUM_THREADS"] = "1"  # as in every entry point of the product; must be set before numpy is loaded
 
@@ -22,10 +23,12 @@ from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
 from agent.core.events import DeviceChange, Event, RunStart
 from agent.engine.identity import NUMBER
+from agent.engine.known import KnownEngine, known_engines
 from agent.recording.reading import RecordingReader
 from agent.recording.signing import Signer
 from benchmarks.online.clamp import blocks
 from benchmarks.online.runner import ticked
+from deploy.engines.earlier import NoHistoryError, build
 from hw.block import SampleBlock
 from hw.virtual.noise import Stream
 from hw.virtual.timebase import Clock
@@ -43,6 +46,15 @@ DURATION_S, SEED = 27.0, 1
 def engine_of(directory: Path) -> int:
     """The number of the engine that made a golden recording."""
     return MADE_FORMATS.get(directory.name) or int(directory.name.removeprefix("engine-"))
+
+
+def engine_wheel(directory: Path) -> tuple[KnownEngine, bytes]:
+    """The engine that made a golden recording, and its wheel. Skips the test where the history is not there."""
+    known = next(known for known in known_engines() if known.number == engine_of(directory))
+    try:
+        return known, build(known.revision, known.number, known.id)
+    except NoHistoryError as reason:
+        pytest.skip(str(reason))
 
 
 def start_of(path: Path) -> RunStart:

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -17,14 +18,14 @@ from click.testing import CliRunner
 from agent.cli.audit import audit
 from agent.core.events import CalibrationUpdate, Output, RunStart, StatusChange, WindowReport
 from agent.engine import identity
+from agent.engine.identity import ROOT, source_files
 from agent.engine.known import known_engines
-from agent.engine.wheel import file_name
+from agent.engine.wheel import PROCESS, file_name, wheel_of
 from agent.recording.reading import RecordingReader
 from agent.recording.signing import Signer
 from agent.recording.writer import Recorder
-from deploy.engines.earlier import NoHistoryError, build
 from tests.replay.forgery import with_sums
-from tests.replay.golden_files import FORMATS, GOLDEN, PRESENT, PUBLIC_KEY, RECORDING, engine_of
+from tests.replay.golden_files import FORMATS, GOLDEN, PRESENT, PUBLIC_KEY, RECORDING, engine_of, engine_wheel
 
 Forge = Callable[[Output], Output]
 UNKNOWN = "12-00000000deadbeef"
@@ -39,11 +40,7 @@ def audited(*arguments: object) -> tuple[int, dict[str, Any]]:
 
 def engines_of(directory: Path, engines: Path) -> Path:
     """A directory with the wheel of the engine that made a golden recording."""
-    known = next(known for known in known_engines() if known.number == engine_of(directory))
-    try:
-        wheel = build(known.revision, known.number, known.id)
-    except NoHistoryError as reason:
-        pytest.skip(str(reason))
+    known, wheel = engine_wheel(directory)
     (engines / file_name(known.id)).write_bytes(wheel)
     return engines
 
@@ -177,13 +174,8 @@ def test_near_results_pass_by_the_name_of_a_release_alone_and_are_told(tmp_path:
 
 def test_a_wheel_that_is_no_release_runs_where_it_is_trusted_alone(tmp_path: Path) -> None:
     """The engine of this program, whose results are forged, under another name."""
-    import hashlib
-
-    from agent.engine.identity import source_files
-    from agent.engine.wheel import PROCESS, wheel_of
-
     sources = {member: path.read_bytes() for member, path in source_files()}
-    sources |= {member: (identity.ROOT / member).read_bytes() for member in PROCESS}
+    sources |= {member: (ROOT / member).read_bytes() for member in PROCESS}
     wheel = wheel_of(12, UNKNOWN[3:], sources)
     home = tmp_path / "data"
     path = forged(home, UNKNOWN, same)

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
-from click.testing import CliRunner
 
-from agent.cli.audit import audit
 from agent.config import recorded_config
 from agent.core.events import DeviceChange, Event, Result, RunStart
 from agent.core.pipeline import Pipeline
@@ -21,14 +18,9 @@ from agent.recording.reading import RecordingReader
 from agent.recording.writer import Recorder
 from tests import golden_site
 from tests.replay.golden_files import PRESENT, RECORDING, start_of
+from tests.replay.test_audit_engines import audited
 
 Kept = dict[str, dict[str, bytes]]
-
-
-def audited(*arguments: object) -> tuple[int, dict[str, Any]]:
-    ran = CliRunner().invoke(audit, [*map(str, arguments), "--json", "-"], standalone_mode=False)
-    assert ran.exception is None, ran.exception
-    return ran.return_value, json.loads(ran.stdout)
 
 
 def two_runs(directory: Path, change: Callable[[Kept], Kept], engine: str = "", unrecorded: int = 0) -> list[Path]:

@@ -21,15 +21,13 @@ from agent.core.events import CalibrationUpdate, DeviceChange, WindowReport
 from agent.core.pipeline import Pipeline
 from agent.delivery.history import History
 from agent.delivery.store import Store
-from agent.engine.known import known_engines
 from agent.engine.process import EngineProcess, EngineResults
 from agent.engine.wheel import read_wheel
 from agent.recording.comparison import differences
 from agent.recording.fingerprint import fingerprint
 from agent.recording.messages import decode
 from agent.recording.reading import RecordingReader
-from deploy.engines.earlier import NoHistoryError, build
-from tests.replay.golden_files import FORMATS, GOLDEN, PRESENT, RECORDING, STATE, config_of, engine_of, start_of
+from tests.replay.golden_files import FORMATS, GOLDEN, PRESENT, RECORDING, STATE, config_of, engine_wheel, start_of
 
 # Relative, where the golden recording was made on another CPU: kernels of other CPUs round differently, which a number
 # that is a small difference of larger ones magnifies (6e-9 between AVX-512 and AVX2).
@@ -79,11 +77,7 @@ def computed(process: EngineProcess, path: Path) -> Iterator[tuple[str, bytes]]:
 
 @pytest.mark.parametrize("directory", EARLIER, ids=lambda path: path.name)
 def test_an_earlier_engine_gives_the_results_that_it_recorded(directory: Path) -> None:
-    engine = next(known for known in known_engines() if known.number == engine_of(directory))
-    try:
-        wheel = build(engine.revision, engine.number, engine.id)
-    except NoHistoryError as reason:
-        pytest.skip(str(reason))
+    engine, wheel = engine_wheel(directory)
     assert hashlib.sha256(wheel).hexdigest() == engine.sha256, (
         "agent/engine/known.json does not know this wheel: `python -m deploy.engines.earlier --write` adds it"
     )

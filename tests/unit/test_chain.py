@@ -28,7 +28,6 @@ def link(number: int, epoch: str = OLD, of: str = "a", deleted: tuple[Deleted, .
         file_sequence=number,
         sha256=sha256(number, of),
         incomplete=False,
-        repaired=False,
         previous_sha256=sha256(number - 1, of),
         previous_results="",
         signed_results=None,

@@ -154,7 +154,7 @@ def test_archive_that_cannot_be_made_is_told_and_leaves_nothing(
 
 
 def test_engines_of_a_data_directory_are_listed_and_not_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    _, sha256 = keep_engine(tmp_path)
+    sha256 = keep_engine(tmp_path)
     (tmp_path / ENGINES / "evil.pth").write_text(f"import os; os.mkdir({str(tmp_path / 'mark')!r})")
     (tmp_path / ENGINES / "a\x1b[2Jname.whl").mkdir()
     assert run_cli(["engines", "list", str(tmp_path)]) == 0

@@ -22,16 +22,16 @@ def kept(directory: Path) -> Path:
 
 
 def test_wheel_is_written_once_and_found_by_an_audit(tmp_path: Path) -> None:
-    engine, sha256 = keep_engine(tmp_path)
+    sha256 = keep_engine(tmp_path)
     path = kept(tmp_path)
     assert hashlib.sha256(path.read_bytes()).hexdigest() == sha256
-    found = find_engine(engine, [tmp_path / ENGINES], [sha256])
+    found = find_engine(engine_id(), [tmp_path / ENGINES], [sha256])
     assert isinstance(found, EngineWheel)
     before = path.stat()
-    assert keep_engine(tmp_path) == (engine, sha256)
+    assert keep_engine(tmp_path) == sha256
     assert (path.stat().st_ino, path.stat().st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
     path.write_bytes(path.read_bytes()[:-1])  # a power cut on a file system without order
-    assert keep_engine(tmp_path) == (engine, sha256)
+    assert keep_engine(tmp_path) == sha256
     assert path.read_bytes() == build()
     assert os.listdir(path.parent) == [path.name]
 
@@ -43,7 +43,7 @@ def test_release_with_the_same_id_stays(tmp_path: Path, monkeypatch: pytest.Monk
     path.write_bytes(b"a wheel with other comments")
     sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
     monkeypatch.setattr(known, "known_engines", lambda: (KnownEngine(1, engine_id(), sha256, "0.3.0", "abc"),))
-    assert keep_engine(tmp_path) == (engine_id(), sha256)
+    assert keep_engine(tmp_path) == sha256
     assert path.read_bytes() == b"a wheel with other comments"
 
 
@@ -52,7 +52,7 @@ def test_directory_that_cannot_be_written_is_told_and_stops_nothing(
 ) -> None:
     (tmp_path / ENGINES).write_text("")  # a file where the directory should be
     with caplog.at_level(logging.WARNING):
-        assert keep_engine(tmp_path) == (engine_id(), hashlib.sha256(build()).hexdigest())
+        assert keep_engine(tmp_path) == hashlib.sha256(build()).hexdigest()
     (line,) = caplog.messages
     assert line.startswith(f"the engine of this run is not kept: {kept(tmp_path)}: ")
 
@@ -60,7 +60,7 @@ def test_directory_that_cannot_be_written_is_told_and_stops_nothing(
         raise RuntimeError("Compression requires the (missing) bz2 module")
 
     monkeypatch.setattr(keeping, "build", without_bz2)
-    assert keep_engine(tmp_path) == (engine_id(), "")
+    assert keep_engine(tmp_path) == ""
     assert "its wheel cannot be made: Compression requires" in caplog.messages[-1]
 
 
@@ -68,7 +68,7 @@ def test_disk_that_is_full_is_left_as_it_was(tmp_path: Path, caplog: pytest.LogC
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
     try:
-        assert keep_engine(tmp_path) == (engine_id(), hashlib.sha256(build()).hexdigest())
+        assert keep_engine(tmp_path) == hashlib.sha256(build()).hexdigest()
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert "is not kept" in caplog.text

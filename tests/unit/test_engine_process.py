@@ -148,6 +148,7 @@ def test_thread_of_an_engine_is_allowed() -> None:
     ("does", "limits", "told"),
     [
         ("while True: pass", Limits(step_s=0.5), "it took more than 0.5 s for one event"),
+        # This engine takes no processor time, so that only the clock of this process can end it.
         ("import time; time.sleep(60)", Limits(whole_s=1.0), "it took more than 1 s in all"),
         ("while True: os.write(1, b'x' * 100)", Limits(step_s=5.0), "it breaks the format"),
         (
