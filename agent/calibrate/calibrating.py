@@ -17,7 +17,7 @@ from agent.calibrate.stated import FILES, options_of
 from agent.calibrate.station import by_metadata, compared, pose_of_station
 from agent.calibrate.tables import ReferenceFile, SensorFile, read_reference, read_sensor
 from agent.reading.formats import NOT_DESCRIBED, Description
-from agent.reading.source import Progress
+from agent.reading.source import Progress, TableError
 from agent.reading.units import Sensitivity, sensitivity_of
 from agent.terminal.text import for_drawing, say
 from calib.recorded import calibrating
@@ -40,7 +40,7 @@ def calibrated(params: dict[str, Any]) -> Outcome:
         options_of(params | dict.fromkeys(FILES)).check(**given)  # before any file is read
     options = options_of(params)
     sensor, reference = _read(params)
-    options, read = _stated(params["poses"], sensor, reference, options)
+    options, read = _stated(params["poses"], sensor, reference, options, params.get("date_order"))
     with as_table_error(read.line):
         outcome = calibrating.calibrated(sensor, reference, read.poses, options)
     if not sensor.components or options.method != 3 or options.plain or outcome.more.get("frame") == "free":
@@ -67,7 +67,11 @@ def tables_of(
 
 
 def _stated(
-    poses: Path | None, sensor: SensorFile, reference: ReferenceFile | None, options: Options
+    poses: Path | None,
+    sensor: SensorFile,
+    reference: ReferenceFile | None,
+    options: Options,
+    date_order: str | None = None,
 ) -> tuple[Options, PosesFile]:
     """The options and the poses, with what the metadata of a station say. Raises TableError."""
     stated = by_metadata(options, sensor.components, reference.components if reference is not None else ())
@@ -76,7 +80,7 @@ def _stated(
         values = pose_of_station(sensor.components, reference.components, stated)
         row = PoseRow(*ends_s(reference.time_s), values)
         return stated, PosesFile.of_metadata(Poses("the metadata", [row]))
-    return stated, PosesFile(poses)
+    return stated, PosesFile(poses, date_order)
 
 
 def _with_filters(options: Options, sensor: SensorFile, reference: ReferenceFile | None) -> Options:
@@ -131,12 +135,14 @@ def _read(params: dict[str, Any]) -> tuple[SensorFile, ReferenceFile | None]:
         described = _description(params, "sensor_metadata")
         sensor = sensor_of(params["sensor"], params.get("columns"), bar, described)
         stated = (params.get("reference_columns"), params.get("sensitivity"))
+        if sensor.restart and (params["reference"] or params["poses"]):
+            raise TableError(f"{sensor.restart}; a reference or poses need one clock: cut the file there")
         described = _description(params, "reference_metadata")
         return sensor, reference_of(params["reference"], *stated, bar, described) if params["reference"] else None
 
 
 def _description(params: dict[str, Any], metadata: str) -> Description:
-    return Description(params.get(metadata), params.get("mapping"))
+    return Description(params.get(metadata), params.get("mapping"), params.get("date_order"))
 
 
 def sensor_of(

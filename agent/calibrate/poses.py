@@ -20,11 +20,11 @@ class PosesFile:
     Raises TableError.
     """
 
-    def __init__(self, path: Path | None) -> None:
+    def __init__(self, path: Path | None, date_order: str | None = None) -> None:
         self.poses: Poses | None = None
         self._lines: list[int] = []
         if path is not None:
-            self._read(path)
+            self._read(path, date_order or "")
 
     @classmethod
     def of_metadata(cls, poses: Poses) -> PosesFile:
@@ -33,8 +33,8 @@ class PosesFile:
         found.poses = poses
         return found
 
-    def _read(self, path: Path) -> None:
-        dialect = dialect_of(path)
+    def _read(self, path: Path, date_order: str) -> None:
+        dialect = dialect_of(path, date_order)
         lines = [(number, dialect.fields(line)) for number, line in lines_of(path, dialect)]
         header = dialect.header
         _require(path, dialect, SPAN)

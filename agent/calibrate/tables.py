@@ -15,6 +15,7 @@ from agent.reading.ground_motion import GroundMotion
 from agent.reading.source import Array, Progress, Source, TableError
 from agent.reading.spool import Spool, Spooled
 from agent.reading.stationxml import Component
+from agent.reading.times import Times
 from agent.reading.units import Sensitivity, unit_of
 from calib.recorded.table import (
     REFERENCES,
@@ -24,7 +25,6 @@ from calib.recorded.table import (
     check_count,
     check_time,
     make_whole,
-    second_of,
 )
 
 TEMPERATURE = "temperature_degc"
@@ -34,10 +34,12 @@ ELECTRICAL = ("indication", "count")
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorFile(SensorTable):
     """The samples of a sensor's file. `components`: what the metadata of a station say of the three outputs; empty
-    where there are none. `filters`: the known filters that its driver states in a recording of `fieldcal run`."""
+    where there are none. `filters`: the known filters that its driver states in a recording of `fieldcal run`.
+    `restart`: where its time begins anew, "" where it does not: then it has the clock of no other file."""
 
     components: tuple[Component, ...] = ()
     filters: tuple[str, ...] = ()
+    restart: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,20 +60,20 @@ def read_sensor(
     with open_source(path, described, "sensor") as source:
         choice = Choice(source, columns, "--columns")
         chosen = choice.in_one_group(_sensor_columns)
-        times, values = _rows(source, chosen, progress, np.ones(len(chosen) - 1))
+        times, values, restart = _rows(source, chosen, progress, np.ones(len(chosen) - 1))
         said, components = _described(source, choice, chosen[1:4])
         filters = source.filters.get(chosen[1].column.group, ())
     temperature_degc = Spooled(values, 3) if len(chosen) > 4 else None
-    return SensorFile(str(path), times, Spooled(values, slice(0, 3)), temperature_degc, said, components, filters)
+    v = Spooled(values, slice(0, 3))
+    return SensorFile(str(path), times, v, temperature_degc, said, components, filters, restart)
 
 
 def _described(
     source: Source, choice: Choice, chosen: Sequence[Chosen]
 ) -> tuple[tuple[str, ...], tuple[Component, ...]]:
     """What the user is told, and what the metadata of a station say of the chosen channels."""
-    if not isinstance(source, GroundMotion):
-        return tuple(choice.said), ()
-    return (*source.said, *choice.said), tuple(source.components[c.column] for c in chosen)
+    components = tuple(source.components[c.column] for c in chosen) if isinstance(source, GroundMotion) else ()
+    return (*source.said, *choice.said), components
 
 
 def _sensor_columns(choice: Choice) -> list[Chosen]:
@@ -112,7 +114,9 @@ def read_reference(
         choice = Choice(source, columns, "--reference-columns")
         chosen, quantity = choice.in_one_group(lambda choice: _reference_columns(choice, sensitivity))
         scale = np.array([_si(choice, c, sensitivity) for c in chosen[1:]])
-        times, values = _rows(source, chosen, progress, scale)
+        times, values, restart = _rows(source, chosen, progress, scale)
+        if restart:
+            raise TableError(f"{restart}; a reference needs one clock: cut the file there")
         said, components = _described(source, choice, chosen[1:])
         filters = source.filters.get(chosen[1].column.group, ())
     column, header = str(chosen[1].column), source.header
@@ -175,26 +179,25 @@ def _si(choice: Choice, chosen: Chosen, sensitivity: Sensitivity | None) -> floa
     return (1.0 if unit is None else unit.si) * sensitivity.per / sensitivity.value
 
 
-def _rows(source: Source, chosen: Sequence[Chosen], progress: Progress | None, scale: Array) -> tuple[Spooled, Spool]:
+def _rows(
+    source: Source, chosen: Sequence[Chosen], progress: Progress | None, scale: Array
+) -> tuple[Spooled, Spool, str]:
     """The first of the chosen columns (n,), n >= 2, which are times in s, and the others (n, k) times `scale`; on disk.
 
-    Where one of the channels (columns 1 to 3) has no value, the others have none either.
+    Where one of the channels (columns 1 to 3) has no value, the others have none either. A row without a time is left
+    out. The third is the place where the time begins anew, "" where it does not.
     """
-    whole, time_unit = 0, unit_of(chosen[0].unit) if chosen[0].unit else None
-    if time_unit is not None and time_unit.quantity != "time":
-        raise TableError(f"{source.path}, {source.header}: column {str(chosen[0].column)!r} is in {chosen[0].unit}, "
-                         "which is no unit of time")  # fmt: skip
-    second = None if time_unit is None else time_unit.si
+    whole, clock = 0, Times(source, chosen[0])
     place, names = str(source.path), [c.column.name for c in chosen]
     times, values = Spool(1), Spool(len(chosen) - 1)
-    with as_table_error(source.place):
-        for rows in source.pieces([c.column for c in chosen], progress):
-            if second is None and len(rows):
-                second = second_of(float(rows[0, 0]))
+    with as_table_error(clock.place):
+        for piece in source.pieces([c.column for c in chosen], progress):
+            rows = clock.timed(piece)
             make_whole(rows, names, place, values.rows)
-            times.append(rows[:, :1] * (1.0 if second is None else second))
+            times.append(clock.seconds(rows[:, 0])[:, None])
             values.append(rows[:, 1:] * scale)
             whole += int(np.isfinite(rows[:, 1]).sum())
         check_count(whole, place)
         check_time(time_s := Spooled(times, 0), names[0], place)
-    return time_s, values
+    source.said = (*source.said, *clock.said())
+    return time_s, values, clock.restart

@@ -14,6 +14,7 @@ from agent.calibrate.origin import origin
 from agent.calibrate.printing import print_outcome
 from agent.calibrate.station import differences, write_proposed
 from agent.cli.finite import Finite
+from agent.reading.dates import ORDERS
 from agent.reading.source import TableError
 from agent.terminal.text import say
 from calib.recorded.options import CHOICES, DEFAULTS, GRAVITY_MPS2
@@ -44,6 +45,7 @@ def _u(name: str, told: str) -> Callable[[Any], Any]:
     "--reference-columns", metavar="time=NAME,x=NAME,...", help="Columns of the reference; a unit as x=NAME:mg."
 )
 @click.option("--sensitivity", metavar="'100 mV/g'", help="Of a reference whose file has mV or counts.")
+@click.option("--date-order", type=click.Choice(ORDERS), help="Order of day, month and year in dates as 03/04/2026.")
 @click.option("--mapping", type=_FILE, metavar="FILE", help="Fields of topics in recordings of ROS 2, in TOML.")
 @click.option("--sensor-metadata", type=_FILE, metavar="FILE", help="StationXML of a sensor in MiniSEED.")
 @click.option("--reference-metadata", type=_FILE, metavar="FILE", help="StationXML of a reference in MiniSEED.")

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
 
 from agent.calibrate.calibrating import as_arguments, by_driver, reference_of, sensor_of
 from agent.calibrate.tables import TEMPERATURE
+from agent.reading.dates import ORDERS
 from agent.reading.formats import Description
 from agent.reading.source import ROWS_AT_ONCE, TableError
 from agent.terminal.text import say
@@ -27,9 +29,10 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
 )  # fmt: skip
 @click.option("--columns", metavar="time=NAME,x=NAME,...", help="Columns to take; a unit as x=NAME:mg.")
 @click.option("--sensitivity", metavar="'100 mV/g'", help="Of a reference whose file has mV or counts.")
+@click.option("--date-order", type=click.Choice(ORDERS), help="Order of day, month and year in dates as 03/04/2026.")
 @click.option("--mapping", type=_FILE, metavar="FILE", help="Fields of topics in a recording of ROS 2, in TOML.")
 @click.option("--metadata", type=_FILE, metavar="FILE", help="StationXML of a file in MiniSEED.")
-def convert(file: Path, output: Path, role: str, columns: str | None, sensitivity: str | None, **beside: Path) -> int:
+def convert(file: Path, output: Path, role: str, columns: str | None, sensitivity: str | None, **beside: Any) -> int:
     """Write the samples of FILE as plain CSV: time_s,vx,vy,vz of a sensor; time_s,a of a reference, or ax,ay,az, v, d.
 
     Exit status 0 if it is written, 2 on bad input.

@@ -165,26 +165,27 @@ def quantity_of(chosen: Chosen) -> str | None:
     unit = unit_of(chosen.unit) if chosen.unit else None
     if unit is not None and unit.quantity in QUANTITY_WORDS:
         return unit.quantity
-    words = set(_words(split(chosen.column.name)[0]))
-    return next((quantity for quantity, known in QUANTITY_WORDS.items() if words & known), None)
+    told = set(words(split(chosen.column.name)[0]))
+    return next((quantity for quantity, known in QUANTITY_WORDS.items() if told & known), None)
 
 
 def _unit(column: Column) -> str:
     return column.unit or split(column.name)[1]
 
 
-def _words(name: str) -> list[str]:
+def words(name: str) -> list[str]:
+    """The words and numbers of a column's name, in lower case."""
     return re.findall(r"[a-z]+|\d+", re.sub(r"([a-z])([A-Z])", r"\1 \2", name).lower())
 
 
 def _role(column: Column) -> str:
-    words = _words(split(column.name)[0])
-    if TIME_WORDS & set(words):
+    told = words(split(column.name)[0])
+    if TIME_WORDS & set(told):
         return "time"
-    if TEMPERATURE_WORDS & set(words):
+    if TEMPERATURE_WORDS & set(told):
         return "temperature"
-    if not words or any(_OTHER_AXES.match(word) for word in words):
+    if not told or any(_OTHER_AXES.match(word) for word in told):
         return ""
-    if found := _AXIS.fullmatch(words[-1]) or (words[0] in AXES and _AXIS.fullmatch(words[0])):
+    if found := _AXIS.fullmatch(told[-1]) or (told[0] in AXES and _AXIS.fullmatch(told[0])):
         return found[1]
     return ""

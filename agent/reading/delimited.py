@@ -6,84 +6,193 @@ read one by one, and the first fault is told with its place.
 
 from __future__ import annotations
 
-import codecs
 import contextlib
 import io
 import itertools
 import re
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
-from agent.reading.dialect import LARGEST, MISSING, Dialect, dialect_of, lines_of, seconds_of
+from agent.reading.choice import words
+from agent.reading.dates import UnclearError, day_of, offset_in, order_of, seconds_of
+from agent.reading.dialect import (
+    COUNTERS,
+    LARGEST,
+    MISSING,
+    SAMPLE_ROWS,
+    Dialect,
+    MixedMarksError,
+    Part,
+    dialect_of_text,
+    lines_of,
+    names_time,
+    separates_thousands,
+)
+from agent.reading.lines import blocks, text_of
 from agent.reading.source import Array, Column, Progress, Source, TableError
 
-CHUNK_BYTES = 1 << 23
 BLOCK_BYTES = 1 << 20  # pyarrow parses blocks of a chunk on all cores
-LONGEST_LINE = 1 << 20
 NEWLINE = ord("\n")
+COUNTED = "time_s"  # the column of times that are counted from the rate in the head
+_NO_ROW = re.compile(rb"(?m)^[ \t]*(?:(?:#|%|//).*|.*\0.*)\n")
+_NO_ROW_SEMICOLON = re.compile(rb"(?m)^[ \t]*(?:(?:#|%|//|;).*|.*\0.*)\n")
+_FORTRAN = re.compile(rb"(?<=[\d.])[dD](?=[+-]?\d)")
 
 
 class Delimited(Source):
-    """A text file with a table. Raises TableError."""
+    """A text file with a table. `date_order`: of day, month and year, where it is stated. Raises TableError."""
 
-    def __init__(self, path: Path) -> None:
-        self.path, self.dialect = path, dialect_of(path)
+    def __init__(self, path: Path, date_order: str = "") -> None:
+        self.path = path
+        self._text = text_of(path)
+        self.dialect = dialect_of_text(self._text, date_order)
         names = self.dialect.header
         self.header = f"line {self.dialect.header_line}"
         named = [name for name in names if name]
         if len(set(named)) < len(named):
             raise TableError(f"{path}, {self.header}: a column is there twice, remove one: {','.join(names)!r}")
-        dates = self.dialect.dates
-        self.columns = tuple(
-            Column(name, "s" if dates[k] else self.dialect.units[k]) for k, name in enumerate(names) if name
-        )
+        self._parts = {Column(part.name, part.unit): part for part in self.dialect.parts}
+        self._count_rows()
+        self.columns = tuple(self._parts)
         self._parse = _arrow_parser() or _numpy
+        self._lost = 0
+        if self._text.unended:
+            self._say(
+                f"{path}: the last line, {self._text.unended!r:.70}, has no end and may be cut off; it is left out"
+            )
+        elif self._text.zeros:
+            self._say(f"{path}: bytes 0 stand behind the last line, as after a power cut; they are left out")
+
+    def _say(self, told: str) -> None:
+        self.said = (*self.said, told)
+
+    def _count_rows(self) -> None:
+        """Where the head states a rate, and no column is a time: a column of times from the count of the samples."""
+        parts, rate_hz = self._parts, self.dialect.rate_hz
+        self.rate_hz = rate_hz
+        unnamed = all(column.name.isdigit() for column in parts) and len(parts) > 3
+        if rate_hz is None or unnamed or any(p.unit == "s" or names_time(p.name) for p in parts.values()):
+            return
+        counter = next((part for part in parts.values() if COUNTERS & set(words(part.name) or [part.name])), None)
+        self._parts = {
+            Column(COUNTED): replace(counter, name=COUNTED) if counter else Part(COUNTED, "", (), ()),
+            **parts,
+        }
+        self.counted = COUNTED
+        what = f"column {counter.name!r}, which counts the samples" if counter else "the number of the row"
+        self._say(f"{self.path}: no column is a time; it is {what}, over the {rate_hz:g} Hz that the head states")
 
     def pieces(self, columns: Sequence[Column], progress: Progress | None) -> Iterator[Array]:
         """Yield the rows of these columns. Raises TableError for the first line that is wrong."""
-        places = [self.dialect.header.index(column.name) for column in columns]
-        line = 1
-        with self.path.open("rb") as file:
-            for text in _whole_lines(self.path, file, self.dialect, progress):
-                lines = int(np.count_nonzero(np.frombuffer(text, np.uint8) == NEWLINE))
-                skip = self.dialect.first_line - line
-                line += lines
-                if skip >= lines:
-                    continue
-                begin = 0
-                for _ in range(skip):
-                    begin = text.index(b"\n", begin) + 1
-                text = text[begin:]
-                if not text.isspace():
-                    yield self._rows(max(line - lines, self.dialect.first_line), text, places)
+        parts = [self._parts[column] for column in columns]
+        places = sorted({place for part in parts for place in part.places})
+        dialect = self._judged(places)
+        line, row = 1, 0
+        for text, last in _with_last(blocks(self._text, progress)):
+            lines = int(np.count_nonzero(np.frombuffer(text, np.uint8) == NEWLINE))
+            skip = dialect.first_line - line
+            line += lines
+            if skip >= lines:
+                continue
+            begin = 0
+            for _ in range(skip):
+                begin = text.index(b"\n", begin) + 1
+            text = text[begin:]
+            if not text.isspace():
+                rows = self._rows(dialect, max(line - lines, dialect.first_line), text, places, last)
+                yield np.column_stack([_sum(part, rows, places, row) for part in parts])
+                row += len(rows)
+        if self._lost:
+            self._say(f"{self.path}: lines that are cut off or have bytes 0: {self._lost}; they are left out")
 
     def place(self, row: int) -> str:
         """The line that holds row `row`."""
         numbers = (number for number, _ in lines_of(self.path, self.dialect))
         return f"line {next(itertools.islice(numbers, row, None), self.dialect.first_line + row)}"
 
-    def _rows(self, line: int, text: bytes, places: Sequence[int]) -> Array:
+    def _judged(self, places: Sequence[int]) -> Dialect:
+        """The dialect of these columns: their decimal mark, and the order of their dates. Raises TableError."""
+        dialect = self.dialect
+        commas = tuple(comma if k in places else "" for k, comma in enumerate(dialect.commas))
+        sample = [dialect.fields(line) for _, line in itertools.islice(lines_of(self.path, dialect), SAMPLE_ROWS)]
+        cells = [row[k] for row in sample for k in places if len(row) > k]
+        if any(commas) and separates_thousands(cells):
+            comma = next(filter(None, commas))
+            raise TableError(
+                f"{self.path}, line {dialect.first_line}: in {comma!r} the comma may be a decimal mark, or separate "
+                f"thousands; write {comma.replace(',', '.')} or {comma.replace(',', '')}"
+            )
+        dialect = replace(dialect, commas=commas)
+        if dialect.comma:
+            self._say(f"{self.path}: the comma is taken as the decimal mark, as in {dialect.comma!r}")
+        dated = [k for k in places if dialect.moments[k] in ("day", "both")]
+        return replace(dialect, order=self._order(dialect, dated[0])) if dated else dialect
+
+    def _order(self, dialect: Dialect, column: int) -> str:
+        """The order of the dates in a column, by all its lines where the first ones leave it open."""
+        order = dialect.order
+        if not order:
+            fields = (dialect.fields(line) for _, line in lines_of(self.path, dialect))
+            order = order_of(day_of(row[column]) for row in fields if len(row) > column)
+        first = next((dialect.fields(line)[column] for _, line in lines_of(self.path, dialect)), "")
+        if order and day_of(first) and not day_of(first)[:4].isdigit():
+            with contextlib.suppress(UnclearError):
+                day = np.datetime64(int(seconds_of([day_of(first)], order)[0]), "s").astype("datetime64[D]")
+                self._say(f"{self.path}: the date {day_of(first)!r} is taken as {day}")
+        return order
+
+    def _rows(self, dialect: Dialect, line: int, text: bytes, places: Sequence[int], last: bool) -> Array:
+        if not places:
+            return np.empty((sum(dialect.is_row(t) for t in text.decode("latin-1").split("\n")), 0))
         with contextlib.suppress(ValueError):
-            rows = self._parse(text, self.dialect, places)
+            rows = self._parse(_rows_alone(text, dialect), dialect, places)
             least, most = np.fmin.reduce(rows, axis=None), np.fmax.reduce(rows, axis=None)
             if not (least < -LARGEST or most > LARGEST):
+                self._lost += sum(b"\0" in told for told in text.split(b"\n")) if b"\0" in text else 0
                 return rows
-        return self._one_by_one(line, text, places)
+        return self._one_by_one(dialect, line, text, places, last)
 
-    def _one_by_one(self, line: int, text: bytes, places: Sequence[int]) -> Array:
-        dialect = self.dialect
+    def _one_by_one(self, dialect: Dialect, line: int, text: bytes, places: Sequence[int], last: bool) -> Array:
         encoding = "utf-8" if dialect.encoding.startswith("utf") else dialect.encoding
-        told = text.decode(encoding, "replace").split("\n")
+        told = [(n, content) for n, content in enumerate(text.decode(encoding, "replace").split("\n"), start=line)]
+        self._lost += sum("\0" in content for _, content in told)
+        told = [(n, content) for n, content in told if dialect.is_row(content)]
+        if told and last and len(dialect.fields(told[-1][1])) < len(dialect.header):
+            self._lost += 1
+            told.pop()
         parsed = []
-        for number, content in enumerate(told, start=line):
-            if not content.strip() or content.lstrip().startswith("#"):
-                continue
+        for number, content in told:
             fields = fields_of(self.path, number, dialect.fields(content), dialect.header)
             parsed.append([number_of(self.path, number, dialect, k, fields[k]) for k in places])
         return np.array(parsed).reshape(-1, len(places))
+
+
+def _sum(part: Part, rows: Array, places: Sequence[int], first: int) -> Array:
+    """The values of a column: the sum of its fields; without fields the number of the row."""
+    if not part.places:
+        return np.arange(first, first + len(rows), dtype=float)
+    fields = [rows[:, places.index(place)] * per for place, per in zip(part.places, part.per, strict=True)]
+    return np.asarray(sum(fields[1:], start=fields[0]))
+
+
+def _with_last(items: Iterator[bytes]) -> Iterator[tuple[bytes, bool]]:
+    """Each item, and whether it is the last one."""
+    held = next(items, None)
+    while held is not None:
+        following = next(items, None)
+        yield held, following is None
+        held = following
+
+
+def _rows_alone(text: bytes, dialect: Dialect) -> bytes:
+    """The lines without comments and without those that have bytes 0, with exponents that all programs read."""
+    if any(mark in text for mark in (b"#", b"%", b"//", b"\0")) or (dialect.delimiter != ";" and b";" in text):
+        text = (_NO_ROW if dialect.delimiter == ";" else _NO_ROW_SEMICOLON).sub(b"", text)
+    return _FORTRAN.sub(b"e", text) if dialect.fortran else text
 
 
 def fields_of(path: Path, line: int, fields: list[str], header: Sequence[str]) -> list[str]:
@@ -99,7 +208,9 @@ def number_of(path: Path, line: int, dialect: Dialect, column: int, text: str) -
     """A number that is not larger than LARGEST, or NaN where it is missing. Raises TableError."""
     where = f"{path}, line {line}, column {dialect.header[column]}"
     try:
-        value = dialect.number(text)
+        value = dialect.number(text, column)
+    except (UnclearError, MixedMarksError) as error:
+        raise TableError(f"{where}: {error}") from None
     except ValueError:
         value = np.inf
     if np.isinf(value):
@@ -109,30 +220,12 @@ def number_of(path: Path, line: int, dialect: Dialect, column: int, text: str) -
     return value
 
 
-def _whole_lines(path: Path, file: IO[bytes], dialect: Dialect, progress: Progress | None) -> Iterator[bytes]:
-    """Yield whole lines as ASCII-compatible bytes, each ended by one newline, from the first line of the file."""
-    decode = codecs.getincrementaldecoder("utf-16")("replace").decode if dialect.encoding == "utf-16" else None
-    rest = b""
-    while data := file.read(CHUNK_BYTES):
-        if progress is not None:
-            progress(len(data))
-        data = decode(data).encode() if decode else data.removeprefix(codecs.BOM_UTF8)
-        cut = data.rfind(b"\n") + 1
-        if cut:
-            yield b"".join((rest, memoryview(data)[:cut])).replace(b"\r", b"")
-            rest = data[cut:]
-        elif len(rest := rest + data) > LONGEST_LINE:
-            raise TableError(f"{path}, line 1: the line is longer than {LONGEST_LINE} bytes; is the file text?")
-    if rest.strip():
-        yield rest.replace(b"\r", b"") + b"\n"
-
-
 def _numpy(text: bytes, dialect: Dialect, places: Sequence[int]) -> Array:
     """The columns at `places` by numpy. Raises ValueError if anything is no plain number."""
-    if any(dialect.dates[k] for k in places) and dialect.delimiter != " ":
-        return _with_dates(text, dialect, places)
-    if dialect.decimal_comma:
-        if dialect.delimiter == ",":
+    if any(dialect.moments[k] for k in places):
+        return _with_moments(text, dialect, places)
+    if dialect.comma:
+        if dialect.delimiter == "," or b"." in text:
             raise ValueError
         text = text.replace(b",", b".")
     delimiter = None if dialect.delimiter == " " else dialect.delimiter
@@ -144,16 +237,21 @@ def _numpy(text: bytes, dialect: Dialect, places: Sequence[int]) -> Array:
     return rows
 
 
-def _with_dates(text: bytes, dialect: Dialect, places: Sequence[int]) -> Array:
-    """The same with dates in some of the columns."""
+def _with_moments(text: bytes, dialect: Dialect, places: Sequence[int]) -> Array:
+    """The same with dates or times of day in some of the columns."""
     fields = [dialect.fields(line) for line in text.decode("latin-1").split("\n") if line.strip()]
     if any(len(row) != len(dialect.header) for row in fields):
         raise ValueError
     columns = []
     for k in places:
         column = [row[k] for row in fields]
-        columns.append(seconds_of(column) if dialect.dates[k] else np.array([dialect.number(f) for f in column]))
+        moment = bool(dialect.moments[k])
+        columns.append(_seconds(column, dialect, k) if moment else np.array([dialect.number(f, k) for f in column]))
     return np.column_stack(columns)
+
+
+def _seconds(texts: Sequence[str], dialect: Dialect, column: int) -> Array:
+    return seconds_of(texts, dialect.order, offset_in(dialect.header[column]))
 
 
 def _arrow_parser() -> Any:
@@ -173,7 +271,7 @@ def _arrow_parser() -> Any:
         own = pa.BufferOutputStream()
         own.write(text)
         names = [str(k) for k in range(len(dialect.header))]
-        kinds = {names[k]: pa.string() if dialect.dates[k] else pa.float64() for k in places}
+        kinds = {names[k]: pa.string() if dialect.moments[k] else pa.float64() for k in places}
         try:
             table = csv.read_csv(
                 pa.BufferReader(own.getvalue()),
@@ -181,16 +279,16 @@ def _arrow_parser() -> Any:
                 csv.ParseOptions(delimiter=dialect.delimiter),
                 csv.ConvertOptions(
                     column_types=kinds, include_columns=[names[k] for k in places], null_values=missing,
-                    decimal_point="," if dialect.decimal_comma else ".",
+                    decimal_point="," if dialect.comma else ".",
                 ),
             )  # fmt: skip
         except pa.ArrowInvalid as error:
             raise ValueError from error
-        return np.column_stack([_values(table.column(names[k]).combine_chunks()) for k in places])
+        return np.column_stack([_values(table.column(names[k]).combine_chunks(), dialect, k) for k in places])
 
-    def _values(column: Any) -> Array:
+    def _values(column: Any, dialect: Dialect, k: int) -> Array:
         if pa.types.is_string(column.type):
-            return seconds_of(column.to_pylist())
+            return _seconds(column.to_pylist(), dialect, k)
         return np.asarray(np.from_dlpack(column.fill_null(np.nan) if column.null_count else column))
 
     return parse

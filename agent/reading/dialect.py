@@ -1,58 +1,130 @@
-"""How a text file writes its table: encoding, delimiter, decimal mark, comment lines, header and row of units."""
+"""How a text file writes its table: delimiter, decimal mark, comment lines, header, units, dates, and the rate."""
 
 from __future__ import annotations
 
-import codecs
 import csv
 import itertools
 import math
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
-from agent.reading.source import Array, TableError
+from agent.reading.choice import TIME_WORDS, words
+from agent.reading.dates import day_of, has_clock, has_day, is_moment, offset_in, order_in, order_of, seconds_of
+from agent.reading.lines import Text, text_of
+from agent.reading.source import TableError
 from agent.reading.units import unit_of
 
-HEAD_BYTES = 1 << 16  # the table must begin in these
 SAMPLE_ROWS = 50  # rows from which the dialect is found
 LARGEST = 1e19  # no indication and no time in ns since 1970 is larger, and its squares and their sums stay finite
-COMMENTS = ("#", "%", "//")
+COMMENTS = ("#", "%", "//")  # and ";" where it is no delimiter
 DELIMITERS = (";", "\t", ",", "|", " ")  # in this order: numbers may contain a comma, dates a blank
-MISSING = frozenset(("", "nan", "-nan", "na", "n/a", "#n/a", "null", "none"))
-_DATE = re.compile(
-    r"(?P<date>(?:19|20)\d\d[-/]\d\d[-/]\d\d)[T ](?P<time>\d\d:\d\d(?::\d\d(?:[.,]\d{1,9})?)?)\s?"
-    r"(?P<zone>Z|UTC|[+-]\d\d:?\d\d)?"
+NO_NUMBERS = frozenset(("nan", "-nan", "na", "n/a", "#n/a", "null", "none"))
+# Cells of loggers where a value is missing or was outside the range.
+MISSING = NO_NUMBERS | {
+    "", "-", "--", "---", "----", "-----", "over", "+over", "-over", "ol", "+ol", "-ol", "overrange", "overload",
+    "#n/v", "no data", "nodata", "burnout", "+++++++", "-------", "+++++", "*****", "******",
+}  # fmt: skip
+COMMENT_COLUMNS = frozenset(("comment", "comments", "note", "notes", "event", "events", "marker", "annotation"))
+# Rows below the names that are none: units and kinds of values, as TOA5 and others have them.
+SECOND_ROWS = frozenset(
+    ("ts", "rn", "smp", "avg", "min", "max", "std", "tot", "cal", "raw", "uncal", "date", "time", "no unit", "unitless")
 )
+COUNTERS = frozenset(("counter", "packetcounter", "count", "index", "sample", "samples", "record", "scan", "no", "n"))
+THOUSANDTHS = frozenset(("ms", "msec", "msecs", "millis", "millisecond", "milliseconds"))
+_FORTRAN = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)[dD][+-]?\d+")
+_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(?:,\d{3})+")
+_GROUPED = re.compile(r"[+-]?\d{1,3}(?:,\d{3})+(?:\.\d+)?")
+_VALUE = r"[^\d\n]{0,30}?(?P<value>\d+(?:[.,]\d+)?(?:[eE][-+]?\d+)?)[;,\t ]*(?:[A-Za-z\xb5/]+)?"
+_RATE = re.compile(
+    r"(?:(?:sampl\w*|scan|update|data|output|measurement|acquisition|logging|recording)[\s_]*(?:rate|freq\w*)"
+    rf"|\b(?:rate|freq|frequency|fs|odr|at)\b){_VALUE}",
+    re.IGNORECASE,
+)
+_INTERVAL = re.compile(rf"(?:\binterval|sampl\w+ (?:period|time)|\bdelta_x\b|\bdt\b){_VALUE}", re.IGNORECASE)
+_HERTZ = {"hz": 1.0, "khz": 1e3, "sps": 1.0, "s/s": 1.0}
+_SECONDS = re.compile(r"(?<![a-z])(?:[mun\xb5]s|s|m?sec)(?![a-z])", re.IGNORECASE)
+
+
+class MixedMarksError(ValueError):
+    """A number whose comma or point may separate thousands. The message says what to do."""
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """A column of the table: its name and unit, and the places of the fields whose sum it is.
+
+    A date and a time of day in two columns are one, and so are a time of day and its ms. `per`: what one unit of each
+    field is in that of the column.
+    """
+
+    name: str
+    unit: str
+    places: tuple[int, ...]
+    per: tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Dialect:
-    """How a file writes its table. `first_line`: number of the first line of data. `units`: of each column, or ""."""
+    """How a file writes its table.
+
+    `first_line`: number of the first line of data. `units`: of each column, or "". `moments`: what the cells of each
+    column are: "day", "clock", "both", or "" for numbers. `commas`: the first number with a comma in each column, or
+    "". `order`: of day, month and year, "" where it is not known. `rate_hz`: as the head states it.
+    `fortran`: whether exponents have a D. `before`: the lines
+    before the data.
+    """
 
     encoding: str
     delimiter: str
-    decimal_comma: bool
+    commas: tuple[str, ...]
     header: tuple[str, ...]
     header_line: int
     units: tuple[str, ...]
     first_line: int
-    dates: tuple[bool, ...] = ()  # which columns hold dates
+    moments: tuple[str, ...]
+    parts: tuple[Part, ...]
+    order: str = ""
+    rate_hz: float | None = None
+    fortran: bool = False
+    before: frozenset[str] = frozenset()
+
+    @property
+    def comma(self) -> str:
+        """The first number with a decimal comma, "" where a point is the decimal mark."""
+        return next((comma for comma in self.commas if comma), "")
 
     def fields(self, line: str) -> list[str]:
         """The fields of a line, without the blanks around them."""
         return _fields(line, self.delimiter)
 
-    def number(self, text: str) -> float:
-        """A number, a date in s since 1970, or NaN for a value that is missing. Raises ValueError."""
+    def is_row(self, line: str) -> bool:
+        """Whether a line after the head is data: no comment, no head that is repeated, and without bytes 0."""
+        return _is_data(line, self.delimiter) and "\0" not in line and line.strip() not in self.before
+
+    def number(self, text: str, column: int) -> float:
+        """A number, a date in s since 1970, a time of day in s, or NaN for a value that is missing.
+
+        Raises ValueError; UnclearError and MixedMarksError say what to do.
+        """
         plain = text.strip()
         if plain.lower() in MISSING:
             return math.nan
-        if _DATE.fullmatch(plain):
-            return float(seconds_of([plain])[0])
-        return float(plain.replace(",", ".") if self.decimal_comma else plain)
+        if is_moment(plain):
+            return float(seconds_of([plain], self.order, offset_in(self.header[column]))[0])
+        if self.comma and "." in plain and _is_value(plain):
+            raise MixedMarksError(
+                f"{plain!r} has a point, and {self.comma!r} a comma; write the numbers without separators of thousands"
+            )
+        if not self.comma and _GROUPED.fullmatch(plain):
+            raise MixedMarksError(
+                f"{plain!r} has a comma, and other numbers have none; write the numbers without separators of thousands"
+            )
+        if _FORTRAN.fullmatch(plain.replace(",", ".")):
+            plain = plain.upper().replace("D", "E")
+        return float(plain.replace(",", ".") if self.comma else plain)
 
 
 def lines_of(path: Path, dialect: Dialect) -> Iterator[tuple[int, str]]:
@@ -60,97 +132,93 @@ def lines_of(path: Path, dialect: Dialect) -> Iterator[tuple[int, str]]:
     try:
         with path.open(encoding=dialect.encoding, errors="replace") as file:
             for number, line in enumerate(file, start=1):
-                if number >= dialect.first_line and _is_data(line):
+                if number >= dialect.first_line and dialect.is_row(line):
                     yield number, line.rstrip("\n")
     except OSError as error:
         raise TableError(f"{path}: {error.strerror}") from None
 
 
-def dialect_of(path: Path) -> Dialect:
-    """Find how the file writes its table. Raises TableError."""
-    try:
-        with path.open("rb") as file:
-            head = file.read(HEAD_BYTES)
-    except OSError as error:
-        raise TableError(f"{path}: {error.strerror}") from None
-    if not head.strip():
-        raise TableError(f"{path}, line 1: the file is empty; expected a header such as time_s,vx,vy,vz")
-    encoding = _encoding(path, head)
-    text = codecs.getincrementaldecoder(encoding)(errors="replace").decode(head)
-    lines = text.splitlines()
-    if len(head) == HEAD_BYTES:
-        lines = lines[:-1]
-    return _found(path, encoding, lines)
+def dialect_of(path: Path, order: str = "") -> Dialect:
+    """Find how the file writes its table. `order`: of day, month and year, as it is stated. Raises TableError."""
+    return dialect_of_text(text_of(path), order)
 
 
-def _encoding(path: Path, head: bytes) -> str:
-    if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        return "utf-16"
-    if b"\0" in head:
-        raise TableError(f"{path}, line 1: the file is not text, and of no format that is known; write it as CSV")
-    try:
-        codecs.getincrementaldecoder("utf-8-sig")().decode(head)
-    except UnicodeDecodeError:
-        return "cp1252" if all(byte not in head for byte in (0x81, 0x8D, 0x8F, 0x90, 0x9D)) else "latin-1"
-    return "utf-8-sig"
-
-
-def _found(path: Path, encoding: str, lines: Sequence[str]) -> Dialect:
-    told = [(n, line) for n, line in enumerate(lines, start=1) if _is_data(line)]
-    for enough, delimiter in itertools.product((_all_values, _two_values), DELIMITERS):
+def dialect_of_text(text: Text, order: str = "") -> Dialect:
+    """The same of a file whose lines are known."""
+    lines = text.head
+    for enough, delimiter in itertools.product((_all_values, _some_values), DELIMITERS):
+        told = [(n, line) for n, line in enumerate(lines, start=1) if _is_data(line, delimiter) and "\0" not in line]
         split = [(n, _fields(line, delimiter)) for n, line in told[: 10 * SAMPLE_ROWS]]
         if _first_row(split, enough) is not None:
-            first = _first_row(split, _two_values)
+            first = _first_row(split, _some_values)
             assert first is not None  # lines of which all fields are values have two of them
-            return _of_rows(encoding, delimiter, lines, split, first)
+            return _of_rows(text.encoding, delimiter, lines, split, first, order)
+    told = [(n, line) for n, line in enumerate(lines, start=1) if _is_data(line, "")]
     if not told:
-        raise TableError(f"{path}, line 1: the file has only comments; expected a header such as time_s,vx,vy,vz")
+        raise TableError(f"{text.path}, line 1: the file has only comments; expected a header such as time_s,vx,vy,vz")
     number, line = told[0]
     delimiter = max(DELIMITERS[:4], key=line.count)
     header = tuple(_fields(line, delimiter))
-    return Dialect(encoding, delimiter, False, header, number, ("",) * len(header), number + 1, (False,) * len(header))
+    nothing = ("",) * len(header)
+    parts = tuple(Part(name, "", (k,), (1.0,)) for k, name in enumerate(header) if name)
+    return Dialect(text.encoding, delimiter, nothing, header, number, nothing, number + 1, nothing, parts)
 
 
-def dialect_of_cells(rows: Sequence[tuple[int, list[str]]]) -> Dialect | None:
+def dialect_of_cells(rows: Sequence[tuple[int, list[str]]], order: str = "") -> Dialect | None:
     """How a sheet of cells writes its table, None where it has none. `rows`: the first ones, each with its number."""
     split = [(n, cells) for n, cells in rows if any(cells) and not cells[0].startswith(COMMENTS)]
-    for enough in (_all_values, _two_values):
+    for enough in (_all_values, _some_values):
         if _first_row(split, enough) is not None:
-            first = _first_row(split, _two_values)
+            first = _first_row(split, _some_values)
             assert first is not None  # lines of which all fields are values have two of them
-            return _of_rows("", "", (), split, first)
+            return _of_rows("", "", [" ".join(cells) for _, cells in rows], split, first, order)
     return None
 
 
 def _first_row(split: Sequence[tuple[int, list[str]]], enough: Callable[[Sequence[str]], bool]) -> int | None:
-    """The first of two lines that have enough values; the last line needs no second one."""
-    return next((k for k in range(len(split)) if all(enough(row) for _, row in split[k : k + 2])), None)
+    """The first of two lines that have enough values; the last line needs no second one.
+
+    Lines with words and as many fields as few other lines have belong to the head.
+    """
+    widths = Counter(len(fields) for _, fields in split if enough(fields))
+    usual = widths.most_common(1)[0][0] if widths else 0
+    for k, (_, fields) in enumerate(split):
+        if all(enough(row) for _, row in split[k : k + 2]) and (_all_values(fields) or len(fields) == usual):
+            return k
+    return None
 
 
 def _of_rows(
-    encoding: str, delimiter: str, lines: Sequence[str], split: Sequence[tuple[int, list[str]]], first: int
+    encoding: str, delimiter: str, lines: Sequence[str], split: Sequence[tuple[int, list[str]]], first: int, order: str
 ) -> Dialect:
     """The dialect of a file whose lines are split, the line at `first` being the first line of data."""
     rows = [fields for _, fields in split[first : first + SAMPLE_ROWS]]
-    width = len(rows[0])
-    before = [(n, fields) for n, fields in split[:first] if len(_stripped(fields)) in (width - 1, width)]
+    width, first_line = len(rows[0]), split[first][0]
+    before = [(n, named) for n, fields in split[:first] if (named := _named(fields, width)) is not None]
     if not before:
-        before = _in_comment(lines, split[first][0], delimiter, width)
+        before = _in_comment(lines, first_line, delimiter, width)
     if not before and first and len(split[first - 1][1]) > 1 and not any(map(_is_value, split[first - 1][1])):
         before = [split[first - 1]]  # the rows have another number of fields, which their reader tells
-        width = len(before[0][1])
+    if before and len(before[-1][1]) != width and _is_counted(rows):
+        width = len(before[-1][1])
     header, header_line, units = _header(before, width)
-    decimal_comma = any(_decimal_comma(field) for row in rows for field in row)
-    dates = tuple(any(len(row) > k and _DATE.fullmatch(row[k]) for row in rows) for k in range(width))
-    return Dialect(encoding, delimiter, decimal_comma, header, header_line, units, split[first][0], dates)
+    head = tuple(lines[: first_line - 1])
+    cells = [[row[k] for row in rows if len(row) > k and row[k].lower() not in MISSING] for k in range(width)]
+    moments = tuple(map(_moments, cells))
+    days = [day_of(cell) for k in range(width) if moments[k] in ("day", "both") for cell in cells[k] if has_day(cell)]
+    fortran = any(_FORTRAN.fullmatch(cell.replace(",", ".")) for column in cells for cell in column)
+    return Dialect(
+        encoding, delimiter, tuple(_comma(column) for column in cells), header, header_line, units, first_line,
+        moments, _parts(header, units, moments, cells),
+        order or order_in(" ".join(head)) or order_of(days), _rate_hz(head), fortran,
+        frozenset(map(str.strip, head)),
+    )  # fmt: skip
 
 
-def _all_values(fields: Sequence[str]) -> bool:
-    return _two_values(fields) and all(_is_value(f) for f in fields if f)
-
-
-def _two_values(fields: Sequence[str]) -> bool:
-    return sum(_is_value(f) for f in fields) >= 2
+def _named(fields: list[str], width: int) -> list[str] | None:
+    """The fields of a line that may name so many columns, None where it cannot. Columns of comments may be missing."""
+    names = fields[:width] if all(f.lower() in COMMENT_COLUMNS for f in _stripped(fields)[width:]) else fields
+    return names if len(_stripped(names)) in (width - 1, width) else None
 
 
 def _header(before: Sequence[tuple[int, list[str]]], width: int) -> tuple[tuple[str, ...], int, tuple[str, ...]]:
@@ -158,32 +226,134 @@ def _header(before: Sequence[tuple[int, list[str]]], width: int) -> tuple[tuple[
     nothing = ("",) * width
     if not before:
         return tuple(str(k + 1) for k in range(width)), 1, nothing
-    line, names = before[-1]
-    units = nothing
-    stated = [f for f in names if f.strip("-[]() ")]
-    if len(before) > 1 and stated and all(unit_of(f) for f in stated):
-        units, (line, names) = tuple([*names, ""][:width]), before[-2]
+    (line, names), units, above = before[-1], nothing, list(before[:-1])
+    while above and _is_second(names, above[-1][1]):
+        if not any(map(unit_of, units)):
+            units = tuple([*names, *nothing][:width])
+        line, names = above.pop()
     return tuple([*names, *nothing][:width]), line, units
+
+
+def _is_second(fields: Sequence[str], above: Sequence[str]) -> bool:
+    """Whether a line tells units or kinds of the columns that the line above names."""
+    stated = [f for f in fields if f.strip("-[]() ")]
+    if not stated or all(unit_of(f) or f.strip("[]() ").lower() in SECOND_ROWS for f in stated):
+        return bool(stated) or any(above)
+    names = [f for f in above if f]
+    return len(set(stated)) < len(stated) <= len(names) == len(set(names)) and not any(map(_is_value, names))
 
 
 def _in_comment(lines: Sequence[str], stop: int, delimiter: str, width: int) -> list[tuple[int, list[str]]]:
     """The last line of comment before line `stop`, if it has a name for each column, as numpy writes it."""
     for number, line in reversed(list(enumerate(lines[: stop - 1], start=1))):
-        if line.lstrip().startswith(COMMENTS):
-            fields = _fields(line.lstrip().lstrip("#%/ "), delimiter)
+        if line.strip() and not _is_data(line, delimiter):
+            fields = _fields(re.sub(r"^[#%/;\s]*(?:[Hh]eaders?\s*[,:])?\s*", "", line), delimiter)
             return [(number, fields)] if len(fields) == width else []
     return []
 
 
-def _is_data(line: str) -> bool:
-    return bool(line.strip()) and not line.lstrip().startswith(COMMENTS)
+def _is_counted(rows: Sequence[Sequence[str]]) -> bool:
+    """Whether rows begin with their own numbers, for which some programs write no name, and end with a value."""
+    counted = [row[0] for row in rows]
+    first = int(counted[0]) if counted[0].isdigit() else 0
+    return first > 0 and counted == [str(first + k) for k in range(len(rows))] and any(row[-1] for row in rows)
+
+
+def _moments(cells: Sequence[str]) -> str:
+    """What the cells of a column are: "day", "clock", "both", or "" for numbers."""
+    if any(map(has_day, cells)):
+        return "both" if any(map(has_clock, cells)) else "day"
+    return "clock" if any(map(is_moment, cells)) else ""
+
+
+def _parts(
+    header: Sequence[str], units: Sequence[str], moments: Sequence[str], cells: Sequence[Sequence[str]]
+) -> tuple[Part, ...]:
+    """The columns of the table. A moment is called "time" where no name tells a time."""
+    days, clocks = ([k for k, kind in enumerate(moments) if kind == which] for which in ("day", "clock"))
+    with_clock = {day: clock for day in days for clock in clocks if abs(day - clock) == 1 or len(clocks) == 1}
+    parts: dict[int, Part] = {}
+    for k, name in enumerate(header):
+        places, per = [k], [1.0]
+        if k in with_clock.values():
+            day = next(d for d, clock in with_clock.items() if clock == k)
+            places, per, name = [day, k], [1.0, 1.0], name or header[day]
+        if moments[k] in ("clock", "both") and _counts_thousandths(header, cells, k):
+            places, per = [*places, k + 1], [*per, 1e-3]
+        if k not in with_clock and name and not any(k in part.places for part in parts.values()):
+            parts[k] = Part(name, "s" if moments[k] else units[k], tuple(places), tuple(per))
+    told = [k for k, part in parts.items() if part.unit == "s" and moments[k]]
+    if len(told) == 1 and not any(names_time(part.name) for part in parts.values()):
+        only = parts[told[0]]
+        parts[told[0]] = Part("time", only.unit, only.places, only.per)
+    return tuple(parts.values())
+
+
+def _counts_thousandths(header: Sequence[str], cells: Sequence[Sequence[str]], clock: int) -> bool:
+    """Whether the column behind a time of day in whole seconds counts its ms."""
+    if clock + 1 >= len(header) or header[clock + 1].strip("[]() .").lower() not in THOUSANDTHS:
+        return False
+    return all(re.search(r":\d\d$", c) for c in cells[clock]) and all(
+        c.isdigit() and len(c) < 4 for c in cells[clock + 1]
+    )
+
+
+def names_time(name: str) -> bool:
+    """Whether the name of a column tells a time."""
+    return bool(TIME_WORDS & set(words(name)))
+
+
+def _rate_hz(lines: Sequence[str]) -> float | None:
+    """The rate that a head states. None where it states none, or several."""
+    rates = set()
+    for line in lines:
+        plain = line.replace('"', "").replace("'", "")
+        for found in _RATE.finditer(plain):
+            hertz = [
+                scale for unit, scale in _HERTZ.items() if re.search(rf"(?<![a-z]){unit}(?![a-z])", found[0].lower())
+            ]
+            if hertz or not found[0].lower().startswith(("rate", "freq", "fs", "odr", "at")):
+                rates.add((hertz or [1.0])[0] * _plain_number(found["value"]))
+        for found in _INTERVAL.finditer(plain):
+            unit = _SECONDS.search(found[0])
+            second = (
+                unit_of(unit[0]) if unit else unit_of("s") if found[0].lower().startswith(("delta", "dt")) else None
+            )
+            value = _plain_number(found["value"])
+            if second is not None and value:
+                rates.add(round(1.0 / (value * second.si), 12))
+    rates.discard(0.0)
+    return rates.pop() if len(rates) == 1 else None
+
+
+def _plain_number(text: str) -> float:
+    """A number of a head, 0 where a comma may separate thousands."""
+    return 0.0 if _THOUSANDS.fullmatch(text) else float(text.replace(",", "."))
+
+
+def _all_values(fields: Sequence[str]) -> bool:
+    return _some_values(fields) and all(_is_value(f) or f.lower() in MISSING for f in fields)
+
+
+def _some_values(fields: Sequence[str]) -> bool:
+    """Whether there are two values, or one among fields in which a value is missing."""
+    values = sum(map(_is_value, fields))
+    rest = [f for f in fields if not _is_value(f)]
+    return values >= 2 or (values == 1 and any(rest) and all(f.lower() in MISSING for f in rest))
+
+
+def _is_data(line: str, delimiter: str) -> bool:
+    plain = line.strip()
+    return bool(plain) and not plain.startswith(COMMENTS) and (delimiter == ";" or not plain.startswith(";"))
 
 
 def _fields(line: str, delimiter: str) -> list[str]:
     if delimiter == " ":
         return line.split()
     try:
-        return [f.strip() for f in next(csv.reader([line.rstrip("\r\n")], delimiter=delimiter), [])]
+        return [
+            f.strip() for f in next(csv.reader([line.rstrip("\r\n")], delimiter=delimiter, skipinitialspace=True), [])
+        ]
     except csv.Error:
         return [line]
 
@@ -194,32 +364,28 @@ def _stripped(fields: list[str]) -> list[str]:
 
 
 def _is_value(text: str) -> bool:
-    if _DATE.fullmatch(text) or text.lower() in MISSING - {""}:
+    if text.lower() in NO_NUMBERS or is_moment(text) or _GROUPED.fullmatch(text):
         return True
+    plain = text.replace(",", ".")
     try:
-        float(text.replace(",", "."))
+        float(plain)
     except ValueError:
-        return False
+        return bool(_FORTRAN.fullmatch(plain))
     return True
 
 
-def _decimal_comma(text: str) -> bool:
-    return "," in text and not _DATE.fullmatch(text) and _is_value(text)
+def _comma(cells: Sequence[str]) -> str:
+    """The first number with a comma, "" where there is none."""
+    return next((f for f in cells if "," in f and not is_moment(f) and _is_value(f)), "")
 
 
-def seconds_of(dates: Sequence[str]) -> Array:
-    """Dates (ISO 8601) as seconds since 1970, UTC; a date without zone is taken as UTC. Raises ValueError."""
-    found = [_DATE.fullmatch(text.strip()) for text in dates]
-    if not all(found):
-        raise ValueError
-    plain = [f"{m['date'].replace('/', '-')}T{m['time'].replace(',', '.')}" for m in found if m]
-    ns = np.array(plain, dtype="datetime64[ns]").astype(np.int64)
-    shift = np.array([_zone_s(m["zone"]) for m in found if m])
-    return np.asarray(ns // 10**9 - shift + (ns % 10**9) * 1e-9)
-
-
-def _zone_s(zone: str | None) -> int:
-    if not zone or zone in ("Z", "UTC"):
-        return 0
-    minutes = 60 * int(zone[1:3]) + int(zone[-2:])
-    return 60 * (minutes if zone[0] == "+" else -minutes)
+def separates_thousands(cells: Sequence[str]) -> bool:
+    """Whether all numbers with a comma may have it between thousands, and no number says that it is a decimal comma."""
+    numbers = [f for f in cells if f.lower() not in MISSING and not is_moment(f)]
+    with_comma = [f for f in numbers if "," in f]
+    plain = [f for f in numbers if "," not in f]
+    return (
+        bool(with_comma)
+        and all(_THOUSANDS.fullmatch(f) for f in with_comma)
+        and all(len(f.lstrip("+-")) < 4 for f in plain)
+    )

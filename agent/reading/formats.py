@@ -55,10 +55,12 @@ LONGEST_BEGIN = 1024
 
 @dataclass(frozen=True, slots=True)
 class Description:
-    """Files that describe another file: the StationXML of a MiniSEED file, and the mapping of a recording of ROS 2."""
+    """What describes a file: the StationXML of a MiniSEED file, the mapping of a recording of ROS 2, and the order of
+    day, month and year in the dates of a text ("dmy", "mdy" or "ymd")."""
 
     metadata: Path | None = None
     mapping: Path | None = None
+    date_order: str | None = None
 
 
 NOT_DESCRIBED = Description()
@@ -76,7 +78,7 @@ def open_source(path: Path, described: Description = NOT_DESCRIBED, role: Role =
         raise TableError(f"{path}: {error.strerror}") from None
     form = format_of(path, begin)
     module, _, name = form.opens.partition(":")
-    opened: Callable[[Path], Source] = getattr(importlib.import_module(module), name)
+    opened: Callable[..., Source] = getattr(importlib.import_module(module), name)
     if described.metadata is not None and form.name != "MiniSEED":
         raise TableError(f"{described.metadata}: it describes MiniSEED, but {path} is {form.name}; leave it out")
     try:
@@ -85,7 +87,7 @@ def open_source(path: Path, described: Description = NOT_DESCRIBED, role: Role =
             from agent.reading.ros2 import RosBag
 
             return RosBag(path, read_mapping(described.mapping))
-        source = opened(path)
+        source = opened(path, described.date_order or "") if form is TEXT else opened(path)
         if described.metadata is not None and isinstance(source, MiniSeed):
             return GroundMotion(source, read_stationxml(described.metadata), role)
         return source

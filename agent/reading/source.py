@@ -48,12 +48,17 @@ class Column:
 class Source(ABC):
     """An opened file. `columns`: what it has. `header`: the place where it names them, for messages.
 
-    `filters`: the known filters of its devices, by group, each in one line of text (calib.signal.known_filters).
+    `said`: what was guessed or left out, for the user. `rate_hz`: as the file states it. `counted`: name of a column
+    that counts samples at this rate. `filters`: the known filters of its devices, by group, each in one line of text
+    (calib.signal.known_filters).
     """
 
     path: Path
     columns: Sequence[Column]
     header = "columns"
+    said: Sequence[str] = ()
+    rate_hz: float | None = None
+    counted = ""
     filters: Mapping[str, tuple[str, ...]] = MappingProxyType({})
 
     @abstractmethod

@@ -125,25 +125,27 @@ def _dialect(sheet: Any) -> Dialect | None:
 
 def _columns(sheet: Any, dialect: Dialect, group: str) -> dict[Name, NDArray[Any]]:
     """The table of one sheet: columns that have a name, and the row of each sample."""
-    places = [k for k, name in enumerate(dialect.header) if name]
-    columns, rows, faults = [array("d") for _ in places], array("q"), [""] * len(places)
+    parts = dialect.parts
+    columns, rows, faults = [array("d") for _ in parts], array("q"), [""] * len(parts)
+    width = max(place for part in parts for place in part.places) + 1
     first = dialect.first_line
-    for number, row in enumerate(sheet.iter_rows(first, MOST_ROWS, 1, max(places) + 1, values_only=True), first):
+    for number, row in enumerate(sheet.iter_rows(first, MOST_ROWS, 1, width, values_only=True), first):
         if all(cell is None for cell in row) or str(row[0]).startswith(COMMENTS):
             continue
         rows.append(number)
-        for j, k in enumerate(places):
-            columns[j].append(value := _number(row[k], dialect))
-            if math.isinf(value) and not faults[j]:
+        for j, part in enumerate(parts):
+            values = [_number(row[k], dialect, k) for k in part.places]
+            columns[j].append(sum(value * per for value, per in zip(values, part.per, strict=True)))
+            if math.inf in values and not faults[j]:
+                k = part.places[values.index(math.inf)]
                 where = f"sheet {sheet.title!r}, row {number}, column {dialect.header[k]}"
                 faults[j] = f"{where}: {_text(row[k])!r:.70} is not a finite number below {LARGEST:g}"
-    units = ["s" if dialect.dates[k] else dialect.units[k] for k in places]
-    names = [(group, dialect.header[k], unit, fault) for k, unit, fault in zip(places, units, faults, strict=True)]
+    names = [(group, part.name, part.unit, fault) for part, fault in zip(parts, faults, strict=True)]
     found = dict(zip(names, map(np.asarray, columns), strict=True))
     return found | {(group, ROWS, "", ""): np.asarray(rows)}
 
 
-def _number(cell: Any, dialect: Dialect) -> float:
+def _number(cell: Any, dialect: Dialect, column: int) -> float:
     """The number in a cell; a date in s since 1970, a time of day or a duration in s, NaN where there is nothing, inf
     where it is no number."""
     if cell is None:
@@ -152,7 +154,7 @@ def _number(cell: Any, dialect: Dialect) -> float:
         value = float(cell)
     else:
         try:
-            value = dialect.number(_text(cell))
+            value = dialect.number(_text(cell), column)
         except ValueError:
             return math.inf
     return math.inf if abs(value) > LARGEST else value
@@ -165,8 +167,7 @@ def _text(cell: Any) -> str:
     if isinstance(cell, datetime):
         return cell.astimezone(UTC).isoformat() if cell.tzinfo else cell.isoformat()
     if isinstance(cell, time):
-        return repr(timedelta(hours=cell.hour, minutes=cell.minute, seconds=cell.second,
-                              microseconds=cell.microsecond).total_seconds())  # fmt: skip
+        return cell.isoformat()
     if isinstance(cell, timedelta):
         return repr(cell.total_seconds())
     return str(cell).strip()
