@@ -20,6 +20,7 @@ import numpy as np
 from agent.reading.choice import words
 from agent.reading.dates import UnclearError, day_of, offset_in, order_of, seconds_of
 from agent.reading.dialect import (
+    COMMENT,
     COUNTERS,
     LARGEST,
     MISSING,
@@ -38,8 +39,8 @@ from agent.reading.source import Array, Column, Progress, Source, TableError
 BLOCK_BYTES = 1 << 20  # pyarrow parses blocks of a chunk on all cores
 NEWLINE = ord("\n")
 COUNTED = "time_s"  # the column of times that are counted from the rate in the head
-_NO_ROW = re.compile(rb"(?m)^[ \t]*(?:(?:#|%|//).*|.*\0.*)\n")
-_NO_ROW_SEMICOLON = re.compile(rb"(?m)^[ \t]*(?:(?:#|%|//|;).*|.*\0.*)\n")
+_NO_ROW = re.compile(rf"(?m)^[ \t]*(?:(?:{COMMENT}).*|.*\0.*)\n".encode())
+_NO_ROW_SEMICOLON = re.compile(rf"(?m)^[ \t]*(?:(?:{COMMENT}|;).*|.*\0.*)\n".encode())
 _FORTRAN = re.compile(rb"(?<=[\d.])[dD](?=[+-]?\d)")
 
 

@@ -18,8 +18,10 @@ from agent.reading.source import TableError
 from agent.reading.units import unit_of
 
 SAMPLE_ROWS = 50  # rows from which the dialect is found
+HEAD_ROWS = 10  # lines with words and values that a head may have before the names
 LARGEST = 1e19  # no indication and no time in ns since 1970 is larger, and its squares and their sums stay finite
-COMMENTS = ("#", "%", "//")  # and ";" where it is no delimiter
+# A line of comment; also one with ";" where that is no delimiter. A first cell may have an error of a spreadsheet.
+COMMENT = r"#(?!N/[AV]|[A-Z/0]+[!?])|%|//"
 DELIMITERS = (";", "\t", ",", "|", " ")  # in this order: numbers may contain a comma, dates a blank
 NO_NUMBERS = frozenset(("nan", "-nan", "na", "n/a", "#n/a", "null", "none"))
 # Cells of loggers where a value is missing or was outside the range.
@@ -34,8 +36,10 @@ SECOND_ROWS = frozenset(
 )
 COUNTERS = frozenset(("counter", "packetcounter", "count", "index", "sample", "samples", "record", "scan", "no", "n"))
 THOUSANDTHS = frozenset(("ms", "msec", "msecs", "millis", "millisecond", "milliseconds"))
+_COMMENT = re.compile(COMMENT)
 _FORTRAN = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)[dD][+-]?\d+")
 _THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(?:,\d{3})+")
+_NUMERIC = re.compile(r"[+-]?[\d.,]+(?:[eE][+-]?\d+)?")
 _GROUPED = re.compile(r"[+-]?\d{1,3}(?:,\d{3})+(?:\.\d+)?")
 _VALUE = r"[^\d\n]{0,30}?(?P<value>\d+(?:[.,]\d+)?(?:[eE][-+]?\d+)?)[;,\t ]*(?:[A-Za-z\xb5/]+)?"
 _RATE = re.compile(
@@ -114,7 +118,7 @@ class Dialect:
             return math.nan
         if is_moment(plain):
             return float(seconds_of([plain], self.order, offset_in(self.header[column]))[0])
-        if self.comma and "." in plain and _is_value(plain):
+        if self.comma and "." in plain and _NUMERIC.fullmatch(plain):
             raise MixedMarksError(
                 f"{plain!r} has a point, and {self.comma!r} a comma; write the numbers without separators of thousands"
             )
@@ -166,7 +170,7 @@ def dialect_of_text(text: Text, order: str = "") -> Dialect:
 
 def dialect_of_cells(rows: Sequence[tuple[int, list[str]]], order: str = "") -> Dialect | None:
     """How a sheet of cells writes its table, None where it has none. `rows`: the first ones, each with its number."""
-    split = [(n, cells) for n, cells in rows if any(cells) and not cells[0].startswith(COMMENTS)]
+    split = [(n, cells) for n, cells in rows if any(cells) and not is_comment(cells[0])]
     for enough in (_all_values, _some_values):
         if _first_row(split, enough) is not None:
             first = _first_row(split, _some_values)
@@ -178,14 +182,27 @@ def dialect_of_cells(rows: Sequence[tuple[int, list[str]]], order: str = "") -> 
 def _first_row(split: Sequence[tuple[int, list[str]]], enough: Callable[[Sequence[str]], bool]) -> int | None:
     """The first of two lines that have enough values; the last line needs no second one.
 
-    Lines with words and as many fields as few other lines have belong to the head.
+    A line of the head may have values too: it has words where other lines have none, and names follow it soon.
     """
-    widths = Counter(len(fields) for _, fields in split if enough(fields))
-    usual = widths.most_common(1)[0][0] if widths else 0
-    for k, (_, fields) in enumerate(split):
-        if all(enough(row) for _, row in split[k : k + 2]) and (_all_values(fields) or len(fields) == usual):
-            return k
+    rows = [fields for _, fields in split]
+    worded = Counter(k for fields in rows if enough(fields) for k in _words_in(fields))
+    usual = {k for k, count in worded.items() if 2 * count > sum(map(enough, rows))}
+    after = 0
+    for k in range(len(rows)):
+        if k < after or not all(enough(row) for row in rows[k : k + 2]):
+            continue
+        soon = rows[k : k + HEAD_ROWS]
+        named = next((n for n, row in enumerate(soon) if len(_words_in(row)) > 1 and not any(map(_is_value, row))), 0)
+        if named and all(_words_in(row) - usual for row in soon[:named]):
+            after = k + named
+            continue
+        return k
     return None
+
+
+def _words_in(fields: Sequence[str]) -> set[int]:
+    """The fields that are neither values nor missing ones."""
+    return {k for k, field in enumerate(fields) if not _is_value(field) and field.lower() not in MISSING}
 
 
 def _of_rows(
@@ -231,7 +248,10 @@ def _header(before: Sequence[tuple[int, list[str]]], width: int) -> tuple[tuple[
         if not any(map(unit_of, units)):
             units = tuple([*names, *nothing][:width])
         line, names = above.pop()
-    return tuple([*names, *nothing][:width]), line, units
+    filled = [*names, *nothing][:width]
+    if above and not all(filled):  # the names of some columns stand a line higher
+        filled = [name or higher for name, higher in zip(filled, [*above[-1][1], *nothing], strict=False)]
+    return tuple(filled), line, units
 
 
 def _is_second(fields: Sequence[str], above: Sequence[str]) -> bool:
@@ -239,6 +259,8 @@ def _is_second(fields: Sequence[str], above: Sequence[str]) -> bool:
     stated = [f for f in fields if f.strip("-[]() ")]
     if not stated or all(unit_of(f) or f.strip("[]() ").lower() in SECOND_ROWS for f in stated):
         return bool(stated) or any(above)
+    if len(set(stated)) == 1 < len(stated):
+        return True
     names = [f for f in above if f]
     return len(set(stated)) < len(stated) <= len(names) == len(set(names)) and not any(map(_is_value, names))
 
@@ -342,9 +364,14 @@ def _some_values(fields: Sequence[str]) -> bool:
     return values >= 2 or (values == 1 and any(rest) and all(f.lower() in MISSING for f in rest))
 
 
+def is_comment(text: str) -> bool:
+    """Whether a line, or the first cell of a row, is a comment."""
+    return _COMMENT.match(text) is not None
+
+
 def _is_data(line: str, delimiter: str) -> bool:
     plain = line.strip()
-    return bool(plain) and not plain.startswith(COMMENTS) and (delimiter == ";" or not plain.startswith(";"))
+    return bool(plain) and not is_comment(plain) and (delimiter == ";" or not plain.startswith(";"))
 
 
 def _fields(line: str, delimiter: str) -> list[str]:

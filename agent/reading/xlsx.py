@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.config.xml import XmlError, check_xml
-from agent.reading.dialect import COMMENTS, LARGEST, Dialect, dialect_of_cells
+from agent.reading.dialect import LARGEST, Dialect, dialect_of_cells, is_comment
 from agent.reading.own_process import Name, arrays_of, write_arrays
 from agent.reading.source import Array, Arrays, Column, Progress, TableError
 from calib.model import Slices
@@ -130,7 +130,7 @@ def _columns(sheet: Any, dialect: Dialect, group: str) -> dict[Name, NDArray[Any
     width = max(place for part in parts for place in part.places) + 1
     first = dialect.first_line
     for number, row in enumerate(sheet.iter_rows(first, MOST_ROWS, 1, width, values_only=True), first):
-        if all(cell is None for cell in row) or str(row[0]).startswith(COMMENTS):
+        if all(cell is None for cell in row) or is_comment(str(row[0])):
             continue
         rows.append(number)
         for j, part in enumerate(parts):
