@@ -74,6 +74,8 @@ def _stated(
     date_order: str | None = None,
 ) -> tuple[Options, PosesFile]:
     """The options and the poses, with what the metadata of a station say. Raises TableError."""
+    if sensor.restart and (reference is not None or poses is not None):
+        raise TableError(f"{sensor.restart}; a reference or poses need one clock: cut the file there")
     stated = by_metadata(options, sensor.components, reference.components if reference is not None else ())
     stated = _with_filters(stated, sensor, reference)
     if poses is None and reference is not None and reference.components and sensor.components:
@@ -135,8 +137,6 @@ def _read(params: dict[str, Any]) -> tuple[SensorFile, ReferenceFile | None]:
         described = _description(params, "sensor_metadata")
         sensor = sensor_of(params["sensor"], params.get("columns"), bar, described)
         stated = (params.get("reference_columns"), params.get("sensitivity"))
-        if sensor.restart and (params["reference"] or params["poses"]):
-            raise TableError(f"{sensor.restart}; a reference or poses need one clock: cut the file there")
         described = _description(params, "reference_metadata")
         return sensor, reference_of(params["reference"], *stated, bar, described) if params["reference"] else None
 

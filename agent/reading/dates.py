@@ -149,7 +149,9 @@ def _day_number(text: str, order: str) -> int:
         numbers = {o: n for o, n in numbers.items() if len(orders) == 1 or o == order}
     if len(set(numbers.values())) != 1:
         if not numbers:
-            raise UnclearError(f"{text!r} is no date{f' in the order {order}' if order else ''}; correct it")
+            raise UnclearError(
+                f"{text!r} is no date{f' in the order {order}, see --date-order' if order else ''}; correct it"
+            )
         meant = " or ".join(f"{date.fromordinal(n)} ({o})" for o, n in numbers.items())
         raise UnclearError(f"{text!r} may be {meant}; state which with --date-order")
     return next(iter(numbers.values()))

@@ -148,7 +148,7 @@ class Delimited(Source):
 
     def _rows(self, dialect: Dialect, line: int, text: bytes, places: Sequence[int], last: bool) -> Array:
         if not places:
-            return np.empty((sum(dialect.is_row(t) for t in text.decode("latin-1").split("\n")), 0))
+            return np.empty((sum(1 for _ in dialect.rows(enumerate(text.decode("latin-1").split("\n")))), 0))
         with contextlib.suppress(ValueError):
             rows = self._parse(_rows_alone(text, dialect), dialect, places)
             least, most = np.fmin.reduce(rows, axis=None), np.fmax.reduce(rows, axis=None)
@@ -161,7 +161,7 @@ class Delimited(Source):
         encoding = "utf-8" if dialect.encoding.startswith("utf") else dialect.encoding
         told = [(n, content) for n, content in enumerate(text.decode(encoding, "replace").split("\n"), start=line)]
         self._lost += sum("\0" in content for _, content in told)
-        told = [(n, content) for n, content in told if dialect.is_row(content)]
+        told = list(dialect.rows(told))
         if told and last and len(dialect.fields(told[-1][1])) < len(dialect.header):
             self._lost += 1
             told.pop()

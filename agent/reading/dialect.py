@@ -7,7 +7,7 @@ import itertools
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -39,6 +39,7 @@ THOUSANDTHS = frozenset(("ms", "msec", "msecs", "millis", "millisecond", "millis
 _COMMENT = re.compile(COMMENT)
 _FORTRAN = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)[dD][+-]?\d+")
 _THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(?:,\d{3})+")
+_BETWEEN_BLANKS = re.compile(r'"([^"]*)"|(\S+)')
 _NUMERIC = re.compile(r"[+-]?[\d.,]+(?:[eE][+-]?\d+)?")
 _GROUPED = re.compile(r"[+-]?\d{1,3}(?:,\d{3})+(?:\.\d+)?")
 _VALUE = r"[^\d\n]{0,30}?(?P<value>\d+(?:[.,]\d+)?(?:[eE][-+]?\d+)?)[;,\t ]*(?:[A-Za-z\xb5/]+)?"
@@ -78,7 +79,7 @@ class Dialect:
     column are: "day", "clock", "both", or "" for numbers. `commas`: the first number with a comma in each column, or
     "". `order`: of day, month and year, "" where it is not known. `rate_hz`: as the head states it.
     `fortran`: whether exponents have a D. `before`: the lines
-    before the data.
+    before the data. `names`: the one that names the columns.
     """
 
     encoding: str
@@ -94,6 +95,7 @@ class Dialect:
     rate_hz: float | None = None
     fortran: bool = False
     before: frozenset[str] = frozenset()
+    names: str = ""
 
     @property
     def comma(self) -> str:
@@ -104,9 +106,21 @@ class Dialect:
         """The fields of a line, without the blanks around them."""
         return _fields(line, self.delimiter)
 
-    def is_row(self, line: str) -> bool:
-        """Whether a line after the head is data: no comment, no head that is repeated, and without bytes 0."""
-        return _is_data(line, self.delimiter) and "\0" not in line and line.strip() not in self.before
+    def rows(self, lines: Iterable[tuple[int, str]]) -> Iterator[tuple[int, str]]:
+        """The lines of data among numbered lines: no comments, none with bytes 0, and no head that is repeated."""
+        held: list[tuple[int, str]] = []
+        for number, line in lines:
+            plain = line.strip()
+            if plain and plain == self.names:
+                held.clear()  # lines that are no rows, and the names after them, are a head that is repeated
+            elif not _is_data(line, self.delimiter) or "\0" in line or plain in self.before:
+                continue
+            elif len(held) < len(self.before) and len(self.fields(line)) != len(self.header):
+                held.append((number, line))
+            else:
+                yield from (*held, (number, line))
+                held.clear()
+        yield from held
 
     def number(self, text: str, column: int) -> float:
         """A number, a date in s since 1970, a time of day in s, or NaN for a value that is missing.
@@ -122,9 +136,10 @@ class Dialect:
             raise MixedMarksError(
                 f"{plain!r} has a point, and {self.comma!r} a comma; write the numbers without separators of thousands"
             )
-        if not self.comma and _GROUPED.fullmatch(plain):
+        if not self.comma and "," in plain and _NUMERIC.fullmatch(plain):
             raise MixedMarksError(
-                f"{plain!r} has a comma, and other numbers have none; write the numbers without separators of thousands"
+                f"{plain!r} has a comma, and other numbers have none; write all numbers with one decimal mark, and "
+                "without separators of thousands"
             )
         if _FORTRAN.fullmatch(plain.replace(",", ".")):
             plain = plain.upper().replace("D", "E")
@@ -135,9 +150,8 @@ def lines_of(path: Path, dialect: Dialect) -> Iterator[tuple[int, str]]:
     """The lines of data with their numbers, without empty lines and comments. Raises TableError."""
     try:
         with path.open(encoding=dialect.encoding, errors="replace") as file:
-            for number, line in enumerate(file, start=1):
-                if number >= dialect.first_line and dialect.is_row(line):
-                    yield number, line.rstrip("\n")
+            lines = ((number, line.rstrip("\n")) for number, line in enumerate(file, start=1))
+            yield from dialect.rows(itertools.islice(lines, dialect.first_line - 1, None))
     except OSError as error:
         raise TableError(f"{path}: {error.strerror}") from None
 
@@ -228,7 +242,7 @@ def _of_rows(
         encoding, delimiter, tuple(_comma(column) for column in cells), header, header_line, units, first_line,
         moments, _parts(header, units, moments, cells),
         order or order_in(" ".join(head)) or order_of(days), _rate_hz(head), fortran,
-        frozenset(map(str.strip, head)),
+        frozenset(map(str.strip, head)), lines[header_line - 1].strip() if before and lines else "",
     )  # fmt: skip
 
 
@@ -376,7 +390,7 @@ def _is_data(line: str, delimiter: str) -> bool:
 
 def _fields(line: str, delimiter: str) -> list[str]:
     if delimiter == " ":
-        return line.split()
+        return [found[1] or found[2] for found in _BETWEEN_BLANKS.finditer(line)] if '"' in line else line.split()
     try:
         return [
             f.strip() for f in next(csv.reader([line.rstrip("\r\n")], delimiter=delimiter, skipinitialspace=True), [])

@@ -7,7 +7,7 @@ import re
 
 import numpy as np
 
-from agent.reading.choice import Chosen
+from agent.reading.choice import Chosen, words
 from agent.reading.source import Array, Source, TableError
 from agent.reading.units import unit_of
 from calib.recorded.table import LATEST_STAMP_S, second_of
@@ -22,13 +22,14 @@ COMPACT = (1.97e13, 2.1e13)  # YYYYMMDDhhmmss as a number
 CLOCKS_S = {
     86400.0: "the time of day passes midnight",
     43200.0: "the clock of 12 hours begins anew",
-    3600.0: "the time goes back by an hour, as at the end of summer time",
+    3600.0: "the time goes back by an hour, as at the end of summer time, or where no hours are written",
 }
 COUNTERS_BITS = (16, 24, 31, 32)
 PARTS = (1.0, 1e-3, 1e-6)  # of a second, which a counter may have counted before it was written in s
-MOST_LOST = 10.0  # usual steps that may be lost where a clock begins anew
+MOST_LOST, MOST_LOST_S = 10.0, 30.0  # usual steps, and s, that may be lost where a clock begins anew
 RESTART_S, PAUSE_S = 1.0, 10.0  # a restart is later than that after 0; a piece follows the one before after this pause
-FEWEST_BEFORE_S = 2.0  # what a piece lasts before a restart; less is disorder
+FEWEST_BEFORE_S, FEWEST_BEFORE = 2.0, 50  # what a piece lasts before a restart, and its rows; less is disorder
+LONG = frozenset(("min", "mins", "minutes", "h", "hours", "days"))  # units that end the name of a time: time_min
 _BRACKETS = re.compile(r"[\[(]([A-Za-z][^\])]*)[\])]")
 SLOW_S, FAST_S = 0.5, 2e-6  # usual steps beyond which another unit is meant
 
@@ -41,11 +42,15 @@ class Times:
 
     def __init__(self, source: Source, chosen: Chosen) -> None:
         self._source, self._name = source, str(chosen.column)
+        self._guessed: list[str] = []
         unit = unit_of(chosen.unit) if chosen.unit else None
         if unit is not None and unit.quantity != "time":
             raise TableError(
                 f"{source.path}, {source.header}: column {self._name!r} is in {chosen.unit}, which is no unit of time"
             )
+        if unit is None and LONG & {word := (words(chosen.column.name) or [""])[-1]}:
+            unit = unit_of(word)
+            self._guessed.append(f"{source.path}: the times of column {self._name!r} are taken in {word}")
         counted = source.rate_hz if chosen.column.name == source.counted else None
         self._guesses = not counted and unit is None
         self._second = 1.0 / counted if counted else 1.0 if unit is None else unit.si  # what one unit is in s
@@ -53,9 +58,9 @@ class Times:
         self._first = self._last = math.nan
         self._usual = self._period_s = 0.0  # the usual step, and the mean one in s
         self._shift, self._rows = 0.0, 0
+        self._piece = 0  # the row with which the present piece begins
         self._dropped: list[int] = []
         self._told: dict[str, tuple[str, int]] = {}
-        self._guessed: list[str] = []
         self.restart = ""
 
     def timed(self, rows: Array) -> Array:
@@ -134,13 +139,15 @@ class Times:
         jumps = np.zeros(len(raw))
         for row in back.tolist():
             jumps[row] = self._jump(float(before[row]), float(raw[row]), self._rows + row)
+            if not jumps[row]:  # disorder, which is refused; the times are told as the file has them
+                return None
         shifts = self._shift + np.cumsum(jumps)
         self._shift = float(shifts[-1])
         return shifts
 
     def _jump(self, before: float, after: float, row: int) -> float:
         """By how much times are later from a row on, whose time is earlier than the one before; 0 for disorder."""
-        most = MOST_LOST * self._usual
+        most = min(MOST_LOST * self._usual, MOST_LOST_S / self._second)
         anew = after <= 2.0 * self._usual and self._first <= 2.0 * self._usual  # both as a count from 0
         for clock_s, kind in CLOCKS_S.items():
             if not anew and 0.0 <= after + clock_s / self._second - before <= most:
@@ -148,10 +155,13 @@ class Times:
                 return clock_s / self._second
         for bits in COUNTERS_BITS:
             for part in PARTS if self._second == 1.0 else (1.0,):
-                if max(before, -after) < 2**bits * part and 0.0 <= after + 2**bits * part - before <= most:
+                size = 2**bits * part
+                if any(0.0 < end - before <= most and 0.0 <= after - end + size <= most for end in (size, size / 2)):
                     self._tell(f"a counter of {bits} bits begins anew; the times go on", row, before, after)
-                    return float(2**bits * part)
-        if 0.0 <= after * self._second <= RESTART_S and (before - after) * self._second >= FEWEST_BEFORE_S:
+                    return float(size)
+        lasted_s, lasted = (before - after) * self._second, row - self._piece
+        if 0.0 <= after * self._second <= RESTART_S and lasted_s >= FEWEST_BEFORE_S and lasted >= FEWEST_BEFORE:
+            self._piece = row
             told = "the time begins anew"
             self._tell(f"{told}; the pieces are taken with {PAUSE_S:g} s between them", row, before, after)
             where = f"{self._source.path}, {self.place(row)}, column {self._name}"

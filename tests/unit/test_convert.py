@@ -20,7 +20,7 @@ def test_a_sensor_with_gaps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     path = written(tmp_path, DATED["ISO 8601"].replace(",", ",,", 1), "a.csv")
     lines = DATED["ISO 8601 with Z"].splitlines()
     lines[5] = lines[5].split(",")[0] + ",,,"
-    path = written(tmp_path, "\n".join(["time,vx,vy,vz,temp [degC]", *(f"{x},21.5" for x in lines[1:])]), "a.csv")
+    path = written(tmp_path, "\n".join(["time,vx,vy,vz,temp [degC]", *(f"{x},21.5" for x in lines[1:]), ""]), "a.csv")
     assert run_cli(["convert", str(path), "-o", str(tmp_path / "b.csv")]) == 0
     assert "400 rows of time_s,vx,vy,vz,temperature_degc" in capsys.readouterr().out
     before, after = read_sensor(path), read_sensor(tmp_path / "b.csv")

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from agent.calibrate.tables import SensorFile, read_sensor
-from agent.reading import delimited
+from agent.reading import delimited, lines
 from agent.reading.formats import Description
 from agent.reading.source import TableError
 from tests.unit.logger_heads import DATED, HEADS, Head
@@ -26,8 +26,10 @@ V = np.column_stack([_RANDOM.integers(-9999, 9999, (N, 2)), 9800 + _RANDOM.integ
 
 @pytest.fixture(params=["pyarrow", "numpy"], autouse=True)
 def engine(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files as a whole by pyarrow, and in pieces of 1000 bytes by numpy."""
     if request.param == "numpy":
         monkeypatch.setattr(delimited, "_arrow_parser", lambda: None)
+        monkeypatch.setattr(lines, "CHUNK_BYTES", 1000)
     elif importlib.util.find_spec("pyarrow") is None:
         pytest.skip("pyarrow is not installed (extra files)")
 
@@ -135,49 +137,49 @@ class Wrong:
 ALL = np.arange(N)
 
 
-def written(way: Written, lines: list[str]) -> bytes:
-    return (way.head + "".join(f"{line}\n" for line in lines)).encode()
+def written(way: Written, body: list[str]) -> bytes:
+    return (way.head + "".join(f"{line}\n" for line in body)).encode()
 
 
 def line_of(way: Written, row: int) -> int:
     return way.head.count("\n") + row + 1
 
 
-def cells(way: Written, lines: list[str], edit: Callable[[int, list[str]], list[str]]) -> list[str]:
+def cells(way: Written, body: list[str], edit: Callable[[int, list[str]], list[str]]) -> list[str]:
     """The rows with some fields changed."""
-    split = [line.split() if way.delimiter == " " else line.split(way.delimiter) for line in lines]
+    split = [line.split() if way.delimiter == " " else line.split(way.delimiter) for line in body]
     return [way.delimiter.join(edit(k, row)) for k, row in enumerate(split)]
 
 
-def no_end(way: Written, lines: list[str]) -> Wrong:
+def no_end(way: Written, body: list[str]) -> Wrong:
     return Wrong(
-        written(way, lines)[:-3], ALL[:-1], r"the last line, '.*', has no end and may be cut off; it is left out"
+        written(way, body)[:-3], ALL[:-1], r"the last line, '.*', has no end and may be cut off; it is left out"
     )
 
 
-def cut_line(way: Written, lines: list[str]) -> Wrong:
-    short = cells(way, lines, lambda k, row: row[:-1] if k == N - 1 else row)
+def cut_line(way: Written, body: list[str]) -> Wrong:
+    short = cells(way, body, lambda k, row: row[:-1] if k == N - 1 else row)
     return Wrong(written(way, short), ALL[:-1], "cut off or have bytes 0: 1; they are left out")
 
 
-def zeros_behind(way: Written, lines: list[str]) -> Wrong:
-    return Wrong(written(way, lines) + bytes(100_000), ALL, "bytes 0 stand behind the last line")
+def zeros_behind(way: Written, body: list[str]) -> Wrong:
+    return Wrong(written(way, body) + bytes(100_000), ALL, "bytes 0 stand behind the last line")
 
 
-def zeros_within(way: Written, lines: list[str]) -> Wrong:
-    within = [*lines[:50], lines[50][:5] + "\0" * 512, *lines[50:]]
+def zeros_within(way: Written, body: list[str]) -> Wrong:
+    within = [*body[:50], body[50][:5] + "\0" * 512, *body[50:]]
     return Wrong(written(way, within), ALL, "bytes 0: 1; they are left out")
 
 
-def no_time(way: Written, lines: list[str]) -> Wrong | None:
+def no_time(way: Written, body: list[str]) -> Wrong | None:
     if way.delimiter == " " or "interval" in way.head:
         return None
     times = 2 if "Date|" in way.head else 1
-    some = cells(way, lines, lambda k, row: [""] * times + row[times:] if k in (30, 31) else row)
+    some = cells(way, body, lambda k, row: [""] * times + row[times:] if k in (30, 31) else row)
     return Wrong(written(way, some), np.delete(ALL, [30, 31]), rf"line {line_of(way, 30)}: rows without a time: 2")
 
 
-def missing_cells(way: Written, lines: list[str]) -> Wrong:
+def missing_cells(way: Written, body: list[str]) -> Wrong:
     words = (
         "---",
         "OVER",
@@ -192,56 +194,56 @@ def missing_cells(way: Written, lines: list[str]) -> Wrong:
     )
     last = 3 if "interval" in way.head else 2
     some = cells(
-        way, lines, lambda k, row: [*row[:-last], words[k], *row[len(row) - last + 1 :]] if k < len(words) else row
+        way, body, lambda k, row: [*row[:-last], words[k], *row[len(row) - last + 1 :]] if k < len(words) else row
     )
     return Wrong(written(way, some), ALL, gaps=tuple(range(len(words))))
 
 
-def comments(way: Written, lines: list[str]) -> Wrong:
+def comments(way: Written, body: list[str]) -> Wrong:
     marks = ["# knock", "% knock", "  // knock", *([] if way.delimiter == ";" else ["; knock"])]
-    return Wrong(written(way, [*lines[:40], *marks, *lines[40:]]), ALL)
+    return Wrong(written(way, [*body[:40], *marks, *body[40:]]), ALL)
 
 
-def head_again(way: Written, lines: list[str]) -> Wrong:
-    return Wrong(written(way, [*lines[:60], *way.head.splitlines(), *lines[60:]]), ALL)
+def head_again(way: Written, body: list[str]) -> Wrong:
+    return Wrong(written(way, [*body[:60], *way.head.splitlines(), *body[60:]]), ALL)
 
 
-def carriage_returns(way: Written, lines: list[str]) -> Wrong:
-    return Wrong(written(way, lines).replace(b"\n", b"\r"), ALL)
+def carriage_returns(way: Written, body: list[str]) -> Wrong:
+    return Wrong(written(way, body).replace(b"\n", b"\r"), ALL)
 
 
-def utf16(way: Written, lines: list[str]) -> Wrong:
-    return Wrong(written(way, lines).decode().encode("utf-16"), ALL)
+def utf16(way: Written, body: list[str]) -> Wrong:
+    return Wrong(written(way, body).decode().encode("utf-16"), ALL)
 
 
-def byte_order_mark(way: Written, lines: list[str]) -> Wrong:
-    return Wrong(b"\xef\xbb\xbf" + written(way, lines).replace(b"\n", b"\r\n"), ALL)
+def byte_order_mark(way: Written, body: list[str]) -> Wrong:
+    return Wrong(b"\xef\xbb\xbf" + written(way, body).replace(b"\n", b"\r\n"), ALL)
 
 
-def fortran(way: Written, lines: list[str]) -> Wrong:
-    some = cells(way, lines, lambda _, row: [*row[:-3], *(f"{value}D+00" for value in row[-3:])])
+def fortran(way: Written, body: list[str]) -> Wrong:
+    some = cells(way, body, lambda _, row: [*row[:-3], *(f"{value}D+00" for value in row[-3:])])
     return Wrong(written(way, some), ALL)
 
 
-def delimiters_at_the_end(way: Written, lines: list[str]) -> Wrong:
-    return Wrong(written(way, [line + way.delimiter for line in lines]), ALL)
+def delimiters_at_the_end(way: Written, body: list[str]) -> Wrong:
+    return Wrong(written(way, [line + way.delimiter for line in body]), ALL)
 
 
-def thousands(way: Written, lines: list[str]) -> Wrong:
-    grouped = "1.402,118" if "," in lines[0].replace(way.delimiter, "") else "1,402.118"
+def thousands(way: Written, body: list[str]) -> Wrong:
+    grouped = "1.402,118" if "," in body[0].replace(way.delimiter, "") else "1,402.118"
     some = cells(
-        way, lines, lambda k, row: [*row[:-1], grouped if way.delimiter == " " else f'"{grouped}"'] if k == 70 else row
+        way, body, lambda k, row: [*row[:-1], grouped if way.delimiter == " " else f'"{grouped}"'] if k == 70 else row
     )
     return Wrong(written(way, some), ALL, refused=rf"line {line_of(way, 70)}, column .*: '{grouped}' has a .*; write ")
 
 
-def a_word(way: Written, lines: list[str]) -> Wrong:
-    some = cells(way, lines, lambda k, row: [*row[:-1], "abc"] if k == 20 else row)
+def a_word(way: Written, body: list[str]) -> Wrong:
+    some = cells(way, body, lambda k, row: [*row[:-1], "abc"] if k == 20 else row)
     return Wrong(written(way, some), ALL, refused=rf"line {line_of(way, 20)}, column .*: 'abc' is not a .*; correct it")
 
 
-def a_field_less(way: Written, lines: list[str]) -> Wrong:
-    short = cells(way, lines, lambda k, row: row[:-1] if k == 20 else row)
+def a_field_less(way: Written, body: list[str]) -> Wrong:
+    short = cells(way, body, lambda k, row: row[:-1] if k == 20 else row)
     return Wrong(
         written(way, short), ALL, refused=rf"line {line_of(way, 20)}: \d fields, but the header has \d; correct"
     )
