@@ -78,10 +78,12 @@ def test_an_ambiguous_date_is_asked(tmp_path: Path, capsys: pytest.CaptureFixtur
 @pytest.mark.parametrize(
     ("text", "columns", "said"),
     [
-        (table(lambda k: f"{10 * k}"), None, "'time' are 10 s apart; state their unit where it is not s, as time=time:ms"),
+        (table(lambda k: f"{10 * k}"), None, "'time' are 10 s apart; state their unit where it is not s, as "
+         "time=time:ms"),
         (table(lambda k: f"{10000 * k}", "time_s,vx,vy,vz\n"), None, "'time_s' are 1e+04 s apart; state their unit"),
         ("rate: 100 Hz\n" + table(lambda k: f"{k}"), None, "1 s apart, and the head states 100 Hz; state their unit"),
-        (table(lambda k: f"{k / 100}", "time [ticks],x,y,z\n"), None, "the unit 'ticks' of column 'time [ticks]' is not known"),
+        (table(lambda k: f"{k / 100}", "time [ticks],x,y,z\n"), None,
+         "the unit 'ticks' of column 'time [ticks]' is not known"),
         (table(lambda k: f"{k / 6000:.9f}", "time_min,x,y,z\n"), None, "'time_min' are taken in min"),
     ],
 )  # fmt: skip
@@ -166,11 +168,14 @@ COMMA_OR_THOUSANDS = (
     [
         (with_fields("0.01", '"402,118"', '"1,118"', '"2,118"'),
          "line 2, column time: '0.01' has a point, and '402,118' a comma; write the numbers without separators"),
-        (with_fields("0,01", "402.118", "0,5", "0,5", delimiter=";"), "line 2, column x: '402.118' has a point, and '0,01'"),
+        (with_fields("0,01", "402.118", "0,5", "0,5", delimiter=";"),
+         "line 2, column x: '402.118' has a point, and '0,01'"),
         (with_fields("#", '"402,118"', '"1,118"', '"2,118"'), COMMA_OR_THOUSANDS),
         (with_fields("2023-11-14 22:13:20.#", "402,118", "1,118", "2,118", delimiter=";"), COMMA_OR_THOUSANDS),
-        (table(lambda k: f"{k / 100:.2f}") + '9,1,2,"1,402"\n', "line 302, column z: '1,402' has a comma, and other numbers"),
-        (with_fields("#", "1", "2", "3", delimiter=";") + "400;1,5;2;3\n", "line 302, column x: '1,5' has a comma, and other"),
+        (table(lambda k: f"{k / 100:.2f}") + '9,1,2,"1,402"\n',
+         "line 302, column z: '1,402' has a comma, and other numbers"),
+        (with_fields("#", "1", "2", "3", delimiter=";") + "400;1,5;2;3\n",
+         "line 302, column x: '1,5' has a comma, and other"),
     ],
 )  # fmt: skip
 def test_separators_of_thousands(text: str, message: str, tmp_path: Path) -> None:
