@@ -39,8 +39,8 @@ from agent.reading.source import Array, Column, Progress, Source, TableError
 BLOCK_BYTES = 1 << 20  # pyarrow parses blocks of a chunk on all cores
 NEWLINE = ord("\n")
 COUNTED = "time_s"  # the column of times that are counted from the rate in the head
-_NO_ROW = re.compile(rf"(?m)^[ \t]*(?:(?:{COMMENT}).*|.*\0.*)\n".encode())
-_NO_ROW_SEMICOLON = re.compile(rf"(?m)^[ \t]*(?:(?:{COMMENT}|;).*|.*\0.*)\n".encode())
+_NO_ROW = re.compile(rf"(?m)^[ \t]*+(?:(?:{COMMENT}).*|[^\0\n]*+\0.*)\n".encode())
+_NO_ROW_SEMICOLON = re.compile(rf"(?m)^[ \t]*+(?:(?:{COMMENT}|;).*|[^\0\n]*+\0.*)\n".encode())
 _FORTRAN = re.compile(rb"(?<=[\d.])[dD](?=[+-]?\d)")
 
 
@@ -90,7 +90,8 @@ class Delimited(Source):
     def pieces(self, columns: Sequence[Column], progress: Progress | None) -> Iterator[Array]:
         """Yield the rows of these columns. Raises TableError for the first line that is wrong."""
         parts = [self._parts[column] for column in columns]
-        places = sorted({place for part in parts for place in part.places})
+        places = list(dict.fromkeys(place for part in parts for place in part.places))
+        plain = len(places) == len(parts) and all(len(part.places) == 1 for part in parts)
         dialect = self._judged(places)
         line, row = 1, 0
         for text, last in _with_last(blocks(self._text, progress)):
@@ -105,7 +106,7 @@ class Delimited(Source):
             text = text[begin:]
             if not text.isspace():
                 rows = self._rows(dialect, max(line - lines, dialect.first_line), text, places, last)
-                yield np.column_stack([_sum(part, rows, places, row) for part in parts])
+                yield rows if plain else np.column_stack([_sum(part, rows, places, row) for part in parts])
                 row += len(rows)
         if self._lost:
             self._say(f"{self.path}: lines that are cut off or have bytes 0: {self._lost}; they are left out")
@@ -119,7 +120,8 @@ class Delimited(Source):
         """The dialect of these columns: their decimal mark, and the order of their dates. Raises TableError."""
         dialect = self.dialect
         commas = tuple(comma if k in places else "" for k, comma in enumerate(dialect.commas))
-        sample = [dialect.fields(line) for _, line in itertools.islice(lines_of(self.path, dialect), SAMPLE_ROWS)]
+        first = enumerate(self._text.head[dialect.first_line - 1 :], start=dialect.first_line)
+        sample = [dialect.fields(line) for _, line in itertools.islice(dialect.rows(first), SAMPLE_ROWS)]
         cells = [row[k] for row in sample for k in places if len(row) > k]
         if any(commas) and separates_thousands(cells):
             comma = next(filter(None, commas))
@@ -131,20 +133,25 @@ class Delimited(Source):
         if dialect.comma:
             self._say(f"{self.path}: the comma is taken as the decimal mark, as in {dialect.comma!r}")
         dated = [k for k in places if dialect.moments[k] in ("day", "both")]
-        return replace(dialect, order=self._order(dialect, dated[0])) if dated else dialect
+        return replace(dialect, order=self._order(dialect, dated[0], sample)) if dated else dialect
 
-    def _order(self, dialect: Dialect, column: int) -> str:
+    def _order(self, dialect: Dialect, column: int, sample: Sequence[Sequence[str]]) -> str:
         """The order of the dates in a column, by all its lines where the first ones leave it open."""
-        order = dialect.order
-        if not order:
-            fields = (dialect.fields(line) for _, line in lines_of(self.path, dialect))
-            order = order_of(day_of(row[column]) for row in fields if len(row) > column)
-        first = next((dialect.fields(line)[column] for _, line in lines_of(self.path, dialect)), "")
-        if order and day_of(first) and not day_of(first)[:4].isdigit():
+        order = dialect.order or order_of(self._days(dialect, column))
+        first = next((day_of(row[column]) for row in sample if len(row) > column), "")
+        if order and first and not first[:4].isdecimal():
             with contextlib.suppress(UnclearError):
-                day = np.datetime64(int(seconds_of([day_of(first)], order)[0]), "s").astype("datetime64[D]")
-                self._say(f"{self.path}: the date {day_of(first)!r} is taken as {day}")
+                day = np.datetime64(int(seconds_of([first], order)[0]), "s").astype("datetime64[D]")
+                self._say(f"{self.path}: the date {first!r} is taken as {day}")
         return order
+
+    def _days(self, dialect: Dialect, column: int) -> Iterator[str]:
+        """The dates in a column, of all lines."""
+        for text in blocks(self._text):
+            for line in text.decode("latin-1").split("\n"):
+                fields = dialect.fields(line)
+                if len(fields) > column and (day := day_of(fields[column])):
+                    yield day
 
     def _rows(self, dialect: Dialect, line: int, text: bytes, places: Sequence[int], last: bool) -> Array:
         if not places:

@@ -9,6 +9,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 from agent.reading.choice import TIME_WORDS, words
@@ -18,6 +19,8 @@ from agent.reading.source import TableError
 from agent.reading.units import unit_of
 
 SAMPLE_ROWS = 50  # rows from which the dialect is found
+RATES_HZ = 1e-6, 1e8  # of loggers
+MOST_DIGITS = 12  # of the number of a row
 HEAD_ROWS = 10  # lines with words and values that a head may have before the names
 LARGEST = 1e19  # no indication and no time in ns since 1970 is larger, and its squares and their sums stay finite
 # A line of comment; also one with ";" where that is no delimiter. A first cell may have an error of a spreadsheet.
@@ -37,18 +40,18 @@ SECOND_ROWS = frozenset(
 COUNTERS = frozenset(("counter", "packetcounter", "count", "index", "sample", "samples", "record", "scan", "no", "n"))
 THOUSANDTHS = frozenset(("ms", "msec", "msecs", "millis", "millisecond", "milliseconds"))
 _COMMENT = re.compile(COMMENT)
-_FORTRAN = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)[dD][+-]?\d+")
+_FORTRAN = re.compile(r"[+-]?(?:\d++\.?\d*+|\.\d++)[dD][+-]?\d+")
 _THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(?:,\d{3})+")
 _BETWEEN_BLANKS = re.compile(r'"([^"]*)"|(\S+)')
 _NUMERIC = re.compile(r"[+-]?[\d.,]+(?:[eE][+-]?\d+)?")
 _GROUPED = re.compile(r"[+-]?\d{1,3}(?:,\d{3})+(?:\.\d+)?")
 _VALUE = r"[^\d\n]{0,30}?(?P<value>\d+(?:[.,]\d+)?(?:[eE][-+]?\d+)?)[;,\t ]*(?:[A-Za-z\xb5/]+)?"
 _RATE = re.compile(
-    r"(?:(?:sampl\w*|scan|update|data|output|measurement|acquisition|logging|recording)[\s_]*(?:rate|freq\w*)"
+    r"(?:(?:sampl\w{0,8}|scan|update|data|output|measurement|acquisition|logging|recording)[\s_]{0,4}(?:rate|freq\w*)"
     rf"|\b(?:rate|freq|frequency|fs|odr|at)\b){_VALUE}",
     re.IGNORECASE,
 )
-_INTERVAL = re.compile(rf"(?:\binterval|sampl\w+ (?:period|time)|\bdelta_x\b|\bdt\b){_VALUE}", re.IGNORECASE)
+_INTERVAL = re.compile(rf"(?:\binterval|sampl\w{0, 8} (?:period|time)|\bdelta_x\b|\bdt\b){_VALUE}", re.IGNORECASE)
 _HERTZ = {"hz": 1.0, "khz": 1e3, "sps": 1.0, "s/s": 1.0}
 _SECONDS = re.compile(r"(?<![a-z])(?:[mun\xb5]s|s|m?sec)(?![a-z])", re.IGNORECASE)
 
@@ -291,7 +294,7 @@ def _in_comment(lines: Sequence[str], stop: int, delimiter: str, width: int) -> 
 def _is_counted(rows: Sequence[Sequence[str]]) -> bool:
     """Whether rows begin with their own numbers, for which some programs write no name, and end with a value."""
     counted = [row[0] for row in rows]
-    first = int(counted[0]) if counted[0].isdigit() else 0
+    first = int(counted[0]) if counted[0].isdecimal() and len(counted[0]) < MOST_DIGITS else 0
     return first > 0 and counted == [str(first + k) for k in range(len(rows))] and any(row[-1] for row in rows)
 
 
@@ -358,7 +361,7 @@ def _rate_hz(lines: Sequence[str]) -> float | None:
             value = _plain_number(found["value"])
             if second is not None and value:
                 rates.add(round(1.0 / (value * second.si), 12))
-    rates.discard(0.0)
+    rates = {rate for rate in rates if RATES_HZ[0] < rate < RATES_HZ[1]}
     return rates.pop() if len(rates) == 1 else None
 
 
@@ -404,14 +407,14 @@ def _stripped(fields: list[str]) -> list[str]:
     return list(itertools.dropwhile(lambda f: not f, fields[::-1]))[::-1]
 
 
+@lru_cache(maxsize=1 << 13)
 def _is_value(text: str) -> bool:
-    if text.lower() in NO_NUMBERS or is_moment(text) or _GROUPED.fullmatch(text):
-        return True
     plain = text.replace(",", ".")
     try:
         float(plain)
     except ValueError:
-        return bool(_FORTRAN.fullmatch(plain))
+        known = text.lower() in NO_NUMBERS or is_moment(text) or _GROUPED.fullmatch(text) or _FORTRAN.fullmatch(plain)
+        return bool(known)
     return True
 
 
