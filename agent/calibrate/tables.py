@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from agent.calibrate.faults import as_table_error
+from agent.calibrate.times import Times
 from agent.reading.choice import AXES, Choice, Chosen, quantity_of
 from agent.reading.formats import NOT_DESCRIBED, Description, open_source
 from agent.reading.ground_motion import GroundMotion
 from agent.reading.source import Array, Progress, Source, TableError
 from agent.reading.spool import Spool, Spooled
 from agent.reading.stationxml import Component
-from agent.reading.times import Times
 from agent.reading.units import Sensitivity, unit_of
 from calib.recorded.table import (
     REFERENCES,

@@ -88,7 +88,7 @@ BROKEN = {
     "a word among numbers": Broken("a.csv", changed(20, "0.1,1,two,3"), "line 20, column vy: 'two'", "write|correct"),
     "a field too few": Broken("a.csv", changed(20, "0.1,1,2"), "line 20", "add|correct|columns"),
     "an infinite value": Broken("a.csv", changed(20, "0.1,1,inf,3"), "line 20, column vy", "correct|remove"),
-    "a row without time": Broken("a.csv", changed(20, ",1,2,3"), "line 20, column time_s", "correct|remove"),
+    "an infinite time": Broken("a.csv", changed(20, "inf,1,2,3"), "line 20, column time_s", "correct|remove"),
     "a time that decreases": Broken("a.csv", changed(20, "0.01,1,2,3"), "line 20, column time_s", "sort or cut"),
     "a column that is missing": Broken("a.csv", changed(1, "time_s,vx,vy,w"), "line 1.*vz is missing", "--columns"),
     "a constant time": Broken("a.csv", text(HEADER + "1,2,3,4\n" * 9), "column time_s", "time must increase"),
