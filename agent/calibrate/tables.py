@@ -69,9 +69,8 @@ def _described(
     source: Source, choice: Choice, chosen: Sequence[Chosen]
 ) -> tuple[tuple[str, ...], tuple[Component, ...]]:
     """What the user is told, and what the metadata of a station say of the chosen channels."""
-    if not isinstance(source, GroundMotion):
-        return tuple(choice.said), ()
-    return (*source.said, *choice.said), tuple(source.components[c.column] for c in chosen)
+    components = source.components if isinstance(source, GroundMotion) else {}
+    return (*source.said, *choice.said), tuple(components[c.column] for c in chosen if c.column in components)
 
 
 def _sensor_columns(choice: Choice) -> list[Chosen]:

@@ -25,7 +25,8 @@ class Recording(Source):
     """A recording. Each device is a group with `time_s`, its axes and, where it has one, `temperature_degc`.
 
     The time is the arrival of the burst to which a sample belongs, in s since 1970. Lost samples that the device
-    counted are rows of NaN. Raises TableError for a file that is damaged; one that only ends early is read to its end.
+    counted are rows of NaN. A file that ends early is read to there, and `said` says it. Raises TableError for a
+    damaged one.
     """
 
     header = "devices"
@@ -110,6 +111,15 @@ class Recording(Source):
             yield step.event
         if reader.fault is not None and reader.fault.kind == "corrupt":
             raise TableError(f"{self.path}, {reader.fault}; `fieldcal audit {self.path}` says more")
+        if reader.fault is not None:
+            self.said = [
+                f"{self.path}: the file ends early, as after a power cut, or is still written; it is read up to byte "
+                f"{reader.good_bytes} of {self.path.stat().st_size} ({reader.fault.reason})"
+            ]
+        elif reader.repaired:
+            self.said = [
+                f"{self.path}: a crash left the file open, and it was closed later; what came after is not in it"
+            ]
 
 
 def _columns(block: SampleBlock, unit: str) -> list[Column]:
