@@ -11,6 +11,7 @@ import numpy as np
 from agent.calibrate.faults import as_table_error
 from agent.reading.choice import AXES, Choice, Chosen, quantity_of
 from agent.reading.formats import NOT_DESCRIBED, Description, open_source
+from agent.reading.gravity import told_in_g
 from agent.reading.ground_motion import GroundMotion
 from agent.reading.source import Array, Progress, Source, TableError
 from agent.reading.spool import Spool, Spooled
@@ -60,6 +61,7 @@ def read_sensor(
         chosen = choice.in_one_group(_sensor_columns)
         times, values = _rows(source, chosen, progress, np.ones(len(chosen) - 1))
         said, components = _described(source, choice, chosen[1:4])
+        said += told_in_g(path, "--columns", chosen[:4], Spooled(values, slice(0, 3)))
         filters = source.filters.get(chosen[1].column.group, ())
     temperature_degc = Spooled(values, 3) if len(chosen) > 4 else None
     return SensorFile(str(path), times, Spooled(values, slice(0, 3)), temperature_degc, said, components, filters)
@@ -113,6 +115,7 @@ def read_reference(
         scale = np.array([_si(choice, c, sensitivity) for c in chosen[1:]])
         times, values = _rows(source, chosen, progress, scale)
         said, components = _described(source, choice, chosen[1:])
+        said += told_in_g(path, "--reference-columns", chosen, Spooled(values, slice(None)))
         filters = source.filters.get(chosen[1].column.group, ())
     column, header = str(chosen[1].column), source.header
     channels = Spooled(values, slice(None))

@@ -46,31 +46,33 @@ class Ros1Bag(Bag):
                     kind, number = _number(header, b"op", 1), _number(header, b"conn", 4)
                     if kind == BAG_HEADER:
                         index_at = _number(header, b"index_pos", 8)
-                        if header.get(b"encryptor"):
-                            raise TableError(f"{self.path}: the bag is encrypted; decrypt it with rosbag")
                     elif kind == CONNECTION:
-                        told = _fields(at, body)
-                        texts = (header.get(b"topic"), told.get(b"type"), told.get(b"message_definition"))
-                        topic, name, definition = (
-                            (t or b"")[:MOST_DEFINITION].decode("utf-8", "replace") for t in texts
-                        )
-                        self.declare(number, Channel(topic, name, "ros1msg", definition, "ros1"))
+                        self._connected(number, header, _fields(at, body))
                     elif kind == MESSAGE and number in self.channels and len(header.get(b"time", b"")) == 8:
                         seconds, ns = struct.unpack("<II", header[b"time"])
                         yield Message(number, 10**9 * seconds + ns, 10**9 * seconds + ns, body)
                     else:
                         unknown += kind == MESSAGE
-            except _FaultError as fault:
-                if 0 < index_at < size:
-                    raise TableError(
-                        f"{self.path}, byte {fault.at}: {fault}; the file is damaged: record it anew, or save what is "
-                        "whole with `rosbag reindex`"
-                    ) from None
-                self.cut(fault.at, size, str(fault))
-            else:
-                if not index_at:
+                if index_at <= 0:
                     self.cut(size, size, "the recorder did not close it")
+            except _FaultError as fault:
+                self._ended(size, index_at, fault)
         self.undeclared(unknown)
+
+    def _connected(self, number: int, header: Header, told: Header) -> None:
+        """Keep a connection as a channel."""
+        texts = [header.get(b"topic", b""), told.get(b"type", b""), told.get(b"message_definition", b"")]
+        topic, kind, definition = (text[:MOST_DEFINITION].decode("utf-8", "replace") for text in texts)
+        self.declare(number, Channel(topic, kind, "ros1msg", definition, "ros1"))
+
+    def _ended(self, size: int, index_at: int, fault: _FaultError) -> None:
+        """Say that the file is cut, or raise TableError where it is damaged: its index is in it."""
+        if 0 < index_at < size:
+            raise TableError(
+                f"{self.path}, byte {fault.at}: {fault}; the file is damaged: record it anew, or save what is "
+                "whole with `rosbag reindex`"
+            )
+        self.cut(fault.at, size, str(fault))
 
 
 def _number(header: Header, name: bytes, size: int) -> int:

@@ -56,6 +56,7 @@ class SqliteBag(Bag):
         """Keep the topics as channels, with the definitions of their types. Raises sqlite3.Error, TableError."""
         file.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LONGEST)
         file.execute("PRAGMA trusted_schema = OFF")
+        file.execute("PRAGMA writable_schema = ON")  # otherwise SQLite reads nothing of a file that is cut
         file.text_factory = lambda text: text[:MOST_DEFINITION].decode("utf-8", "replace")
         tables = {name for (name,) in file.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
         if not {"topics", "messages"} <= tables:
@@ -69,15 +70,16 @@ class SqliteBag(Bag):
             self.declare(number, Channel(str(topic), str(kind), language, definition, str(serial)))
 
     def _rows(self, file: sqlite3.Connection) -> Iterator[tuple[int, int, bytes]]:
-        """Yield the rows of the messages. Raises TableError where they are more than the file can hold."""
-        rows, left = (
-            file.execute("SELECT topic_id, timestamp, data FROM messages NOT INDEXED"),
-            self.path.stat().st_size,
-        )
-        for number, time_ns, data in rows:
+        """Yield the rows of the messages. Raises sqlite3.Error at a cut, TableError where the file cannot hold them."""
+        left, last = self.path.stat().st_size, 0
+        rows = file.execute("SELECT rowid, topic_id, timestamp, data FROM messages NOT INDEXED")
+        for row, number, time_ns, data in rows:
             left -= 1 + (len(data) if isinstance(data, bytes) else 0)
             if left < 0:
                 raise TableError(
                     f"{self.path}: the messages have more bytes than the file; it is damaged or hostile: record it anew"
                 )
+            if row <= last:  # the part of a page that is missing reads as zeros
+                raise sqlite3.DatabaseError("the next one is not there")
+            last = row
             yield number, time_ns, data

@@ -15,6 +15,7 @@ from agent.reading.source import ROWS_AT_ONCE, Array
 from agent.reading.spool import Spool
 from calib.recorded.errors import InputError
 from calib.recorded.table import check_time
+from calib.signal.stamps import kind_of
 
 LONG_RUN = 100  # messages
 MOST_CHANGES = 20  # of the run, for each long run, where runs only overlap at their ends
@@ -55,16 +56,19 @@ class Stream:
     def _order(self) -> NDArray[np.intp] | None:
         """The numbers of the rows in the order of their times; None where it is that of the file.
 
-        Rows are sorted by when they were recorded and, if their times then still decrease, by these. Where neither
-        helps, as after a clock that was set back, they stay as they are, and the caller refuses their times.
+        Rows are sorted by when they were recorded and, if their times are then still no times of samples, by these:
+        times on an exact grid must not decrease at all, others may be late. Where neither helps, as after a clock that
+        was set back, they stay as they are, and the caller refuses their times.
         """
         self.moved = 0
         if self._increases():
             return None
         time_s, logged = (self._column(k) for k in (TIME, LOGGED))
+        exact = _are_exact(np.sort(time_s))
         for keys in ((logged,), (logged, time_s)):
             order = np.lexsort(keys)
-            if _is_usable(time_s[order]) and not self._mixes(order, time_s):
+            increase = bool((np.diff(time_s[order]) >= 0.0).all())
+            if (increase or (not exact and _is_usable(time_s[order]))) and not self._mixes(order, time_s):
                 self.moved = int((np.diff(order) < 0).sum())
                 return order if self.moved else None
         return None
@@ -106,6 +110,14 @@ def _same(rows: Array, before: Array, columns: list[int]) -> NDArray[np.bool_]:
     """Which rows have the same bytes as those before, in these columns."""
     a, b = (np.ascontiguousarray(each[:, columns]).view(np.uint64) for each in (rows, before))
     return np.asarray((a == b).all(axis=1))
+
+
+def _are_exact(time_s: Array) -> bool:
+    """Whether times (n,) that increase are on a grid, but for gaps and for times that are there twice."""
+    try:
+        return kind_of(np.unique(time_s)[:ROWS_AT_ONCE]) == "grid"
+    except ValueError:
+        return False
 
 
 def _is_usable(time_s: Array) -> bool:

@@ -48,6 +48,8 @@ class Recording(Source):
                 columns[event.device] = _columns(event, units.get(event.device, "count"))
                 if isinstance(devices, list) and len(columns) == len(devices):
                     break
+        if self.said and not columns:
+            raise TableError(f"{self.said[0]}; no sample is before that")
         self.columns = [column for name in sorted(columns) for column in columns[name]]
         self.filters = filters
 
