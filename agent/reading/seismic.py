@@ -76,7 +76,8 @@ def open_miniseed(path: Path) -> MiniSeed:
         try:
             stream = obspy.read(BytesIO(whole), format="MSEED", check_compression=False)
         except Exception as error:  # ObsPy raises many kinds for broken files
-            raise TableError(f"{path}: the file cannot be read: {error}; write it anew") from None
+            reason = " ".join(str(error).split())
+            raise TableError(f"{path}: the file cannot be read: {reason}; write it anew") from None
     groups: dict[str, list[Component]] = {}
     for component in _components(path, stream, found):
         groups.setdefault(component.seed_id[:-1], []).append(component)
