@@ -165,7 +165,8 @@ def _content(at: int, body: bytes, length: int, allowed: int) -> tuple[bytes, bo
         if compression == b"":
             data = packed[:limit]
         elif compression == b"zstd":
-            data = zstandard.ZstdDecompressor(max_window_size=WINDOW).stream_reader(BytesIO(packed)).read(limit)
+            unpacker = zstandard.ZstdDecompressor(max_window_size=WINDOW)
+            data = unpacker.stream_reader(BytesIO(packed), read_across_frames=True).read(limit)
         elif compression == b"lz4":
             import lz4.frame
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import re
+import struct
 import zlib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,18 +14,22 @@ import numpy as np
 import zstandard
 
 from agent.config.files import open_file
-from agent.reading.bag import Bag, Message
+from agent.reading.bag import Bag, Channel, Message
 from agent.reading.bag_mcap import McapBag
 from agent.reading.bag_ros1 import Ros1Bag
 from agent.reading.bag_sqlite import SqliteBag
 from agent.reading.in_order import Stream
 from agent.reading.mapping import TIMES, Topic
-from agent.reading.ros2_fields import FieldError, Fields, plain, read_definition
+from agent.reading.ros2_fields import BIG, FieldError, Fields, plain, read_definition
 from agent.reading.source import ROWS_AT_ONCE, Array, Column, Progress, Source, TableError
 
 IMU = "sensor_msgs/Imu"
 BAGS: dict[bytes, type[Bag]] = {b"#ROSBAG": Ros1Bag, b"SQLite ": SqliteBag}  # by their first bytes; others are MCAP
 ZSTD_BEGINS, LONGEST_MESSAGE = b"\x28\xb5\x2f\xfd", 1 << 27  # `ros2 bag record --compression-mode message`
+# A header is a time of 8 bytes, after four bytes of CDR, or of `seq` of ROS 1, and the frame.
+_HEADER_FIRST = re.compile(r"(?:\s*(?:#.*|\w+\s+\w+\s*=.*)?\n)*\s*(?:std_msgs/(?:msg/)?)?Header\s")
+FRAME_AT, LONGEST_FRAME, MOST_FRAMES, FEWEST_MESSAGES = 12, 64, 4, 10
+Sender = tuple[int, bytes | None]  # a channel, and the frame where a channel has several
 # Up to the acceleration; a file may state the type alone.
 IMU_DEFINITION = """std_msgs/Header header
 geometry_msgs/Quaternion orientation
@@ -66,36 +72,59 @@ class RosBag(Source):
     def __init__(self, path: Path, mapping: Mapping[str, Topic] | None = None) -> None:
         self.path = path
         self._bag = _bag_of(path)
-        counts = Counter(message.channel for message in self._bag.messages())
-        self._channels = self._named(counts)
-        self._about = list(self._publishers(counts))
-        self.said = [*self._bag.said, *self._about]
+        counts = self._counted()
+        self._senders = self._named(counts)
         self._topics = self._imus() if mapping is None else self._mapped(mapping)
+        self._about = list(self._several(counts))
+        self.said = [*self._bag.said, *self._about]
         self._fields = {name: self._readable(name, fields) for name, fields in self._topics.items()}
         self.columns = [column for name, fields in self._topics.items() for column in fields.columns(name)]
 
-    def _named(self, counts: Mapping[int, int]) -> dict[str, int]:
-        """The channels with messages, each by its topic, or by its topic and its number among several."""
-        by_topic: dict[str, list[int]] = {}
-        for number in sorted(counts):
-            by_topic.setdefault(self._bag.channels[number].topic, []).append(number)
+    def _counted(self) -> dict[Sender, int]:
+        """How many messages each publisher sent.
+
+        rosbag2 has one channel for all publishers of a topic; the frame of the header tells them apart. Where there are
+        more frames than MOST_FRAMES, or one of them has hardly a message, they do not mean sensors: the channel is one.
+        """
+        counts: dict[int, Counter[bytes]] = {}
+        for message in self._bag.messages():
+            frames = counts.setdefault(message.channel, Counter())
+            frame = _frame(self._bag.channels[message.channel], message)
+            frames[frame if frame in frames or len(frames) <= MOST_FRAMES else b""] += 1
+        found: dict[Sender, int] = {}
+        for number, frames in sorted(counts.items()):
+            if 1 < len(frames) <= MOST_FRAMES and min(frames.values()) >= FEWEST_MESSAGES:
+                found |= {(number, frame): count for frame, count in sorted(frames.items())}
+            else:
+                found[number, None] = frames.total()
+        return found
+
+    def _named(self, counts: Mapping[Sender, int]) -> dict[str, Sender]:
+        """The publishers, each by its topic, or by its topic and its number among several."""
+        by_topic: dict[str, list[Sender]] = {}
+        for sender in counts:
+            by_topic.setdefault(self._bag.channels[sender[0]].topic, []).append(sender)
         return {
-            f"{topic}#{k}" if len(numbers) > 1 else topic: number
-            for topic, numbers in sorted(by_topic.items()) for k, number in enumerate(numbers, 1)
+            f"{topic}#{k}" if len(senders) > 1 else topic: sender
+            for topic, senders in sorted(by_topic.items()) for k, sender in enumerate(senders, 1)
         }  # fmt: skip
 
-    def _publishers(self, counts: Mapping[int, int]) -> Iterator[str]:
-        """Yield a line for each topic that has several publishers."""
-        topics = Counter(self._bag.channels[number].topic for number in counts)
-        for topic, several in topics.items():
-            if several > 1:
-                names = [name for name, number in self._channels.items() if self._bag.channels[number].topic == topic]
-                told = ", ".join(f"{name} ({counts[self._channels[name]]} messages)" for name in names)
-                yield f"{self.path}: {topic} has {several} publishers, each is a group of its own: {told}"
+    def _several(self, counts: Mapping[Sender, int]) -> Iterator[str]:
+        """Yield a line for each topic that is read and has several publishers."""
+        by_topic: dict[str, list[str]] = {}
+        for name in self._topics:
+            sender = self._senders[name]
+            frame = f"frame {sender[1].decode('utf-8', 'replace')!r}, " if sender[1] is not None else ""
+            told = f"{name} ({frame}{counts[sender]} messages)"
+            by_topic.setdefault(self._bag.channels[sender[0]].topic, []).append(told)
+        for topic, lines in by_topic.items():
+            if len(lines) > 1:
+                told = ", ".join(lines)
+                yield f"{self.path}: {topic} has {len(lines)} publishers, each is a group of its own: {told}"
 
     def _imus(self) -> dict[str, Topic]:
-        """The Imu of each channel that can be read. Raises TableError where there is none."""
-        channels = {name: self._bag.channels[number] for name, number in self._channels.items()}
+        """The Imu of each publisher that can be read. Raises TableError where there is none."""
+        channels = {name: self._bag.channels[number] for name, (number, _) in self._senders.items()}
         imus = [name for name, channel in channels.items() if plain(channel.kind) == IMU]
         if found := [name for name in imus if channels[name].is_read]:
             return dict.fromkeys(found, ACCELERATION)
@@ -113,10 +142,10 @@ class RosBag(Source):
         )
 
     def _mapped(self, mapping: Mapping[str, Topic]) -> dict[str, Topic]:
-        """The mapping of each channel. Raises TableError where it names a topic that has no messages."""
+        """The mapping of each publisher. Raises TableError where it names a topic that has no messages."""
         found: dict[str, Topic] = {}
         for topic, fields in mapping.items():
-            names = [n for n, number in self._channels.items() if topic in (n, self._bag.channels[number].topic)]
+            names = [n for n, (number, _) in self._senders.items() if topic in (n, self._bag.channels[number].topic)]
             if not names:
                 raise TableError(
                     f"{self.path}, topics: there is no topic {topic!r} with messages; the topics are {self._told()}"
@@ -126,10 +155,11 @@ class RosBag(Source):
 
     def _told(self) -> str:
         """The topics with their types, for messages."""
-        return ", ".join(str(self._bag.channels[number]) for number in self._channels.values()) or "none"
+        numbers = dict.fromkeys(number for number, _ in self._senders.values())
+        return ", ".join(str(self._bag.channels[number]) for number in numbers) or "none"
 
     def _readable(self, name: str, fields: Topic) -> Fields:
-        channel = self._bag.channels[self._channels[name]]
+        channel = self._bag.channels[self._senders[name][0]]
         if not channel.is_read:
             raise TableError(
                 f"{self.path}: {channel} cannot be read: only messages of ROS with ros2msg in CDR, or with ros1msg, "
@@ -172,9 +202,12 @@ class RosBag(Source):
 
     def _rows(self, name: str) -> Iterator[Array]:
         """Yield the messages of one publisher as they stand in the file, as rows of `Stream`."""
-        clock, fields, taken = self._topics[name].time, self._fields[name], self._channels[name]
+        clock, fields, (number, frame) = self._topics[name].time, self._fields[name], self._senders[name]
+        channel = self._bag.channels[number]
         rows: list[list[float]] = []
-        for count, message in enumerate(each for each in self._bag.messages() if each.channel == taken):
+        for count, message in enumerate(each for each in self._bag.messages() if each.channel == number):
+            if frame is not None and _frame(channel, message) != frame:
+                continue
             try:
                 row = fields.read(_unpacked(message))
             except FieldError as error:
@@ -197,6 +230,19 @@ def _bag_of(path: Path) -> Bag:
     except OSError as error:
         raise TableError(f"{path}: {error.strerror}") from None
     return BAGS.get(begin, McapBag)(path)
+
+
+def _frame(channel: Channel, message: Message) -> bytes:
+    """The frame in the header with which a message begins; b"" where it begins otherwise."""
+    if not channel.is_read or not (_HEADER_FIRST.match(channel.definition) or plain(channel.kind) == IMU):
+        return b""
+    try:
+        data = _unpacked(message)
+        order = ">" if channel.serial != "ros1" and data[1] == BIG else "<"
+        (length,) = struct.unpack_from(f"{order}I", data, FRAME_AT)
+    except (FieldError, struct.error, IndexError):
+        return b""
+    return data[FRAME_AT + 4 : FRAME_AT + 4 + min(length, LONGEST_FRAME)].rstrip(b"\0")
 
 
 def _unpacked(message: Message) -> bytes:

@@ -90,6 +90,8 @@ def open_miniseed(path: Path) -> MiniSeed:
             code = component.seed_id.rpartition(".")[2][-1:]
             column = Column(AXES.get(code, code or "a"), "counts", group)
             values[column], seed_ids[column] = samples, component.seed_id
+    if not values:
+        raise TableError(f"{path}: no channel has numbers; give the file with the channels of the sensor")
     return MiniSeed(path, values, seed_ids, said)
 
 

@@ -189,6 +189,24 @@ def test_two_publishers_on_one_topic_are_two_streams(tmp_path: Path) -> None:
     np.testing.assert_allclose(mapped.x[:][:, 0], -9.80665 * V[:, 2], rtol=1e-15)
 
 
+def test_two_publishers_in_one_channel_are_told_apart_by_their_frames(tmp_path: Path) -> None:
+    """rosbag2 records all publishers of a topic in one channel."""
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2", "test")
+        channel = writer.register_channel("/imu", "cdr", writer.register_schema(IMU, "ros2msg", b""))
+        for stamp, log, v in rows():
+            writer.add_message(channel, log, imu(stamp, v, "left"), log)
+            writer.add_message(channel, log, imu(stamp, -v, "right"), log)
+        writer.finish()
+    fault(path, r"several groups could be meant \(/imu#1, /imu#2\), add group=NAME")
+    left, right = (read_sensor(path, columns=f"group=/imu#{k}") for k in (1, 2))
+    assert begins(left) == N
+    np.testing.assert_array_equal(right.v[:], -V)
+    assert f"/imu#1 (frame 'left', {N} messages), /imu#2 (frame 'right', {N} messages)" in left.said[0]
+
+
 # What is not read
 
 
@@ -232,7 +250,7 @@ def messages(store: Any, *, ros1: bool) -> Iterator[tuple[int, Any]]:
     vector, turn = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
     for k, (ns, v) in enumerate(zip(NS.tolist(), V.tolist(), strict=True)):
         now = types["builtin_interfaces/msg/Time"](ns // 10**9, ns % 10**9)
-        header = types["std_msgs/msg/Header"](*((k,) if ros1 else ()), now, "imu" + "k" * (k % 3))
+        header = types["std_msgs/msg/Header"](*((k,) if ros1 else ()), now, "imu_link")
         yield ns, types[IMU](header, turn, none, vector(7.0, 8.0, 9.0), none, vector(*v), none)
 
 
