@@ -113,15 +113,7 @@ class Recording(Source):
             yield step.event
         if reader.fault is not None and reader.fault.kind == "corrupt":
             raise TableError(f"{self.path}, {reader.fault}; `fieldcal audit {self.path}` says more")
-        if reader.fault is not None:
-            self.said = [
-                f"{self.path}: the file ends early, as after a power cut, or is still written; it is read up to byte "
-                f"{reader.good_bytes} of {self.path.stat().st_size} ({reader.fault.reason})"
-            ]
-        elif reader.repaired:
-            self.said = [
-                f"{self.path}: a crash left the file open, and it was closed later; what came after is not in it"
-            ]
+        self.said = end_of(reader)
 
 
 def _columns(block: SampleBlock, unit: str) -> list[Column]:
@@ -130,6 +122,18 @@ def _columns(block: SampleBlock, unit: str) -> list[Column]:
         axes = (QUANTITIES.get(unit, "a"),)
     found = [Column("time_s", "s", block.device), *(Column(axis, unit, block.device) for axis in axes)]
     return [*found, Column("temperature_degc", "degC", block.device)] if block.temperature_degc is not None else found
+
+
+def end_of(reader: RecordingReader) -> list[str]:
+    """What the user should know of the end of a recording that was read: that it is missing."""
+    if reader.fault is not None:
+        return [
+            f"{reader.path}: the file ends early, as after a power cut, or is still written; it is read up to byte "
+            f"{reader.good_bytes} of {reader.path.stat().st_size} ({reader.fault.reason})"
+        ]
+    if reader.repaired:
+        return [f"{reader.path}: a crash left the file open, and it was closed later; what came after is not in it"]
+    return []
 
 
 def open_mcap(path: Path) -> Source:
