@@ -10,11 +10,13 @@ import wave
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from agent.delivery.history import Record
 from agent.delivery.store import Store
+from agent.export.cdr import DEFINITIONS, IMU, imu
 from tests.replay.golden_files import FORMATS, RECORDING
 from tests.unit.recorded_bench import record
 from tests.unit.results import calibration, status, window
@@ -178,7 +180,10 @@ def _tables(site: Path, time_s: np.ndarray, v: np.ndarray) -> list[tuple[str, st
     for title, name, write in (
         ("Parquet", "a.parquet", _parquet), ("Feather", "a.feather", _feather), ("WAV", "a.wav", _wav),
         ("MATLAB", "a.mat", _matlab), ("HDF5", "a.h5", _hdf5), ("TDMS", "a.tdms", _tdms),
-        ("MiniSEED", "a.mseed", _miniseed), ("NPZ", "a.npz", _npz), ("Excel", "a.xlsx", _excel),
+        ("MiniSEED", "a[1].mseed", _miniseed), ("MiniSEED with gaps", "gaps.mseed", _miniseed_with_gaps),
+        ("bag (MCAP)", "a.mcap", _bag), ("bag without chunks", "b.mcap", _bag_without_chunks),
+        ("bag (SQLite)", "a.db3", _bag_in_sqlite), ("bag (ROS 1)", "a.bag", _bag_of_ros_1),
+        ("NPZ", "a.npz", _npz), ("Excel", "a.xlsx", _excel),
     ):  # fmt: skip
         try:
             write(site / name, time_s, v)
@@ -244,6 +249,62 @@ def _miniseed(path: Path, _: np.ndarray, v: np.ndarray) -> None:
     about = {"sampling_rate": float(RATE_HZ), "station": "A"}
     traces = [Trace((1000 * v[:, k]).astype(np.int32), about | {"channel": f"HN{'ENZ'[k]}"}) for k in range(3)]
     Stream(traces).write(str(path), format="MSEED", reclen=512)
+
+
+def _miniseed_with_gaps(path: Path, _: np.ndarray, v: np.ndarray) -> None:
+    """Stays of a logger that is off between them, of which the clock is set after the first."""
+    from obspy import Stream, Trace, UTCDateTime
+
+    traces = []
+    for n, stay in enumerate(np.array_split(v, min(4, len(v)))):
+        about = {"sampling_rate": float(RATE_HZ), "station": "A", "starttime": UTCDateTime(1e9 * (n > 0) + 50.123 * n)}
+        counts = np.ascontiguousarray((1000 * stay).astype(np.int32))
+        traces += [Trace(np.ascontiguousarray(counts[:, k]), about | {"channel": f"HN{'ENZ'[k]}"}) for k in range(3)]
+    Stream(traces).write(str(path), format="MSEED", reclen=512)
+
+
+def _bag(path: Path, time_s: np.ndarray, v: np.ndarray, **options: Any) -> None:
+    from mcap.writer import Writer
+
+    with path.open("wb") as file:
+        writer = Writer(file, **options)
+        writer.start("ros2", "benchmark")
+        schema = writer.register_schema(IMU, "ros2msg", DEFINITIONS[IMU].encode())
+        channel = writer.register_channel("/imu", "cdr", schema)
+        for ns, sample in zip(np.round(1e9 * time_s).astype(int).tolist(), v, strict=True):
+            writer.add_message(channel, ns, imu(ns, "imu", sample), ns)
+        writer.finish()
+
+
+def _bag_without_chunks(path: Path, time_s: np.ndarray, v: np.ndarray) -> None:
+    _bag(path, time_s, v, use_chunking=False)
+
+
+def _bag_in_sqlite(path: Path, time_s: np.ndarray, v: np.ndarray) -> None:
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store, folder = get_typestore(Stores.ROS2_HUMBLE), path.with_suffix("")
+    with Writer(folder, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        connection = writer.add_connection("/imu", IMU, typestore=store)
+        for ns, sample in zip(np.round(1e9 * time_s).astype(int).tolist(), v, strict=True):
+            writer.write(connection, ns, imu(ns, "imu", sample))
+    next(folder.glob("*.db3")).rename(path)
+
+
+def _bag_of_ros_1(path: Path, time_s: np.ndarray, v: np.ndarray) -> None:
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store, none = get_typestore(Stores.ROS1_NOETIC), np.zeros(9)
+    types = store.types
+    vector, turn = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
+    with Writer(path) as writer:
+        connection = writer.add_connection("/imu", IMU, typestore=store)
+        for ns, sample in zip(np.round(1e9 * time_s).astype(int).tolist(), v, strict=True):
+            header = types["std_msgs/msg/Header"](0, types["builtin_interfaces/msg/Time"](ns // 10**9, ns % 10**9), "")
+            message = types[IMU](header, turn, none, vector(0.0, 0.0, 0.0), none, vector(*sample.tolist()), none)
+            writer.write(connection, ns, store.serialize_ros1(message, IMU))
 
 
 def _npz(path: Path, time_s: np.ndarray, v: np.ndarray) -> None:

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import bz2
 import io
 import random
 import re
+import sqlite3
 import struct
 import tempfile
 import zipfile
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import zstandard
 from google.protobuf.descriptor import FieldDescriptor
 
 from agent.proto import fieldcal_pb2 as pb
@@ -234,7 +238,8 @@ def _of_format(title: str) -> bytes:
     """A bomb of a binary format; empty where there is none, or its library is not here."""
     makers: dict[str, Callable[[Path], None]] = {
         "Parquet": _zeros_in_parquet, "MATLAB": _zeros_in_matlab, "HDF5": _zeros_in_hdf5, "WAV": _long_wav,
-        "Excel": _cells_in_excel,
+        "Excel": _cells_in_excel, "MiniSEED": _archive_behind_miniseed, "MiniSEED with gaps": _hours_between_samples,
+        "bag (MCAP)": _zeros_in_a_bag, "bag (SQLite)": _computed_messages, "bag (ROS 1)": _zeros_in_a_bag_of_ros_1,
         "NPZ": lambda path: np.savez_compressed(path, vx=np.zeros(50_000_000, np.uint8)),
     }  # fmt: skip
     if title not in makers:
@@ -270,6 +275,58 @@ def _zeros_in_hdf5(path: Path) -> None:
     with h5py.File(path, "w") as file:
         for name in ("time", "x", "y", "z"):
             file.create_dataset(name, shape=(60_000_000,), dtype="f8", chunks=(1_000_000,), compression="gzip")
+
+
+def _archive_behind_miniseed(path: Path) -> None:
+    """A program that looks for an archive in the file unpacks 1 GiB."""
+    path.write_bytes(_seed_record(0, 100))
+    with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED, compresslevel=1) as archive, archive.open("a", "w") as file:
+        for _ in range(64):
+            file.write(bytes(1 << 24))
+
+
+def _hours_between_samples(path: Path) -> None:
+    path.write_bytes(b"".join(_seed_record(k, 1) for k in range(1900)))
+
+
+def _seed_record(hour: int, samples: int, rate_hz: int = 20_000) -> bytes:
+    """A record of MiniSEED with 32-bit integers."""
+    head = b"000001D A      HNZXX" + struct.pack(">HHBBBBH", 2023, 1 + hour // 24, hour % 24, 0, 0, 0, 0)
+    head += struct.pack(">HhhBBBBiHH", samples, rate_hz, 1, 0, 0, 0, 1, 0, 64, 48)
+    return (head + struct.pack(">HHBBBB", 1000, 0, 3, 1, 9, 0)).ljust(512, b"\0")
+
+
+def _zeros_in_a_bag(path: Path) -> None:
+    """Chunks of zeros, and of empty messages."""
+    header = b"\x01" + struct.pack("<QII", 8, 0, 0)
+    empty = (b"\x05" + struct.pack("<QHIQQ", 22, 1, 0, 0, 0)) * 200_000
+    path.write_bytes(MAGIC + header + b"".join(_chunk(data) for data in (empty, empty, *[bytes(100 << 20)] * 8)))
+
+
+def _chunk(data: bytes) -> bytes:
+    packed = zstandard.compress(data)
+    body = struct.pack("<QQQI", 0, 0, len(data), 0) + struct.pack("<I", 4) + b"zstd" + struct.pack("<Q", len(packed))
+    return b"\x06" + struct.pack("<Q", len(body) + len(packed)) + body + packed
+
+
+def _computed_messages(path: Path) -> None:
+    """A table of which the values are not in the file."""
+    with closing(sqlite3.connect(path)) as file:
+        file.executescript(
+            "CREATE TABLE topics(id, name, type, serialization_format);"
+            "INSERT INTO topics VALUES (1, '/imu', 'sensor_msgs/msg/Imu', 'cdr');"
+            "CREATE TABLE messages(topic_id, timestamp, data AS (zeroblob(100000000)));"
+        )
+        file.executemany("INSERT INTO messages VALUES (1, ?)", [(k,) for k in range(9999)])
+        file.commit()
+
+
+def _zeros_in_a_bag_of_ros_1(path: Path) -> None:
+    packed = bz2.compress(bytes(100 << 20), 9)
+    fields = [b"op=\x05", b"compression=bz2", b"size=" + struct.pack("<I", 100 << 20)]
+    head = b"".join(struct.pack("<I", len(each)) + each for each in fields)
+    chunk = struct.pack("<I", len(head)) + head + struct.pack("<I", len(packed)) + packed
+    path.write_bytes(b"#ROSBAG V2.0\n" + chunk * 20)
 
 
 def _cells_in_excel(path: Path) -> None:

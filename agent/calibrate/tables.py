@@ -12,6 +12,7 @@ from agent.calibrate.faults import as_table_error
 from agent.calibrate.times import Times
 from agent.reading.choice import AXES, Choice, Chosen, quantity_of
 from agent.reading.formats import NOT_DESCRIBED, Description, open_source
+from agent.reading.gravity import told_in_g
 from agent.reading.ground_motion import GroundMotion
 from agent.reading.source import Array, Progress, Source, TableError
 from agent.reading.spool import Spool, Spooled
@@ -62,6 +63,7 @@ def read_sensor(
         chosen = choice.in_one_group(_sensor_columns)
         times, values, restart = _rows(source, chosen, progress, np.ones(len(chosen) - 1))
         said, components = _described(source, choice, chosen[1:4])
+        said += told_in_g(path, "--columns", chosen[:4], Spooled(values, slice(0, 3)))
         filters = source.filters.get(chosen[1].column.group, ())
     temperature_degc = Spooled(values, 3) if len(chosen) > 4 else None
     v = Spooled(values, slice(0, 3))
@@ -72,8 +74,8 @@ def _described(
     source: Source, choice: Choice, chosen: Sequence[Chosen]
 ) -> tuple[tuple[str, ...], tuple[Component, ...]]:
     """What the user is told, and what the metadata of a station say of the chosen channels."""
-    components = tuple(source.components[c.column] for c in chosen) if isinstance(source, GroundMotion) else ()
-    return (*source.said, *choice.said), components
+    components = source.components if isinstance(source, GroundMotion) else {}
+    return (*source.said, *choice.said), tuple(components[c.column] for c in chosen if c.column in components)
 
 
 def _sensor_columns(choice: Choice) -> list[Chosen]:
@@ -118,6 +120,7 @@ def read_reference(
         if restart:
             raise TableError(f"{restart}; a reference needs one clock: cut the file there")
         said, components = _described(source, choice, chosen[1:])
+        said += told_in_g(path, "--reference-columns", chosen, Spooled(values, slice(None)))
         filters = source.filters.get(chosen[1].column.group, ())
     column, header = str(chosen[1].column), source.header
     channels = Spooled(values, slice(None))

@@ -24,8 +24,10 @@ from agent.core.identity import identity_of, nominal_of, not_certified
 from agent.core.schedule import pose_beside, pose_of
 from agent.fleet.meeting import Meeting, meeting
 from agent.reading.formats import open_source
+from agent.reading.recording import end_of
 from agent.reading.source import TableError
 from agent.recording.reading import RecordingReader, first_event
+from agent.terminal.text import say
 from calib.estimate.device import Device
 from calib.estimate.nuisances import Priors
 from calib.estimate.quantities import YEAR_DAYS
@@ -97,11 +99,14 @@ def _channels(path: Path, start: RunStart) -> Iterator[Recorded]:
         config = recorded_config(start.config_json)
     except (ValueError, OverflowError) as error:
         raise TableError(f"{path}: its configuration cannot be read: {error}") from None
+    reader = RecordingReader(path)
     infos = {
         step.event.device: step.event.info_json
-        for step in RecordingReader(path).steps()
+        for step in reader.steps()
         if isinstance(step.event, DeviceChange) and step.event.info_json
     }
+    for line in end_of(reader):
+        say(line, err=True)
     for channel in config.channels:
         filters = DriverFilters(channel)
         for device, info_json in infos.items():

@@ -38,6 +38,8 @@ XLSX_BEGINS = rb"(?s)PK\x03\x04.{26}(\[Content_Types\]\.xml|_rels/|docProps/|xl/
 MINISEED = "agent.reading.seismic:open_miniseed"
 FORMATS = (
     Format("MCAP", (".mcap",), (rb"\x89MCAP0\r\n",), "agent.reading.recording:open_mcap"),
+    Format("SQLite", (".db3",), (rb"SQLite format 3\x00",), "agent.reading.ros2:RosBag"),
+    Format("ROS 1", (".bag",), (rb"#ROSBAG V",), "agent.reading.ros2:RosBag"),
     Format("Parquet", (".parquet",), (b"PAR1",), "agent.reading.arrow:Parquet", "files"),
     Format("Feather", (".feather", ".arrow"), (b"ARROW1",), "agent.reading.arrow:Feather", "files"),
     Format("WAV", (".wav",), (b"RIFF", b"RF64"), "agent.reading.wav:open_wav"),
@@ -49,6 +51,7 @@ FORMATS = (
     Format("Excel", (".xlsx", ".xlsm"), (XLSX_BEGINS,), "agent.reading.xlsx:open_xlsx", "files"),
     Format("TDMS", (".tdms",), (b"TDSm",), "agent.reading.tdms:open_tdms", "tdms"),
 )
+BAGS = FORMATS[:3]
 TEXT = Format("CSV", (".csv", ".tsv", ".txt", ".dat"), (), "agent.reading.delimited:Delimited")
 LONGEST_BEGIN = 1024
 
@@ -82,7 +85,7 @@ def open_source(path: Path, described: Description = NOT_DESCRIBED, role: Role =
     if described.metadata is not None and form.name != "MiniSEED":
         raise TableError(f"{described.metadata}: it describes MiniSEED, but {path} is {form.name}; leave it out")
     try:
-        if described.mapping is not None and form.name == "MCAP":
+        if described.mapping is not None and form in BAGS:
             from agent.reading.mapping import read_mapping
             from agent.reading.ros2 import RosBag
 

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from agent.reading.seismic import MiniSeed
-from agent.reading.source import Array, Arrays, Column, Grid, TableError
+from agent.reading.source import Array, Arrays, Column, Grid, Stretches, TableError
 from agent.reading.stationxml import CONSISTENT, Component, StationXml
 from calib.model import Slices
 
@@ -34,7 +34,7 @@ class GroundMotion(Arrays):
 
     def __init__(self, source: MiniSeed, station: StationXml, role: Role) -> None:
         self.components: dict[Column, Component] = {}
-        self.said: list[str] = []
+        self.said: list[str] = [*source.said]
         values: dict[Column, Slices] = {}
         faults: list[TableError] = []
         for time in [c for c in source.columns if c not in source.seed_ids]:
@@ -48,7 +48,7 @@ class GroundMotion(Arrays):
 
     def _group(self, source: MiniSeed, station: StationXml, role: Role, time: Column) -> dict[Column, Slices]:
         grid = source.values[time]
-        assert isinstance(grid, Grid)
+        assert isinstance(grid, Grid | Stretches)
         columns = [c for c in source.seed_ids if c.group == time.group]
         found = [station.component(source.seed_ids[c], grid.start_s, grid.rate_hz) for c in columns]
         for component in found:

@@ -25,7 +25,8 @@ class Recording(Source):
     """A recording. Each device is a group with `time_s`, its axes and, where it has one, `temperature_degc`.
 
     The time is the arrival of the burst to which a sample belongs, in s since 1970. Lost samples that the device
-    counted are rows of NaN. Raises TableError for a file that is damaged; one that only ends early is read to its end.
+    counted are rows of NaN. A file that ends early is read to there, and `said` says it. Raises TableError for a
+    damaged one.
     """
 
     header = "devices"
@@ -47,6 +48,8 @@ class Recording(Source):
                 columns[event.device] = _columns(event, units.get(event.device, "count"))
                 if isinstance(devices, list) and len(columns) == len(devices):
                     break
+        if self.said and not columns:
+            raise TableError(f"{self.said[0]}; no sample is before that")
         self.columns = [column for name in sorted(columns) for column in columns[name]]
         self.filters = filters
 
@@ -110,6 +113,7 @@ class Recording(Source):
             yield step.event
         if reader.fault is not None and reader.fault.kind == "corrupt":
             raise TableError(f"{self.path}, {reader.fault}; `fieldcal audit {self.path}` says more")
+        self.said = end_of(reader)
 
 
 def _columns(block: SampleBlock, unit: str) -> list[Column]:
@@ -118,6 +122,18 @@ def _columns(block: SampleBlock, unit: str) -> list[Column]:
         axes = (QUANTITIES.get(unit, "a"),)
     found = [Column("time_s", "s", block.device), *(Column(axis, unit, block.device) for axis in axes)]
     return [*found, Column("temperature_degc", "degC", block.device)] if block.temperature_degc is not None else found
+
+
+def end_of(reader: RecordingReader) -> list[str]:
+    """What the user should know of the end of a recording that was read: that it is missing."""
+    if reader.fault is not None:
+        return [
+            f"{reader.path}: the file ends early, as after a power cut, or is still written; it is read up to byte "
+            f"{reader.good_bytes} of {reader.path.stat().st_size} ({reader.fault.reason})"
+        ]
+    if reader.repaired:
+        return [f"{reader.path}: a crash left the file open, and it was closed later; what came after is not in it"]
+    return []
 
 
 def open_mcap(path: Path) -> Source:

@@ -1,4 +1,6 @@
-"""Numbers in messages of ROS 2: the definition of a message (ros2msg), and chosen fields of its CDR.
+"""Numbers in messages of ROS: the definition of a message (ros2msg, ros1msg), and chosen fields of its bytes.
+
+ROS 2 sends CDR. ROS 1 sends the same values little-endian without alignment; its `time` is a type of its own.
 
 Definitions and messages are hostile: lengths are checked before use, and nothing recurses deeper than DEEPEST.
 """
@@ -39,17 +41,22 @@ class Member:
 
 
 Types = Mapping[str, Sequence[Member]]
+ROS1_TIMES = {
+    "time": [Member("sec", "uint32", None), Member("nsec", "uint32", None)],
+    "duration": [Member("sec", "int32", None), Member("nsec", "int32", None)],
+}
+TIMES = ([("sec", "int32"), ("nanosec", "uint32")], [("sec", "uint32"), ("nsec", "uint32")])
 
 
 def read_definition(name: str, text: str) -> tuple[str, Types]:
-    """The name of the root type, and the fields of all types in a definition of kind ros2msg. Raises FieldError."""
-    root = _plain(name)
-    types: dict[str, list[Member]] = {}
+    """The name of the root type, and the fields of all types in a definition (ros2msg, ros1msg). Raises FieldError."""
+    root = plain(name)
+    types: dict[str, list[Member]] = dict(ROS1_TIMES)
     for k, block in enumerate(_BREAK.split(text)):
         title, _, rest = block.strip().partition("\n")
         if k and not title.startswith("MSG:"):
             raise FieldError(f"the definition of {name}: {title[:60]!r} stands where MSG: is expected")
-        here = _plain(title[4:].strip()) if k else root
+        here = plain(title[4:].strip()) if k else root
         types[here] = _members(rest if k else block, here.partition("/")[0])
         if len(types) > MOST_TYPES:
             raise FieldError(f"the definition of {name} has more than {MOST_TYPES} types")
@@ -68,8 +75,8 @@ def _members(text: str, package: str) -> list[Member]:
         if found["constant"]:
             continue
         kind = found["type"]
-        if kind not in NUMBERS and kind not in ("string", "wstring"):
-            kind = _plain(kind if "/" in kind else f"{package}/{kind}")
+        if kind not in NUMBERS and kind not in ("string", "wstring") and kind not in ROS1_TIMES:
+            kind = plain(kind if "/" in kind else f"{package}/{kind}")
             kind = "std_msgs/Header" if kind == f"{package}/Header" and package != "std_msgs" else kind
         members.append(Member(found["name"], kind, _length(found["array"])))
     return members
@@ -86,7 +93,7 @@ def _length(array: str | None) -> int | None:
     return int(digits)
 
 
-def _plain(name: str) -> str:
+def plain(name: str) -> str:
     """pkg/msg/Type as pkg/Type."""
     return name.replace("/msg/", "/")
 
@@ -94,11 +101,13 @@ def _plain(name: str) -> str:
 class Fields:
     """Reads chosen numbers of messages. `paths`: fields as in `linear_acceleration.x` or `samples[2].z`.
 
-    A field of type builtin_interfaces/Time is a number of seconds. Raises FieldError where a path leads to no number.
+    A field of type builtin_interfaces/Time, or time of ROS 1, is a number of seconds. `serial`: cdr, or ros1. Raises
+    FieldError where a path leads to no number.
     """
 
-    def __init__(self, root: str, types: Types, paths: Sequence[str]) -> None:
+    def __init__(self, root: str, types: Types, paths: Sequence[str], serial: str = "cdr") -> None:
         self._root, self._types, self._paths = root, types, paths
+        self._reader = _Ros1 if serial == "ros1" else _Cdr
         self._wanted: dict[Any, Any] = {}
         for column, path in enumerate(paths):
             self._want(path, column)
@@ -141,15 +150,13 @@ class Fields:
         return f"; it has {', '.join(names[:24])}" if names else ""
 
     def _is_time(self, kind: str) -> bool:
-        return [(m.name, m.kind) for m in self._types.get(kind, ())] == [("sec", "int32"), ("nanosec", "uint32")]
+        return [(m.name, m.kind) for m in self._types.get(kind, ())] in TIMES
 
     def read(self, data: bytes) -> list[float]:
-        """The numbers of a message in CDR; NaN for an element that a sequence does not have. Raises FieldError."""
-        if len(data) < 4 or data[0] != 0 or data[1] not in (BIG, LITTLE):
-            raise FieldError(f"a message of {len(data)} bytes does not begin as CDR")
+        """The numbers of a message; NaN for an element that a sequence does not have. Raises FieldError."""
         values = [float("nan")] * len(self._paths)
         try:
-            _Cdr(data, self._types, values).take(self._root, self._wanted, 0)
+            self._reader(data, self._types, values).take(self._root, self._wanted, 0)
         except (struct.error, IndexError):
             raise FieldError(f"a message of {len(data)} bytes ends before its last field {self._paths[-1]!r}") from None
         return values
@@ -159,6 +166,8 @@ class _Cdr:
     """One message. Numbers are aligned to their size, counted from the fifth byte."""
 
     def __init__(self, data: bytes, types: Types, values: list[float]) -> None:
+        if len(data) < 4 or data[0] != 0 or data[1] not in (BIG, LITTLE):
+            raise FieldError(f"a message of {len(data)} bytes does not begin as CDR")
         self._data, self._types, self._values, self._at = data, types, values, 4
         self._order = "<" if data[1] == LITTLE else ">"
 
@@ -177,7 +186,7 @@ class _Cdr:
         if members is None or depth > DEEPEST:
             raise FieldError(f"the definition of {kind} is not in the file" if members is None else "it is too deep")
         if columns:
-            value = self._number("int32") + 1e-9 * self._number("uint32")
+            value = self._number(members[0].kind) + 1e-9 * self._number(members[1].kind)
             for column in columns:
                 self._values[column] = value
             return
@@ -222,3 +231,13 @@ class _Cdr:
         self._at += n * size
         if self._at > len(self._data):
             raise IndexError
+
+
+class _Ros1(_Cdr):
+    """One message of ROS 1: nothing is aligned."""
+
+    def __init__(self, data: bytes, types: Types, values: list[float]) -> None:
+        self._data, self._types, self._values, self._at, self._order = data, types, values, 0, "<"
+
+    def _aligned(self, _: int) -> int:
+        return self._at

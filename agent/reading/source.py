@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
+from bisect import bisect_right
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -48,9 +50,9 @@ class Column:
 class Source(ABC):
     """An opened file. `columns`: what it has. `header`: the place where it names them, for messages.
 
-    `said`: what was guessed or left out, for the user. `rate_hz`: as the file states it. `counted`: name of a column
-    that counts samples at this rate. `filters`: the known filters of its devices, by group, each in one line of text
-    (calib.signal.known_filters).
+    `said`: what was guessed or left out of the file and of the columns that were read last, for the user. `rate_hz`: as
+    the file states it. `counted`: name of a column that counts samples at this rate. `filters`: the known filters of
+    its devices, by group, each in one line of text (calib.signal.known_filters).
     """
 
     path: Path
@@ -94,6 +96,38 @@ class Grid:
         return self.start_s + np.arange(*rows.indices(self.samples)) / self.rate_hz
 
 
+@dataclass(frozen=True, slots=True)
+class Stretches:
+    """The times of samples in stretches, in s. `firsts`: the first row of each; `starts_s`: its time; `periods_s`."""
+
+    rate_hz: float
+    samples: int
+    firsts: tuple[int, ...]
+    starts_s: tuple[float, ...]
+    periods_s: tuple[float, ...]
+
+    def __len__(self) -> int:
+        return self.samples
+
+    def __getitem__(self, rows: slice, /) -> Array:
+        at = np.arange(*rows.indices(self.samples))
+        k = np.searchsorted(self.firsts, at, "right") - 1
+        return np.asarray(np.array(self.starts_s)[k] + (at - np.array(self.firsts)[k]) * np.array(self.periods_s)[k])
+
+    @property
+    def start_s(self) -> float:
+        """The time of the first sample."""
+        return self.starts_s[0]
+
+    def place(self, time_s: float) -> tuple[int, int, float]:
+        """The row at a time, the row where its stretch ends, and the time at which the next one begins."""
+        k = max(0, bisect_right(self.starts_s, time_s + 0.5 / self.rate_hz) - 1)
+        stop, next_s = (
+            (self.firsts[k + 1], self.starts_s[k + 1]) if k + 1 < len(self.firsts) else (self.samples, math.inf)
+        )
+        return self.firsts[k] + round((time_s - self.starts_s[k]) / self.periods_s[k]), stop, next_s
+
+
 class Arrays(Source):
     """A file whose columns can be sliced: each column with its values (n,). `closes` closes the file.
 
@@ -103,7 +137,7 @@ class Arrays(Source):
     def __init__(
         self, path: Path, values: Mapping[Column, Slices], closes: Callable[[], object] = lambda: None
     ) -> None:
-        check_announced(path, sum(8 * len(v) for v in values.values() if not isinstance(v, Grid)))
+        check_announced(path, sum(8 * len(v) for v in values.values() if not isinstance(v, Grid | Stretches)))
         self.path, self.columns, self._values, self._closes = path, tuple(values), values, closes
 
     def close(self) -> None:

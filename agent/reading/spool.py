@@ -8,6 +8,7 @@ import weakref
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agent.reading.source import Array
 
@@ -39,6 +40,16 @@ class Spool:
         self._file.seek(8 * self.width * first)
         while len(left):
             left = left[self._file.readinto(left.data) :]
+        return found
+
+    def take(self, rows: NDArray[np.intp]) -> Array:
+        """These rows (n, width) in this order, a copy; in memory are never more than as many again."""
+        found = np.empty((len(rows), self.width))
+        step = max(len(rows), 1)
+        for first in np.unique(rows // step).tolist():
+            inside = np.flatnonzero(rows // step == first)
+            part = self.read(first * step, min((first + 1) * step, self.rows))
+            found[inside] = part[rows[inside] - first * step]
         return found
 
 

@@ -108,6 +108,11 @@ BROKEN = {
     "a TDMS file that is cut": Broken("a.tdms", cut("npTDMS", 0.003), "a.tdms", "write it|columns", ("nptdms",)),
     "an Excel file that is cut": Broken("a.xlsx", cut("openpyxl"), "a.xlsx", "as CSV", ("openpyxl",)),
     "a word in Excel": Broken("a.xlsx", workbook, "row 11, column vy: 'two'", "correct it", ("openpyxl",)),
-    "a bag that is cut": Broken("a.mcap", cut("rosbags Imu", 0.4), "byte \\d+", "ros2 bag convert", ("rosbags",)),
+    "a bag that is cut before a message": Broken(
+        "a.mcap", cut("rosbags Imu", 0.0005), "byte \\d+ of \\d+", "record it anew", ("rosbags",)),
+    "a bag of ROS 1 that is cut before a message": Broken(
+        "a.bag", cut("rosbags Imu of ROS 1", 0.0005), "byte \\d+ of \\d+", "record it anew", ("rosbags",)),
+    "a database that is cut": Broken(
+        "a.db3", cut("rosbags Imu in SQLite", 0.0005), "a.db3", "record it anew|give a .db3", ("rosbags",)),
     "a bag without Imu": Broken("a.mcap", part("rosbags AccelStamped", rows=3), "/imu", "--mapping", ("rosbags",)),
 }  # fmt: skip

@@ -226,7 +226,7 @@ def tdms(waveform: bool) -> Write:
     return write
 
 
-def rosbag(kind: str, compressed: bool = False) -> Write:
+def rosbag(kind: str, compressed: bool = False, storage: str = "MCAP") -> Write:
     def write(path: Path, _: str, v: np.ndarray) -> None:
         from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
         from rosbags.rosbag2 import Writer as BagWriter
@@ -238,7 +238,7 @@ def rosbag(kind: str, compressed: bool = False) -> Write:
         turn = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
         name, none = f"{kind.replace('/', '/msg/')}", np.zeros(9)
         bag = path.with_suffix("")
-        writer = BagWriter(bag, version=9, storage_plugin=StoragePlugin.MCAP)
+        writer = BagWriter(bag, version=9, storage_plugin=StoragePlugin[storage])
         if compressed:
             writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
         with writer:
@@ -251,9 +251,25 @@ def rosbag(kind: str, compressed: bool = False) -> Write:
                 else:
                     message = types[name](header, types["geometry_msgs/msg/Accel"](acceleration, vector(7.0, 8.0, 9.0)))
                 writer.write(connection, ns, store.serialize_cdr(message, name))
-        next(bag.glob("*.mcap")).rename(path)
+        next(bag.glob(f"*{path.suffix}")).rename(path)
 
     return write
+
+
+def rosbag_1(path: Path, _: str, v: np.ndarray) -> None:
+    from rosbags.rosbag1 import Writer as BagWriter
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC)
+    types, name, none = store.types, "sensor_msgs/msg/Imu", np.zeros(9)
+    vector, now = types["geometry_msgs/msg/Vector3"], types["builtin_interfaces/msg/Time"]
+    turn = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
+    with BagWriter(path) as writer:
+        connection = writer.add_connection("/imu", name, typestore=store)
+        for ns, (x, y, z) in zip(TIME_NS.tolist(), v.tolist(), strict=False):
+            header = types["std_msgs/msg/Header"](0, now(ns // 10**9, ns % 10**9), "imu_link")
+            message = types[name](header, turn, none, vector(0.0, 0.0, 0.0), none, vector(x, y, z), none)
+            writer.write(connection, ns, store.serialize_ros1(message, name))
 
 
 MAPPING = """["/imu"]
@@ -329,6 +345,8 @@ WRITERS: dict[str, Writer] = {
     "npTDMS": Writer("nptdms", ".tdms", tdms(False)),
     "rosbags Imu": Writer("rosbags", ".mcap", rosbag("sensor_msgs/Imu"), since_1970=True),
     "rosbags Imu zstd": Writer("rosbags", ".mcap", rosbag("sensor_msgs/Imu", compressed=True), since_1970=True),
+    "rosbags Imu in SQLite": Writer("rosbags", ".db3", rosbag("sensor_msgs/Imu", storage="SQLITE3"), since_1970=True),
+    "rosbags Imu of ROS 1": Writer("rosbags", ".bag", rosbag_1, since_1970=True),
     "rosbags AccelStamped": Writer(
         "rosbags", ".mcap", rosbag("geometry_msgs/AccelStamped"), ("--mapping",), since_1970=True
     ),

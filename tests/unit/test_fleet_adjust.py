@@ -12,6 +12,7 @@ from agent.cli.main import run_cli
 from agent.config.earlier import read_earlier
 from tests.unit.drawn_recording import Devices, Recording
 from tests.unit.recorded_bench import record
+from tests.unit.test_reading_formats import GOLDEN
 
 RATE_HZ, SECONDS = 50.0, 30.0
 S_TRUE = np.array([[204.0, 2.0, -3.0], [1.0, 212.0, 2.0], [-2.0, 1.0, 208.0]])
@@ -221,6 +222,14 @@ def test_recordings_need_no_list_of_meetings(tmp_path: Path, capsys: pytest.Capt
     assert expanded.max() < 0.03 * truth.sensitivity.max()
     assert run_cli(["fleet", "adjust", str(recording), str(recording)]) == 2
     assert "give each recording once" in capsys.readouterr().err
+
+
+def test_a_cut_recording_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data = GOLDEN.read_bytes()
+    (tmp_path / "a.mcap").write_bytes(data[: len(data) // 2])
+    run_cli(["fleet", "adjust", str(tmp_path / "a.mcap")])
+    told = f"{tmp_path}/a.mcap: the file ends early, as after a power cut, or is still written; it is read up to byte "
+    assert capsys.readouterr().err.count(told) == 1
 
 
 def test_a_file_that_is_no_recording_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
