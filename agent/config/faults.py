@@ -18,12 +18,13 @@ from agent.config.names import Told, name_faults
 from agent.config.sinks import Tls
 from agent.config.tls import tls_faults
 from agent.config.whole import Config
-from agent.config.words import in_words, length_fault, meant
+from agent.config.words import in_words, length_fault, may_be_truth, meant
 from hw.sensor import DeviceError, Options, load_driver
 
 MOST_DEVICES = 100  # whose options are checked; more are a fault of their own
 SHOWN_FAULTS = 100
 SHOWN_CHARACTERS = 100  # of a value or a path in a fault
+_SPOILT = re.compile(r"[A-Za-z]:[^\x00-\x1f]*([\x00-\x1f])")
 _PATH = re.compile(r"([a-z_]\w*(?:\.\w+)*): ")  # with which a check of several settings begins
 
 
@@ -42,6 +43,7 @@ def faults_of(raw: Mapping[str, Any]) -> tuple[Config | None, list[Told]]:
     faults += _unknown_sensitivities(raw, dict(options))
     faults += _uncertified_references(raw, dict(options))
     faults += _file_faults(raw)
+    faults += _misread(raw, (), Config)
     return config, faults
 
 
@@ -58,6 +60,7 @@ def _options(raw: Mapping[str, Any], faults: list[Told]) -> Iterator[tuple[str, 
             continue  # the section's own check names it
         try:
             model = load_driver(driver).options_model
+            faults += [(("devices", i, "options", *path), what) for path, what in _misread(options, (), model)]
             held = model.model_validate(options)
             held.check_installed()
             filters_of(held.known_filters)
@@ -130,6 +133,20 @@ def _file_faults(raw: Mapping[str, Any]) -> Iterator[Told]:
     for fault in tls_faults(files):
         field, _, what = fault.partition(": ")
         yield ("zenoh", "tls", field), what
+
+
+def _misread(value: Any, path: Path, kind: type[BaseModel]) -> Iterator[Told]:
+    """Values that are silently taken for others: true for 1, and a path of Windows in double quotes, in which TOML took
+    a backslash and a letter for a control character."""
+    if isinstance(value, bool) and not may_be_truth(kind, path):
+        yield path, f"true and false are no numbers; state a number, not {value}"
+    elif isinstance(value, str) and (found := _SPOILT.match(value)):
+        what = f"{_value(value)} has {found[1]!r} in it: in double quotes \\ begins a code; write it in single quotes"
+        yield path, what
+    elif isinstance(value, Mapping | list):
+        for name, item in value.items() if isinstance(value, Mapping) else enumerate(value):
+            if name not in ("poses", "options"):  # of poses there may be 86,400; options have a model of their own
+                yield from _misread(item, (*path, name), kind)
 
 
 def _entries(raw: Mapping[str, Any], section: str) -> list[Mapping[str, Any]]:

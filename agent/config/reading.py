@@ -92,6 +92,11 @@ def _text(data: bytes) -> str:
     for mark, name in _MARKS.items():
         if data.startswith(mark):
             raise ValueError(f"line 1: the file begins with {name}; save it as UTF-8 without byte order mark (BOM)")
+    if (zero := data.find(0)) >= 0:
+        line = data.count(b"\n", 0, zero) + 1
+        raise ValueError(
+            f"line {line}: the file has bytes of 0, as after a power cut, or in UTF-16; write it anew in UTF-8"
+        )
     try:
         return data.decode("utf-8")
     except UnicodeDecodeError as error:

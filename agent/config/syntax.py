@@ -61,6 +61,7 @@ _CORRECTIONS: tuple[_Correction, ...] = (
     ),
     ("a text with \\ stands in single quotes, or has \\\\", r'"([^"\']*\\[^"\']*)"', r"'\1'"),
     ("a text has the same quotes at both ends", r"""(=\s*)(["'])([^"']*)["']?\s*$""", r"\1\2\3\2"),
+    ("a section stands in brackets", r"^\s*([\w.-]+):\s*(?=$|#)", r"[\1] "),
     ("= stands between name and value", r"^(\s*[\w.-]+)\s*:=?\s*", r"\1 = "),
     ("= stands between name and value, and a text in quotes", r"^(\s*[\w.-]+)\s*:\s*([^#\"']*\w)", r'\1 = "\2"'),
     ("a name has no blanks", r"^\s*\w+(?: \w+)+(?=\s*=)", lambda found: found[0].replace(" ", "_")),

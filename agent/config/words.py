@@ -42,6 +42,7 @@ _IN_WORDS = {
 }
 _TABLES = ("dict_type", "model_type", "model_attributes_type")
 _A_NUMBER = re.compile(r"\s*([-+]?\d+(?:[.,]\d+)?(?:[eE][-+]?\d+)?)")
+ELSEWHERE = 0.8  # how like a name of another section must be
 _SOME = 3  # places at most that are named for a setting
 
 
@@ -78,6 +79,12 @@ def length_fault(stated: list[Any] | tuple[Any, ...], path: Path, kind: type[Bas
     return f"has {len(stated)} {what}, needs {' or '.join(map(str, sorted(needed)))}{in_rows}"
 
 
+def may_be_truth(kind: type[BaseModel], path: Path) -> bool:
+    """Whether a setting may be true or false; also where nothing is known of it."""
+    types = [one for annotation in _annotations(kind, path) for one in _parts(annotation)]
+    return not types or any(one in (bool, Any) for one in types)
+
+
 def meant(kind: type[BaseModel], path: Path) -> str:
     """What to do about a setting at `path` that a file of this kind does not have."""
     name, here = str(path[-1]), {field for model in _models(kind, path[:-1]) for field in model.model_fields}
@@ -92,7 +99,7 @@ def meant(kind: type[BaseModel], path: Path) -> str:
     if "options" in here:
         return "an option of the driver belongs into the section options of its device"
     everywhere = {field: (*place, field) for place, model in _sections(kind) for field in model.model_fields}
-    if near := difflib.get_close_matches(wanted, everywhere, n=1):
+    if near := difflib.get_close_matches(wanted, everywhere, n=1, cutoff=ELSEWHERE):
         return f"did you mean {'.'.join(everywhere[near[0]])}?"
     return f"remove it or correct its name; there is {', '.join(sorted(here))}"
 
