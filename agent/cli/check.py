@@ -36,8 +36,8 @@ def check(config: Path, json_to: str | None) -> int:
     machine who they are. A device that does not answer is a warning; an adapter that refuses the transfers of the
     driver is a fault.
 
-    Where no position is stated, which only `fieldcal bench` and `fieldcal visit` do not need, the file is not called
-    good, though it has no fault.
+    A file without a fault is not called good where no position is stated, which only `fieldcal bench` and `fieldcal
+    visit` do not need, or where an uncertainty is so small that a fraction in the place of % may be meant.
 
     JSON: `good`, `faults` and `warnings` (lists of texts), and of a good one `devices`, `channels`, `poses` and
     `positions` (their numbers), `filters` (of each sensor and reference: `sensor` of the channel, `device`,
@@ -60,8 +60,9 @@ def check(config: Path, json_to: str | None) -> int:
                 say(fault, err=True)
         return 2
     warnings = [*_warnings(config, loaded), *(f"{a.says}; {a.remedy}" for a in answers if a.verdict != "good")]
-    unplaced = [f"{config}: {shown(place)}: {what}" for one in plans for place, what in one.unplaced]
-    warnings += unplaced
+    unplaced = [told for one in plans for told in one.unplaced]
+    doubts = [f"{config}: {shown(place)}: {what}" for place, what in (*unplaced, *small_uncertainties(loaded))]
+    warnings += doubts
     counts = {
         "devices": len(loaded.devices),
         "channels": len(loaded.channels),
@@ -72,13 +73,13 @@ def check(config: Path, json_to: str | None) -> int:
     if json_to:
         plans_json = [one.json for one in plans if one.plan is not None]
         more = {**counts, "filters": [asdict(one) for one in filters], "plans": plans_json}
-        click.echo(json.dumps({"good": not unplaced, "faults": [], "warnings": warnings, **more}))
+        click.echo(json.dumps({"good": not doubts, "faults": [], "warnings": warnings, **more}))
         return 0
     for warning in warnings:
         say(warning, err=True)
     told = [counted(count, name) for name, count in counts.items() if count or name in ("devices", "channels")]
     found = ", which the agent finds by gravity" if counts["positions"] else ""
-    verdict = "no fault, but `fieldcal run` cannot calibrate every sensor" if unplaced else "good"
+    verdict = "no fault, but what is told of it must be right before `fieldcal run` can calibrate" if doubts else "good"
     say(f"{config}: {verdict}; {', '.join(told)}{found}")
     answered = [a.says for a in answers if a.verdict == "good"]
     planned = [one.told for one in plans if one.plan is not None]
@@ -106,7 +107,6 @@ def _warnings(path: Path, config: Config) -> Iterator[str]:
         yield from (f"{path}: devices.{i}.options: {advice}" for advice in options.advice)
     for finding in (*sharing_findings(config, loaded), *missing_ports(loaded)):
         yield f"{path}: {finding.says}; {finding.remedy}"
-    yield from (f"{path}: {shown(place)}: {what}" for place, what in small_uncertainties(config))
     for i, channel in enumerate(config.channels):
         for section, beside in zip(("", "check_reference."), channel.by_reference, strict=False):
             if overdue := beside.certificate.overdue(now):

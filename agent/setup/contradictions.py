@@ -23,8 +23,9 @@ from hw.units import STANDARD_GRAVITY_MPS2, nominal_sensitivity
 # Data sheets of MEMS accelerometers state the sensitivity to 10 % or better; a wrong range is off by a factor of 2.
 AGREES = 1.25
 LOOKS_LIKE = 1.05  # times the factor of a mistake
-GRAVITY_WITHIN_MPS2 = 0.1  # standard gravity is off by 0.03 m/s2, and 9.9 is written by nobody
-# The best laboratories state U = 0.1 % (k = 2) for accelerometers: what is below u = 0.02 % is a fraction as a rule.
+GRAVITY_WITHIN_MPS2 = 0.1  # on the earth, local gravity differs from the standard one by 0.05 m/s2 at most
+# PTB (working group 1.71, calibration and measurement capabilities) states U = 0.2 % or more for the sensitivity of
+# accelerometers, and 0.1 % or more for their motion (k = 2). What is below u = 0.02 % is a fraction as a rule.
 LEAST_U_PCT = 0.02
 _FACTORS = {
     STANDARD_GRAVITY_MPS2: "it seems to be stated per g; divide it by 9.80665",
