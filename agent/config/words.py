@@ -101,7 +101,7 @@ def meant(kind: type[BaseModel], path: Path) -> str:
     everywhere = {field: (*place, field) for place, model in _sections(kind) for field in model.model_fields}
     if near := difflib.get_close_matches(wanted, everywhere, n=1, cutoff=ELSEWHERE):
         return f"did you mean {'.'.join(everywhere[near[0]])}?"
-    return f"remove it or correct its name; there is {', '.join(sorted(here))}"
+    return f"remove it or correct its name; there are {', '.join(sorted(here))}"
 
 
 def _one_of(expected: str, value: Any) -> str:
