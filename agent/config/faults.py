@@ -99,9 +99,9 @@ def _uncertified_references(raw: Mapping[str, Any], options: Mapping[str, Option
         if isinstance(beside, Mapping):
             places.append((("check_reference",), beside.get("device"), beside.get("certificate")))
         for path, device, certificate in places:
-            if device not in options:
-                continue
-            held, driver = certificate if isinstance(certificate, Mapping) else {}, options[str(device)]
+            if not isinstance(device, str) or device not in options:
+                continue  # the section's own check names it
+            held, driver = certificate if isinstance(certificate, Mapping) else {}, options[device]
             stated = held.get("sensitivity") or held.get("file")
             if stated is None and (asked := driver.asked_of_certificate):
                 yield ("channels", i, *path, "certificate", "sensitivity"), f"is missing for {device!r}: {asked}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import functools
 import re
+import unicodedata
 from collections.abc import Iterator, Mapping
 from typing import Any, Literal, get_args, get_origin
 
@@ -55,7 +56,8 @@ def in_words(fault: Mapping[str, Any], path: Path) -> str:
         header = ".".join(str(part) for part in path if isinstance(part, str))
         return f"a table is needed, as [{header}] with a setting in each line"
     if name in ("tuple_type", "list_type") and isinstance(value, Mapping):
-        return f"there may be several, so that each begins with two brackets: [[{path[-1]}]]"
+        header = ".".join(str(part) for part in path if isinstance(part, str))
+        return f"there may be several, so that each begins with two brackets: [[{header}]]"
     words = _IN_WORDS.get(name)
     if words is None:
         return str(fault["msg"]).removeprefix("Value error, ").replace("Input should be", "must be")
@@ -110,7 +112,8 @@ def _one_of(expected: str, value: Any) -> str:
     if not isinstance(value, str):
         return words
     allowed = re.findall(r"'([^']*)'", expected)
-    near = difflib.get_close_matches(value.strip().lower(), [one.lower() for one in allowed], n=1)
+    wanted = unicodedata.normalize("NFKC", value).strip().lower()  # m/s² is m/s2
+    near = difflib.get_close_matches(wanted, [one.lower() for one in allowed], n=1)
     found = [one for one in allowed if near and one.lower() == near[0]]
     return f"{words}; write {found[0]!r}" if found else words
 

@@ -14,7 +14,6 @@ import numpy as np
 from agent.config import Channel, Config
 from agent.config.lines import Path
 from agent.config.names import Told
-from calib.model import scale_of
 from hw.fifo_options import FifoOptions
 from hw.fifo_sensor import FifoSensor
 from hw.sensor import Options, load_driver
@@ -120,7 +119,7 @@ def _sensitivities(
     """Stated sensitivities against those of the devices, by data sheet or unit."""
     by_device, prior = nominal[channel.sensor], channel.prior
     if prior.sensitivity is not None and by_device is not None and not prior.file:
-        stated = scale_of(prior.mean(None))
+        stated = float(np.sqrt(np.sum(prior.mean(None)[:9] ** 2) / 3.0))
         yield from _contradicts(("prior", "sensitivity"), stated, by_device, channel.sensor, options[channel.sensor])
     for path, beside in zip(((), ("check_reference",)), channel.by_reference, strict=False):
         device, certificate = beside.reference, beside.certificate
@@ -138,12 +137,12 @@ def _contradicts(path: Path, stated: float, nominal: float, device: str, held: O
     by = f"by its unit {unit}" if unit else "by its data sheet and its range"
     remedy = next(
         (words for each, words in _FACTORS.items() if 1.0 / LOOKS_LIKE <= factor / each <= LOOKS_LIKE),
-        f"or state the unit of {device} in its options (count, mV)" if unit else "or correct the range in its options",
+        f"correct it, or the unit of {device} in its options (count, mV)" if unit else "correct it, or the range there",
     )
     if not unit and any(1.0 / LOOKS_LIKE <= factor / each <= LOOKS_LIKE for each in _RANGES):
         remedy = f"it seems to be that of another range; correct it, or the range in the options of {device}"
     what = f"{stated:g} is {factor:.3g} times what {device} indicates per m/s2 {by}"
-    yield path, f"{what}; state {nominal:.6g}, or leave it out: {remedy}"
+    yield path, f"{what}; {remedy}: about {nominal:.6g} is right"
 
 
 def _gravity(channel: Channel) -> Iterator[Told]:

@@ -273,6 +273,16 @@ VALUES = {
     "an infinite interval": row(
         "keep_days = 30", "keep_days = inf", "recording.keep_days: a finite number is needed, not inf"
     ),
+    "a list for a name": row(REFERENCE, 'reference = ["laser"]', "channels.0.reference: a text in quotes is needed"),
+    "a unit with a small 2": row('unit = "m/s2"', 'unit = "m/s²"', "options.unit: must be", "write 'm/s2', not 'm/s²'"),
+    "one pose as a table": row(POSES, "poses = { theta_deg = 35 }\n", "channels.0.poses: ", "[[channels.poses]]"),
+    "S with exchanged axes": row(
+        "u_main_pct = 5",
+        "u_main_pct = 5\nsensitivity = [0, 26105, 0, 26105, 0, 0, 0, 0, 26105]",
+        "channels.0.prior.sensitivity: ",
+        "no main sensitivity may be 0",
+        remedy="u_main_pct = 5\nsensitivity = [26105, 0, 0, 0, 26105, 0, 0, 0, 26105]",
+    ),
     "a number for a text": row('site = "bridge"', "site = 7", "gateway.site: a text in quotes is needed, not 7"),
     "a text for a list": row("range_g = 2", "range_g = 3", "range_g: must be 2, 4 or 8", "not 3"),
     "a table for a number": row(
@@ -373,7 +383,7 @@ PLANS = {
     "counts called m/s2": row(
         'unit = "count"',
         'unit = "m/s2"',
-        "unit of mems in its options (count, mV)",
+        "the unit of mems in its options (count, mV)",
         sound=SERIAL.replace('unit = "g"', 'unit = "count"').replace(
             "u_main_pct = 5", "u_main_pct = 5\nsensitivity = 26000"
         ),
