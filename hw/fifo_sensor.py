@@ -397,6 +397,11 @@ class FifoSensor(PollingSensor):
         self._device.write(last, settings[last][1])
         self._check_settings()
 
+    @property
+    def nominal_sensitivity(self) -> float:
+        """Counts per m/s2 by the data sheet, for the range that the options state."""
+        return self._counts_per_g() / STANDARD_GRAVITY_MPS2
+
     def _info(self, driver: str, rate_hz: float, found: Mapping[str, int]) -> DeviceInfo:
         """Build the result of `open`; `found` are registers that were read but not set, by name."""
         counts_per_g, filters = self._counts_per_g(), self._filters()
@@ -409,7 +414,7 @@ class FifoSensor(PollingSensor):
             axes=3,
             nominal_rate_hz=rate_hz,
             range_mps2=-self._limits()[0] / counts_per_g * STANDARD_GRAVITY_MPS2,
-            nominal_sensitivity=counts_per_g / STANDARD_GRAVITY_MPS2,
+            nominal_sensitivity=self.nominal_sensitivity,
             settings={name: f"0x{value:02X}" for name, value in registers.items()},
             filters=filters,
             filter_settings=self.filter_settings if filters else (),

@@ -54,6 +54,11 @@ class Mcc172Options(Options):
         _library()
 
     @property
+    def axis_count(self) -> int:
+        """That of the channel."""
+        return 1
+
+    @property
     def tells_sensitivity(self) -> bool:
         """It tells mV; the sensitivity is that of the sensor behind it."""
         return False

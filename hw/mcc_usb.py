@@ -48,6 +48,11 @@ class MccUsbOptions(Options):
         _library()
 
     @property
+    def axis_count(self) -> int:
+        """As stated."""
+        return self.axes
+
+    @property
     def tells_sensitivity(self) -> bool:
         """It tells mV; the sensitivity is that of the sensor behind it."""
         return False

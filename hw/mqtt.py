@@ -73,6 +73,11 @@ class MqttOptions(Options):
         _library()
 
     @property
+    def axis_count(self) -> int:
+        """One for each array of a message."""
+        return len(self.metrics)
+
+    @property
     def tells_sensitivity(self) -> bool:
         """Whether it indicates m/s2 or g: nothing else is known of such a device."""
         return tells_sensitivity(self.unit)

@@ -53,6 +53,11 @@ class NiOptions(Options):
         _library()
 
     @property
+    def axis_count(self) -> int:
+        """One for each channel."""
+        return len(self.channels)
+
+    @property
     def tells_sensitivity(self) -> bool:
         """It tells mV; the sensitivity is that of the sensor behind it."""
         return False

@@ -39,6 +39,11 @@ class SeedlinkOptions(Options):
         return value
 
     @property
+    def axis_count(self) -> int:
+        """One for each channel."""
+        return len(self.channels)
+
+    @property
     def tells_sensitivity(self) -> bool:
         """It tells counts; the metadata of the station state the sensitivity."""
         return False

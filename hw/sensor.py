@@ -53,6 +53,11 @@ class Options(BaseModel):
         """Raises ConfigurationError, with what to install, where a library that the driver needs is not there."""
 
     @property
+    def axis_count(self) -> int:
+        """How many axes the opened device has, 1 or 3."""
+        return 3
+
+    @property
     def tells_sensitivity(self) -> bool:
         """Whether the opened device may tell its sensitivity: by its data sheet, or since it indicates m/s2 or g."""
         return True

@@ -104,6 +104,11 @@ class SerialBinaryOptions(SerialOptions):
         return self
 
     @property
+    def axis_count(self) -> int:
+        """One for each number of a frame."""
+        return len(self.indications)
+
+    @property
     def known_filters(self) -> tuple[str, ...]:
         """As the user states them."""
         return self.filters

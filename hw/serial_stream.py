@@ -65,6 +65,11 @@ class SerialCsvOptions(SerialOptions):
         return self
 
     @property
+    def axis_count(self) -> int:
+        """As stated."""
+        return self.axes
+
+    @property
     def line(self) -> tuple[Column, ...]:
         """The columns of a line."""
         return self.columns or columns_of(self.axes, self.sequence)

@@ -59,6 +59,11 @@ class ShakeUdpOptions(Options):
         return str(ipaddress.ip_address(value)) if value else value
 
     @property
+    def axis_count(self) -> int:
+        """One for each channel."""
+        return len(self.channels)
+
+    @property
     def quantity(self) -> str:
         """By the names of the channels."""
         return QUANTITIES[self.channels[0][:2]]

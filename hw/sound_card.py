@@ -33,6 +33,11 @@ class SoundCardOptions(Options):
         8000.0, description="one of 8000, 11025, 16000, 22050, 32000, 44100, 48000", gt=0, le=192_000
     )
 
+    @property
+    def axis_count(self) -> int:
+        """That of the channel."""
+        return 1
+
     def check_installed(self) -> None:
         """Raises ConfigurationError, with what to install, where the vendor's library is not there."""
         _library()

@@ -15,6 +15,7 @@ from agent import __version__
 from agent.acquisition.arena import one_arena
 from agent.acquisition.reader import EventQueue, Reader, reader_of
 from agent.acquisition.stalls import few_objects
+from agent.acquisition.weighing import Weighing
 from agent.audit.recalling import memories_of
 from agent.commanding.reception import Reception
 from agent.config import Channel, Config
@@ -56,6 +57,7 @@ class Service:
         self._config = config
         self._data_dir = data_dir
         self._watch = watch
+        self._weighing = Weighing(config)
         self._stop_request = threading.Event()
         self._sequence = 0
         self.refused: list[str] = []  # why the run ended by itself: transfers that the adapters of all channels refuse
@@ -243,6 +245,8 @@ class Service:
         writer.put(self._sequence, event, outputs, self._pipeline.memories(outputs))
         results = [item for item in outputs if isinstance(item, Result)]
         self._watch.update(event, results)
+        for told in self._weighing.told(event):
+            _log.warning("%s", told)
         if self._publisher is not None:
             for item in outputs:
                 if isinstance(item, Acceleration):

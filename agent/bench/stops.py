@@ -77,14 +77,14 @@ def turned_by_hand(rotation: Array, gravity_mps2: float) -> list[Stop]:
             dict(zip(GRAVITY, (gravity_mps2 * up).tolist(), strict=True)),
             np.asarray(rotation).T @ (gravity_mps2 * up),
         )
-        for told, name, up in _ways(CORNER)
+        for told, name, up in ways(CORNER)
     ]
 
 
 def on_faces(gravity_mps2: float) -> list[Stop]:
     """Rests on the six faces of the sensor's housing, on a level table."""
     found = []
-    for told, name, up in _ways(FACE):
+    for told, name, up in ways(FACE):
         felt = gravity_mps2 * up
         columns = dict(zip(GRAVITY, felt.tolist(), strict=True))
         found.append(
@@ -93,7 +93,7 @@ def on_faces(gravity_mps2: float) -> list[Stop]:
     return found
 
 
-def _ways(most: int) -> list[tuple[str, str, Array]]:
+def ways(most: int) -> list[tuple[str, str, Array]]:
     """Directions with up to `most` axes up equally: for people, as typed, and the unit vector."""
     found = []
     for signs in itertools.product((0, 1, -1), repeat=3):

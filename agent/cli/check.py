@@ -10,9 +10,13 @@ from pathlib import Path
 
 import click
 
-from agent.config import Config, ConfigError, load_config
+from agent.bench.plan_told import shortcomings
+from agent.config import Config, ConfigError
+from agent.config.faults import shown
+from agent.config.reading import parse_config, read_toml, refused
 from agent.config.tls import expiry_warning
-from agent.setup.device_checks import answer_findings, loaded_options, place_findings, sharing_findings
+from agent.setup.contradictions import small_uncertainties
+from agent.setup.device_checks import answer_findings, loaded_options, missing_ports, sharing_findings
 from agent.setup.finding import Finding
 from agent.setup.key_checks import signing_key_warnings
 from agent.setup.known_filters import stated_filters
@@ -26,16 +30,27 @@ from agent.terminal.text import say
 def check(config: Path, json_to: str | None) -> int:
     """Report every fault in CONFIG, with its line, its setting and what to do. Exit status 2 if there is a fault.
 
-    Of a good one, tell which filters of each device are divided out, and who states them, and ask the devices on I2C
-    and SPI buses of this machine who they are. A device that does not answer is a warning; an adapter that refuses the
-    transfers of the driver is a fault.
+    Statements that contradict each other or the devices are faults, and so are positions that do not determine the
+    parameters which the first calibration needs. Of a good one, tell to what U the positions determine them, which
+    filters of each device are divided out, and who states them, and ask the devices on I2C and SPI buses of this
+    machine who they are. A device that does not answer is a warning; an adapter that refuses the transfers of the
+    driver is a fault.
+
+    A file without a fault is not called good where no position is stated, which only `fieldcal bench` and `fieldcal
+    visit` do not need, or where an uncertainty is so small that a fraction in the place of % may be meant.
 
     JSON: `good`, `faults` and `warnings` (lists of texts), and of a good one `devices`, `channels`, `poses` and
-    `positions` (their numbers), and `filters` (of each sensor and reference: `sensor` of the channel, `device`,
-    `lines`, `stated_by`).
+    `positions` (their numbers), `filters` (of each sensor and reference: `sensor` of the channel, `device`,
+    `lines`, `stated_by`), and `plans` (of each channel with positions: `sensor`, how many parameters are `determined`,
+    how many are `needed`, which are `missing`, and U in `expanded_u_main_pct`, `expanded_u_transverse_pct`,
+    `expanded_u_offset_mps2`).
     """
     try:
-        loaded = load_config(config)
+        raw, text = read_toml(config)
+        loaded = parse_config(raw, str(config), text)
+        faults, plans = shortcomings(loaded)
+        if faults:
+            raise refused(faults, str(config), text)
         answers = _answers(config, loaded)
     except ConfigError as error:
         if json_to:
@@ -45,6 +60,9 @@ def check(config: Path, json_to: str | None) -> int:
                 say(fault, err=True)
         return 2
     warnings = [*_warnings(config, loaded), *(f"{a.says}; {a.remedy}" for a in answers if a.verdict != "good")]
+    unplaced = [told for one in plans for told in one.unplaced]
+    doubts = [f"{config}: {shown(place)}: {what}" for place, what in (*unplaced, *small_uncertainties(loaded))]
+    warnings += doubts
     counts = {
         "devices": len(loaded.devices),
         "channels": len(loaded.channels),
@@ -53,15 +71,19 @@ def check(config: Path, json_to: str | None) -> int:
     }
     filters = list(stated_filters(loaded))
     if json_to:
-        more = {**counts, "filters": [asdict(one) for one in filters]}
-        click.echo(json.dumps({"good": True, "faults": [], "warnings": warnings, **more}))
+        plans_json = [one.json for one in plans if one.plan is not None]
+        more = {**counts, "filters": [asdict(one) for one in filters], "plans": plans_json}
+        click.echo(json.dumps({"good": not doubts, "faults": [], "warnings": warnings, **more}))
         return 0
     for warning in warnings:
         say(warning, err=True)
     told = [counted(count, name) for name, count in counts.items() if count or name in ("devices", "channels")]
     found = ", which the agent finds by gravity" if counts["positions"] else ""
-    say(f"{config}: good; {', '.join(told)}{found}")
-    for line in dict.fromkeys([one.told for one in filters] + [a.says for a in answers if a.verdict == "good"]):
+    verdict = "no fault, but what is told of it must be right before `fieldcal run` can calibrate" if doubts else "good"
+    say(f"{config}: {verdict}; {', '.join(told)}{found}")
+    answered = [a.says for a in answers if a.verdict == "good"]
+    planned = [one.told for one in plans if one.plan is not None]
+    for line in dict.fromkeys([*planned, *(one.told for one in filters), *answered]):
         say(f"  {line}")
     return 0
 
@@ -83,7 +105,7 @@ def _warnings(path: Path, config: Config) -> Iterator[str]:
     loaded = loaded_options(config)
     for i, options in enumerate(loaded.values()):
         yield from (f"{path}: devices.{i}.options: {advice}" for advice in options.advice)
-    for finding in (*place_findings(config, loaded), *sharing_findings(config, loaded)):
+    for finding in (*sharing_findings(config, loaded), *missing_ports(loaded)):
         yield f"{path}: {finding.says}; {finding.remedy}"
     for i, channel in enumerate(config.channels):
         for section, beside in zip(("", "check_reference."), channel.by_reference, strict=False):

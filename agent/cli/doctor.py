@@ -12,7 +12,9 @@ from typing import Any
 
 import click
 
+from agent.bench.plan_told import shortcomings
 from agent.config import Config, ConfigError, load_config
+from agent.config.faults import shown
 from agent.delivery.history import FILE_NAME, History, StoreError
 from agent.setup import device_checks, key_checks, machine_checks
 from agent.setup.finding import Finding
@@ -72,7 +74,8 @@ def _findings(path: Path | None, data_dir: Path, measure_s: float | None) -> Ite
     yield from device_checks.bus_findings(options)
     if config is not None:
         yield from device_checks.answer_findings(config, options)
-        yield from device_checks.place_findings(config, options)
+        for place, what in shortcomings(config)[0]:
+            yield Finding("configuration", "fault", f"{shown(place)}: {what}", "`fieldcal check` names its line")
         yield from device_checks.sharing_findings(config, options)
         yield from _throughput(config, options, data_dir, measure_s)
     yield from machine_checks.disk_findings(config, options, data_dir)

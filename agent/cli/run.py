@@ -78,7 +78,7 @@ def run(
             said = [stack.enter_context(router(LOOPBACK, stopping))] if with_router else []
             title = f"virtual bench, {preset}" if truth else str(config)
             watch = stack.enter_context(Watch(settings, title, truth, lines=not as_json))
-            for line in (*said, *signing_key_warnings(settings, data_dir)):
+            for line in (*said, *signing_key_warnings(settings, data_dir), *_shortcomings(settings)):
                 watch.say(line)
             stopping.service = Service(settings, data_dir, watch)
             return serve(stopping.service, duration)
@@ -113,6 +113,16 @@ def serve(service: Service, duration_s: float | None) -> int:
     for fault in service.refused:
         say(f"fieldcal run: {fault}", err=True)
     return 2 if service.refused else 0
+
+
+def _shortcomings(settings: Config) -> Iterator[str]:
+    """Why nothing sound will be calibrated as it is stated. The agent runs all the same: it records."""
+    from agent.bench.plan_told import shortcomings
+    from agent.config.faults import shown
+
+    faults, plans = shortcomings(settings)
+    for place, what in (*faults, *(told for one in plans for told in one.unplaced)):
+        yield f"{shown(place)}: {what}; `fieldcal check` names the line"
 
 
 @contextmanager

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import Discriminator, FailFast, Field, Tag, model_validator
 
 from agent.config.knowledge import Certificate, Knowledge, Nine
 from agent.config.pose import PoseInterval, Stop, tell_apart
 from agent.config.section import Name, Section, Vector
-from calib.geometry import beside
+from calib.geometry import UNIT_TOLERANCE
 from calib.model import Pose
 
 # Least length of a pose after its guards are taken off. A shorter pose cannot be used, and many of them, after a typing
@@ -20,6 +21,24 @@ LEAST_LEANING_DEG = 5.0  # of a clamp, if alpha is found from gravity: 1 mg of o
 
 
 FEWEST_DISMISSING = 3  # of two references one may have two windows in a row
+
+
+def check_rotation(name: str, stated: Nine) -> None:
+    """Check that nine numbers, row by row, are a rotation. Raises ValueError, which begins with the name."""
+    R = np.reshape(stated, (3, 3))
+    left, _, right = np.linalg.svd(R)
+    nearest = left @ right
+    if np.linalg.det(nearest) < 0.0:
+        raise ValueError(
+            f"{name}: {list(stated)} is left-handed: an axis has the wrong sign, or two are exchanged; change the sign "
+            "of one row or column, as the sensor is mounted"
+        )
+    if (off := float(np.abs(R @ R.T - np.eye(3)).max())) > UNIT_TOLERANCE:
+        told = ", ".join(f"{x:.5g}" for x in np.round(nearest.ravel(), 5) + 0.0)
+        raise ValueError(
+            f"{name}: its rows must have the length 1 and right angles between them, and are off by {off:.2g} (limit "
+            f"{UNIT_TOLERANCE:g}); correct it, or state more digits: the nearest rotation is [{told}]"
+        )
 
 
 class CheckReference(Section):
@@ -110,7 +129,7 @@ class Channel(Knowledge):
         if check.rotation is not None and self.rotation is None:
             raise ValueError("check_reference.rotation needs rotation of the first reference; add that, or remove it")
         if check.rotation is not None:
-            beside([check.rotation[i : i + 3] for i in (0, 3, 6)])
+            check_rotation("check_reference.rotation", check.rotation)
         if self.gate.dismiss_windows < FEWEST_DISMISSING:
             raise ValueError(
                 f"gate.dismiss_windows {self.gate.dismiss_windows}: with check_reference it must be "
@@ -128,7 +147,7 @@ class Channel(Knowledge):
                     "rotation is for a channel with a tri-axial reference and without "
                     "poses; remove poses, or name the reference"
                 )
-            beside([self.rotation[i : i + 3] for i in (0, 3, 6)])
+            check_rotation("rotation", self.rotation)
         if self.every_s and self.every_s < self.window_s:
             raise ValueError(f"every_s {self.every_s} is shorter than window_s {self.window_s}; make it longer, or 0")
         end = 0.0

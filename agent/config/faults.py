@@ -18,16 +18,13 @@ from agent.config.names import Told, name_faults
 from agent.config.sinks import Tls
 from agent.config.tls import tls_faults
 from agent.config.whole import Config
+from agent.config.words import in_words, length_fault, may_be_truth, meant
 from hw.sensor import DeviceError, Options, load_driver
 
 MOST_DEVICES = 100  # whose options are checked; more are a fault of their own
+SHOWN_FAULTS = 100
 SHOWN_CHARACTERS = 100  # of a value or a path in a fault
-_IN_WORDS = {
-    "missing": "is missing; add it",
-    "extra_forbidden": "there is no such setting; remove it or correct its name",
-    "tuple_type": 'a list in brackets is needed, as [1, 2] or ["x", "y"]',
-    "list_type": 'a list in brackets is needed, as [1, 2] or ["x", "y"]',
-}
+_SPOILT = re.compile(r"[A-Za-z]:[^\x00-\x1f]*([\x00-\x1f])")
 _PATH = re.compile(r"([a-z_]\w*(?:\.\w+)*): ")  # with which a check of several settings begins
 
 
@@ -40,12 +37,13 @@ def faults_of(raw: Mapping[str, Any]) -> tuple[Config | None, list[Told]]:
         config = Config.model_validate(raw)
     except ValidationError as error:
         # The model looks at its names only when all else is sound; they are named here, and only once.
-        faults += told(error, raw, but_of_the_whole=bool(named))
+        faults += told(error, raw, Config, but_of_the_whole=bool(named))
     faults += named
     options = list(_options(raw, faults))
     faults += _unknown_sensitivities(raw, dict(options))
     faults += _uncertified_references(raw, dict(options))
     faults += _file_faults(raw)
+    faults += _misread(raw, (), Config)
     return config, faults
 
 
@@ -61,7 +59,9 @@ def _options(raw: Mapping[str, Any], faults: list[Told]) -> Iterator[tuple[str, 
         if not isinstance(driver, str) or not isinstance(options, dict):
             continue  # the section's own check names it
         try:
-            held = load_driver(driver).options_model.model_validate(options)
+            model = load_driver(driver).options_model
+            faults += [(("devices", i, "options", *path), what) for path, what in _misread(options, (), model)]
+            held = model.model_validate(options)
             held.check_installed()
             filters_of(held.known_filters)
         except DeviceError as error:
@@ -69,7 +69,7 @@ def _options(raw: Mapping[str, Any], faults: list[Told]) -> Iterator[tuple[str, 
         except FiltersError as error:
             faults.append((("devices", i, "options", "filters"), str(error)))
         except ValidationError as error:
-            faults += [(("devices", i, "options", *path), what) for path, what in told(error, options)]
+            faults += [(("devices", i, "options", *path), what) for path, what in told(error, options, model)]
         except (Exception, SystemExit) as error:  # of a plug-in
             fault = f"driver {driver!r} fails on its options: {type(error).__name__}: {error}"
             faults.append((("devices", i, "driver"), fault))
@@ -99,9 +99,9 @@ def _uncertified_references(raw: Mapping[str, Any], options: Mapping[str, Option
         if isinstance(beside, Mapping):
             places.append((("check_reference",), beside.get("device"), beside.get("certificate")))
         for path, device, certificate in places:
-            if device not in options:
-                continue
-            held, driver = certificate if isinstance(certificate, Mapping) else {}, options[str(device)]
+            if not isinstance(device, str) or device not in options:
+                continue  # the section's own check names it
+            held, driver = certificate if isinstance(certificate, Mapping) else {}, options[device]
             stated = held.get("sensitivity") or held.get("file")
             if stated is None and (asked := driver.asked_of_certificate):
                 yield ("channels", i, *path, "certificate", "sensitivity"), f"is missing for {device!r}: {asked}"
@@ -135,30 +135,74 @@ def _file_faults(raw: Mapping[str, Any]) -> Iterator[Told]:
         yield ("zenoh", "tls", field), what
 
 
+def _misread(value: Any, path: Path, kind: type[BaseModel]) -> Iterator[Told]:
+    """Values that are silently taken for others: true for 1, and a path of Windows in double quotes, in which TOML took
+    a backslash and a letter for a control character."""
+    if isinstance(value, bool) and not may_be_truth(kind, path):
+        yield path, f"true and false are no numbers; state a number, not {value}"
+    elif isinstance(value, str) and (found := _SPOILT.match(value)):
+        what = f"{_value(value)} has {found[1]!r} in it: in double quotes \\ begins a code; write it in single quotes"
+        yield path, what
+    elif isinstance(value, Mapping | list):
+        for name, item in value.items() if isinstance(value, Mapping) else enumerate(value):
+            if name not in ("poses", "options"):  # of poses there may be 86,400; options have a model of their own
+                yield from _misread(item, (*path, name), kind)
+
+
 def _entries(raw: Mapping[str, Any], section: str) -> list[Mapping[str, Any]]:
     held = raw.get(section)
     return [entry if isinstance(entry, Mapping) else {} for entry in held] if isinstance(held, list) else []
 
 
-def told(error: ValidationError, raw: Any, *, but_of_the_whole: bool = False) -> Iterator[Told]:
-    """The faults that a model found in the values of a TOML file: where, and what is wrong."""
+def told(error: ValidationError, raw: Any, kind: type[BaseModel], *, but_of_the_whole: bool = False) -> Iterator[Told]:
+    """The faults that a model of this kind found in the values of a TOML file: where, and what is wrong."""
     faults = [fault for fault in error.errors() if fault["loc"] or not but_of_the_whole]
     # A list that is too short only because what is in it was refused is no fault of its own.
     around = {fault["loc"][:n] for fault in faults for n in range(len(fault["loc"]))}
+    said: set[Path] = set()
     for fault in faults:
         if fault["type"] == "too_short" and fault["loc"] in around:
             continue
-        path, value = _path(fault["loc"], raw), fault.get("input")
-        what = fault["msg"].removeprefix("Value error, ")
-        if (named := _PATH.match(what)) is not None:
-            path, what = (*path, *named[1].split(".")), what[named.end() :]
-        what = _IN_WORDS.get(fault["type"], what)
-        # A whole section as "the offending value" would bury the message.
-        whole = isinstance(value, dict | BaseModel | list | tuple) or fault["type"] == "missing"
-        held = repr(value) if isinstance(value, str) else None
-        if held and fault["type"] == "literal_error" and held not in what and _is_number(value):
-            what += " as a number without quotes"
-        yield path, what if whole or (held and held in what) else f"{what}, not {_value(value)}"
+        path = _path(fault["loc"], raw)
+        if len(said) >= SHOWN_FAULTS:
+            yield path, ""  # only counted: to word tens of thousands takes minutes
+            continue
+        for length in range(len(path), 0, -1):
+            if isinstance(value := _at(raw, path[:length]), list | tuple) and (
+                what := length_fault(value, path[:length], kind)
+            ):
+                path = path[:length]
+                break
+        else:
+            path, what = _what(fault, path, kind)
+        if path in said and fault["type"] not in ("value_error", "extra_forbidden"):
+            continue  # of alternatives that all do not fit, and of a list whose length is wrong, one fault is told
+        said.add(path)
+        yield path, what
+
+
+def _what(fault: Mapping[str, Any], path: Path, kind: type[BaseModel]) -> Told:
+    """Where a fault of a model is, and what is wrong, with the value."""
+    value, what = fault.get("input"), in_words(fault, path)
+    if fault["type"] == "value_error" and (named := _PATH.match(what)) is not None:
+        path, what = (*path, *named[1].split(".")), what[named.end() :]
+    # A whole section as "the offending value" would bury the message.
+    whole = isinstance(value, dict | BaseModel | list | tuple) or fault["type"] == "missing"
+    if fault["type"] == "extra_forbidden":
+        return path, f"there is no such setting{'' if whole else f' ({_value(value)})'}; {meant(kind, path)}"
+    if isinstance(value, str) and fault["type"] == "literal_error" and repr(value) not in what and _is_number(value):
+        what += " as a number without quotes"
+    return path, what if whole or (isinstance(value, str) and repr(value) in what) else f"{what}, not {_value(value)}"
+
+
+def _at(raw: Any, path: Path) -> Any:
+    """The value at a path; None where there is none."""
+    for part in path:
+        held = isinstance(raw, Mapping) and part in raw
+        if not held and not (isinstance(raw, list | tuple) and isinstance(part, int) and part < len(raw)):
+            return None
+        raw = raw[part]
+    return raw
 
 
 def _path(location: tuple[str | int, ...], raw: Any) -> Path:

@@ -41,7 +41,9 @@ class Stop(Section):
         if self.theta_deg is None and self.direction is None and self.gravity_mps2 is None:
             raise ValueError("needs theta_deg and alpha_deg, or direction, or gravity_mps2")
         if self.direction is not None and abs(sum(x * x for x in self.direction) - 1) > 1e-3:
-            raise ValueError(f"direction {self.direction} is not a unit vector; divide it by its length")
+            length = sum(x * x for x in self.direction) ** 0.5
+            unit = ", ".join(f"{x / length if length else 0.0:.5g}" for x in self.direction)
+            raise ValueError(f"direction {self.direction} is not a unit vector; divide it by its length: [{unit}]")
         return self
 
     @property

@@ -65,7 +65,7 @@ class Setting:
         try:
             Channel.model_validate({"sensor": "sensor"} | nest)
         except ValidationError as error:
-            for path, what in told(error, {"sensor": "sensor"} | nest):
+            for path, what in told(error, {"sensor": "sensor"} | nest, Channel):
                 own = path[: len(self.path)] == self.path or (what.startswith("there is no") and path)
                 if own and not (self.scaled and path == self.path and "no such setting" not in what):
                     raise SettingError(f"{shown(('channels', self.channel, *path))}: {what}") from None
@@ -84,7 +84,7 @@ def changed_config(config_json: str, settings: Sequence[Setting]) -> Config:
     try:
         return Config.model_validate(raw)
     except ValidationError as error:
-        lines = [f"{shown(path)}: {what}" for path, what in told(error, raw)]
+        lines = [f"{shown(path)}: {what}" for path, what in told(error, raw, Config)]
         raise SettingError("; ".join(lines[:5])) from None
 
 

@@ -16,6 +16,7 @@ from agent.config import Config
 from agent.config.devices import Device
 from agent.core.events import IN_DRIVER
 from agent.setup.buses import bus_clock_khz
+from agent.setup.contradictions import place_of
 from agent.setup.finding import Finding
 from hw.block import BlockFlags
 from hw.fifo_options import FifoOptions
@@ -43,31 +44,6 @@ def option_findings(options: Mapping[str, Options]) -> Iterator[Finding]:
             yield Finding("options", "advice", f"{name}: {advice}")
 
 
-def place_findings(config: Config, options: Mapping[str, Options]) -> Iterator[Finding]:
-    """Is a device stated twice, or a channel's sensor one that cannot be calibrated?"""
-    first: dict[str, str] = {}
-    for name, held in options.items():
-        place = _place(held)
-        if place and place in first:
-            says = f"{first[place]} and {name} are both at {place}: only one of them can be opened"
-            yield Finding("device", "fault", says, "correct the options of one of them, or remove it")
-        first.setdefault(place, name)
-    for channel in config.channels:
-        if getattr(options[channel.sensor], "axes", 3) == 1:
-            says = f"{channel.sensor} has one axis, and the sensor of a channel needs three"
-            yield Finding(
-                "device", "fault", says, "name a sensor with x, y and z; a device with one can be a reference"
-            )
-
-
-def _place(held: Options) -> str:
-    """Where a device is connected that only one can be at; "" where the options do not tell."""
-    if isinstance(held, FifoOptions):
-        return held.node if held.over_spi else f"0x{getattr(held, 'address', 0):02X} on {held.node}"
-    port = getattr(held, "port", None)
-    return os.path.realpath(port) if isinstance(port, str) else ""
-
-
 def sharing_findings(config: Config, options: Mapping[str, Options]) -> Iterator[Finding]:
     """Does a device that must be alone on its bus share it? The device's identity is read where the bus is here."""
     for device in config.devices:
@@ -77,7 +53,7 @@ def sharing_findings(config: Config, options: Mapping[str, Options]) -> Iterator
         others = [
             name
             for name, other in options.items()
-            if isinstance(other, FifoOptions) and other.bus == held.bus and _place(other) != _place(held)
+            if isinstance(other, FifoOptions) and other.bus == held.bus and place_of(other) != place_of(held)
         ]
         if not others:
             continue
@@ -103,6 +79,13 @@ def access_findings(options: Mapping[str, Options]) -> Iterator[Finding]:
         else:
             continue
         yield _access(name, node)
+
+
+def missing_ports(options: Mapping[str, Options]) -> Iterator[Finding]:
+    """Which serial ports are not on this machine?"""
+    for name, held in options.items():
+        if isinstance(port := getattr(held, "port", None), str) and "://" not in port and not Path(port).exists():
+            yield _access(name, Path(port))
 
 
 def _access(name: str, node: Path) -> Finding:

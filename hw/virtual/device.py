@@ -46,6 +46,11 @@ class VirtualOptions(Options):
             raise ValueError(f"no preset {value!r}; available: {', '.join(PRESETS)}")
         return value
 
+    @property
+    def axis_count(self) -> int:
+        """Three of the sensor; of a reference as its bench has it."""
+        return 3 if self.role == "sensor" else parameters_of(self).reference.channels
+
 
 class BenchClock:
     """Time of one bench: the clock of its data, and the time since its first device was opened."""

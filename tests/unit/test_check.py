@@ -33,6 +33,11 @@ axes = 1
 [[channels]]
 sensor = "imu"
 reference = "laser"
+poses = [
+  { start_s = 10, stop_s = 40, theta_deg = 35, alpha_deg = 0 },
+  { start_s = 50, stop_s = 80, theta_deg = 35, alpha_deg = 120 },
+  { start_s = 90, stop_s = 120, theta_deg = 35, alpha_deg = 240 },
+]
 [channels.prior]
 sensitivity = 26000
 [recording]
@@ -72,7 +77,9 @@ def test_a_sound_configuration_is_good(tmp_path: Path, capsys: pytest.CaptureFix
     path.write_text(GOOD)
     assert run_cli(["check", str(path)]) == 0
     assert capsys.readouterr().out.splitlines() == [
-        f"{path}: good; 2 devices, 1 channel",
+        f"{path}: good; 2 devices, 1 channel, 3 poses",
+        "  imu: the stated positions determine 12 of 12 parameters; U (k = 2) once each was taken: main 1.9 %, "
+        "transverse 1.1 %, offset 0.18 m/s2, without the reference's own, with motion of 5 m/s2 rms",
         *(f"  filters of {device}: none stated; its response is estimated with S" for device in ("imu", "laser")),
     ]
 
@@ -85,7 +92,7 @@ def test_a_certificate_older_than_its_interval_is_told_and_is_no_fault(
     path.write_text(GOOD + f"[channels.certificate]\ncalibrated = {calibrated}\ninterval_years = 2\n")
     assert run_cli(["check", str(path)]) == 0
     shown = capsys.readouterr()
-    assert shown.err.startswith(f"{path}: channels.0.certificate.calibrated: 2001-05-01 is ")
+    assert f"{path}: channels.0.certificate.calibrated: 2001-05-01 is " in shown.err
     assert "more than interval_years 2;" in shown.err
     assert shown.out.startswith(f"{path}: good")
 
@@ -145,7 +152,8 @@ sensor = "mems"
 reference = "imu"
 rotation = [1, 0, 0, 0, 1, 0, 0, 0, 1]
 [channels.prior]
-sensitivity = 26000
+[channels.certificate]
+sensitivity = 1670.7
 """
 
 
@@ -170,7 +178,7 @@ def test_a_part_that_answers_for_others_and_is_not_alone(
         (
             "sensitivity = 26000",
             "u_main_pct = 1",
-            "line 17: channels.0.prior.sensitivity: is missing: the device 'imu' tells none; state it in its unit per "
+            "line 22: channels.0.prior.sensitivity: is missing: the device 'imu' tells none; state it in its unit per "
             "m/s2, from its data sheet",
         ),
         (
@@ -192,7 +200,7 @@ def test_a_part_that_answers_for_others_and_is_not_alone(
         (
             "keep_days = 30",
             "keep_day = 30",
-            "line 20: recording.keep_day: there is no such setting; remove it or correct its name, not 30",
+            "line 25: recording.keep_day: there is no such setting (30); did you mean keep_days?",
         ),
         ("port = \"/dev/ttyUSB1\"\n", "", "line 10: devices.1.options.port: is missing; add it"),
         (
@@ -201,7 +209,11 @@ def test_a_part_that_answers_for_others_and_is_not_alone(
             "line 15: channels.0.certificate.sensitivity: is missing for 'laser': it indicates g; state 0.101971621 "
             "(1/9.80665), or its certificate's",
         ),
-        ("keep_days = 30", "keep_days = ", "line 20: not TOML: Invalid value (at line 20, column 13)"),
+        (
+            "keep_days = 30",
+            "keep_days = ",
+            "line 25: keep_days =: a setting without a value is left out; write # keep_days =",
+        ),
     ],
 )  # fmt: skip
 def test_a_fault_names_line_path_and_remedy(
@@ -295,7 +307,7 @@ def test_a_signing_key_that_cannot_sign_is_a_fault(
     key = tmp_path / "recording.key"
     key_of(kind, key)
     [line] = checked(tmp_path / "f.toml", f'{GOOD}signing_key = "{key}"\n', capsys)
-    assert line.startswith(f"line 21: recording.signing_key: {key}: {why}; ")
+    assert line.startswith(f"line 26: recording.signing_key: {key}: {why}; ")
 
 
 def test_a_signing_key_that_can_sign_is_good(tmp_path: Path) -> None:
@@ -317,10 +329,10 @@ def test_names_come_with_all_other_faults(tmp_path: Path, capsys: pytest.Capture
             "line 6: devices.0.options.rate_hz",
             "line 15: channels.0.sensor",
             "line 16: channels.0.reference",
-            "line 20: recording.keep_days",
-            "line 21: recording.signing_key",
-            "line 24: commands.keys.0.public_key",
-            "line 26: commands.keys.0.sensors.0",
+            "line 25: recording.keep_days",
+            "line 26: recording.signing_key",
+            "line 29: commands.keys.0.public_key",
+            "line 31: commands.keys.0.sensors.0",
         ]
     )
 
@@ -329,10 +341,14 @@ def test_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "gateway.toml"
     path.write_text(GOOD)
     assert run_cli(["check", str(path), "--json", "-"]) == 0
-    counts = {"devices": 2, "channels": 1, "poses": 0, "positions": 0}
+    counts = {"devices": 2, "channels": 1, "poses": 3, "positions": 0}
     filters = [{"sensor": "imu", "device": device, "lines": [], "stated_by": ""} for device in ("imu", "laser")]
-    told = {"good": True, "faults": [], "warnings": [], **counts, "filters": filters}
-    assert json.loads(capsys.readouterr().out) == told
+    told = json.loads(capsys.readouterr().out)
+    (plan,) = told.pop("plans")
+    assert len(told.pop("warnings")) == 2  # this machine has none of the ports
+    assert told == {"good": True, "faults": [], **counts, "filters": filters}
+    assert (plan["sensor"], plan["determined"], plan["needed"], plan["missing"]) == ("imu", 12, 12, [])
+    assert plan["expanded_u_main_pct"] == pytest.approx(1.9, abs=0.05)
     path.write_text(GOOD.replace("bridge", "a bridge").replace("axes = 1", "axes = 2"))
     assert run_cli(["check", str(path), "--json", "-"]) == 2
     said = capsys.readouterr()

@@ -74,14 +74,14 @@ def test_faults_have_their_lines(made: Path, tmp_path: Path, capsys: pytest.Capt
         f'file = "{tmp_path}/partly.json"': "state sensitivity, u_main_pct and u_transverse_pct instead of file",
         f'u_main_pct = 1\nfile = "{xml}"': f"prior.u_main_pct: {xml} states it too; remove it here, or remove file",
         f'file_sha256 = "{"0" * 64}"\nfile = "{xml}"': "name the file that was meant, or state this one",
-        "file = 3": "prior.file: Input should be a valid string, not 3",
+        "file = 3": "prior.file: a text in quotes is needed, not 3",
     }
     for lines, words in cases.items():
         faults = checked(path, GOOD.replace(PRIOR, lines), capsys)
         assert len(faults) == 1, faults
-        assert faults[0].startswith("line 18: channels.0.prior."), faults
+        assert faults[0].startswith("line 23: channels.0.prior."), faults
         assert any(words in fault for fault in faults), faults
     text = f'{GOOD}[channels.certificate]\nfile = "{xml}"\nsensitivity = 1.0\n'
     assert checked(path, text, capsys) == [
-        f"line 23: channels.0.certificate.sensitivity: {xml} states it too; remove it here, or remove file"
+        f"line 28: channels.0.certificate.sensitivity: {xml} states it too; remove it here, or remove file"
     ]

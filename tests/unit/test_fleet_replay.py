@@ -207,8 +207,8 @@ def test_a_recording_that_continues_another_is_recomputed_from_its_own_windows_a
     ("text", "told"),
     [
         ("channels.*.certificate.sensitivty=1", "channels.*.certificate.sensitivty: there is no such setting"),
-        ("channels.mems.certificate.sensitivity=-3", "channels.mems.certificate.sensitivity: Input should be greater"),
-        ('channels.*.window_s="a"', "channels.*.window_s: Input should be a valid number"),
+        ("channels.mems.certificate.sensitivity=-3", "channels.mems.certificate.sensitivity: must be above 0"),
+        ('channels.*.window_s="a"', "channels.*.window_s: a number is needed"),
         ("channels.*.certificate.sensitivity*=big", "needs a number"),
         ("recording.signing_key=/etc/shadow", "only channels decide"),
         ("channels.*", "must be channels.<sensor>.<key>=<value>"),
@@ -227,7 +227,7 @@ def test_a_setting_that_a_recording_cannot_have_refuses_that_recording(recording
     for setting, told in (
         ("channels.other.window_s=20", "channels.other: the recording has no such channel; there is mems"),
         ("channels.*.poses.99.theta_deg=1", "channels.mems.poses.99.theta_deg: the recorded configuration has nothing"),
-        ("channels.*.gravity_mps2*=2", "channels.0.gravity_mps2: Input should be less than 9.9"),
+        ("channels.*.gravity_mps2*=2", "channels.0.gravity_mps2: must be below 9.9"),
     ):
         assert here(recordings / "gateway-1.mcap", setting).reasons[0].startswith(told)
 
