@@ -28,6 +28,7 @@ FEWEST_NEIGHBOURS = 4  # the last burst of a file may be cut off, its newest sam
 # Of the usual period. Less cannot be told from the scatter of bursts, and then costs less than it does; exact stamps
 # show each missing sample.
 LEAST_GAP, LEAST_GAP_ON_GRID = 5.0, 0.5
+WHOLE = 0.9  # of a period: on a grid so long a step is a missing sample, with few neighbours as well
 SPAN_S = 1.0  # no burst lasts longer: the median period over such spans is that of the samples
 SPANS = 4096  # that are looked at
 # A longer step in the time is a time in which nothing was recorded, however few samples stand beside it. So much may be
@@ -271,6 +272,7 @@ def _gaps(arrivals: Arrivals, period: float) -> IntArray:
     late = arrivals.arrival_s - period * arrivals.index
     on_grid = arrivals.kind == "grid"
     least = period * (LEAST_GAP_ON_GRID if on_grid else LEAST_GAP)
+    sure = WHOLE * period if on_grid else OFF_S
     steps = np.diff(late)
     found = [0, len(late)]
     # The largest first: a stall just before a gap would else be taken for it.
@@ -278,7 +280,7 @@ def _gaps(arrivals: Arrivals, period: float) -> IntArray:
         right = bisect.bisect(found, b)
         before = late[max(found[right - 1], b - NEIGHBOURS) : b]
         after = late[b : min(found[right], b + NEIGHBOURS)]
-        if min(len(before), len(after)) < FEWEST_NEIGHBOURS and not (on_grid or steps[b - 1] > OFF_S):
+        if min(len(before), len(after)) < FEWEST_NEIGHBOURS and steps[b - 1] < sure:
             continue
         if min(after.min() - before.min(), np.median(after) - np.median(before)) > least:
             found.insert(right, b)
