@@ -100,14 +100,14 @@ def test_a_gap_between_two_blocks_of_a_long_file(monkeypatch: pytest.MonkeyPatch
     assert len(cut.values) == 10_000
 
 
-@pytest.mark.parametrize(("after", "row"), [(2.0, 6000), (0.5, 6000), (1.15, 6000)])
+@pytest.mark.parametrize("after", [2.0, 0.5, 1.15])
 @pytest.mark.parametrize("off_s", [0.0, 30.0])
-def test_two_rates_in_one_file_are_told(after: float, row: int, off_s: float) -> None:
+def test_two_rates_in_one_file_are_told(after: float, off_s: float) -> None:
     t = np.concatenate([np.arange(6000) / 100.0, 60.0 + off_s + np.arange(6000) / (100.0 * after)])
     with pytest.raises(InputError, match=rf"from 100 Hz to {100 * after:.4g} Hz.*cut the file here") as told:
         calib.calibrate((t, np.zeros((len(t), 3))), {"time_s": t, "a": np.zeros(len(t))}, [])
     assert told.value.row is not None
-    assert abs(told.value.row - row) <= 200
+    assert abs(told.value.row - 6000) <= 200
 
 
 def test_stalls_losses_and_a_slow_clock_are_no_other_rate() -> None:
