@@ -106,7 +106,7 @@ def mean_frequency_hz(data: Condensed) -> float:
     if data.bands is None or not power.any():
         return 0.0
     square = -data.bands.projected[:, 0, real, real]  # by c_2, the slopes on u move by -omega^2
-    return float(np.sqrt(np.sum(power * square) / power.sum())) / (2.0 * np.pi)
+    return float(np.sqrt(max(np.sum(power * square), 0.0) / power.sum())) / (2.0 * np.pi)  # below 0 it only drifts
 
 
 def effective(data: Condensed, independent: Array) -> Condensed:

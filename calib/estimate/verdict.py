@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib.distributions import chi2_quantile
+from calib.distributions import chi2_quantile, coverage_factor
 from calib.estimate.budget import Budget
 from calib.estimate.gauss_newton import Flags, Solution
 from calib.estimate.quantities import LAG
@@ -41,13 +41,15 @@ def reasons(
     `polarity`.
     """
     return (
-        _rank_reasons(windows, solution)
+        _not_finite(solution, shares.covariance)
+        or _rank_reasons(windows, solution)
         or _sign_reasons(solution, turned)
         or _lag_reasons(solution, shares)
         or _response_reasons(shares)
         or [*_prior_reasons(solution), *_misfit_reasons(solution)]
         or _nuisance_reasons(solution, shares.covariance)
         or _nothing_determined(solution, determined)
+        or _too_uncertain(solution, shares, determined)
         or dead_reasons(np.where(determined, solution.x[:12], np.nan)[:9].reshape(3, 3))
     )
 
@@ -63,6 +65,31 @@ def _rank_reasons(windows: Sequence[Window], solution: Solution) -> list[str]:
             "least three different alphas, and with motion"
         ]
     return []
+
+
+def _not_finite(solution: Solution, covariance: Array) -> list[str]:
+    if np.isfinite(solution.x).all() and np.isfinite(covariance).all():
+        return []
+    return [
+        "the adjustment has no solution in finite numbers: the motion leaves too much open; measure longer, with more "
+        "motion or in more positions"
+    ]
+
+
+def _too_uncertain(solution: Solution, shares: Budget, determined: Flags) -> list[str]:
+    """Whether U of a determined element of S is above the largest main sensitivity: then not even a sign is known."""
+    told = np.flatnonzero(determined[:9])
+    if not told.size:
+        return []
+    k = coverage_factor(float(np.min(shares.degrees_of_freedom[determined])))
+    expanded, main = k * np.sqrt(np.diag(shares.covariance)[told]), float(np.abs(solution.x[[0, 4, 8]]).max())
+    worst = int(np.argmax(expanded))
+    if expanded[worst] <= main:
+        return []
+    return [
+        f"{PARAMETERS[told[worst]]} is {solution.x[told[worst]]:.4g} with U {expanded[worst]:.4g}, above the largest "
+        f"main sensitivity, {main:.4g}; measure longer, with more motion or in more positions"
+    ]
 
 
 def _nothing_determined(solution: Solution, determined: Flags) -> list[str]:
@@ -167,7 +194,7 @@ def nuisance_pull(solution: Solution, covariance: Array) -> tuple[float, float, 
     """
     terms = solution.equations.nuisances.terms
     stated = [j for j, t in enumerate(terms) if t.kind.stated]
-    if not stated:
+    if not stated or _not_finite(solution, covariance):
         return 0.0, np.inf, ""
     u, k = np.array([terms[j].uncertainty for j in stated]), 12 + np.array(stated)
     pull = (solution.x[k] - solution.prior_mean[k]) / u

@@ -20,7 +20,7 @@ from calib.excitation.disturbance import NoiseFilter, against_noise, not_more_th
 from calib.excitation.turning import feels_gravity, standing_parts
 from calib.excitation.window_verdict import DEFAULT_LIMITS, Limits
 from calib.excitation.windows import Points, at_rest, motion_windows, rest_window, still_window
-from calib.model import Array, BandSums, Pose, Window, WindowSums
+from calib.model import Array, BandSums, Pose, Window, WindowSums, own_channels
 from calib.signal.band import band_above_noise, lowpass, without_short_holes
 from calib.signal.corner import integral, with_integral, without_corner
 from calib.signal.glitches import glitches
@@ -44,6 +44,10 @@ MOST_MARGIN_S = 5.0  # a second derivative at 10 Hz takes 4.2 s
 MOST_MISSING_PCT = 5.0
 # A sensor that follows the motion better, with fewer knocks, needs no other weights of the frequencies.
 COHERENT, KNOCKED_PCT = 0.999, 1.0
+# Of the motion in a window: with fewer, its spectrum is that of the window's ends, and it shows no direction but one.
+FEWEST_CYCLES = 2.0
+LEAST_CYCLES, LEAST_LONG_CYCLES, LONG_S = 1.0, 0.5, 10.0  # a few ms of lag bend a long turn less than a short one
+SLOW_HZ, SLOW_SHARE = 10.0, 0.8  # means of so long a time keep so much of a slow motion, and little of the noise
 
 
 class Unusable(ValueError):  # noqa: N818 - said of samples
@@ -265,7 +269,7 @@ def _motion(
             found, made = better, _beside(pose, better, settings, before=found.points)
     u_lag_s = float(np.hypot(sensor.clock.u_offset_s, reference.clock.u_offset_s))
     taken = () if response.is_flat else response.terms
-    made = [replace(_told(w, found), u_lag_s=u_lag_s, response=taken) for w in made]
+    made = [replace(_slow(_told(w, found), found.points), u_lag_s=u_lag_s, response=taken) for w in made]
     # Where the noise of the reference is stated, all other noise is the sensor's.
     sensor_noise = np.full(3, np.inf) if instrument.noise > 0.0 else found.sensor_noise
     return [w if w.bands is None else replace(w, bands=_noisy(w.bands, sensor_noise, against)) for w in made]
@@ -326,6 +330,41 @@ def _told(window: Window, found: Aligned) -> Window:
     count = {"clipped_points": float(found.clipped_points), "clipped_points_threshold": 0.0}
     reason = window.reason or f"clipped: {found.clipped_points} points at the end of the sensor's range"
     return replace(window, used=False, reason=reason, numbers={**window.numbers, **count})
+
+
+def _slow(window: Window, points: Points) -> Window:
+    """A window in which the motion makes less than FEWEST_CYCLES, as a turn against gravity, without its bands: what is
+    in them leaked from motion that is slower than the window, so it tells no response. Such motion leaves directions
+    in which nothing moves: what the window shows to be noise of the reference counts there. With too few
+    cycles the window is not used: what looks like a second direction is the bend of the first one."""
+    if window.kind != "motion" or window.reference_noise is None or not window.points:
+        return window
+    u = points.within(window.start_s, window.stop_s).u[:, : own_channels(window.sums.reference_channels)]
+    noise, rate_hz = detection.white_noise(u), (len(u) - 1) / (window.stop_s - window.start_s)
+    cycles = _slow_cycles(u, rate_hz, noise)
+    if cycles >= FEWEST_CYCLES:
+        return window
+    least = np.stack([noise, noise * np.pi / np.sqrt(3.0) * rate_hz])  # white to half of the rate
+    needed, reason = LEAST_CYCLES if len(u) < LONG_S * rate_hz else LEAST_LONG_CYCLES, window.reason
+    numbers = {**window.numbers, "cycles": cycles, "cycles_threshold": needed}
+    if cycles < needed and window.used:
+        reason = f"the motion is slow: it makes {cycles:.2g} cycles here, {needed:g} needed; turn it to and fro"
+    return replace(
+        window, bands=None, reference_noise=np.maximum(window.reference_noise, least), used=not reason, reason=reason,
+        numbers=numbers,
+    )  # fmt: skip
+
+
+def _slow_cycles(u: Array, rate_hz: float, noise: Array) -> float:
+    """How many cycles the motion u (n, m) makes, by its mean frequency; inf where it is not slow."""
+    width = max(round(rate_hz / SLOW_HZ), 1)
+    means = detection.averaged(u, width)
+    moved = float(np.var(u[: len(means) * width], axis=0).sum() - np.sum(noise**2)) if len(means) else 0.0
+    slow = float(np.var(means, axis=0).sum()) if len(means) > 1 else 0.0
+    if slow < SLOW_SHARE * moved or not slow > 0.0:
+        return float("inf")
+    rate = np.diff(means, axis=0) * rate_hz / width
+    return float(np.sqrt(np.mean(np.sum(rate**2, axis=1)) / slow)) * len(u) / rate_hz / (2.0 * np.pi)
 
 
 def _clipped(columns: Array) -> int:

@@ -25,6 +25,7 @@ from calib.excitation.sums import pool, window_sums
 from calib.excitation.window_verdict import DEFAULT_LIMITS, Limits, Verdict, judge
 from calib.model import Array, BandSums, Pose, Window, WindowSums
 from calib.signal.order_statistics import median
+from calib.signal.stamps import OFF_S
 
 SHORTEST_QUIET_S = 1.0  # a shorter pause makes no window of kind "quiet"
 
@@ -181,7 +182,9 @@ def rests_anywhere(time_s: Array, V: Array, gravity_mps2: float, limits: Limits 
     `time_s` (n,) in s, `V` (n, 3) in output unit, `gravity_mps2` the magnitude of gravity. The pose of each window has
     gravity along z in place of its unknown direction; a norm fit does not use the pose.
     """
-    rate_hz = _rate(time_s)
+    steps = np.diff(time_s)
+    off = steps[steps > OFF_S]  # nothing was recorded meanwhile
+    rate_hz = float((len(steps) - len(off)) / (time_s[-1] - time_s[0] - off.sum()))
     windows = []
     for k, (first, stop) in enumerate(find_rests(V, rate_hz)):
         pose = geometry.at_rest([0.0, 0.0, gravity_mps2], position=f"rest {k + 1}")

@@ -8,7 +8,7 @@ import numpy as np
 
 from calib.model import Slices
 from calib.signal.samples import Samples
-from calib.signal.stamps import clock_from_stamps, counted
+from calib.signal.stamps import OFF_S, clock_from_stamps, counted
 from calib.signal.timing import ClockFit
 
 
@@ -35,20 +35,33 @@ class TableStream:
         first_s, end_s = self.clock.time_of([0, self._count]).tolist()
         return first_s, end_s
 
+    @property
+    def off_s(self) -> list[tuple[float, float]]:
+        """From when to when in s nothing was recorded, where that took longer than OFF_S."""
+        stop = self._numbers[:-1] + np.diff(self._rows)  # number of the sample that would follow each run
+        from_s, to_s = self.clock.time_of(stop - 1), self.clock.time_of(self._numbers[1:])
+        long = to_s - from_s > OFF_S
+        return list(zip(from_s[long].tolist(), to_s[long].tolist(), strict=True))
+
     def stretch(self, rate: float, at_s: float) -> None:
         """Change the times of the samples to a scale that runs faster by `rate`, see ClockFit.stretched."""
         self.clock = self.clock.stretched(rate, at_s)
 
     def cut(self, start_s: float, stop_s: float) -> Samples | None:
-        """The samples with start_s <= t < stop_s, a row of NaN for each missing one; None if there are no samples."""
+        """The samples with start_s <= t < stop_s, a row of NaN for each one that is missing between them; None if there
+        are no samples."""
         edges = np.ceil(self.clock.index_of(np.array([start_s, stop_s])))
         first, stop = (int(edge) for edge in np.clip(edges, 0, self._count))
-        if stop <= first:
-            return None
-        held = np.full((self.axes, stop - first), np.nan)  # the samples of an axis lie side by side
         ends = [*self._rows.tolist(), len(self._values)]
-        for (row, next_row), number in zip(itertools.pairwise(ends), self._numbers.tolist(), strict=True):
-            a, b = max(first, number), min(stop, number + next_row - row)
-            if a < b:
-                held[:, a - first : b - first] = self._values[row + a - number : row + b - number].T
+        parts = [
+            (max(first, number), min(stop, number + next_row - row), row - number)
+            for (row, next_row), number in zip(itertools.pairwise(ends), self._numbers.tolist(), strict=True)
+            if max(first, number) < min(stop, number + next_row - row)
+        ]
+        if not parts:
+            return None
+        first, stop = parts[0][0], parts[-1][1]
+        held = np.full((self.axes, stop - first), np.nan)  # the samples of an axis lie side by side
+        for a, b, to_row in parts:
+            held[:, a - first : b - first] = self._values[a + to_row : b + to_row].T
         return Samples(self._name, first, held.T, self.clock)

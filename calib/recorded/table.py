@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.model import Array, Slices
 from calib.recorded.errors import InputError
-from calib.signal.stamps import kind_of
+from calib.signal.stamps import change_of_rate, kind_of
 
 # Columns of a sensor, and of a reference with the quantity that they hold.
 SENSOR = ("time_s", "vx", "vy", "vz")
@@ -116,7 +116,7 @@ def _most_late_s(time_s: Slices) -> float:
 
 
 def check_time(time_s: Slices, column: str, place: str) -> None:
-    """Check that time increases. Stamps may decrease by LATEST_STAMP_S, but not if they are on an exact grid.
+    """Check that time increases, at one rate. Stamps may decrease by LATEST_STAMP_S, but not on an exact grid.
 
     Raises InputError.
     """
@@ -145,3 +145,10 @@ def check_time(time_s: Slices, column: str, place: str) -> None:
         raise InputError(
             f"the value is {newest:.10g} in every row", "time must increase", place=place, column=column, value=newest
         )
+    change = change_of_rate(time_s)
+    if change is not None:
+        row, before_hz, after_hz = change
+        raise InputError(
+            f"the rate changes about here from {before_hz:.4g} Hz to {after_hz:.4g} Hz, and a device's filters with it",
+            "cut the file here, and calibrate each part", place=place, row=row, column=column,
+        )  # fmt: skip

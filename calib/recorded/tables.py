@@ -138,9 +138,19 @@ class Tables:
     def _pieces(self, interval: PoseInterval) -> Iterator[tuple[float, float]]:
         longest_s, guard_s = self._making.settings.limits.longest_s, self._making.guard_s
         first_s, end_s = self._sensor.span_s  # there are no windows outside, however long a pose is said to be
-        return pieces_of(
-            interval.start_s, min(interval.stop_s, end_s + guard_s), longest_s, guard_s, after_s=first_s - longest_s
-        )
+        for start_s, stop_s in self._recorded(interval.start_s, min(interval.stop_s, end_s + guard_s)):
+            yield from pieces_of(start_s, stop_s, longest_s, guard_s, after_s=first_s - longest_s)
+
+    def _recorded(self, start_s: float, stop_s: float) -> Iterator[tuple[float, float]]:
+        """From when to when in s, between these times, neither the sensor nor the reference was off."""
+        off_s = self._sensor.off_s + ([] if self._reference is None else self._reference.off_s)
+        for from_s, to_s in sorted(off_s):
+            if from_s < stop_s and to_s > start_s:
+                if from_s > start_s:
+                    yield start_s, from_s
+                start_s = to_s
+        if start_s < stop_s:
+            yield start_s, stop_s
 
     def _windows(
         self,

@@ -1,0 +1,34 @@
+"""Slow turning beside a DC-coupled reference: right or refused, never an error (a short `benchmarks.turning`)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.turning import Counts, one
+from calib.estimate.adjustment import adjust
+from calib.estimate.nuisances import Priors
+from tests.clamp_windows import clamp_points
+
+
+@pytest.mark.parametrize("axes", [1, 2, 3])
+def test_slow_turning(axes: int) -> None:
+    """To and fro, without a stop, and in steps; before, some of these ended with LinAlgError."""
+    counts = Counts()
+    for seed in range(9):
+        one(seed, axes, counts)
+    assert counts.crashed == 0
+    assert counts.wrong == []
+    assert counts.valid >= 3
+    assert counts.coverage > 0.95
+
+
+def test_what_is_not_finite_is_refused_and_so_is_a_u_above_the_main_sensitivity() -> None:
+    grounds = adjust(clamp_points(np.random.default_rng(1)).windows, Priors()).grounds
+    assert grounds.reasons == ()
+    nothing = replace(grounds.solution, x=np.full_like(grounds.solution.x, np.nan))
+    assert "no solution in finite numbers" in replace(grounds, solution=nothing).reasons[0]
+    wide = replace(grounds.shares, covariance=1e6 * grounds.shares.covariance)
+    assert "above the largest main sensitivity" in replace(grounds, shares=wide).reasons[0]
