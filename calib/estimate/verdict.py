@@ -1,4 +1,4 @@
-"""Checks of an adjustment: rank, contradictions of priors and stated values, reversed signs, misfit, dead outputs."""
+"""Checks of an adjustment: rank, contradictions of priors and stated values, reversed signs, misfit, and S itself."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib.distributions import chi2_quantile
+from calib.distributions import chi2_quantile, coverage_factor
+from calib.estimate.axes import sensitivity_reasons
 from calib.estimate.budget import Budget
 from calib.estimate.gauss_newton import Flags, Solution
 from calib.estimate.quantities import LAG
-from calib.model import PARAMETERS, Array, Window
+from calib.model import PARAMETERS, Array, Calibration, Window
 
 CONTRADICTED = 0.999  # probability: one sound calibration in a thousand is refused as a contradiction of its priors
 PRIOR_SHARE = 0.01  # a prior is tested only in directions in which the data reduce its variance by this part
@@ -23,8 +24,8 @@ MISFIT_LIMIT = 0.1  # of the signal; with right signs, 0.01 was left in the wors
 # A stated value is contradicted only if the data contradict it even with every stated standard uncertainty doubled: a
 # clamp whose errors are twice its default uncertainty is still used.
 STATED_TIMES = 2.0
-LEAST_FELT = 0.1  # least sensitivity of a working output in its best direction, relative to the largest sensitivity
 MOST_BETWEEN_BANDS = 0.01  # relative; a pair that is far apart, or turned, deviates by several per cent
+LEAST_S = 10.0  # of one window alone; some periods of the slowest motion that a hand or a structure has
 CONFOUNDED_LAG = 0.01  # largest error of S due to an undetermined lag, relative to the scale of S
 
 
@@ -41,15 +42,45 @@ def reasons(
     `polarity`.
     """
     return (
-        _rank_reasons(windows, solution)
+        _number_reasons(solution, shares)
+        or _rank_reasons(windows, solution)
         or _sign_reasons(solution, turned)
         or _lag_reasons(solution, shares)
         or _response_reasons(shares)
         or [*_prior_reasons(solution), *_misfit_reasons(solution)]
         or _nuisance_reasons(solution, shares.covariance)
         or _nothing_determined(solution, determined)
-        or dead_reasons(np.where(determined, solution.x[:12], np.nan)[:9].reshape(3, 3))
+        or _sensitivity_reasons(solution, shares, determined)
+        or _short_reasons(windows)
     )
+
+
+def _number_reasons(solution: Solution, shares: Budget) -> list[str]:
+    if np.isfinite(solution.chi2) and np.isfinite(shares.covariance).all():
+        return []
+    return [
+        "the equations have no solution in numbers: something that they divide by is zero; measure longer, with more "
+        "motion or in more positions"
+    ]
+
+
+def _sensitivity_reasons(solution: Solution, shares: Budget, determined: Flags) -> list[str]:
+    known = determined | solution.bounded
+    values = np.where(known, solution.x[:12], np.nan)
+    covariance = np.where(np.outer(known, known), shares.covariance[:12, :12], np.nan)
+    found = Calibration(values[:9].reshape(3, 3), values[9:], covariance, determined, np.inf, "")
+    k = coverage_factor(float(np.min(shares.degrees_of_freedom[determined], initial=np.inf)))
+    return sensitivity_reasons(found, k, stated=bool(solution.bounded[:9].any()))
+
+
+def _short_reasons(windows: Sequence[Window]) -> list[str]:
+    length_s = sum(w.stop_s - w.start_s for w in windows)
+    if len(windows) > 1 or length_s >= LEAST_S:
+        return []
+    return [
+        f"only one window of {length_s:.3g} s can be used; two windows, or {LEAST_S:g} s, are needed to see whether "
+        "the data agree with each other: measure longer"
+    ]
 
 
 def _rank_reasons(windows: Sequence[Window], solution: Solution) -> list[str]:
@@ -190,24 +221,6 @@ def _nuisance_reasons(solution: Solution, covariance: Array) -> list[str]:
     return [
         f"the data contradict the stated values: {told} ({found:.3g} standard deviations, limit {limit:.3g}); "
         "check the stated value, or state a larger uncertainty"
-    ]
-
-
-def dead_reasons(sensitivity: Array) -> list[str]:
-    """A reason for each output (row of S) that responds to almost nothing.
-
-    `sensitivity` (3, 3), NaN for elements that are not determined. Exchanged axes are not refused here: S shows them,
-    and only a prior of S can contradict them.
-    """
-    size = np.abs(sensitivity)
-    largest = float(np.nanmax(size, initial=0.0))
-    felt = np.nanmax(size, axis=1, initial=0.0)
-    told = [bool(np.isfinite(row).all()) for row in size]
-    return [
-        f"output {axis} is dead: its largest sensitivity is {felt[i]:.4g}, that of the others is {largest:.4g} "
-        f"(limit {LEAST_FELT:.0%}); check the wiring of this output"
-        for i, axis in enumerate("xyz")
-        if told[i] and felt[i] < LEAST_FELT * largest
     ]
 
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from calib.estimate.axes import sensitivity_reasons
 from calib.estimate.nuisances import Priors
-from calib.estimate.verdict import dead_reasons
 from calib.excitation.front_end import Settings
 from calib.excitation.window_verdict import Limits
 from calib.geometry import STANDARD_GRAVITY_MPS2
@@ -110,7 +110,7 @@ def _plain(tables: Tables, priors: Priors) -> Outcome:
     found = fit(windows)
     reasons = (
         *refusal(found, windows),
-        *dead_reasons(found.calibration.sensitivity),
+        *sensitivity_reasons(found.calibration, COVERAGE_FACTOR, stated=priors.parameters is not None),
         *contradictions(found.calibration, priors),
     )
     return Outcome(
