@@ -14,6 +14,7 @@ LEAST_FELT = 0.1  # least sensitivity of a working output in its best direction,
 # Largest transverse sensitivity, relative to the largest sensitivity of its row. Data sheets of MEMS say 1 to 3 %, and
 # 5 % at most; a sensor that is turned by 11 deg against what was stated has 20 %.
 MOST_TRANSVERSE = 0.2
+COPIED = 1e-9  # relative: rows of S differ by less where two outputs hold the same samples
 
 
 def sensitivity_reasons(found: Calibration, coverage_factor: float, *, stated: bool) -> list[str]:
@@ -99,8 +100,9 @@ def _transverse_reasons(S: Array, U: Array) -> list[str]:
     """Whether S is, within MOST_TRANSVERSE of the largest of each row, no permutation of the axes with signs."""
     size = np.abs(S)
     scale = _row_scale(S)
-    placed = _permutation(S)
-    beyond = np.where(np.isfinite(S) & ~placed, size - np.nan_to_num(U), 0.0) / scale[:, None]
+    judged = np.isfinite(S) & ~_permutation(S)
+    judged[_copies(S)] = False
+    beyond = np.where(judged, size - np.nan_to_num(U), 0.0) / scale[:, None]
     i, j = (int(k) for k in np.unravel_index(np.argmax(beyond), (3, 3)))
     if beyond[i, j] <= MOST_TRANSVERSE:
         return []
@@ -131,6 +133,12 @@ def _permutation(S: Array) -> NDArray[np.bool_]:
     return placed
 
 
+def _copies(S: Array) -> list[int]:
+    """The outputs that are copied from another one, as people do it who have a sensor of one axis."""
+    return [i for i in range(1, 3) if any(np.allclose(S[i], S[k], rtol=COPIED, atol=0.0, equal_nan=True)
+                                          and np.isfinite(S[i]).any() for k in range(i))]  # fmt: skip
+
+
 def axis_warnings(S: Array) -> list[str]:
     """A sentence for each sign that axes are exchanged or inverted. `S` (3, 3) is NaN where it is not known."""
     warnings = []
@@ -139,11 +147,18 @@ def axis_warnings(S: Array) -> list[str]:
             f"det S is negative ({np.linalg.det(S):.3g}): an axis is inverted, or two are exchanged; check the order "
             "and the signs of the columns, the sense of alpha, and the polarity of the reference"
         )
+    if copies := _copies(S):
+        names, holds = _listed([AXES[i] for i in copies]), "hold" if len(copies) > 1 else "holds"
+        warnings.append(
+            f"output {names} {holds} the samples of another output: only a sensor of one axis may be stated so"
+        )
     size, shown = np.abs(S), MOST_TRANSVERSE * _row_scale(S)[:, None]
-    off = np.argwhere(_permutation(S) & ~np.eye(3, dtype=bool) & (np.nan_to_num(size) > shown)).tolist()
-    if off:
-        told = ", ".join(f"{PARAMETERS[3 * i + j]} = {S[i, j]:.4g}" for i, j in off)
-        rows = f"row{'s' * (len(off) > 1)} {_listed([AXES[i] for i, _ in off])}"
+    off = _permutation(S) & ~np.eye(3, dtype=bool) & (np.nan_to_num(size) > shown)
+    off[copies] = False
+    if off.any():
+        places = np.argwhere(off).tolist()
+        told = ", ".join(f"{PARAMETERS[3 * i + j]} = {S[i, j]:.4g}" for i, j in places)
+        rows = f"row{'s' * (len(places) > 1)} {_listed([AXES[i] for i, _ in places])}"
         warnings.append(
             f"the largest element of {rows} is off the diagonal ({told}): axes are exchanged, or a rotation by 90 deg "
             "is stated wrongly; check the order of the columns, the poses and the rotation"

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib.estimate.axes import sensitivity_reasons
+from calib.estimate.axes import axis_warnings, sensitivity_reasons
 from calib.estimate.nuisances import Priors
 from calib.excitation.front_end import Settings
 from calib.excitation.window_verdict import Limits
@@ -22,7 +22,7 @@ from calib.recorded.poses import PoseInterval, Poses, Setting, beside_reference,
 from calib.recorded.priors import contradictions, instrument_of, priors_of
 from calib.recorded.table import ReferenceTable, SensorTable, ends_s
 from calib.recorded.tables import Making, Tables
-from calib.recorded.wrong_unit import check_gravity
+from calib.recorded.wrong_unit import check_gravity, gravity_warnings
 from calib.signal.instrument import Instrument
 
 COVERAGE_FACTOR = 2.0  # of plain Method 3, as in the paper: there are thousands of points
@@ -30,6 +30,14 @@ COVERAGE_FACTOR = 2.0  # of plain Method 3, as in the paper: there are thousands
 
 def calibrated(sensor: SensorTable, reference: ReferenceTable | None, poses: Poses | None, options: Options) -> Outcome:
     """The outcome for these samples, poses and options, which passed `options.check`. Raises InputError."""
+    outcome = _estimated(sensor, reference, poses, options)
+    told = [] if outcome.calibration is None else axis_warnings(outcome.sensitivity)
+    if reference is not None and _setting(options, reference).reference_coupling == "dc":
+        told += gravity_warnings(reference)
+    return replace(outcome, warnings=tuple(told))
+
+
+def _estimated(sensor: SensorTable, reference: ReferenceTable | None, poses: Poses | None, options: Options) -> Outcome:
     if reference is None and poses is None and not options.plain:
         return norm_fitted(sensor, options)
     if options.method != 3:

@@ -35,6 +35,7 @@ class NuisanceValue:
 class Outcome:
     """The outcome of a calibration. If the data are refused, `calibration` is None and `reasons` say why.
 
+    `warnings`: what a reader must see before S and Q.
     Arrays of 12 are in the order of calib.model.PARAMETERS: S row by row, then Q. They are read-only.
     """
 
@@ -50,6 +51,7 @@ class Outcome:
     rank: int | None = None
     residual_sd: Sequence[float] | None = None
     statistics: Mapping[str, Any] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
     more: Mapping[str, Any] = field(default_factory=dict)  # further members of the JSON object
 
     @property
@@ -190,6 +192,7 @@ def as_object(outcome: Outcome) -> dict[str, Any]:
         "rate_hz": outcome.rate_hz,
         "status": outcome.status,
         "reasons": list(outcome.reasons),
+        "warnings": list(outcome.warnings),
         "windows": [_window(w) for w in outcome.windows],
         "statistics": dict(outcome.statistics),
         "version": __version__,

@@ -9,6 +9,7 @@ import numpy as np
 
 from calib.estimate.nuisances import Priors
 from calib.estimate.quantities import PRIORS
+from calib.geometry import u_of_gravity_mps2
 from calib.model import PARAMETERS, Array, Calibration
 from calib.recorded.errors import OptionError
 from calib.recorded.options import Options
@@ -53,10 +54,10 @@ def instrument_of(options: Options) -> Instrument:
 
 
 def u_gravity_mps2(options: Options) -> float:
-    """Standard uncertainty of gravity, m/s2."""
+    """Standard uncertainty of gravity, m/s2; where it is not stated, by the digits of gravity."""
     if options.u_gravity_mps2 is not None:
         return options.u_gravity_mps2
-    return U_STANDARD_GRAVITY_MPS2 if options.gravity is None else 0.0
+    return U_STANDARD_GRAVITY_MPS2 if options.gravity is None else u_of_gravity_mps2(options.gravity)[0]
 
 
 def _known(options: Options) -> tuple[Array | None, Array | None]:

@@ -135,3 +135,11 @@ def test_a_wild_element_is_no_measure_for_others() -> None:
     values[8], u[8], values[1], u[1] = 6000.0, 4000.0, -22.0, 500.0
     told = determined(values, u, np.full(12, np.inf), np.ones(12, dtype=bool))
     assert np.flatnonzero(~told).tolist() == [1, 8]
+
+
+def test_a_sensor_of_one_axis_whose_samples_are_copied_is_valid_and_told() -> None:
+    one = np.array([[7713.0, NAN, NAN]] * 3)
+    assert reasons(one) == []
+    (line,) = axis_warnings(one)
+    assert line.startswith("output y and z hold the samples of another output")
+    assert reasons([[7713.0, NAN, NAN], [7713.1, NAN, NAN], [10.0, NAN, NAN]]) != []

@@ -1,0 +1,194 @@
+"""Mistakes that users make: each is told with its cause and with what to do, and what it says to do is accepted."""
+
+from __future__ import annotations
+
+import itertools
+import json
+
+import numpy as np
+import pytest
+
+from calib.recorded.errors import InputError
+from calib.recorded.notebook import calibrate
+from calib.recorded.outcome import Outcome
+from calib.recorded.table import ReferenceTable
+from calib.recorded.wrong_unit import check_gravity, gravity_warnings
+
+G_MPS2 = 9.80665
+RATE_HZ = 200.0
+S_TRUE = 26.0 * np.array([[1.02, 0.01, -0.02], [0.015, 0.98, 0.005], [-0.01, 0.02, 1.01]])
+Q_TRUE = np.array([9.0, -4.0, 14.0])
+STRAIGHT = np.eye(3)
+FACES = [sign * axis for axis in np.eye(3) for sign in (1.0, -1.0)]
+EDGES = [np.array(v) / np.sqrt(2.0) for v in itertools.product((1.0, 0.0, -1.0), repeat=3) if np.count_nonzero(v) == 2]
+
+
+def rests(ups: list[np.ndarray], seed: int = 1) -> tuple[tuple[np.ndarray, np.ndarray], list[dict[str, float]]]:
+    """A sensor that rests for 6 s with each of these directions up, and is turned in 1 s; and the poses."""
+    random = np.random.default_rng(seed)
+    way = np.linspace(0.0, 1.0, int(RATE_HZ))[:, None]
+    parts, poses, at_s = [], [], 0.0
+    for up, after in zip(ups, [*ups[1:], ups[0]], strict=True):
+        turned = up + way * (after + 0.1 * random.normal(size=3) - up)
+        parts += [np.tile(up, (6 * len(way), 1)), turned / np.linalg.norm(turned, axis=1, keepdims=True)]
+        gravity = dict(zip(("gx", "gy", "gz"), G_MPS2 * up, strict=True))
+        poses.append({"start_s": at_s, "stop_s": at_s + 6.0, **gravity})
+        at_s += 7.0
+    a = G_MPS2 * np.concatenate(parts)
+    V = a @ S_TRUE.T + Q_TRUE + 0.1 * random.normal(size=a.shape)
+    return (np.arange(len(V)) / RATE_HZ, V), poses
+
+
+def right(found: Outcome) -> None:
+    """Valid, and each parameter within its U of the truth."""
+    assert found.reasons == ()
+    away = np.abs(found.values - np.append(S_TRUE.ravel(), Q_TRUE))
+    known = np.isfinite(found.values)
+    assert known.any()
+    assert (away[known] <= 1.5 * found.expanded_uncertainty[known] + 1e-9).all()
+
+
+def only_reason(found: Outcome) -> str:
+    assert found.status == "refused"
+    assert len(found.reasons) == 1, found.reasons
+    return found.reasons[0]
+
+
+def test_six_rests_without_poses_ask_for_them() -> None:
+    sensor, poses = rests(FACES)
+    reason = only_reason(calibrate(sensor))
+    assert "10 rests are needed, and 6 were found" in reason
+    assert "`poses` (start_s,stop_s,gx,gy,gz)" in reason
+    assert "edges" in reason
+    right(calibrate(sensor, poses=poses))
+
+
+def test_faces_twice_ask_for_edges_and_not_for_faces() -> None:
+    sensor, poses = rests([*FACES, *FACES])
+    reason = only_reason(calibrate(sensor))
+    assert "the positions of the 12 rests do not determine all 9 parameters" in reason
+    assert "up and down" not in reason
+    assert "edges" in reason
+    right(calibrate(sensor, poses=poses))
+    assert calibrate(rests([*FACES, *EDGES])[0]).reasons == ()
+
+
+def triad(
+    S: np.ndarray = S_TRUE, seconds: float = 60.0, seed: int = 3, turn: np.ndarray = STRAIGHT
+) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    """A sensor beside a DC-coupled triad, a = turn a_ref, moved in all directions and leaned by some degrees."""
+    random = np.random.default_rng(seed)
+    t = np.arange(round(seconds * RATE_HZ)) / RATE_HZ
+    a = np.zeros((len(t), 3))
+    for axis in range(3):
+        for frequency_hz in random.uniform(0.5, 6.0, 25):
+            a[:, axis] += 0.6 * np.sin(2.0 * np.pi * frequency_hz * t + random.uniform(0.0, 2.0 * np.pi))
+    lean = 0.3 * np.column_stack([np.sin(2 * np.pi * 0.11 * t), np.cos(2 * np.pi * 0.07 * t)])
+    up = np.column_stack([lean, np.ones(len(t))])
+    a += G_MPS2 * up / np.linalg.norm(up, axis=1, keepdims=True)
+    V = a @ S.T + Q_TRUE + 0.1 * random.normal(size=a.shape)
+    return (t, V), (t, a @ turn + 0.002 * random.normal(size=a.shape))
+
+
+def beside(sensor: object, reference: object, **options: object) -> Outcome:
+    return calibrate(sensor, reference, **{"rotation": np.eye(3), **options})
+
+
+def test_a_sound_triad_has_no_warning() -> None:
+    found = beside(*triad())
+    right(found)
+    assert found.warnings == ()
+
+
+def test_sensor_and_reference_exchanged_are_refused_by_the_size_of_gravity() -> None:
+    sensor, reference = triad(10.0 * S_TRUE)
+    told = r"\(26\d g\): another unit, or `sensor` and `reference` are exchanged; exchange them"
+    with pytest.raises(InputError, match=told):
+        beside(reference, sensor)
+    assert beside(sensor, reference).reasons == ()
+
+
+@pytest.mark.parametrize(
+    ("factor", "unit"), [(1 / G_MPS2, "g"), (1000 / G_MPS2, "mg"), (100.0, "cm/s2"), (1e3, "mm/s2")]
+)
+def test_a_reference_in_another_unit_is_told_the_unit(factor: float, unit: str) -> None:
+    sensor, (t, a) = triad()
+    with pytest.raises(InputError, match=f"convert them from {unit} to m/s2"):
+        beside(sensor, (t, factor * a))
+
+
+@pytest.mark.parametrize("factor", [G_MPS2, 0.3048, 1e6, 1.08])
+def test_a_reference_whose_mean_is_not_gravity_is_refused(factor: float) -> None:
+    sensor, (t, a) = triad()
+    with pytest.raises(InputError, match="another unit, or"):
+        beside(sensor, (t, factor * a))
+
+
+@pytest.mark.parametrize("rms_mps2", [0.1, 3.0, 8.0])
+@pytest.mark.parametrize("hz", [0.3, 3.0, 30.0])
+def test_strong_motion_and_turning_are_no_other_unit(rms_mps2: float, hz: float) -> None:
+    """The mean over some samples is gravity at strong fast motion, that over few ones where the sensor is turned."""
+    t = np.arange(12_000) / RATE_HZ
+    shaken = np.sqrt(2.0) * rms_mps2 * np.sin(2.0 * np.pi * hz * t)
+    felt = np.column_stack([shaken, 0.0 * t, G_MPS2 + 0.0 * t])
+    check_gravity(ReferenceTable("reference", t, felt, "acceleration", "ax"))
+    turned = G_MPS2 * np.column_stack([np.sin(0.9 * t), np.cos(0.9 * t), 0.0 * t])
+    check_gravity(
+        ReferenceTable("reference", t, turned + 0.1 * rms_mps2 * shaken[:, None] / 30.0, "acceleration", "ax")
+    )
+    not_felt = np.column_stack([shaken, shaken, shaken])
+    check_gravity(ReferenceTable("reference", t, not_felt, "acceleration", "ax"))
+
+
+def test_a_stated_unit_is_believed_and_the_size_told() -> None:
+    t = np.arange(1000) / RATE_HZ
+    felt = np.tile([0.0, 0.0, 2550.0], (1000, 1))
+    stated = ReferenceTable("reference", t, felt, "acceleration", "ax", unit_stated=True)
+    check_gravity(stated)
+    (line,) = gravity_warnings(stated)
+    assert line.startswith("the reference reads 260 g where it feels gravity, 1 g")
+    assert gravity_warnings(ReferenceTable("reference", t, felt / 260.0, "acceleration", "ax", unit_stated=True)) == []
+    assert gravity_warnings(ReferenceTable("reference", t, felt[:, 2:], "acceleration", "a")) != []
+    assert gravity_warnings(ReferenceTable("reference", t, felt[:, 2:] / 600.0, "acceleration", "a")) == []
+
+
+QUARTER_TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+PLACES = {
+    "alpha the other way": (np.diag([-1.0, 1.0, 1.0]), "det S is negative"),
+    "all signs": (-np.eye(3), "det S is negative"),
+    "a rotation of 90 deg": (
+        np.array([[0, -1.0, 0], [1, 0, 0], [0, 0, 1]]),
+        "the largest element of rows x and y is off",
+    ),
+    "outputs exchanged in turn": (np.eye(3)[[1, 2, 0]], "the largest element of rows x, y and z is off"),
+    "a half turn": (np.diag([-1.0, -1.0, 1.0]), "Sxx = -26."),
+}
+
+
+@pytest.mark.parametrize("name", PLACES)
+def test_axes_that_are_not_where_they_were_stated_are_valid_with_a_warning(name: str) -> None:
+    place, said = PLACES[name]
+    found = beside(*triad(place @ S_TRUE))
+    assert found.reasons == ()
+    assert found.warnings[0].startswith(said)
+    np.testing.assert_allclose(found.sensitivity, place @ S_TRUE, rtol=0, atol=0.1)
+    assert json.loads(found.to_json())["warnings"] == list(found.warnings)
+
+
+def test_a_sensor_turned_by_thirty_degrees_needs_its_rotation() -> None:
+    c, s = np.cos(np.deg2rad(30.0)), np.sin(np.deg2rad(30.0))
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    sensor, reference = triad(turn=turn)
+    reason = only_reason(beside(sensor, reference))
+    assert "% of the largest sensitivity of row" in reason
+    assert "correct the poses or the rotation" in reason
+    right(beside(sensor, reference, rotation=turn))
+
+
+def test_one_short_window_is_refused_and_a_longer_one_is_not() -> None:
+    sensor, reference = triad(seconds=20.0)
+    short = [part[:800] for part in sensor], [part[:800] for part in reference]
+    reason = only_reason(beside(*(tuple(each) for each in short)))
+    assert "only one window of" in reason
+    assert "two windows, or 10 s" in reason
+    right(beside(sensor, reference))
