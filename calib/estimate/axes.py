@@ -60,7 +60,7 @@ def _dead_reasons(S: Array, told: NDArray[np.bool_]) -> list[str]:
         return [
             f"{PARAMETERS[3 * i + j]} is {S[i, j]:.4g}, but outputs {AXES[weak[0]]} and {AXES[weak[1]]} have "
             f"{felt[weak[0]]:.4g} and {felt[weak[1]]:.4g}: the reference's channel along {AXES[j]} is dead or too "
-            f"weak; mend it, or use a reference that measures there"
+            "weak (or both these outputs are); mend it, or use a reference that measures there"
         ]
     return [
         f"output {AXES[i]} is dead: its largest sensitivity is {felt[i]:.4g}, that of the others is {largest:.4g} "
@@ -72,9 +72,11 @@ def _dead_reasons(S: Array, told: NDArray[np.bool_]) -> list[str]:
 def _alike(size: Array, rows: NDArray[np.int64]) -> bool:
     """Whether two outputs respond alike, each along its own axis: then they are sound, and it is too small what the
     third one's sensitivity is divided by. Dead outputs have only crosstalk."""
-    felt, second = np.sort(size[rows], axis=1)[:, :0:-1].T
-    places = set(np.nanargmax(size, axis=1).tolist())
-    return len(places) == 3 and felt.min() > LEAST_FELT * felt.max() and bool(np.all(second < 0.5 * felt))
+    third = int(np.nanargmax(np.nanmax(size, axis=0)))
+    own = np.delete(size[rows], third, axis=1)
+    felt = own.max(axis=1)
+    alike = felt.min() > LEAST_FELT * felt.max() and bool(np.all(own.min(axis=1) < 0.5 * felt))
+    return alike and own[0].argmax() != own[1].argmax()
 
 
 def _main_reasons(S: Array, U: Array, told: NDArray[np.bool_]) -> list[str]:

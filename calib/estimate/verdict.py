@@ -11,6 +11,7 @@ from calib.distributions import chi2_quantile, coverage_factor
 from calib.estimate.axes import sensitivity_reasons
 from calib.estimate.budget import Budget
 from calib.estimate.gauss_newton import Flags, Solution
+from calib.estimate.mistakes import FACTORS, of_a_prior, of_means, with_unit
 from calib.estimate.quantities import LAG
 from calib.model import PARAMETERS, Array, Calibration, Window
 
@@ -25,6 +26,7 @@ MISFIT_LIMIT = 0.1  # of the signal; with right signs, 0.01 was left in the wors
 # clamp whose errors are twice its default uncertainty is still used.
 STATED_TIMES = 2.0
 MOST_BETWEEN_BANDS = 0.01  # relative; a pair that is far apart, or turned, deviates by several per cent
+GROSS = 10.0  # chi-squared over its expectation; another unit of the reference gives a hundred and more
 LEAST_S = 10.0  # of one window alone; some periods of the slowest motion that a hand or a structure has
 CONFOUNDED_LAG = 0.01  # largest error of S due to an undetermined lag, relative to the scale of S
 
@@ -34,17 +36,17 @@ def reasons(
     solution: Solution,
     shares: Budget,
     determined: Flags,
-    turned: Callable[[int, int], Solution],
+    turned: Callable[[int, float], Solution],
 ) -> list[str]:
     """The reasons why the adjustment is refused, each with its numbers; empty if it is accepted.
 
-    `turned(static, polarity)` solves again with gravity multiplied by the sign `static` and the reference by the sign
-    `polarity`.
+    `turned(static, factor)` solves again with gravity multiplied by the sign `static` and the reference by `factor`.
     """
     return (
         _number_reasons(solution, shares)
         or _rank_reasons(windows, solution)
         or _sign_reasons(solution, turned)
+        or _unit_reasons(solution, turned)
         or _lag_reasons(solution, shares)
         or _response_reasons(shares)
         or [*_prior_reasons(solution), *_misfit_reasons(solution)]
@@ -134,14 +136,36 @@ def _response_reasons(shares: Budget) -> list[str]:
         return []
     return [
         f"no smooth response over frequency explains the bands: they deviate by {bands.relative_u:.1%}, limit "
-        f"{MOST_BETWEEN_BANDS:.0%}, most at {bands.at_hz:.3g} Hz by {bands.largest:.1%}; look there for a resonance, "
-        "a filter's edge, a source of noise or a loose mount, or calibrate with motion that leaves this band out"
+        f"{MOST_BETWEEN_BANDS:.0%}, and most of it comes from {bands.at_hz:.3g} Hz; look there for a resonance, a "
+        "filter's edge, a source of noise or a loose mount, or calibrate with motion that leaves this band out"
     ]
 
 
-def _sign_reasons(solution: Solution, turned: Callable[[int, int], Solution]) -> list[str]:
+def _contradicted(solution: Solution) -> bool:
+    return solution.chi2 > chi2_quantile(CONTRADICTED, solution.residual.size) or bool(_prior_reasons(solution))
+
+
+def _unit_reasons(solution: Solution, turned: Callable[[int, float], Solution]) -> list[str]:
+    if not (_contradicted(solution) and solution.chi2 > GROSS * solution.residual.size):
+        return []
+    tried = {factor: turned(1, factor) for factor in FACTORS}
+    fits = {
+        factor: other.chi2
+        for factor, other in tried.items()
+        if np.isfinite(other.chi2) and misfit(other) <= MISFIT_LIMIT and not _contradicted(other)
+    }
+    if not fits or min(fits.values()) > solution.chi2 - DECISIVE_CHI2:
+        return []
+    factor = min(fits, key=lambda f: fits[f])
+    return [
+        f"the data fit if the reference is multiplied by {factor:.4g}: chi-squared {fits[factor]:.4g}, as stated "
+        f"{solution.chi2:.4g}; {FACTORS[factor]}: state its unit, or convert it to m/s2"
+    ]
+
+
+def _sign_reasons(solution: Solution, turned: Callable[[int, float], Solution]) -> list[str]:
     # With reversed signs a poor fit may end anywhere, so only chi2 and the misfit of such a fit are looked at.
-    if solution.chi2 <= chi2_quantile(CONTRADICTED, solution.residual.size) and not _prior_reasons(solution):
+    if not _contradicted(solution):
         return []
     tried = {
         "the static sign (gravity)": turned(-1, 1),
@@ -182,10 +206,13 @@ def _prior_reasons(solution: Solution) -> list[str]:
     u = np.sqrt(np.diag(before))
     worst = int(np.argmax(np.abs(solution.x[known] - solution.prior_mean[known]) / u))
     p = known[worst]
+    S, S_known = (values[:9].reshape(3, 3) for values in (solution.x, solution.prior_mean))
+    mistake = of_a_prior(S, S_known, of_offset=bool(p >= 9))
     return [
         f"the data contradict the prior of S and Q: chi-squared {statistic:.4g}, limit {limit:.4g} "
         f"({int(tested.sum())} degrees of freedom); {PARAMETERS[p]} is {solution.x[p]:.5g}, "
         f"{solution.prior_mean[p]:.5g} with u {u[worst]:.3g} was expected; check the prior and how the axes are mounted"
+        f"{mistake}"
     ]
 
 
@@ -209,7 +236,10 @@ def nuisance_pull(solution: Solution, covariance: Array) -> tuple[float, float, 
     single = 1.0 - (1.0 - CONTRADICTED) / max(len(found), 1)
     worst = int(np.argmax(np.abs(pull)))
     term, moved = terms[stated[worst]], pull[worst] * u[worst]
-    told = f"{term.name} would be off by {moved:.3g} {term.unit}, its standard uncertainty was stated as {u[worst]:.3g}"
+    told = (
+        f"{term.name} would be off by {with_unit(moved, term.unit)}, its standard uncertainty was stated as "
+        f"{with_unit(u[worst], term.unit)}"
+    )
     limit = STATED_TIMES * float(np.sqrt(chi2_quantile(single, 1.0)))
     return float(found.max(initial=0.0)), limit, told
 
@@ -230,8 +260,16 @@ def _misfit_reasons(solution: Solution) -> list[str]:
         return []
     return [
         f"S a + Q leaves {found:.1%} of the signal between windows unexplained (limit {MISFIT_LIMIT:.0%}); "
-        "check that each position was stated as it was"
+        f"check that each position was stated as it was{of_means(_left_of_means(solution))}"
     ]
+
+
+def _left_of_means(solution: Solution) -> Array:
+    """(W, 3) what the windows' means differ by from S a + Q, in m/s2."""
+    equations = solution.equations
+    _, mean = equations.split(solution.residual)
+    weight = np.where(equations.mean_weight > 0.0, equations.mean_weight, np.inf)
+    return np.asarray(mean / weight / equations.output_per_mps2)
 
 
 def misfit(solution: Solution) -> float:
@@ -254,12 +292,12 @@ def misfit(solution: Solution) -> float:
     return float(np.sqrt(max(shares)))
 
 
-def turned_windows(windows: Sequence[Window], static: int, polarity: int) -> list[Window]:
-    """The same windows with gravity multiplied by the sign `static` and the direction of motion by `polarity`."""
+def turned_windows(windows: Sequence[Window], static: int, factor: float) -> list[Window]:
+    """The same windows with gravity multiplied by the sign `static` and the reference by `factor`."""
     return [
         replace(
             w,
-            pose=replace(w.pose, direction=polarity * w.pose.direction, gravity_mps2=static * w.pose.gravity_mps2),
+            pose=replace(w.pose, direction=factor * w.pose.direction, gravity_mps2=static * w.pose.gravity_mps2),
         )
         for w in windows
     ]

@@ -15,6 +15,7 @@ from calib.geometry import STANDARD_GRAVITY_MPS2
 from calib.paper.method3 import PLAIN, fit, refusal
 from calib.recorded.adjusting import adjusted, norm_fitted
 from calib.recorded.amplitude_methods import by_amplitudes
+from calib.recorded.causes import causes, silent_channels
 from calib.recorded.errors import InputError, OptionError
 from calib.recorded.options import Options
 from calib.recorded.outcome import Outcome, nothing_used
@@ -31,7 +32,14 @@ COVERAGE_FACTOR = 2.0  # of plain Method 3, as in the paper: there are thousands
 def calibrated(sensor: SensorTable, reference: ReferenceTable | None, poses: Poses | None, options: Options) -> Outcome:
     """The outcome for these samples, poses and options, which passed `options.check`. Raises InputError."""
     outcome = _estimated(sensor, reference, poses, options)
-    told = [] if outcome.calibration is None else axis_warnings(outcome.sensitivity)
+    silent, feels = [], False
+    if reference is not None and reference.channels == 3 and options.rotation is not None:
+        silent = silent_channels(sensor, reference, options.rotation)
+        feels = _setting(options, reference).reference_coupling == "dc"
+    if outcome.reasons or (silent and feels):  # what a dead channel does not feel of gravity would be taken for Q
+        found = causes(sensor, reference, poses, outcome)
+        return replace(outcome, calibration=None, reasons=(*found, *silent, *outcome.reasons))
+    told = [*axis_warnings(outcome.sensitivity), *silent]
     if reference is not None and _setting(options, reference).reference_coupling == "dc":
         told += gravity_warnings(reference)
     return replace(outcome, warnings=tuple(told))
