@@ -1,4 +1,4 @@
-"""What S says of the axes: elements that no sensor has, axes that are exchanged or inverted, outputs that are dead."""
+"""What makes S and Q fit for use: elements that a sensor can have, axes in their places, outputs that are not dead."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ LEAST_FELT = 0.1  # least sensitivity of a working output in its best direction,
 # Largest transverse sensitivity, relative to the largest sensitivity of its row. Data sheets of MEMS say 1 to 3 %, and
 # 5 % at most; a sensor that is turned by 11 deg against what was stated has 20 %.
 MOST_TRANSVERSE = 0.2
+LEAST_S = 10.0  # of one window alone; some periods of the slowest motion that a hand or a structure has
 COPIED = 1e-9  # relative: rows of S differ by less where two outputs hold the same samples
 
 
@@ -24,13 +25,16 @@ def sensitivity_reasons(found: Calibration, coverage_factor: float, *, stated: b
     transverse sensitivities.
     """
     S, U = found.sensitivity, coverage_factor * found.standard_uncertainty[:9].reshape(3, 3)
-    told = found.determined[:9].reshape(3, 3)
     return (
-        _number_reasons(found)
-        or _main_reasons(S, U, told)
-        or _dead_reasons(S, told)
+        unusable(found, coverage_factor)
+        or _dead_reasons(S, found.determined[:9].reshape(3, 3))
         or ([] if stated else _transverse_reasons(S, U))
     )
+
+
+def unusable(found: Calibration, coverage_factor: float) -> list[str]:
+    """The reason why S and Q may not be used, whatever was stated: no number, no main sensitivity, or U above it."""
+    return _number_reasons(found) or _main_reasons(found, coverage_factor)
 
 
 def _number_reasons(found: Calibration) -> list[str]:
@@ -79,8 +83,10 @@ def _alike(size: Array, rows: NDArray[np.int64]) -> bool:
     return alike and own[0].argmax() != own[1].argmax()
 
 
-def _main_reasons(S: Array, U: Array, told: NDArray[np.bool_]) -> list[str]:
+def _main_reasons(found: Calibration, coverage_factor: float) -> list[str]:
     """Whether a main sensitivity is known, or the one in its place where axes are exchanged, and nothing is wider."""
+    S, U = found.sensitivity, coverage_factor * found.standard_uncertainty[:9].reshape(3, 3)
+    told = found.determined[:9].reshape(3, 3)
     size = np.where(np.isfinite(np.diag(S)) & (np.abs(S) > U), np.abs(S), 0.0)  # of columns whose main one is known
     main = float(size.max())
     if main == 0.0:

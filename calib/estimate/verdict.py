@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from calib.distributions import chi2_quantile, coverage_factor
-from calib.estimate.axes import sensitivity_reasons
+from calib.estimate.axes import LEAST_S, sensitivity_reasons
 from calib.estimate.budget import Budget
 from calib.estimate.gauss_newton import Flags, Solution
 from calib.estimate.mistakes import FACTORS, of_a_prior, of_means, with_unit
@@ -27,7 +27,6 @@ MISFIT_LIMIT = 0.1  # of the signal; with right signs, 0.01 was left in the wors
 STATED_TIMES = 2.0
 MOST_BETWEEN_BANDS = 0.01  # relative; a pair that is far apart, or turned, deviates by several per cent
 GROSS = 10.0  # chi-squared over its expectation; another unit of the reference gives a hundred and more
-LEAST_S = 10.0  # of one window alone; some periods of the slowest motion that a hand or a structure has
 CONFOUNDED_LAG = 0.01  # largest error of S due to an undetermined lag, relative to the scale of S
 
 

@@ -76,8 +76,12 @@ def prior_of(values: Array, covariance: Array) -> tuple[Array, Array]:
     """
     values, covariance = np.array(values, dtype=float), np.array(covariance, dtype=float)
     if values.shape != (12,) or covariance.shape != (12, 12):
-        raise OptionError("sensitivity must be 3 x 3, offset 3, covariance 12 x 12", column="prior")
+        raise OptionError(
+            "sensitivity must be 3 x 3, offset 3, covariance 12 x 12", "give a whole result", column="prior"
+        )
     unknown = ~(np.isfinite(values) & np.isfinite(np.diag(covariance)))
+    if unknown[[0, 4, 8]].all() or not values[[0, 4, 8]][~unknown[[0, 4, 8]]].any():
+        raise OptionError("it tells no main sensitivity", "give a result that is valid", column="prior")
     covariance[unknown, :], covariance[:, unknown] = 0.0, 0.0
     covariance[unknown, unknown] = np.inf
     known = covariance[np.ix_(~unknown, ~unknown)]

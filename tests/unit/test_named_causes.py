@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from calib.estimate.mistakes import with_unit
-from calib.recorded.errors import InputError
+from calib.recorded.errors import InputError, OptionError
 from calib.recorded.notebook import calibrate
 from calib.recorded.outcome import Outcome
 from calib.recorded.table import ReferenceTable
@@ -198,7 +198,7 @@ def test_one_short_window_is_refused_and_a_longer_one_is_not() -> None:
 
 
 ALPHAS_DEG = (0.0, 30.0, 120.0, 210.0)
-STAY_S = 6.0
+STAY_S = 8.0
 
 
 def clamped(
@@ -270,7 +270,7 @@ def test_times_in_ms_are_named_for_the_table_that_has_them() -> None:
         assert f"the times of {name} are in ms; divide them by 1000" in found.reasons[0]
     found = beside(in_ms(sensor), in_ms(reference))
     assert found.reasons[0].startswith(
-        "by its times the sensor's sampling rate is 0.2 Hz: if they are in ms, divide all"
+        "by its times the sensor's sampling rate is 0.1 Hz: if they are in ms, divide all"
     )
     right(beside(sensor, reference))
 
@@ -337,7 +337,7 @@ def test_a_nominal_sensitivity_per_g_is_named() -> None:
 def test_a_self_test_that_was_left_on_for_some_windows_is_named() -> None:
     (t, V), reference, poses = clamped()
     on = V.copy()
-    on[t < 31.0, 2] += 26.0 * 5.0
+    on[t < 39.0, 2] += 26.0 * 5.0
     reason = only_reason(calibrate((t, on), reference, poses))
     assert "the mean of output z alone differs" in reason
     assert "self-test that was left on" in reason
@@ -359,3 +359,10 @@ def test_no_unit_is_printed_that_says_nothing() -> None:
     assert with_unit(-0.919, "1") == "-91.9 %"
     assert with_unit(np.deg2rad(2.0), "rad") == "2 deg"
     assert with_unit(0.05, "m/s2") == "0.05 m/s2"
+
+
+def test_a_refused_result_is_no_prior() -> None:
+    sensor, reference = triad(seconds=20.0)
+    refused = beside(in_ms(sensor), reference)
+    with pytest.raises(OptionError, match="it tells no main sensitivity; give a result that is valid"):
+        beside(sensor, reference, prior=refused)
