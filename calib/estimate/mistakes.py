@@ -21,7 +21,7 @@ FACTORS: Mapping[float, str] = {
     1000.0: "it was divided by 1000, or V were taken for mV",
 }
 ABOUT = 1.3  # ratio: a sensor differs by less from its nominal sensitivity, and units by more
-LEAST_JUMP_MPS2 = 0.5  # of an offset; smaller ones wander
+LEAST_JUMP_MPS2 = 0.5  # of an offset: self-tests cause 50 to 1200 mg (ICM-42688-P: kriswiner/ICM42688, issue 6)
 ONE_OUTPUT = 0.9  # of the power of what is left: then only this output is wrong
 OF_A_UNIT = {"1": ("%", 100.0), "rad": ("deg", 180.0 / np.pi)}
 

@@ -12,7 +12,10 @@ from calib.recorded.table import ReferenceTable
 
 # How large gravity is in units that are taken for m/s2.
 GRAVITY_IN = {"g": 1.0, "mg": 1000.0, "cm/s2": 100 * STANDARD_GRAVITY_MPS2, "mm/s2": 1000 * STANDARD_GRAVITY_MPS2}
-NEAR = 0.05  # relative: offsets of a sensor in g are not larger
+NEAR = 0.05  # relative: offsets of a reference are not larger
+# Of a sensor in another unit: Livox-SDK/livox_ros_driver pull request 98 shows 0.88 at rest in a message for m/s2, and
+# uzh-rpg/rpg_dvs_ros issue 58 shows 0.9.
+NEAR_IN_UNIT = 0.15
 NOT_FELT_MPS2 = 1.0  # largest mean of a reference that does not feel gravity: offsets of 0.1 g
 MEANS_OF = (1, 8, 64, 512)  # samples
 FEWEST = 10  # means that tell how they scatter
@@ -92,4 +95,4 @@ def _in_g(length: float) -> str:
 def _unit(length: float) -> str:
     """The unit in which gravity has about this length, the nearest of several; "" if there is none."""
     name, g = min(GRAVITY_IN.items(), key=lambda unit: abs(length / unit[1] - 1.0))
-    return name if math.isclose(length, g, rel_tol=NEAR) else ""
+    return name if math.isclose(length, g, rel_tol=NEAR_IN_UNIT) else ""

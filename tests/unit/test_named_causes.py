@@ -120,6 +120,14 @@ def test_a_reference_in_another_unit_is_told_the_unit(factor: float, unit: str) 
         beside(sensor, (t, factor * a))
 
 
+@pytest.mark.parametrize("length", [0.88, 0.92, 1.1])
+def test_a_reference_in_g_with_a_large_offset_is_none_that_does_not_feel_gravity(length: float) -> None:
+    """As drivers of lidars and cameras publish it in messages for m/s2."""
+    sensor, (t, a) = triad()
+    with pytest.raises(InputError, match="convert them from g to m/s2"):
+        beside(sensor, (t, a * length / G_MPS2))
+
+
 @pytest.mark.parametrize("factor", [G_MPS2, 0.3048, 1e6, 1.08])
 def test_a_reference_whose_mean_is_not_gravity_is_refused(factor: float) -> None:
     sensor, (t, a) = triad()
@@ -233,7 +241,7 @@ def test_what_the_next_tests_are_told_to_do_is_accepted() -> None:
     ("divided_by", "multiply", "told"),
     [
         (G_MPS2, "9.807", "it is in g"),
-        (G_MPS2 / 1000.0, "0.009807", "it is in mg"),
+        (G_MPS2 / 1000.0, "0.0", "in mg"),
         (1.0 / G_MPS2, "0.102", "values in m/s2 were taken for g"),
         (0.001, "0.001", "it is in mm/s2"),
     ],
