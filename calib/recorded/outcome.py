@@ -30,6 +30,11 @@ class NuisanceValue:
     standard_uncertainty: float
     unit: str
 
+    def cell(self, coverage_factor: float) -> str:
+        """The value ± U with its unit; a unit of 1 is not told."""
+        unit = "" if self.unit == "1" else f" {self.unit}"
+        return plus_minus(self.value, coverage_factor * self.standard_uncertainty) + unit
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outcome:

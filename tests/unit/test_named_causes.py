@@ -11,7 +11,7 @@ import pytest
 from calib.estimate.mistakes import with_unit
 from calib.recorded.errors import InputError, OptionError
 from calib.recorded.notebook import calibrate
-from calib.recorded.outcome import Outcome
+from calib.recorded.outcome import NuisanceValue, Outcome
 from calib.recorded.table import ReferenceTable
 from calib.recorded.wrong_unit import check_gravity, gravity_warnings
 from tests.clamp_windows import frame
@@ -367,6 +367,8 @@ def test_no_unit_is_printed_that_says_nothing() -> None:
     assert with_unit(-0.919, "1") == "-91.9 %"
     assert with_unit(np.deg2rad(2.0), "rad") == "2 deg"
     assert with_unit(0.05, "m/s2") == "0.05 m/s2"
+    assert NuisanceValue("response_2", -0.02, 0.185, "1").cell(2.0) == "-0.02 ± 0.37"
+    assert NuisanceValue("gravity", 0.001, 0.01, "m/s2").cell(2.0) == "0.001 ± 0.020 m/s2"
 
 
 def test_a_refused_result_is_no_prior() -> None:
