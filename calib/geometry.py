@@ -6,7 +6,9 @@ ValueError, with the wrong value in the message, if an argument has the wrong sh
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from decimal import Decimal
 from typing import Literal
 
 import numpy as np
@@ -14,10 +16,27 @@ import numpy as np
 from calib.model import Array, Pose
 
 STANDARD_GRAVITY_MPS2 = 9.80665
+NOMINAL_DECIMALS = 2  # a value of gravity with no more is that of a table or of a habit, not of a place
+# Of a nominal value: 9.81 is right within it from 39 to 60 degrees of latitude (normal gravity of WGS 84).
+U_NOMINAL_GRAVITY_MPS2 = 0.01
 # A unit vector written with three decimals has a length that is off by up to 1e-3. A larger error is a mistake.
 UNIT_TOLERANCE = 2e-3
 AXES = ("x", "y", "z")
 UNKNOWN_GRAVITY = (float("nan"),) * 3
+
+
+def u_of_gravity_mps2(gravity_mps2: float) -> tuple[float, str]:
+    """Standard uncertainty of a stated gravity by its digits, m/s2, and the reason for it in words.
+
+    A value with at most two decimals, and standard gravity, are nominal. Of another one only the last digit is rounded.
+    """
+    exponent = Decimal(repr(float(gravity_mps2))).as_tuple().exponent
+    assert isinstance(exponent, int)  # a finite number
+    if gravity_mps2 == STANDARD_GRAVITY_MPS2:
+        return U_NOMINAL_GRAVITY_MPS2, "it is standard gravity, not that of a place"
+    if -exponent <= NOMINAL_DECIMALS:
+        return U_NOMINAL_GRAVITY_MPS2, f"it has at most {NOMINAL_DECIMALS} decimals, as a nominal value has"
+    return 0.5 * 10.0**exponent / math.sqrt(3.0), "half of its last digit"
 
 
 def clamp(

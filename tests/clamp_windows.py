@@ -15,6 +15,7 @@ G_MPS2 = 9.80665
 S_TRUE = np.array([[1.02, 0.01, -0.02], [0.015, 0.98, 0.005], [-0.01, 0.02, 1.01]])
 Q_TRUE = np.array([0.36, -0.06, 0.165])
 TRUTH = np.concatenate([S_TRUE.ravel(), Q_TRUE])
+RATE_HZ = 250.0  # of the windows, where nothing else is said
 ALPHAS_DEG = (0.0, 30.0, 120.0, 210.0)
 
 
@@ -60,7 +61,7 @@ def sums_of(u: np.ndarray, du: np.ndarray, V: np.ndarray, segments: int) -> Wind
 
 def window_of(pose: Pose, u: np.ndarray, du: np.ndarray, V: np.ndarray, segments: int) -> Window:
     """A used window."""
-    return Window(0.0, 1.0, pose, sums_of(u, du, V, segments), True, "", len(V), 0)
+    return Window(0.0, len(V) / RATE_HZ, pose, sums_of(u, du, V, segments), True, "", len(V), 0)
 
 
 def clamp_points(
@@ -70,7 +71,7 @@ def clamp_points(
     alphas_deg: tuple[float, ...] = ALPHAS_DEG,
     repetitions: int = 3,
     frequency_hz: float = 3.0,
-    rate_hz: float = 250.0,
+    rate_hz: float = RATE_HZ,
     cycles: int = 6,
     S: np.ndarray = S_TRUE,
     Q: np.ndarray = Q_TRUE,

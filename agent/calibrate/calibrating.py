@@ -11,7 +11,7 @@ from typing import Any
 
 import click
 
-from agent.calibrate.faults import as_table_error
+from agent.calibrate.faults import as_table_error, with_dashes
 from agent.calibrate.poses import PosesFile
 from agent.calibrate.stated import FILES, options_of
 from agent.calibrate.station import by_metadata, compared, pose_of_station
@@ -20,6 +20,7 @@ from agent.reading.formats import NOT_DESCRIBED, Description
 from agent.reading.source import Progress, TableError
 from agent.reading.units import Sensitivity, sensitivity_of
 from agent.terminal.text import for_drawing, say
+from calib.geometry import U_NOMINAL_GRAVITY_MPS2, u_of_gravity_mps2
 from calib.recorded import calibrating
 from calib.recorded.options import Options
 from calib.recorded.outcome import Outcome
@@ -39,13 +40,28 @@ def calibrated(params: dict[str, Any]) -> Outcome:
     with as_table_error():
         options_of(params | dict.fromkeys(FILES)).check(**given)  # before any file is read
     options = options_of(params)
+    _say_gravity(options)
     sensor, reference = _read(params)
     options, read = _stated(params["poses"], sensor, reference, options, params.get("date_order"))
     with as_table_error(read.line):
         outcome = calibrating.calibrated(sensor, reference, read.poses, options)
+    outcome = replace(outcome, reasons=tuple(map(with_dashes, outcome.reasons)))
     if not sensor.components or options.method != 3 or options.plain or outcome.more.get("frame") == "free":
         return outcome
     return replace(outcome, more={**outcome.more, "station": compared(outcome, sensor.components)})
+
+
+def _say_gravity(options: Options) -> None:
+    """Say which uncertainty a gravity has that is no better than a nominal one."""
+    if options.gravity is None or options.u_gravity_mps2 is not None or options.plain:
+        return
+    u_mps2, why = u_of_gravity_mps2(options.gravity)
+    if u_mps2 >= U_NOMINAL_GRAVITY_MPS2:
+        say(
+            f"--gravity {options.gravity:g}: u of gravity is {u_mps2:g} m/s2, because {why}; "
+            "give local gravity with more digits, or state --u-gravity-mps2",
+            err=True,
+        )
 
 
 def read_files(params: dict[str, Any]) -> Tables:

@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.model import PARAMETERS, Array, Window
 from calib.recorded.outcome import Outcome
-from calib.rounding import KNOWN_BEFORE, plus_minus
+from calib.rounding import KNOWN_BEFORE
 
 AXES = "xyz"
 FILE_WIDTH = 120  # columns if the output is no terminal
@@ -25,7 +25,7 @@ def print_outcome(outcome: Outcome) -> None:
     if outcome.calibration is not None:
         _print_calibration(console, outcome)
     for n in outcome.nuisances:
-        console.print(f"  {n.name}: {plus_minus(n.value, outcome.coverage_factor * n.standard_uncertainty)} {n.unit}")
+        console.print(f"  {n.name}: {n.cell(outcome.coverage_factor)}")
     console.print_line(f"  sampling rate {outcome.rate_hz:.7g} Hz")
 
 

@@ -42,7 +42,7 @@ def read_prior(path: Path) -> tuple[Array, Array]:
     try:
         return prior_of(*read_earlier(path))
     except OptionError as error:
-        raise TableError(f"{path}: {error.problem}") from None
+        raise TableError(f"{path}: {error.problem}; {error.remedy}") from None
     except EarlierError as error:
         raise TableError(str(error)) from None
 

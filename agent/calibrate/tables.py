@@ -124,7 +124,8 @@ def read_reference(
         filters = source.filters.get(chosen[1].column.group, ())
     column, header = str(chosen[1].column), source.header
     channels = Spooled(values, slice(None))
-    return ReferenceFile(str(path), times, channels, quantity, column, header, said, components, filters)
+    stated = sensitivity is not None or all(c.unit for c in chosen[1:])
+    return ReferenceFile(str(path), times, channels, quantity, column, header, said, stated, components, filters)
 
 
 def _reference_columns(choice: Choice, sensitivity: Sensitivity | None) -> tuple[list[Chosen], str]:

@@ -88,7 +88,11 @@ def _u(name: str, told: str) -> Callable[[Any], Any]:
 @click.option("--rotation", metavar="R11,...,R33", help="Rotation of a tri-axial reference: a = R a_ref.")
 @_u("u_rotation_deg", "u of the rotation, about each axis.")
 @click.option("--gravity", "gravity_mps2", type=Finite(*GRAVITY_MPS2), help="Local gravity in m/s2.")
-@click.option("--u-gravity-mps2", type=_U, help="u of gravity. Default: 0.03, or 0 with --gravity.")
+@click.option(
+    "--u-gravity-mps2",
+    type=_U,
+    help="u of gravity. Default: 0.03; with --gravity by its digits: 0.01 of 9.81, 3e-6 of 9.80123.",
+)
 @click.option(
     "--static-sign",
     type=_choice("static_sign", "{:+d}"),

@@ -15,6 +15,7 @@ from agent.core.jump import jumped, possible_jump, tilt_rad
 from agent.core.time_shift import Anew, LagWatch
 from agent.core.windows import Found
 from agent.core.witnesses import Witnesses
+from calib.estimate.axes import LEAST_S
 from calib.estimate.correction import Law
 from calib.estimate.drift import DriftTest, DriftVerdict
 from calib.estimate.innovation import Innovation
@@ -157,7 +158,10 @@ class Estimation:
         jump = jumped(self.recursion, held, stability, self.gate.limit) if agree else None
         adopted, who = self._witnesses.judge(self.recursion, held, jump, self.gate.limit, self._place)
         same = not self._held or any(held_one.reference == summary.reference for held_one in self._held)
-        evidence = Evidence(day * DAY_S, innovation.statistic, innovation.degrees_of_freedom, dismisses=same)
+        enough = trial.windows > 1 or window.stop_s - window.start_s >= LEAST_S
+        evidence = Evidence(
+            day * DAY_S, innovation.statistic, innovation.degrees_of_freedom, dismisses=same, enough=enough
+        )
         decision = self.gate.judge(evidence, candidate, None if adopted is None else adopted.result())
         if decision.action == "take":
             self.recursion = trial

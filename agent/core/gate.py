@@ -8,10 +8,12 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agent.config.gate import GateSettings
-from agent.core.anchor import Anchor, Change
+from agent.core.anchor import COVERAGE_FACTOR, MAIN, Anchor, Change
 from calib.distributions import chi2_quantile
+from calib.estimate.axes import LEAST_S, unusable
 from calib.model import PARAMETERS, Calibration
 
 Limit = Callable[[float], float]  # from the degrees of freedom: the largest chi-squared of a consistent window
@@ -22,7 +24,8 @@ PROPOSALS_KEPT = 8  # so that an operator can accept an estimate after newer one
 @dataclass(frozen=True, slots=True)
 class Evidence:
     """What the gate needs of one window: chi-squared of its innovation, with the covariance of the state, and whether
-    its excitation supports an update; if not, `reason` says why. `dismisses`: if it fits, it may dismiss held ones."""
+    its excitation supports an update; if not, `reason` says why. `dismisses`: if it fits, it may dismiss held ones.
+    `enough`: with it the state has seen two windows, or 10 s, which a first calibration needs."""
 
     t_s: float
     statistic: float
@@ -30,6 +33,7 @@ class Evidence:
     supported: bool = True
     reason: str = ""
     dismisses: bool = True
+    enough: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,7 +160,7 @@ class Gate:
         consistent = evidence.degrees_of_freedom <= 0 or evidence.statistic <= limit
         change = self._anchor.change(candidate)
         if consistent and not change.reason:
-            return self._consistent(candidate, numbers | change.numbers, evidence.dismisses)
+            return self._consistent(candidate, numbers | change.numbers, evidence)
         self._held, self._agreeing = min(self._held + 1, self._settings.confirm_windows), 0
         if confirmed is not None and self._held >= self._settings.confirm_windows:
             return self._confirmed(confirmed, numbers)
@@ -166,15 +170,16 @@ class Gate:
             "hold", "the window contradicts the calibration; held until further windows confirm a jump", numbers
         )
 
-    def _consistent(self, candidate: Calibration, numbers: dict[str, float], dismisses: bool) -> Decision:
+    def _consistent(self, candidate: Calibration, numbers: dict[str, float], evidence: Evidence) -> Decision:
         self._taken = True
         if self._held:
-            self._agreeing += dismisses
+            self._agreeing += evidence.dismisses
             if self._agreeing >= self._settings.dismiss_windows:
                 self._held = self._agreeing = 0
         elif self._settling:
             self._settling -= 1
-        return self._accepted("take", candidate, "consistent with the calibration so far", numbers)
+        said = "consistent with the calibration so far"
+        return self._accepted("take", candidate, said, numbers, enough=evidence.enough)
 
     def _confirmed(self, confirmed: Calibration, numbers: dict[str, float]) -> Decision:
         change = self._anchor.change(confirmed)
@@ -190,11 +195,19 @@ class Gate:
         )
 
     def _beyond(self, calibration: Calibration, change: Change, numbers: dict[str, float]) -> Decision:
+        if wrong := unusable(calibration, COVERAGE_FACTOR):
+            return self._decision("hold", f"{change.reason}; {wrong[0]}", numbers | change.numbers)
         reason = f"{change.reason}; held until an operator accepts it"
         return self._decision("hold", reason, numbers | change.numbers, proposal=calibration)
 
     def _accepted(
-        self, action: Literal["take", "adopt"], calibration: Calibration, reason: str, numbers: dict[str, float]
+        self,
+        action: Literal["take", "adopt"],
+        calibration: Calibration,
+        reason: str,
+        numbers: dict[str, float],
+        *,
+        enough: bool = True,
     ) -> Decision:
         """The state takes the window. Policy and determined parameters decide whether S and Q in force change too."""
         # The data need not determine a parameter that the certificate states well enough.
@@ -206,6 +219,9 @@ class Gate:
             self._settling = 0  # RECALIBRATING is only for a calibration in force
             numbers |= {"determined": determined, "determined_threshold": least}
             return self._decision(action, f"not in force yet, parameters not determined: {', '.join(missing)}", numbers)
+        if not self._calibrated and (lacking := _lacking(calibration, known, enough=enough)):
+            self._settling = 0
+            return self._decision(action, f"not in force yet: {lacking}", numbers)
         if self._settings.policy == "propose":
             return self._decision(
                 action,
@@ -339,6 +355,15 @@ class Gate:
         self._agreeing, self._settling = state["agreeing"], state["settling"]
         kept = [dict(proposal) for proposal in state["proposals"]]
         self._proposals = [(proposal.pop("sequence"), Calibration(**proposal)) for proposal in kept]
+
+
+def _lacking(calibration: Calibration, known: NDArray[np.bool_], *, enough: bool) -> str:
+    """What a first calibration lacks, besides the number of its parameters; "" if nothing."""
+    if not known[MAIN].any():
+        return "no main sensitivity (Sxx, Syy, Szz) is determined"
+    if wrong := unusable(calibration, COVERAGE_FACTOR):
+        return wrong[0]
+    return "" if enough else f"two windows, or {LEAST_S:g} s, are needed to see whether the data agree with each other"
 
 
 def fields_of(calibration: Calibration) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from agent.config.knowledge import Certificate, Prior, Uncertainty
 from agent.config.sinks import Recording, Zenoh
 from agent.setup.asking import Stated
 from agent.setup.toml import Setting, Table
+from calib.geometry import u_of_gravity_mps2
 
 Mount = Literal["clamp", "beside", "rests"]
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
@@ -186,8 +187,10 @@ def _uncertainty(answers: Answers) -> Table:
         ),
         "rests": (("angle_deg", "standard uncertainty of the direction of gravity, of each position", "deg"),),
     }[answers.mount.value]
-    exact = answers.gravity_mps2.source != "default"
-    gravity = Stated(0.0, "init, since local gravity is stated") if exact else _default(Uncertainty, "gravity_mps2")
+    gravity = _default(Uncertainty, "gravity_mps2")
+    if answers.gravity_mps2.source != "default":
+        u_mps2, why = u_of_gravity_mps2(answers.gravity_mps2.value)
+        gravity = Stated(float(f"{u_mps2:.2g}"), f"init, by the digits of gravity_mps2: {why}")
     settings = [_setting(Uncertainty, name, _default(Uncertainty, name), says, unit) for name, says, unit in stated]
     says = "standard uncertainty of gravity_mps2"
     return Table("[channels.uncertainty]", [*settings, _setting(Uncertainty, "gravity_mps2", gravity, says, "m/s2")])

@@ -64,8 +64,8 @@ class Grounds:
         """Why the adjustment is refused, empty if it is not."""
         return tuple(reasons(self.windows, self.solution, self.shares, self.determined, self._turned))
 
-    def _turned(self, static: int, polarity: int) -> Solution:
-        turned = [excited(w).pose for w in turned_windows(self.windows, static, polarity)]
+    def _turned(self, static: int, factor: float) -> Solution:
+        turned = [excited(w).pose for w in turned_windows(self.windows, static, factor)]
         return _solution(turned, self.data, self.priors, self.applied, self.scatter)
 
 

@@ -32,6 +32,10 @@ STEPS = 64  # of the random walk of Q over all rests
 # Variance of that walk over the whole time, in that of one rest. From nothing to so much that only the walk is left.
 WALKS = np.append(0.0, np.geomspace(0.1, 1e3, 13))
 TURNS = 3  # of the linearisation at the average; the second changes nothing that matters
+HOW_TO_TELL = (
+    "state the position of each rest in `poses` (start_s,stop_s,gx,gy,gz), of which six suffice, or add rests on edges "
+    "of all three axes, where two axes share gravity"
+)
 RESIDUAL_LIMIT = 0.02  # of g; real rests leave 2e-4, a stretch that was no rest or a clipped axis leaves more
 
 
@@ -63,8 +67,8 @@ def norm_fit(windows: Sequence[Window], gravity_mps2: float, u_gravity_mps2: flo
     used = [w for w in windows if w.used]
     if len(used) <= UNKNOWNS:
         raise ValueError(
-            f"a norm fit needs at least {UNKNOWNS + 1} rests in different positions, {len(used)} were found: "
-            "let the sensor rest for some seconds in more positions"
+            f"the positions of the rests are not stated, so that {UNKNOWNS + 1} rests are needed, and {len(used)} were "
+            f"found; {HOW_TO_TELL}"
         )
     count = np.array([w.sums.count.sum() for w in used])
     means = np.array([w.sums.count @ w.sums.mean[:, -3:] / w.sums.count.sum() for w in used])
@@ -76,10 +80,9 @@ def norm_fit(windows: Sequence[Window], gravity_mps2: float, u_gravity_mps2: flo
     singular = np.linalg.svd(jacobian / scale, compute_uv=False)
     reasons = []
     if singular[-1] < RANK_TOLERANCE * singular[0]:
-        rank = int((singular >= RANK_TOLERANCE * singular[0]).sum())
         reasons.append(
-            f"rank {rank} of {UNKNOWNS}: the positions of the rests do not determine all parameters; "
-            "add rests in other positions, with each axis up and down"
+            f"the positions of the {len(used)} rests do not determine all {UNKNOWNS} parameters: "
+            f"those on the faces alone, or in one plane, leave some open; {HOW_TO_TELL}"
         )
     if np.abs(residual).max() > RESIDUAL_LIMIT * gravity_mps2:
         worst = int(np.argmax(np.abs(residual)))

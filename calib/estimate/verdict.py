@@ -1,4 +1,4 @@
-"""Checks of an adjustment: rank, contradictions of priors and stated values, reversed signs, misfit, dead outputs."""
+"""Checks of an adjustment: rank, contradictions of priors and stated values, reversed signs, misfit, and S itself."""
 
 from __future__ import annotations
 
@@ -8,10 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from calib.distributions import chi2_quantile, coverage_factor
+from calib.estimate.axes import LEAST_S, sensitivity_reasons
 from calib.estimate.budget import Budget
 from calib.estimate.gauss_newton import Flags, Solution
+from calib.estimate.mistakes import FACTORS, of_a_prior, of_means, with_unit
 from calib.estimate.quantities import LAG
-from calib.model import PARAMETERS, Array, Window
+from calib.model import PARAMETERS, Array, Calibration, Window
 
 CONTRADICTED = 0.999  # probability: one sound calibration in a thousand is refused as a contradiction of its priors
 PRIOR_SHARE = 0.01  # a prior is tested only in directions in which the data reduce its variance by this part
@@ -23,8 +25,8 @@ MISFIT_LIMIT = 0.1  # of the signal; with right signs, 0.01 was left in the wors
 # A stated value is contradicted only if the data contradict it even with every stated standard uncertainty doubled: a
 # clamp whose errors are twice its default uncertainty is still used.
 STATED_TIMES = 2.0
-LEAST_FELT = 0.1  # least sensitivity of a working output in its best direction, relative to the largest sensitivity
 MOST_BETWEEN_BANDS = 0.01  # relative; a pair that is far apart, or turned, deviates by several per cent
+GROSS = 10.0  # chi-squared over its expectation; another unit of the reference gives a hundred and more
 CONFOUNDED_LAG = 0.01  # largest error of S due to an undetermined lag, relative to the scale of S
 
 
@@ -33,25 +35,53 @@ def reasons(
     solution: Solution,
     shares: Budget,
     determined: Flags,
-    turned: Callable[[int, int], Solution],
+    turned: Callable[[int, float], Solution],
 ) -> list[str]:
     """The reasons why the adjustment is refused, each with its numbers; empty if it is accepted.
 
-    `turned(static, polarity)` solves again with gravity multiplied by the sign `static` and the reference by the sign
-    `polarity`.
+    `turned(static, factor)` solves again with gravity multiplied by the sign `static` and the reference by `factor`.
     """
     return (
-        _not_finite(solution, shares.covariance)
+        _number_reasons(solution, shares.covariance)
         or _rank_reasons(windows, solution)
         or _sign_reasons(solution, turned)
+        or _unit_reasons(solution, turned)
         or _lag_reasons(solution, shares)
         or _response_reasons(shares)
         or [*_prior_reasons(solution), *_misfit_reasons(solution)]
         or _nuisance_reasons(solution, shares.covariance)
         or _nothing_determined(solution, determined)
-        or _too_uncertain(solution, shares, determined)
-        or dead_reasons(np.where(determined, solution.x[:12], np.nan)[:9].reshape(3, 3))
+        or _sensitivity_reasons(solution, shares, determined)
+        or _short_reasons(windows)
     )
+
+
+def _number_reasons(solution: Solution, covariance: Array) -> list[str]:
+    if np.isfinite(solution.chi2) and np.isfinite(covariance).all():
+        return []
+    return [
+        "the equations have no solution in numbers: something that they divide by is zero; measure longer, with more "
+        "motion or in more positions"
+    ]
+
+
+def _sensitivity_reasons(solution: Solution, shares: Budget, determined: Flags) -> list[str]:
+    known = determined | solution.bounded
+    values = np.where(known, solution.x[:12], np.nan)
+    covariance = np.where(np.outer(known, known), shares.covariance[:12, :12], np.nan)
+    found = Calibration(values[:9].reshape(3, 3), values[9:], covariance, determined, np.inf, "")
+    k = coverage_factor(float(np.min(shares.degrees_of_freedom[determined], initial=np.inf)))
+    return sensitivity_reasons(found, k, stated=bool(solution.bounded[:9].any()))
+
+
+def _short_reasons(windows: Sequence[Window]) -> list[str]:
+    length_s = sum(w.stop_s - w.start_s for w in windows)
+    if len(windows) > 1 or length_s >= LEAST_S:
+        return []
+    return [
+        f"only one window of {length_s:.3g} s can be used; two windows, or {LEAST_S:g} s, are needed to see whether "
+        "the data agree with each other: measure longer"
+    ]
 
 
 def _rank_reasons(windows: Sequence[Window], solution: Solution) -> list[str]:
@@ -65,31 +95,6 @@ def _rank_reasons(windows: Sequence[Window], solution: Solution) -> list[str]:
             "least three different alphas, and with motion"
         ]
     return []
-
-
-def _not_finite(solution: Solution, covariance: Array) -> list[str]:
-    if np.isfinite(solution.x).all() and np.isfinite(covariance).all():
-        return []
-    return [
-        "the adjustment has no solution in finite numbers: the motion leaves too much open; measure longer, with more "
-        "motion or in more positions"
-    ]
-
-
-def _too_uncertain(solution: Solution, shares: Budget, determined: Flags) -> list[str]:
-    """Whether U of a determined element of S is above the largest main sensitivity: then not even a sign is known."""
-    told = np.flatnonzero(determined[:9])
-    if not told.size:
-        return []
-    k = coverage_factor(float(np.min(shares.degrees_of_freedom[determined])))
-    expanded, main = k * np.sqrt(np.diag(shares.covariance)[told]), float(np.abs(solution.x[[0, 4, 8]]).max())
-    worst = int(np.argmax(expanded))
-    if expanded[worst] <= main:
-        return []
-    return [
-        f"{PARAMETERS[told[worst]]} is {solution.x[told[worst]]:.4g} with U {expanded[worst]:.4g}, above the largest "
-        f"main sensitivity, {main:.4g}; measure longer, with more motion or in more positions"
-    ]
 
 
 def _nothing_determined(solution: Solution, determined: Flags) -> list[str]:
@@ -130,14 +135,36 @@ def _response_reasons(shares: Budget) -> list[str]:
         return []
     return [
         f"no smooth response over frequency explains the bands: they deviate by {bands.relative_u:.1%}, limit "
-        f"{MOST_BETWEEN_BANDS:.0%}, most at {bands.at_hz:.3g} Hz by {bands.largest:.1%}; look there for a resonance, "
-        "a filter's edge, a source of noise or a loose mount, or calibrate with motion that leaves this band out"
+        f"{MOST_BETWEEN_BANDS:.0%}, and most of it comes from {bands.at_hz:.3g} Hz; look there for a resonance, a "
+        "filter's edge, a source of noise or a loose mount, or calibrate with motion that leaves this band out"
     ]
 
 
-def _sign_reasons(solution: Solution, turned: Callable[[int, int], Solution]) -> list[str]:
+def _contradicted(solution: Solution) -> bool:
+    return solution.chi2 > chi2_quantile(CONTRADICTED, solution.residual.size) or bool(_prior_reasons(solution))
+
+
+def _unit_reasons(solution: Solution, turned: Callable[[int, float], Solution]) -> list[str]:
+    if not (_contradicted(solution) and solution.chi2 > GROSS * solution.residual.size):
+        return []
+    tried = {factor: turned(1, factor) for factor in FACTORS}
+    fits = {
+        factor: other.chi2
+        for factor, other in tried.items()
+        if np.isfinite(other.chi2) and misfit(other) <= MISFIT_LIMIT and not _contradicted(other)
+    }
+    if not fits or min(fits.values()) > solution.chi2 - DECISIVE_CHI2:
+        return []
+    factor = min(fits, key=lambda f: fits[f])
+    return [
+        f"the data fit if the reference is multiplied by {factor:.4g}: chi-squared {fits[factor]:.4g}, as stated "
+        f"{solution.chi2:.4g}; {FACTORS[factor]}: state its unit, or convert it to m/s2"
+    ]
+
+
+def _sign_reasons(solution: Solution, turned: Callable[[int, float], Solution]) -> list[str]:
     # With reversed signs a poor fit may end anywhere, so only chi2 and the misfit of such a fit are looked at.
-    if solution.chi2 <= chi2_quantile(CONTRADICTED, solution.residual.size) and not _prior_reasons(solution):
+    if not _contradicted(solution):
         return []
     tried = {
         "the static sign (gravity)": turned(-1, 1),
@@ -178,10 +205,13 @@ def _prior_reasons(solution: Solution) -> list[str]:
     u = np.sqrt(np.diag(before))
     worst = int(np.argmax(np.abs(solution.x[known] - solution.prior_mean[known]) / u))
     p = known[worst]
+    S, S_known = (values[:9].reshape(3, 3) for values in (solution.x, solution.prior_mean))
+    mistake = of_a_prior(S, S_known, of_offset=bool(p >= 9))
     return [
         f"the data contradict the prior of S and Q: chi-squared {statistic:.4g}, limit {limit:.4g} "
         f"({int(tested.sum())} degrees of freedom); {PARAMETERS[p]} is {solution.x[p]:.5g}, "
         f"{solution.prior_mean[p]:.5g} with u {u[worst]:.3g} was expected; check the prior and how the axes are mounted"
+        f"{mistake}"
     ]
 
 
@@ -194,7 +224,7 @@ def nuisance_pull(solution: Solution, covariance: Array) -> tuple[float, float, 
     """
     terms = solution.equations.nuisances.terms
     stated = [j for j, t in enumerate(terms) if t.kind.stated]
-    if not stated or _not_finite(solution, covariance):
+    if not stated or _number_reasons(solution, covariance):
         return 0.0, np.inf, ""
     u, k = np.array([terms[j].uncertainty for j in stated]), 12 + np.array(stated)
     pull = (solution.x[k] - solution.prior_mean[k]) / u
@@ -205,7 +235,10 @@ def nuisance_pull(solution: Solution, covariance: Array) -> tuple[float, float, 
     single = 1.0 - (1.0 - CONTRADICTED) / max(len(found), 1)
     worst = int(np.argmax(np.abs(pull)))
     term, moved = terms[stated[worst]], pull[worst] * u[worst]
-    told = f"{term.name} would be off by {moved:.3g} {term.unit}, its standard uncertainty was stated as {u[worst]:.3g}"
+    told = (
+        f"{term.name} would be off by {with_unit(moved, term.unit)}, its standard uncertainty was stated as "
+        f"{with_unit(u[worst], term.unit)}"
+    )
     limit = STATED_TIMES * float(np.sqrt(chi2_quantile(single, 1.0)))
     return float(found.max(initial=0.0)), limit, told
 
@@ -220,32 +253,22 @@ def _nuisance_reasons(solution: Solution, covariance: Array) -> list[str]:
     ]
 
 
-def dead_reasons(sensitivity: Array) -> list[str]:
-    """A reason for each output (row of S) that responds to almost nothing.
-
-    `sensitivity` (3, 3), NaN for elements that are not determined. Exchanged axes are not refused here: S shows them,
-    and only a prior of S can contradict them.
-    """
-    size = np.abs(sensitivity)
-    largest = float(np.nanmax(size, initial=0.0))
-    felt = np.nanmax(size, axis=1, initial=0.0)
-    told = [bool(np.isfinite(row).all()) for row in size]
-    return [
-        f"output {axis} is dead: its largest sensitivity is {felt[i]:.4g}, that of the others is {largest:.4g} "
-        f"(limit {LEAST_FELT:.0%}); check the wiring of this output"
-        for i, axis in enumerate("xyz")
-        if told[i] and felt[i] < LEAST_FELT * largest
-    ]
-
-
 def _misfit_reasons(solution: Solution) -> list[str]:
     found = misfit(solution)
     if found <= MISFIT_LIMIT:
         return []
     return [
         f"S a + Q leaves {found:.1%} of the signal between windows unexplained (limit {MISFIT_LIMIT:.0%}); "
-        "check that each position was stated as it was"
+        f"check that each position was stated as it was{of_means(_left_of_means(solution))}"
     ]
+
+
+def _left_of_means(solution: Solution) -> Array:
+    """(W, 3) what the windows' means differ by from S a + Q, in m/s2."""
+    equations = solution.equations
+    _, mean = equations.split(solution.residual)
+    weight = np.where(equations.mean_weight > 0.0, equations.mean_weight, np.inf)
+    return np.asarray(mean / weight / equations.output_per_mps2)
 
 
 def misfit(solution: Solution) -> float:
@@ -268,12 +291,12 @@ def misfit(solution: Solution) -> float:
     return float(np.sqrt(max(shares)))
 
 
-def turned_windows(windows: Sequence[Window], static: int, polarity: int) -> list[Window]:
-    """The same windows with gravity multiplied by the sign `static` and the direction of motion by `polarity`."""
+def turned_windows(windows: Sequence[Window], static: int, factor: float) -> list[Window]:
+    """The same windows with gravity multiplied by the sign `static` and the reference by `factor`."""
     return [
         replace(
             w,
-            pose=replace(w.pose, direction=polarity * w.pose.direction, gravity_mps2=static * w.pose.gravity_mps2),
+            pose=replace(w.pose, direction=factor * w.pose.direction, gravity_mps2=static * w.pose.gravity_mps2),
         )
         for w in windows
     ]

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.estimate.verdict import dead_reasons
+from calib.estimate.axes import sensitivity_reasons
 from calib.model import PARAMETERS
 from calib.paper import method1, method2
 from calib.paper.amplitudes import AmplitudeCalibration, Run
@@ -43,7 +43,7 @@ def by_amplitudes(tables: Tables, options: Options) -> Outcome:
         return Outcome(None, (str(error),), windows, tables.rate_hz, str(method))
     reasons = (
         *found.reasons,
-        *dead_reasons(found.calibration.sensitivity),
+        *sensitivity_reasons(found.calibration, found.coverage_factor, stated=priors.parameters is not None),
         *contradictions(found.calibration, priors),
     )
     omega = 2 * np.pi * found.frequency_hz

@@ -7,14 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 
+from calib.estimate.axes import axis_warnings, sensitivity_reasons
 from calib.estimate.nuisances import Priors
-from calib.estimate.verdict import dead_reasons
 from calib.excitation.front_end import Settings
 from calib.excitation.window_verdict import Limits
 from calib.geometry import STANDARD_GRAVITY_MPS2
 from calib.paper.method3 import PLAIN, fit, refusal
 from calib.recorded.adjusting import adjusted, norm_fitted
 from calib.recorded.amplitude_methods import by_amplitudes
+from calib.recorded.causes import causes, silent_channels
 from calib.recorded.errors import InputError, OptionError
 from calib.recorded.options import Options
 from calib.recorded.outcome import Outcome, nothing_used
@@ -22,7 +23,7 @@ from calib.recorded.poses import PoseInterval, Poses, Setting, beside_reference,
 from calib.recorded.priors import contradictions, instrument_of, priors_of
 from calib.recorded.table import ReferenceTable, SensorTable, ends_s
 from calib.recorded.tables import Making, Tables
-from calib.recorded.wrong_unit import check_gravity
+from calib.recorded.wrong_unit import check_gravity, gravity_warnings
 from calib.signal.instrument import Instrument
 
 COVERAGE_FACTOR = 2.0  # of plain Method 3, as in the paper: there are thousands of points
@@ -30,6 +31,21 @@ COVERAGE_FACTOR = 2.0  # of plain Method 3, as in the paper: there are thousands
 
 def calibrated(sensor: SensorTable, reference: ReferenceTable | None, poses: Poses | None, options: Options) -> Outcome:
     """The outcome for these samples, poses and options, which passed `options.check`. Raises InputError."""
+    outcome = _estimated(sensor, reference, poses, options)
+    silent, feels = [], False
+    if reference is not None and reference.channels == 3 and options.rotation is not None:
+        silent = silent_channels(sensor, reference, options.rotation)
+        feels = _setting(options, reference).reference_coupling == "dc"
+    if outcome.reasons or (silent and feels):  # what a dead channel does not feel of gravity would be taken for Q
+        found = causes(sensor, reference, poses, outcome)
+        return replace(outcome, calibration=None, reasons=(*found, *silent, *outcome.reasons))
+    told = [*axis_warnings(outcome.sensitivity), *silent]
+    if reference is not None and _setting(options, reference).reference_coupling == "dc":
+        told += gravity_warnings(reference)
+    return replace(outcome, warnings=tuple(told))
+
+
+def _estimated(sensor: SensorTable, reference: ReferenceTable | None, poses: Poses | None, options: Options) -> Outcome:
     if reference is None and poses is None and not options.plain:
         return norm_fitted(sensor, options)
     if options.method != 3:
@@ -110,7 +126,7 @@ def _plain(tables: Tables, priors: Priors) -> Outcome:
     found = fit(windows)
     reasons = (
         *refusal(found, windows),
-        *dead_reasons(found.calibration.sensitivity),
+        *sensitivity_reasons(found.calibration, COVERAGE_FACTOR, stated=priors.parameters is not None),
         *contradictions(found.calibration, priors),
     )
     return Outcome(

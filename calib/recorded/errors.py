@@ -33,10 +33,11 @@ class InputError(ValueError):
 
 
 class UnitError(InputError):
-    """Accelerations in another unit than m/s2, as the size of gravity tells; `unit` is the probable one."""
+    """Accelerations in another unit than m/s2, as the size of gravity tells. `unit`: the probable one, or ""."""
 
     def __init__(self, problem: str, unit: str, *, place: str, column: str, value: float) -> None:
-        super().__init__(problem, f"convert them from {unit} to m/s2", place=place, column=column, value=value)
+        remedy = f"convert them from {unit} to m/s2" if unit else "exchange them, or convert the values to m/s2"
+        super().__init__(problem, remedy, place=place, column=column, value=value)
         self.unit = unit
 
 

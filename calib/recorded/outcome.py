@@ -30,11 +30,17 @@ class NuisanceValue:
     standard_uncertainty: float
     unit: str
 
+    def cell(self, coverage_factor: float) -> str:
+        """The value ± U with its unit; a unit of 1 is not told."""
+        unit = "" if self.unit == "1" else f" {self.unit}"
+        return plus_minus(self.value, coverage_factor * self.standard_uncertainty) + unit
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outcome:
     """The outcome of a calibration. If the data are refused, `calibration` is None and `reasons` say why.
 
+    `warnings`: what a reader must see before S and Q.
     Arrays of 12 are in the order of calib.model.PARAMETERS: S row by row, then Q. They are read-only.
     """
 
@@ -50,6 +56,7 @@ class Outcome:
     rank: int | None = None
     residual_sd: Sequence[float] | None = None
     statistics: Mapping[str, Any] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
     more: Mapping[str, Any] = field(default_factory=dict)  # further members of the JSON object
 
     @property
@@ -190,6 +197,7 @@ def as_object(outcome: Outcome) -> dict[str, Any]:
         "rate_hz": outcome.rate_hz,
         "status": outcome.status,
         "reasons": list(outcome.reasons),
+        "warnings": list(outcome.warnings),
         "windows": [_window(w) for w in outcome.windows],
         "statistics": dict(outcome.statistics),
         "version": __version__,

@@ -9,6 +9,7 @@ import numpy as np
 
 from calib.estimate.nuisances import Priors
 from calib.estimate.quantities import PRIORS
+from calib.geometry import u_of_gravity_mps2
 from calib.model import PARAMETERS, Array, Calibration
 from calib.recorded.errors import OptionError
 from calib.recorded.options import Options
@@ -53,10 +54,10 @@ def instrument_of(options: Options) -> Instrument:
 
 
 def u_gravity_mps2(options: Options) -> float:
-    """Standard uncertainty of gravity, m/s2."""
+    """Standard uncertainty of gravity, m/s2; where it is not stated, by the digits of gravity."""
     if options.u_gravity_mps2 is not None:
         return options.u_gravity_mps2
-    return U_STANDARD_GRAVITY_MPS2 if options.gravity is None else 0.0
+    return U_STANDARD_GRAVITY_MPS2 if options.gravity is None else u_of_gravity_mps2(options.gravity)[0]
 
 
 def _known(options: Options) -> tuple[Array | None, Array | None]:
@@ -75,8 +76,12 @@ def prior_of(values: Array, covariance: Array) -> tuple[Array, Array]:
     """
     values, covariance = np.array(values, dtype=float), np.array(covariance, dtype=float)
     if values.shape != (12,) or covariance.shape != (12, 12):
-        raise OptionError("sensitivity must be 3 x 3, offset 3, covariance 12 x 12", column="prior")
+        raise OptionError(
+            "sensitivity must be 3 x 3, offset 3, covariance 12 x 12", "give a whole result", column="prior"
+        )
     unknown = ~(np.isfinite(values) & np.isfinite(np.diag(covariance)))
+    if unknown[[0, 4, 8]].all() or not values[[0, 4, 8]][~unknown[[0, 4, 8]]].any():
+        raise OptionError("it tells no main sensitivity", "give a result that is valid", column="prior")
     covariance[unknown, :], covariance[:, unknown] = 0.0, 0.0
     covariance[unknown, unknown] = np.inf
     known = covariance[np.ix_(~unknown, ~unknown)]

@@ -50,7 +50,7 @@ class ReferenceTable:
     """Stamps (n,) in s, channels (n, 1 or 3) of a quantity of calib.signal.instrument in SI units, arrays or on disk.
 
     `name`: of the file, or "reference". `column` is the first channel's; `header`: where the file names its columns,
-    for messages. `said`: what was guessed, for the user.
+    for messages. `said`: what was guessed, for the user. `unit_stated`: whether anybody named the unit of the values.
     """
 
     name: str
@@ -60,6 +60,7 @@ class ReferenceTable:
     column: str
     header: str = ""
     said: tuple[str, ...] = ()
+    unit_stated: bool = False
 
     @property
     def channels(self) -> int:

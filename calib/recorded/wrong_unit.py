@@ -12,7 +12,14 @@ from calib.recorded.table import ReferenceTable
 
 # How large gravity is in units that are taken for m/s2.
 GRAVITY_IN = {"g": 1.0, "mg": 1000.0, "cm/s2": 100 * STANDARD_GRAVITY_MPS2, "mm/s2": 1000 * STANDARD_GRAVITY_MPS2}
-NEAR = 0.05  # relative: offsets of a sensor in g are not larger
+NEAR = 0.05  # relative: offsets of a reference are not larger
+# Of a sensor in another unit: Livox-SDK/livox_ros_driver pull request 98 shows 0.88 at rest in a message for m/s2, and
+# uzh-rpg/rpg_dvs_ros issue 58 shows 0.9.
+NEAR_IN_UNIT = 0.15
+NOT_FELT_MPS2 = 1.0  # largest mean of a reference that does not feel gravity: offsets of 0.1 g
+MEANS_OF = (1, 8, 64, 512)  # samples
+FEWEST = 10  # means that tell how they scatter
+STEADY = 0.2  # quartiles of their magnitudes, relative; 0.6 of noise around zero
 ROWS = 100_000  # spread over the file
 ROWS_AT_ONCE = 1000  # of them
 
@@ -24,18 +31,68 @@ def unit_hint(length: float) -> str:
 
 
 def check_gravity(reference: ReferenceTable) -> None:
-    """Refuse a tri-axial reference that feels gravity as in another unit. Raises UnitError with the unit."""
-    if reference.channels != 3:
+    """Refuse a tri-axial reference whose unit nobody stated and which feels gravity as in another unit, or as in none.
+
+    Raises UnitError, with the unit where it is a known one.
+    """
+    if reference.channels != 3 or reference.unit_stated or reference.quantity != "acceleration":
         return
+    length, usual = _mean_length(reference)
+    if usual:
+        return
+    unit = _unit(length)
+    raise UnitError(
+        f"the mean has a magnitude of {length:.4g} m/s2, but gravity has 9.8"
+        f"{unit_hint(length) or f' ({_in_g(length)}): another unit, or `sensor` and `reference` are exchanged'}",
+        unit, place=reference.place, column=reference.column, value=length,
+    )  # fmt: skip
+
+
+def gravity_warnings(reference: ReferenceTable) -> list[str]:
+    """A sentence where a reference that feels gravity reads what gravity cannot be, though its unit was stated."""
+    if reference.quantity != "acceleration":
+        return []
+    length, usual = _mean_length(reference)
+    if usual or (reference.channels == 1 and length <= STANDARD_GRAVITY_MPS2):
+        return []
+    return [
+        f"the reference reads {_in_g(length)} where it feels gravity, 1 g: check its unit and its sensitivity, and "
+        "whether sensor and reference are exchanged"
+    ]
+
+
+def _mean_length(reference: ReferenceTable) -> tuple[float, bool]:
+    """The magnitude of the mean where it is steadiest, and whether it is a usual one over any number of samples.
+
+    Means over more and more samples are tried: those of a few contain the motion, those of many how the reference was
+    turned.
+    """
     x, step = reference.x, -(-len(reference.x) // ROWS)
     some = [x[first : first + ROWS_AT_ONCE * step : step] for first in range(0, len(x), ROWS_AT_ONCE * step)]
-    length = float(np.nanmedian(np.linalg.norm(np.concatenate(some), axis=1)))
-    if unit := _unit(length):
-        raise UnitError(
-            f"the median magnitude is {length:.4g} m/s2, but gravity has 9.8{unit_hint(length)}",
-            unit, place=reference.place, column=reference.column, value=length,
-        )  # fmt: skip
+    rows = np.concatenate(some)
+    rows = rows[np.isfinite(rows).all(axis=1)]
+    lengths, scatter = [], []
+    for size in (size for size in MEANS_OF if FEWEST * size <= len(rows) or size == 1):
+        means = rows[: len(rows) // size * size].reshape(-1, size, rows.shape[1]).mean(axis=1)
+        low, middle, high = np.quantile(np.linalg.norm(means, axis=1), (0.25, 0.5, 0.75)).tolist()
+        lengths.append(middle)
+        scatter.append((high - low) / max(middle, np.finfo(float).tiny))
+    named = [k for k, length in enumerate(lengths) if _unit(length) and scatter[k] < STEADY]
+    best = min(named or range(len(lengths)), key=lambda k: scatter[k])
+    not_felt = float(np.linalg.norm(rows.mean(axis=0))) < NOT_FELT_MPS2
+    return lengths[best], (not_felt or any(map(_usual, lengths))) and not named
+
+
+def _usual(length: float) -> bool:
+    """Whether this is the length of gravity in m/s2, or of the mean of a reference that does not feel it."""
+    return length < NOT_FELT_MPS2 or math.isclose(length, STANDARD_GRAVITY_MPS2, rel_tol=NEAR)
+
+
+def _in_g(length: float) -> str:
+    return f"{length / STANDARD_GRAVITY_MPS2:.3g} g"
 
 
 def _unit(length: float) -> str:
-    return next((name for name, g in GRAVITY_IN.items() if math.isclose(length, g, rel_tol=NEAR)), "")
+    """The unit in which gravity has about this length, the nearest of several; "" if there is none."""
+    name, g = min(GRAVITY_IN.items(), key=lambda unit: abs(length / unit[1] - 1.0))
+    return name if math.isclose(length, g, rel_tol=NEAR_IN_UNIT) else ""

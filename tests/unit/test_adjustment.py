@@ -106,7 +106,7 @@ def test_coloured_residuals_are_not_taken_for_white():
 
 def test_one_direction_gives_one_column():
     random = np.random.default_rng(9)
-    t = np.arange(1500) / 250.0
+    t = np.arange(2500) / 250.0
     u, du = 5.0 * np.sin(18.85 * t)[:, None], 5.0 * 18.85 * np.cos(18.85 * t)[:, None]
     V = u @ S_TRUE[:, :1].T + Q_TRUE + 0.02 * random.normal(size=(len(t), 3))
     for gravity in (UNKNOWN, np.array([0.0, 0.0, G_MPS2])):

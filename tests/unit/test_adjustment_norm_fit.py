@@ -69,11 +69,11 @@ def test_gravity_s_uncertainty_goes_into_s_alone():
     assert np.all(u[9:] < 1e-5)
 
 
-def test_rests_in_one_plane_are_refused_with_the_rank():
+def test_rests_in_one_plane_are_refused():
     random = np.random.default_rng(72)
     angles = np.arange(12) * np.pi / 6.0
     found = norm_fit(_rests(random, np.column_stack([np.cos(angles), np.sin(angles), 0.0 * angles]), 1e-3), G_MPS2)
-    assert any("rank" in reason and "of 9" in reason for reason in found.reasons)
+    assert any("do not determine all 9 parameters" in reason for reason in found.reasons)
 
 
 def test_a_direction_hardly_tilted_into_is_not_stated():
@@ -97,5 +97,5 @@ def test_a_rest_that_was_none_is_named():
 
 def test_nine_rests_are_too_few():
     random = np.random.default_rng(74)
-    with pytest.raises(ValueError, match="at least 10 rests"):
+    with pytest.raises(ValueError, match="10 rests are needed, and 9 were found"):
         norm_fit(_rests(random, random.normal(size=(9, 3)), 0.002), G_MPS2)

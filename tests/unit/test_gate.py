@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -70,6 +72,58 @@ def test_the_limit_of_consistency_is_the_stated_quantile() -> None:
 def test_nan_is_not_consistent() -> None:
     assert valid().judge(Evidence(0.0, float("nan"), DOF), NEAR).action == "hold"
     assert valid().judge(consistent(), calibration(NOMINAL * np.nan)).action == "hold"
+
+
+def test_what_is_no_number_is_not_proposed() -> None:
+    decision = valid().judge(consistent(), calibration(NOMINAL * np.nan))
+    assert (decision.action, decision.propose) == ("hold", False)
+    assert "the estimate gives no number for Sxx" in decision.reason
+    assert valid().judge(consistent(), scaled(1.06)).propose
+
+
+def _without(*parameters: int) -> Calibration:
+    """A calibration whose data determine all but these parameters."""
+    found = calibration()
+    return replace(found, determined=~np.isin(np.arange(12), parameters))
+
+
+def _wide(u: float) -> Calibration:
+    """A calibration with this standard uncertainty of Sxy; the largest main sensitivity is 2.1."""
+    found = calibration()
+    covariance = found.covariance.copy()
+    covariance[1, 1] = u**2
+    return replace(found, covariance=covariance)
+
+
+@pytest.mark.parametrize(
+    ("candidate", "reason"),
+    [
+        (_without(0, 4, 8), "not in force yet: no main sensitivity (Sxx, Syy, Szz) is determined"),
+        (_wide(1.1), "not in force yet: U(Sxy) is 2.2, above the largest main sensitivity, 2.1;"),
+    ],
+)
+@pytest.mark.parametrize("policy", ["auto", "propose"])
+def test_a_first_calibration_needs_a_main_sensitivity_and_u_below_it(
+    candidate: Calibration, reason: str, policy: Literal["auto", "propose"]
+) -> None:
+    g = Gate(GateSettings(least_determined=4, policy=policy), calibration(u_pct=20.0))  # a data sheet
+    decision = g.judge(consistent(), candidate)
+    assert (decision.action, decision.in_force, decision.propose) == ("take", False, False)
+    assert decision.reason.startswith(reason)
+    assert decision.status == "COLLECTING"
+    after = g.judge(consistent(), _without(0, 4))
+    assert (after.in_force, after.propose) == (policy == "auto", policy == "propose")
+
+
+@pytest.mark.parametrize("policy", ["auto", "propose"])
+def test_a_first_calibration_needs_two_windows_or_ten_seconds(policy: str) -> None:
+    g = gate(policy=policy)
+    decision = g.judge(replace(consistent(), enough=False), NEAR)
+    assert (decision.action, decision.in_force, decision.propose) == ("take", False, False)
+    assert decision.reason.startswith("not in force yet: two windows, or 10 s, are needed")
+    after = g.judge(consistent(), NEAR)
+    assert (after.in_force, after.propose) == (policy == "auto", policy == "propose")
+    assert valid().judge(replace(consistent(), enough=False), NEAR).in_force  # what is in force once stays
 
 
 def test_an_unsupported_window_is_refused_with_its_reason() -> None:
