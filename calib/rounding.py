@@ -17,6 +17,11 @@ def plus_minus(value: float | None, expanded: float | None) -> str:
     return f"{value:.{decimals}f} ± {expanded:.{decimals}f}"
 
 
+def rounded(value: float) -> str:
+    """The value with two digits that count: 330, 0.017."""
+    return f"{float(f'{value:.2g}'):g}"
+
+
 def from_to(low: float, high: float) -> str:
     """`low to high`, with as many digits, three at least, as show that they differ."""
     texts = [(f"{low:.{digits}g}", f"{high:.{digits}g}") for digits in range(3, 8)]

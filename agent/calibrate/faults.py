@@ -18,15 +18,15 @@ def as_table_error(place: Callable[[int], str] = "row {}".format) -> Iterator[No
     try:
         yield
     except OptionError as error:
-        raise click.UsageError(_with_dashes(str(error))) from None
+        raise click.UsageError(with_dashes(str(error))) from None
     except UnitError as error:
         names = ",".join(f"{axis}=NAME:{error.unit}" for axis in "xyz")
         error.remedy = f"state the unit with --reference-columns time=NAME,{names}"
         raise TableError(str(error)) from None
     except InputError as error:
-        raise TableError(_with_dashes(error.told(place))) from None
+        raise TableError(with_dashes(error.told(place))) from None
 
 
-def _with_dashes(text: str) -> str:
+def with_dashes(text: str) -> str:
     """`u_angle_deg` as --u-angle-deg."""
     return re.sub(r"`(\w+)`", lambda found: "--" + found[1].replace("_", "-"), text)

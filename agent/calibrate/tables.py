@@ -15,7 +15,8 @@ from agent.reading.ground_motion import GroundMotion
 from agent.reading.source import Array, Progress, Source, TableError
 from agent.reading.spool import Spool, Spooled
 from agent.reading.stationxml import Component
-from agent.reading.units import Sensitivity, unit_of
+from agent.reading.units import Sensitivity, unit_name, unit_of
+from calib.recorded.output_unit import common
 from calib.recorded.table import (
     REFERENCES,
     SENSOR,
@@ -59,10 +60,12 @@ def read_sensor(
         choice = Choice(source, columns, "--columns")
         chosen = choice.in_one_group(_sensor_columns)
         times, values = _rows(source, chosen, progress, np.ones(len(chosen) - 1))
+        unit = common([unit_name(c.unit) for c in chosen[1:4]])
         said, components = _described(source, choice, chosen[1:4])
         filters = source.filters.get(chosen[1].column.group, ())
     temperature_degc = Spooled(values, 3) if len(chosen) > 4 else None
-    return SensorFile(str(path), times, Spooled(values, slice(0, 3)), temperature_degc, said, components, filters)
+    channels = Spooled(values, slice(0, 3))
+    return SensorFile(str(path), times, channels, temperature_degc, said, unit, components, filters)
 
 
 def _described(

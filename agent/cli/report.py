@@ -69,11 +69,15 @@ def _status(material: Material) -> int:
 
 def _name_unit(material: Material, unit: str | None) -> None:
     """Set the unit of results that do not state it. Raises MaterialError if the results have several units."""
+    from agent.reading.units import unit_name
     from agent.report.material import MaterialError
     from agent.report.units import output_unit
 
     if unit is not None:
-        material.results = [replace(r, unit=r.unit or unit) for r in material.results]
-    units = {output_unit(r.unit) for r in material.results} | ({output_unit(unit)} if unit else set())
+        named = unit_name(unit) or unit
+        if told := [r.unit for r in material.results if r.unit and (unit_name(r.unit) or r.unit) != named]:
+            raise MaterialError(f"--unit {unit}: the indications are in {told[0]}; leave --unit out")
+        material.results = [replace(r, unit=r.unit or named) for r in material.results]
+    units = {output_unit(r.unit) for r in material.results}
     if len(units) > 1:
         raise MaterialError(f"all indications in a report must have one unit, but here are {', '.join(sorted(units))}")

@@ -30,6 +30,12 @@ COVERAGE_FACTOR = 2.0  # of plain Method 3, as in the paper: there are thousands
 
 def calibrated(sensor: SensorTable, reference: ReferenceTable | None, poses: Poses | None, options: Options) -> Outcome:
     """The outcome for these samples, poses and options, which passed `options.check`. Raises InputError."""
+    outcome = _estimated(sensor, reference, poses, options)
+    more = {**outcome.more, "reference_quantity": None if reference is None else reference.quantity}
+    return replace(outcome, unit=sensor.unit, more=more)
+
+
+def _estimated(sensor: SensorTable, reference: ReferenceTable | None, poses: Poses | None, options: Options) -> Outcome:
     if reference is None and poses is None and not options.plain:
         return norm_fitted(sensor, options)
     if options.method != 3:

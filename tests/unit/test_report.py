@@ -259,7 +259,7 @@ def bad_inputs(recorded: Path, folder: Path) -> dict[str, tuple[list[str | Path]
         "damaged recording": ([folder / "damaged.mcap"], "damaged.mcap: the recording is damaged at "),
         "mixture": ([good, recorded], "the inputs are of several kinds"),
         "sensor": ([recorded, "--sensor", "other"], "there is no sensor 'other'; the sensors are: mems"),
-        "unit": ([good, "--unit", "count"], "must have one unit, but here are count, mV"),
+        "unit": ([good, "--unit", "count"], "--unit count: the indications are in mV; leave --unit out"),
     }
 
 
