@@ -11,6 +11,7 @@ from calib.geometry import STANDARD_GRAVITY_MPS2
 from calib.model import Array
 
 ACCELERATION = "m/s²"
+IN_G = "g/g"  # S of an output in g
 G_IN = {"g": 1.0, "mg": 1e3, "µg": 1e6}  # how many of these units are 1 g
 _WRITTEN = {"uV": "µV", "ug": "µg"}
 
@@ -26,6 +27,12 @@ class Shown:
     offset: str
     factors: Array
 
+    @property
+    def words(self) -> str:
+        """Both units in words."""
+        S = self.sensitivity if self.sensitivity == IN_G else f"{self.offset} per {ACCELERATION}"
+        return f"S in {S}, Q in {self.offset}"
+
 
 def written(unit: str) -> str:
     """The unit as people write it; "output unit" where nothing tells it."""
@@ -36,7 +43,7 @@ def shown_in(unit: str) -> Shown:
     """How S and Q of an output in `unit` are shown: as they are, but S in g/g and Q in mg where the output is in g."""
     name = written(unit)
     if (one_g := G_IN.get(name)) is not None:
-        return Shown("g/g", "mg", _factors(STANDARD_GRAVITY_MPS2 / one_g, G_IN["mg"] / one_g))
+        return Shown(IN_G, "mg", _factors(STANDARD_GRAVITY_MPS2 / one_g, G_IN["mg"] / one_g))
     return Shown("1" if name == ACCELERATION else f"{name}/({ACCELERATION})", name, _factors(1.0, 1.0))
 
 

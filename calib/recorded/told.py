@@ -5,7 +5,7 @@ Names of options are in `...`, as in the messages of calib.recorded.errors.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -13,8 +13,8 @@ import numpy as np
 
 from calib.estimate.quantities import BETWEEN_WINDOWS, KINDS
 from calib.model import PARAMETERS, Array
-from calib.recorded.output_unit import ACCELERATION, shown_in
-from calib.rounding import KNOWN_BEFORE, plus_minus, rounded
+from calib.recorded.output_unit import shown_in
+from calib.rounding import KNOWN_BEFORE, aligned, plus_minus, rounded
 
 if TYPE_CHECKING:
     from calib.recorded.outcome import Outcome
@@ -52,12 +52,12 @@ def lines_of(outcome: Outcome) -> Iterator[str]:
     """S and Q with U, their units, where S holds, and the largest sources of U. Nothing where S and Q are refused."""
     if outcome.calibration is None:
         return
-    yield from _aligned([("", "Sx", "Sy", "Sz", "Q"), *rows_of(outcome)])
+    yield from aligned([("", "Sx", "Sy", "Sz", "Q"), *rows_of(outcome)])
     yield from notes_of(outcome)
     if sources := largest_sources(outcome):
         heads = [f"U({PARAMETERS[k]})" for k in parameters_of(outcome)]
         rows = [(s.name, *map(rounded, s.expanded), s.way) for s in sources]
-        yield from _aligned([("largest sources", *heads, "smaller with"), *rows], words=(0, len(heads) + 1))
+        yield from aligned([("largest sources", *heads, "smaller with"), *rows], words=(0, len(heads) + 1))
 
 
 def rows_of(outcome: Outcome) -> list[tuple[str, ...]]:
@@ -69,9 +69,8 @@ def rows_of(outcome: Outcome) -> list[tuple[str, ...]]:
 def notes_of(outcome: Outcome) -> Iterator[str]:
     """Units and k, what was known before, and where S holds, each as a sentence without its full stop."""
     shown = shown_in(outcome.unit)
-    S = f"S in {f'{ACCELERATION} per {ACCELERATION}' if shown.sensitivity == '1' else shown.sensitivity}"
     kind = f", {outcome.uncertainty_kind}" if outcome.uncertainty_kind else ""
-    yield f"{S}, Q in {shown.offset}, U with k = {outcome.coverage_factor:.3g}{kind}"
+    yield f"{shown.words}, U with k = {outcome.coverage_factor:.3g}{kind}"
     if np.any(np.isfinite(outcome.values) & ~outcome.determined):
         yield f"{KNOWN_BEFORE} known before: the data do not halve its uncertainty"
     if outcome.where_it_holds:
@@ -120,14 +119,3 @@ def way_of(source: str) -> str:
 
 def _of(source: Mapping[str, float] | Array, k: int) -> float:
     return float(source[PARAMETERS[k]] if isinstance(source, Mapping) else source[k])
-
-
-def _aligned(rows: Sequence[Sequence[str]], words: Sequence[int] = (0,)) -> Iterator[str]:
-    """The rows as lines; columns of `words` are aligned to the left, the others to the right."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        cells = [
-            cell.ljust(width) if k in words else cell.rjust(width)
-            for k, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ]
-        yield "  ".join(cells).rstrip()

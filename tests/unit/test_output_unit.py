@@ -100,7 +100,7 @@ def test_the_result_has_the_unit_that_all_three_columns_have(
 
 def test_the_unit_is_in_table_report_and_certificate(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     result, told = calibrated(tmp_path, *files(tmp_path, ("X [mV]", "Y [mV]", "Z [mV]")))
-    assert "  S in mV/(m/s²), Q in mV, U with k = 2" in capsys.readouterr().out
+    assert "  S in mV per m/s², Q in mV, U with k = 2" in capsys.readouterr().out
     assert "S in mV/(m/s²), Q in mV. After ±" in report(result)
     found = certificate(tmp_path, result, output_unit="")
     assert rows(found)["S xx"] == f"{told['sensitivity'][0][0]:.4f} ± 0.0084 mV/(m/s²)"
