@@ -42,11 +42,10 @@ def test_what_takes_files_takes_a_data_directory_by_its_option(
 
 
 def test_the_option_and_the_directory_audit_the_same(capsys: pytest.CaptureFixture[str]) -> None:
-    told = []
-    for arguments in ([str(PRESENT)], ["--data-dir", str(PRESENT)]):
-        told.append((run_cli(["audit", *arguments]), capsys.readouterr().out))
-    assert told[0] == told[1]
-    assert "fieldcal-000001.mcap" in told[0][1]
+    one, other = ((run_cli(["audit", *given]), capsys.readouterr().out)
+                  for given in ([str(PRESENT)], ["--data-dir", str(PRESENT)]))  # fmt: skip
+    assert one == other
+    assert "fieldcal-000001.mcap" in one[1]
     assert run_cli(["engines", "list", "--data-dir", str(PRESENT)]) == 0
 
 
