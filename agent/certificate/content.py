@@ -16,13 +16,13 @@ from agent.calibrate.origin import SourceFile, source_file
 from agent.certificate.provenance import graph
 from agent.certificate.statements import Decision, Statements
 from agent.core.events import CalibrationUpdate
-from agent.reading.units import unit_name
 from agent.report.material import Material, MaterialError
 from agent.report.result import CalibrationResult, plain
 from agent.report.trace import Residuals
 from agent.report.units import reference_name
 from calib.distributions import NORMAL
 from calib.model import PARAMETERS, Array
+from calib.recorded.units import unit_name
 
 COVERAGE_PROBABILITY = NORMAL.cdf(2.0) - NORMAL.cdf(-2.0)  # 95.45 %, for which `coverage_factor` gives k
 MAIN = [0, 4, 8]

@@ -72,9 +72,9 @@ def _status(material: Material) -> int:
 
 def _name_unit(material: Material, unit: str | None) -> None:
     """Set the unit of results that do not state it. Raises MaterialError if the results have several units."""
-    from agent.reading.units import unit_name
     from agent.report.material import MaterialError
     from agent.report.units import output_unit
+    from calib.recorded.units import unit_name
 
     if unit is not None:
         named = unit_name(unit) or unit

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from agent.reading.source import Array, TableError
-from agent.reading.units import unit_of
+from calib.recorded.units import unit_of
 
 HEAD_BYTES = 1 << 16  # the table must begin in these
 SAMPLE_ROWS = 50  # rows from which the dialect is found

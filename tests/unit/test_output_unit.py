@@ -174,3 +174,16 @@ def test_a_reference_of_velocity_is_a_vibrometer(tmp_path: Path) -> None:
 def test_a_reference_of_acceleration_is_an_accelerometer(tmp_path: Path) -> None:
     result, _ = calibrated(tmp_path, *files(tmp_path, ("X [mV]", "Y [mV]", "Z [mV]")))
     assert reference_of(certificate(tmp_path, result, output_unit="")).startswith("reference accelerometer: PCB ")
+
+
+def test_warnings_are_in_report_and_certificate_before_the_results(tmp_path: Path) -> None:
+    result, told = calibrated(tmp_path, *files(tmp_path, ("X [mV]", "Y [mV]", "Z [mV]")))
+    result.write_text(json.dumps(told | {"warnings": ["det S is negative"]}))
+    page = report(result)
+    assert "Warning det S is negative" in page
+    assert page.index("det S is negative") < page.index("S in mV/(m/s²)")
+    found = certificate(tmp_path, result, output_unit="")
+    first = next(before_results(found, ""))
+    assert (first.heading, list(first.rows)) == ("Warnings", [("warning", "det S is negative")])
+    assert as_object(found)["result"]["warnings"] == ["det S is negative"]
+    assert "det S is negative" in dcc(found, Signer(None, "")).decode()
