@@ -168,6 +168,7 @@ def _chosen_rows(columns: Mapping[Any, Any], chosen: Sequence[Chosen], scale: Ar
         raise InputError(problem, "rename the column", place=place, column=str(chosen[0].column))
     by_name = {str(name): values for name, values in columns.items()}
     named = [(each.column.name, by_name[each.column.name]) for each in chosen]
+    named[0] = (named[0][0], _times(named[0][1]))
     rows = _rows(named, place, None if time is None else time.si)
     rows[:, 1:] *= scale
     return rows
@@ -206,7 +207,7 @@ def _numbers(values: Any, place: str, column: str) -> Array:
         problem = f"it has the shape {found.shape}"
         raise InputError(problem, "give one value for each sample", place=place, column=column)
     if found.dtype.kind == "M":
-        return np.where(np.isnat(found), np.nan, found.astype("datetime64[ns]").astype(np.int64) * NS)
+        return _seconds(found)
     if found.dtype.kind == "m":
         return np.where(np.isnat(found), np.nan, found.astype("timedelta64[ns]").astype(np.int64) * NS)
     try:
@@ -219,6 +220,23 @@ def _numbers(values: Any, place: str, column: str) -> Array:
         f"{found[row]!r} is no number", "correct the value, or remove the row; give dates as datetime64", place=place,
         row=row, column=column, value=found[row],
     )  # fmt: skip
+
+
+def _seconds(dates: np.ndarray[Any, Any]) -> Array:
+    """Dates (n,) as seconds since 1970, UTC."""
+    ns = dates.astype("datetime64[ns]").astype(np.int64)
+    return np.where(np.isnat(dates), np.nan, ns // 10**9 + (ns % 10**9) * NS)
+
+
+def _times(values: Any) -> Any:
+    """Dates that are still text (ISO 8601, without a zone in UTC) as datetime64; anything else as it is."""
+    found = _filled(values)
+    if found.dtype.kind not in "OUT" or not len(found) or _is_number(found[0]):
+        return values
+    try:
+        return np.array([str(text).removesuffix("Z").strip() for text in found.tolist()], dtype="datetime64[ns]")
+    except ValueError:
+        return values
 
 
 def _is_number(value: Any) -> bool:

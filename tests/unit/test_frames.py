@@ -19,6 +19,7 @@ from tests.unit.test_output_unit import calibrated, files
 from tests.unit.test_reading_csv import DATED, SENSORS, VALUES, written
 
 pandas = pytest.importorskip("pandas", reason="the test of DataFrames needs pandas")
+TEXTS = ("ISO 8601", "ISO 8601 with Z")
 PLAIN = ("plain", "units in the names", "suffixes", "many other columns", "names without a meaning", "an index before",
          "s since 1970", "ms since 1970", "us since 1970", "ns since 1970")  # fmt: skip
 
@@ -93,6 +94,16 @@ def test_dates_with_a_zone_are_times() -> None:
     )
     np.testing.assert_array_equal(zoned, naive)
     np.testing.assert_allclose(naive - 1e9, SENSOR["time_s"], atol=3e-7)
+
+
+@pytest.mark.parametrize("kind", TEXTS)
+def test_dates_as_text_and_as_dates_are_those_of_the_csv(tmp_path: Path, kind: str) -> None:
+    text = DATED[kind].replace("vx,vy,vz", "X,Y,Z")
+    of_file = read_sensor(written(tmp_path, text)).time_s[:]
+    as_text = pandas.read_csv(io.StringIO(text))
+    as_dates = as_text.assign(**{as_text.columns[0]: pandas.to_datetime(as_text.iloc[:, 0])})
+    for frame in (as_text, as_dates):
+        np.testing.assert_array_equal(sensor_table(frame).time_s[:], of_file)
 
 
 def test_our_own_names_need_no_guess() -> None:
