@@ -70,6 +70,13 @@ def rows(found: Certificate) -> dict[str, str]:
     return {name: f"{value} {unit}" for name, value, unit, *_ in parameters(found)}
 
 
+def first(told: dict[str, Any], factor: float) -> str:
+    """S xx with its U in another unit."""
+    return "{:.4f} ± {:.4f}".format(
+        *(factor * part["sensitivity"][0][0] for part in (told, told["expanded_uncertainty"]))
+    )
+
+
 def reference_of(found: Certificate) -> str:
     return next(text for section in before_results(found, "") for name, text in section.rows if name == "reference")
 
@@ -103,7 +110,7 @@ def test_the_unit_is_in_table_report_and_certificate(tmp_path: Path, capsys: pyt
     assert "  S in mV per m/s², Q in mV, U with k = 2" in capsys.readouterr().out
     assert "S in mV/(m/s²), Q in mV. After ±" in report(result)
     found = certificate(tmp_path, result, output_unit="")
-    assert rows(found)["S xx"] == f"{told['sensitivity'][0][0]:.4f} ± 0.0084 mV/(m/s²)"
+    assert rows(found)["S xx"] == f"{first(told, 1.0)} mV/(m/s²)"
     assert rows(found)["Q x"].endswith(" mV")
     assert as_object(found)["result"]["output_unit"] == "mV"
     assert r"\milli\volt\metre\tothe{-1}" in dcc(found, Signer(None, "")).decode()
@@ -148,7 +155,7 @@ def test_an_output_in_g_is_shown_in_g_per_g_and_mg(
     np.testing.assert_allclose(np.diag(told["sensitivity"]), np.array(MAIN) * one_g / G_MPS2, rtol=0.01)
     assert "S in g/g, Q in mg. After ±" in report(result)
     found = certificate(tmp_path, result, output_unit="")
-    assert rows(found)["S xx"] == f"{told['sensitivity'][0][0] * G_MPS2 / one_g:.4f} ± 0.0084 g/g"
+    assert rows(found)["S xx"] == f"{first(told, G_MPS2 / one_g)} g/g"
     assert re.fullmatch(r"\d\d\.\d ± \d\.\d mg", rows(found)["Q x"])
     xml = dcc(found, Signer(None, ""))
     assert f"numbers in {unit}: {one_g:g} is 9.80665 m/s²" in xml.decode()
