@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 
 KNOWN_BEFORE = "*"  # marks a parameter that a nominal value or a prior tells rather than the data
 
@@ -15,6 +16,20 @@ def plus_minus(value: float | None, expanded: float | None) -> str:
         return f"{value:.6g} ± ?"
     decimals = max(0, 1 - math.floor(math.log10(expanded)))
     return f"{value:.{decimals}f} ± {expanded:.{decimals}f}"
+
+
+def rounded(value: float) -> str:
+    """The value with two digits that count: 330, 0.017."""
+    return f"{float(f'{value:.2g}'):g}"
+
+
+def aligned(rows: Sequence[Sequence[str]], words: Sequence[int] = (0,)) -> Iterator[str]:
+    """The rows of a table, each as one line. Columns of `words` begin together, the others end together."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        cells = zip(row, widths, strict=True)
+        told = [cell.ljust(width) if k in words else cell.rjust(width) for k, (cell, width) in enumerate(cells)]
+        yield "  ".join(told).rstrip()
 
 
 def from_to(low: float, high: float) -> str:

@@ -16,6 +16,7 @@ from agent.bench.stops import GRAVITY, Stop, on_clamp, on_faces, turned_by_hand
 from agent.config import Channel
 from calib.estimate.quantities import PRIORS, REFERENCE, YEAR_DAYS
 from calib.geometry import beside
+from calib.recorded.units import unit_name
 
 Kind = Literal["clamp", "triad", "gravity"]
 
@@ -49,12 +50,17 @@ def mounted(channel: Channel) -> Stop:
     return Stop("", channel.sensor, pose, dict(zip(GRAVITY, up.tolist(), strict=True)), np.zeros(3))
 
 
-def stated(channel: Channel, directory: Path) -> list[str]:
-    """The options of `fieldcal calibrate` that state what the configuration states, with files of `directory`."""
+def stated(channel: Channel, directory: Path, unit: str) -> list[str]:
+    """The options of `fieldcal calibrate` that state what the configuration states, with files of `directory`.
+
+    `unit`: of the sensor's output, as its driver states it.
+    """
     kind = kind_of(channel)
     options = [f"--sensor={directory / 'sensor.csv'}", f"--poses={directory / 'poses.csv'}"]
     options += [f"--prior={directory / 'prior.json'}", f"--coupling={channel.coupling}"]
     options += [f"--gravity={channel.gravity_mps2!r}", f"--static-sign={channel.static_sign:+d}"]
+    if name := unit_name(unit):
+        options.append("--columns=time=time_s," + ",".join(f"{axis}=v{axis}:{name}" for axis in "xyz"))
     if kind != "gravity":
         options.append(f"--reference={directory / 'reference.csv'}")
         options += [f"--sensor-filter={line}" for line in channel.prior.filters]

@@ -18,7 +18,6 @@ from agent.calibrate.station import by_metadata, compared, pose_of_station
 from agent.calibrate.tables import ReferenceFile, SensorFile, read_reference, read_sensor
 from agent.reading.formats import NOT_DESCRIBED, Description
 from agent.reading.source import Progress, TableError
-from agent.reading.units import Sensitivity, sensitivity_of
 from agent.terminal.text import for_drawing, say
 from calib.geometry import U_NOMINAL_GRAVITY_MPS2, u_of_gravity_mps2
 from calib.recorded import calibrating
@@ -27,6 +26,7 @@ from calib.recorded.outcome import Outcome
 from calib.recorded.poses import PoseRow, Poses
 from calib.recorded.table import ends_s
 from calib.recorded.tables import Tables
+from calib.recorded.units import Sensitivity, sensitivity_of
 from calib.signal.instrument import Instrument
 from calib.signal.known_filters import corner_apart
 

@@ -10,8 +10,8 @@ from agent.calibrate.faults import as_table_error
 from agent.reading.delimited import fields_of, number_of
 from agent.reading.dialect import Dialect, dialect_of, lines_of
 from agent.reading.source import TableError
-from agent.reading.units import SUFFIXES
 from calib.recorded.poses import AXIS, SPAN, PoseRow, Poses, columns_of
+from calib.recorded.units import SUFFIXES
 
 
 class PosesFile:

@@ -10,26 +10,23 @@ import numpy as np
 
 from agent.calibrate.faults import as_table_error
 from agent.calibrate.times import Times
-from agent.reading.choice import AXES, Choice, Chosen, quantity_of
 from agent.reading.formats import NOT_DESCRIBED, Description, open_source
 from agent.reading.gravity import told_in_g
 from agent.reading.ground_motion import GroundMotion
 from agent.reading.source import Array, Progress, Source, TableError
 from agent.reading.spool import Spool, Spooled
 from agent.reading.stationxml import Component
-from agent.reading.units import Sensitivity, unit_of
+from calib.recorded.choice import Choice, Chosen
+from calib.recorded.columns import reference_columns, sensor_columns, si_of
+from calib.recorded.output_unit import common
 from calib.recorded.table import (
-    REFERENCES,
-    SENSOR,
     ReferenceTable,
     SensorTable,
     check_count,
     check_time,
     make_whole,
 )
-
-TEMPERATURE = "temperature_degc"
-ELECTRICAL = ("indication", "count")
+from calib.recorded.units import Sensitivity, unit_name
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,16 +55,17 @@ def read_sensor(
 
     `columns` is the option --columns.
     """
-    with open_source(path, described, "sensor") as source:
+    with as_table_error(), open_source(path, described, "sensor") as source:
         choice = Choice(source, columns, "--columns")
-        chosen = choice.in_one_group(_sensor_columns)
+        chosen = choice.in_one_group(sensor_columns)
         times, values, restart = _rows(source, chosen, progress, np.ones(len(chosen) - 1))
+        unit = common([unit_name(c.unit) for c in chosen[1:4]])
         said, components = _described(source, choice, chosen[1:4])
         said += told_in_g(path, "--columns", chosen[:4], Spooled(values, slice(0, 3)))
         filters = source.filters.get(chosen[1].column.group, ())
     temperature_degc = Spooled(values, 3) if len(chosen) > 4 else None
     v = Spooled(values, slice(0, 3))
-    return SensorFile(str(path), times, v, temperature_degc, said, components, filters, restart)
+    return SensorFile(str(path), times, v, temperature_degc, said, unit, components, filters, restart)
 
 
 def _described(
@@ -76,29 +74,6 @@ def _described(
     """What the user is told, and what the metadata of a station say of the chosen channels."""
     components = source.components if isinstance(source, GroundMotion) else {}
     return (*source.said, *choice.said), tuple(components[c.column] for c in chosen if c.column in components)
-
-
-def _sensor_columns(choice: Choice) -> list[Chosen]:
-    """Columns of time, x, y, z and, where there is one, temperature."""
-    if not choice.is_stated and (found := choice.standard(SENSOR)):
-        return [*found, *(choice.standard([TEMPERATURE]) or [])]
-    roles = {role: choice.stated(role) or choice.guessed(role) for role in ("time", *AXES)}
-    known = {role: column for role, column in roles.items() if column}
-    rest = choice.rest(list(known.values()))
-    if "time" in known and len(known) == 1 and len(rest) == len(AXES):
-        known |= dict(zip(AXES, rest, strict=True))
-    if not known and len(rest) == 4 and all(c.column.name.isdigit() for c in rest):
-        known = dict(zip(("time", *AXES), rest, strict=True))
-    missing = [role for role in ("time", *AXES) if role not in known]
-    if missing:
-        names = dict(zip(("time", *AXES), SENSOR, strict=True))
-        raise choice.fault(f"column {', '.join(names[role] for role in missing)} is missing")
-    temperature = choice.stated("temperature") or choice.guessed("temperature")
-    if temperature and temperature.column.group == known["time"].column.group:
-        known["temperature"] = temperature
-    if not choice.is_stated:
-        choice.say(known)
-    return list(known.values())
 
 
 def read_reference(
@@ -112,10 +87,10 @@ def read_reference(
 
     `columns` is the option --reference-columns, `metadata` a StationXML.
     """
-    with open_source(path, described, "reference") as source:
+    with as_table_error(), open_source(path, described, "reference") as source:
         choice = Choice(source, columns, "--reference-columns")
-        chosen, quantity = choice.in_one_group(lambda choice: _reference_columns(choice, sensitivity))
-        scale = np.array([_si(choice, c, sensitivity) for c in chosen[1:]])
+        chosen, quantity = choice.in_one_group(lambda choice: reference_columns(choice, sensitivity))
+        scale = np.array([si_of(choice, c, sensitivity) for c in chosen[1:]])
         times, values, restart = _rows(source, chosen, progress, scale)
         if restart:
             raise TableError(f"{restart}; a reference needs one clock: cut the file there")
@@ -126,61 +101,6 @@ def read_reference(
     channels = Spooled(values, slice(None))
     stated = sensitivity is not None or all(c.unit for c in chosen[1:])
     return ReferenceFile(str(path), times, channels, quantity, column, header, said, stated, components, filters)
-
-
-def _reference_columns(choice: Choice, sensitivity: Sensitivity | None) -> tuple[list[Chosen], str]:
-    """Columns of time and of one or three channels, and their quantity."""
-    if not choice.is_stated:
-        found = {names: choice.standard(("time_s", *names)) for names in REFERENCES}
-        there = [(names, columns) for names, columns in found.items() if columns]
-        if len(there) > 1:
-            raise choice.fault(f"expected exactly one of {' | '.join(','.join(names) for names, _ in there)}")
-        if there:
-            names, columns = there[0]
-            return columns or [], sensitivity.quantity if sensitivity else REFERENCES[names]
-    time = choice.stated("time") or choice.guessed("time")
-    letters = {letter: choice.stated(letter) for letter in "avd"}
-    one = [(letter, column) for letter, column in letters.items() if column]
-    three = [choice.stated(axis) for axis in AXES]
-    if not one and not any(three):
-        three = [choice.guessed(axis) for axis in AXES]
-    given = [column for column in three if column]
-    if not one and not given and time:
-        given = choice.rest([time])
-    if not time or len(one) + len(given) not in (1, 3) or (one and given):
-        raise choice.fault("expected exactly one of time and one channel, or time and x, y and z,")
-    channels = [column for _, column in one] or given
-    quantity = {"a": "acceleration", "v": "velocity", "d": "displacement"}[one[0][0]] if one else None
-    quantity = (sensitivity.quantity if sensitivity else None) or quantity or quantity_of(channels[0])
-    if quantity is None and len(channels) == 3:
-        quantity = "acceleration"
-    if quantity is None and not _is_electrical(channels[0]):
-        raise choice.fault(f"neither name nor unit tells what {str(channels[0].column)!r} is, add its unit")
-    if not choice.is_stated:
-        choice.say({"time": time} | {f"{k}": c for k, c in zip(AXES, channels, strict=False)})
-    return [time, *channels], quantity or "acceleration"
-
-
-def _is_electrical(chosen: Chosen) -> bool:
-    unit = unit_of(chosen.unit) if chosen.unit else None
-    return unit is not None and unit.quantity in ELECTRICAL
-
-
-def _si(choice: Choice, chosen: Chosen, sensitivity: Sensitivity | None) -> float:
-    """What one unit of the column is in SI units."""
-    unit = unit_of(chosen.unit) if chosen.unit else None
-    if sensitivity is None:
-        if unit is not None and unit.quantity in ELECTRICAL:
-            raise choice.fault(f"column {str(chosen.column)!r} is in {chosen.unit}, so --sensitivity is needed, "
-                               "for example --sensitivity '100 mV/g'")  # fmt: skip
-        return 1.0 if unit is None else unit.si
-    if unit is not None and unit.quantity not in ELECTRICAL:
-        raise choice.fault(f"column {str(chosen.column)!r} is in {chosen.unit} already; remove --sensitivity")
-    if not sensitivity.indication:
-        return sensitivity.per / sensitivity.value
-    if unit is not None and unit.quantity != sensitivity.indication:
-        raise choice.fault(f"--sensitivity is not for {chosen.unit}, the unit of column {str(chosen.column)!r}")
-    return (1.0 if unit is None else unit.si) * sensitivity.per / sensitivity.value
 
 
 def _rows(

@@ -7,10 +7,10 @@ import re
 
 import numpy as np
 
-from agent.reading.choice import Chosen, words
 from agent.reading.source import Array, Source, TableError
-from agent.reading.units import unit_of
+from calib.recorded.choice import Chosen, words
 from calib.recorded.table import LATEST_STAMP_S, second_of
+from calib.recorded.units import unit_of
 
 DAY_S = 86400.0
 # Days since 1899-12-30 (Excel) and since the year 0 (MATLAB's datenum), which a time without unit may count: those of

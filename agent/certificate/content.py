@@ -19,8 +19,10 @@ from agent.core.events import CalibrationUpdate
 from agent.report.material import Material, MaterialError
 from agent.report.result import CalibrationResult, plain
 from agent.report.trace import Residuals
+from agent.report.units import reference_name
 from calib.distributions import NORMAL
 from calib.model import PARAMETERS, Array
+from calib.recorded.units import unit_name
 
 COVERAGE_PROBABILITY = NORMAL.cdf(2.0) - NORMAL.cdf(-2.0)  # 95.45 %, for which `coverage_factor` gives k
 MAIN = [0, 4, 8]
@@ -85,9 +87,10 @@ def certificate_of(material: Material, stated: Statements, beside: Path, seen: I
     """The certificate of the first result. `beside`: directory of certificate.toml. Raises CertificateError and
     MaterialError."""
     result = material.results[0]
-    result = replace(result, unit=_unit(result.unit, stated.instrument.output_unit))
-    residuals, levels = tuple(seen), _levels(material)
     source = material.files[0].path if material.files else "the input"
+    result = replace(result, unit=_unit(result.unit, stated.instrument.output_unit, source))
+    stated = _named(stated, result.fields.get("reference_quantity"))
+    residuals, levels = tuple(seen), _levels(material)
     known = np.isfinite(result.values) & np.isfinite(result.expanded_uncertainty)
     if not any(np.isfinite(result.covariance[k][known]).all() for k in np.flatnonzero(known)):
         raise MaterialError(
@@ -99,7 +102,7 @@ def certificate_of(material: Material, stated: Statements, beside: Path, seen: I
         temperature_degc=_temperature(stated, material.history), frequency_hz=_frequencies(residuals),
         levels_mps2=(min(levels), max(levels)) if levels else None,
         positions=tuple(dict.fromkeys(w.position for w in result.windows if w.used and w.position)),
-        relative_pct=_relative(result), verdicts=_verdicts(result, stated.decision),
+        relative_pct=_relative(result), verdicts=_verdicts(result.shown, stated.decision),
         history=tuple(material.history), seen=residuals,
     )  # fmt: skip
     if found.number:
@@ -115,7 +118,8 @@ def as_object(certificate: Certificate) -> dict[str, Any]:
     measured = plain(
         {name: told.get(name) for name in
          ("sensitivity", "offset", "standard_uncertainty", "expanded_uncertainty", "covariance", "determined",
-          "response", "budget", "lag_s", "frame", "method", "uncertainty_kind", "identity", "shared_errors")}
+          "response", "budget", "warnings", "reference_quantity", "lag_s", "frame", "method", "uncertainty_kind",
+          "identity", "shared_errors")}
         | {"parameters": PARAMETERS, "output_unit": result.unit, "degrees_of_freedom": result.degrees_of_freedom,
            "coverage_probability": COVERAGE_PROBABILITY, "expanded_uncertainty_pct": c.relative_pct}
     )  # fmt: skip
@@ -149,16 +153,25 @@ def as_object(certificate: Certificate) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _unit(told: str, stated: str) -> str:
-    if told and stated and told != stated:
+def _unit(told: str, stated: str, source: str) -> str:
+    """The output unit: of the result, or as it is stated. Raises CertificateError where the two contradict."""
+    named = unit_name(stated) or stated
+    if told and stated and (unit_name(told) or told) != named:
         raise CertificateError(
-            f"instrument.output_unit: the result is in {told}, not in {stated}; correct it, or leave it out"
+            f"instrument.output_unit: {stated!r}, but the indications in {source} are in {told!r}; "
+            f"write {told!r}, or leave the line out"
         )
     if not told and not stated:
         raise CertificateError(
             "instrument.output_unit: is missing, and the result does not state it; add it, for example mV or count"
         )
-    return told or stated
+    return told or named
+
+
+def _named(stated: Statements, quantity: object) -> Statements:
+    """The statements with a name of the reference, by what it gives, where none is stated."""
+    named = stated.reference.name or reference_name(quantity)
+    return stated.model_copy(update={"reference": stated.reference.model_copy(update={"name": named})})
 
 
 def _reference_file(name: str, beside: Path) -> SourceFile | None:
@@ -208,12 +221,12 @@ def _relative(result: CalibrationResult) -> Array:
     return np.append(100.0 * result.expanded_uncertainty[:9] / main, np.full(3, np.nan))
 
 
-def _verdicts(result: CalibrationResult, decision: Decision | None) -> tuple[Verdict, ...]:
+def _verdicts(shown: CalibrationResult, decision: Decision | None) -> tuple[Verdict, ...]:
     if decision is None:
         return ()
     found = []
     for k in MAIN:
-        value, expanded = result.values[k], result.expanded_uncertainty[k]
+        value, expanded = shown.values[k], shown.expanded_uncertainty[k]
         deviation, U = 100.0 * (value / decision.nominal - 1.0), 100.0 * expanded / decision.nominal
         guard = U if decision.rule == "guard band" else 0.0
         conforms = bool(abs(deviation) + guard <= decision.limit_pct)  # NaN, for what is not known, does not conform

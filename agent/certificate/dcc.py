@@ -20,6 +20,7 @@ from agent.config.earlier import COVARIANCE, DCC, PARAMETER_LIST, SI
 from agent.report.units import output_unit
 from agent.terminal.text import one_line
 from calib.model import PARAMETERS, Array
+from calib.recorded.output_unit import G_IN
 
 VERSION = "3.2.1"
 LANGUAGE = "en"
@@ -28,6 +29,10 @@ PER_MPS2 = r"\metre\tothe{-1}\second\tothe{2}"
 UNITS = {
     "m/s²": r"\metre\second\tothe{-2}", "V": r"\volt", "mV": r"\milli\volt", "uV": r"\micro\volt", "µV": r"\micro\volt",
     "count": r"\one", "A": r"\ampere", "mA": r"\milli\ampere", "C": r"\coulomb", "pC": r"\pico\coulomb",
+    "mm/s²": r"\milli\metre\second\tothe{-2}", "cm/s²": r"\centi\metre\second\tothe{-2}",
+    "m/s": r"\metre\second\tothe{-1}", "cm/s": r"\centi\metre\second\tothe{-1}",
+    "mm/s": r"\milli\metre\second\tothe{-1}", "m": r"\metre", "mm": r"\milli\metre", "µm": r"\micro\metre",
+    **dict.fromkeys(G_IN, r"\one"),  # D-SI has no g: the indication is a number, and a statement says what of
 }  # fmt: skip
 _CLOSING = b"</dcc:digitalCalibrationCertificate>"
 
@@ -79,11 +84,21 @@ def _administrative(data: ET.Element, c: Certificate) -> None:
     _contact(_add(data, "customer"), s.customer)
     statements = _add(data, "statements")
     for name, text in (("title", s.title), ("accreditation", c.statement), ("place", s.place.description),
+                       *(("warning", warning) for warning in c.result.warnings), *_output_in_g(c.result.unit),
                        *(("remark", remark) for remark in s.remarks)):  # fmt: skip
         statement = _add(statements, "statement")
         _texts(statement, "name", name)
         _texts(statement, "declaration", text)
     _conformity(statements, c)
+
+
+def _output_in_g(unit: str) -> list[tuple[str, str]]:
+    """What the numbers of an output in g are, which D-SI cannot say."""
+    one_g = G_IN.get(output_unit(unit))
+    if one_g is None:
+        return []
+    told = f"the indications V and the offsets Q are numbers in {output_unit(unit)}: {one_g:g} is 9.80665 m/s²"
+    return [("output unit", told)]
 
 
 def _conformity(statements: ET.Element, c: Certificate) -> None:
@@ -241,7 +256,7 @@ def _unit(told: str, k: int) -> str:
         return UNITS[unit]
     if unit == "m/s²":
         return r"\one"
-    return PER_MPS2 if unit == "count" else UNITS[unit] + PER_MPS2
+    return PER_MPS2 if UNITS[unit] == r"\one" else UNITS[unit] + PER_MPS2
 
 
 def _result(listed: ET.Element, name: str, kind: str) -> ET.Element:

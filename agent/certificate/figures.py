@@ -45,7 +45,7 @@ def figure(c: Certificate, height_in: float, draw: Draw) -> Figure:
 
 
 def _main(on: FigureBase, c: Certificate) -> None:
-    result = c.result
+    result = c.result.shown
     subplots = on.subplots(3, 1)
     for k, axes in enumerate(subplots):
         value, U = result.values[MAIN[k]], result.expanded_uncertainty[MAIN[k]]

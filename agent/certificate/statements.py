@@ -77,9 +77,12 @@ class Item(Section):
 
 
 class Reference(Section):
-    """The reference with its own certificate. `certificate_file` is found beside certificate.toml, and is hashed."""
+    """The reference with its own certificate. `certificate_file` is found beside certificate.toml, and is hashed.
 
-    name: Line = "reference accelerometer"
+    `name`: left out, it is called by what it gives: reference accelerometer, or vibrometer where it gives a velocity.
+    """
+
+    name: Optional = ""
     manufacturer: Line
     model: Line
     serial_number: Line

@@ -16,6 +16,10 @@ from agent.setup.asking import Asking
 from agent.setup.toml import toml_value
 
 OPTION = "--state"
+WITHOUT_FILE = (
+    "--stated certificate.toml is missing: the file with what only people know; copy examples/certificate.toml, which "
+    f"is complete, and change it, or state each entry with {OPTION}:"
+)
 
 
 def gather_statements(path: Path | None, entries: Sequence[str], asking: Asking) -> tuple[Statements, str]:
@@ -39,7 +43,7 @@ def gather_statements(path: Path | None, entries: Sequence[str], asking: Asking)
         told = asking.value(f"{OPTION} {name}=...", None, f"{name} (docs/certificate.md)", default)
         _put(raw, place, told.value)
     if asking.faults:
-        raise ConfigError(asking.faults)
+        raise ConfigError(asking.faults if path or entries else [WITHOUT_FILE, *asking.faults])
     return check_model(raw, Statements, OPTION if path is None else f"{path} with {OPTION}"), _text(raw)
 
 

@@ -11,8 +11,9 @@ from agent import __version__
 from agent.calibrate.origin import SourceFile
 from agent.certificate.content import COVERAGE_PROBABILITY, EQUATION, Certificate
 from agent.report.tables import number
-from agent.report.units import ACCELERATION, output_unit, position_name, sensitivity_unit
+from agent.report.units import offset_unit, position_name, sensitivity_unit
 from calib.model import PARAMETERS
+from calib.recorded.output_unit import ACCELERATION
 from calib.rounding import plus_minus
 
 Rows = Sequence[tuple[str, str]]
@@ -31,6 +32,8 @@ class Section:
 def before_results(c: Certificate, signature: str) -> Iterator[Section]:
     """All that stands before the results."""
     s = c.stated
+    if c.result.warnings:
+        yield Section("Warnings", [("warning", warning) for warning in c.result.warnings])
     role = f", {s.operator.role}" if s.operator.role else ""
     yield Section("Certificate", [
         ("number", c.number),
@@ -70,7 +73,8 @@ def after_results(c: Certificate) -> Iterator[Section]:
     decision = c.stated.decision
     if decision is not None:
         U = "deviation and U together are" if decision.rule == "guard band" else "the deviation is"
-        limit = f"at most {decision.limit_pct:g} % of {decision.nominal:g}"
+        unit = sensitivity_unit(c.result.unit)
+        limit = f"at most {decision.limit_pct:g} % of {decision.nominal:g}{'' if unit == '1' else f' {unit}'}"
         yield Section("Conformity", [("decision rule", f"{decision.rule}: {U} {limit}"), *[
             (v.parameter, f"deviation {v.deviation_pct:+.2f} %, U {v.expanded_uncertainty_pct:.2f} %: "
                           f"{'conforms' if v.conforms else 'does not conform'}")
@@ -89,8 +93,8 @@ def after_results(c: Certificate) -> Iterator[Section]:
 
 def parameters(c: Certificate) -> list[tuple[str, ...]]:
     """A row for each parameter, under HEADS."""
-    result = c.result
-    units = [sensitivity_unit(result.unit)] * 9 + [output_unit(result.unit)] * 3
+    result = c.result.shown
+    units = [sensitivity_unit(result.unit)] * 9 + [offset_unit(result.unit)] * 3
     return [
         (
             f"{name[0]} {name[1:]}",

@@ -17,6 +17,7 @@ from agent.audit.engines import Engines
 from agent.audit.parallel import for_each
 from agent.audit.replaying import Replayer
 from agent.audit.replaying import link as link_replays
+from agent.cli.data_dir import DATA_DIR, files_or
 from agent.cli.engine_options import ENGINES, JOBS, TRUST_ENGINE, engines_for
 from agent.cli.given import Given, add_witnessed, read_head, recordings_of
 from agent.cli.kernels import compute_as_in
@@ -41,7 +42,8 @@ OPEN_AFTER_CRASH = (
 
 
 @click.command()
-@click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="FILE.mcap...")
+@click.argument("files", nargs=-1, type=click.Path(path_type=Path), metavar="[FILE.mcap...]")
+@DATA_DIR
 @click.option(
     "--public-key", metavar="K", type=click.Path(path_type=Path), help="Require signatures by this key (PEM)."
 )
@@ -67,6 +69,7 @@ OPEN_AFTER_CRASH = (
 @click.option("--json", "json_to", type=click.Choice(["-"]), help="Print one JSON object on standard output.")
 def audit(
     files: tuple[Path, ...],
+    data_dir: Path | None,
     public_key: Path | None,
     known_keys: Path | None,
     heads: tuple[Path, ...],
@@ -79,7 +82,7 @@ def audit(
 ) -> int:
     """Check recordings: every byte, whether results follow from the data, whether a file is missing.
 
-    Give a data directory instead of files to check all its recordings; then no recording may be missing. Exit status: 0
+    With --data-dir all recordings of the directory are checked, and none may be missing. Exit status: 0
     all passed, 3 a check failed, 4 not decided here because another engine made the results, 2 a file cannot be read.
     The end of the output says what cannot be proven.
     """
@@ -88,6 +91,7 @@ def audit(
     from agent.recording.signed_text import SignedTextError
     from agent.recording.witness import WitnessError
 
+    files = files_or(data_dir, files, "FILE.mcap")
     try:
         keys = _known(public_key, known_keys)
         given = recordings_of(files)

@@ -175,7 +175,7 @@ def _led(
             channel = with_filters(channel, capture)
             output.mkdir(parents=True)
             scale = write_prior(channel, info.get("nominal_sensitivity"), output / "prior.json")
-            arguments = [*stated(channel, output), f"--json={output / 'result.json'}"]
+            arguments = [*stated(channel, output, info.get("unit", "")), f"--json={output / 'result.json'}"]
             told = parsed(arguments)
             measuring = Measuring(channel, options_of(told))
             session = _begun(stops, measuring, wanted, scale, capture)

@@ -11,7 +11,7 @@ import click
 
 from agent.calibrate.calibrating import calibrated
 from agent.calibrate.origin import origin
-from agent.calibrate.printing import print_outcome
+from agent.calibrate.printing import print_outcome, print_warnings
 from agent.calibrate.station import differences, write_proposed
 from agent.cli.finite import Finite
 from agent.reading.dates import ORDERS
@@ -108,12 +108,13 @@ def _u(name: str, told: str) -> Callable[[Any], Any]:
     type=Finite(min=0, min_open=True),
     help="The frequency at which S holds. Default: the geometric middle of the motion's band.",
 )
+@click.option("--all", "everything", is_flag=True, help="Print the nuisances too: lag, angles, response and others.")
 @click.option("--plain", is_flag=True, help="Method 3 exactly as in the paper, without nuisances.")
 @click.option(
     "--json", "json_to", type=click.Path(path_type=Path, allow_dash=True, dir_okay=False, writable=True),
     help="Write one JSON object to this file; -: print it, and nothing else, on standard output.",
 )  # fmt: skip
-def calibrate(**options: Any) -> int:
+def calibrate(*, everything: bool, **options: Any) -> int:
     """Calibrate from files: sensor.csv, reference.csv, poses.csv.
 
     Exit status 0 if the calibration is valid, 2 on bad input, 3 if the data are refused. The reasons are printed.
@@ -136,8 +137,10 @@ def calibrate(**options: Any) -> int:
                 file.write(told + "\n")
         except OSError as error:
             raise click.BadParameter(f"{json_to}: {error.strerror}", param_hint="--json") from None
-    if json_to != Path("-"):
-        print_outcome(outcome)
+    if json_to == Path("-"):
+        print_warnings(outcome.warnings, err=True)
+    else:
+        print_outcome(outcome, everything=everything)
     for reason in outcome.reasons:
         say(f"refused: {reason}", err=True)
     return 3 if outcome.reasons else 0

@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from agent.cli.data_dir import DATA_DIR, files_or
 from agent.config.key_file import KeyFileError, load_private_key
 from agent.config.reading import ConfigError
 from agent.terminal.text import say
@@ -16,11 +17,12 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
 
 
 @click.command()
-@click.argument("inputs", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="INPUT...")
+@click.argument("inputs", nargs=-1, type=click.Path(path_type=Path), metavar="[INPUT...]")
 @click.option("--stated", type=_FILE, metavar="certificate.toml",
               help="What only people know: organisation, customer, serial numbers, dates.")  # fmt: skip
 @click.option("--state", "entries", multiple=True, metavar="ENTRY=VALUE",
               help="One of these statements, as customer.city=Pescara; repeat it for more.")  # fmt: skip
+@DATA_DIR
 @click.option("-o", "--output", type=click.Path(path_type=Path, file_okay=False), required=True, metavar="DIR",
               help="Directory for certificate.pdf, .html, .xml and .json.")  # fmt: skip
 @click.option("--key", type=_FILE, help="Ed25519 private key (PEM) that signs the certificate.")
@@ -28,18 +30,19 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
 @click.option("--x509-certificate", type=_FILE, help="Its X.509 certificate (PEM), then those of the authorities.")
 @click.option("--xsd", type=_FILE, help="dcc.xsd of PTB, with SI_Format.xsd beside it: the XML is checked against it.")
 @click.option("--sensor", metavar="NAME", help="The sensor, if the input has several.")
-def certificate(inputs: tuple[Path, ...], output: Path, **options: Any) -> int:
+def certificate(inputs: tuple[Path, ...], data_dir: Path | None, output: Path, **options: Any) -> int:
     """Make a calibration certificate.
 
-    INPUT is RESULT.json of `fieldcal calibrate --json RESULT.json`, a recording (several of one sensor are read one
-    after the other), or the data directory of an agent: its calibration in force.
+    --stated names the file with what only people know, such as examples/certificate.toml; docs/certificate.md explains
+    each entry. Entries that are in neither --stated nor --state are asked on a terminal. What is not only in a file is
+    kept in DIR/certificate.toml: give it as --stated the next time.
 
-    Statements that are in neither --stated nor --state are asked on a terminal. What is not only in a file is kept in
-    DIR/certificate.toml: give it as --stated the next time.
+    INPUT is RESULT.json of `fieldcal calibrate --json RESULT.json`, or a recording (several of one sensor are read one
+    after the other). Of --data-dir the calibration in force is certified.
 
     Exit status 3 if the data were refused: then there is no certificate. 2 if the input cannot be used.
     """
-    return make(inputs, output, **options)
+    return make(files_or(data_dir, inputs, "INPUT"), output, **options)
 
 
 def make(

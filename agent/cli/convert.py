@@ -9,12 +9,12 @@ import click
 import numpy as np
 
 from agent.calibrate.calibrating import as_arguments, by_driver, reference_of, sensor_of
-from agent.calibrate.tables import TEMPERATURE
 from agent.reading.dates import ORDERS
 from agent.reading.formats import Description
 from agent.reading.source import ROWS_AT_ONCE, TableError
 from agent.terminal.text import say
 from calib.model import Slices
+from calib.recorded.columns import TEMPERATURE
 from calib.recorded.table import REFERENCES, SENSOR
 
 _FILE = click.Path(path_type=Path, dir_okay=False)

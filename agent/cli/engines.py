@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from agent.cli.data_dir import DATA_DIR
 from agent.terminal.text import say
 
 if TYPE_CHECKING:
@@ -29,8 +30,9 @@ def engines() -> None:
 @click.argument(
     "directories", nargs=-1, type=click.Path(path_type=Path, exists=True, file_okay=False), metavar="[DIR...]"
 )
+@DATA_DIR
 @click.option("--json", "json_to", type=click.Choice(["-"]), help="Print one JSON object on standard output.")
-def list_engines(directories: tuple[Path, ...], json_to: str | None) -> int:
+def list_engines(directories: tuple[Path, ...], data_dir: Path | None, json_to: str | None) -> int:
     """List the running engine, the releases that this program knows, and the wheels in DIR or in its `engines`.
 
     Nothing of these wheels is run. One that is no release is run by `fieldcal audit` only if --trust-engine names its
@@ -40,7 +42,9 @@ def list_engines(directories: tuple[Path, ...], json_to: str | None) -> int:
     from agent.engine.known import known_engines, told_of
     from agent.engine.wheel import ENGINES
 
-    places = [inner if (inner := place / ENGINES).is_dir() else place for place in directories]
+    places = [
+        inner if (inner := place / ENGINES).is_dir() else place for place in (*directories, *filter(None, [data_dir]))
+    ]
     files = [told_of(path) for place in places for path in sorted(place.iterdir())[:MOST_LISTED]]
     if json_to:
         known = [release._asdict() for release in known_engines()]

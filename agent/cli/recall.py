@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 import msgspec
 
+from agent.cli.data_dir import DATA_DIR, files_or
 from agent.config.key_file import KeyFileError, load_private_key
 from agent.terminal.text import say
 
@@ -14,7 +15,8 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
 
 
 @click.command()
-@click.argument("paths", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="PATH...")
+@click.argument("paths", nargs=-1, type=click.Path(path_type=Path), metavar="[PATH...]")
+@DATA_DIR
 @click.option("--reference", "serial_number", required=True, metavar="SERIAL", help="Serial number of the reference.")
 @click.option("--new", "new_certificate", type=_FILE, required=True, metavar="CERTIFICATE",
               help="TOML with [certificate], or JSON or DCC of `fieldcal certificate`.")  # fmt: skip
@@ -23,12 +25,13 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
 @click.option("--signing-key", type=_FILE, help="Ed25519 private key (PEM) that signs each file.")
 @click.option("--json", "json_to", type=click.Choice(["-"]), help="Print one JSON object on standard output.")
 def recall(
-    paths: tuple[Path, ...], serial_number: str, new_certificate: Path, output: Path, signing_key: Path | None,
-    json_to: str | None,
+    paths: tuple[Path, ...], data_dir: Path | None, serial_number: str, new_certificate: Path, output: Path,
+    signing_key: Path | None, json_to: str | None,
 ) -> int:  # fmt: skip
     """Say which results rest on a reference, and correct them by its new certificate. Old files stay as they are.
 
-    PATH is the data directory of an agent, a recording, or a JSON of `fieldcal calibrate` or `fieldcal certificate`.
+    PATH is a recording, or a JSON of `fieldcal calibrate` or `fieldcal certificate`. --data-dir names the data
+    directory of an agent; several directories are given as PATH.
 
     Exit status 0 if all results that rest on the reference were corrected, 3 if some cannot be corrected, 2 if an input
     cannot be used.
@@ -38,6 +41,7 @@ def recall(
     from agent.delivery.history import StoreError
     from agent.reading.source import TableError
 
+    paths = files_or(data_dir, paths, "PATH")
     try:
         new = read_reference_certificate(new_certificate)
         if new.serial_number not in ("", serial_number):

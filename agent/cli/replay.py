@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -17,8 +16,12 @@ from agent.audit.replaying import Replayed, ReplayedFile, Replayer, link
 from agent.cli.engine_options import ENGINES, JOBS, TRUST_ENGINE, engines_for
 from agent.cli.kernels import compute_as_in
 from agent.core.events import CalibrationUpdate
-from agent.terminal.text import say
+from agent.terminal.text import one_line, say
+from agent.terminal.wording import calibration_cells
+from calib.recorded.output_unit import shown_in
+from calib.rounding import aligned
 
+HEADS = ("sensor", "result", "windows", "Sxx", "Syy", "Szz", "Qx", "Qy", "Qz", "unit of S", "unit of Q")
 SHOWN = 12  # calibrations shown in the table; `--json` gives all
 
 
@@ -96,21 +99,13 @@ def as_object(replayed: Sequence[Replayed]) -> dict[str, Any]:
 
 
 def _print(replayed: Sequence[Replayed]) -> None:
-    from rich import box
-    from rich.table import Table
-
-    from agent.terminal.console import TextConsole
-
-    console = TextConsole(width=None if sys.stdout.isatty() else 120)
-    table = Table(box=box.SIMPLE, title="Calibrations, with expanded uncertainty")
-    for name in ("sensor", "result", "windows", "Sxx", "Syy", "Szz", "Qx", "Qy", "Qz", "unit"):
-        table.add_column(name, overflow="fold")
     calibrations = [update for one in replayed for update in one.calibrations]
-    for update in calibrations[-SHOWN:]:
-        table.add_row(update.sensor, str(update.sequence), str(update.windows), *_cells(update), update.output_unit)
-    console.print(table)
+    if calibrations:
+        say("calibrations, with expanded uncertainty")
+        for line in aligned([HEADS, *map(_row, calibrations[-SHOWN:])]):
+            say(f"  {line}")
     if len(calibrations) > SHOWN:
-        console.print(f"only the last {SHOWN} of {len(calibrations)} calibrations are shown; --json - has all")
+        say(f"only the last {SHOWN} of {len(calibrations)} calibrations are shown; --json - has all")
     for one in replayed:
         for line in describe(one.file):
             say(line)
@@ -139,7 +134,8 @@ def describe(file: ReplayedFile) -> list[str]:
     return lines
 
 
-def _cells(update: CalibrationUpdate) -> list[str]:
-    values = [update.sensitivity[axis][axis] for axis in range(3)] + update.offset
-    u = [update.standard_uncertainty[i] for i in (0, 4, 8, 9, 10, 11)]
-    return [f"{value:.6g} ± {update.coverage_factor * s:.2g}" for value, s in zip(values, u, strict=True)]
+def _row(update: CalibrationUpdate) -> tuple[str, ...]:
+    rows = calibration_cells(update)
+    cells = (*(rows[i][i] for i in range(3)), *(row[3] for row in rows))
+    shown = shown_in(update.output_unit)
+    return (one_line(update.sensor), str(update.sequence), str(update.windows), *cells, shown.sensitivity, shown.offset)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from agent.cli.data_dir import DATA_DIR, files_or
 from agent.terminal.text import say
 
 if TYPE_CHECKING:
@@ -15,7 +16,8 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("inputs", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="INPUT...")
+@click.argument("inputs", nargs=-1, type=click.Path(path_type=Path), metavar="[INPUT...]")
+@DATA_DIR
 @click.option("-o", "--output", type=click.Path(path_type=Path, file_okay=False), required=True, metavar="DIR",
               help="Directory for report.html, report.json and the figures.")  # fmt: skip
 @click.option(
@@ -26,14 +28,15 @@ if TYPE_CHECKING:
     metavar="NAME",
     help="The sensor to report, if the input has several. For results: the name on the page.",
 )
-def report(inputs: tuple[Path, ...], output: Path, unit: str | None, sensor: str | None) -> int:
+def report(inputs: tuple[Path, ...], data_dir: Path | None, output: Path, unit: str | None, sensor: str | None) -> int:
     """Make figures and one page of a calibration.
 
-    INPUT is RESULT.json of `fieldcal calibrate --json -` (several are compared), a recording (several are read one
-    after the other), or the data directory of an agent: the calibration in force, with its history.
+    INPUT is RESULT.json of `fieldcal calibrate --json -` (several are compared), or a recording (several are read one
+    after the other). Of --data-dir the calibration in force is reported, with its history.
 
     Exit status 3 if the data were refused (the report then shows why), 2 if the input cannot be used.
     """
+    inputs = files_or(data_dir, inputs, "INPUT")
     try:
         import matplotlib  # noqa: F401 - imported to check for it before any other work
     except ImportError:
@@ -71,9 +74,13 @@ def _name_unit(material: Material, unit: str | None) -> None:
     """Set the unit of results that do not state it. Raises MaterialError if the results have several units."""
     from agent.report.material import MaterialError
     from agent.report.units import output_unit
+    from calib.recorded.units import unit_name
 
     if unit is not None:
-        material.results = [replace(r, unit=r.unit or unit) for r in material.results]
-    units = {output_unit(r.unit) for r in material.results} | ({output_unit(unit)} if unit else set())
+        named = unit_name(unit) or unit
+        if told := [r.unit for r in material.results if r.unit and (unit_name(r.unit) or r.unit) != named]:
+            raise MaterialError(f"--unit {unit}: the indications are in {told[0]}; leave --unit out")
+        material.results = [replace(r, unit=r.unit or named) for r in material.results]
+    units = {output_unit(r.unit) for r in material.results}
     if len(units) > 1:
         raise MaterialError(f"all indications in a report must have one unit, but here are {', '.join(sorted(units))}")

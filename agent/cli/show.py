@@ -197,20 +197,14 @@ def _print_sensor(console: TextConsole, sensor: str, held: SensorHistory) -> Non
 
 
 def _print_calibration(console: TextConsole, calibration: CalibrationUpdate) -> None:
-    from rich import box
-    from rich.table import Table
-
     from agent.terminal.wording import calibration_cells, uncertainty_words
+    from calib.recorded.output_unit import shown_in
+    from calib.rounding import aligned
 
-    unit = calibration.output_unit.replace("m/s2", "m/s²")
-    table = Table(box=box.SIMPLE_HEAD)
-    for heading in ("", "Sx", "Sy", "Sz", "Q"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    for axis, cells in zip("xyz", calibration_cells(calibration), strict=True):
-        table.add_row(axis, *cells)
-    console.print(table)
+    rows = [(axis, *cells) for axis, cells in zip("xyz", calibration_cells(calibration), strict=True)]
     for line in (
-        f"S in {unit} per m/s², Q in {unit}, {uncertainty_words(calibration)}",
+        *aligned([("", "Sx", "Sy", "Sz", "Q"), *rows]),
+        f"{shown_in(calibration.output_unit).words}, {uncertainty_words(calibration)}",
         f"method {calibration.method}, {counted(calibration.windows, 'windows')}, {_since(calibration)}",
         f"of {calibration.identity}",
     ):

@@ -152,9 +152,10 @@ def _visit(
     output.mkdir()
     devices = [channel.sensor, channel.reference]
     with Capture(settings, devices) as capture:
-        write_prior(channel, opened(capture, devices).get("nominal_sensitivity"), output / "prior.json")
+        info = opened(capture, devices)
+        write_prior(channel, info.get("nominal_sensitivity"), output / "prior.json")
         channel = with_filters(channel, capture)
-        arguments = [*stated(channel, output), f"--json={output / 'result.json'}"]
+        arguments = [*stated(channel, output, info.get("unit", "")), f"--json={output / 'result.json'}"]
         measuring = Measuring(channel, options_of(parsed(arguments)))
         across = options["u_transverse_pct"]
         wanted = Wanted(options["u_pct"] / 100.0, np.inf if across is None else across / 100.0)

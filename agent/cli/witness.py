@@ -62,9 +62,9 @@ def witness(
 ) -> int:
     """Keep the heads that gateways publish, with the time of this machine, signed with a key of this machine.
 
-    `fieldcal audit DATA --witness DIR` then notices recordings that are missing at the end. Run it on a machine that
-    those who can write on the gateway cannot write on. While the disk is full it says so, and keeps nothing. Without
-    --public-key and --keys it keeps heads of 100 gateways at most.
+    `fieldcal audit --data-dir D --witness DIR` then notices recordings that are missing at the end. Run it on a machine
+    that those who can write on the gateway cannot write on. While the disk is full it says so, and keeps nothing.
+    Without --public-key and --keys it keeps heads of 100 gateways at most.
 
     Exit status: 1 no router or a fault of the disk, 2 bad input.
     """

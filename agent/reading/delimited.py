@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from agent.reading.choice import words
 from agent.reading.dates import UnclearError, day_of, offset_in, order_of, seconds_of
 from agent.reading.dialect import (
     COMMENT,
@@ -35,6 +34,7 @@ from agent.reading.dialect import (
 )
 from agent.reading.lines import blocks, text_of
 from agent.reading.source import Array, Column, Progress, Source, TableError
+from calib.recorded.choice import words
 
 BLOCK_BYTES = 1 << 20  # pyarrow parses blocks of a chunk on all cores
 NEWLINE = ord("\n")

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
-from agent.reading.choice import TIME_WORDS, words
 from agent.reading.dates import day_of, has_clock, has_day, is_moment, offset_in, order_in, order_of, seconds_of
 from agent.reading.lines import Text, text_of
 from agent.reading.source import TableError
-from agent.reading.units import unit_of
+from calib.recorded.choice import TIME_WORDS, words
+from calib.recorded.units import unit_of
 
 SAMPLE_ROWS = 50  # rows from which the dialect is found
 RATES_HZ = 1e-6, 1e8  # of loggers

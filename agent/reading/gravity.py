@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from agent.reading.choice import Chosen
 from agent.reading.source import ROWS_AT_ONCE
-from agent.reading.units import unit_of
 from calib.model import Slices
+from calib.recorded.choice import Chosen
+from calib.recorded.units import unit_of
 
 MEANT = 64  # samples whose mean shows gravity without the motion
 MIDDLE = (0.25, 0.75)

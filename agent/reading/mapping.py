@@ -10,7 +10,7 @@ from pydantic import AfterValidator, Field, RootModel, model_validator
 from agent.config.reading import ConfigError, load_model
 from agent.config.section import Section
 from agent.reading.source import Column, TableError
-from agent.reading.units import UNITS, unit_of
+from calib.recorded.units import UNITS, unit_of
 
 TIMES = ("log_time", "publish_time")  # of the message in the MCAP file
 CHANNELS = ("x", "y", "z", "a", "v", "d")

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.model import Slices
+from calib.recorded.choice import Column as Column
 
 Array = NDArray[np.float64]
 Progress = Callable[[int], Any]  # called with the number of bytes that were just read
@@ -28,23 +29,6 @@ ALWAYS_ALLOWED_BYTES = 1 << 28
 
 class TableError(Exception):
     """The file cannot be used. The message names file, line or row, column, value and remedy."""
-
-
-@dataclass(frozen=True, slots=True)
-class Column:
-    """A column of numbers as the file names it.
-
-    `unit`: as the file states it, "" where it states none. A time that the file gives as a date has the unit "s": it is
-    in seconds since 1970, UTC. `group`: the device, channel group or topic to which the column belongs; "" where the
-    file has no groups.
-    """
-
-    name: str
-    unit: str = ""
-    group: str = ""
-
-    def __str__(self) -> str:
-        return f"{self.group}.{self.name}" if self.group else self.name
 
 
 class Source(ABC):

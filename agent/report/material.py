@@ -162,6 +162,7 @@ def _of(recorded: Recorded, windows: list[WindowVerdict], calibrations: list[Cal
     versions = recorded.starts[-1].versions if recorded.starts else {}
     if calibrations:
         fields = from_update(calibrations[-1], tuple(windows), versions)
+        fields["reference_quantity"] = recorded.reference_quantity
     else:
         reason = recorded.status.reason if recorded.status else "the data hold no calibration"
         refused = [f"window {w.start_s:.1f} to {w.stop_s:.1f} s: {w.reason}" for w in windows if not w.used]

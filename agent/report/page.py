@@ -11,8 +11,9 @@ from agent.report.figures import Drawn
 from agent.report.material import Material
 from agent.report.result import CalibrationResult
 from agent.report.trace import Residuals
-from agent.report.units import ACCELERATION, output_unit, sensitivity_unit
+from agent.report.units import offset_unit, reference_name, sensitivity_unit
 from agent.terminal.text import page_text
+from calib.recorded.output_unit import ACCELERATION
 
 
 def page(material: Material, figures: Sequence[Drawn], seen: Sequence[Residuals]) -> str:
@@ -41,21 +42,28 @@ def _head(title: str, material: Material) -> Iterator[str]:
 def _summary(result: CalibrationResult, *, several: bool) -> Iterator[str]:
     status = "refused" if result.refused else "valid"
     method = "" if several or not result.fields.get("method") else f", {page_text(result.label)}"
-    yield f'<p><span class="status {status}">{status.upper()}</span>{method}</p>'
+    beside = f", beside a {reference_name(quantity)}" if (quantity := result.fields.get("reference_quantity")) else ""
+    yield f'<p><span class="status {status}">{status.upper()}</span>{method}{page_text(beside)}</p>'
     if identity := result.fields.get("identity"):
         yield f'<p class="soft">of {page_text(str(identity))}</p>'
+    if result.warnings:
+        yield _box("Warning", result.warnings)
     if result.reasons:
-        reasons = "".join(f"<li>{page_text(reason)}</li>" for reason in result.reasons)
-        yield f'<div class="box">{"Refused, because" if result.refused else "Please note"}<ul>{reasons}</ul></div>'
+        yield _box("Refused, because" if result.refused else "Please note", result.reasons)
     if not result.determined.any():
         return
-    yield tables.matrix(result)
-    unit, kind = output_unit(result.unit), result.fields.get("uncertainty_kind")
+    yield tables.matrix(result.shown)
+    unit, kind = offset_unit(result.unit), result.fields.get("uncertainty_kind")
     s_unit = sensitivity_unit(result.unit)
     s_words = f"S without a dimension, in {unit} per {ACCELERATION}" if s_unit == "1" else f"S in {s_unit}"
     factors = sorted({f"{k:.3g}" for k in result.coverage_factor[result.determined]})
     words = f"{s_words}, Q in {unit}. After ±: expanded uncertainty U with k = {' or '.join(factors)}"
     yield f'<p class="soft">{page_text(words)}{f", {page_text(str(kind))}" if kind else ""}.</p>'
+
+
+def _box(heading: str, sentences: Sequence[str]) -> str:
+    listed = "".join(f"<li>{page_text(sentence)}</li>" for sentence in sentences)
+    return f'<div class="box">{heading}<ul>{listed}</ul></div>'
 
 
 def _figures(figures: Sequence[Drawn]) -> Iterator[str]:
@@ -72,11 +80,11 @@ def _numbers(material: Material, seen: Sequence[Residuals]) -> Iterator[str]:
         about = f", {page_text(result.label)}" if len(material.results) > 1 else ""
         yield f"<h2>Numbers{about}</h2>"
         if result.determined.any():
-            yield "<h3>Parameters</h3>" + tables.parameters(result)
+            yield "<h3>Parameters</h3>" + tables.parameters(result.shown)
         if result.frequencies.bands:
-            yield "<h3>Main sensitivities over frequency, with U</h3>" + tables.over_frequency(result)
+            yield "<h3>Main sensitivities over frequency, with U</h3>" + tables.over_frequency(result.shown)
         if result.budget and result.determined.any():
-            yield "<h3>Uncertainty budget: u by source</h3>" + tables.budget(result)
+            yield "<h3>Uncertainty budget: u by source</h3>" + tables.budget(result.shown)
         if result.fields.get("nuisances"):
             yield "<h3>Nuisances</h3>" + tables.nuisances(result)
         if statistics := result.fields.get("statistics"):
@@ -90,7 +98,7 @@ def _numbers(material: Material, seen: Sequence[Residuals]) -> Iterator[str]:
         if more := tables.facts(result.more):
             yield "<h3>Further</h3>" + more
         if result.determined.any():
-            yield "<h3>Covariance</h3>" + tables.covariance(result)
+            yield "<h3>Covariance</h3>" + tables.covariance(result.shown)
 
 
 def _origin(material: Material) -> Iterator[str]:

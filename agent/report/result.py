@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 import msgspec
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from agent.calibrate.origin import SourceFile
 from agent.core.events import CalibrationUpdate
 from calib.model import PARAMETERS, Array
+from calib.recorded.output_unit import shown_in
 
 Item = TypeVar("Item")
 Row = tuple[float | None, float | None, float | None]
@@ -26,7 +27,7 @@ SHOWN = frozenset(
     {
         "sensitivity", "offset", "standard_uncertainty", "expanded_uncertainty", "covariance", "determined",
         "degrees_of_freedom", "nuisances", "budget", "status", "reasons", "windows", "statistics", "options", "files",
-        "shared_errors", "response",
+        "shared_errors", "response", "warnings", "unit",
     }
 )  # fmt: skip
 
@@ -71,6 +72,15 @@ class Frequencies(msgspec.Struct, frozen=True):
         known = self.response or ()
         return tuple(b for b in known if b.sensitivity_re and b.sensitivity_im and b.standard_uncertainty)
 
+    def times(self, factor: float) -> Frequencies:
+        """The same with the sensitivity of each band multiplied."""
+        bands = [
+            Band(b.low_hz, b.high_hz, *((factor * np.array(m, dtype=float)).tolist()
+                 for m in (b.sensitivity_re, b.sensitivity_im, b.standard_uncertainty)))
+            for b in self.bands
+        ]  # fmt: skip
+        return msgspec.structs.replace(self, response=tuple(bands))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationResult:
@@ -110,6 +120,25 @@ class CalibrationResult:
         return self.values[9:]
 
     @property
+    def shown(self) -> CalibrationResult:
+        """The same in the units in which people read S and Q, which `agent.report.units` names: g/g and mg for g."""
+        factors = shown_in(self.unit).factors
+        return replace(
+            self,
+            values=factors * self.values,
+            standard_uncertainty=factors * self.standard_uncertainty,
+            expanded_uncertainty=factors * self.expanded_uncertainty,
+            covariance=np.outer(factors, factors) * self.covariance,
+            budget={source: factors * u for source, u in self.budget.items()},
+            frequencies=self.frequencies.times(float(factors[0])),
+        )
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What a reader must see before S and Q."""
+        return tuple(map(str, self.fields.get("warnings") or ()))
+
+    @property
     def more(self) -> dict[str, Any]:
         """Members of the object that no other table shows."""
         return {name: value for name, value in self.fields.items() if name not in SHOWN}
@@ -145,7 +174,7 @@ def parse(fields: Mapping[str, Any], name: str) -> CalibrationResult:
         refused=fields["status"] != "valid",
         reasons=tuple(str(reason) for reason in fields.get("reasons") or ()),
         windows=tuple(_list_of(WindowVerdict, fields.get("windows"), "windows")),
-        unit=str(fields.get("output_unit") or ""),
+        unit=str(fields.get("unit") or fields.get("output_unit") or ""),
         budget={source: _source(part, f"budget.{source}") for source, part in (fields.get("budget") or {}).items()},
         files=tuple(_list_of(SourceFile, fields.get("files"), "files")),
         frequencies=_frequencies(fields),

@@ -10,9 +10,10 @@ import numpy as np
 
 from agent.report.result import CalibrationResult
 from agent.report.trace import Residuals
-from agent.report.units import ACCELERATION, output_unit, position_name, said, sensitivity_unit
+from agent.report.units import offset_unit, output_unit, position_name, said, sensitivity_unit
 from agent.terminal.text import page_text
 from calib.model import PARAMETERS
+from calib.recorded.output_unit import ACCELERATION
 from calib.rounding import plus_minus
 
 AXES = "xyz"
@@ -50,7 +51,7 @@ def matrix(result: CalibrationResult) -> str:
 
 def parameters(result: CalibrationResult) -> str:
     """All twelve parameters with u, U, k and degrees of freedom."""
-    units = [sensitivity_unit(result.unit)] * 9 + [output_unit(result.unit)] * 3
+    units = [sensitivity_unit(result.unit)] * 9 + [offset_unit(result.unit)] * 3
     rows = [
         [
             f"{name[0]} {name[1:]}",

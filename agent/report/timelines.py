@@ -12,9 +12,10 @@ from matplotlib.patches import Patch
 from agent.core.events import CalibrationUpdate
 from agent.report.result import CalibrationResult, WindowVerdict
 from agent.report.style import INK, PALE, REFUSED, SHADES, USED, bare, figure, series
-from agent.report.units import output_unit, position_name
+from agent.report.units import offset_unit, position_name
 from agent.terminal.text import figure_text
 from calib.model import PARAMETERS
+from calib.recorded.output_unit import shown_in
 
 LANES = 16  # a figure has room for so many positions; if there are more, windows are arranged by verdict
 MAIN = [0, 4, 8]
@@ -65,15 +66,16 @@ def history(updates: Sequence[CalibrationUpdate], unit: str) -> Figure | None:
         return None
     when = [dt.datetime.fromtimestamp(u.date_utc_ns / 1e9, dt.UTC) for u in updates]
     S = np.array([np.diag(u.sensitivity) for u in updates])
-    Q = np.array([u.offset for u in updates])
+    factor = shown_in(unit).factors[9]
+    Q = factor * np.array([u.offset for u in updates])
     U = np.array([u.coverage_factor * np.array(u.standard_uncertainty) for u in updates])
     drawn = figure(5.0)
     upper, lower = drawn.subplots(2, 1, sharex=True)
     for k in range(3):
         upper.errorbar(when, 100 * (S[:, k] / S[-1, k] - 1), 100 * U[:, MAIN[k]] / abs(S[-1, k]), **series(k))
-        lower.errorbar(when, Q[:, k], U[:, 9 + k], **series(k))
+        lower.errorbar(when, Q[:, k], factor * U[:, 9 + k], **series(k))
     upper.set(title="main sensitivities", ylabel="% difference from the newest")
-    lower.set(title="offsets", ylabel=f"Q in {figure_text(output_unit(unit))}", xlabel="UTC")
+    lower.set(title="offsets", ylabel=f"Q in {figure_text(offset_unit(unit))}", xlabel="UTC")
     handles, labels = upper.get_legend_handles_labels()
     drawn.legend(handles, labels, loc="outside upper right", ncols=3)
     return drawn

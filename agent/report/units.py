@@ -2,18 +2,33 @@
 
 from __future__ import annotations
 
-ACCELERATION = "m/s²"
+from calib.recorded.output_unit import ACCELERATION, shown_in, written
+
+_REFERENCES = {
+    "acceleration": "reference accelerometer",
+    "velocity": "reference vibrometer (velocity)",
+    "displacement": "reference displacement sensor",
+}
 
 
 def output_unit(stated: str) -> str:
-    """The unit of V and Q; "output unit" if the result does not state it."""
-    return {"m/s2": ACCELERATION, "m/s^2": ACCELERATION, "": "output unit"}.get(stated, stated)
+    """The unit of V; "output unit" if the result does not state it."""
+    return written(stated)
 
 
 def sensitivity_unit(stated: str) -> str:
-    """The unit of S. If the output is in m/s², S is dimensionless (section 3 of the paper)."""
-    unit = output_unit(stated)
-    return "1" if unit == ACCELERATION else f"{unit}/({ACCELERATION})"
+    """The unit of S as it is shown. If the output is in m/s², S is dimensionless (section 3 of the paper)."""
+    return shown_in(stated).sensitivity
+
+
+def offset_unit(stated: str) -> str:
+    """The unit of Q as it is shown: that of V, but mg where V is in g."""
+    return shown_in(stated).offset
+
+
+def reference_name(quantity: object) -> str:
+    """What an instrument is called that gives acceleration, velocity or displacement as the reference."""
+    return _REFERENCES.get(str(quantity), "reference instrument")
 
 
 def labelled(quantity: str, unit: str) -> str:

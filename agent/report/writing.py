@@ -37,7 +37,7 @@ def as_object(material: Material, seen: list[Residuals], figures: list[str]) -> 
     return {
         "version": __version__,
         "sensor": material.sensor,
-        "results": [plain(r.fields) | {"output_unit": r.unit or None} for r in material.results],
+        "results": [plain(r.fields) | dict.fromkeys(("unit", "output_unit"), r.unit or None) for r in material.results],
         "history": [Record.of(update, recorded=True, recording="").fields for update in material.history],
         "residuals": [
             {"position": r.position, "start_s": plain(r.time_s[0]), "stop_s": plain(r.time_s[-1]), "rms": plain(r.rms)}

@@ -27,6 +27,7 @@ from agent.terminal.wording import (
     verdict,
     window_span,
 )
+from calib.recorded.output_unit import shown_in
 
 REFRESH_S = 0.5  # results come a few times a minute, the clock changes once a second
 
@@ -109,11 +110,10 @@ class Picture:
         return lines + self._calibration(calibration)
 
     def _calibration(self, calibration: CalibrationUpdate) -> list[Text]:
-        unit = calibration.output_unit.replace("m/s2", "m/s²")
         lines = [_heading("", "Sx", "Sy", "Sz", "Q", widths=_PARAMETERS)]
         for axis, cells in zip("xyz", calibration_cells(calibration), strict=True):
             lines.append(Text(_row((axis, *cells), _PARAMETERS)))
-        lines.append(Text(f"  S in {unit} per m/s², Q in {unit}, {uncertainty_words(calibration)}", "dim"))
+        lines.append(Text(f"  {shown_in(calibration.output_unit).words}, {uncertainty_words(calibration)}", "dim"))
         lines.append(Text(f"  method {calibration.method}, {calibration.windows} windows", "dim"))
         truth = self._state.truths.get(calibration.sensor)
         if truth is not None:

@@ -20,6 +20,7 @@ from agent.core.events import (
 )
 from agent.terminal.quantity import counted, size
 from calib.model import Array
+from calib.recorded.output_unit import shown_in
 from calib.rounding import plus_minus
 
 if TYPE_CHECKING:
@@ -106,14 +107,13 @@ def uncertainty_words(calibration: CalibrationUpdate) -> str:
 
 
 def calibration_cells(calibration: CalibrationUpdate) -> list[list[str]]:
-    """Three rows x, y, z of S_x, S_y, S_z and Q, each with its expanded uncertainty."""
-    expanded = [calibration.coverage_factor * u for u in calibration.standard_uncertainty]
-    found = calibration.determined
-    rows = []
-    for i in range(3):
-        cells = [(calibration.sensitivity[i][j], 3 * i + j) for j in range(3)] + [(calibration.offset[i], 9 + i)]
-        rows.append([plus_minus(value, expanded[n]) if found[n] else "not known" for value, n in cells])
-    return rows
+    """Three rows x, y, z of S_x, S_y, S_z and Q, each with its expanded uncertainty, in the units of `shown_in`."""
+    factors = shown_in(calibration.output_unit).factors
+    values = (factors * np.append(np.ravel(calibration.sensitivity), calibration.offset)).tolist()
+    expanded = (factors * calibration.coverage_factor * np.array(calibration.standard_uncertainty)).tolist()
+    told = zip(values, expanded, calibration.determined, strict=True)
+    cells = [plus_minus(value, U) if found else "not known" for value, U, found in told]
+    return [[*cells[3 * i : 3 * i + 3], cells[9 + i]] for i in range(3)]
 
 
 def calibration_rows(calibration: CalibrationUpdate) -> list[str]:

@@ -11,7 +11,10 @@ from typing import Any
 import numpy as np
 
 from calib.model import Array
+from calib.recorded.choice import Choice, Chosen, Column
+from calib.recorded.columns import reference_columns, sensor_columns, si_of
 from calib.recorded.errors import InputError
+from calib.recorded.output_unit import common
 from calib.recorded.poses import AXIS, SPAN, PoseRow, Poses, columns_of
 from calib.recorded.table import (
     REFERENCES,
@@ -23,18 +26,34 @@ from calib.recorded.table import (
     make_whole,
     second_of,
 )
+from calib.recorded.units import unit_name, unit_of
 
 REFERENCE_HEADERS = " | ".join(",".join(("time_s", *names)) for names in REFERENCES)
 BY_QUANTITY = {quantity: names for names, quantity in REFERENCES.items()}  # the last of a quantity: one channel
 NS = 1e-9
 
 
+class _Frame:
+    """The columns of a table in memory, as Choice reads them. Dates are in s since 1970."""
+
+    def __init__(self, place: str, columns: Mapping[Any, Any]) -> None:
+        dated = {name: _filled(values).dtype.kind in "Mm" for name, values in columns.items()}
+        self.path, self.header = place, ""
+        self.columns: Sequence[Column] = [Column(str(name), "s" if is_date else "") for name, is_date in dated.items()]
+
+
 def sensor_table(given: Any) -> SensorTable:
-    """The samples of a sensor. Raises InputError."""
+    """The samples of a sensor, in the unit of the table. Raises InputError."""
     place = "sensor"
     columns = _columns(given, SENSOR, place)
-    rows = _rows([(name, _column(columns, name, place)) for name in SENSOR], place)
-    return SensorTable(place, rows[:, 0], rows[:, 1:])
+    if "time_s" in columns and set(SENSOR[1:]) & set(columns):
+        rows = _rows([(name, _column(columns, name, place)) for name in SENSOR], place)
+        return SensorTable(place, rows[:, 0], rows[:, 1:])
+    choice = Choice(_Frame(place, columns))
+    chosen = sensor_columns(choice)[:4]
+    unit = common([unit_name(each.unit) for each in chosen[1:]])
+    rows = _chosen_rows(columns, chosen, np.ones(3), place)
+    return SensorTable(place, rows[:, 0], rows[:, 1:], None, tuple(choice.said), unit)
 
 
 def reference_table(given: Any, quantity: str | None) -> ReferenceTable:
@@ -44,14 +63,21 @@ def reference_table(given: Any, quantity: str | None) -> ReferenceTable:
     unnamed = ("time_s", *(BY_QUANTITY[quantity or "acceleration"] if width == 2 else ("ax", "ay", "az")))
     columns = _columns(given, unnamed, place)
     there = [names for names in REFERENCES if set(names) & set(columns)]
-    if len(there) != 1:
-        raise InputError(
-            f"the columns are {', '.join(map(str, columns))}", f"give one of {REFERENCE_HEADERS}",
-            place=place, value=tuple(columns),
-        )  # fmt: skip
-    names = there[0]
-    rows = _rows([(name, _column(columns, name, place)) for name in ("time_s", *names)], place)
-    return ReferenceTable(place, rows[:, 0], rows[:, 1:], REFERENCES[names], names[0])
+    if "time_s" in columns and there:
+        if len(there) > 1:
+            raise InputError(
+                f"the columns are {', '.join(map(str, columns))}", f"give one of {REFERENCE_HEADERS}",
+                place=place, value=tuple(columns),
+            )  # fmt: skip
+        names = there[0]
+        rows = _rows([(name, _column(columns, name, place)) for name in ("time_s", *names)], place)
+        return ReferenceTable(place, rows[:, 0], rows[:, 1:], REFERENCES[names], names[0])
+    choice = Choice(_Frame(place, columns))
+    chosen, found = reference_columns(choice, None)
+    scale = np.array([si_of(choice, each, None) for each in chosen[1:]])
+    rows = _chosen_rows(columns, chosen, scale, place)
+    column, stated = str(chosen[1].column), all(each.unit for each in chosen[1:])
+    return ReferenceTable(place, rows[:, 0], rows[:, 1:], found, column, "", tuple(choice.said), stated)
 
 
 def poses_of(given: Any) -> Poses:
@@ -134,10 +160,25 @@ def _column(columns: Mapping[Any, Any], name: str, place: str) -> Any:
     return columns[name]
 
 
-def _rows(columns: Iterable[tuple[str, Any]], place: str) -> Array:
-    """Columns of time and channels as rows (n, k), checked: times in s."""
+def _chosen_rows(columns: Mapping[Any, Any], chosen: Sequence[Chosen], scale: Array, place: str) -> Array:
+    """The chosen columns as rows (n, k), checked: times in s, the others times `scale` (k - 1)."""
+    time = unit_of(chosen[0].unit) if chosen[0].unit else None
+    if time is not None and time.quantity != "time":
+        problem = f"it is in {chosen[0].unit}, which is no unit of time"
+        raise InputError(problem, "rename the column", place=place, column=str(chosen[0].column))
+    by_name = {str(name): values for name, values in columns.items()}
+    named = [(each.column.name, by_name[each.column.name]) for each in chosen]
+    named[0] = (named[0][0], _times(named[0][1]))
+    rows = _rows(named, place, None if time is None else time.si)
+    rows[:, 1:] *= scale
+    return rows
+
+
+def _rows(columns: Iterable[tuple[str, Any]], place: str, second: float | None = None) -> Array:
+    """Columns of time and channels as rows (n, k), checked: times in s. `second`: one unit of the times in s."""
     named = {name: _numbers(values, place, name) for name, values in columns}
-    names, length = list(named), len(named["time_s"])
+    names = list(named)
+    length = len(named[names[0]])
     for name, values in named.items():
         if len(values) != length:
             problem = f"there are {len(values)} values, but {length} times"
@@ -145,13 +186,15 @@ def _rows(columns: Iterable[tuple[str, Any]], place: str) -> Array:
     rows = np.column_stack(list(named.values()))
     make_whole(rows, names, place)
     check_count(int(np.isfinite(rows[:, 1]).sum()), place)
-    rows[:, 0] *= second_of(float(rows[0, 0]))
+    rows[:, 0] *= second_of(float(rows[0, 0])) if second is None else second
     check_time(rows[:, 0], names[0], place)
     return rows
 
 
 def _filled(values: Any) -> np.ndarray[Any, Any]:
-    """An array in which masked values are NaN."""
+    """An array in which masked values are NaN, and dates with a zone are in UTC."""
+    if getattr(getattr(values, "dtype", None), "tz", None) is not None:
+        return np.asarray(values.to_numpy(dtype="datetime64[ns]"))
     if isinstance(values, np.ma.MaskedArray):
         return np.ma.filled(values.astype(float), np.nan)
     return np.asarray(values)
@@ -164,7 +207,7 @@ def _numbers(values: Any, place: str, column: str) -> Array:
         problem = f"it has the shape {found.shape}"
         raise InputError(problem, "give one value for each sample", place=place, column=column)
     if found.dtype.kind == "M":
-        return np.where(np.isnat(found), np.nan, found.astype("datetime64[ns]").astype(np.int64) * NS)
+        return _seconds(found)
     if found.dtype.kind == "m":
         return np.where(np.isnat(found), np.nan, found.astype("timedelta64[ns]").astype(np.int64) * NS)
     try:
@@ -174,9 +217,26 @@ def _numbers(values: Any, place: str, column: str) -> Array:
         pass
     row = next((k for k, value in enumerate(found.tolist()) if not _is_number(value)), 0)
     raise InputError(
-        f"{found[row]!r} is no number", "correct the value, or remove the row", place=place, row=row, column=column,
-        value=found[row],
+        f"{found[row]!r} is no number", "correct the value, or remove the row; give dates as datetime64", place=place,
+        row=row, column=column, value=found[row],
     )  # fmt: skip
+
+
+def _seconds(dates: np.ndarray[Any, Any]) -> Array:
+    """Dates (n,) as seconds since 1970, UTC."""
+    ns = dates.astype("datetime64[ns]").astype(np.int64)
+    return np.where(np.isnat(dates), np.nan, ns // 10**9 + (ns % 10**9) * NS)
+
+
+def _times(values: Any) -> Any:
+    """Dates that are still text (ISO 8601, without a zone in UTC) as datetime64; anything else as it is."""
+    found = _filled(values)
+    if found.dtype.kind not in "OUT" or not len(found) or _is_number(found[0]):
+        return values
+    try:
+        return np.array([str(text).removesuffix("Z").strip() for text in found.tolist()], dtype="datetime64[ns]")
+    except ValueError:
+        return values
 
 
 def _is_number(value: Any) -> bool:

@@ -32,6 +32,8 @@ COVERAGE_FACTOR = 2.0  # of plain Method 3, as in the paper: there are thousands
 def calibrated(sensor: SensorTable, reference: ReferenceTable | None, poses: Poses | None, options: Options) -> Outcome:
     """The outcome for these samples, poses and options, which passed `options.check`. Raises InputError."""
     outcome = _estimated(sensor, reference, poses, options)
+    more = {**outcome.more, "reference_quantity": None if reference is None else reference.quantity}
+    outcome = replace(outcome, unit=sensor.unit, more=more)
     silent, feels = [], False
     if reference is not None and reference.channels == 3 and options.rotation is not None:
         silent = silent_channels(sensor, reference, options.rotation)

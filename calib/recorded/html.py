@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from html import escape
 from typing import TYPE_CHECKING
 
-from calib.model import Window
-from calib.rounding import KNOWN_BEFORE
+from calib.model import PARAMETERS, Window
+from calib.recorded.told import largest_sources, notes_of, parameters_of, rows_of
+from calib.rounding import rounded
 
 if TYPE_CHECKING:
     from calib.recorded.outcome import Outcome
@@ -26,37 +27,38 @@ def _parts(outcome: Outcome) -> Iterator[str]:
     used = sum(window.used for window in outcome.windows)
     windows = f"{used} of {len(outcome.windows)} windows used"
     yield f"<p><b>{outcome.status}</b>: method {escape(outcome.method)}, {windows}</p>"
+    if outcome.warnings:
+        yield f"<ul>{''.join(f'<li><b>Warning: {escape(warning)}</b></li>' for warning in outcome.warnings)}</ul>"
     if outcome.reasons:
         yield f"<ul>{''.join(f'<li>{escape(reason)}</li>' for reason in outcome.reasons)}</ul>"
     if outcome.calibration is not None:
-        yield _table(outcome)
+        yield _table(("", "Sx", "Sy", "Sz", "Q"), rows_of(outcome))
         yield f"<p>{'. '.join(_notes(outcome))}.</p>"
+        yield _sources(outcome)
     unused = [window for window in outcome.windows if not window.used]
     if unused:
         yield _unused(unused)
 
 
-def _table(outcome: Outcome) -> str:
-    cells = outcome.cells()
-    rows = []
-    for i, axis in enumerate("xyz"):
-        row = [f"<b>{axis}</b>", *map(escape, [*cells[3 * i : 3 * i + 3], cells[9 + i]])]
-        rows.append("".join(f"<td {CELL}>{cell}</td>" for cell in row))
-    head = "".join(f"<th {CELL}>{name}</th>" for name in ("", "Sx", "Sy", "Sz", "Q"))
-    body = "".join(f"<tr>{row}</tr>" for row in rows)
+def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    head = "".join(f"<th {CELL}>{escape(name)}</th>" for name in heads)
+    told = [(f"<b>{escape(first)}</b>", *map(escape, rest)) for first, *rest in rows]
+    body = "".join(f"<tr>{''.join(f'<td {CELL}>{cell}</td>' for cell in row)}</tr>" for row in told)
     return f"<table {TABLE}><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 
 
 def _notes(outcome: Outcome) -> Iterator[str]:
-    kind = f" ({escape(outcome.uncertainty_kind)})" if outcome.uncertainty_kind else ""
-    yield f"S in output unit per m/s², Q in output unit, ± U with k = {outcome.coverage_factor:.3g}{kind}"
-    if any(KNOWN_BEFORE in cell for cell in outcome.cells()):
-        yield f"{KNOWN_BEFORE} known before: the data do not halve its uncertainty"
-    if outcome.where_it_holds:
-        yield outcome.where_it_holds
+    yield from map(escape, notes_of(outcome))
     if outcome.lag_s is not None:
         yield f"The sensor lags by {1000.0 * outcome.lag_s:.3g} ms"
     yield f"Sampling rate {outcome.rate_hz:.7g} Hz"
+
+
+def _sources(outcome: Outcome) -> str:
+    """The largest sources of U and what makes them smaller; "" where nothing is known of them."""
+    rows = [(s.name, *map(rounded, s.expanded), s.way) for s in largest_sources(outcome)]
+    heads = ["largest sources", *(f"U({PARAMETERS[k]})" for k in parameters_of(outcome)), "smaller with"]
+    return _table(heads, rows) if rows else ""
 
 
 def _unused(windows: Sequence[Window]) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import inspect
+import warnings
 from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
@@ -25,7 +26,8 @@ def calibrate(sensor: Any, reference: Any = None, poses: Any = None, **options: 
     """S and Q from recorded samples, with the uncertainty and the reasons for a refusal.
 
     sensor: times in s and indications in the output unit: a DataFrame, a dict of columns or a structured array with the
-    columns time_s, vx, vy, vz; an array (n, 4); or a pair of times (n,) and values (n, 3).
+    columns time_s, vx, vy, vz; an array (n, 4); or a pair of times (n,) and values (n, 3). Columns with other names and
+    units, as "X [mV]", are chosen and converted as those of a CSV are; a warning says what was guessed.
     reference: the same with the columns time_s and a (m/s2), v (m/s), d (m), or ax, ay, az (m/s2). None: only rests.
     poses: a DataFrame, or a list with a dict for each pose: start_s, stop_s and theta_deg, alpha_deg | dx, dy, dz |
     axis | gx, gy, gz. None beside a tri-axial reference, and for rests in positions that nobody knows.
@@ -36,12 +38,11 @@ def calibrate(sensor: Any, reference: Any = None, poses: Any = None, **options: 
     """
     stated = _options(options)
     stated.check(reference=reference is not None, poses=poses is not None, prior=stated.prior is not None)
-    return calibrated(
-        sensor_table(sensor),
-        None if reference is None else reference_table(reference, stated.reference_quantity),
-        None if poses is None else poses_of(poses),
-        stated,
-    )
+    read = sensor_table(sensor)
+    beside = None if reference is None else reference_table(reference, stated.reference_quantity)
+    for line in (*read.said, *(beside.said if beside else ())):
+        warnings.warn(line, stacklevel=2)
+    return calibrated(read, beside, None if poses is None else poses_of(poses), stated)
 
 
 def _signature() -> inspect.Signature:

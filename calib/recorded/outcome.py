@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from calib import __version__
 from calib.estimate.response_told import BandSensitivity
 from calib.model import Array, Calibration, Window
+from calib.recorded.output_unit import shown_in
 from calib.rounding import KNOWN_BEFORE, from_to, plus_minus
 
 if TYPE_CHECKING:
@@ -36,11 +37,11 @@ class NuisanceValue:
         return plus_minus(self.value, coverage_factor * self.standard_uncertainty) + unit
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Outcome:
     """The outcome of a calibration. If the data are refused, `calibration` is None and `reasons` say why.
 
-    `warnings`: what a reader must see before S and Q.
+    `unit` is the sensor's output unit, "" where nothing tells it. `warnings`: what a reader must see before S and Q.
     Arrays of 12 are in the order of calib.model.PARAMETERS: S row by row, then Q. They are read-only.
     """
 
@@ -56,6 +57,7 @@ class Outcome:
     rank: int | None = None
     residual_sd: Sequence[float] | None = None
     statistics: Mapping[str, Any] = field(default_factory=dict)
+    unit: str = ""
     warnings: tuple[str, ...] = ()
     more: Mapping[str, Any] = field(default_factory=dict)  # further members of the JSON object
 
@@ -109,7 +111,7 @@ class Outcome:
     @property
     def where_it_holds(self) -> str:
         """The frequency at which S holds and the band in which it is right, as a sentence; "" where nothing is told."""
-        if not self.reference_frequency_hz:
+        if self.reference_frequency_hz is None:
             return ""
         band = self.more.get("valid_band_hz")
         within = f"; from {from_to(*band)} Hz it is right within a third of U" if band else ""
@@ -127,9 +129,24 @@ class Outcome:
         )  # fmt: skip
 
     def cells(self) -> list[str]:
-        """(12,) each parameter as value ± U; with KNOWN_BEFORE where the data do not halve its prior uncertainty."""
-        told = zip(self.values.tolist(), self.expanded_uncertainty.tolist(), self.determined.tolist(), strict=True)
+        """(12,) each parameter as value ± U; with KNOWN_BEFORE where the data do not halve its prior uncertainty.
+
+        In the units of `calib.recorded.output_unit.shown_in`: g/g and mg where the sensor's output is in g.
+        """
+        factors = shown_in(self.unit).factors
+        values, expanded = (factors * each for each in (self.values, self.expanded_uncertainty))
+        told = zip(values.tolist(), expanded.tolist(), self.determined.tolist(), strict=True)
         return [_cell(*each) for each in told]
+
+    def __repr__(self) -> str:
+        """The status, S and Q with U, and what else tells whether to use them: few lines."""
+        from calib.recorded.told import lines_of
+
+        used = sum(window.used for window in self.windows)
+        told = [f"{self.status}: method {self.method}, {used} of {len(self.windows)} windows used"]
+        told += [f"WARNING: {warning}" for warning in self.warnings]
+        told += [f"refused: {reason}" for reason in self.reasons]
+        return "\n".join([*told, *lines_of(self)])
 
     def to_json(self) -> str:
         """The JSON object of docs/calibrate.md, with null for what is not known."""
@@ -195,6 +212,7 @@ def as_object(outcome: Outcome) -> dict[str, Any]:
         },
         "lag_s": outcome.lag_s,
         "rate_hz": outcome.rate_hz,
+        "unit": outcome.unit or None,
         "status": outcome.status,
         "reasons": list(outcome.reasons),
         "warnings": list(outcome.warnings),

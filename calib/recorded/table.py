@@ -35,7 +35,7 @@ class SensorTable:
     """Stamps (n,) in s, indications (n, 3), temperature (n,) in degC or None, all as arrays or on disk.
 
     `name`: of the file, or "sensor". A row of indications is NaN where one of them is missing. `said`: what was
-    guessed, for the user.
+    guessed, for the user. `unit`: of the indications, "" where nothing tells it.
     """
 
     name: str
@@ -43,6 +43,7 @@ class SensorTable:
     v: Slices
     temperature_degc: Slices | None = None
     said: tuple[str, ...] = ()
+    unit: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

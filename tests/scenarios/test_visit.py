@@ -38,7 +38,7 @@ def test_two_visits_with_a_turned_and_a_loose_clamp(tmp_path):
     assert len(found["shared_errors"]) >= 1
     truth = Structure(StructureParameters(u_turned_deg=0.2, u_reference=0.001), SEED).sensitivity
     for number, visit in zip((0, 2), found["visits"], strict=True):
-        assert visit["status"] == "valid"
+        assert (visit["status"], visit["unit"]) == ("valid", "m/s2")
         assert visit["reached"]
         assert visit["clamp"]["findings"] == []
         U = np.array(visit["expanded_uncertainty"]["sensitivity"])

@@ -185,12 +185,36 @@ def test_too_few_rests_are_refused(tmp_path):
     assert "10 rests" in result.stderr
 
 
-def test_the_table_says_where_the_uncertainty_comes_from(session):
-    files = [part for name in ("sensor", "reference", "poses") for part in (f"--{name}", str(session / f"{name}.csv"))]
-    result = CliRunner().invoke(calibrate, files, standalone_mode=False)
-    lines = [line.strip() for line in result.stdout.splitlines()]
-    assert any(line.startswith("u(Szz) = ") and ": transverse motion " in line for line in lines), result.stdout
-    assert any(line.startswith("u(Qz) = ") and "transverse motion" in line for line in lines), result.stdout
+def test_the_table_ends_with_s_q_the_band_and_the_three_largest_sources(session):
+    lines = _run(session).stdout.splitlines()
+    told = _told(_run(session, "--json", "-"))
+    at = lines.index("  largest sources          U(Szz)  U(Qz)  smaller with")
+    assert len(lines) == at + 4
+    assert [line.split()[0] for line in lines[at - 6 : at - 3]] == ["x", "y", "z"]
+    assert lines[at - 2].startswith("  S holds at 3 Hz; from ")
+    assert lines[at - 1].startswith("  at 0 Hz: Sxx ")
+    k, budget = told["expanded_uncertainty"]["coverage_factor"], told["budget"]
+    shares = {
+        name: max(part["Szz"] / told["standard_uncertainty"]["sensitivity"][2][2],
+                  part["Qz"] / told["standard_uncertainty"]["offset"][2])
+        for name, part in budget.items()
+    }  # fmt: skip
+    largest = sorted(shares, key=lambda name: -shares[name])[:3]
+    ways = ("--u-transverse-motion-pct", "--u-gravity-mps2", "--sensor-filter, --reference-filter")
+    for line, name, way in zip(lines[at + 1 :], largest, ways, strict=True):
+        assert line.startswith(f"  {name} ")
+        assert line.endswith(way)
+        S, Q = line.removeprefix(f"  {name} ").split()[:2]
+        assert float(S) == pytest.approx(k * budget[name]["Szz"], rel=0.06)
+        assert float(Q) == pytest.approx(k * budget[name]["Qz"], rel=0.06)
+
+
+def test_nuisances_are_shown_where_all_is_asked_for(session):
+    short, whole = (_run(session, *more).stdout for more in ((), ("--all",)))
+    nuisances = [line for line in whole.splitlines() if line not in short.splitlines()]
+    assert {line.split(":")[0].strip() for line in nuisances} >= {"lag", "theta", "gravity", "attenuation"}
+    assert "sampling rate" in whole
+    assert all(len(line) <= 80 for line in short.splitlines()), short
 
 
 def test_a_refused_result_tells_nothing_of_s(session):

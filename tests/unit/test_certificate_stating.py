@@ -111,3 +111,14 @@ def test_a_led_session_ends_with_the_certificate(tmp_path: Path) -> None:
     options["json_to"] = str(tmp_path / "result.json")
     assert made(options, tmp_path, STATED) == 0
     assert (tmp_path / "certificate" / "certificate.pdf").exists()
+
+
+def test_without_statements_the_file_is_named_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    result = tmp_path / "result.json"
+    result.write_text(json.dumps(uneven()))
+    status, said = run(capsys, result, "-o", tmp_path / "out")
+    first, second, *_ = said.splitlines()
+    assert status == 2
+    assert first.startswith("fieldcal certificate: --stated certificate.toml is missing: ")
+    assert "examples/certificate.toml" in first
+    assert "--state organisation.name=... is missing" in second

@@ -245,6 +245,41 @@ def test_what_a_notebook_shows_is_escaped_and_has_no_colours_of_its_own(result: 
     assert "background" not in result._repr_html_()
 
 
+def test_what_print_shows_fits_a_screen_and_is_what_the_command_prints(
+    result: Outcome, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    poses = {name: [row[name] for row in POSES] for name in POSES[0]}
+    files = [f"--{name}={as_csv(tmp_path / f'{name}.csv', columns)}"
+             for name, columns in (("sensor", SENSOR), ("reference", REFERENCE), ("poses", poses))]  # fmt: skip
+    assert run_cli(["calibrate", *files, "--u-angle-deg=0.1", "--gravity=9.80665"]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    head, *shown = str(result).splitlines()
+    assert head == "valid: method 3 (adjustment), 6 of 6 windows used"
+    assert [f"  {line.replace('`u_', '--u-').replace('_', '-').replace('`', '')}" for line in shown] == [
+        line.replace("_", "-") for line in printed[-len(shown) :]
+    ]
+    assert repr(result) == str(result)
+    assert len(shown) < 24
+    assert max(map(len, shown)) <= 80
+    refused = calibrate(SENSOR, REFERENCE, POSES, nominal=1.5, u_nominal_pct=1.0)
+    assert str(refused).splitlines()[1].startswith("refused: ")
+    assert len(str(refused)) < 2000
+
+
+def test_warnings_stand_above_the_table(result: Outcome, capsys: pytest.CaptureFixture[str]) -> None:
+    from dataclasses import replace
+
+    from agent.calibrate.printing import print_outcome
+
+    warned = replace(result, warnings=("det S is negative", "the reference reads 260 g"))
+    print_outcome(warned)
+    for lines in (capsys.readouterr().out.splitlines(), str(warned).splitlines()):
+        at = next(k for k, line in enumerate(lines) if line.split() == ["Sx", "Sy", "Sz", "Q"])
+        assert lines[at - 2 : at] == ["WARNING: det S is negative", "WARNING: the reference reads 260 g"]
+    assert "<b>Warning: det S is negative</b>" in warned._repr_html_()
+    assert json.loads(warned.to_json())["warnings"] == ["det S is negative", "the reference reads 260 g"]
+
+
 def test_the_figure_shows_s_q_response_and_windows(result: Outcome) -> None:
     figure = result.plot()
     assert [axes.get_title(loc="left").split(":")[0] for axes in figure.axes] == ["S", "Q", "response", "windows"]

@@ -14,7 +14,7 @@ from agent.calibrate.tables import ReferenceTable, SensorTable, read_reference, 
 from agent.cli.main import run_cli
 from agent.reading import delimited
 from agent.reading.source import TableError
-from agent.reading.units import sensitivity_of
+from calib.recorded.units import sensitivity_of
 
 G = 9.80665
 N = 400

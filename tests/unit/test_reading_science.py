@@ -13,7 +13,7 @@ from scipy.io import savemat
 
 from agent.calibrate.tables import read_reference, read_sensor
 from agent.reading import source
-from agent.reading.units import sensitivity_of
+from calib.recorded.units import sensitivity_of
 from tests.unit.test_reading_csv import written
 from tests.unit.test_reading_formats import RATE_HZ, TIME_S, V, fault, same
 

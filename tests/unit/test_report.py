@@ -116,7 +116,7 @@ def test_a_data_directory(recorded: tuple[Path, Truth], tmp_path: Path, capsys: 
     for words in (
         "Calibration of mems", "VALID", "Method 3 (recursive adjustment)",
         "count/(m/s²)", "fieldcal-000001.mcap", "θ 35°",
-        "combined", "SHA-256", "mems-1", "Covariance",
+        "combined", "SHA-256", "mems-1", "Covariance", "beside a reference accelerometer",
     ):  # fmt: skip
         assert words in seen.text, words
     held = json.loads((tmp_path / "out" / "report.json").read_text())
@@ -259,7 +259,7 @@ def bad_inputs(recorded: Path, folder: Path) -> dict[str, tuple[list[str | Path]
         "damaged recording": ([folder / "damaged.mcap"], "damaged.mcap: the recording is damaged at "),
         "mixture": ([good, recorded], "the inputs are of several kinds"),
         "sensor": ([recorded, "--sensor", "other"], "there is no sensor 'other'; the sensors are: mems"),
-        "unit": ([good, "--unit", "count"], "must have one unit, but here are count, mV"),
+        "unit": ([good, "--unit", "count"], "--unit count: the indications are in mV; leave --unit out"),
     }
 
 

@@ -1,4 +1,4 @@
-"""Chooses the columns of a file: those that are stated, those with this program's names, or those that it can guess."""
+"""Chooses columns of a table: those that are stated, those with this program's names, or those that it can guess."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, Protocol, TypeVar
 
-from agent.reading.source import Column, Source, TableError
-from agent.reading.units import UNITS, split, unit_of
+from calib.recorded.errors import InputError
+from calib.recorded.units import UNITS, split, unit_of
 
 TIME_WORDS = frozenset(
     ["time", "timestamp", "t", "datetime", "date", "epoch", "stamp", "utc", "zeit", "temps", "seconds", "secs"]
@@ -29,6 +29,31 @@ Result = TypeVar("Result")
 
 
 @dataclass(frozen=True, slots=True)
+class Column:
+    """A column of numbers as the table names it.
+
+    `unit`: as the table states it, "" where it states none. A time that is given as a date has the unit "s": it is
+    in seconds since 1970, UTC. `group`: the device, channel group or topic to which the column belongs; "" where the
+    table has no groups.
+    """
+
+    name: str
+    unit: str = ""
+    group: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.group}.{self.name}" if self.group else self.name
+
+
+class Named(Protocol):
+    """What has named columns: a file, or a table in memory. `header`: where it names them, for messages."""
+
+    path: Any
+    columns: Sequence[Column]
+    header: str
+
+
+@dataclass(frozen=True, slots=True)
 class Chosen:
     """A column and its unit in lower case, "" where none is stated."""
 
@@ -37,13 +62,15 @@ class Chosen:
 
 
 class Choice:
-    """Chooses columns of one file. `stated`: the text of the option `option`, such as "time=t,x=ax". Raises TableError.
+    """Chooses columns of a table. `stated`: the text of the option `option`, such as "time=t,x=ax". Raises InputError.
+
+    A table in memory has no such option, "": its columns can be renamed.
 
     Words on the left side are time, x, y, z, temperature, a, v, d and group; on the right side stands a name of a
     column, with ":UNIT" if the file does not state the unit.
     """
 
-    def __init__(self, source: Source, stated: str | None, option: str) -> None:
+    def __init__(self, source: Named, stated: str | None = None, option: str = "") -> None:
         self._source, self._option = source, option
         self._stated = self._read(stated)
         group = self._stated.pop("group", None)
@@ -53,7 +80,7 @@ class Choice:
             raise self.fault(f"there is no group {group!r}" if group else "there are no columns of numbers")
 
     def in_one_group(self, choose: Callable[[Choice], Result]) -> Result:
-        """What `choose` finds in the only group where it finds something. Raises TableError if there is no such one.
+        """What `choose` finds in the only group where it finds something. Raises InputError if there is no such one.
 
         Where several groups have something, the one with the fewest columns is taken if it is the only one: a device
         with one axis is the reference.
@@ -65,7 +92,7 @@ class Choice:
         for group in groups:
             inner = copy(self)
             inner._columns, inner.said = [c for c in self._columns if c.group == group], []
-            with suppress(TableError):
+            with suppress(InputError):
                 found[group] = (inner, choose(inner))
         sizes = {group: len(inner._columns) for group, (inner, _) in found.items()}
         fewest = [group for group, size in sizes.items() if size == min(sizes.values())]
@@ -82,21 +109,32 @@ class Choice:
         for part in re.split(r",(?=\s*\w+\s*=)", stated) if stated else ():
             word, equals, name = (piece.strip() for piece in part.partition("="))
             if not equals or not name or word not in ("time", *AXES, "temperature", "a", "v", "d", "group"):
-                raise TableError(
+                raise InputError(
                     f"{self._option}: {part!r} is not understood; write time=NAME,x=NAME,y=NAME,z=NAME with names of "
                     "columns; a unit may follow a name: x=NAME:mg"
                 )
             words[word] = name
         return words
 
-    def fault(self, what: str) -> TableError:
+    def fault(self, what: str) -> InputError:
         """An error that says what was seen and how to say it."""
         seen = ",".join(str(c) for c in self._source.columns[:24])
         more = ",..." if len(self._source.columns) > 24 else ""
-        return TableError(
-            f"{self._source.path}, {self._source.header}: {what} in the header {seen + more!r}; say which columns to "
-            f"use: {self._option} time=NAME,x=NAME,... (a unit may follow a name: x=NAME:mg)"
-        )
+        remedy = (
+            f"say which columns to use: {self._option} time=NAME,x=NAME,... (a unit may follow a name: x=NAME:mg)"
+            if self._option else "rename the columns; a unit may stand in a name: 'x [mg]'"
+        )  # fmt: skip
+        return InputError(f"{what} in the header {seen + more!r}", remedy, place=self.place)
+
+    @property
+    def place(self) -> str:
+        """Where the columns are named, for messages."""
+        return f"{self._source.path}, {self._source.header}" if self._source.header else str(self._source.path)
+
+    @property
+    def can_be_stated(self) -> bool:
+        """Whether an option can state the columns."""
+        return bool(self._option)
 
     @property
     def is_stated(self) -> bool:
@@ -122,7 +160,7 @@ class Choice:
     def standard(self, names: Iterable[str]) -> list[Chosen] | None:
         """The columns that have exactly these names, in the units of these names. None where one is missing.
 
-        Raises TableError where one of them is also there in another unit.
+        Raises InputError where one of them is also there in another unit.
         """
         found = []
         for name in names:
@@ -157,7 +195,8 @@ class Choice:
     def say(self, found: Mapping[str, Chosen]) -> None:
         """Keep for the user what was guessed."""
         told = ", ".join(f"{word}={c.column}{f' in {c.unit}' if c.unit else ''}" for word, c in found.items())
-        self.said.append(f"{self._source.path}: columns guessed: {told}; state others with {self._option}")
+        other = f"state others with {self._option}" if self._option else "rename them where others are meant"
+        self.said.append(f"{self._source.path}: columns guessed: {told}; {other}")
 
 
 def quantity_of(chosen: Chosen) -> str | None:

@@ -10,16 +10,18 @@ from calib.geometry import STANDARD_GRAVITY_MPS2
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """A unit: the quantity, and how much of the SI unit (s, m/s2, m/s, m) one of it is."""
+    """A unit: the quantity, how much of the SI unit (s, m/s2, m/s, m) one of it is, and its name in results."""
 
     quantity: str
     si: float
+    name: str
 
 
+# The first spelling is the unit's name.
 _SPELLINGS = {
     ("time", 1.0): "s sec secs second seconds utc",
     ("time", 1e-3): "ms msec millisecond milliseconds",
-    ("time", 1e-6): "us µs usec microsecond microseconds",
+    ("time", 1e-6): "µs us usec microsecond microseconds",
     ("time", 1e-9): "ns nsec nanosecond nanoseconds",
     ("time", 60.0): "min mins minutes",
     ("time", 3600.0): "h hr hrs hour hours",
@@ -29,20 +31,20 @@ _SPELLINGS = {
     ("acceleration", 1e-2): "cm/s2 cm/s^2 gal",
     ("acceleration", STANDARD_GRAVITY_MPS2): "g gn g0 g_n grav",
     ("acceleration", 1e-3 * STANDARD_GRAVITY_MPS2): "mg milli-g millig mgn",
-    ("acceleration", 1e-6 * STANDARD_GRAVITY_MPS2): "ug µg",
+    ("acceleration", 1e-6 * STANDARD_GRAVITY_MPS2): "µg ug",
     ("velocity", 1.0): "m/s mps",
     ("velocity", 1e-2): "cm/s",
     ("velocity", 1e-3): "mm/s",
     ("displacement", 1.0): "m",
     ("displacement", 1e-3): "mm",
-    ("displacement", 1e-6): "um µm",
-    ("indication", 1e3): "v volt volts",  # of the electrical units the base is 1 mV
-    ("indication", 1.0): "mv",
-    ("indication", 1e-3): "uv µv",
+    ("displacement", 1e-6): "µm um",
+    ("indication", 1e3): "V volt volts",  # of the electrical units the base is 1 mV
+    ("indication", 1.0): "mV",
+    ("indication", 1e-3): "µV uv",
     ("count", 1.0): "count counts lsb cnt cnts digit digits raw",
-    ("temperature", 1.0): "degc °c c celsius deg_c",
+    ("temperature", 1.0): "degC °c c celsius deg_c",
 }
-UNITS = {name: Unit(*key) for key, names in _SPELLINGS.items() for name in names.split()}
+UNITS = {name.lower(): Unit(*key, names.split()[0]) for key, names in _SPELLINGS.items() for name in names.split()}
 # After "_" in a name these are units, not parts of the name: time_ms, ax_g.
 SUFFIXES = frozenset(
     [
@@ -74,6 +76,12 @@ def unit_of(text: str) -> Unit | None:
     """The unit that `text` names, None where it names none that is known."""
     plain = text.strip().strip("[]()").strip().lower().replace("²", "2").replace("\u03bc", "µ").replace(" ", "")
     return UNITS.get(_ALSO.get(plain, plain))
+
+
+def unit_name(text: str) -> str:
+    """The name of the unit that `text` names; "" where it names none that is known."""
+    unit = unit_of(text)
+    return "" if unit is None else unit.name
 
 
 _BRACKETS = re.compile(r"(?P<base>.*?)[\s_]*[\[(](?P<unit>[^\])]*)[\])]\s*")
