@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from agent.calibrate.origin import SourceFile
 from agent.core.events import CalibrationUpdate
+from calib.estimate.axes import axis_warnings
 from calib.model import PARAMETERS, Array
 from calib.recorded.output_unit import shown_in
 
@@ -201,6 +202,7 @@ def from_update(
         "rate_hz": None,
         "status": "valid",
         "reasons": [],
+        "warnings": axis_warnings(values[:9].reshape(3, 3)),
         "windows": [asdict(window) for window in windows],
         "statistics": {},
         "version": versions.get("fieldcal", ""),
