@@ -51,7 +51,7 @@ _RATE = re.compile(
     rf"|\b(?:rate|freq|frequency|fs|odr|at)\b){_VALUE}",
     re.IGNORECASE,
 )
-_INTERVAL = re.compile(rf"(?:\binterval|sampl\w{0, 8} (?:period|time)|\bdelta_x\b|\bdt\b){_VALUE}", re.IGNORECASE)
+_INTERVAL = re.compile(rf"(?:\binterval|sampl\w{{0,8}} (?:period|time)|\bdelta_x\b|\bdt\b){_VALUE}", re.IGNORECASE)
 _HERTZ = {"hz": 1.0, "khz": 1e3, "sps": 1.0, "s/s": 1.0}
 _SECONDS = re.compile(r"(?<![a-z])(?:[mun\xb5]s|s|m?sec)(?![a-z])", re.IGNORECASE)
 
@@ -80,9 +80,8 @@ class Dialect:
 
     `first_line`: number of the first line of data. `units`: of each column, or "". `moments`: what the cells of each
     column are: "day", "clock", "both", or "" for numbers. `commas`: the first number with a comma in each column, or
-    "". `order`: of day, month and year, "" where it is not known. `rate_hz`: as the head states it.
-    `fortran`: whether exponents have a D. `before`: the lines
-    before the data. `names`: the one that names the columns.
+    "". `order`: of day, month and year, "" where it is not known. `rate_hz`: as the head states it. `fortran`: whether
+    exponents have a D. `before`: the lines before the data. `names`: the one that names the columns.
     """
 
     encoding: str

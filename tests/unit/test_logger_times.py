@@ -113,6 +113,23 @@ def test_units_of_time(tmp_path: Path) -> None:
         read(tmp_path, table(lambda k: f"2026-04-03 {clock(k / 100)} IST"))
 
 
+@pytest.mark.parametrize(
+    "head", ["Sample period: 0.01 s", "Sampling time,10,ms", "Sampling interval (ms);10", "Sample rate: 100 Hz"]
+)
+def test_the_head_states_the_rate(head: str, tmp_path: Path) -> None:
+    found = read(tmp_path, head + "\nx,y,z\n" + "".join(f"{k % 7 - 3},{k % 5 - 2},9.81\n" for k in range(N)))
+    np.testing.assert_allclose(found.time_s[:], np.arange(N) / 100, rtol=0, atol=1e-9)
+    assert "over the 100 Hz that the head states" in found.said[0]
+
+
+@pytest.mark.parametrize(
+    ("zone", "east_h"), [("+0530", 5.5), ("+05:30", 5.5), ("+530", 5.5), ("-02", -2.0), ("UTC+1", 1.0), ("Z", 0.0)]
+)
+def test_offsets_from_utc(zone: str, east_h: float, tmp_path: Path) -> None:
+    found = read(tmp_path, table(lambda k: f"2026-04-03 {clock(43200 + k / 100)}{zone}"))
+    np.testing.assert_allclose(found.time_s[:1][0], APRIL_3 + 43200 - 3600 * east_h, rtol=0, atol=1e-6)
+
+
 @pytest.mark.parametrize("head", ["", HEADER, "Logger 7\nstarted 2023-11-14 10:05:00\n" + HEADER])
 def test_a_restart_makes_pieces(head: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = "Logger 7\nstarted 2023-11-14 10:00:00\n" + table(lambda k: f"{k / 100:.2f}")
