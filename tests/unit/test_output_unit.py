@@ -21,6 +21,7 @@ from agent.config.reading import load_model
 from agent.report.material import gather
 from agent.report.page import page
 from agent.report.writing import left_over
+from calib.recorded.notebook import calibrate
 from tests.unit.certificates import STATED
 from tests.unit.test_notebook import OPTIONS, POSES, REFERENCE, SENSOR, as_csv
 
@@ -183,14 +184,50 @@ def test_a_reference_of_acceleration_is_an_accelerometer(tmp_path: Path) -> None
     assert reference_of(certificate(tmp_path, result, output_unit="")).startswith("reference accelerometer: PCB ")
 
 
-def test_warnings_are_in_report_and_certificate_before_the_results(tmp_path: Path) -> None:
-    result, told = calibrated(tmp_path, *files(tmp_path, ("X [mV]", "Y [mV]", "Z [mV]")))
-    result.write_text(json.dumps(told | {"warnings": ["det S is negative"]}))
-    page = report(result)
-    assert "Warning det S is negative" in page
-    assert page.index("det S is negative") < page.index("S in mV/(m/s²)")
+def test_a_warning_is_told_once_wherever_the_result_is_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """All outputs of the sensor have the wrong sign: S is valid, and negative."""
+    given = files(tmp_path, ("X [mV]", "Y [mV]", "Z [mV]"), -1.0)
+    result, told = calibrated(tmp_path, *given)
+    warnings = told["warnings"]
+    assert [line.split(" (")[0].split(",")[0] for line in warnings] == ["det S is negative", "Sxx = -1.02"]
+    printed = capsys.readouterr()
+    assert printed.out.count("WARNING: det S is negative") == 1
+    assert printed.out.index("WARNING: det S is negative") < printed.out.index("S in mV per m/s²")
+    assert "det S" not in printed.err
+    options = [f"--{name.replace('_', '-')}={value}" for name, value in OPTIONS.items()]
+    assert run_cli(["calibrate", *given, *options, "--json=-"]) == 0
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)["warnings"] == warnings
+    assert printed.err.count("WARNING: det S is negative") == 1
+    shown = report(result)
+    assert shown.count("det S is negative") == 1
+    assert shown.index("Warning det S is negative") < shown.index("S in mV/(m/s²)")
     found = certificate(tmp_path, result, output_unit="")
     first = next(before_results(found, ""))
-    assert (first.heading, list(first.rows)) == ("Warnings", [("warning", "det S is negative")])
-    assert as_object(found)["result"]["warnings"] == ["det S is negative"]
-    assert "det S is negative" in dcc(found, Signer(None, "")).decode()
+    assert (first.heading, list(first.rows)) == ("Warnings", [("warning", warning) for warning in warnings])
+    assert as_object(found)["result"]["warnings"] == warnings
+    assert dcc(found, Signer(None, "")).decode().count("det S is negative") == 1
+    inverted = calibrate({n: v if n == "time_s" else -v for n, v in SENSOR.items()}, REFERENCE, POSES, **OPTIONS)
+    html = inverted._repr_html_()
+    assert html.count("Warning: det S is negative") == 1
+    assert html.index("det S is negative") < html.index("<table")
+
+
+def test_a_nominal_gravity_has_the_uncertainty_of_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What gravity contributes to U of the offset is in proportion to its u, stated or by its digits."""
+    given = ["calibrate", *files(tmp_path, ("X [mV]", "Y [mV]", "Z [mV]")), "--u-angle-deg=0.1", "--json=-"]
+    line = (
+        "--gravity 9.81: u of gravity is 0.01 m/s2, because it has at most 2 decimals, as a nominal value has; give "
+        "local gravity with more digits, or state --u-gravity-mps2"
+    )
+    of_gravity = []
+    for options in (["--gravity=9.81"], ["--gravity=9.81", "--u-gravity-mps2=0.002"], ["--gravity=9.8103"]):
+        assert run_cli([*given, *options]) == 0
+        printed = capsys.readouterr()
+        of_gravity.append(json.loads(printed.out)["budget"]["gravity"]["Qz"])
+        assert printed.err.splitlines().count(line) == (options == ["--gravity=9.81"])
+        assert printed.err.count("u of gravity") == (options == ["--gravity=9.81"])
+    rounded_mps2 = 0.5e-4 / 3**0.5  # half of the last digit, rectangular
+    np.testing.assert_allclose(
+        np.array(of_gravity) / of_gravity[1], np.array([0.01, 0.002, rounded_mps2]) / 0.002, rtol=0.02
+    )
