@@ -206,6 +206,6 @@ def _zone_s(zone: str, local_s: int) -> int:
 def _offset_s(zone: str) -> int:
     if zone in ("Z", "UTC"):
         return 0
-    sign, *digits = zone.removeprefix("UTC").removeprefix("GMT").strip().replace(":", "")
-    hours, minutes = (digits[:-2], digits[-2:]) if len(digits) > 2 else (digits, ["0"])
-    return (-60 if sign == "-" else 60) * (60 * int("".join(hours)) + int("".join(minutes)))
+    plain = zone.removeprefix("UTC").removeprefix("GMT").strip().replace(":", "")
+    hours, minutes = (plain[1:-2], plain[-2:]) if len(plain) > 3 else (plain[1:], "0")
+    return (-60 if plain[0] == "-" else 60) * (60 * int(hours) + int(minutes))
