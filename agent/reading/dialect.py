@@ -232,6 +232,7 @@ def _of_rows(
         before = _in_comment(lines, first_line, delimiter, width)
     if not before and first and len(split[first - 1][1]) > 1 and not any(map(_is_value, split[first - 1][1])):
         before = [split[first - 1]]  # the rows have another number of fields, which their reader tells
+        width = max(width, len(_stripped(before[0][1])))
     if before and len(before[-1][1]) != width and _is_counted(rows):
         width = len(before[-1][1])
     header, header_line, units = _header(before, width)

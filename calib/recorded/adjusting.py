@@ -228,7 +228,7 @@ def norm_fitted(sensor: SensorTable, options: Options) -> Outcome:
 
 
 def _outcome(found: Adjustment, windows: Sequence[Window], rate_hz: float) -> Outcome:
-    reasons = found.reasons or _hardly_used(windows)
+    reasons = _hardly_used(windows) or found.reasons
     nuisances = [NuisanceValue(n.name, n.value, n.standard_uncertainty, n.unit) for n in found.nuisances]
     return Outcome(
         None if reasons else found.calibration, reasons, windows, rate_hz, found.calibration.method,

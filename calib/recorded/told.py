@@ -93,9 +93,9 @@ def _at_0hz(outcome: Outcome, factors: Array) -> str:
 def parameters_of(outcome: Outcome) -> list[int]:
     """The main sensitivity with the largest relative U, and the offset with the largest U, as far as they are known."""
     u, values = outcome.standard_uncertainty, outcome.values
-    relative = np.append(u[:9] / np.abs(values[:9]), u[9:])
-    told = [[k for k in group if np.isfinite(relative[k])] for group in (MAIN, OFFSET)]
-    return [max(group, key=lambda k: float(relative[k])) for group in told if group]
+    compared = {k: u[k] / abs(values[k]) for k in MAIN if values[k]} | {k: u[k] for k in OFFSET}
+    told = [[k for k in group if np.isfinite(compared.get(k, np.nan))] for group in (MAIN, OFFSET)]
+    return [max(group, key=lambda k: float(compared[k])) for group in told if group]
 
 
 def largest_sources(outcome: Outcome) -> list[Source]:

@@ -57,7 +57,7 @@ def test_replay_keeps_a_value_and_its_uncertainty_on_one_line() -> None:
     )  # fmt: skip
     head, *rows = [line for line in run.stdout.splitlines() if line.startswith("  sensor") or "±" in line]
     assert head.split()[:9] == ["sensor", "result", "windows", "Sxx", "Syy", "Szz", "Qx", "Qy", "Qz"]
-    assert len(rows) > 3
+    assert len(rows) > 1
     for row in rows:
         # Both are rounded to the same place: 0.9887 ± 0.0086.
         assert re.fullmatch(r" +imu +\d+ +\d+" + r" +-?\d+\.(\d+) ± \d+\.\d+" * 6 + r" +1 +m/s²", row), row
