@@ -12,10 +12,8 @@ from calib.recorded.outcome import Outcome
 from calib.recorded.poses import CLAMP, Poses
 from calib.recorded.table import ReferenceTable, SensorTable, ends_s
 
-BLOCKS, BLOCK = (
-    200,
-    500,
-)  # blocks of consecutive samples that are looked at, spread over the recording, and their length
+# Blocks of consecutive samples that are looked at, spread over the recording, and their length.
+BLOCKS, BLOCK = 200, 500
 STUCK_SHARE = 0.1  # of the blocks
 SILENT = 0.02  # rms of a channel over that of the strongest; a sensor that moves in a plane has outputs as silent
 MOVES = 0.2
