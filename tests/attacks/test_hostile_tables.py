@@ -274,18 +274,29 @@ def test_a_result_without_all_its_numbers_is_told(tmp_path: Path, damaged: dict[
         read_reference_certificate(path)
 
 
-def test_a_damaged_time_in_miniseed_does_not_fill_the_memory_with_a_gap(tmp_path: Path) -> None:
-    """Three components, one record of one of them 31 h early: 11 million samples each, 24 kB in the file."""
+def with_an_early_record(path: Path, samples: int) -> Path:
+    """Three components, one record of one of them 40 h early: 14 million samples each, 24 kB in the file. `samples`: of
+    the other records of this component; the other two have 3000."""
     obspy = pytest.importorskip("obspy", reason="the extra seismic is not installed")
     traces = [
-        obspy.Trace(np.arange(3000, dtype=np.int32), {"sampling_rate": 100.0, "channel": f"HN{k}"}) for k in "ENZ"
+        obspy.Trace(np.arange(n, dtype=np.int32), {"sampling_rate": 100.0, "channel": f"HN{k}"})
+        for k, n in zip("ENZ", (samples, 3000, 3000), strict=True)
     ]
     early = obspy.Trace(np.arange(600, dtype=np.int32), {"sampling_rate": 100.0, "channel": "HNE"})
-    early.stats.starttime -= 31 * 3600
-    path = tmp_path / "a.mseed"
+    early.stats.starttime -= 40 * 3600
     obspy.Stream([*traces, early]).write(str(path), format="MSEED")
+    return path
+
+
+def test_a_damaged_time_in_miniseed_does_not_fill_the_memory_with_a_gap(tmp_path: Path) -> None:
     with pytest.raises(TableError, match=r"the file says that it holds .* bytes of values"):
-        open_miniseed(path)
+        open_miniseed(with_an_early_record(tmp_path / "a.mseed", 2000))
+    values = open_miniseed(with_an_early_record(tmp_path / "b.mseed", 3000)).values  # this component has the most
+    (time_s,) = (held for column, held in values.items() if column.name == "time_s")
+    expected_s = [*(np.arange(601) / 100 - 40 * 3600), *(np.arange(3000) / 100)]
+    np.testing.assert_allclose(time_s[:], expected_s, rtol=0, atol=1e-9)
+    (north,) = (held for column, held in values.items() if column.name == "y")
+    np.testing.assert_array_equal(north[:], [*([np.nan] * 601), *range(3000)])
 
 
 def test_a_header_of_miniseed_that_is_no_text_shows_no_traceback(
