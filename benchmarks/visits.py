@@ -79,7 +79,7 @@ class Visit:
         with tempfile.TemporaryDirectory() as name:
             directory = Path(name)
             write_prior(channel, None, directory / "prior.json")
-            measuring = Measuring(channel, options_of(parsed(stated(channel, directory))))
+            measuring = Measuring(channel, options_of(parsed(stated(channel, directory, ""))))
         return cls(Structure(parameters, seed, way), channel, measuring)
 
     def record(self, seconds: float) -> Record:

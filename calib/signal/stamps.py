@@ -71,7 +71,7 @@ def clock_from_stamps(stamp_s: Slices) -> ClockFit:
         parts = [(arrivals.index[a:b], arrivals.arrival_s[a:b]) for a, b in itertools.pairwise(cuts)]
         edge = edge or _edge(arrivals.kind, *max(parts, key=lambda part: len(part[0])))
         bounds = [0, *found.tolist(), stop - first]
-        if first and stamp_s[first] - stamp_s[first - 1] > OFF_S:
+        if first and np.ptp(stamp_s[first - 1 : first + 1]) > OFF_S:
             gaps.append(first)
         for (index, arrival_s), (a, b) in zip(parts, itertools.pairwise(bounds), strict=True):
             telling = len(pieces) if len(index) >= FEWEST_FOR_RATE else telling

@@ -128,13 +128,13 @@ def calibrated(path: Path, *options: str) -> list[list[float]]:
 
 
 def test_calibrate_uses_the_corner_in_a_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    coupled = {**STATED, "reference": ("flat", "highpass corner_hz=0.01")}
+    coupled = {**STATED, "reference": ("flat", "highpass corner_hz=0.01 u_corner_pct=30")}
     with_it, without = recorded(tmp_path / "a", coupled), recorded(tmp_path / "b", STATED)
-    stated = calibrated(without, "--reference-corner-hz", "0.01", "--u-reference-corner-hz", "0.001")
+    stated = calibrated(without, "--reference-corner-hz", "0.01", "--u-reference-corner-hz", "0.003")
     capsys.readouterr()
     assert calibrated(with_it) == stated
     assert "--reference-corner-hz 0.01, as its driver states in the recording" in capsys.readouterr().err
-    own = ["--reference-corner-hz", "0.008", "--u-reference-corner-hz", "0.001"]
+    own = ["--reference-corner-hz", "0.008", "--u-reference-corner-hz", "0.003"]
     assert calibrated(with_it, *own) == calibrated(without, *own) != stated
 
 

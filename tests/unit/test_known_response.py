@@ -79,8 +79,8 @@ def test_a_filter_whose_corner_is_within_the_motion_is_right_only_if_it_is_state
 
 def test_a_corner_that_is_hardly_known_within_the_motion_determines_nothing() -> None:
     _, found = recorded(2, lowpass(4, 16.0), known_of(["lowpass order=4 corner_hz=16 u_corner_pct=20"], ["flat"]))
-    assert found.calibration is not None
-    assert np.isnan(np.diag(found.calibration.sensitivity)).all()
+    (reason,) = found.reasons
+    assert reason.startswith("rank 3 of 4: the data determine none of the 12 parameters")
 
 
 @pytest.mark.parametrize("side", ["sensor", "reference"])
